@@ -1,0 +1,60 @@
+"""What core itself offers, registered as any plugin would: the three executors and the local transport."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+from ibrobot_core.descriptors import ExecutorDescriptor, TransportDescriptor
+from ibrobot_core.executor_options import GripperOptions, PositionOptions, TrajectoryOptions
+from ibrobot_core.hookspecs import hookimpl
+
+if TYPE_CHECKING:
+    from ibrobot_core.interfaces import Context, Executor, Transport
+
+
+def _position(options: Any, ctx: Context) -> Executor:
+    from ibrobot_core.control.executors.position import PositionExecutor
+
+    return PositionExecutor(options, ctx)
+
+
+def _trajectory(options: Any, ctx: Context) -> Executor:
+    from ibrobot_core.control.executors.trajectory import TrajectoryExecutor
+
+    return TrajectoryExecutor(options, ctx)
+
+
+def _gripper(options: Any, ctx: Context) -> Executor:
+    from ibrobot_core.control.executors.gripper import GripperExecutor
+
+    return GripperExecutor(options, ctx)
+
+
+def _local(options: Any, ctx: Context) -> Transport:
+    from ibrobot_core.local_transport import LocalTransport
+
+    return LocalTransport()
+
+
+@hookimpl
+def ibrobot_executors() -> Iterable[ExecutorDescriptor]:
+    """The three that IB-Robot users know."""
+    yield ExecutorDescriptor(
+        type="position", options=PositionOptions, make=_position, streams=True,
+        summary="follows a stream of setpoints; holds when it goes stale",
+    )  # fmt: skip
+    yield ExecutorDescriptor(
+        type="trajectory", options=TrajectoryOptions, make=_trajectory,
+        summary="follows joint trajectories, with path and goal tolerances",
+    )  # fmt: skip
+    yield ExecutorDescriptor(
+        type="gripper", options=GripperOptions, make=_gripper,
+        summary="opens or closes a gripper; a stall counts as grasped",
+    )  # fmt: skip
+
+
+@hookimpl
+def ibrobot_transports() -> Iterable[TransportDescriptor]:
+    """Within one process."""
+    yield TransportDescriptor(type="local", make=_local, summary="within this process")

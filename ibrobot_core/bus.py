@@ -1,0 +1,168 @@
+"""The in-process bus: topics with bounded queues per subscriber, latched topics, counted drops, and service calls."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import attrs
+
+from ibrobot_core.clock import Clock
+from ibrobot_core.errors import TransportError
+from ibrobot_core.messages import Message
+
+
+@attrs.frozen
+class Received:
+    """A message with the time at which the bus took it [ns]."""
+
+    topic: str
+    message: Message
+    received_ns: int
+
+
+class Subscription:
+    """One subscriber's queue: `keep_last` of `depth`; when full the oldest is dropped and counted."""
+
+    def __init__(self, bus: Bus, topic: str, depth: int) -> None:
+        self.topic = topic
+        self.depth = depth
+        self.dropped = 0
+        self._bus = bus
+        self._queue: deque[Received] = deque()
+        self._arrived = threading.Condition(bus._lock)
+
+    def _put(self, item: Received) -> None:
+        """Called with the bus lock held."""
+        if len(self._queue) >= self.depth:
+            self._queue.popleft()
+            self.dropped += 1
+        self._queue.append(item)
+        self._arrived.notify_all()
+
+    def get(self, timeout_s: float | None = 0.0) -> Received | None:
+        """The oldest message waiting, or None when none comes within `timeout_s` (None waits for ever)."""
+        with self._arrived:
+            if not self._queue and timeout_s != 0.0:
+                self._arrived.wait_for(lambda: bool(self._queue), timeout_s)
+            return self._queue.popleft() if self._queue else None
+
+    def drain(self) -> list[Received]:
+        """All messages waiting, oldest first."""
+        with self._arrived:
+            items = list(self._queue)
+            self._queue.clear()
+            return items
+
+    def close(self) -> None:
+        """Receive nothing more."""
+        self._bus._unsubscribe(self)
+
+
+class Bus:
+    """Publish and subscribe within a process. Publishing never blocks on a subscriber.
+
+    Receive stamps are taken under the bus lock, so that a reader that holds `now_ns` from `snapshot_ns` has, in its
+    queues, every message received at or before it: this is what makes live sampling reproducible from a bag.
+    """
+
+    def __init__(self, clock: Clock) -> None:
+        self.clock = clock
+        self._lock = threading.RLock()
+        self._subscriptions: dict[str, list[Subscription]] = {}
+        self._all: list[Subscription] = []
+        self._types: dict[str, str] = {}
+        self._latched: dict[str, Received] = {}
+        self._counts: dict[str, int] = {}
+        self._services: dict[str, Callable[[Any], Any]] = {}
+
+    def publish(self, topic: str, message: Message, *, latched: bool = False) -> None:
+        """Hand `message` to every subscriber of `topic`; a latched one is also given to later subscribers.
+
+        Raises:
+            TransportError: if the topic carries another message type.
+        """
+        with self._lock:
+            known = self._types.setdefault(topic, message.ros_type)
+            if known != message.ros_type:
+                raise TransportError(f"topic {topic} carries {known}, not {message.ros_type}")
+            item = Received(topic, message, self.clock.now_ns())
+            self._counts[topic] = self._counts.get(topic, 0) + 1
+            if latched:
+                self._latched[topic] = item
+            for subscription in self._subscriptions.get(topic, ()):
+                subscription._put(item)
+            for subscription in self._all:
+                subscription._put(item)
+
+    def subscribe(self, topic: str | None, depth: int = 10) -> Subscription:
+        """A new queue on `topic` (None: every topic), holding the newest `depth` messages.
+
+        Raises:
+            ValueError: for a depth below one.
+        """
+        if depth < 1:
+            raise ValueError(f"depth must be at least 1, got {depth}")
+        with self._lock:
+            subscription = Subscription(self, topic or "", depth)
+            if topic is None:
+                self._all.append(subscription)
+                for item in self._latched.values():
+                    subscription._put(item)
+            else:
+                self._subscriptions.setdefault(topic, []).append(subscription)
+                if topic in self._latched:
+                    subscription._put(self._latched[topic])
+            return subscription
+
+    def _unsubscribe(self, subscription: Subscription) -> None:
+        with self._lock:
+            for subscriptions in (self._all, self._subscriptions.get(subscription.topic, [])):
+                if subscription in subscriptions:
+                    subscriptions.remove(subscription)
+
+    def snapshot_ns(self) -> int:
+        """Now [ns], such that every message received at or before it is in its subscribers' queues."""
+        with self._lock:
+            return self.clock.now_ns()
+
+    def topics(self) -> dict[str, tuple[str, int]]:
+        """Every topic seen: message type and number of messages published."""
+        with self._lock:
+            return {topic: (self._types[topic], count) for topic, count in sorted(self._counts.items())}
+
+    def dropped(self) -> dict[str, int]:
+        """Messages dropped from full queues, per topic, over the present subscribers; topics without loss left out."""
+        with self._lock:
+            lost: dict[str, int] = {}
+            for subscriptions in (self._all, *self._subscriptions.values()):
+                for subscription in subscriptions:
+                    if subscription.dropped:
+                        name = subscription.topic or "*"
+                        lost[name] = lost.get(name, 0) + subscription.dropped
+            return lost
+
+    def serve(self, name: str, handler: Callable[[Any], Any]) -> None:
+        """Answer calls of service `name` with `handler`, in the caller's thread.
+
+        Raises:
+            TransportError: if the service is served already.
+        """
+        with self._lock:
+            if name in self._services:
+                raise TransportError(f"service {name} is served already")
+            self._services[name] = handler
+
+    def call(self, name: str, request: Any) -> Any:
+        """Call service `name`.
+
+        Raises:
+            TransportError: if nobody serves it.
+        """
+        with self._lock:
+            handler = self._services.get(name)
+        if handler is None:
+            raise TransportError(f"nobody serves {name}; served: {', '.join(sorted(self._services)) or 'nothing'}")
+        return handler(request)

@@ -1,0 +1,64 @@
+"""The two clocks: `real`, whose deadlines are wall time, and `lockstep`, which advances when a tick's work is done."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+
+from ibrobot_core.units import NS_PER_S
+
+
+class Clock(ABC):
+    """Where every stamp comes from, in integer nanoseconds."""
+
+    @abstractmethod
+    def now_ns(self) -> int:
+        """The current time [ns]. Never runs backwards."""
+
+    @abstractmethod
+    def sleep_until(self, deadline_ns: int) -> None:
+        """Return at `deadline_ns` [ns] or at once when it has passed."""
+
+
+class RealClock(Clock):
+    """Monotonic time shifted to the Unix epoch once, so that stamps are dates and never jump.
+
+    Args:
+        epoch_offset_ns: epoch time minus monotonic time [ns]. Processes of one run share the host's.
+    """
+
+    def __init__(self, epoch_offset_ns: int | None = None) -> None:
+        self.epoch_offset_ns = time.time_ns() - time.monotonic_ns() if epoch_offset_ns is None else epoch_offset_ns
+
+    def now_ns(self) -> int:
+        return time.monotonic_ns() + self.epoch_offset_ns
+
+    def sleep_until(self, deadline_ns: int) -> None:
+        remaining = deadline_ns - self.now_ns()
+        if remaining > 0:
+            time.sleep(remaining / NS_PER_S)
+
+
+class SteppedClock(Clock):
+    """Time that moves only when told to: lockstep runs and tests."""
+
+    def __init__(self, start_ns: int = 0) -> None:
+        self._now_ns = start_ns
+
+    def now_ns(self) -> int:
+        return self._now_ns
+
+    def sleep_until(self, deadline_ns: int) -> None:
+        """Move time to `deadline_ns` when that lies ahead."""
+        self._now_ns = max(self._now_ns, deadline_ns)
+
+    def advance(self, step_ns: int) -> int:
+        """Move time on by `step_ns` [ns] and return it.
+
+        Raises:
+            ValueError: for a negative step, since no clock here runs backwards.
+        """
+        if step_ns < 0:
+            raise ValueError(f"step_ns must not be negative, got {step_ns}")
+        self._now_ns += step_ns
+        return self._now_ns

@@ -1,0 +1,196 @@
+"""The robot YAML as frozen attrs classes: what each section may say, its defaults and its ranges."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import attrs
+
+from ibrobot_core.options import option
+from ibrobot_core.robot import Robot
+
+
+@attrs.frozen
+class Component:
+    """A section with a `type`: which plugin, and that plugin's own options (an instance of its options class)."""
+
+    type: str
+    options: Any
+
+
+@attrs.frozen
+class HardwareComponent(Component):
+    """Hardware, and the joints that it owns (all of the robot's where the YAML does not say)."""
+
+    name: str
+    joints: tuple[str, ...]
+
+
+@attrs.frozen
+class Peripheral(Component):
+    """A sensor. Under `--sim` the simulation's own sensor of the same kind stands for it."""
+
+    name: str
+    kind: str
+
+
+@attrs.frozen
+class ExecutorComponent(Component):
+    """An executor and the joints that it owns: those of its group, in group order."""
+
+    name: str
+    group: str
+    joints: tuple[str, ...]
+
+
+@attrs.frozen
+class Align:
+    """How samples become a value at tick t; only samples with stamp <= t count."""
+
+    strategy: str = option(
+        "hold",
+        choices=("hold", "asof", "drop"),
+        help="hold: the newest; asof: the newest if at most tol_ms old; drop: the newest if within the last step",
+    )
+    stamp: str = option("header", choices=("header", "receive"), help="which stamp counts")
+    tol_ms: float | None = option(None, unit="ms", ge=0, help="greatest age, for asof")
+
+    def __attrs_post_init__(self) -> None:
+        if self.strategy == "asof" and self.tol_ms is None:
+            raise ValueError("strategy asof needs tol_ms, e.g. tol_ms: 100")
+        if self.strategy != "asof" and self.tol_ms is not None:
+            raise ValueError(f"tol_ms has no meaning for strategy {self.strategy}; it belongs to asof")
+
+
+@attrs.frozen
+class ImageSpec:
+    """How an image becomes an array."""
+
+    resize: tuple[int, int] | None = option(None, unit="px", help="[height, width]; None keeps the camera's size")
+    encoding: str = option("rgb8", choices=("rgb8", "bgr8", "mono8", "16UC1", "32FC1"), help="of the array")
+
+
+@attrs.frozen
+class ObservationSpec:
+    """One topic that feeds one key of the observations. Several under one key concatenate in file order."""
+
+    key: str = option(help="e.g. observation.state, observation.images.top")
+    topic: str = option("", help="where the messages come from; a peripheral's own topic where it names one")
+    type: str = option("", help="ROS 2 message type; known by itself for /joint_states and peripherals")
+    peripheral: str | None = option(None, help="the peripheral that publishes it")
+    select: tuple[str, ...] = option((), help="dotted paths into the message, e.g. position.shoulder_pan")
+    image: ImageSpec | None = option(None, help="for images")
+    align: Align = option(factory=Align, help="how samples become a value at a tick")
+
+
+@attrs.frozen
+class ActionSpec:
+    """One part of the action vector, for one executor. Several under one key split it in file order."""
+
+    key: str = option("action", help="action")
+    executor: str = option(help="the executor that takes it")
+    topic: str = option(help="where what the robot was told is published")
+    type: str = option("std_msgs/msg/Float64MultiArray", choices=("std_msgs/msg/Float64MultiArray",), help="message type")
+    safety_behavior: str = option("hold", choices=("hold", "relax"), help="what follows when the setpoints go stale")
+
+
+@attrs.frozen
+class ContractConfig:
+    """The `contract:` section: rate, observations and actions."""
+
+    rate_hz: float = option(30.0, unit="Hz", gt=0, help="ticks of observations and actions")
+    max_duration_s: float = option(90.0, unit="s", gt=0, help="longest episode")
+    observations: tuple[ObservationSpec, ...] = option((), help="topics -> observation keys")
+    actions: tuple[ActionSpec, ...] = option((), help="the action vector -> executors")
+
+
+@attrs.frozen
+class ModelConfig(Component):
+    """A policy, the unit of its vectors, and what it sees beyond the contract."""
+
+    name: str
+    norm_mode: str = "radians"
+    extra_observations: tuple[ObservationSpec, ...] = ()
+
+
+@attrs.frozen
+class Smoothing:
+    """How an arriving chunk joins the plan."""
+
+    enabled: bool = option(True, help="blend where chunks overlap; otherwise the new chunk replaces the plan")
+    temporal_ensemble_coeff: float = option(0.01, help="c in w_k = exp(-c k), k = 0 the oldest prediction")
+
+
+@attrs.frozen
+class Dispatch:
+    """How the plan is kept filled."""
+
+    watermark: int = option(20, unit="actions", ge=0, help="ask for a chunk when no more than this remains of the plan")
+    smoothing: Smoothing = option(factory=Smoothing, help="how chunks blend")
+
+
+@attrs.frozen
+class Inference:
+    """Which model a mode runs, and where."""
+
+    model: str = option(help="a name under models")
+    execution_mode: str = option("monolithic", choices=("monolithic",), help="where infer runs")
+    request_timeout: float = option(5.0, unit="s", gt=0, help="after which a request counts as failed and the arm holds")
+    prompt: str = option("", help="task for language-conditioned policies")
+
+
+@attrs.frozen
+class ControlMode:
+    """A mode: the executors that are active in it, and what feeds them."""
+
+    name: str
+    executors: tuple[str, ...]
+    teleop: str | None = None
+    inference: Inference | None = None
+    dispatch: Dispatch = attrs.field(factory=Dispatch)
+    planner: Component | None = None
+
+
+@attrs.frozen
+class Recording(Component):
+    """The `recording:` section."""
+
+    root: Path = Path("episodes")
+    dataset: str = "default"
+    topics: str | tuple[str, ...] = "contract"
+
+
+@attrs.frozen
+class Control:
+    """The `control:` section."""
+
+    rate_hz: float = option(100.0, unit="Hz", gt=0, le=1000, help="rate of the control loop")
+    stop: str = option("hold", help="what stopping does: hold, relax, or pose NAME")
+    priority: int = option(60, ge=1, le=99, help="SCHED_FIFO priority, where the machine permits it")
+    state_timeout: float = option(0.1, unit="s", gt=0, help="time without a state from the hardware before a fault")
+
+
+@attrs.frozen(slots=False)
+class RobotConfig:
+    """A whole robot YAML, checked. `source` names the file; `document` is the plain data it was made of."""
+
+    robot: Robot
+    executors: Mapping[str, ExecutorComponent]
+    control_modes: Mapping[str, ControlMode]
+    default_control_mode: str
+    hardware: Mapping[str, HardwareComponent] = attrs.field(factory=dict)
+    simulation: Component | None = None
+    peripherals: Mapping[str, Peripheral] = attrs.field(factory=dict)
+    models: Mapping[str, ModelConfig] = attrs.field(factory=dict)
+    teleoperation: Mapping[str, Component] = attrs.field(factory=dict)
+    contract: ContractConfig = attrs.field(factory=ContractConfig)
+    recording: Recording | None = None
+    transport: Component | None = None
+    viewer: Component | None = None
+    control: Control = attrs.field(factory=Control)
+    simulated: bool = False
+    """Whether `simulation` stands for `hardware` in this run."""
+    source: Path = Path("<memory>")
+    document: Mapping[str, Any] = attrs.field(factory=dict, repr=False)

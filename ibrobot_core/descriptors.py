@@ -1,0 +1,131 @@
+"""Descriptors: what a plugin says about each thing it offers, without importing anything heavy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import attrs
+
+from ibrobot_core.options import NoOptions
+
+if TYPE_CHECKING:
+    import click
+
+    from ibrobot_core.interfaces import (
+        Context,
+        DatasetWriter,
+        Executor,
+        Hardware,
+        Planner,
+        Policy,
+        Recorder,
+        Sensor,
+        Teleop,
+        Transport,
+        Viewer,
+    )
+
+
+@attrs.frozen
+class Descriptor[T]:
+    """One implementation of one kind.
+
+    `make(options, ctx)` imports what it needs when it is called, and opens no device: that is for the object's own
+    `connect`, `open` or `load`.
+    """
+
+    type: str
+    """What the YAML says after `type:`."""
+    make: Callable[[Any, Context], T]
+    summary: str
+    options: type = NoOptions
+    """A frozen attrs class made with `ibrobot_core.options.option`."""
+
+
+@attrs.frozen
+class HardwareDescriptor(Descriptor["Hardware"]):
+    """Hardware; `simulated` ones are `SimulatedHardware` and may stand in the `simulation:` section."""
+
+    simulated: bool = False
+    sensors: Mapping[str, str] = attrs.field(factory=dict)
+    """For simulated hardware: sensor kind -> the sensor type that stands for it, e.g. `{"camera": "mujoco"}`."""
+
+
+@attrs.frozen
+class SensorDescriptor(Descriptor["Sensor"]):
+    """A sensor of a kind: `camera`, `imu`, …"""
+
+    kind: str = "camera"
+
+
+@attrs.frozen
+class TeleopDescriptor(Descriptor["Teleop"]):
+    """A teleoperation device."""
+
+
+@attrs.frozen
+class PolicyDescriptor(Descriptor["Policy"]):
+    """A policy."""
+
+
+@attrs.frozen
+class ExecutorDescriptor(Descriptor["Executor"]):
+    """An executor; `streams` says that it follows setpoints (from policies and teleop) rather than goals."""
+
+    streams: bool = False
+
+
+@attrs.frozen
+class PlannerDescriptor(Descriptor["Planner"]):
+    """A motion planner."""
+
+
+@attrs.frozen
+class TransportDescriptor(Descriptor["Transport"]):
+    """A transport."""
+
+
+@attrs.frozen
+class RecorderDescriptor(Descriptor["Recorder"]):
+    """An episode recorder."""
+
+
+@attrs.frozen
+class DatasetDescriptor(Descriptor["DatasetWriter"]):
+    """A dataset writer."""
+
+
+@attrs.frozen
+class ViewerDescriptor(Descriptor["Viewer"]):
+    """A viewer."""
+
+
+@attrs.frozen
+class ConfigFile:
+    """A robot YAML that a plugin ships; `ibrobot launch NAME` finds it."""
+
+    name: str
+    path: Path
+    summary: str = ""
+
+
+@attrs.frozen
+class Command:
+    """A command that a plugin adds: `ibrobot NAME …`; `load` imports it when it is called."""
+
+    name: str
+    summary: str
+    load: Callable[[], click.Command]
+
+
+@attrs.frozen
+class Check:
+    """One line of `ibrobot doctor`."""
+
+    name: str
+    ok: bool
+    found: str
+    remedy: str = ""
+    """What to do about it, where `ok` is False."""

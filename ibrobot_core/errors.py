@@ -1,0 +1,99 @@
+"""The errors that a user may see; each prints as one line and carries the command's exit code."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import attrs
+
+
+class IbrobotError(Exception):
+    """Base of every error that ibrobot raises on purpose.
+
+    The command line prints `str(error)` and exits with `exit_code`; anything else is a bug and prints a traceback.
+    """
+
+    exit_code = 1
+
+
+@attrs.frozen
+class Problem:
+    """One thing wrong with a config file."""
+
+    file: Path
+    line: int
+    path: str
+    message: str
+
+    def __str__(self) -> str:
+        where = f"{self.file}:{self.line}: " if self.line else f"{self.file}: "
+        return f"{where}{self.path}: {self.message}" if self.path else f"{where}{self.message}"
+
+
+class ConfigError(IbrobotError):
+    """A robot YAML that cannot be used, e.g. an unknown key; `problems` has every fault found, in file order."""
+
+    exit_code = 2
+
+    def __init__(self, problems: Iterable[Problem]) -> None:
+        self.problems = tuple(problems)
+        super().__init__("\n".join(str(p) for p in self.problems))
+
+
+class PluginError(IbrobotError):
+    """A plugin that is asked for but is missing or broken, e.g. `type: feetech_so101` without its package."""
+
+    exit_code = 2
+
+
+class ContractError(IbrobotError):
+    """Data that does not fit the contract, e.g. a policy trained on other joints than the robot's."""
+
+    exit_code = 2
+
+
+class HardwareError(IbrobotError):
+    """Hardware that cannot be opened, read or written, e.g. a servo that stopped answering."""
+
+
+class SensorError(IbrobotError):
+    """A sensor that cannot be opened or read, e.g. a camera that another program holds."""
+
+
+class TeleopError(IbrobotError):
+    """A teleoperation device that cannot be opened or read, e.g. no terminal for the keyboard."""
+
+
+class PolicyError(IbrobotError):
+    """A policy that cannot be loaded or run, e.g. a checkpoint without its statistics."""
+
+
+class PlanningError(IbrobotError):
+    """A motion that cannot be planned, e.g. a goal outside the joint limits."""
+
+
+class TransportError(IbrobotError):
+    """A message that cannot be sent, e.g. a request that nobody serves."""
+
+
+class RecorderError(IbrobotError):
+    """A recording that cannot be written or read, e.g. a full disk."""
+
+
+class DatasetError(IbrobotError):
+    """A dataset that cannot be written or read, e.g. a frame of another shape than the first."""
+
+
+class GoalRejected(IbrobotError):
+    """A goal that an executor refuses, e.g. a trajectory whose times do not increase."""
+
+
+class ComponentFailed(IbrobotError):
+    """A running component that died, e.g. a control process that was killed; the rest was stopped."""
+
+
+class NotSupported(IbrobotError):
+    """Something that this implementation cannot do, e.g. `control.stop: relax` on hardware without torque control."""
+
+    exit_code = 2

@@ -1,0 +1,129 @@
+"""The hooks. Registering hooks are called once, at discovery, and yield descriptors; event hooks tell what happened.
+
+A plugin is a module (or object) named by an entry point of group `ibrobot`:
+
+    [project.entry-points.ibrobot]
+    feetech = "ibrobot_feetech"
+
+with functions marked `@ibrobot_core.hookimpl`, each yielding descriptors:
+
+    @hookimpl
+    def ibrobot_hardware():
+        yield HardwareDescriptor(
+            type="feetech_so101", summary="SO-101 follower on a Feetech bus", options=FollowerOptions, make=_make_follower,
+        )
+
+An implementation may leave out arguments that it does not need.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+import pluggy
+
+if TYPE_CHECKING:
+    from ibrobot_core.descriptors import (
+        Check,
+        Command,
+        ConfigFile,
+        DatasetDescriptor,
+        ExecutorDescriptor,
+        HardwareDescriptor,
+        PlannerDescriptor,
+        PolicyDescriptor,
+        RecorderDescriptor,
+        SensorDescriptor,
+        TeleopDescriptor,
+        TransportDescriptor,
+        ViewerDescriptor,
+    )
+
+hookspec = pluggy.HookspecMarker("ibrobot")
+hookimpl = pluggy.HookimplMarker("ibrobot")
+
+
+@hookspec
+def ibrobot_hardware() -> Iterable[HardwareDescriptor]:  # type: ignore[empty-body]
+    """Hardware that this plugin drives or simulates."""
+
+
+@hookspec
+def ibrobot_sensors() -> Iterable[SensorDescriptor]:  # type: ignore[empty-body]
+    """Cameras and other sensors."""
+
+
+@hookspec
+def ibrobot_teleop() -> Iterable[TeleopDescriptor]:  # type: ignore[empty-body]
+    """Teleoperation devices."""
+
+
+@hookspec
+def ibrobot_policies() -> Iterable[PolicyDescriptor]:  # type: ignore[empty-body]
+    """Policies."""
+
+
+@hookspec
+def ibrobot_executors() -> Iterable[ExecutorDescriptor]:  # type: ignore[empty-body]
+    """Executors, ahead of the safety layer in the control process."""
+
+
+@hookspec
+def ibrobot_planners() -> Iterable[PlannerDescriptor]:  # type: ignore[empty-body]
+    """Motion planners."""
+
+
+@hookspec
+def ibrobot_transports() -> Iterable[TransportDescriptor]:  # type: ignore[empty-body]
+    """Transports between processes and machines."""
+
+
+@hookspec
+def ibrobot_recorders() -> Iterable[RecorderDescriptor]:  # type: ignore[empty-body]
+    """Episode recorders."""
+
+
+@hookspec
+def ibrobot_datasets() -> Iterable[DatasetDescriptor]:  # type: ignore[empty-body]
+    """Dataset writers."""
+
+
+@hookspec
+def ibrobot_viewers() -> Iterable[ViewerDescriptor]:  # type: ignore[empty-body]
+    """Viewers."""
+
+
+@hookspec
+def ibrobot_configs() -> Iterable[ConfigFile]:  # type: ignore[empty-body]
+    """Robot YAMLs that this plugin ships."""
+
+
+@hookspec
+def ibrobot_commands() -> Iterable[Command]:  # type: ignore[empty-body]
+    """Commands that this plugin adds to `ibrobot`."""
+
+
+@hookspec
+def ibrobot_doctor() -> Iterable[Check]:  # type: ignore[empty-body]
+    """Checks that `ibrobot doctor` runs."""
+
+
+@hookspec
+def ibrobot_episode_started(robot: str, episode: int, mode: str, stamp_ns: int) -> None:
+    """Event: episode number `episode` (from 1) began."""
+
+
+@hookspec
+def ibrobot_episode_ended(robot: str, episode: int, outcome: str, stamp_ns: int) -> None:
+    """Event: an episode ended as `success`, `failure` or `unknown`."""
+
+
+@hookspec
+def ibrobot_mode_changed(robot: str, mode: str, previous: str, stamp_ns: int) -> None:
+    """Event: the control mode switched."""
+
+
+@hookspec
+def ibrobot_fault_raised(robot: str, fault: str, stamp_ns: int) -> None:
+    """Event: a fault was raised, e.g. hardware that stopped answering."""

@@ -1,0 +1,45 @@
+"""One abstract class per plugin kind; the whole of what an implementation must know."""
+
+from ibrobot_core.interfaces.context import Context
+from ibrobot_core.interfaces.dataset import DatasetWriter, Feature
+from ibrobot_core.interfaces.executor import Executor, GoalState, GoalStatus, Plan
+from ibrobot_core.interfaces.hardware import Episode, Hardware, JointReading, Signal, SimulatedHardware, nan_vector
+from ibrobot_core.interfaces.planner import JointGoal, Planner, PlanRequest, PoseGoal
+from ibrobot_core.interfaces.policy import Frame, Policy, PolicySpec, Tensors
+from ibrobot_core.interfaces.recorder import EpisodeEnd, EpisodeStart, Recorder
+from ibrobot_core.interfaces.sensor import Sensor
+from ibrobot_core.interfaces.teleop import Teleop, TeleopCommand
+from ibrobot_core.interfaces.transport import Transport
+from ibrobot_core.interfaces.viewer import Viewer
+
+__all__ = [
+    "Context",
+    "DatasetWriter",
+    "Episode",
+    "EpisodeEnd",
+    "EpisodeStart",
+    "Executor",
+    "Feature",
+    "Frame",
+    "GoalState",
+    "GoalStatus",
+    "Hardware",
+    "JointGoal",
+    "JointReading",
+    "Plan",
+    "PlanRequest",
+    "Planner",
+    "Policy",
+    "PolicySpec",
+    "PoseGoal",
+    "Recorder",
+    "Sensor",
+    "Signal",
+    "SimulatedHardware",
+    "Teleop",
+    "TeleopCommand",
+    "Tensors",
+    "Transport",
+    "Viewer",
+    "nan_vector",
+]

@@ -1,0 +1,62 @@
+"""Recorders: what writes an episode's messages to disk."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from pathlib import Path
+
+import attrs
+
+from ibrobot_core.messages import Message
+
+
+@attrs.frozen
+class EpisodeStart:
+    """What is known when an episode begins."""
+
+    directory: Path
+    """Where to write; does not exist yet, its parent does."""
+    stamp_ns: int
+    topics: Mapping[str, str]
+    """Topic -> ROS 2 message type, for all that may be written."""
+    metadata: Mapping[str, str]
+    """Prompt, contract, fingerprint, calibration, versions: string to string."""
+
+
+@attrs.frozen
+class EpisodeEnd:
+    """How an episode ended."""
+
+    stamp_ns: int
+    outcome: str
+    """`success`, `failure`, `discarded` or `unknown`."""
+    dropped: Mapping[str, int] = attrs.field(factory=dict)
+    """Messages lost before they reached the recorder, per topic."""
+
+
+class Recorder(ABC):
+    """Writes one episode at a time. All methods are called from the recorder's own thread."""
+
+    @abstractmethod
+    def begin(self, episode: EpisodeStart) -> None:
+        """Open a new episode.
+
+        Raises:
+            RecorderError: e.g. the directory exists, or cannot be written.
+        """
+
+    @abstractmethod
+    def write(self, topic: str, message: Message, received_ns: int) -> None:
+        """Append one message. Topics that this recorder does not keep are passed over.
+
+        Raises:
+            RecorderError: e.g. a full disk; what was written before stays readable.
+        """
+
+    @abstractmethod
+    def end(self, episode: EpisodeEnd) -> Path | None:
+        """Close the episode; returns where it is, or None when it was discarded (and nothing is left)."""
+
+    def close(self) -> None:
+        """Release everything; an episode still open is ended as `unknown`. Safe to call twice."""

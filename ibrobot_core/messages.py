@@ -1,0 +1,371 @@
+"""The ROS 2 message vocabulary as frozen classes; field names and order follow the `.msg` definitions.
+
+Sources: common_interfaces (std_msgs, sensor_msgs, geometry_msgs, trajectory_msgs, diagnostic_msgs), geometry2
+(tf2_msgs), and ibrobot_msgs. Differences from the wire: stamps and durations are integer nanoseconds, and arrays are numpy.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import attrs
+import numpy as np
+from numpy.typing import NDArray
+
+
+def _array(dtype: Any, default: Any = attrs.NOTHING) -> Any:
+    def convert(value: Any) -> NDArray[Any]:
+        return np.asarray(value, dtype=dtype)
+
+    kind = {"factory": lambda: np.empty(0, dtype=dtype)} if default is not attrs.NOTHING else {}
+    return attrs.field(converter=convert, eq=attrs.cmp_using(eq=np.array_equal), **kind)
+
+
+@attrs.frozen
+class Message:
+    """Base of all messages; `ros_type` is the full ROS 2 name."""
+
+    ros_type: ClassVar[str] = ""
+
+
+@attrs.frozen
+class Header:
+    """std_msgs/msg/Header: when and in which frame. `stamp_ns` is `stamp` [ns]."""
+
+    stamp_ns: int = 0
+    frame_id: str = ""
+
+
+@attrs.frozen
+class Bool(Message):
+    """std_msgs/msg/Bool."""
+
+    ros_type: ClassVar[str] = "std_msgs/msg/Bool"
+    data: bool
+
+
+@attrs.frozen
+class Int32(Message):
+    """std_msgs/msg/Int32."""
+
+    ros_type: ClassVar[str] = "std_msgs/msg/Int32"
+    data: int
+
+
+@attrs.frozen
+class String(Message):
+    """std_msgs/msg/String."""
+
+    ros_type: ClassVar[str] = "std_msgs/msg/String"
+    data: str
+
+
+@attrs.frozen
+class MultiArrayDimension:
+    """std_msgs/msg/MultiArrayDimension."""
+
+    label: str = ""
+    size: int = 0
+    stride: int = 0
+
+
+@attrs.frozen
+class MultiArrayLayout:
+    """std_msgs/msg/MultiArrayLayout."""
+
+    dim: tuple[MultiArrayDimension, ...] = ()
+    data_offset: int = 0
+
+
+@attrs.frozen
+class Float32MultiArray(Message):
+    """std_msgs/msg/Float32MultiArray; `data` has shape (N,)."""
+
+    ros_type: ClassVar[str] = "std_msgs/msg/Float32MultiArray"
+    data: NDArray[np.float32] = _array(np.float32)
+    layout: MultiArrayLayout = MultiArrayLayout()
+
+
+@attrs.frozen
+class Float64MultiArray(Message):
+    """std_msgs/msg/Float64MultiArray; `data` has shape (N,)."""
+
+    ros_type: ClassVar[str] = "std_msgs/msg/Float64MultiArray"
+    data: NDArray[np.float64] = _array(np.float64)
+    layout: MultiArrayLayout = MultiArrayLayout()
+
+
+@attrs.frozen
+class Int32MultiArray(Message):
+    """std_msgs/msg/Int32MultiArray; `data` has shape (N,)."""
+
+    ros_type: ClassVar[str] = "std_msgs/msg/Int32MultiArray"
+    data: NDArray[np.int32] = _array(np.int32)
+    layout: MultiArrayLayout = MultiArrayLayout()
+
+
+@attrs.frozen
+class JointState(Message):
+    """sensor_msgs/msg/JointState: position [rad], velocity [rad/s], effort [Nm], each shape (J,) or (0,) where unknown."""
+
+    ros_type: ClassVar[str] = "sensor_msgs/msg/JointState"
+    header: Header
+    name: tuple[str, ...]
+    position: NDArray[np.float64] = _array(np.float64, None)
+    velocity: NDArray[np.float64] = _array(np.float64, None)
+    effort: NDArray[np.float64] = _array(np.float64, None)
+
+
+@attrs.frozen
+class Image(Message):
+    """sensor_msgs/msg/Image: `data` holds `height` rows of `step` bytes, padding included, shape (height * step,)."""
+
+    ros_type: ClassVar[str] = "sensor_msgs/msg/Image"
+    header: Header
+    height: int
+    width: int
+    encoding: str
+    step: int
+    data: NDArray[np.uint8] = _array(np.uint8)
+    is_bigendian: int = 0
+
+
+@attrs.frozen
+class CompressedImage(Message):
+    """sensor_msgs/msg/CompressedImage: `data` is a JPEG or PNG file's bytes, shape (N,)."""
+
+    ros_type: ClassVar[str] = "sensor_msgs/msg/CompressedImage"
+    header: Header
+    format: str
+    data: NDArray[np.uint8] = _array(np.uint8)
+
+
+@attrs.frozen
+class CameraInfo(Message):
+    """sensor_msgs/msg/CameraInfo without binning and region of interest: `k` (9,), `r` (9,), `p` (12,), row-major."""
+
+    ros_type: ClassVar[str] = "sensor_msgs/msg/CameraInfo"
+    header: Header
+    height: int
+    width: int
+    distortion_model: str = "plumb_bob"
+    d: NDArray[np.float64] = _array(np.float64, None)
+    k: NDArray[np.float64] = _array(np.float64, None)
+    r: NDArray[np.float64] = _array(np.float64, None)
+    p: NDArray[np.float64] = _array(np.float64, None)
+
+
+@attrs.frozen
+class Vector3:
+    """geometry_msgs/msg/Vector3."""
+
+    x: float = 0.0
+    y: float = 0.0
+    z: float = 0.0
+
+
+@attrs.frozen
+class Quaternion:
+    """geometry_msgs/msg/Quaternion; scalar last, as in ROS."""
+
+    x: float = 0.0
+    y: float = 0.0
+    z: float = 0.0
+    w: float = 1.0
+
+
+@attrs.frozen
+class Imu(Message):
+    """sensor_msgs/msg/Imu: angular velocity [rad/s], linear acceleration [m/s^2]; covariances (9,), row-major."""
+
+    ros_type: ClassVar[str] = "sensor_msgs/msg/Imu"
+    header: Header
+    orientation: Quaternion = Quaternion()
+    angular_velocity: Vector3 = Vector3()
+    linear_acceleration: Vector3 = Vector3()
+    orientation_covariance: NDArray[np.float64] = _array(np.float64, None)
+    angular_velocity_covariance: NDArray[np.float64] = _array(np.float64, None)
+    linear_acceleration_covariance: NDArray[np.float64] = _array(np.float64, None)
+
+
+@attrs.frozen
+class Joy(Message):
+    """sensor_msgs/msg/Joy: `axes` (A,) in -1..1, `buttons` (B,) 0 or 1."""
+
+    ros_type: ClassVar[str] = "sensor_msgs/msg/Joy"
+    header: Header
+    axes: NDArray[np.float32] = _array(np.float32, None)
+    buttons: NDArray[np.int32] = _array(np.int32, None)
+
+
+@attrs.frozen
+class PointField:
+    """sensor_msgs/msg/PointField."""
+
+    name: str
+    offset: int
+    datatype: int
+    count: int = 1
+
+
+@attrs.frozen
+class PointCloud2(Message):
+    """sensor_msgs/msg/PointCloud2: `data` has shape (height * row_step,)."""
+
+    ros_type: ClassVar[str] = "sensor_msgs/msg/PointCloud2"
+    header: Header
+    height: int
+    width: int
+    fields: tuple[PointField, ...]
+    is_bigendian: bool
+    point_step: int
+    row_step: int
+    data: NDArray[np.uint8] = _array(np.uint8)
+    is_dense: bool = True
+
+
+@attrs.frozen
+class Pose(Message):
+    """geometry_msgs/msg/Pose: position [m] and orientation."""
+
+    ros_type: ClassVar[str] = "geometry_msgs/msg/Pose"
+    position: Vector3 = Vector3()
+    orientation: Quaternion = Quaternion()
+
+
+@attrs.frozen
+class PoseStamped(Message):
+    """geometry_msgs/msg/PoseStamped."""
+
+    ros_type: ClassVar[str] = "geometry_msgs/msg/PoseStamped"
+    header: Header
+    pose: Pose
+
+
+@attrs.frozen
+class Twist(Message):
+    """geometry_msgs/msg/Twist: linear [m/s], angular [rad/s]."""
+
+    ros_type: ClassVar[str] = "geometry_msgs/msg/Twist"
+    linear: Vector3 = Vector3()
+    angular: Vector3 = Vector3()
+
+
+@attrs.frozen
+class TransformStamped(Message):
+    """geometry_msgs/msg/TransformStamped: `child_frame_id` as seen from `header.frame_id`."""
+
+    ros_type: ClassVar[str] = "geometry_msgs/msg/TransformStamped"
+    header: Header
+    child_frame_id: str
+    translation: Vector3 = Vector3()
+    rotation: Quaternion = Quaternion()
+
+
+@attrs.frozen
+class TFMessage(Message):
+    """tf2_msgs/msg/TFMessage."""
+
+    ros_type: ClassVar[str] = "tf2_msgs/msg/TFMessage"
+    transforms: tuple[TransformStamped, ...]
+
+
+@attrs.frozen
+class JointTrajectoryPoint:
+    """trajectory_msgs/msg/JointTrajectoryPoint; arrays (J,), or (0,) where not given; time from the start [ns]."""
+
+    time_from_start_ns: int
+    positions: NDArray[np.float64] = _array(np.float64, None)
+    velocities: NDArray[np.float64] = _array(np.float64, None)
+    accelerations: NDArray[np.float64] = _array(np.float64, None)
+    effort: NDArray[np.float64] = _array(np.float64, None)
+
+
+@attrs.frozen
+class JointTrajectory(Message):
+    """trajectory_msgs/msg/JointTrajectory."""
+
+    ros_type: ClassVar[str] = "trajectory_msgs/msg/JointTrajectory"
+    header: Header
+    joint_names: tuple[str, ...]
+    points: tuple[JointTrajectoryPoint, ...]
+
+
+@attrs.frozen
+class KeyValue:
+    """diagnostic_msgs/msg/KeyValue."""
+
+    key: str
+    value: str
+
+
+@attrs.frozen
+class DiagnosticStatus:
+    """diagnostic_msgs/msg/DiagnosticStatus: level 0 OK, 1 WARN, 2 ERROR, 3 STALE."""
+
+    OK: ClassVar[int] = 0
+    WARN: ClassVar[int] = 1
+    ERROR: ClassVar[int] = 2
+    STALE: ClassVar[int] = 3
+    level: int
+    name: str
+    message: str = ""
+    hardware_id: str = ""
+    values: tuple[KeyValue, ...] = ()
+
+
+@attrs.frozen
+class DiagnosticArray(Message):
+    """diagnostic_msgs/msg/DiagnosticArray."""
+
+    ros_type: ClassVar[str] = "diagnostic_msgs/msg/DiagnosticArray"
+    header: Header
+    status: tuple[DiagnosticStatus, ...]
+
+
+@attrs.frozen
+class Variant(Message):
+    """ibrobot_msgs/msg/Variant: one named tensor; `data` in C order as bytes of `dtype` with `shape`."""
+
+    ros_type: ClassVar[str] = "ibrobot_msgs/msg/Variant"
+    key: str
+    dtype: str
+    shape: tuple[int, ...]
+    data: NDArray[np.uint8] = _array(np.uint8)
+
+
+@attrs.frozen
+class VariantsList(Message):
+    """ibrobot_msgs/msg/VariantsList: named tensors that belong to one instant."""
+
+    ros_type: ClassVar[str] = "ibrobot_msgs/msg/VariantsList"
+    header: Header
+    variants: tuple[Variant, ...]
+
+
+@attrs.frozen
+class RobotStatus(Message):
+    """ibrobot_msgs/msg/RobotStatus: what the robot is doing."""
+
+    ros_type: ClassVar[str] = "ibrobot_msgs/msg/RobotStatus"
+    header: Header
+    robot: str
+    mode: str
+    active_executors: tuple[str, ...] = ()
+    estop: bool = False
+    faults: tuple[str, ...] = ()
+    episode: int = 0
+    plan_length: int = 0
+    latency_ms: float = 0.0
+
+
+MESSAGE_TYPES: dict[str, type[Message]] = {
+    cls.ros_type: cls
+    for cls in (
+        Bool, Int32, String, Float32MultiArray, Float64MultiArray, Int32MultiArray,
+        JointState, Image, CompressedImage, CameraInfo, Imu, Joy, PointCloud2,
+        Pose, PoseStamped, Twist, TransformStamped, TFMessage, JointTrajectory, DiagnosticArray,
+        Variant, VariantsList, RobotStatus,
+    )
+}  # fmt: skip
+"""Every message class by its ROS 2 name."""

@@ -1,0 +1,69 @@
+"""Options of plugins and config sections: attrs fields that carry unit, help and range, and check themselves."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import attrs
+
+
+@attrs.frozen
+class NoOptions:
+    """For implementations without options."""
+
+
+def option(
+    default: Any = attrs.NOTHING,
+    *,
+    unit: str = "",
+    help: str = "",
+    ge: float | None = None,
+    gt: float | None = None,
+    le: float | None = None,
+    lt: float | None = None,
+    choices: Sequence[Any] | None = None,
+    factory: Any = None,
+    validator: Any = None,
+) -> Any:
+    """An attrs field for an options class.
+
+    Args:
+        default: value where the YAML says nothing; none makes the option required.
+        unit: SI unit or word, shown by `ibrobot plugins show` and in the JSON Schema.
+        help: one line that says what it does.
+        ge: least allowed value; `gt`, `le`, `lt` likewise.
+        gt: value that must be exceeded.
+        le: greatest allowed value.
+        lt: value that must not be reached.
+        choices: the allowed values.
+        factory: makes the default, for mutable ones.
+        validator: a further attrs validator; it raises ValueError with what would be right.
+    """
+    bounds = {"ge": ge, "gt": gt, "le": le, "lt": lt}
+    metadata = {"unit": unit, "help": help, "choices": tuple(choices) if choices is not None else None, **bounds}
+
+    def check(instance: Any, attribute: attrs.Attribute[Any], value: Any) -> None:
+        if value is None:
+            return
+        if choices is not None and value not in choices:
+            raise ValueError(f"{value!r} is not one of: {', '.join(str(c) for c in choices)}")
+        if any(b is not None for b in bounds.values()):
+            # The comparisons are written so that NaN fails them.
+            suffix = f" {unit}" if unit else ""
+            if ge is not None and not value >= ge:
+                raise ValueError(f"{value} is too small, must be at least {ge}{suffix}")
+            if gt is not None and not value > gt:
+                raise ValueError(f"{value} is too small, must be above {gt}{suffix}")
+            if le is not None and not value <= le:
+                raise ValueError(f"{value} is too large, must be at most {le}{suffix}")
+            if lt is not None and not value < lt:
+                raise ValueError(f"{value} is too large, must be below {lt}{suffix}")
+        if isinstance(value, float) and not math.isfinite(value):
+            raise ValueError(f"{value} is not a finite number")
+
+    validators = [check] if validator is None else [check, validator]
+    if factory is not None:
+        return attrs.field(factory=factory, metadata=metadata, validator=validators)
+    return attrs.field(default=default, metadata=metadata, validator=validators)

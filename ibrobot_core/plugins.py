@@ -1,0 +1,223 @@
+"""Discovery: plugins found through entry points, each in a manager of its own so that a broken one harms no other."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Mapping
+from difflib import get_close_matches
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from types import ModuleType
+from typing import Any
+
+import attrs
+import pluggy
+
+from ibrobot_core import hookspecs
+from ibrobot_core.descriptors import Check, Command, ConfigFile, Descriptor
+from ibrobot_core.errors import PluginError
+
+ENTRY_POINT_GROUP = "ibrobot"
+
+KINDS: Mapping[str, str] = {
+    "hardware": "ibrobot_hardware",
+    "sensor": "ibrobot_sensors",
+    "teleop": "ibrobot_teleop",
+    "policy": "ibrobot_policies",
+    "executor": "ibrobot_executors",
+    "planner": "ibrobot_planners",
+    "transport": "ibrobot_transports",
+    "recorder": "ibrobot_recorders",
+    "dataset": "ibrobot_datasets",
+    "viewer": "ibrobot_viewers",
+}
+"""Plugin kind -> the hook that registers it."""
+
+KNOWN_PACKAGES: Mapping[tuple[str, str], str] = {
+    ("hardware", "mujoco"): "ibrobot-plugin-mujoco",
+    ("sensor", "mujoco"): "ibrobot-plugin-mujoco",
+    ("policy", "scripted_pick"): "ibrobot-plugin-mujoco",
+    ("viewer", "mujoco"): "ibrobot-plugin-mujoco",
+    ("teleop", "keyboard"): "ibrobot-plugin-keyboard",
+    ("teleop", "replay"): "ibrobot-plugin-jointlog",
+    ("recorder", "joint_log"): "ibrobot-plugin-jointlog",
+    ("dataset", "npz"): "ibrobot-plugin-jointlog",
+    ("planner", "joint"): "ibrobot-plugin-planning",
+}
+"""Types of this project's own plugins, so that a missing one can be named."""
+
+_log = logging.getLogger("ibrobot.plugins")
+
+
+@attrs.frozen
+class Failure:
+    """A plugin that could not be used, and why."""
+
+    plugin: str
+    package: str
+    stage: str
+    """`import`, `hooks` (a misspelt or ill-formed one), or the name of the hook that raised."""
+    reason: str
+
+    def __str__(self) -> str:
+        doing = {"import": "failed to import", "hooks": "has a wrong hook"}.get(self.stage, f"failed in {self.stage}")
+        return f"plugin {self.plugin!r} ({self.package}) {doing}: {self.reason}"
+
+
+@attrs.frozen
+class Entry:
+    """A descriptor with where it comes from."""
+
+    kind: str
+    descriptor: Descriptor[Any]
+    plugin: str
+    package: str
+    version: str
+
+
+@attrs.define
+class Registry:
+    """All that the installed plugins offer, and the plugins that failed."""
+
+    entries: dict[tuple[str, str], Entry] = attrs.field(factory=dict)
+    failures: list[Failure] = attrs.field(factory=list)
+    configs: list[ConfigFile] = attrs.field(factory=list)
+    commands: dict[str, Command] = attrs.field(factory=dict)
+    managers: dict[str, pluggy.PluginManager] = attrs.field(factory=dict)
+
+    def types(self, kind: str) -> list[str]:
+        """The types offered of a kind, sorted."""
+        return sorted(t for k, t in self.entries if k == kind)
+
+    def find(self, kind: str, type_: str) -> Descriptor[Any]:
+        """The descriptor of `type_`.
+
+        Raises:
+            PluginError: when no installed plugin offers it; says which package would, or which plugin is broken.
+        """
+        entry = self.entries.get((kind, type_))
+        if entry is None:
+            raise PluginError(self._why_missing(kind, type_))
+        return entry.descriptor
+
+    def _why_missing(self, kind: str, type_: str) -> str:
+        package = KNOWN_PACKAGES.get((kind, type_))
+        for failure in self.failures:
+            if failure.package == package:
+                return f"{kind} type {type_!r} is not available: {failure}"
+        if package is not None:
+            return f"{kind} type {type_!r} needs a plugin that is not installed: pip install {package}"
+        offered = self.types(kind)
+        close = get_close_matches(type_, offered, 1)
+        hint = f", did you mean {close[0]!r}?" if close else f"; installed: {', '.join(offered) or 'none'}"
+        broken = "".join(f"; {failure}" for failure in self.failures)
+        return f"unknown {kind} type {type_!r}{hint}{broken}"
+
+    def doctor(self) -> list[Check]:
+        """The checks of all plugins; a plugin whose check raises is itself a failed check."""
+        checks: list[Check] = []
+        for name, manager in self.managers.items():
+            try:
+                checks += [check for result in manager.hook.ibrobot_doctor() for check in result]
+            except Exception as error:  # noqa: BLE001 - contained: a plugin's fault must not hide the other checks
+                checks.append(Check(f"plugin {name}", False, f"its doctor check failed: {_reason(error)}", "report it"))
+        return checks
+
+    def emit(self, event: str, **facts: Any) -> None:
+        """Tell every plugin of an event. One that raises is logged; the others are told all the same."""
+        for name, manager in self.managers.items():
+            try:
+                getattr(manager.hook, event)(**facts)
+            except Exception as error:  # noqa: BLE001 - contained: an observer must not stop the robot
+                _log.error("plugin %r failed in %s: %s", name, event, _reason(error))
+
+
+def _reason(error: BaseException) -> str:
+    first_line = str(error).strip().splitlines()[0] if str(error).strip() else ""
+    return f"{type(error).__name__}: {first_line}" if first_line else type(error).__name__
+
+
+def _manager() -> pluggy.PluginManager:
+    manager = pluggy.PluginManager("ibrobot")
+    manager.add_hookspecs(hookspecs)
+    return manager
+
+
+def _check_names(plugin: Any) -> None:
+    """Refuse functions that look like hooks but are none, marked or not: a typo would otherwise pass in silence."""
+    known = {name for name in vars(hookspecs) if name.startswith("ibrobot_")}
+    for name in vars(plugin) if isinstance(plugin, ModuleType) else dir(plugin):
+        if name.startswith("ibrobot_") and name not in known and hasattr(getattr(plugin, name), "ibrobot_impl"):
+            close = get_close_matches(name, known, 1)
+            raise ValueError(f"unknown hook {name!r}" + (f", did you mean {close[0]!r}?" if close else ""))
+
+
+def _collect(registry: Registry, plugin: str, package: str, version: str, manager: pluggy.PluginManager) -> None:
+    """Call the registering hooks; a plugin that raises in one offers nothing."""
+    found: list[tuple[str, Descriptor[Any]]] = []
+    stage = ""
+    try:
+        for kind, stage in KINDS.items():
+            for descriptor in (d for result in getattr(manager.hook, stage)() for d in result):
+                if not isinstance(descriptor, Descriptor):
+                    raise TypeError(f"expected a Descriptor, got {descriptor!r}")
+                found.append((kind, descriptor))
+        stage = "ibrobot_configs"
+        configs = [c for result in manager.hook.ibrobot_configs() for c in result]
+        stage = "ibrobot_commands"
+        commands = [c for result in manager.hook.ibrobot_commands() for c in result]
+    except Exception as error:  # noqa: BLE001 - contained: reported where the plugin is asked for
+        registry.failures.append(Failure(plugin, package, stage, _reason(error)))
+        return
+    for kind, descriptor in found:
+        other = registry.entries.get((kind, descriptor.type))
+        if other is not None:
+            reason = f"{kind} type {descriptor.type!r} is offered by {other.package} already"
+            registry.failures.append(Failure(plugin, package, KINDS[kind], reason))
+            continue
+        registry.entries[kind, descriptor.type] = Entry(kind, descriptor, plugin, package, version)
+    registry.configs += configs
+    registry.commands.update({command.name: command for command in commands})
+    registry.managers[plugin] = manager
+
+
+def _load(registry: Registry, entry_point: EntryPoint) -> None:
+    package = entry_point.dist.name if entry_point.dist else "?"
+    version = entry_point.dist.version if entry_point.dist else "?"
+    try:
+        plugin = entry_point.load()
+    except (Exception, SystemExit) as error:  # noqa: BLE001 - contained: reported where the plugin is asked for
+        registry.failures.append(Failure(entry_point.name, package, "import", _reason(error)))
+        return
+    manager = _manager()
+    try:
+        _check_names(plugin)
+        manager.register(plugin, entry_point.name)
+        manager.check_pending()
+    except Exception as error:  # noqa: BLE001 - contained: reported where the plugin is asked for
+        registry.failures.append(Failure(entry_point.name, package, "hooks", _reason(error)))
+        return
+    _collect(registry, entry_point.name, package, version, manager)
+
+
+def discover(found: Iterable[EntryPoint] | None = None) -> Registry:
+    """Load the built-in plugin and every installed one. Never raises for a plugin's fault: see `Registry.failures`.
+
+    Args:
+        found: entry points to load; the installed ones of group `ibrobot` when None.
+    """
+    from ibrobot_core import __version__, builtin
+
+    registry = Registry()
+    manager = _manager()
+    manager.register(builtin, "core")
+    _collect(registry, "core", "ibrobot-core", __version__, manager)
+    for entry_point in sorted(entry_points(group=ENTRY_POINT_GROUP) if found is None else found, key=lambda e: e.name):
+        _load(registry, entry_point)
+    return registry
+
+
+@cache
+def installed() -> Registry:
+    """The registry of the installed plugins, discovered once per process."""
+    return discover()

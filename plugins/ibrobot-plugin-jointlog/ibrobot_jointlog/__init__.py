@@ -1,0 +1,1 @@
+"""Joint logs for ibrobot: record them to CSV, replay them, and NPZ datasets."""

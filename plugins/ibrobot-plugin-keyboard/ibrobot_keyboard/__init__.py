@@ -1,0 +1,1 @@
+"""Jog a robot from the terminal: joint and Cartesian teleoperation for ibrobot."""

@@ -1,0 +1,1 @@
+"""Joint-space motion planning for ibrobot."""
