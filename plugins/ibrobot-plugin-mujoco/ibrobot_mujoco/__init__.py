@@ -1,1 +1,77 @@
 """The SO-101 in MuJoCo: hardware, cameras, scenes, a scripted pick policy and a viewer for ibrobot."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+from ibrobot_core import hookimpl
+from ibrobot_core.descriptors import Check, HardwareDescriptor, PolicyDescriptor, SensorDescriptor, ViewerDescriptor
+from ibrobot_mujoco.options import CameraOptions, MujocoOptions, ScriptedPickOptions
+
+if TYPE_CHECKING:
+    from ibrobot_core.interfaces import Context, Hardware, Policy, Sensor, Viewer
+
+
+def _hardware(options: Any, ctx: Context) -> Hardware:
+    from ibrobot_mujoco.hardware import MujocoHardware
+
+    return MujocoHardware(options, ctx)
+
+
+def _camera(options: Any, ctx: Context) -> Sensor:
+    from ibrobot_mujoco.camera import MujocoCamera
+
+    return MujocoCamera(options, ctx)
+
+
+def _scripted_pick(options: Any, ctx: Context) -> Policy:
+    from ibrobot_mujoco.scripted_pick import ScriptedPick
+
+    return ScriptedPick(options, ctx)
+
+
+def _viewer(options: Any, ctx: Context) -> Viewer:
+    from ibrobot_mujoco.viewer import MujocoViewer
+
+    return MujocoViewer(ctx)
+
+
+@hookimpl
+def ibrobot_hardware() -> Iterable[HardwareDescriptor]:
+    """Physics."""
+    yield HardwareDescriptor(
+        type="mujoco", options=MujocoOptions, make=_hardware, simulated=True, sensors={"camera": "mujoco"},
+        summary="the robot's MJCF in MuJoCo, on an empty table or with a cube and a bin",
+    )  # fmt: skip
+
+
+@hookimpl
+def ibrobot_sensors() -> Iterable[SensorDescriptor]:
+    """Cameras in the simulated scene."""
+    yield SensorDescriptor(
+        type="mujoco", kind="camera", options=CameraOptions, make=_camera, summary="a camera in the simulated scene"
+    )
+
+
+@hookimpl
+def ibrobot_policies() -> Iterable[PolicyDescriptor]:
+    """An expert that needs no training."""
+    yield PolicyDescriptor(
+        type="scripted_pick", options=ScriptedPickOptions, make=_scripted_pick,
+        summary="picks the cube and puts it into the bin, by inverse kinematics and the scene's ground truth",
+    )  # fmt: skip
+
+
+@hookimpl
+def ibrobot_viewers() -> Iterable[ViewerDescriptor]:
+    """A window on a desktop."""
+    yield ViewerDescriptor(type="mujoco", make=_viewer, summary="a desktop window on the simulated scene")
+
+
+@hookimpl
+def ibrobot_doctor() -> Iterable[Check]:
+    """Whether cameras can render here."""
+    from ibrobot_mujoco.gl import check
+
+    yield check()

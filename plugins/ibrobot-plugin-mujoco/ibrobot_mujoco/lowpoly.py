@@ -1,0 +1,60 @@
+"""Low-poly meshes for rendering: vertices clustered on a grid, so that small machines render several cameras."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ibrobot_core.errors import HardwareError
+
+GRID_M = 0.0025
+_STL_FACET = np.dtype([("normal", "<f4", 3), ("vertices", "<f4", (3, 3)), ("attribute", "<u2")])
+_STL_HEADER = 84
+
+
+def read_stl(path: Path) -> NDArray[np.float64]:
+    """The triangles of a binary STL file [file units], shape (F, 3, 3): face, corner, axis.
+
+    Raises:
+        HardwareError: for a file that is no binary STL.
+    """
+    content = path.read_bytes()
+    count = int.from_bytes(content[80:_STL_HEADER], "little")
+    if len(content) != _STL_HEADER + count * _STL_FACET.itemsize:
+        raise HardwareError(f"{path}: not a binary STL file")
+    return np.frombuffer(content, _STL_FACET, count, _STL_HEADER)["vertices"].astype(np.float64)
+
+
+def cluster(triangles: NDArray[np.float64], grid: float) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    """Merge all corners within a cell of `grid` into their mean; triangles that collapse or repeat are left out.
+
+    Args:
+        triangles: shape (F, 3, 3): face, corner, axis.
+        grid: edge of a cell, in the triangles' unit.
+
+    Returns:
+        Vertices, shape (V, 3), and faces as indices into them, shape (G, 3) with G <= F.
+    """
+    corners = triangles.reshape(-1, 3)
+    cells = np.floor(corners / grid).astype(np.int64)
+    cells -= cells.min(axis=0)
+    extent = cells.max(axis=0) + 1
+    keys = (cells[:, 0] * extent[1] + cells[:, 1]) * extent[2] + cells[:, 2]
+    _, index, counts = np.unique(keys, return_inverse=True, return_counts=True)
+    vertices = np.stack([np.bincount(index, corners[:, axis]) for axis in range(3)], axis=1) / counts[:, None]
+    faces = index.reshape(-1, 3)
+    first, second, third = faces.T
+    faces = faces[(first != second) & (second != third) & (third != first)]
+    # Equal triangles start at any of their corners: rolled so that the least index comes first they compare equal.
+    start = faces.argmin(axis=1)[:, None]
+    faces = np.unique(np.take_along_axis(faces, (start + np.arange(3)) % 3, axis=1), axis=0)
+    return vertices, faces.astype(np.int32)
+
+
+@lru_cache(maxsize=256)
+def low_poly(path: Path, grid: float) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    """The clustered vertices and faces of an STL file, kept for the next camera that asks."""
+    return cluster(read_stl(path), grid)

@@ -1,0 +1,220 @@
+"""The scene as a MuJoCo model: the robot's MJCF, a table, and for `pick_cube` a cube and a bin.
+
+The physics model has no visual meshes, the visual model has low-poly ones; their qpos and qvel have one layout.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from ibrobot_core.errors import HardwareError
+from ibrobot_core.robot import Robot
+from ibrobot_core.units import NS_PER_S, ns
+from ibrobot_mujoco.lowpoly import GRID_M, low_poly
+from ibrobot_mujoco.options import MujocoOptions, SceneCamera
+
+CUBE = "cube"
+"""Name of the cube's body, free joint and geom."""
+TABLE = "table"
+BIN = "bin"
+"""Name of the bin's body; its frame is at the middle of the bin's floor, on the table."""
+BIN_INNER = 0.11
+"""Inner edge of the square bin [m]."""
+BIN_HEIGHT = 0.05
+"""Height of the bin's rim above the table [m]."""
+BIN_WALL = 0.004
+CUBE_DENSITY = 1000.0
+
+CAMERAS = (
+    SceneCamera(name="top", pos=(0.16, 0.04, 0.80), lookat=(0.16, 0.04, 0.0), fovy=42.0),
+    SceneCamera(name="front", pos=(0.75, -0.25, 0.42), lookat=(0.14, 0.05, 0.07), fovy=42.0),
+)
+"""The cameras of every scene, beside the MJCF's own."""
+
+_Mesh = mujoco.mjtGeom.mjGEOM_MESH
+_Box = mujoco.mjtGeom.mjGEOM_BOX
+
+
+def build_model(options: MujocoOptions, robot: Robot, *, visual: bool) -> mujoco.MjModel:
+    """The compiled scene: for rendering when `visual`, for physics otherwise.
+
+    Raises:
+        HardwareError: e.g. no MJCF, or one without a position actuator for a joint.
+    """
+    spec = build_spec(options, robot)
+    if visual:
+        _simplify(spec)
+    else:
+        _strip(spec)
+    try:
+        return spec.compile()
+    except ValueError as error:
+        raise HardwareError(f"{robot.description.mjcf} does not compile: {error}") from error
+
+
+def build_spec(options: MujocoOptions, robot: Robot) -> mujoco.MjSpec:
+    """The editable scene, with the MJCF's full meshes.
+
+    Raises:
+        HardwareError: e.g. no MJCF, or one without a position actuator for a joint.
+    """
+    path = robot.description.mjcf
+    if path is None:
+        raise HardwareError(f"robot {robot.name!r} has no MJCF to simulate: robot.description.mjcf must name one")
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+    except ValueError as error:
+        raise HardwareError(f"{path} cannot be loaded: {error}") from error
+    spec.option.timestep = ns(options.timestep) / NS_PER_S
+    # Grasping needs both: with the pyramidal cone, or an impedance ratio of 1, the cube slips out.
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.impratio = 10
+    _tune_servos(spec, options, robot)
+    _add_surroundings(spec)
+    if options.scene == "pick_cube":
+        _add_cube(spec, options.cube_size)
+        _add_bin(spec, options.bin_position)
+    present = {camera.name for camera in spec.cameras}
+    for camera in CAMERAS:
+        if camera.name not in present:
+            _add_camera(spec, camera)
+    for camera in options.cameras:
+        _add_camera(spec, camera)
+    return spec
+
+
+def _tune_servos(spec: mujoco.MjSpec, options: MujocoOptions, robot: Robot) -> None:
+    """Find each joint's position actuator, and set what the options override."""
+    joints = {joint.name: joint for joint in spec.joints}
+    actuators = {a.target: a for a in spec.actuators if a.trntype == mujoco.mjtTrn.mjTRN_JOINT}
+    for name in robot.joint_names:
+        if name not in joints:
+            raise HardwareError(f"{robot.description.mjcf} has no joint {name!r}; it has: {', '.join(joints)}")
+        servo = actuators.get(name)
+        if servo is None or servo.biastype != mujoco.mjtBias.mjBIAS_AFFINE or servo.gainprm[0] != -servo.biasprm[1]:
+            raise HardwareError(f"{robot.description.mjcf} has no position actuator for joint {name!r}")
+        if options.kp is not None:
+            servo.gainprm[0], servo.biasprm[1] = options.kp, -options.kp
+        if options.kv is not None:
+            servo.biasprm[2] = -options.kv
+        if options.torque_limit is not None:
+            servo.forcelimited = True
+            servo.forcerange = [-options.torque_limit, options.torque_limit]
+        for field in ("damping", "frictionloss", "armature"):
+            value = getattr(options, field)
+            if value is not None:
+                _set_joint(joints[name], field, value)
+
+
+def _set_joint(joint: mujoco.MjsJoint, field: str, value: float) -> None:
+    # Damping is a polynomial's coefficients in newer versions of MuJoCo, a number in older ones.
+    old = getattr(joint, field)
+    setattr(joint, field, value if np.ndim(old) == 0 else [value, *np.zeros(len(old) - 1)])
+
+
+def _add_surroundings(spec: mujoco.MjSpec) -> None:
+    world = spec.worldbody
+    spec.add_texture(
+        name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=[0.75, 0.82, 0.9], rgb2=[0.4, 0.48, 0.58], width=64, height=384,
+    )  # fmt: skip
+    spec.visual.headlight.ambient = [0.35, 0.35, 0.35]
+    spec.visual.headlight.diffuse = [0.25, 0.25, 0.25]
+    spec.visual.headlight.specular = [0.0, 0.0, 0.0]
+    world.add_light(
+        name="lamp", type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, pos=[0.3, -0.5, 1.3], dir=[-0.3, 0.4, -1.0],
+        diffuse=[0.6, 0.6, 0.58], specular=[0.15, 0.15, 0.15], castshadow=True,
+    )  # fmt: skip
+    # A plane bears contacts wherever it is looked at; its size is only what is drawn.
+    world.add_geom(
+        name=TABLE, type=mujoco.mjtGeom.mjGEOM_PLANE, pos=[0.2, 0, 0], size=[0.6, 0.6, 0.05],
+        rgba=[0.72, 0.70, 0.66, 1], friction=[1, 0.005, 0.0001],
+    )  # fmt: skip
+
+
+def _add_cube(spec: mujoco.MjSpec, size: float) -> None:
+    body = spec.worldbody.add_body(name=CUBE, pos=[0.24, 0, size / 2])
+    body.add_freejoint(name=CUBE)
+    body.add_geom(
+        name=CUBE, type=_Box, size=[size / 2] * 3, density=CUBE_DENSITY, condim=4, friction=[1, 0.005, 0.0001],
+        rgba=[0.85, 0.12, 0.1, 1],
+    )  # fmt: skip
+
+
+def _add_bin(spec: mujoco.MjSpec, position: tuple[float, float]) -> None:
+    body = spec.worldbody.add_body(name=BIN, pos=[*position, 0])
+    inner, wall, rim = BIN_INNER / 2, BIN_WALL / 2, BIN_HEIGHT / 2
+    outer, middle = inner + BIN_WALL, inner + wall
+    boxes = {
+        "floor": ([0, 0, wall], [outer, outer, wall]),
+        "left": ([0, middle, rim], [outer, wall, rim]),
+        "right": ([0, -middle, rim], [outer, wall, rim]),
+        "front": ([middle, 0, rim], [wall, inner, rim]),
+        "back": ([-middle, 0, rim], [wall, inner, rim]),
+    }
+    for name, (pos, size) in boxes.items():
+        body.add_geom(name=f"{BIN}_{name}", type=_Box, pos=pos, size=size, rgba=[0.16, 0.36, 0.62, 1])
+
+
+def _add_camera(spec: mujoco.MjSpec, camera: SceneCamera) -> None:
+    if spec.camera(camera.name) is not None:
+        raise HardwareError(f"simulation.cameras: the scene has a camera {camera.name!r} already")
+    body = spec.body(camera.parent)
+    if body is None:
+        bodies = ", ".join(b.name for b in spec.bodies)
+        raise HardwareError(f"camera {camera.name!r}: no body {camera.parent!r}; the bodies are: {bodies}")
+    body.add_camera(name=camera.name, pos=camera.pos, quat=_look_at(camera), fovy=camera.fovy)
+
+
+def _look_at(camera: SceneCamera) -> NDArray[np.float64]:
+    """Orientation of a camera (which looks along its -z, with y up) as a quaternion wxyz, shape (4,)."""
+    backward = np.subtract(camera.pos, camera.lookat)
+    backward /= np.linalg.norm(backward)
+    # Straight down, "up" in the image is the robot's forward.
+    up = np.array([1.0, 0.0, 0.0]) if abs(backward[2]) > 0.999 else np.array([0.0, 0.0, 1.0])
+    right = np.cross(up, backward)
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(backward, right), backward], axis=1)
+    quaternion = np.empty(4)
+    mujoco.mju_mat2Quat(quaternion, rotation.ravel())
+    return quaternion
+
+
+def _strip(spec: mujoco.MjSpec) -> None:
+    """Remove what has no effect on the motion. A visual geom that gives its body mass stays."""
+    for geom in list(spec.geoms):
+        if geom.type == _Mesh and not geom.contype and not geom.conaffinity and geom.parent.explicitinertial:
+            spec.delete(geom)
+    _delete_unused_meshes(spec)
+
+
+def _simplify(spec: mujoco.MjSpec) -> None:
+    """Replace visual STL meshes by low-poly ones; meshes in other formats stay as they are."""
+    _delete_unused_meshes(spec)
+    colliding = {g.meshname for g in spec.geoms if g.type == _Mesh and (g.contype or g.conaffinity)}
+    directory = Path(spec.modelfiledir) / spec.meshdir
+    for mesh in spec.meshes:
+        name = _mesh_name(mesh)
+        if name in colliding or Path(mesh.file).suffix.lower() != ".stl":
+            continue
+        scale = float(np.max(np.abs(mesh.scale)))
+        vertices, faces = low_poly(directory / mesh.file, GRID_M / scale)
+        mesh.name, mesh.file = name, ""
+        mesh.uservert, mesh.userface = vertices.ravel(), faces.ravel()
+        # Clustered meshes are not closed, so they have no volume to take an inertia from.
+        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+
+
+def _mesh_name(mesh: mujoco.MjsMesh) -> str:
+    return mesh.name or Path(mesh.file).stem
+
+
+def _delete_unused_meshes(spec: mujoco.MjSpec) -> None:
+    used = {geom.meshname for geom in spec.geoms if geom.type == _Mesh}
+    for mesh in list(spec.meshes):
+        if _mesh_name(mesh) not in used:
+            spec.delete(mesh)

@@ -1,0 +1,95 @@
+"""What the YAML may say about the simulation and its cameras; light, so that listing plugins imports no MuJoCo."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import attrs
+
+from ibrobot_core.options import option
+
+Vec3 = tuple[float, float, float]
+Range = tuple[float, float]
+
+
+def _ordered(instance: Any, attribute: attrs.Attribute[Any], value: Range) -> None:
+    if not value[0] <= value[1]:
+        raise ValueError(f"[{value[0]}, {value[1]}] is no range, the first must not exceed the second")
+
+
+@attrs.frozen
+class SceneCamera:
+    """A camera added to the scene. Without `parent` it stands still in the robot's base frame."""
+
+    name: str = option(help="what a peripheral's `camera` says")
+    pos: Vec3 = option(unit="m", help="where it is, in the parent's frame")
+    lookat: Vec3 = option(unit="m", help="the point that it looks at, in the parent's frame")
+    fovy: float = option(45.0, unit="deg", gt=0, lt=180, help="vertical field of view")
+    parent: str = option("world", help="the MJCF body that carries it")
+
+    def __attrs_post_init__(self) -> None:
+        if self.pos == self.lookat:
+            raise ValueError(f"lookat must differ from pos, both are {list(self.pos)}")
+
+
+@attrs.frozen
+class Fault:
+    """A fault to inject, at a time counted from the beginning of each episode."""
+
+    at: float = option(unit="s", ge=0, help="when it begins")
+    kind: str = option(
+        choices=("silent", "freeze_joint", "read_error"),
+        help="silent: no replies, readings go stale and commands are lost; freeze_joint: one servo ignores commands; "
+        "read_error: reading raises",
+    )
+    joint: str | None = option(None, help="which joint, for freeze_joint")
+    duration: float | None = option(None, unit="s", gt=0, help="how long; None: until faults are reset")
+
+    def __attrs_post_init__(self) -> None:
+        if (self.kind == "freeze_joint") != (self.joint is not None):
+            need = "needs" if self.kind == "freeze_joint" else "takes no"
+            raise ValueError(f"a fault of kind {self.kind} {need} joint")
+
+
+@attrs.frozen
+class MujocoOptions:
+    """Options of the simulation. Servo values that are None are those of the MJCF."""
+
+    scene: str = option("pick_cube", choices=("empty", "pick_cube"), help="what stands on the table")
+    timestep: float = option(0.002, unit="s", ge=1e-4, le=0.02, help="step of the physics")
+    start_pose: str = option("rest", help="named pose of the robot at the beginning of an episode")
+
+    kp: float | None = option(None, unit="Nm/rad", gt=0, help="position gain of the servos")
+    kv: float | None = option(None, unit="Nm s/rad", ge=0, help="velocity gain of the servos")
+    damping: float | None = option(None, unit="Nm s/rad", ge=0, help="viscous friction of the joints")
+    frictionloss: float | None = option(None, unit="Nm", ge=0, help="dry friction of the joints")
+    armature: float | None = option(None, unit="kg m^2", ge=0, help="rotor inertia seen by the joints")
+    torque_limit: float | None = option(None, unit="Nm", gt=0, help="torque that no servo exceeds")
+    velocity_limit: float = option(4.7, unit="rad/s", gt=0, help="speed of the servos' own setpoint")
+
+    latency: float = option(0.0, unit="s", ge=0, le=1, help="delay of commands, and of readings")
+    noise: float = option(0.0, unit="rad", ge=0, help="standard deviation of the measured positions")
+    faults: tuple[Fault, ...] = option((), help="faults to inject")
+
+    cube_size: float = option(0.025, unit="m", gt=0, le=0.1, help="edge of the cube")
+    cube_distance: Range = option((0.20, 0.27), unit="m", validator=_ordered, help="cube from the base's origin")
+    cube_bearing: Range = option((-0.7, 0.5), unit="rad", validator=_ordered, help="cube's direction; 0 is ahead")
+    cube_yaw: Range = option((-3.14159, 3.14159), unit="rad", validator=_ordered, help="cube's rotation")
+    bin_position: Range = option((0.10, 0.24), unit="m", help="x and y of the bin's centre")
+    cameras: tuple[SceneCamera, ...] = option((), help="cameras beside `top`, `front` and those of the MJCF")
+
+
+@attrs.frozen
+class CameraOptions:
+    """Options of a simulated camera."""
+
+    camera: str | None = option(None, help="camera in the scene; None: the one of the peripheral's name (or NAME_cam)")
+    width: int = option(640, unit="px", ge=1, le=8192, help="width of the image")
+    height: int = option(480, unit="px", ge=1, le=8192, help="height of the image")
+    fps: float = option(30.0, unit="Hz", gt=0, le=1000, help="images a second of simulated time")
+    shadows: bool = option(False, help="whether to render shadows (three times the cost)")
+
+
+@attrs.frozen
+class ScriptedPickOptions:
+    """Options of the scripted pick."""
