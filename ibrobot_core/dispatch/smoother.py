@@ -1,0 +1,163 @@
+"""The temporal smoother: joins arriving action chunks into one plan, blending where they overlap in time."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ibrobot_core.robot import Vector
+
+_FIRST_GAINS = 256
+
+
+class TemporalSmoother:
+    """The plan of a run, and how each arriving chunk changes it.
+
+    Every time step of the plan has a count `c` of the predictions that went into it. A further prediction for it
+    gets the weight `w_c`, with `w_k = exp(-coeff * k)` and k = 0 the oldest:
+
+        plan = (plan * cumsum(w)[c - 1] + new * w[c]) / cumsum(w)[c]
+
+    Steps that the plan does not have yet are appended. With smoothing off, the chunk replaces the plan from the
+    chunk's start on.
+
+    Time decides, never a count of executed actions: action i of a chunk belongs to `start_ns + i * step_ns`. A chunk
+    whose start falls between two steps of the plan goes to the nearest: observations are stamped on the contract's
+    ticks, so this is jitter, the error is at most half a step and does not add up, and every action stays as the
+    policy gave it, where interpolation would low-pass each chunk once more. A chunk that nothing of the plan touches
+    starts afresh at its own exact times.
+
+    Not thread-safe: one thread owns it. Arrays that `plan` returned never change afterwards.
+
+    Args:
+        step_ns: time from one action to the next [ns].
+        action_size: numbers in an action, A.
+        coeff: `c` in `w_k = exp(-c k)`; positive favours old predictions, negative new ones, 0 is the plain mean.
+        enabled: whether chunks blend.
+
+    Raises:
+        ValueError: for a step or a size below one, or a coefficient out of range.
+    """
+
+    def __init__(self, step_ns: int, action_size: int, *, coeff: float = 0.01, enabled: bool = True) -> None:
+        if step_ns < 1:
+            raise ValueError(f"step_ns must be at least 1, got {step_ns}")
+        if action_size < 1:
+            raise ValueError(f"action_size must be at least 1, got {action_size}")
+        if not abs(coeff) < 700:
+            raise ValueError(f"coeff must lie between -700 and 700, got {coeff}")
+        self.step_ns = step_ns
+        self.action_size = action_size
+        self.enabled = enabled
+        self._ratio = math.exp(-coeff)
+        self._gains = _gains(self._ratio, _FIRST_GAINS)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the plan and the time: a new episode begins."""
+        self._set(0, np.empty((0, self.action_size)), np.empty(0, dtype=np.intp))
+        self._now_ns: int | None = None
+
+    def toggle(self, enabled: bool) -> None:
+        """Switch smoothing on or off for the chunks to come; the plan stays."""
+        self.enabled = enabled
+
+    def plan(self) -> tuple[int, Vector]:
+        """The time of the first action [ns] and the actions, shape (M, A), read-only; `(0, empty)` without a plan."""
+        return self._start_ns, self._positions
+
+    def remaining(self, now_ns: int) -> int:
+        """How many actions are later than `now_ns`; 0 when the plan ran dry."""
+        begun = (now_ns - self._start_ns) // self.step_ns + 1
+        return min(max(len(self._positions) - begun, 0), len(self._positions))
+
+    def trim(self, now_ns: int) -> None:
+        """Drop the actions whose step is over at `now_ns`; the one in effect stays: interpolation starts there."""
+        self._now_ns = now_ns if self._now_ns is None else max(now_ns, self._now_ns)
+        over = (now_ns - self._start_ns) // self.step_ns
+        if over >= len(self._positions):
+            self._set(0, self._positions[:0], self._counts[:0])
+        elif over > 0:
+            self._set(self._start_ns + over * self.step_ns, self._positions[over:], self._counts[over:])
+
+    def update(self, chunk: NDArray[np.floating], start_ns: int) -> int:
+        """Join a chunk to the plan.
+
+        Args:
+            chunk: actions, shape (N, A) with N >= 1.
+            start_ns: time of the first action [ns]: that of the observation it answers.
+
+        Returns:
+            How many of its actions joined: those that are past, by the last `trim`, do not. With 0, the chunk came
+            too late to be of use and the plan is as it was.
+
+        Raises:
+            ValueError: for another shape, or values that are not finite; the plan stays as it was.
+        """
+        actions = np.asarray(chunk, dtype=np.float64)
+        if actions.ndim != 2 or actions.shape[1] != self.action_size or not len(actions):
+            raise ValueError(f"a chunk must have the shape (N, {self.action_size}) with N >= 1, got {actions.shape}")
+        if not np.isfinite(actions).all():
+            raise ValueError(f"a chunk must be finite, got {_first_not_finite(actions)}")
+        length = len(self._positions)
+        offset = (start_ns - self._start_ns + self.step_ns // 2) // self.step_ns
+        # An observation is never from the future: a chunk that begins beyond the end shows that the plan ran dry.
+        if not length or offset > length or (offset <= 0 and not self.enabled):
+            return self._begin(actions, start_ns)
+        actions = actions[max(-offset, 0) :]  # a trimmed plan begins with the action in effect: what is earlier is past
+        offset = max(offset, 0)
+        if not len(actions):
+            return 0
+        if self.enabled:
+            self._blend(actions, offset)
+        else:
+            counts = np.ones(offset + len(actions), dtype=np.intp)
+            counts[:offset] = self._counts[:offset]
+            self._set(self._start_ns, np.concatenate((self._positions[:offset], actions)), counts)
+        return len(actions)
+
+    def _begin(self, actions: Vector, start_ns: int) -> int:
+        """A plan of this chunk alone, from the action in effect on."""
+        past = 0 if self._now_ns is None else max((self._now_ns - start_ns) // self.step_ns, 0)
+        rest = len(actions) - past
+        if rest <= 0:
+            return 0
+        self._set(start_ns + past * self.step_ns, actions[past:].copy(), np.ones(rest, dtype=np.intp))
+        return rest
+
+    def _blend(self, actions: Vector, offset: int) -> None:
+        """Blend `actions` into the plan from its step `offset` on; what reaches beyond its end is appended."""
+        length, end = len(self._positions), offset + len(actions)
+        shared = min(length, end)
+        positions = np.empty((max(length, end), self.action_size))
+        positions[:length] = self._positions
+        positions[length:] = actions[shared - offset :]
+        counts = np.ones(len(positions), dtype=np.intp)
+        counts[:length] = self._counts
+        overlap, seen = positions[offset:shared], counts[offset:shared]
+        if shared > offset and (most := int(seen.max())) >= len(self._gains):
+            self._gains = _gains(self._ratio, 2 * most)
+        # The formula of the class, divided out: plan + (new - plan) * w[c] / cumsum(w)[c].
+        overlap += (actions[: shared - offset] - overlap) * self._gains[seen, None]
+        seen += 1
+        self._set(self._start_ns, positions, counts)
+
+    def _set(self, start_ns: int, positions: Vector, counts: NDArray[np.intp]) -> None:
+        self._start_ns, self._positions, self._counts = (start_ns if len(positions) else 0), positions, counts
+        positions.flags.writeable = False
+
+
+def _gains(ratio: float, size: int) -> Vector:
+    """`w_c / (w_0 + … + w_c)` for c < size, shape (size,), with `w_k = ratio**k`; free of overflow."""
+    gains = [1.0]
+    while len(gains) < size:
+        step = ratio * gains[-1]
+        gains.append(step / (1.0 + step))
+    return np.array(gains)
+
+
+def _first_not_finite(actions: Vector) -> str:
+    row, column = np.argwhere(~np.isfinite(actions))[0]
+    return f"{actions[row, column]} in action {row}, element {column}"
