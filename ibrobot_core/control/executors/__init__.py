@@ -1,0 +1,1 @@
+"""The built-in executors: `position`, `trajectory` and `gripper`."""

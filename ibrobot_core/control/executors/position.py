@@ -1,0 +1,116 @@
+"""The `position` executor: follows a plan of setpoints by time, and says so when the plan has run dry."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import ClassVar, override
+
+import numpy as np
+
+from ibrobot_core.executor_options import PositionOptions
+from ibrobot_core.interfaces import Context, Executor, JointReading, Plan
+from ibrobot_core.robot import Vector
+from ibrobot_core.units import ns
+
+
+class PositionExecutor(Executor):
+    """Interpolates linearly between the setpoints of its plan; a plan of length one is a teleop command.
+
+    Before the plan's first setpoint is due it holds, and goes there over the last step before it. After the last one it
+    holds it; once that is older than `stale_timeout`, the plan is stale and `safety_behavior` applies: `hold` keeps the
+    last setpoint that was given out, `relax` asks for torque off until another plan comes.
+    """
+
+    accepts_plans: ClassVar[bool] = True
+
+    def __init__(self, options: PositionOptions, ctx: Context) -> None:
+        self.joints = ctx.joints
+        self._stale_ns = ns(options.stale_timeout)
+        self._relaxes = options.safety_behavior == "relax"
+        self._log = ctx.log
+        self._counters = {"stale": 0, "refused_shape": 0, "refused_nonfinite": 0, "refused_step": 0}
+        self._setpoint: Vector = np.full(len(self.joints), np.nan)
+        self._stamp_ns = 0
+        self._plan: Plan | None = None
+        self._approach_ns = 0
+        self._approach_from = self._setpoint
+        self._stale = False
+
+    @override
+    def activate(self, measured: JointReading) -> None:
+        self.deactivate()
+        self._setpoint = measured.position.copy()
+        self._stamp_ns = measured.stamp_ns
+
+    @override
+    def deactivate(self) -> None:
+        self._plan = None
+        self._stale = False
+
+    @override
+    def set_plan(self, plan: Plan) -> None:
+        """Replace the plan; one that is no finite (N, J) with a positive step is counted, and the old one stays."""
+        try:
+            positions = np.array(plan.positions, dtype=np.float64)
+        except (TypeError, ValueError):
+            positions = np.empty(0)
+        if positions.ndim != 2 or positions.shape[0] == 0 or positions.shape[1] != len(self.joints):
+            self._refuse("refused_shape", f"shape {positions.shape}, not (N, {len(self.joints)})")
+        elif not np.isfinite(positions).all():
+            self._refuse("refused_nonfinite", "values that are not finite")
+        elif plan.step_ns <= 0:
+            self._refuse("refused_step", f"step_ns {plan.step_ns}, which must be above 0")
+        else:
+            self._plan = Plan(start_ns=plan.start_ns, step_ns=plan.step_ns, positions=positions)
+            self._approach_ns = max(self._stamp_ns, plan.start_ns - plan.step_ns)
+            self._approach_from = self._setpoint
+            self._stale = False
+
+    @override
+    def update(self, measured: JointReading) -> Vector:
+        now_ns = self._stamp_ns = measured.stamp_ns
+        plan = self._plan
+        if plan is not None:
+            last_ns = plan.start_ns + (len(plan.positions) - 1) * plan.step_ns
+            if now_ns - last_ns >= self._stale_ns:
+                self._plan = None
+                self._stale = True
+                self._counters["stale"] += 1
+            else:
+                self._setpoint = self._at(plan, now_ns)
+        if self.wants_relax:
+            # The arm falls: whatever comes next starts from where it lies.
+            self._setpoint = np.where(np.isfinite(measured.position), measured.position, self._setpoint)
+        return self._setpoint.copy()
+
+    @property
+    def wants_relax(self) -> bool:
+        """Whether torque should be off: the plan is stale and `safety_behavior` is `relax`."""
+        return self._stale and self._relaxes
+
+    @override
+    def counters(self) -> Mapping[str, int]:
+        """`stale`: times a plan ran dry; `refused_*`: plans refused."""
+        return dict(self._counters)
+
+    def _at(self, plan: Plan, now_ns: int) -> Vector:
+        """The plan's setpoint [rad] at `now_ns`, shape (J,)."""
+        if now_ns < plan.start_ns:
+            done = max(0, now_ns - self._approach_ns) / (plan.start_ns - self._approach_ns)
+            return _between(self._approach_from, plan.positions[0], done)
+        index, rest_ns = divmod(now_ns - plan.start_ns, plan.step_ns)
+        if index >= len(plan.positions) - 1:
+            index, rest_ns = len(plan.positions) - 1, 0
+        there = min(index + 1, len(plan.positions) - 1)
+        return _between(plan.positions[index], plan.positions[there], rest_ns / plan.step_ns)
+
+    def _refuse(self, counter: str, why: str) -> None:
+        self._counters[counter] += 1
+        if self._counters[counter] == 1:
+            self._log.warning("refused a plan: %s; further ones are counted as %s", why, counter)
+
+
+def _between(here: Vector, there: Vector, done: float) -> Vector:
+    """Linear between two setpoints, `done` in 0..1."""
+    result: Vector = here + done * (there - here)
+    return result

@@ -1,0 +1,218 @@
+"""The safety layer: the one way to the motors; keeps commands within position, velocity and acceleration limits."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ibrobot_core.errors import HardwareError
+from ibrobot_core.robot import Robot, Vector
+from ibrobot_core.units import seconds
+
+KINDS = ("estop", "nonfinite", "unmeasured", "first_command", "position", "velocity", "acceleration")
+"""Why a joint was not given what was asked for. A joint counts once a tick, under the first of these that applies."""
+
+
+class SafetyLayer:
+    """Turns what is asked for into what the hardware is told, one tick at a time.
+
+    From `activate` on, at every tick and for every joint, whatever is asked for:
+    `lower <= p <= upper`, `|p - p'| <= max_velocity * dt` and `|(p - p') - (p' - p'')| <= max_acceleration * dt^2`,
+    where p, p', p'' are the last three commands and dt is the period. So that braking never ends beyond a position
+    limit, a step is taken only if braking from it at max_acceleration stops in time.
+
+    What can be had within these limits passes unchanged, bit by bit. After something that could not, the command
+    catches up as fast as the limits allow and brakes so as not to overshoot.
+
+    Not thread-safe: it belongs to the control loop.
+
+    Args:
+        robot: joints and their limits; J is their number.
+        period_ns: the control period [ns]; `apply` is called once in each.
+    """
+
+    def __init__(self, robot: Robot, period_ns: int) -> None:
+        if period_ns <= 0:
+            raise ValueError(f"period_ns must be above 0, got {period_ns}")
+        self._names = robot.joint_names
+        self._period_s = seconds(period_ns)
+        self._lower = robot.lower.astype(np.float64)
+        self._upper = robot.upper.astype(np.float64)
+        # Velocities are kept as steps [rad per tick], accelerations as changes of step: no rounding by dt comes in.
+        self._max_step = robot.max_velocity * self._period_s
+        self._max_change = robot.max_acceleration * self._period_s**2
+        # A plan that runs exactly at a limit exceeds it by rounding; that much is let through.
+        largest = np.maximum(np.abs(self._lower), np.abs(self._upper))
+        self._slack = np.maximum(1e-10 * np.minimum(self._max_step, self._max_change), 8 * np.spacing(largest))
+        size = len(self._names)
+        self._nothing: Vector = np.full(size, np.nan)
+        self._counts = np.zeros((len(KINDS), size), dtype=np.int64)
+        self._events = {"outside": 0, "wrong_length": 0, "missing": 0}
+        self._estopped = False
+        self._active = False
+
+    def activate(self, measured: Vector) -> None:
+        """Start at rest from the measured positions [rad], shape (J,). Also to be called when torque returns.
+
+        A joint outside its limits may stay there or move inwards, never further out; counted as `outside`.
+
+        Raises:
+            HardwareError: when a position is not finite: a start from nowhere is none.
+        """
+        position = _vector(measured, len(self._names))
+        if position is None:
+            raise HardwareError(f"measured positions must be {len(self._names)} numbers, got {measured!r}")
+        if not np.isfinite(position).all():
+            joint = int(np.argmin(np.isfinite(position)))
+            raise HardwareError(f"joint {self._names[joint]} is measured at {position[joint]}, which is no position")
+        self._position = position.copy()
+        self._step = np.zeros_like(position)
+        self._target = self._nothing
+        self._target_step = self._nothing
+        self._fresh = np.ones(len(position), dtype=bool)
+        self._events["outside"] += int(np.count_nonzero((position < self._lower) | (position > self._upper)))
+        self._active = True
+
+    def apply(self, desired: object, measured: Vector) -> Vector:
+        """One tick: the positions [rad] for the hardware, shape (J,), always finite.
+
+        Args:
+            desired: positions [rad], shape (J,), a numpy array; None for silence. A joint brakes and holds where
+                its value is missing, not finite, or where the joint is not measured; all do on a wrong length or type.
+            measured: positions [rad], shape (J,); NaN where a joint is not measured.
+
+        Raises:
+            RuntimeError: before the first `activate`.
+        """
+        if not self._active:
+            raise RuntimeError("the safety layer must be activated at the measured positions first")
+        wanted = _vector(desired, len(self._names))
+        if wanted is None:
+            self._events["missing" if desired is None else "wrong_length"] += 1
+            command = self._next(self._nothing, np.zeros(len(self._names), dtype=bool))
+        else:
+            seen = _vector(measured, len(self._names))
+            known = np.isfinite(self._nothing if seen is None else seen)
+            follow = np.isfinite(wanted) & known & (not self._estopped)
+            before = self._position
+            command = self._next(wanted, follow)
+            differs = command != wanted
+            if differs.any():
+                self._count(differs, wanted, known, before)
+            self._fresh &= ~follow
+        return command.copy()
+
+    def estop(self) -> None:
+        """Latch the emergency stop: every joint brakes at its limit and holds; what is asked for is not followed."""
+        self._estopped = True
+
+    def reset(self, measured: Vector) -> None:
+        """Release the emergency stop and start at rest from the measured positions [rad], shape (J,).
+
+        Raises:
+            HardwareError: when a position is not finite; the stop stays latched.
+        """
+        self.activate(measured)
+        self._estopped = False
+
+    @property
+    def estopped(self) -> bool:
+        """Whether the emergency stop is latched."""
+        return self._estopped
+
+    @property
+    def current(self) -> Vector:
+        """The last command [rad], shape (J,)."""
+        return self._position.copy()
+
+    @property
+    def velocity(self) -> Vector:
+        """The speed of the last command [rad/s], shape (J,)."""
+        return self._step / self._period_s
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether the last command moved no joint: a stop is complete."""
+        return not self._step.any()
+
+    def counters(self) -> Mapping[str, int]:
+        """Counts since construction: joint-ticks for each of `KINDS`; `outside` joints; refused and missing vectors."""
+        return dict(zip(KINDS, self._counts.sum(axis=1).tolist(), strict=True)) | self._events
+
+    @property
+    def interventions(self) -> Mapping[str, int]:
+        """By joint, the ticks at which the joint was not given what was asked for."""
+        totals = self._counts.sum(axis=0) + self._events["wrong_length"]
+        return dict(zip(self._names, totals.tolist(), strict=True))
+
+    def _next(self, wanted: Vector, follow: NDArray[np.bool_]) -> Vector:
+        """Advance by a tick towards `wanted` [rad] where `follow`, to a stop elsewhere; shapes (J,)."""
+        position, change, slack = self._position, self._max_change, self._slack
+        # A joint that started outside may come in, and then not go back out.
+        lower, upper = np.minimum(self._lower, position), np.maximum(self._upper, position)
+        target = np.clip(np.where(follow, wanted, position), lower, upper)
+        ahead = target - position
+        # Where the target moves smoothly it is expected to go on; otherwise to be a place to stop at.
+        target_step = target - self._target
+        smooth = np.abs(target_step - self._target_step) <= change + slack
+        expected = np.where(smooth, target_step, 0.0)
+
+        slowest = np.maximum(self._step - change, -self._max_step)
+        fastest = np.minimum(self._step + change, self._max_step)
+        room_below, room_above = _reach(np.stack((position - lower, upper - position)), change)
+        highest, lowest = np.minimum(fastest, room_above) + slack, np.maximum(slowest, -room_below) - slack
+        within = (lowest <= ahead) & (ahead <= highest)
+        # Arriving faster than the target goes would overshoot it; while already on it, it leads.
+        matched = (self._target == position) | (np.abs(ahead - expected) <= change + slack)
+        passes = follow & within & matched
+
+        if passes.all():
+            command = target
+        else:
+            gap = ahead - expected
+            step = np.where(follow, expected + np.copysign(_reach(np.abs(gap), change), gap), 0.0)
+            step = np.minimum(np.maximum(step, slowest), fastest)
+            # Last, since a position limit must hold even where rounding leaves no step that satisfies all.
+            step = np.minimum(np.maximum(step, -room_below), room_above)
+            command = np.where(passes, target, np.clip(position + step, lower, upper))
+        self._step = command - position
+        self._position = command
+        self._target = np.where(follow, target, np.nan)
+        self._target_step = target_step
+        return command
+
+    def _count(self, differs: NDArray[np.bool_], wanted: Vector, known: NDArray[np.bool_], before: Vector) -> None:
+        """Count the joints that `differs` marks, each under the first of `KINDS` that applies."""
+        lower, upper = np.minimum(self._lower, before), np.maximum(self._upper, before)
+        step = np.clip(wanted, lower, upper) - before
+        reasons = np.stack(
+            (
+                np.full_like(differs, self._estopped),
+                ~np.isfinite(wanted),
+                ~known,
+                self._fresh,
+                (wanted < lower) | (wanted > upper),
+                np.abs(step) > self._max_step + self._slack,
+                differs,
+            )
+        )
+        joints = np.flatnonzero(differs)
+        self._counts[reasons.argmax(axis=0)[joints], joints] += 1
+
+
+def _vector(value: object, size: int) -> Vector | None:
+    """`value` as float64 where it is an array of `size` real numbers, else None."""
+    if isinstance(value, np.ndarray) and value.shape == (size,) and value.dtype.kind in "fiu" and value.itemsize <= 8:
+        return value.astype(np.float64, copy=False)
+    return None
+
+
+def _reach(distance: Vector, change: Vector) -> Vector:
+    """The largest step from which braking by `change` a tick ends no further than `distance`; shapes (..., J).
+
+    A step u, then u - D, u - 2 D, … while positive, covers (n + 1) u - D n (n + 1) / 2 with n = floor(u / D).
+    """
+    n = np.floor((np.sqrt(1.0 + 8.0 * distance / change) - 1.0) / 2.0)
+    return distance / (n + 1.0) + n * change / 2.0
