@@ -21,7 +21,8 @@ class IbrobotError(Exception):
 class Problem:
     """One thing wrong with a config file."""
 
-    file: Path
+    file: Path | str
+    """The file as it was given, or the override, e.g. `--set control.rate_hz=abc`."""
     line: int
     path: str
     message: str

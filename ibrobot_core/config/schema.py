@@ -89,9 +89,9 @@ class ObservationSpec:
 class ActionSpec:
     """One part of the action vector, for one executor. Several under one key split it in file order."""
 
-    key: str = option("action", help="action")
     executor: str = option(help="the executor that takes it")
     topic: str = option(help="where what the robot was told is published")
+    key: str = option("action", choices=("action",), help="the key of the action vector, as in datasets")
     type: str = option("std_msgs/msg/Float64MultiArray", choices=("std_msgs/msg/Float64MultiArray",), help="message type")
     safety_behavior: str = option("hold", choices=("hold", "relax"), help="what follows when the setpoints go stale")
 

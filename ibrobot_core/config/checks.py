@@ -1,0 +1,180 @@
+"""What must hold between sections: joints, groups, poses, hardware, executors, modes, stop behaviour."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import attrs
+
+from ibrobot_core.config.convert import hint
+from ibrobot_core.config.keys import ModeKeys
+from ibrobot_core.config.schema import Control
+from ibrobot_core.config.structure import Part, Parts
+from ibrobot_core.config.yaml_nodes import Document, Key
+from ibrobot_core.descriptors import ExecutorDescriptor
+from ibrobot_core.robot import Robot
+
+
+@attrs.frozen
+class Checks:
+    """Checks of one document; what does not hold is noted in it. Parts that failed are passed over."""
+
+    document: Document
+    parts: Parts
+
+    def run(self) -> None:
+        """All checks."""
+        robot = self.parts.plain.get("robot")
+        if robot is not None:
+            self._robot(robot)
+            self._hardware(robot)
+            self._executors(robot)
+            self._stop(robot)
+        for name, mode in (self.parts.plain.get("control_modes") or {}).items():
+            self._mode(name, mode, robot)
+        self._default_mode()
+        self._recording()
+
+    def _known(self, section: str) -> list[str]:
+        """The names that a section gives, faulty or not, so that one fault is told once."""
+        value = self.document.root.get(section)
+        return list(value) if isinstance(value, Mapping) else []
+
+    def _refer(self, key: Key, name: str, known: list[str], what: str) -> bool:
+        if name in known:
+            return True
+        self.document.add(key, f"unknown {what} {name!r}{hint(name, known, 'known')}")
+        return False
+
+    def _unique(self, key: Key, names: tuple[str, ...], what: str) -> None:
+        for i, name in enumerate(names):
+            if name in names[:i]:
+                self.document.add((*key, i), f"{what} {name!r} is given twice")
+
+    def _robot(self, robot: Robot) -> None:
+        at: Key = ("robot",)
+        names = list(robot.joint_names)
+        if not names:
+            self.document.add((*at, "joints"), "a robot needs at least one joint")
+        for i, name in enumerate(names):
+            if name in names[:i]:
+                self.document.add((*at, "joints", i, "name"), f"a second joint named {name!r}")
+        for group, members in robot.groups.items():
+            for i, joint in enumerate(members):
+                self._refer((*at, "groups", group, i), joint, names, "joint")
+            self._unique((*at, "groups", group), members, "joint")
+        grouped = {joint for members in robot.groups.values() for joint in members}
+        for i, name in enumerate(names):
+            if name not in grouped:
+                message = f"joint {name!r} is in no group, so no executor can own it; add it to one under robot.groups"
+                self.document.add((*at, "joints", i), message)
+        for pose, positions in robot.description.poses.items():
+            self._pose((*at, "description", "poses", pose), robot, positions)
+        for model in ("mjcf", "urdf"):
+            path = getattr(robot.description, model)
+            if path is not None and not path.is_file():
+                message = f"no such file: {path}; a relative path starts at the folder of the YAML file"
+                self.document.add((*at, "description", model), message)
+
+    def _pose(self, key: Key, robot: Robot, positions: tuple[float, ...]) -> None:
+        if len(positions) != len(robot.joints):
+            self.document.add(key, f"expected {len(robot.joints)} positions, one for each joint, got {len(positions)}")
+            return
+        for i, (joint, position) in enumerate(zip(robot.joints, positions, strict=True)):
+            if not joint.lower <= position <= joint.upper:
+                message = f"{position} rad is outside the limits of {joint.name}, {joint.lower} to {joint.upper}"
+                self.document.add((*key, i), message)
+
+    def _hardware(self, robot: Robot) -> None:
+        owners: dict[str, str] = {}
+        several = len(self.parts.hardware) > 1
+        for name, part in self.parts.hardware.items():
+            if several and not part.keys.joints:
+                self.document.add(part.key, "joints: required where there is more than one hardware component")
+            for i, joint in enumerate(part.keys.joints):
+                key: Key = (*part.key, "joints", i)
+                self._refer(key, joint, list(robot.joint_names), "joint")
+                if joint in owners:
+                    self.document.add(key, f"joint {joint!r} is owned by hardware {owners[joint]!r} already")
+                owners.setdefault(joint, name)
+        written = self.document.root.get("hardware")
+        complete = isinstance(written, Mapping) and (len(self.parts.hardware) == len(written) or "type" in written)
+        missing = [joint for joint in robot.joint_names if joint not in owners]
+        if owners and missing and complete and all(part.keys.joints for part in self.parts.hardware.values()):
+            self.document.add(("hardware",), f"no hardware owns: {', '.join(missing)}")
+
+    def _executors(self, robot: Robot) -> None:
+        for part in self.parts.executors.values():
+            self._refer((*part.key, "group"), part.keys.group, list(robot.groups), "group")
+
+    def _stop(self, robot: Robot) -> None:
+        control: Control | None = self.parts.plain.get("control", Control())
+        if control is None or control.stop in ("hold", "relax"):
+            return
+        word, _, pose = control.stop.partition(" ")
+        if word != "pose" or not pose:
+            self.document.add(("control", "stop"), f"{control.stop!r} is not one of: hold, relax, pose NAME")
+        else:
+            self._refer(("control", "stop"), pose, list(robot.description.poses), "pose")
+
+    def _mode(self, name: str, mode: ModeKeys, robot: Robot | None) -> None:
+        key: Key = ("control_modes", name)
+        known = self._known("executors")
+        for i, executor in enumerate(mode.executors):
+            self._refer((*key, "executors", i), executor, known, "executor")
+        self._unique((*key, "executors"), mode.executors, "executor")
+        if not mode.executors:
+            self.document.add((*key, "executors"), "a mode needs at least one executor")
+        if robot is not None:
+            self._claims(key, mode, robot)
+        if mode.teleop is not None:
+            self._refer((*key, "teleop"), mode.teleop, self._known("teleoperation"), "teleoperation device")
+        if mode.inference is not None:
+            self._refer((*key, "inference", "model"), mode.inference.model, self._known("models"), "model")
+        sources = [source for source in ("teleop", "inference", "planner") if getattr(mode, source) is not None]
+        if len(sources) > 1:
+            self.document.add((*key, sources[1]), f"{sources[0]} drives this mode already; make a mode for each")
+        elif sources:
+            self._drives(key, mode, sources[0])
+        if mode.dispatch is not None and mode.inference is None:
+            self.document.add((*key, "dispatch"), "has a meaning only beside inference")
+
+    def _claims(self, key: Key, mode: ModeKeys, robot: Robot) -> None:
+        owners: dict[str, str] = {}
+        for i, name in enumerate(mode.executors):
+            part = self.parts.executors.get(name)
+            if part is None or name in mode.executors[:i]:
+                continue
+            for joint in robot.groups.get(part.keys.group, ()):
+                if joint in owners:
+                    message = f"executors {owners[joint]!r} and {name!r} both claim joint {joint!r}"
+                    self.document.add((*key, "executors", i), message)
+                    break
+                owners[joint] = name
+
+    def _drives(self, key: Key, mode: ModeKeys, source: str) -> None:
+        for i, name in enumerate(mode.executors):
+            part = self.parts.executors.get(name)
+            if part is None or streams(part) == (source != "planner"):
+                continue
+            takes, sends, example = (
+                ("streams of setpoints", "goals", "trajectory") if streams(part) else ("goals", "setpoints", "position")
+            )
+            message = f"executor {name!r} takes {takes}, but {source} sends {sends}; use one of type {example}, say"
+            self.document.add((*key, "executors", i), message)
+
+    def _default_mode(self) -> None:
+        name = self.parts.plain.get("default_control_mode")
+        if name is not None:
+            self._refer(("default_control_mode",), name, self._known("control_modes"), "control mode")
+
+    def _recording(self) -> None:
+        topics: Any = self.parts.recording.keys.topics if self.parts.recording else ()
+        if isinstance(topics, str) and topics not in ("contract", "all"):
+            self.document.add(("recording", "topics"), f"{topics!r} is not one of: contract, all, or a list of topics")
+
+
+def streams(part: Part) -> bool:
+    """Whether an executor follows setpoints rather than goals."""
+    return isinstance(part.descriptor, ExecutorDescriptor) and part.descriptor.streams

@@ -1,0 +1,183 @@
+"""The contract against the robot: what it names must exist, and what it may leave out is filled in."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import attrs
+
+from ibrobot_core import messages
+from ibrobot_core.config.checks import streams
+from ibrobot_core.config.convert import hint
+from ibrobot_core.config.schema import ActionSpec, ContractConfig, ObservationSpec
+from ibrobot_core.config.structure import Parts
+from ibrobot_core.config.yaml_nodes import Document, Key
+
+JOINT_STATES = "/joint_states"
+PERIPHERAL_TOPICS: Mapping[str, tuple[str, type[messages.Message]]] = {
+    "camera": ("/camera/{name}/image_raw", messages.Image),
+}
+"""Peripheral kind -> where its messages go, and their type."""
+
+_IMAGES = (messages.Image.ros_type, messages.CompressedImage.ros_type)
+_JOINT_FIELDS = ("position", "velocity", "effort")
+
+
+def message_types() -> dict[str, type[messages.Message]]:
+    """ROS 2 name -> class, for every message that core knows."""
+    found = (value for value in vars(messages).values() if isinstance(value, type))
+    return {m.ros_type: m for m in found if issubclass(m, messages.Message) and m.ros_type}
+
+
+@attrs.frozen
+class ContractChecks:
+    """Checks and completes the contract; what does not hold is noted in the document."""
+
+    document: Document
+    parts: Parts
+
+    def run(self) -> ContractConfig:
+        """The contract, complete."""
+        contract = self.parts.plain.get("contract") or ContractConfig()
+        key: Key = ("contract",)
+        observations = self.observations((*key, "observations"), contract.observations)
+        for name, part in self.parts.models.items():
+            extra: Key = ("models", name, "extra_observations")
+            self._same_kind(extra, self.observations(extra, part.keys.extra_observations), observations)
+        self._same_kind((*key, "observations"), observations, ())
+        actions = tuple(self._action((*key, "actions", i), a, contract.actions[:i]) for i, a in enumerate(contract.actions))
+        for mode_name, mode in (self.parts.plain.get("control_modes") or {}).items():
+            if mode.inference is not None:
+                self._driven(("control_modes", mode_name), mode.executors, contract)
+        control = self.parts.plain.get("control")
+        if control is not None and contract.rate_hz > control.rate_hz:
+            message = f"{contract.rate_hz} Hz is faster than the control loop, {control.rate_hz} Hz"
+            self.document.add((*key, "rate_hz"), message)
+        return attrs.evolve(contract, observations=observations, actions=actions)
+
+    def observations(self, key: Key, specs: Sequence[ObservationSpec]) -> tuple[ObservationSpec, ...]:
+        """Observations with topic and type filled in."""
+        return tuple(self._observation((*key, i), spec) for i, spec in enumerate(specs))
+
+    def _observation(self, key: Key, spec: ObservationSpec) -> ObservationSpec:
+        if spec.peripheral is not None:
+            return self._of_peripheral(key, spec)
+        if not spec.topic:
+            self.document.add(key, "needs a topic, or a peripheral")
+            return spec
+        if not spec.topic.startswith("/"):
+            self.document.add((*key, "topic"), f"a topic starts with /, got {spec.topic!r}")
+        if not spec.type and spec.topic == JOINT_STATES:
+            spec = attrs.evolve(spec, type=messages.JointState.ros_type)
+        if not spec.type:
+            self.document.add(key, f"needs a type, since that of {spec.topic} is not known by itself")
+        elif spec.type not in message_types():
+            known = sorted(message_types())
+            self.document.add((*key, "type"), f"unknown message type {spec.type!r}{hint(spec.type, known, 'known')}")
+        elif spec.topic == JOINT_STATES and spec.type != messages.JointState.ros_type:
+            self.document.add((*key, "type"), f"{JOINT_STATES} carries {messages.JointState.ros_type}, not {spec.type}")
+        else:
+            self._fits(key, spec)
+        return spec
+
+    def _of_peripheral(self, key: Key, spec: ObservationSpec) -> ObservationSpec:
+        for other in ("topic", "type"):
+            if getattr(spec, other):
+                self.document.add((*key, other), f"comes from peripheral {spec.peripheral!r}; give one or the other")
+                return spec
+        written = self.document.root.get("peripherals")
+        items = [item for item in written if isinstance(item, Mapping)] if isinstance(written, list) else []
+        kinds = {str(item.get("name")): item.get("kind") for item in items}
+        if spec.peripheral not in kinds:
+            remark = hint(str(spec.peripheral), list(kinds), "known")
+            self.document.add((*key, "peripheral"), f"unknown peripheral {spec.peripheral!r}{remark}")
+            return spec
+        kind = kinds[spec.peripheral]
+        if kind not in PERIPHERAL_TOPICS:
+            message = f"the topic of a peripheral of kind {kind!r} is not known by itself; give topic and type instead"
+            self.document.add((*key, "peripheral"), message)
+            return spec
+        topic, message_type = PERIPHERAL_TOPICS[kind]
+        spec = attrs.evolve(spec, topic=topic.format(name=spec.peripheral), type=message_type.ros_type)
+        self._fits(key, spec)
+        return spec
+
+    def _fits(self, key: Key, spec: ObservationSpec) -> None:
+        """Whether `image` and `select` suit the message type."""
+        is_image = spec.type in _IMAGES
+        if spec.image is not None and not is_image:
+            self.document.add((*key, "image"), f"needs a camera; {spec.topic} carries {spec.type}")
+        if spec.key.startswith("observation.images.") and not is_image:
+            self.document.add((*key, "key"), f"{spec.key} needs a camera; {spec.topic} carries {spec.type}")
+        for i, path in enumerate(spec.select):
+            self._select((*key, "select", i), path, spec)
+
+    def _select(self, key: Key, path: str, spec: ObservationSpec) -> None:
+        first, _, rest = path.partition(".")
+        if spec.type in _IMAGES:
+            self.document.add(key, "nothing can be selected from an image")
+        elif spec.type == messages.JointState.ros_type:
+            if first not in _JOINT_FIELDS or not rest:
+                fields = " or ".join(f"{field}.JOINT" for field in _JOINT_FIELDS)
+                self.document.add(key, f"expected {fields}, got {path!r}")
+            elif spec.topic == JOINT_STATES and (robot := self.parts.plain.get("robot")) is not None:
+                if rest not in robot.joint_names:
+                    remark = hint(rest, list(robot.joint_names), "known")
+                    self.document.add(key, f"unknown joint {rest!r}{remark}")
+        else:
+            names = [field.name for field in attrs.fields(message_types()[spec.type])]
+            if first not in names:
+                self.document.add(key, f"{spec.type} has no field {first!r}{hint(first, names, 'its fields')}")
+
+    def _same_kind(self, key: Key, specs: Sequence[ObservationSpec], others: Sequence[ObservationSpec]) -> None:
+        """Values under one key concatenate, which an image and a vector cannot."""
+        kinds = {spec.key: spec.type in _IMAGES for spec in others if spec.type}
+        for i, spec in enumerate(specs):
+            if spec.type and kinds.setdefault(spec.key, spec.type in _IMAGES) != (spec.type in _IMAGES):
+                message = f"{spec.key} is an image in one observation and a vector in another; give them different keys"
+                self.document.add((*key, i, "key"), message)
+
+    def _action(self, key: Key, spec: ActionSpec, earlier: Sequence[ActionSpec]) -> ActionSpec:
+        if not spec.topic.startswith("/"):
+            self.document.add((*key, "topic"), f"a topic starts with /, got {spec.topic!r}")
+        written = self.document.root.get("executors")
+        known = list(written) if isinstance(written, Mapping) else []
+        if spec.executor not in known:
+            self.document.add(
+                (*key, "executor"), f"unknown executor {spec.executor!r}{hint(spec.executor, known, 'known')}"
+            )
+            return spec
+        if any(other.executor == spec.executor for other in earlier):
+            self.document.add((*key, "executor"), f"executor {spec.executor!r} has an action already")
+        part = self.parts.executors.get(spec.executor)
+        if part is None:
+            return spec
+        if not streams(part):
+            message = f"executor {spec.executor!r} takes goals; an action needs one that streams, such as type position"
+            self.document.add((*key, "executor"), message)
+        return self._safety(key, spec, part.key, part.options)
+
+    def _safety(self, key: Key, spec: ActionSpec, executor: Key, options: Any) -> ActionSpec:
+        """One answer to what follows stale setpoints, whether the action or the executor gives it."""
+        given = getattr(options, "safety_behavior", None)
+        said_here = self.document.get(*key, "safety_behavior") is not None
+        said_there = self.document.get(*executor, "safety_behavior") is not None
+        if not said_there or given is None:
+            return spec
+        if said_here and given != spec.safety_behavior:
+            message = f"{spec.safety_behavior!r} contradicts {given!r}, which executor {spec.executor!r} says"
+            self.document.add((*key, "safety_behavior"), message)
+        return attrs.evolve(spec, safety_behavior=given)
+
+    def _driven(self, key: Key, executors: Sequence[str], contract: ContractConfig) -> None:
+        """A policy's action vector and the executors of its mode must be the same thing."""
+        acted = [action.executor for action in contract.actions]
+        for i, name in enumerate(executors):
+            if name in self.parts.executors and name not in acted:
+                message = f"no action of the contract drives executor {name!r}; add one under contract.actions"
+                self.document.add((*key, "executors", i), message)
+        for name in acted:
+            if name in self.parts.executors and name not in executors:
+                message = f"the contract's action of executor {name!r} goes nowhere in this mode; add the executor to it"
+                self.document.add((*key, "executors"), message)

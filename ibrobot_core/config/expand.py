@@ -1,0 +1,53 @@
+"""What stands for something else in a value: `${ENV:default}`, `~/` and `package://PACKAGE/path`."""
+
+from __future__ import annotations
+
+import os
+import re
+from importlib.util import find_spec
+from pathlib import Path
+
+_VARIABLE = re.compile(r"\$\{([A-Za-z_][A-Za-z0-9_]*)(?::([^}]*))?\}")
+
+
+def expand(text: str) -> str:
+    """`text` with `${ENV:default}` replaced by the environment's value and a leading `~/` by the home directory.
+
+    Raises:
+        ValueError: for a variable that is not set and has no default, or an ill-formed `${`.
+    """
+
+    def replace(match: re.Match[str]) -> str:
+        name, default = match.groups()
+        value = os.environ.get(name, default)
+        if value is None:
+            raise ValueError(f"the environment variable {name} is not set; set it, or give a default: ${{{name}:value}}")
+        return value
+
+    if "${" in _VARIABLE.sub("", text):
+        raise ValueError(f"ill-formed variable in {text!r}; write ${{NAME}} or ${{NAME:default}}")
+    expanded = _VARIABLE.sub(replace, text)
+    return str(Path(expanded).expanduser()) if expanded.startswith("~/") else expanded
+
+
+def resolve_path(text: str, base: Path) -> Path:
+    """A path from a config: `package://PACKAGE/path` within an installed package, a relative one from `base`.
+
+    Packages are found without importing them.
+
+    Raises:
+        ValueError: if the package is not installed or has no such file.
+    """
+    if not text.startswith("package://"):
+        return base / text
+    package, _, inside = text.removeprefix("package://").partition("/")
+    if not package.isidentifier() or not inside:
+        raise ValueError(f"expected package://PACKAGE/path, got {text!r}")
+    spec = find_spec(package)
+    if spec is None or not spec.submodule_search_locations:
+        distribution = package.replace("_", "-")
+        raise ValueError(f"the Python package {package!r} is not installed: pip install {distribution}")
+    path = Path(next(iter(spec.submodule_search_locations))) / inside
+    if not path.exists():
+        raise ValueError(f"the Python package {package!r} has no file {inside!r}; check its version and the path")
+    return path

@@ -1,0 +1,174 @@
+"""Robot YAML -> `RobotConfig`, with every fault told at once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+import attrs
+
+import ibrobot_core
+from ibrobot_core.config.checks import Checks
+from ibrobot_core.config.contract_checks import ContractChecks
+from ibrobot_core.config.convert import shown
+from ibrobot_core.config.overrides import apply, put
+from ibrobot_core.config.schema import (
+    ControlMode,
+    Dispatch,
+    ExecutorComponent,
+    HardwareComponent,
+    ModelConfig,
+    Peripheral,
+    Recording,
+    RobotConfig,
+)
+from ibrobot_core.config.structure import Part, Parts, Structurer
+from ibrobot_core.config.yaml_nodes import Document, Place, parse
+from ibrobot_core.errors import ConfigError, Problem
+from ibrobot_core.plugins import Registry, installed
+
+DEFAULT_CONFIG = "so101"
+
+
+def load(
+    path: str | Path,
+    *,
+    overrides: Sequence[str] = (),
+    mode: str | None = None,
+    sim: bool = False,
+    registry: Registry | None = None,
+) -> RobotConfig:
+    """Read and check a robot YAML.
+
+    Args:
+        path: the file.
+        overrides: `path.to.key=value`, each checked like the file.
+        mode: in place of its `default_control_mode`.
+        sim: use the `simulation` section even where there is `hardware`.
+        registry: the plugins; the installed ones when None.
+
+    Raises:
+        ConfigError: with everything that is wrong, in file order.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+        raise ConfigError([Problem(str(path), 0, "", f"cannot be read: {reason}")]) from None
+    document = parse(text, str(path))
+    if not isinstance(document.root, Mapping):
+        document.add((), f"expected a mapping of sections, got {shown(document.root)}")
+        document.raise_problems()
+    apply(document, overrides)
+    if mode is not None:
+        place = Place(len(overrides) + 1, 0, 0, f"--mode {mode}")
+        put(document, "default_control_mode", Document(mode, {}, [], place.file), place)
+    return _build(document, Path(path), sim, registry or installed())
+
+
+def from_document(
+    document: Mapping[str, Any], *, source: Path, sim: bool, registry: Registry | None = None
+) -> RobotConfig:
+    """A config from the `document` of another, e.g. in another process.
+
+    Raises:
+        ConfigError: e.g. when the plugins installed are not those it was made with.
+    """
+    return _build(Document(dict(document), {}, [], str(source)), source, sim, registry or installed())
+
+
+def _build(document: Document, source: Path, sim: bool, registry: Registry) -> RobotConfig:
+    parts = Structurer(document, registry, source.absolute().parent, sim).parts()
+    Checks(document, parts).run()
+    contract_checks = ContractChecks(document, parts)
+    contract = contract_checks.run()
+    document.raise_problems()
+    plain = parts.plain
+    robot = plain["robot"]
+    config = RobotConfig(
+        robot=robot,
+        executors={
+            name: ExecutorComponent(part.descriptor.type, part.options, name, part.keys.group, robot.groups[part.keys.group])
+            for name, part in parts.executors.items()
+        },
+        control_modes=_modes(parts),
+        default_control_mode=plain["default_control_mode"],
+        hardware={} if parts.simulated else {
+            name: HardwareComponent(part.descriptor.type, part.options, name, part.keys.joints or robot.joint_names)
+            for name, part in parts.hardware.items()
+        },
+        simulation=_component(parts.simulation),
+        peripherals={
+            name: Peripheral(part.descriptor.type, part.options, name, part.keys.kind)
+            for name, part in parts.peripherals.items()
+        },
+        models={
+            name: ModelConfig(
+                part.descriptor.type, part.options, name, part.keys.norm_mode,
+                contract_checks.observations(part.key, part.keys.extra_observations),
+            )
+            for name, part in parts.models.items()
+        },
+        teleoperation={name: part.component for name, part in parts.teleoperation.items()},
+        contract=contract,
+        recording=_recording(parts.recording),
+        transport=_component(parts.transport),
+        viewer=_component(parts.viewer),
+        simulated=parts.simulated,
+        source=source,
+        document=document.root,
+    )  # fmt: skip
+    return attrs.evolve(config, control=plain["control"]) if "control" in plain else config
+
+
+def _component(part: Part | None) -> Any:
+    return part.component if part is not None else None
+
+
+def _modes(parts: Parts) -> dict[str, ControlMode]:
+    return {
+        name: ControlMode(
+            name, mode.executors, mode.teleop, mode.inference, mode.dispatch or Dispatch(), _component(parts.planners.get(name))
+        )
+        for name, mode in parts.plain["control_modes"].items()
+    }  # fmt: skip
+
+
+def _recording(part: Part | None) -> Recording | None:
+    if part is None:
+        return None
+    keys = part.keys
+    return Recording(part.descriptor.type, part.options, keys.root, keys.dataset, keys.topics)
+
+
+def shipped_configs(registry: Registry) -> dict[str, Path]:
+    """Name -> file of the robot YAMLs that come with ibrobot and with plugins; ibrobot's own come first."""
+    package = Path(ibrobot_core.__file__).parent
+    in_wheel = package / "_configs"
+    folder = in_wheel if in_wheel.is_dir() else package.parent / "configs"
+    found = {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+    for config in registry.configs:
+        found.setdefault(config.name, config.path)
+    return found
+
+
+def find_config(name: str | None, registry: Registry) -> Path:
+    """The file that a user means by `name`: a path, or the name of a shipped config with or without `.yaml`.
+
+    Raises:
+        ConfigError: when there is none; says which names there are.
+    """
+    name = name or DEFAULT_CONFIG
+    if Path(name).is_file():
+        return Path(name)
+    known = shipped_configs(registry)
+    stem = name.removesuffix(".yaml")
+    if stem in known:
+        return known[stem]
+    if Path(name).name != name:
+        raise ConfigError([Problem(name, 0, "", "no such file")])
+    close = get_close_matches(stem, known, 1)
+    remark = f", did you mean {close[0]!r}?" if close else f"; the configs are: {', '.join(known) or 'none'}"
+    raise ConfigError([Problem(name, 0, "", f"no such file, and no config of this name{remark}")])

@@ -1,0 +1,66 @@
+"""`--set path.to.key=value`: a value put into the document, checked afterwards like the file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from ibrobot_core.config.convert import hint, shown
+from ibrobot_core.config.yaml_nodes import Document, Key, Place, parse
+from ibrobot_core.errors import ConfigError, Problem
+
+
+def apply(document: Document, overrides: Sequence[str]) -> None:
+    """Put `overrides` into `document`, in order; faults in them are noted there."""
+    for rank, text in enumerate(overrides, start=1):
+        place = Place(rank, 0, 0, f"--set {text}")
+        path, equals, value_text = text.partition("=")
+        if not equals or not path or not all(path.split(".")):
+            document.problems.append((place, Problem(place.file, 0, "", "expected PATH=VALUE, e.g. control.rate_hz=50")))
+            continue
+        try:
+            value = parse(value_text, place.file)
+        except ConfigError as error:
+            document.problems += [(place, Problem(place.file, 0, path, p.message)) for p in error.problems]
+            continue
+        document.problems += [(place, Problem(place.file, 0, path, p.message)) for _, p in value.problems]
+        put(document, path, value, place)
+
+
+def put(document: Document, path: str, value: Document, place: Place) -> None:
+    parts = path.split(".")
+    holder: Any = document.root
+    key: Key = ()
+    for depth, word in enumerate(parts):
+        last = depth == len(parts) - 1
+        try:
+            part = _part(holder, word)
+        except ValueError as error:
+            document.problems.append((place, Problem(place.file, 0, ".".join(parts[: depth + 1]), str(error))))
+            return
+        key = (*key, part)
+        if last:
+            holder[part] = value.root
+        elif isinstance(part, str) and holder.get(part) is None:
+            holder[part] = {}
+            document.places[key] = place
+        holder = holder[part]
+    for known in [k for k in document.places if k[: len(key)] == key]:
+        del document.places[known]
+    document.places[key] = place
+    document.places.update({(*key, *inner): place for inner in value.places})
+
+
+def _part(holder: Any, word: str) -> str | int:
+    """`word` as a key of `holder`: of a list, an index or an item's name."""
+    if isinstance(holder, Mapping):
+        return word
+    if not isinstance(holder, list):
+        raise ValueError(f"{shown(holder)} has no keys")
+    names = [item.get("name") if isinstance(item, Mapping) else None for item in holder]
+    if word in names:
+        return names.index(word)
+    if word.isdecimal() and int(word) < len(holder):
+        return int(word)
+    known = [name for name in names if isinstance(name, str)] or [str(i) for i in range(len(holder))]
+    raise ValueError(f"the list has no such item{hint(word, known, 'items')}")

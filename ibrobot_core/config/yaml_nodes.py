@@ -1,0 +1,215 @@
+"""YAML text -> plain values and the place of every key, with the scalars of YAML 1.2 and no repeated keys."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import attrs
+import yaml
+from yaml.composer import Composer
+from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
+from yaml.parser import Parser
+from yaml.reader import Reader
+from yaml.resolver import BaseResolver
+from yaml.scanner import Scanner
+
+from ibrobot_core.config.expand import expand
+from ibrobot_core.errors import ConfigError, Problem
+
+Key = tuple[str | int, ...]
+"""Where a value is in a document: mapping keys and list indices from the top."""
+
+_BOOLS = {"true": True, "True": True, "TRUE": True, "false": False, "False": False, "FALSE": False}
+_NULLS = {"", "~", "null", "Null", "NULL"}
+_INT = re.compile(r"[-+]?[0-9]+")
+_BASED = re.compile(r"0o[0-7]+|0x[0-9a-fA-F]+")
+_FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
+_SPECIAL = re.compile(r"([-+]?)\.(inf|Inf|INF)|\.(nan|NaN|NAN)")
+
+
+@attrs.frozen(order=True)
+class Place:
+    """Where something was written: line and column from 1 in a file, or an override, whose line is 0."""
+
+    rank: int
+    line: int
+    column: int
+    file: str
+
+
+@attrs.define
+class Document:
+    """Plain values with the places of their keys and items, and the faults found on the way."""
+
+    root: Any
+    places: dict[Key, Place]
+    problems: list[tuple[Place, Problem]]
+    file: str
+
+    def place(self, key: Key) -> Place:
+        """The place of `key`, or of what encloses it where it was not written."""
+        while key and key not in self.places:
+            key = key[:-1]
+        return self.places.get(key, Place(0, 0, 0, self.file))
+
+    def add(self, key: Key, message: str) -> None:
+        """Note a fault at `key`."""
+        place = self.place(key)
+        self.problems.append((place, Problem(place.file, place.line, self.dotted(key), message)))
+
+    def dotted(self, key: Key) -> str:
+        """`key` as `--set` takes it: list items by their name where they have one."""
+        words: list[str] = []
+        value = self.root
+        for part in key:
+            value = _child(value, part)
+            name = value.get("name") if isinstance(part, int) and isinstance(value, Mapping) else None
+            words.append(name if isinstance(name, str) else str(part))
+        return ".".join(words)
+
+    def get(self, *key: str | int) -> Any:
+        """The value at `key`, or None."""
+        value = self.root
+        for part in key:
+            value = _child(value, part)
+        return value
+
+    def raise_problems(self) -> None:
+        """Raise all that was noted, in file order.
+
+        Raises:
+            ConfigError: if anything was noted.
+        """
+        if self.problems:
+            unique = dict.fromkeys(problem for _, problem in sorted(self.problems, key=lambda item: item[0]))
+            raise ConfigError(unique)
+
+
+def _child(value: Any, part: str | int) -> Any:
+    if isinstance(value, Mapping):
+        return value.get(part)
+    if isinstance(value, Sequence) and not isinstance(value, str) and isinstance(part, int) and part < len(value):
+        return value[part]
+    return None
+
+
+class _Composer(Reader, Scanner, Parser, Composer, BaseResolver):  # type: ignore[misc]
+    """PyYAML's composer without its YAML 1.1 scalars: plain ones keep their text."""
+
+    def __init__(self, text: str) -> None:
+        Reader.__init__(self, text)
+        Scanner.__init__(self)
+        Parser.__init__(self)
+        Composer.__init__(self)
+        BaseResolver.__init__(self)
+
+
+def scalar(text: str) -> str | int | float | bool | None:
+    """The value of a plain scalar by the core schema of YAML 1.2: `1e-3` is a number, `on` is text."""
+    if text in _NULLS:
+        return None
+    if text in _BOOLS:
+        return _BOOLS[text]
+    if _INT.fullmatch(text):
+        return int(text)
+    if _BASED.fullmatch(text):
+        return int(text, 0)
+    if _FLOAT.fullmatch(text):
+        return float(text)
+    special = _SPECIAL.fullmatch(text)
+    return float(text.replace(".", "")) if special else text
+
+
+def parse(text: str, file: str) -> Document:
+    """Read one YAML document. Faults are noted in the result, but for text that is no YAML at all.
+
+    Raises:
+        ConfigError: e.g. an unclosed bracket.
+    """
+    try:
+        node = _Composer(text).get_single_node()
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        raise ConfigError([Problem(file, mark.line + 1 if mark else 0, "", f"not valid YAML: {error.problem}")]) from None
+    except yaml.YAMLError as error:
+        raise ConfigError([Problem(file, 0, "", f"not valid YAML: {str(error).splitlines()[0]}")]) from None
+    document = Document(None, {}, [], file)
+    document.root = None if node is None else _Constructor(document).value(node, ())
+    return document
+
+
+@attrs.define
+class _Constructor:
+    document: Document
+    _open: set[int] = attrs.field(factory=set)
+    """Nodes under construction: one met again is an alias to what encloses it."""
+
+    def place(self, node: Node) -> Place:
+        return Place(0, node.start_mark.line + 1, node.start_mark.column + 1, self.document.file)
+
+    def fault(self, node: Node, key: Key, message: str) -> None:
+        place = self.place(node)
+        self.document.problems.append((place, Problem(place.file, place.line, self.document.dotted(key), message)))
+
+    def value(self, node: Node, key: Key) -> Any:
+        if id(node) in self._open:
+            self.fault(node, key, "an alias to the block that contains it")
+            return None
+        self._open.add(id(node))
+        try:
+            if isinstance(node, ScalarNode):
+                return self.scalar(node, key)
+            if node.tag not in (BaseResolver.DEFAULT_MAPPING_TAG, BaseResolver.DEFAULT_SEQUENCE_TAG):
+                self.fault(node, key, f"the tag {node.tag!r} is not known here; remove it")
+            if isinstance(node, SequenceNode):
+                for i, item in enumerate(node.value):
+                    self.document.places[*key, i] = self.place(item)
+                return [self.value(item, (*key, i)) for i, item in enumerate(node.value)]
+            return self.mapping(node, key)
+        finally:
+            self._open.discard(id(node))
+
+    def scalar(self, node: ScalarNode, key: Key) -> Any:
+        if node.tag != BaseResolver.DEFAULT_SCALAR_TAG:
+            self.fault(node, key, f"the tag {node.tag!r} is not known here; remove it")
+        try:
+            text = expand(node.value)
+        except ValueError as error:
+            self.fault(node, key, str(error))
+            return node.value
+        return scalar(text) if node.style is None else text
+
+    def mapping(self, node: MappingNode, key: Key) -> dict[str, Any]:
+        result: dict[str, Any] = {}
+        lines: dict[str, int] = {}
+        merged: list[Node] = []
+        for key_node, value_node in node.value:
+            if not isinstance(key_node, ScalarNode):
+                self.fault(key_node, key, "a key must be a single word")
+            elif key_node.value == "<<" and key_node.style is None:
+                merged += value_node.value if isinstance(value_node, SequenceNode) else [value_node]
+            elif key_node.value in result:
+                first = lines[key_node.value]
+                self.fault(key_node, (*key, key_node.value), f"repeated key, first given in line {first}")
+            else:
+                lines[key_node.value] = key_node.start_mark.line + 1
+                self.document.places[*key, key_node.value] = self.place(key_node)
+                result[key_node.value] = self.value(value_node, (*key, key_node.value))
+        for name, key_node, value_node in self.merged_pairs(merged, key):
+            if name not in result:
+                self.document.places[*key, name] = self.place(key_node)
+                result[name] = self.value(value_node, (*key, name))
+        return result
+
+    def merged_pairs(self, nodes: list[Node], key: Key) -> Iterator[tuple[str, Node, Node]]:
+        for node in nodes:
+            if not isinstance(node, MappingNode):
+                self.fault(node, key, "<< takes an alias to a mapping, or a list of them")
+                continue
+            for key_node, value_node in node.value:
+                if isinstance(key_node, ScalarNode) and key_node.value == "<<":
+                    self.fault(key_node, key, "<< inside a merged mapping; merge both where they are used")
+                elif isinstance(key_node, ScalarNode):
+                    yield key_node.value, key_node, value_node
