@@ -47,6 +47,8 @@ def build_model(options: MujocoOptions, robot: Robot, *, visual: bool) -> mujoco
     """
     spec = build_spec(options, robot)
     if visual:
+        # Multisampling costs a software renderer twice the time.
+        spec.visual.quality.offsamples = 0
         _simplify(spec)
     else:
         _strip(spec)
@@ -122,7 +124,7 @@ def _add_surroundings(spec: mujoco.MjSpec) -> None:
         name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
         rgb1=[0.75, 0.82, 0.9], rgb2=[0.4, 0.48, 0.58], width=64, height=384,
     )  # fmt: skip
-    spec.visual.headlight.ambient = [0.35, 0.35, 0.35]
+    spec.visual.headlight.ambient = [0.4, 0.4, 0.4]
     spec.visual.headlight.diffuse = [0.25, 0.25, 0.25]
     spec.visual.headlight.specular = [0.0, 0.0, 0.0]
     world.add_light(

@@ -1,0 +1,119 @@
+"""A camera in the simulated scene: draws the newest physics state on the bus, at its own rate in simulated time."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import override
+
+import mujoco
+import numpy as np
+
+from ibrobot_core.bus import Subscription
+from ibrobot_core.errors import SensorError
+from ibrobot_core.interfaces import Context, Sensor
+from ibrobot_core.messages import CameraInfo, Header, Image, Message
+from ibrobot_core.units import ns
+from ibrobot_mujoco.model import build_model
+from ibrobot_mujoco.options import CameraOptions, MujocoOptions
+from ibrobot_mujoco.render import Renderer
+from ibrobot_mujoco.state import PHYSICS_TOPIC, newest, pose_scene, stamp_of
+
+# A second of states at 100 Hz: what arrives while a picture is drawn is skipped over, not lost from the queue.
+_QUEUE = 100
+
+
+class MujocoCamera(Sensor):
+    """Renders in the thread of `open` and `read`; pictures that there was no time for are counted, not queued."""
+
+    message_type = Image
+
+    def __init__(self, options: CameraOptions, ctx: Context) -> None:
+        self.topic = f"/camera/{ctx.name}/image_raw"
+        self.skipped = 0
+        """Pictures that were due and never drawn."""
+        self._options = options
+        self._ctx = ctx
+        self._period_ns = ns(1.0 / options.fps)
+        self._last_slot: int | None = None
+        self._renderer: Renderer | None = None
+        self._states: Subscription | None = None
+
+    @override
+    def open(self) -> None:
+        simulation, bus = self._ctx.simulation, self._ctx.bus
+        if not isinstance(simulation, MujocoOptions) or bus is None:
+            raise SensorError(f"camera {self._ctx.name!r}: type mujoco needs a running simulation: {{type: mujoco}}")
+        self._model = build_model(simulation, self._ctx.robot, visual=True)
+        self._drawn = mujoco.MjData(self._model)
+        camera = self._find_camera()
+        self._fovy = math.radians(self._model.cam_fovy[camera])
+        size = self._options.width, self._options.height
+        self._renderer = Renderer(self._model, camera, *size, shadows=self._options.shadows)
+        self._ctx.log.info("camera %s renders with %s", self._ctx.name, self._renderer.backend)
+        self._last_slot = None
+        self._states = bus.subscribe(PHYSICS_TOPIC, _QUEUE)
+
+    def _find_camera(self) -> int:
+        """The camera's number in the model: by `camera`, or by the peripheral's name, with or without `_cam`."""
+        asked = self._options.camera
+        names = (asked,) if asked is not None else (self._ctx.name, f"{self._ctx.name}_cam")
+        for name in names:
+            number = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_CAMERA, name)
+            if number >= 0:
+                return int(number)
+        there = ", ".join(self._model.camera(i).name for i in range(self._model.ncam))
+        raise SensorError(f"camera {self._ctx.name!r}: no {' or '.join(names)} in the scene; its cameras are: {there}")
+
+    @override
+    def read(self, timeout_s: float) -> Image | None:
+        if self._renderer is None or self._states is None:
+            raise SensorError(f"camera {self._ctx.name!r} is not open")
+        deadline = time.monotonic() + timeout_s
+        while True:
+            state = newest(self._states, max(0.0, deadline - time.monotonic()) if timeout_s > 0 else 0.0)
+            if state is None:
+                return None
+            stamp_ns = stamp_of(state)
+            if self._is_due(stamp_ns):
+                pose_scene(self._model, self._drawn, state)
+                return self._image(stamp_ns, self._renderer.render(self._drawn))
+            if timeout_s <= 0:
+                return None
+
+    def _is_due(self, stamp_ns: int) -> bool:
+        """Whether a state is the first in its slot of the camera's time grid, which begins at stamp 0."""
+        slot, last = stamp_ns // self._period_ns, self._last_slot
+        if last is not None and slot <= last:
+            return False
+        self.skipped += 0 if last is None else slot - last - 1
+        self._last_slot = slot
+        return True
+
+    def _image(self, stamp_ns: int, pixels: np.ndarray) -> Image:
+        height, width, _ = pixels.shape
+        return Image(self._header(stamp_ns), height, width, "rgb8", 3 * width, pixels.reshape(-1))
+
+    def _header(self, stamp_ns: int) -> Header:
+        return Header(stamp_ns, f"{self._ctx.name}_optical_frame")
+
+    @override
+    def close(self) -> None:
+        if self._states is not None:
+            self._states.close()
+            self._states = None
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+    @override
+    def latched(self) -> tuple[tuple[str, Message], ...]:
+        width, height = self._options.width, self._options.height
+        focal = height / 2 / math.tan(self._fovy / 2)
+        centre_x, centre_y = (width - 1) / 2, (height - 1) / 2
+        k = np.array([[focal, 0, centre_x], [0, focal, centre_y], [0, 0, 1]])
+        info = CameraInfo(
+            self._header(self._ctx.clock.now_ns()), height, width, d=np.zeros(5), k=k.ravel(), r=np.eye(3).ravel(),
+            p=np.hstack([k, np.zeros((3, 1))]).ravel(),
+        )  # fmt: skip
+        return ((f"/camera/{self._ctx.name}/camera_info", info),)

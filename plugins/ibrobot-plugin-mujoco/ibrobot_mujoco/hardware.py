@@ -1,0 +1,212 @@
+"""The robot in MuJoCo as hardware: servos with latency, noise, limits and injected faults, and physics in our time."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import override
+
+import attrs
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from ibrobot_core.errors import HardwareError
+from ibrobot_core.interfaces import Context, Episode, JointReading, Signal, SimulatedHardware
+from ibrobot_core.robot import Vector
+from ibrobot_core.units import ns
+from ibrobot_mujoco.faults import Faults
+from ibrobot_mujoco.model import build_model
+from ibrobot_mujoco.options import MujocoOptions
+from ibrobot_mujoco.pick_cube import PickCube
+from ibrobot_mujoco.state import PHYSICS_TOPIC, SCENE_SIZE, SCENE_TOPIC, physics_size, write_physics
+
+_RELAXED = int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
+
+
+@attrs.frozen(eq=False)
+class _Sample:
+    """The joints at a time of the episode, as the servos measured them."""
+
+    time_ns: int
+    position: Vector
+    velocity: Vector
+    effort: Vector
+
+
+class MujocoHardware(SimulatedHardware):
+    """The joints of an MJCF. The model is built here, so that `signals` are known before `connect`.
+
+    Raises:
+        HardwareError: when the MJCF, or a joint or position actuator in it, is missing.
+    """
+
+    def __init__(self, options: MujocoOptions, ctx: Context) -> None:
+        self.joints = ctx.joints
+        self._options = options
+        self._ctx = ctx
+        self._model = model = build_model(options, ctx.robot, visual=False)
+        self._physics: mujoco.MjData | None = None
+        self._qpos = _addresses(model, ctx.joints, model.jnt_qposadr)
+        self._dofs = _addresses(model, ctx.joints, model.jnt_dofadr)
+        self._servos = _servos(model, ctx.joints)
+        self._start = _start_pose(options, ctx)
+        self._task = PickCube(options, model) if options.scene == "pick_cube" else None
+        self._faults = Faults(options.faults, ctx.joints)
+        self._latency_ns = ns(options.latency)
+        self._timestep_ns = ns(options.timestep)
+        self._stride = options.velocity_limit * options.timestep
+        physics = Signal(PHYSICS_TOPIC, physics_size(model), "stamp and state, for cameras and viewers")
+        scene = Signal(SCENE_TOPIC, SCENE_SIZE, "cube position, cube quaternion wxyz, bin centre [m, base frame]")
+        self.signals = (physics, scene) if self._task is not None else (physics,)  # type: ignore[misc]
+
+    @override
+    def connect(self) -> None:
+        self._physics = mujoco.MjData(self._model)
+        self.reset(Episode(self._ctx.seed))
+
+    @override
+    def disconnect(self) -> None:
+        self._physics = None
+
+    @override
+    def reset(self, episode: Episode) -> None:
+        model, physics = self._model, self._connected()
+        model.opt.disableflags &= ~_RELAXED
+        mujoco.mj_resetData(model, physics)
+        every_joint = self._ctx.robot.joint_names
+        physics.qpos[_addresses(model, every_joint, model.jnt_qposadr)] = self._start
+        physics.ctrl[_servos(model, every_joint)] = self._start
+        rng = np.random.default_rng(episode.seed)
+        if self._task is not None:
+            self._task.place(physics, rng)
+        self._noise = rng.spawn(1)[0]
+        mujoco.mj_forward(model, physics)
+        self._faults.restart()
+        self._now_ns = self._stepped_ns = 0
+        self._stamp_ns = self._ctx.clock.now_ns()
+        self._target: Vector = physics.ctrl[self._servos]
+        self._setpoint = self._target.copy()
+        self._commands: deque[tuple[int, Vector | None]] = deque()
+        self._samples = deque([self._sample()])
+        self._last: JointReading | None = None
+
+    @override
+    def read(self) -> JointReading:
+        self._connected()
+        self._stamp_ns = self._ctx.clock.now_ns()
+        if self._faults.active("read_error", self._now_ns):
+            raise HardwareError(f"{self._ctx.name}: reading failed (injected fault read_error)")
+        if self._faults.active("silent", self._now_ns):
+            if self._last is None:
+                raise HardwareError(f"{self._ctx.name}: no joint has ever answered (injected fault silent)")
+            return attrs.evolve(self._last, stale=True)
+        while len(self._samples) > 1 and self._samples[1].time_ns <= self._now_ns - self._latency_ns:
+            self._samples.popleft()
+        sample = self._samples[0]
+        noise = self._noise.normal(0.0, self._options.noise, len(self.joints)) if self._options.noise else 0.0
+        position = sample.position + noise
+        self._last = JointReading(self._stamp_ns, position, sample.velocity.copy(), sample.effort.copy())
+        return self._last
+
+    @override
+    def write(self, position: Vector) -> None:
+        self._connected()
+        if position.shape != (len(self.joints),) or not np.isfinite(position).all():
+            raise HardwareError(f"{self._ctx.name}: a command is {len(self.joints)} finite angles, got {position}")
+        self._send(position.copy())
+
+    @override
+    def relax(self) -> None:
+        """Take torque off every servo of the model."""
+        self._connected()
+        self._send(None)
+
+    def _send(self, command: Vector | None) -> None:
+        """Put a command (None: torque off) on its way."""
+        if not self._faults.active("silent", self._now_ns):
+            self._commands.append((self._now_ns + self._latency_ns, command))
+
+    @override
+    def reset_faults(self) -> None:
+        self._connected()
+        self._faults.clear(self._now_ns)
+
+    @override
+    def advance(self, step_ns: int) -> None:
+        physics = self._connected()
+        end_ns = self._now_ns + step_ns
+        frozen = self._faults.frozen(self._now_ns)
+        # What remains of a step that is no multiple of the timestep is made up for by the next.
+        while self._stepped_ns + self._timestep_ns <= end_ns:
+            self._drive(physics, frozen)
+            mujoco.mj_step(self._model, physics)
+            self._stepped_ns += self._timestep_ns
+            if self._latency_ns:
+                self._samples.append(self._sample())
+        if not self._latency_ns:
+            self._samples[0] = self._sample()
+        self._now_ns = end_ns
+        self._stamp_ns += step_ns
+
+    def _drive(self, physics: mujoco.MjData, frozen: list[int]) -> None:
+        """Take the commands that have arrived, and move the servos' setpoints towards the last of them."""
+        while self._commands and self._commands[0][0] <= self._stepped_ns:
+            command = self._commands.popleft()[1]
+            if command is None:
+                self._model.opt.disableflags |= _RELAXED
+                continue
+            if self._model.opt.disableflags & _RELAXED:
+                self._model.opt.disableflags &= ~_RELAXED
+                self._setpoint = physics.qpos[self._qpos]
+            command[frozen] = self._target[frozen]
+            self._target = command
+        # Half the time of np.clip, and this runs at every timestep.
+        self._setpoint += np.minimum(np.maximum(self._target - self._setpoint, -self._stride), self._stride)
+        physics.ctrl[self._servos] = self._setpoint
+
+    def _sample(self) -> _Sample:
+        physics = self._connected()
+        position, velocity = physics.qpos[self._qpos], physics.qvel[self._dofs]
+        return _Sample(self._stepped_ns, position, velocity, physics.qfrc_actuator[self._dofs])
+
+    @override
+    def success(self) -> bool | None:
+        physics = self._connected()
+        return None if self._task is None else self._task.success(physics)
+
+    @override
+    def read_signal(self, index: int, out: Vector) -> None:
+        physics = self._connected()
+        if index == 0:
+            write_physics(self._model, physics, self._stamp_ns, out)
+        elif index == 1 and self._task is not None:
+            self._task.observe(physics, out)
+        else:
+            raise HardwareError(f"no signal {index}, there are {len(self.signals)}")
+
+    def _connected(self) -> mujoco.MjData:
+        if self._physics is None:
+            raise HardwareError(f"{self._ctx.name} is not connected")
+        return self._physics
+
+
+def _addresses(model: mujoco.MjModel, joints: tuple[str, ...], table: NDArray[np.int32]) -> NDArray[np.intp]:
+    return np.array([table[model.joint(name).id] for name in joints], dtype=np.intp)
+
+
+def _servos(model: mujoco.MjModel, joints: tuple[str, ...]) -> NDArray[np.intp]:
+    """The actuators of `joints`, found by what they drive: an MJCF may call them otherwise."""
+    driven = {
+        int(model.actuator_trnid[i, 0]): i
+        for i in range(model.nu)
+        if model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT
+    }
+    return np.array([driven[model.joint(name).id] for name in joints], dtype=np.intp)
+
+
+def _start_pose(options: MujocoOptions, ctx: Context) -> Vector:
+    """Positions of all the robot's joints at the beginning of an episode [rad], in robot order."""
+    try:
+        return ctx.robot.pose(options.start_pose)
+    except KeyError as error:
+        raise HardwareError(f"simulation.start_pose: {error.args[0]}") from error

@@ -1,0 +1,71 @@
+"""Off-screen rendering of a scene, with the OpenGL backend that this machine has."""
+
+from __future__ import annotations
+
+import importlib
+import threading
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from ibrobot_core.errors import SensorError
+from ibrobot_mujoco import gl
+
+# EGL's display is global and initialised by the first context: two threads must not both be the first.
+_creating = threading.Lock()
+
+
+class Renderer:
+    """Draws one camera's view. Made, used and closed in one thread, for that is where the OpenGL context lives.
+
+    MuJoCo's own renderer settles on a backend when `mujoco` is first imported; this one when it is made.
+
+    Raises:
+        SensorError: when the backend cannot make a context.
+    """
+
+    def __init__(self, model: mujoco.MjModel, camera: int, width: int, height: int, *, shadows: bool) -> None:
+        self.backend = gl.choose()
+        self._model = model
+        model.vis.global_.offwidth = width
+        model.vis.global_.offheight = height
+        self._context = _make_context(self.backend, width, height)
+        self._mjr = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._mjr)
+        self._scene = mujoco.MjvScene(model, maxgeom=model.ngeom + 100)
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
+        self._option = mujoco.MjvOption()
+        self._view = mujoco.MjvCamera()
+        self._view.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        self._view.fixedcamid = camera
+        self._rect = mujoco.MjrRect(0, 0, width, height)
+
+    def render(self, drawn: mujoco.MjData) -> NDArray[np.uint8]:
+        """The camera's picture of `drawn`, shape (height, width, 3), RGB, top row first."""
+        self._context.make_current()
+        everything = mujoco.mjtCatBit.mjCAT_ALL
+        mujoco.mjv_updateScene(self._model, drawn, self._option, None, self._view, everything, self._scene)
+        mujoco.mjr_render(self._rect, self._scene, self._mjr)
+        pixels = np.empty((self._rect.height, self._rect.width, 3), np.uint8)
+        mujoco.mjr_readPixels(pixels, None, self._rect, self._mjr)
+        return np.ascontiguousarray(pixels[::-1])
+
+    def close(self) -> None:
+        """Release the context. Safe to call twice."""
+        if self._context is not None:
+            self._context.make_current()
+            self._mjr.free()
+            self._context.free()
+            self._context = None
+
+
+def _make_context(backend: str, width: int, height: int) -> Any:
+    with _creating:
+        try:
+            context = importlib.import_module(f"mujoco.{backend}").GLContext(width, height)
+            context.make_current()
+        except Exception as error:
+            raise SensorError(f"OpenGL backend {backend} does not work here ({error}); {gl.REMEDY}") from error
+    return context

@@ -1,0 +1,67 @@
+"""A window on a desktop that shows the simulated scene; the mouse turns and zooms the view."""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import Any, override
+
+import mujoco
+
+from ibrobot_core.bus import Subscription
+from ibrobot_core.errors import IbrobotError
+from ibrobot_core.interfaces import Context, Viewer
+from ibrobot_mujoco.model import build_model
+from ibrobot_mujoco.options import MujocoOptions
+from ibrobot_mujoco.state import PHYSICS_TOPIC, newest, pose_scene
+
+_QUEUE = 100
+
+
+class MujocoViewer(Viewer):
+    """Shows the physics state on the bus. It looks only: nothing that is done in the window reaches the simulation."""
+
+    def __init__(self, ctx: Context) -> None:
+        self._ctx = ctx
+        self._window: Any = None
+        self._states: Subscription | None = None
+
+    @override
+    def open(self) -> None:
+        simulation, bus = self._ctx.simulation, self._ctx.bus
+        if not isinstance(simulation, MujocoOptions) or bus is None:
+            raise IbrobotError("viewer type mujoco needs a running simulation: {type: mujoco}")
+        if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+            raise IbrobotError("no display for the viewer's window: DISPLAY and WAYLAND_DISPLAY are not set")
+        # Imported here: it opens the window system, which only this viewer needs.
+        from mujoco import viewer
+
+        self._model = build_model(simulation, self._ctx.robot, visual=True)
+        self._drawn = mujoco.MjData(self._model)
+        mujoco.mj_forward(self._model, self._drawn)
+        self._window = viewer.launch_passive(self._model, self._drawn, show_left_ui=False, show_right_ui=False)
+        self._states = bus.subscribe(PHYSICS_TOPIC, _QUEUE)
+
+    @override
+    def update(self) -> bool:
+        if self._window is None or self._states is None or not self._window.is_running():
+            return False
+        state = newest(self._states)
+        if state is not None:
+            with self._window.lock():
+                pose_scene(self._model, self._drawn, state)
+            self._window.sync()
+        return True
+
+    @override
+    def close(self) -> None:
+        if self._states is not None:
+            self._states.close()
+            self._states = None
+        if self._window is not None:
+            self._window.close()
+            self._window = None
+
+    @override
+    def where(self) -> str:
+        return "a window on this desktop"
