@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import builtins
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -40,7 +41,7 @@ class Descriptor[T]:
     """What the YAML says after `type:`."""
     make: Callable[[Any, Context], T]
     summary: str
-    options: type = NoOptions
+    options: builtins.type[Any] = NoOptions
     """A frozen attrs class made with `ibrobot_core.options.option`."""
 
 

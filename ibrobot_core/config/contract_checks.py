@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import attrs
 
@@ -11,7 +10,7 @@ from ibrobot_core import messages
 from ibrobot_core.config.checks import streams
 from ibrobot_core.config.convert import hint
 from ibrobot_core.config.schema import ActionSpec, ContractConfig, ObservationSpec
-from ibrobot_core.config.structure import Parts
+from ibrobot_core.config.structure import Part, Parts
 from ibrobot_core.config.yaml_nodes import Document, Key
 
 JOINT_STATES = "/joint_states"
@@ -46,7 +45,8 @@ class ContractChecks:
             extra: Key = ("models", name, "extra_observations")
             self._same_kind(extra, self.observations(extra, part.keys.extra_observations), observations)
         self._same_kind((*key, "observations"), observations, ())
-        actions = tuple(self._action((*key, "actions", i), a, contract.actions[:i]) for i, a in enumerate(contract.actions))
+        given = contract.actions
+        actions = tuple(self._action((*key, "actions", i), spec, given[:i]) for i, spec in enumerate(given))
         for mode_name, mode in (self.parts.plain.get("control_modes") or {}).items():
             if mode.inference is not None:
                 self._driven(("control_modes", mode_name), mode.executors, contract)
@@ -88,7 +88,7 @@ class ContractChecks:
                 return spec
         written = self.document.root.get("peripherals")
         items = [item for item in written if isinstance(item, Mapping)] if isinstance(written, list) else []
-        kinds = {str(item.get("name")): item.get("kind") for item in items}
+        kinds = {str(item.get("name")): str(item.get("kind")) for item in items}
         if spec.peripheral not in kinds:
             remark = hint(str(spec.peripheral), list(kinds), "known")
             self.document.add((*key, "peripheral"), f"unknown peripheral {spec.peripheral!r}{remark}")
@@ -121,10 +121,11 @@ class ContractChecks:
             if first not in _JOINT_FIELDS or not rest:
                 fields = " or ".join(f"{field}.JOINT" for field in _JOINT_FIELDS)
                 self.document.add(key, f"expected {fields}, got {path!r}")
-            elif spec.topic == JOINT_STATES and (robot := self.parts.plain.get("robot")) is not None:
-                if rest not in robot.joint_names:
-                    remark = hint(rest, list(robot.joint_names), "known")
-                    self.document.add(key, f"unknown joint {rest!r}{remark}")
+                return
+            robot = self.parts.plain.get("robot")
+            joints = list(robot.joint_names) if robot is not None else [rest]
+            if spec.topic == JOINT_STATES and rest not in joints:
+                self.document.add(key, f"unknown joint {rest!r}{hint(rest, joints, 'known')}")
         else:
             names = [field.name for field in attrs.fields(message_types()[spec.type])]
             if first not in names:
@@ -156,19 +157,22 @@ class ContractChecks:
         if not streams(part):
             message = f"executor {spec.executor!r} takes goals; an action needs one that streams, such as type position"
             self.document.add((*key, "executor"), message)
-        return self._safety(key, spec, part.key, part.options)
+        return self._safety(key, spec, part)
 
-    def _safety(self, key: Key, spec: ActionSpec, executor: Key, options: Any) -> ActionSpec:
-        """One answer to what follows stale setpoints, whether the action or the executor gives it."""
-        given = getattr(options, "safety_behavior", None)
-        said_here = self.document.get(*key, "safety_behavior") is not None
-        said_there = self.document.get(*executor, "safety_behavior") is not None
-        if not said_there or given is None:
+    def _safety(self, key: Key, spec: ActionSpec, part: Part) -> ActionSpec:
+        """One answer to what follows stale setpoints, in both, whether the action or the executor gives it."""
+        there = getattr(part.options, "safety_behavior", None)
+        if there is None:
             return spec
-        if said_here and given != spec.safety_behavior:
-            message = f"{spec.safety_behavior!r} contradicts {given!r}, which executor {spec.executor!r} says"
+        if self.document.get(*part.key, "safety_behavior") is None:
+            options = attrs.evolve(part.options, safety_behavior=spec.safety_behavior)
+            self.parts.executors[spec.executor] = attrs.evolve(part, options=options)
+        elif self.document.get(*key, "safety_behavior") is None:
+            spec = attrs.evolve(spec, safety_behavior=there)
+        elif there != spec.safety_behavior:
+            message = f"{spec.safety_behavior!r} contradicts {there!r}, which executor {spec.executor!r} says"
             self.document.add((*key, "safety_behavior"), message)
-        return attrs.evolve(spec, safety_behavior=given)
+        return spec
 
     def _driven(self, key: Key, executors: Sequence[str], contract: ContractConfig) -> None:
         """A policy's action vector and the executors of its mode must be the same thing."""
@@ -179,5 +183,5 @@ class ContractChecks:
                 self.document.add((*key, "executors", i), message)
         for name in acted:
             if name in self.parts.executors and name not in executors:
-                message = f"the contract's action of executor {name!r} goes nowhere in this mode; add the executor to it"
+                message = f"lacks executor {name!r}, which an action of the contract drives; add it to this mode"
                 self.document.add((*key, "executors"), message)

@@ -1,4 +1,4 @@
-"""Plain values -> attrs classes, strictly: every fault is collected with its key, no scalar is bent into another type."""
+"""Plain values -> attrs classes, strictly: every fault is collected with its key, and no scalar changes its type."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin
 
 import attrs
-import cattrs
 from cattrs import Converter
 
 from ibrobot_core.config.expand import resolve_path
@@ -113,10 +112,15 @@ def is_union(kind: Any) -> bool:
     return get_origin(kind) in (Union, types.UnionType)
 
 
+def is_literal(kind: Any) -> bool:
+    """Whether a type annotation says `Literal[...]`."""
+    return get_origin(kind) in (Literal,)
+
+
 Hook = Callable[[Any, Any], Any]
 
 
-def _sequence_hook(kind: Any, converter: cattrs.BaseConverter) -> Hook:
+def _sequence_hook(kind: Any, converter: Converter) -> Hook:
     args = get_args(kind) or (Any, ...)
     build = list if (get_origin(kind) or kind) is list else tuple
     any_length = build is list or len(args) == 1 or args[1] is Ellipsis
@@ -137,7 +141,7 @@ def _sequence_hook(kind: Any, converter: cattrs.BaseConverter) -> Hook:
     return structure
 
 
-def _mapping_hook(kind: Any, converter: cattrs.BaseConverter) -> Hook:
+def _mapping_hook(kind: Any, converter: Converter) -> Hook:
     _, item_kind = get_args(kind) or (str, Any)
 
     def structure(value: Any, _: Any) -> dict[str, Any]:
@@ -154,7 +158,7 @@ def _mapping_hook(kind: Any, converter: cattrs.BaseConverter) -> Hook:
     return structure
 
 
-def _union_hook(kind: Any, converter: cattrs.BaseConverter) -> Hook:
+def _union_hook(kind: Any, converter: Converter) -> Hook:
     members = [member for member in get_args(kind) if member is not type(None)]
     optional = len(members) < len(get_args(kind))
 
@@ -177,7 +181,7 @@ def _union_hook(kind: Any, converter: cattrs.BaseConverter) -> Hook:
     return structure
 
 
-def _literal_hook(kind: Any, converter: cattrs.BaseConverter) -> Hook:
+def _literal_hook(kind: Any, converter: Converter) -> Hook:
     choices = get_args(kind)
 
     def structure(value: Any, _: Any) -> Any:
@@ -194,7 +198,7 @@ def fields(kind: type) -> dict[str, attrs.Attribute[Any]]:
     return {field.name: field for field in attrs.fields(kind) if field.init}
 
 
-def _class_hook(kind: type, converter: cattrs.BaseConverter) -> Hook:
+def _class_hook(kind: type, converter: Converter) -> Hook:
     known = fields(kind)
 
     def structure(value: Any, _: Any) -> Any:
@@ -212,7 +216,7 @@ def _class_hook(kind: type, converter: cattrs.BaseConverter) -> Hook:
 
 
 def structure_fields(
-    known: Mapping[str, attrs.Attribute[Any]], value: Mapping[str, Any], converter: cattrs.BaseConverter, faults: Faults
+    known: Mapping[str, attrs.Attribute[Any]], value: Mapping[str, Any], converter: Converter, faults: Faults
 ) -> dict[str, Any]:
     """The fields that `value` gives, each converted and validated; what is wrong or missing goes to `faults`."""
     arguments: dict[str, Any] = {}
@@ -240,6 +244,6 @@ def make_converter(base: Path) -> Converter:
     converter.register_structure_hook_factory(is_sequence, _sequence_hook)
     converter.register_structure_hook_factory(is_mapping, _mapping_hook)
     converter.register_structure_hook_factory(is_union, _union_hook)
-    converter.register_structure_hook_factory(lambda kind: get_origin(kind) is Literal, _literal_hook)
+    converter.register_structure_hook_factory(is_literal, _literal_hook)
     converter.register_structure_hook_factory(attrs.has, _class_hook)
     return converter

@@ -21,7 +21,7 @@ def expand(text: str) -> str:
         name, default = match.groups()
         value = os.environ.get(name, default)
         if value is None:
-            raise ValueError(f"the environment variable {name} is not set; set it, or give a default: ${{{name}:value}}")
+            raise ValueError(f"environment variable {name} is not set; set it, or give a default: ${{{name}:value}}")
         return value
 
     if "${" in _VARIABLE.sub("", text):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import attrs
@@ -25,7 +24,9 @@ class HardwareKeys:
     """Keys of a hardware component."""
 
     type: str = option(help="which plugin; `ibrobot plugins` lists them")
-    joints: tuple[str, ...] = option((), help="the joints that it owns; may be left out by the only one, which owns all")
+    joints: tuple[str, ...] = option(
+        (), help="the joints that it owns; the only component may leave them out and owns all"
+    )
 
 
 @attrs.frozen
@@ -73,7 +74,7 @@ class RecordingKeys:
     """Keys of the recorder."""
 
     type: str = option(help="which plugin; `ibrobot plugins` lists them")
-    root: Path = option(Path("episodes"), help="where episodes go; relative to the working directory")
+    root: str = option("episodes", help="where episodes go; relative to the working directory")
     dataset: str = option("default", help="folder of one task's episodes, below root")
     topics: str | tuple[str, ...] = option("contract", help="contract, all, or a list of topics")
 
@@ -86,8 +87,10 @@ class Sections:
     executors: Mapping[str, Mapping[str, Any]] = option(help="who moves the joints: name -> type, group, options")
     control_modes: Mapping[str, ModeKeys] = option(help="name -> the executors active in it, and what feeds them")
     default_control_mode: str = option(help="the mode to start in")
-    hardware: Mapping[str, Any] = option(factory=dict, help="the robot's hardware, or several named ones with their joints")
-    simulation: Mapping[str, Any] | None = option(None, help="used instead of hardware with --sim, or when there is none")
+    hardware: Mapping[str, Any] = option(factory=dict, help="one component, or several by name, each with its joints")
+    simulation: Mapping[str, Any] | None = option(
+        None, help="stands for the hardware with --sim, or where there is none"
+    )
     peripherals: tuple[Mapping[str, Any], ...] = option((), help="cameras and other sensors")
     models: Mapping[str, Mapping[str, Any]] = option(factory=dict, help="policies by name")
     teleoperation: Mapping[str, Mapping[str, Any]] = option(factory=dict, help="devices by name")

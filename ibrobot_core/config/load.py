@@ -90,8 +90,9 @@ def _build(document: Document, source: Path, sim: bool, registry: Registry) -> R
     config = RobotConfig(
         robot=robot,
         executors={
-            name: ExecutorComponent(part.descriptor.type, part.options, name, part.keys.group, robot.groups[part.keys.group])
+            name: ExecutorComponent(part.descriptor.type, part.options, name, group, robot.groups[group])
             for name, part in parts.executors.items()
+            for group in (part.keys.group,)
         },
         control_modes=_modes(parts),
         default_control_mode=plain["default_control_mode"],
@@ -130,7 +131,8 @@ def _component(part: Part | None) -> Any:
 def _modes(parts: Parts) -> dict[str, ControlMode]:
     return {
         name: ControlMode(
-            name, mode.executors, mode.teleop, mode.inference, mode.dispatch or Dispatch(), _component(parts.planners.get(name))
+            name, mode.executors, mode.teleop, mode.inference,
+            mode.dispatch or Dispatch(), _component(parts.planners.get(name)),
         )
         for name, mode in parts.plain["control_modes"].items()
     }  # fmt: skip
@@ -140,7 +142,7 @@ def _recording(part: Part | None) -> Recording | None:
     if part is None:
         return None
     keys = part.keys
-    return Recording(part.descriptor.type, part.options, keys.root, keys.dataset, keys.topics)
+    return Recording(part.descriptor.type, part.options, Path(keys.root), keys.dataset, keys.topics)
 
 
 def shipped_configs(registry: Registry) -> dict[str, Path]:

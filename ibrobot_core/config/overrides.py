@@ -16,7 +16,8 @@ def apply(document: Document, overrides: Sequence[str]) -> None:
         place = Place(rank, 0, 0, f"--set {text}")
         path, equals, value_text = text.partition("=")
         if not equals or not path or not all(path.split(".")):
-            document.problems.append((place, Problem(place.file, 0, "", "expected PATH=VALUE, e.g. control.rate_hz=50")))
+            message = "expected PATH=VALUE, e.g. control.rate_hz=50"
+            document.problems.append((place, Problem(place.file, 0, "", message)))
             continue
         try:
             value = parse(value_text, place.file)
@@ -28,6 +29,7 @@ def apply(document: Document, overrides: Sequence[str]) -> None:
 
 
 def put(document: Document, path: str, value: Document, place: Place) -> None:
+    """Set `path` of `document` to `value`, written at `place`; missing sections on the way are made."""
     parts = path.split(".")
     holder: Any = document.root
     key: Key = ()

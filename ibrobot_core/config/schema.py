@@ -92,7 +92,9 @@ class ActionSpec:
     executor: str = option(help="the executor that takes it")
     topic: str = option(help="where what the robot was told is published")
     key: str = option("action", choices=("action",), help="the key of the action vector, as in datasets")
-    type: str = option("std_msgs/msg/Float64MultiArray", choices=("std_msgs/msg/Float64MultiArray",), help="message type")
+    type: str = option(
+        "std_msgs/msg/Float64MultiArray", choices=("std_msgs/msg/Float64MultiArray",), help="message type"
+    )
     safety_behavior: str = option("hold", choices=("hold", "relax"), help="what follows when the setpoints go stale")
 
 
@@ -137,7 +139,7 @@ class Inference:
 
     model: str = option(help="a name under models")
     execution_mode: str = option("monolithic", choices=("monolithic",), help="where infer runs")
-    request_timeout: float = option(5.0, unit="s", gt=0, help="after which a request counts as failed and the arm holds")
+    request_timeout: float = option(5.0, unit="s", gt=0, help="after it a request has failed and the arm holds")
     prompt: str = option("", help="task for language-conditioned policies")
 
 

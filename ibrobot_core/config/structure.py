@@ -95,9 +95,9 @@ class Structurer:
         parts.models = self._named("policy", "models", ModelKeys)
         parts.teleoperation = self._named("teleop", "teleoperation", ComponentKeys)
         for name, mode in (parts.plain.get("control_modes") or {}).items():
-            planner = self._component("planner", ("control_modes", name, "planner"), ComponentKeys) if mode.planner else None
-            if planner is not None:
-                parts.planners[name] = planner
+            if mode.planner is not None:
+                planner = self._component("planner", ("control_modes", name, "planner"), ComponentKeys)
+                parts.planners |= {name: planner} if planner is not None else {}
         for section, kind in (("transport", "transport"), ("viewer", "viewer")):
             if section in given:
                 setattr(parts, section, self._component(kind, (section,), ComponentKeys))
@@ -206,7 +206,8 @@ class Structurer:
         if part is None:
             return
         if not getattr(part.descriptor, "simulated", False):
-            self.document.add(("simulation", "type"), f"{part.descriptor.type!r} is no simulation; it belongs in hardware")
+            message = f"{part.descriptor.type!r} is no simulation; it belongs in the hardware section"
+            self.document.add(("simulation", "type"), message)
         elif parts.simulated:
             parts.simulation = part
 
@@ -239,7 +240,8 @@ class Structurer:
             if isinstance(name, str):
                 self._check_name((*key, "name"), name)
                 if name in lines:
-                    self.document.add((*key, "name"), f"a second peripheral named {name!r}, first in line {lines[name]}")
+                    message = f"a second peripheral named {name!r}, first in line {lines[name]}"
+                    self.document.add((*key, "name"), message)
                 lines.setdefault(name, self.document.place((*key, "name")).line)
             stand_in = stand_ins.get(item.get("kind", ""))
             needed = not parts.simulated or (parts.simulation is not None and stand_in is None)
@@ -250,7 +252,7 @@ class Structurer:
     def _peripheral(
         self, key: Key, item: Mapping[str, Any], stand_in: str | None, *, needed: bool, simulated: bool
     ) -> Part | None:
-        """The sensor as it is, or, where the simulation has a sensor of its kind, that one with the options both have."""
+        """The sensor as it is, or the simulation's of its kind with the options that both have."""
         before = len(self.document.problems)
         as_is = self._component("sensor", key, PeripheralKeys, needed=needed)
         if as_is is not None and isinstance(as_is.descriptor, SensorDescriptor):

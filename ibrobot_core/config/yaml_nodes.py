@@ -95,7 +95,7 @@ def _child(value: Any, part: str | int) -> Any:
     return None
 
 
-class _Composer(Reader, Scanner, Parser, Composer, BaseResolver):  # type: ignore[misc]
+class _Composer(Reader, Scanner, Parser, Composer, BaseResolver):
     """PyYAML's composer without its YAML 1.1 scalars: plain ones keep their text."""
 
     def __init__(self, text: str) -> None:
@@ -132,7 +132,8 @@ def parse(text: str, file: str) -> Document:
         node = _Composer(text).get_single_node()
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
-        raise ConfigError([Problem(file, mark.line + 1 if mark else 0, "", f"not valid YAML: {error.problem}")]) from None
+        line = mark.line + 1 if mark else 0
+        raise ConfigError([Problem(file, line, "", f"not valid YAML: {error.problem}")]) from None
     except yaml.YAMLError as error:
         raise ConfigError([Problem(file, 0, "", f"not valid YAML: {str(error).splitlines()[0]}")]) from None
     document = Document(None, {}, [], file)
@@ -167,7 +168,7 @@ class _Constructor:
                 for i, item in enumerate(node.value):
                     self.document.places[*key, i] = self.place(item)
                 return [self.value(item, (*key, i)) for i, item in enumerate(node.value)]
-            return self.mapping(node, key)
+            return self.mapping(node, key) if isinstance(node, MappingNode) else None
         finally:
             self._open.discard(id(node))
 
