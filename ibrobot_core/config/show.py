@@ -1,0 +1,95 @@
+"""`RobotConfig` -> YAML with every default filled in, which loads again to the same config."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import attrs
+import yaml
+
+from ibrobot_core.config.schema import Component, ContractConfig, ControlMode, ObservationSpec, RobotConfig
+from ibrobot_core.config.yaml_nodes import scalar
+
+
+def plain(value: Any) -> Any:
+    """attrs classes, tuples, paths and enums as what YAML and JSON know."""
+    if isinstance(value, ObservationSpec) and value.peripheral is not None:
+        # Its topic and type were filled in; a file says either these or the peripheral.
+        return {k: v for k, v in _fields(value).items() if k not in ("topic", "type")}
+    if isinstance(value, Component):
+        own = _fields(value)
+        return {**own, **own.pop("options")}
+    if attrs.has(type(value)):
+        return _fields(value)
+    if isinstance(value, Mapping):
+        return {name: plain(item) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, enum.Enum):
+        return plain(value.value)
+    return str(value) if isinstance(value, Path) else value
+
+
+def _fields(value: Any) -> dict[str, Any]:
+    return {field.name: plain(getattr(value, field.name)) for field in attrs.fields(type(value)) if field.init}
+
+
+def _named(components: Mapping[str, Component], *left_out: str) -> dict[str, Any]:
+    return {
+        name: {key: item for key, item in plain(component).items() if key not in ("name", *left_out)}
+        for name, component in components.items()
+    }
+
+
+def _mode(mode: ControlMode) -> dict[str, Any]:
+    own = _fields(mode)
+    del own["name"]
+    if mode.inference is None:
+        del own["dispatch"]
+    return {key: item for key, item in own.items() if item is not None}
+
+
+def document(config: RobotConfig) -> dict[str, Any]:
+    """What a YAML that says everything about this run would hold."""
+    hardware = _named(config.hardware)
+    sections: dict[str, Any] = {
+        "robot": plain(config.robot),
+        "hardware": hardware["hardware"] if list(hardware) == ["hardware"] else hardware,
+        "simulation": plain(config.simulation),
+        "peripherals": [plain(peripheral) for peripheral in config.peripherals.values()],
+        "executors": _named(config.executors, "joints"),
+        "models": _named(config.models),
+        "control_modes": {name: _mode(mode) for name, mode in config.control_modes.items()},
+        "default_control_mode": config.default_control_mode,
+        "teleoperation": _named(config.teleoperation),
+        "contract": plain(config.contract) if config.contract != ContractConfig() else None,
+        "recording": plain(config.recording),
+        "transport": plain(config.transport),
+        "viewer": plain(config.viewer),
+        "control": plain(config.control),
+    }
+    return {name: section for name, section in sections.items() if section not in (None, {}, [])}
+
+
+class _Dumper(yaml.SafeDumper):
+    """Quotes text that YAML 1.2 would read as something else, e.g. `1e-3`."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        """Write everything out."""
+        return True
+
+
+def _text(dumper: yaml.SafeDumper, value: str) -> yaml.ScalarNode:
+    style = None if isinstance(scalar(value), str) else "'"
+    return dumper.represent_scalar("tag:yaml.org,2002:str", value, style=style)
+
+
+_Dumper.add_representer(str, _text)
+
+
+def to_yaml(config: RobotConfig) -> str:
+    """The whole config as YAML text."""
+    return yaml.dump(document(config), Dumper=_Dumper, sort_keys=False, width=120, allow_unicode=True)
