@@ -2,41 +2,84 @@
 
 from __future__ import annotations
 
+import logging
 import queue
 import threading
 from collections.abc import Callable
+from typing import override
 
 from ibrobot_core.errors import TransportError
 from ibrobot_core.interfaces.transport import Transport
 
+_log = logging.getLogger("ibrobot.transport.local")
+
+_END_S = 1.0
+
+
+class _Subscriber:
+    """A callback with a queue and a thread of its own, so that a slow one delays nobody else."""
+
+    def __init__(self, topic: str, callback: Callable[[bytes], None]) -> None:
+        self._topic = topic
+        self._callback = callback
+        self._waiting: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
+        self._ended = False
+        self._thread = threading.Thread(target=self._deliver, name=f"subscriber of {topic}", daemon=True)
+        self._thread.start()
+
+    def put(self, payload: bytes) -> None:
+        self._waiting.put(payload)
+
+    def end(self) -> None:
+        """Deliver nothing more. Waits a little for a callback that is running, unless it is the one that calls this."""
+        self._ended = True
+        self._waiting.put(None)
+        if threading.current_thread() is not self._thread:
+            self._thread.join(_END_S)
+
+    def _deliver(self) -> None:
+        while (payload := self._waiting.get()) is not None and not self._ended:
+            try:
+                self._callback(payload)
+            except Exception:  # noqa: BLE001 - contained: a subscriber's fault must not reach the others
+                _log.exception("a subscriber of %s failed", self._topic)
+
 
 class LocalTransport(Transport):
-    """Delivers in the sender's thread, in order. A request runs in a thread of its own so that a timeout can end it."""
+    """Delivers to each subscriber in its own thread, and answers each request in one, so that a timeout can end it.
+
+    What a slow subscriber has not taken yet waits for it in memory.
+    """
 
     def __init__(self) -> None:
-        self._lock = threading.RLock()
-        self._subscribers: dict[str, list[Callable[[bytes], None]]] = {}
+        self._lock = threading.Lock()
+        self._subscribers: dict[str, list[_Subscriber]] = {}
         self._servers: dict[str, Callable[[bytes], bytes]] = {}
         self._closed = False
 
+    @override
     def publish(self, topic: str, payload: bytes) -> None:
         with self._lock:
             self._check_open()
-            for callback in tuple(self._subscribers.get(topic, ())):
-                callback(payload)
+            for subscriber in self._subscribers.get(topic, ()):
+                subscriber.put(payload)
 
+    @override
     def subscribe(self, topic: str, callback: Callable[[bytes], None]) -> Callable[[], None]:
         with self._lock:
             self._check_open()
-            self._subscribers.setdefault(topic, []).append(callback)
+            subscriber = _Subscriber(topic, callback)
+            self._subscribers.setdefault(topic, []).append(subscriber)
 
         def end() -> None:
             with self._lock:
-                if callback in self._subscribers.get(topic, []):
-                    self._subscribers[topic].remove(callback)
+                if subscriber in self._subscribers.get(topic, ()):
+                    self._subscribers[topic].remove(subscriber)
+            subscriber.end()
 
         return end
 
+    @override
     def serve(self, name: str, handler: Callable[[bytes], bytes]) -> Callable[[], None]:
         with self._lock:
             self._check_open()
@@ -51,6 +94,7 @@ class LocalTransport(Transport):
 
         return end
 
+    @override
     def request(self, name: str, payload: bytes, timeout_s: float) -> bytes:
         with self._lock:
             self._check_open()
@@ -74,11 +118,15 @@ class LocalTransport(Transport):
             raise TransportError(f"{name} failed: {type(result).__name__}: {result}") from result
         return result
 
+    @override
     def close(self) -> None:
         with self._lock:
             self._closed = True
+            ended = [subscriber for subscribers in self._subscribers.values() for subscriber in subscribers]
             self._subscribers.clear()
             self._servers.clear()
+        for subscriber in ended:
+            subscriber.end()
 
     def _check_open(self) -> None:
         if self._closed:

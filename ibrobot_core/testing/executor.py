@@ -1,0 +1,237 @@
+"""The conformance suite of executors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar, override
+
+import attrs
+import numpy as np
+import pytest
+
+from ibrobot_core.errors import GoalRejected
+from ibrobot_core.interfaces import Context, Executor, GoalState, GoalStatus, JointReading, Plan
+from ibrobot_core.robot import Vector
+from ibrobot_core.testing.contexts import ARM, control_context
+from ibrobot_core.testing.suite import Suite
+from ibrobot_core.units import seconds
+
+
+class ExecutorSuite(Suite[Executor]):
+    """What every `Executor` must do. Where it takes goals, the subclass says which: `goal` and `wrong_goals`."""
+
+    tolerance_rad: ClassVar[float] = 1e-6
+    """How far a held setpoint may be from the position to hold [rad]."""
+    goal_ticks: ClassVar[int] = 2000
+    """Ticks within which a goal must end."""
+
+    @override
+    def context(self) -> Context:
+        return control_context(joints=ARM)
+
+    def goal(self, ctx: Context, position: Vector) -> Mapping[str, Any] | None:
+        """A goal that ends at `position` [rad], shape (J,); None for executors that take no goals."""
+        return None
+
+    def wrong_goals(self, ctx: Context) -> list[Mapping[str, Any]]:
+        """Goals that must be refused."""
+        return [{}, {"nonsense": 1}]
+
+    def poses(self, ctx: Context) -> list[Vector]:
+        """Positions [rad], each shape (J,): none at zero, all within limits."""
+        order = ctx.robot.indices(ctx.joints)
+        lower, upper = ctx.robot.lower[order], ctx.robot.upper[order]
+        return [lower + share * (upper - lower) for share in (0.3, 0.35, 0.65)]
+
+    def active(self) -> tuple[Executor, Context, Vector]:
+        """An executor that took over at the first of `poses`, with its context and that position."""
+        ctx = self.context()
+        executor = self.make(ctx)
+        start = self.poses(ctx)[0]
+        executor.activate(measure(ctx, start))
+        return executor, ctx, start
+
+    def _goal(self, ctx: Context, position: Vector) -> Mapping[str, Any]:
+        goal = self.goal(ctx, position)
+        if goal is None:
+            pytest.skip("takes no goals")
+        return goal
+
+    def _follow(self, executor: Executor, ctx: Context, position: Vector, ticks: int) -> list[Vector]:
+        """Setpoints of `ticks` ticks with joints that follow them at once, from `position`."""
+        setpoints = []
+        for _ in range(ticks):
+            position = executor.update(tick(ctx, position)).copy()
+            setpoints.append(position)
+        return setpoints
+
+    def test_owns_the_joints_it_was_given(self) -> None:
+        """`joints` is set by the constructor and equals `ctx.joints`."""
+        ctx = self.context()
+        assert self.make(ctx).joints == ctx.joints
+
+    def test_activation_holds_the_measured_position(self) -> None:
+        """From the first tick the setpoint is where the joints were, and it does not follow them when they sag."""
+        ctx = self.context()
+        executor = self.make(ctx)
+        for pose in self.poses(ctx):
+            executor.activate(measure(ctx, pose))
+            for sag in (0.0, 0.01, 0.02, 0.03):
+                setpoint = executor.update(tick(ctx, pose - sag))
+                np.testing.assert_allclose(setpoint, pose, atol=self.tolerance_rad)
+            executor.deactivate()
+
+    def test_setpoints_are_complete(self) -> None:
+        """Every tick gives a finite number for each joint."""
+        executor, ctx, start = self.active()
+        for noise in np.random.default_rng(0).normal(0, 0.02, (20, len(start))):
+            setpoint = executor.update(tick(ctx, start + noise))
+            assert setpoint.shape == (len(ctx.joints),)
+            assert setpoint.dtype == np.float64
+            assert np.isfinite(setpoint).all()
+
+    def test_keeps_no_hold_of_the_callers_arrays(self) -> None:
+        """Buffers that the caller uses again do not change what is held, and nothing given is changed."""
+        executor, ctx, start = self.active()
+        reading = measure(ctx, start)
+        executor.activate(reading)
+        np.testing.assert_array_equal(reading.position, start)
+        reading.position[:] = 0.0
+        first = executor.update(tick(ctx, start))
+        np.testing.assert_allclose(first, start, atol=self.tolerance_rad)
+        first[:] = 0.0
+        np.testing.assert_allclose(executor.update(tick(ctx, start)), start, atol=self.tolerance_rad)
+
+    def test_deactivation_forgets(self) -> None:
+        """After `deactivate` neither plan nor goal lives on: the next activation holds."""
+        executor, ctx, start = self.active()
+        target, elsewhere = self.poses(ctx)[1:]
+        if executor.accepts_plans:
+            executor.set_plan(plan_towards(ctx, start, target))
+        elif (goal := self.goal(ctx, target)) is not None:
+            executor.set_goal("old", goal, measure(ctx, start))
+        self._follow(executor, ctx, start, 3)
+        executor.deactivate()
+        executor.deactivate()
+        executor.activate(measure(ctx, elsewhere))
+        for setpoint in self._follow(executor, ctx, elsewhere, 20):
+            np.testing.assert_allclose(setpoint, elsewhere, atol=self.tolerance_rad)
+
+    def test_follows_a_plan_by_time(self) -> None:
+        """The setpoint at the time of a plan's point is that point."""
+        executor, ctx, start = self.active()
+        plan = plan_towards(ctx, start, self.poses(ctx)[1])
+        if not executor.accepts_plans:
+            with pytest.raises(NotImplementedError):
+                executor.set_plan(plan)
+            return
+        executor.set_plan(plan)
+        position = start
+        for i, point in enumerate(plan.positions):
+            ctx.clock.sleep_until(plan.start_ns + i * plan.step_ns)
+            position = executor.update(measure(ctx, position)).copy()
+            np.testing.assert_allclose(position, point, atol=self.tolerance_rad, err_msg=f"point {i}")
+
+    def test_refuses_an_impossible_plan(self) -> None:
+        """A plan with NaN or of another width is counted, and the old setpoint stays."""
+        executor, ctx, start = self.active()
+        if not executor.accepts_plans:
+            pytest.skip("accepts no plans")
+        whole = plan_towards(ctx, start, self.poses(ctx)[1])
+        with_nan = whole.positions.copy()
+        with_nan[1, 0] = np.nan
+        for wrong in (with_nan, whole.positions[:, 1:], np.hstack([whole.positions, whole.positions])):
+            before = sum(executor.counters().values())
+            executor.set_plan(attrs.evolve(whole, positions=wrong))
+            np.testing.assert_allclose(executor.update(tick(ctx, start)), start, atol=self.tolerance_rad)
+            assert sum(executor.counters().values()) > before, "a refused plan must be counted"
+
+    def test_reaches_its_goal(self) -> None:
+        """A goal that the joints can follow succeeds, with the setpoint at the goal."""
+        executor, ctx, start = self.active()
+        target = self.poses(ctx)[1]
+        executor.set_goal("one", self._goal(ctx, target), measure(ctx, start))
+        position = start
+        statuses: list[GoalStatus] = []
+        for _ in range(self.goal_ticks):
+            position = executor.update(tick(ctx, position)).copy()
+            statuses += drain(executor)
+            if statuses and statuses[-1].state is not GoalState.EXECUTING:
+                break
+        assert statuses, f"no status within {self.goal_ticks} ticks"
+        assert (statuses[-1].goal_id, statuses[-1].state) == ("one", GoalState.SUCCEEDED), statuses[-1]
+        np.testing.assert_allclose(position, target, atol=0.05)
+
+    def test_a_rejected_goal_leaves_the_old_one(self) -> None:
+        """A wrong goal raises GoalRejected, and what was under way goes on to the bit."""
+        executor, ctx, start = self.active()
+        twin = self.make(ctx)
+        twin.activate(measure(ctx, start))
+        goal = self.goal(ctx, self.poses(ctx)[1])
+        if goal is not None:
+            for one in (executor, twin):
+                one.set_goal("old", goal, measure(ctx, start))
+        position = start
+        for wrong in self.wrong_goals(ctx):
+            reading = tick(ctx, position)
+            with pytest.raises(GoalRejected):
+                executor.set_goal("wrong", wrong, reading)
+            position = executor.update(reading).copy()
+            np.testing.assert_array_equal(position, twin.update(reading))
+        assert drain(executor) == drain(twin), "a goal that was rejected has no state"
+
+    def test_replacing_a_goal_makes_no_step(self) -> None:
+        """A new goal begins where the setpoint is."""
+        executor, ctx, start = self.active()
+        near, far = self.poses(ctx)[1:]
+        executor.set_goal("old", self._goal(ctx, near), measure(ctx, start))
+        before = self._follow(executor, ctx, start, 5)[-1]
+        executor.set_goal("new", self._goal(ctx, far), measure(ctx, before))
+        after = self._follow(executor, ctx, before, 1)[0]
+        reach = ctx.robot.max_velocity[ctx.robot.indices(ctx.joints)] * seconds(ctx.period_ns)
+        assert (np.abs(after - before) <= reach + self.tolerance_rad).all(), f"a step of {np.abs(after - before).max()}"
+
+    def test_cancel_holds_the_measured_position(self) -> None:
+        """After `cancel` the setpoint is the measured position, and the goal is reported as canceled."""
+        executor, ctx, start = self.active()
+        executor.set_goal("one", self._goal(ctx, self.poses(ctx)[1]), measure(ctx, start))
+        position = self._follow(executor, ctx, start, 5)[-1] - 0.01
+        executor.cancel(tick(ctx, position))
+        for _ in range(5):
+            np.testing.assert_allclose(executor.update(tick(ctx, position)), position, atol=self.tolerance_rad)
+        last = drain(executor)[-1]
+        assert (last.goal_id, last.state) == ("one", GoalState.CANCELED)
+
+    def test_cancel_without_a_goal_does_nothing_bad(self) -> None:
+        """`cancel` with no goal holds, and reports nothing."""
+        executor, ctx, start = self.active()
+        executor.cancel(tick(ctx, start))
+        np.testing.assert_allclose(executor.update(tick(ctx, start)), start, atol=self.tolerance_rad)
+        assert drain(executor) == []
+
+
+def measure(ctx: Context, position: Vector) -> JointReading:
+    """Joints at rest at `position` [rad], shape (J,), now."""
+    zero = np.zeros_like(position)
+    return JointReading(ctx.clock.now_ns(), position.copy(), zero, zero.copy())
+
+
+def tick(ctx: Context, position: Vector) -> JointReading:
+    """Joints at rest at `position` [rad], shape (J,), one control period later."""
+    ctx.clock.sleep_until(ctx.clock.now_ns() + ctx.period_ns)
+    return measure(ctx, position)
+
+
+def plan_towards(ctx: Context, start: Vector, target: Vector) -> Plan:
+    """A plan of ten slow points from `start` some way to `target`, beginning two ticks from now."""
+    shares = np.linspace(0.0, 0.2, 10)[:, None]
+    positions = start + shares * (target - start)
+    return Plan(ctx.clock.now_ns() + 2 * ctx.period_ns, 3 * ctx.period_ns, positions)
+
+
+def drain(executor: Executor) -> list[GoalStatus]:
+    """Every status not yet reported."""
+    statuses = []
+    while (status := executor.pop_status()) is not None:
+        statuses.append(status)
+    return statuses

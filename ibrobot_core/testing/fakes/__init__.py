@@ -1,0 +1,18 @@
+"""The least that is a correct implementation of each kind: for tests, and as examples to read."""
+
+from ibrobot_core.testing.fakes.control import FakeExecutor, FakeHardware, FakeRealHardware
+from ibrobot_core.testing.fakes.host import FakePlanner, FakePolicy, FakeSensor, FakeTeleop, FakeViewer
+from ibrobot_core.testing.fakes.storage import FakeDataset, FakeRecorder
+
+__all__ = [
+    "FakeDataset",
+    "FakeExecutor",
+    "FakeHardware",
+    "FakePlanner",
+    "FakePolicy",
+    "FakeRealHardware",
+    "FakeRecorder",
+    "FakeSensor",
+    "FakeTeleop",
+    "FakeViewer",
+]

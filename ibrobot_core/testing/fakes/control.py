@@ -1,0 +1,201 @@
+"""Fakes of what runs in the control process: hardware and executors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, override
+
+import numpy as np
+
+from ibrobot_core.errors import GoalRejected, HardwareError
+from ibrobot_core.interfaces import (
+    Context,
+    Episode,
+    Executor,
+    GoalState,
+    GoalStatus,
+    Hardware,
+    JointReading,
+    Plan,
+    Signal,
+    SimulatedHardware,
+    nan_vector,
+)
+from ibrobot_core.robot import Vector
+from ibrobot_core.units import seconds
+
+
+class FakeHardware(SimulatedHardware):
+    """Joints that follow their command with a first-order lag; a reset puts them at a random place near the middle.
+
+    Args:
+        ctx: its joints are the hardware's.
+        lag_s: time constant [s].
+    """
+
+    signals = (Signal("/fake/command", 1, "largest distance to the command [rad]"),)
+
+    def __init__(self, ctx: Context, lag_s: float = 0.1) -> None:
+        self.joints = ctx.joints
+        self._ctx = ctx
+        self._lag_s = lag_s
+        self._open = False
+        self.relaxed = False
+        self._position: Vector = np.zeros(len(ctx.joints))
+        self.reset(Episode(ctx.seed))
+
+    @override
+    def connect(self) -> None:
+        self._command = self._position.copy()
+        self._open = True
+
+    @override
+    def read(self) -> JointReading:
+        self._check_open()
+        stamp_ns = self._ctx.clock.now_ns()
+        return JointReading(stamp_ns, self._position.copy(), self._velocity.copy(), nan_vector(len(self.joints)))
+
+    @override
+    def write(self, position: Vector) -> None:
+        self._check_open()
+        if position.shape != self._position.shape:
+            raise HardwareError(f"position must have shape {self._position.shape}, got {position.shape}")
+        self._command = position.copy()
+        self.relaxed = False
+
+    @override
+    def disconnect(self) -> None:
+        self._open = False
+
+    @override
+    def relax(self) -> None:
+        self._check_open()
+        self.relaxed = True
+
+    @override
+    def read_signal(self, index: int, out: Vector) -> None:
+        out[:] = np.abs(self._command - self._position).max()
+
+    @override
+    def advance(self, step_ns: int) -> None:
+        before = self._position
+        if not self.relaxed:
+            self._position = before + (self._command - before) * -np.expm1(-seconds(step_ns) / self._lag_s)
+        self._velocity = (self._position - before) / seconds(step_ns)
+
+    @override
+    def reset(self, episode: Episode) -> None:
+        order = self._ctx.robot.indices(self.joints)
+        lower, upper = self._ctx.robot.lower[order], self._ctx.robot.upper[order]
+        share = np.random.default_rng(episode.seed).uniform(0.4, 0.6, len(self.joints))
+        self._position = lower + share * (upper - lower)
+        self._velocity = np.zeros(len(self.joints))
+        self._command = self._position.copy()
+
+    def _check_open(self) -> None:
+        if not self._open:
+            raise HardwareError("the fake hardware is not connected")
+
+
+class FakeRealHardware(Hardware):
+    """`FakeHardware` whose time is the clock's: as a real robot, it moves by itself."""
+
+    def __init__(self, ctx: Context, lag_s: float = 0.1) -> None:
+        self._joints = FakeHardware(ctx, lag_s)
+        self._clock = ctx.clock
+        self._moved_ns = ctx.clock.now_ns()
+        self.joints = ctx.joints
+
+    @override
+    def connect(self) -> None:
+        self._joints.connect()
+        self._moved_ns = self._clock.now_ns()
+
+    @override
+    def read(self) -> JointReading:
+        self._catch_up()
+        return self._joints.read()
+
+    @override
+    def write(self, position: Vector) -> None:
+        self._catch_up()
+        self._joints.write(position)
+
+    @override
+    def disconnect(self) -> None:
+        self._joints.disconnect()
+
+    def _catch_up(self) -> None:
+        now_ns = self._clock.now_ns()
+        if now_ns > self._moved_ns:
+            self._joints.advance(now_ns - self._moved_ns)
+        self._moved_ns = now_ns
+
+
+class FakeExecutor(Executor):
+    """Takes both kinds of work: plans, read at their nearest point, and goals `{"position": …}`, approached evenly."""
+
+    accepts_plans = True
+
+    def __init__(self, ctx: Context) -> None:
+        self.joints = ctx.joints
+        self._step = 0.5 * ctx.robot.max_velocity[ctx.robot.indices(ctx.joints)] * seconds(ctx.period_ns)
+        self._statuses: list[GoalStatus] = []
+        self._refused = 0
+        self._setpoint: Vector = np.zeros(len(ctx.joints))
+        self.deactivate()
+
+    @override
+    def activate(self, measured: JointReading) -> None:
+        self._setpoint = measured.position.copy()
+
+    @override
+    def deactivate(self) -> None:
+        self._plan: Plan | None = None
+        self._goal: Vector | None = None
+        self._goal_id = ""
+
+    @override
+    def update(self, measured: JointReading) -> Vector:
+        plan = self._plan
+        if plan is not None and measured.stamp_ns >= plan.start_ns:
+            index = min((measured.stamp_ns - plan.start_ns) // plan.step_ns, len(plan.positions) - 1)
+            self._setpoint = plan.positions[index].copy()
+        if self._goal is not None:
+            self._setpoint = self._setpoint + np.clip(self._goal - self._setpoint, -self._step, self._step)
+            if np.array_equal(self._setpoint, self._goal):
+                self._end_goal(GoalState.SUCCEEDED)
+        return self._setpoint.copy()
+
+    @override
+    def set_plan(self, plan: Plan) -> None:
+        if plan.positions.shape[1:] != self._setpoint.shape or not np.isfinite(plan.positions).all():
+            self._refused += 1
+            return
+        self._plan = plan
+
+    @override
+    def set_goal(self, goal_id: str, goal: Mapping[str, Any], measured: JointReading) -> None:
+        position = np.asarray(goal.get("position", ()), np.float64)
+        if position.shape != self._setpoint.shape or not np.isfinite(position).all():
+            raise GoalRejected(f"position must be {len(self.joints)} finite numbers, got {goal!r}")
+        self._goal, self._goal_id = position, goal_id
+        self._statuses.append(GoalStatus(goal_id, GoalState.EXECUTING))
+
+    @override
+    def cancel(self, measured: JointReading) -> None:
+        if self._goal is not None:
+            self._end_goal(GoalState.CANCELED)
+            self._setpoint = measured.position.copy()
+
+    @override
+    def pop_status(self) -> GoalStatus | None:
+        return self._statuses.pop(0) if self._statuses else None
+
+    @override
+    def counters(self) -> Mapping[str, int]:
+        return {"refused_plans": self._refused}
+
+    def _end_goal(self, state: GoalState) -> None:
+        self._statuses.append(GoalStatus(self._goal_id, state))
+        self._goal = None

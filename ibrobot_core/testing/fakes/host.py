@@ -1,0 +1,190 @@
+"""Fakes of what runs in the host: sensor, teleoperation device, policy, planner and viewer."""
+
+from __future__ import annotations
+
+from typing import override
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ibrobot_core.bus import Subscription
+from ibrobot_core.errors import PlanningError, PolicyError, SensorError, TeleopError
+from ibrobot_core.interfaces import (
+    Context,
+    Frame,
+    JointGoal,
+    JointReading,
+    Planner,
+    PlanRequest,
+    Policy,
+    PolicySpec,
+    Sensor,
+    Teleop,
+    TeleopCommand,
+    Tensors,
+    Viewer,
+)
+from ibrobot_core.messages import Header, Image, JointTrajectory, JointTrajectoryPoint, Message
+from ibrobot_core.robot import Vector
+from ibrobot_core.units import ns, seconds
+
+
+class FakeSensor(Sensor):
+    """A camera that captures an image whenever the clock has moved since the last."""
+
+    message_type = Image
+
+    def __init__(self, ctx: Context, width: int = 8, height: int = 6) -> None:
+        self.topic = f"/camera/{ctx.name}/image_raw"
+        self._ctx = ctx
+        self._size = (height, width)
+        self._open = False
+        self._last_ns = -1
+
+    @override
+    def open(self) -> None:
+        self._open = True
+
+    @override
+    def read(self, timeout_s: float) -> Message | None:
+        if not self._open:
+            raise SensorError(f"{self._ctx.name} is not open")
+        stamp_ns = self._ctx.clock.now_ns()
+        if stamp_ns == self._last_ns:
+            return None
+        self._last_ns = stamp_ns
+        height, width = self._size
+        pixels = np.full(height * width * 3, stamp_ns // 1_000_000 % 256, np.uint8)
+        return Image(Header(stamp_ns, self._ctx.name), height, width, "rgb8", 3 * width, pixels)
+
+    @override
+    def close(self) -> None:
+        self._open = False
+
+
+class FakeTeleop(Teleop):
+    """A device whose deadman and velocity are attributes."""
+
+    def __init__(self, ctx: Context) -> None:
+        self._names = ctx.robot.joint_names
+        self._open = False
+        self._positions = np.zeros(len(self._names))
+        self._last_ns = 0
+        self.deadman = False
+        self.velocity = 0.0
+        """Of all joints [rad/s]."""
+
+    @override
+    def connect(self) -> None:
+        self._open = True
+
+    @override
+    def disconnect(self) -> None:
+        self._open = False
+
+    @override
+    def activate(self, measured: JointReading) -> None:
+        self._positions = measured.position.copy()
+        self._last_ns = measured.stamp_ns
+
+    @override
+    def read(self, measured: JointReading) -> TeleopCommand:
+        if not self._open:
+            raise TeleopError("the fake device is not connected")
+        self._positions = self._positions + self.velocity * seconds(measured.stamp_ns - self._last_ns)
+        self._last_ns = measured.stamp_ns
+        return TeleopCommand(dict(zip(self._names, self._positions.tolist(), strict=True)) if self.deadman else None)
+
+
+class FakePolicy(Policy):
+    """Steers every joint towards a place that is drawn anew for each episode, in chunks of ten."""
+
+    def __init__(self, ctx: Context) -> None:
+        names = ctx.robot.joint_names
+        self.spec = PolicySpec({"observation.state": (len(names),)}, names, len(names), chunk_size=10)
+        self._goal = np.zeros(len(names))
+
+    @override
+    def reset(self, seed: int) -> None:
+        self._goal = np.random.default_rng(seed).uniform(-0.5, 0.5, self.spec.action_size)
+
+    @override
+    def preprocess(self, frame: Frame) -> Tensors:
+        for key in self.spec.observations:
+            if key not in frame.values:
+                raise PolicyError(f"the frame lacks {key}")
+        return {"state": frame.values["observation.state"].astype(np.float64)}
+
+    @override
+    def infer(self, tensors: Tensors) -> Tensors:
+        return {"delta": self._goal - np.asarray(tensors["state"], np.float64), "state": tensors["state"]}
+
+    @override
+    def postprocess(self, tensors: Tensors) -> NDArray[np.float64]:
+        shares = np.linspace(0.1, 1.0, self.spec.chunk_size)[:, None]
+        return np.asarray(tensors["state"], np.float64) + shares * np.asarray(tensors["delta"], np.float64)
+
+
+class FakePlanner(Planner):
+    """A cubic from start to goal for all joints together, slow enough for the slowest."""
+
+    def __init__(self, ctx: Context) -> None:
+        self._robot = ctx.robot
+
+    @override
+    def plan(self, request: PlanRequest) -> JointTrajectory:
+        if not isinstance(request.goal, JointGoal):
+            raise PlanningError(f"the fake planner knows joint goals only, not {type(request.goal).__name__}")
+        unknown = set(request.goal.joints) - set(request.joints)
+        if unknown:
+            raise PlanningError(f"no joint {min(unknown)!r} in the request; it has: {', '.join(request.joints)}")
+        end = request.start.copy()
+        end[[request.joints.index(joint) for joint in request.goal.joints]] = request.goal.positions
+        order = self._robot.indices(request.joints)
+        for joint, position, lower, upper in zip(
+            request.joints, end, self._robot.lower[order], self._robot.upper[order], strict=True
+        ):
+            if not lower <= position <= upper:
+                raise PlanningError(f"{joint}: {position} rad is outside {lower} to {upper} rad")
+        way = np.abs(end - request.start)
+        velocity = self._robot.max_velocity[order] * request.velocity_scaling
+        acceleration = self._robot.max_acceleration[order] * request.acceleration_scaling
+        # The peaks of a cubic over time T: velocity 1.5 way / T, acceleration 6 way / T^2.
+        duration = max((1.5 * way / velocity).max(), np.sqrt(6 * way / acceleration).max(), 0.01)
+        points = tuple(_cubic_point(request.start, end, duration, share) for share in np.linspace(0.0, 1.0, 50))
+        return JointTrajectory(Header(), request.joints, points)
+
+
+def _cubic_point(start: Vector, end: Vector, duration: float, share: float) -> JointTrajectoryPoint:
+    position = start + (end - start) * (3 * share**2 - 2 * share**3)
+    velocity = (end - start) * (6 * share - 6 * share**2) / duration
+    return JointTrajectoryPoint(ns(duration * share), position, velocity)
+
+
+class FakeViewer(Viewer):
+    """Keeps the newest message on `/joint_states`; `person_closed` stands for the window's close button."""
+
+    def __init__(self, ctx: Context) -> None:
+        if ctx.bus is None:
+            raise ValueError("a viewer needs the host's bus")
+        self._bus = ctx.bus
+        self._subscription: Subscription | None = None
+        self.shown: Message | None = None
+        self.person_closed = False
+
+    @override
+    def open(self) -> None:
+        self._subscription = self._bus.subscribe("/joint_states", depth=1)
+
+    @override
+    def update(self) -> bool:
+        received = self._subscription.get() if self._subscription is not None else None
+        if received is not None:
+            self.shown = received.message
+        return not self.person_closed
+
+    @override
+    def close(self) -> None:
+        if self._subscription is not None:
+            self._subscription.close()
+            self._subscription = None

@@ -1,0 +1,107 @@
+"""Fakes of what writes to disk: a recorder and a dataset writer, in files that numpy and JSON read."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, override
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ibrobot_core.errors import DatasetError, RecorderError
+from ibrobot_core.interfaces import Context, DatasetWriter, EpisodeEnd, EpisodeStart, Feature, Recorder
+from ibrobot_core.messages import JointState, Message
+
+
+class FakeRecorder(Recorder):
+    """Writes JointStates to `records.jsonl`, a line each, flushed; metadata to `metadata.json`."""
+
+    def __init__(self, ctx: Context) -> None:
+        self._episode: EpisodeStart | None = None
+
+    @override
+    def begin(self, episode: EpisodeStart) -> None:
+        if self._episode is not None:
+            raise RecorderError(f"the episode in {self._episode.directory} has not ended")
+        if episode.directory.exists():
+            raise RecorderError(f"{episode.directory} exists already")
+        episode.directory.mkdir()
+        self._file = (episode.directory / "records.jsonl").open("w")
+        self._episode = episode
+
+    @override
+    def write(self, topic: str, message: Message, received_ns: int) -> None:
+        if topic not in self._open().topics or not isinstance(message, JointState):
+            return
+        arrays = {name: getattr(message, name).tolist() for name in ("position", "velocity", "effort")}
+        line = {"topic": topic, "received_ns": received_ns, "stamp_ns": message.header.stamp_ns, "name": message.name}
+        self._file.write(json.dumps(line | arrays) + "\n")
+        self._file.flush()
+
+    @override
+    def end(self, episode: EpisodeEnd) -> Path | None:
+        start = self._open()
+        self._file.close()
+        self._episode = None
+        if episode.outcome == "discarded":
+            shutil.rmtree(start.directory)
+            return None
+        metadata = {**start.metadata, "outcome": episode.outcome, "dropped": dict(episode.dropped)}
+        (start.directory / "metadata.json").write_text(json.dumps(metadata))
+        return start.directory
+
+    @override
+    def close(self) -> None:
+        if self._episode is not None:
+            self.end(EpisodeEnd(self._episode.stamp_ns, "unknown"))
+
+    def _open(self) -> EpisodeStart:
+        if self._episode is None:
+            raise RecorderError("no episode has begun")
+        return self._episode
+
+
+class FakeDataset(DatasetWriter):
+    """Writes each episode to `episode_N.npz`: a column a feature, and the tasks."""
+
+    def __init__(self, ctx: Context) -> None:
+        self._root: Path | None = None
+        self._features: Mapping[str, Feature] = {}
+        self._frames: list[dict[str, NDArray[np.generic]]] = []
+        self._episodes = 0
+
+    @override
+    def create(self, root: Path, fps: float, features: Mapping[str, Feature], metadata: Mapping[str, Any]) -> None:
+        if root.exists() and any(root.iterdir()):
+            raise DatasetError(f"{root} is not empty")
+        root.mkdir(parents=True, exist_ok=True)
+        (root / "metadata.json").write_text(json.dumps({"fps": fps, **metadata}))
+        self._root, self._features = root, features
+
+    @override
+    def add_frame(self, values: Mapping[str, NDArray[np.generic]], task: str) -> None:
+        if self._root is None:
+            raise DatasetError("create comes before add_frame")
+        for key in sorted(self._features.keys() ^ values.keys()):
+            raise DatasetError(f"{key} is {'missing' if key in self._features else 'no feature of this dataset'}")
+        for key, feature in self._features.items():
+            if values[key].shape != feature.shape:
+                raise DatasetError(f"{key} must have shape {feature.shape}, got {values[key].shape}")
+        self._frames.append({key: np.array(value) for key, value in values.items()} | {"task": np.array(task)})
+
+    @override
+    def save_episode(self) -> int:
+        if self._root is None or not self._frames:
+            raise DatasetError("the episode has no frames")
+        columns = {key: np.stack([frame[key] for frame in self._frames]) for key in self._frames[0]}
+        np.savez(self._root / f"episode_{self._episodes}.npz", **columns)  # type: ignore[arg-type]
+        self._frames = []
+        self._episodes += 1
+        return self._episodes - 1
+
+    @override
+    def finalize(self) -> None:
+        self._frames = []

@@ -1,0 +1,282 @@
+"""The conformance suites of hardware, real and simulated."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import override
+
+import numpy as np
+import pytest
+
+from ibrobot_core.clock import SteppedClock
+from ibrobot_core.errors import HardwareError, NotSupported
+from ibrobot_core.interfaces import Context, Episode, Hardware, JointReading, SimulatedHardware
+from ibrobot_core.robot import Vector
+from ibrobot_core.testing.contexts import control_context
+from ibrobot_core.testing.suite import Suite
+from ibrobot_core.units import ns
+
+
+class HardwareSuite(Suite[Hardware]):
+    """What every `Hardware` must do. A driver runs it against a fake of its bus."""
+
+    settle_s = 1.0
+    """Time in which every joint comes at least half-way to a command near by [s]."""
+    move_rad = 0.2
+    """How far the checks move a joint [rad]."""
+    tolerance_rad = 0.03
+    """How far a joint that holds may be from where it was [rad]."""
+
+    @override
+    def context(self) -> Context:
+        return control_context()
+
+    def elapse(self, hardware: Hardware, ctx: Context, duration_s: float) -> None:
+        """Let `duration_s` [s] pass; override where a fake bus must be told."""
+        for _ in range(max(1, round(ns(duration_s) / ctx.period_ns))):
+            ctx.clock.sleep_until(ctx.clock.now_ns() + ctx.period_ns)
+            if isinstance(hardware, SimulatedHardware):
+                hardware.advance(ctx.period_ns)
+
+    @contextmanager
+    def connected(self) -> Iterator[tuple[Hardware, Context]]:
+        """Connected hardware with its context."""
+        ctx = self.context()
+        hardware = self.make(ctx)
+        try:
+            hardware.connect()
+            yield hardware, ctx
+        finally:
+            hardware.disconnect()
+
+    def moved(self, hardware: Hardware, ctx: Context) -> Vector:
+        """Move every joint towards the middle of its range and return the measured position [rad], shape (J,).
+
+        Without this a check for holding would pass hardware that always goes to zero.
+        """
+        hardware.write(self._target(hardware, ctx))
+        self.elapse(hardware, ctx, 2 * self.settle_s)
+        return hardware.read().position.copy()
+
+    def _target(self, hardware: Hardware, ctx: Context) -> Vector:
+        position = hardware.read().position
+        order = ctx.robot.indices(hardware.joints)
+        middle = (ctx.robot.lower[order] + ctx.robot.upper[order]) / 2
+        return np.asarray(position + np.where(position < middle, self.move_rad, -self.move_rad))
+
+    def test_owns_the_joints_it_was_given(self) -> None:
+        """`joints` is set by the constructor and equals `ctx.joints`."""
+        ctx = self.context()
+        assert self.make(ctx).joints == ctx.joints
+
+    def test_reading_is_complete(self) -> None:
+        """Every vector has one number a joint; positions and velocities are finite."""
+        with self.connected() as (hardware, ctx):
+            self.elapse(hardware, ctx, 0.0)
+            reading = hardware.read()
+            for name in ("position", "velocity", "effort"):
+                vector = getattr(reading, name)
+                assert vector.shape == (len(hardware.joints),), f"{name} has shape {vector.shape}"
+                assert vector.dtype == np.float64, f"{name} has dtype {vector.dtype}"
+            assert np.isfinite(reading.position).all()
+            assert np.isfinite(reading.velocity).all()
+            assert not np.isinf(reading.effort).any(), "effort that is not measured is NaN"
+
+    def test_stamps_follow_the_clock(self) -> None:
+        """A stamp is an int, not in the future, and later once time has passed."""
+        with self.connected() as (hardware, ctx):
+            previous = -1
+            for _ in range(5):
+                self.elapse(hardware, ctx, 0.0)
+                stamp_ns = hardware.read().stamp_ns
+                assert type(stamp_ns) is int
+                assert previous < stamp_ns <= ctx.clock.now_ns()
+                previous = stamp_ns
+
+    def test_holds_where_it_is(self) -> None:
+        """Joints stay where the last command brought them, with nobody writing."""
+        with self.connected() as (hardware, ctx):
+            before = self.moved(hardware, ctx)
+            self.elapse(hardware, ctx, self.settle_s)
+            np.testing.assert_allclose(hardware.read().position, before, atol=self.tolerance_rad)
+
+    def test_connecting_moves_nothing(self) -> None:
+        """After `connect` the joints hold where they are, also when they are not at zero."""
+        with self.connected() as (hardware, ctx):
+            self.moved(hardware, ctx)
+            hardware.disconnect()
+            hardware.connect()
+            before = hardware.read().position.copy()
+            self.elapse(hardware, ctx, self.settle_s)
+            np.testing.assert_allclose(hardware.read().position, before, atol=self.tolerance_rad)
+
+    def test_write_moves_each_joint_towards_its_command(self) -> None:
+        """A command for one joint moves this joint, and no other."""
+        with self.connected() as (hardware, ctx):
+            for i, name in enumerate(hardware.joints):
+                start = hardware.read().position.copy()
+                goal = start.copy()
+                goal[i] = self._target(hardware, ctx)[i]
+                hardware.write(goal)
+                self.elapse(hardware, ctx, self.settle_s)
+                left = np.abs(hardware.read().position - goal)
+                assert left[i] < 0.5 * abs(goal[i] - start[i]), f"{name} did not come half-way in {self.settle_s} s"
+                assert np.delete(left, i).max(initial=0.0) < 0.5 * self.move_rad, f"{name} moved another joint"
+
+    def test_refuses_a_command_of_wrong_shape(self) -> None:
+        """A vector of wrong length is refused (HardwareError or ValueError) and moves nothing."""
+        with self.connected() as (hardware, ctx):
+            before = self.moved(hardware, ctx)
+            for size in (len(hardware.joints) + 1, len(hardware.joints) - 1, 1):
+                if size != len(hardware.joints):
+                    with pytest.raises((HardwareError, ValueError)):
+                        hardware.write(np.zeros(size))
+            self.elapse(hardware, ctx, self.settle_s)
+            np.testing.assert_allclose(hardware.read().position, before, atol=self.tolerance_rad)
+
+    def test_keeps_no_hold_of_the_callers_arrays(self) -> None:
+        """A command is taken as it was at `write`, and a reading stays as it was at `read`."""
+        with self.connected() as (hardware, ctx):
+            start = hardware.read()
+            copy = start.position.copy()
+            goal = self._target(hardware, ctx)
+            command = goal.copy()
+            hardware.write(command)
+            np.testing.assert_array_equal(command, goal, err_msg="write changed its argument")
+            command[:] = copy
+            self.elapse(hardware, ctx, self.settle_s)
+            now = hardware.read().position
+            assert (np.abs(now - goal) < np.abs(now - copy)).all(), "the command changed with the caller's array"
+            np.testing.assert_array_equal(start.position, copy, err_msg="an earlier reading changed")
+
+    def test_disconnect_is_safe_at_any_time(self) -> None:
+        """`disconnect` may come before `connect` and twice; `connect` works again afterwards."""
+        hardware = self.make(self.context())
+        hardware.disconnect()
+        hardware.connect()
+        hardware.disconnect()
+        hardware.disconnect()
+        try:
+            hardware.connect()
+            assert np.isfinite(hardware.read().position).all()
+        finally:
+            hardware.disconnect()
+
+    def test_refuses_use_while_disconnected(self) -> None:
+        """`read` and `write` raise HardwareError once disconnected, rather than repeat what was."""
+        with self.connected() as (hardware, _):
+            position = hardware.read().position
+        with pytest.raises(HardwareError):
+            hardware.read()
+        with pytest.raises(HardwareError):
+            hardware.write(position)
+
+    def test_relax_ends_with_the_next_write(self) -> None:
+        """`relax` is not supported, or the next `write` puts torque back on."""
+        with self.connected() as (hardware, ctx):
+            try:
+                hardware.relax()
+            except NotSupported:
+                pytest.skip("has no torque control")
+            self.elapse(hardware, ctx, 0.0)
+            start = hardware.read().position.copy()
+            goal = self._target(hardware, ctx)
+            hardware.write(goal)
+            self.elapse(hardware, ctx, 2 * self.settle_s)
+            assert (np.abs(hardware.read().position - goal) < 0.5 * np.abs(goal - start)).all()
+
+    def test_reset_faults_moves_nothing(self) -> None:
+        """`reset_faults` on healthy hardware changes nothing."""
+        with self.connected() as (hardware, ctx):
+            before = self.moved(hardware, ctx)
+            hardware.reset_faults()
+            self.elapse(hardware, ctx, self.settle_s)
+            np.testing.assert_allclose(hardware.read().position, before, atol=self.tolerance_rad)
+
+    def test_signals_fill_their_vectors(self) -> None:
+        """Every declared signal has a topic of its own and writes as many numbers as it declares."""
+        with self.connected() as (hardware, ctx):
+            self.elapse(hardware, ctx, 0.0)
+            topics = [signal.topic for signal in hardware.signals]
+            assert len(set(topics)) == len(topics), f"a topic twice in {topics}"
+            for i, signal in enumerate(hardware.signals):
+                assert signal.topic.startswith("/"), f"topic {signal.topic!r} must begin with /"
+                assert signal.size > 0
+                first, second = np.full(signal.size, 1e300), np.full(signal.size, -1e300)
+                hardware.read_signal(i, first)
+                hardware.read_signal(i, second)
+                assert not ((first == 1e300) | (second == -1e300)).any(), f"{signal.topic} leaves numbers unwritten"
+
+
+class SimulatedHardwareSuite(HardwareSuite):
+    """What every `SimulatedHardware` must do, beyond `HardwareSuite`."""
+
+    def _run(self, hardware: SimulatedHardware, ctx: Context, seed: int) -> list[JointReading]:
+        hardware.reset(Episode(seed))
+        readings = [hardware.read()]
+        hardware.write(self._target(hardware, ctx))
+        for _ in range(20):
+            self.elapse(hardware, ctx, 0.0)
+            readings.append(hardware.read())
+        return readings
+
+    @contextmanager
+    def simulated(self) -> Iterator[tuple[SimulatedHardware, Context]]:
+        """Connected simulated hardware with its context."""
+        with self.connected() as (hardware, ctx):
+            assert isinstance(hardware, SimulatedHardware)
+            yield hardware, ctx
+
+    def test_time_passes_only_by_advance(self) -> None:
+        """Two readings without `advance` between them are equal, whatever the clock does."""
+        with self.simulated() as (hardware, ctx):
+            hardware.write(self._target(hardware, ctx))
+            self.elapse(hardware, ctx, 0.0)
+            first = hardware.read()
+            if isinstance(ctx.clock, SteppedClock):
+                ctx.clock.advance(10 * ctx.period_ns)
+            second = hardware.read()
+            np.testing.assert_array_equal(first.position, second.position)
+            np.testing.assert_array_equal(first.velocity, second.velocity)
+
+    def test_equal_seeds_run_alike(self) -> None:
+        """After `reset` with the same seed the same commands give the same bits, whatever happened before."""
+        with self.simulated() as (hardware, ctx):
+            first = self._run(hardware, ctx, 7)
+            signals = self._signals(hardware)
+            self._run(hardware, ctx, 8)
+            second = self._run(hardware, ctx, 7)
+            for a, b in zip(first, second, strict=True):
+                np.testing.assert_array_equal(a.position, b.position)
+                np.testing.assert_array_equal(a.velocity, b.velocity)
+            for x, y in zip(signals, self._signals(hardware), strict=True):
+                np.testing.assert_array_equal(x, y)
+
+    def test_equal_seeds_run_alike_in_another_object(self) -> None:
+        """A second simulation with the same seed gives the same bits as the first."""
+        with self.simulated() as (hardware, ctx), self.simulated() as (twin, twin_ctx):
+            for a, b in zip(self._run(hardware, ctx, 7), self._run(twin, twin_ctx, 7), strict=True):
+                np.testing.assert_array_equal(a.position, b.position)
+
+    def test_reset_holds(self) -> None:
+        """After `reset` nothing moves: an old command is forgotten."""
+        with self.simulated() as (hardware, ctx):
+            self.moved(hardware, ctx)
+            hardware.reset(Episode(1))
+            before = hardware.read().position.copy()
+            self.elapse(hardware, ctx, self.settle_s)
+            np.testing.assert_allclose(hardware.read().position, before, atol=self.tolerance_rad)
+
+    def test_success_is_a_verdict(self) -> None:
+        """`success` is True, False or None, and never True right after a reset."""
+        with self.simulated() as (hardware, _):
+            hardware.reset(Episode(1))
+            assert hardware.success() in (False, None)
+
+    @staticmethod
+    def _signals(hardware: Hardware) -> list[Vector]:
+        values = [np.empty(signal.size) for signal in hardware.signals]
+        for i, out in enumerate(values):
+            hardware.read_signal(i, out)
+        return values

@@ -1,0 +1,182 @@
+"""The conformance suite of planners."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import ClassVar
+
+import attrs
+import numpy as np
+import pytest
+
+from ibrobot_core.errors import PlanningError
+from ibrobot_core.interfaces import Context, JointGoal, Planner, PlanRequest
+from ibrobot_core.messages import JointTrajectory
+from ibrobot_core.robot import Vector
+from ibrobot_core.testing.suite import Suite
+from ibrobot_core.units import seconds
+
+
+class PlannerSuite(Suite[Planner]):
+    """What every `Planner` must do with joint goals."""
+
+    tolerance_rad: ClassVar[float] = 1e-6
+    """How far the ends of a trajectory may be from what was asked [rad]."""
+    samples: ClassVar[int] = 20
+    """Samples between two points, at which limits are checked."""
+
+    @contextmanager
+    def loaded(self) -> Iterator[tuple[Planner, Context]]:
+        """A loaded planner with its context."""
+        ctx = self.context()
+        planner = self.make(ctx)
+        try:
+            planner.load()
+            yield planner, ctx
+        finally:
+            planner.close()
+
+    def request(self, ctx: Context, seed: int, joints: tuple[str, ...] | None = None) -> PlanRequest:
+        """A request between random positions within limits; override where these would collide."""
+        joints = ctx.robot.joint_names if joints is None else joints
+        order = ctx.robot.indices(joints)
+        lower, upper = ctx.robot.lower[order], ctx.robot.upper[order]
+        start, goal = np.random.default_rng(seed).uniform(lower, upper, (2, len(joints)))
+        return PlanRequest(joints, start, JointGoal(joints, goal))
+
+    def test_goes_from_start_to_goal(self) -> None:
+        """The first point is the start at time zero, the last the goal, and times increase."""
+        with self.loaded() as (planner, ctx):
+            for seed in range(5):
+                request = self.request(ctx, seed)
+                points = planner.plan(request).points
+                assert isinstance(request.goal, JointGoal)
+                assert points[0].time_from_start_ns == 0
+                np.testing.assert_allclose(points[0].positions, request.start, atol=self.tolerance_rad)
+                np.testing.assert_allclose(points[-1].positions, request.goal.positions, atol=self.tolerance_rad)
+                assert (np.diff([p.time_from_start_ns for p in points]) > 0).all(), "times must increase"
+
+    def test_names_the_joints_asked_for(self) -> None:
+        """The trajectory has exactly the request's joints, in its order, and a number for each in every point."""
+        with self.loaded() as (planner, ctx):
+            for joints in (ctx.robot.joint_names, ctx.robot.joint_names[::-1], ctx.robot.joint_names[1:3]):
+                request = self.request(ctx, 1, joints)
+                trajectory = planner.plan(request)
+                assert trajectory.joint_names == joints
+                for point in trajectory.points:
+                    assert point.positions.shape == (len(joints),)
+                    assert np.isfinite(point.positions).all()
+                np.testing.assert_allclose(trajectory.points[0].positions, request.start, atol=self.tolerance_rad)
+
+    def test_begins_and_ends_at_rest(self) -> None:
+        """Velocities at both ends are zero."""
+        with self.loaded() as (planner, ctx):
+            points = planner.plan(self.request(ctx, 2)).points
+            for point in (points[0], points[-1]):
+                if point.velocities.size:
+                    np.testing.assert_allclose(point.velocities, 0.0, atol=1e-6)
+
+    def test_keeps_the_limits(self) -> None:
+        """Sampled between its points, no trajectory leaves the limits on position, velocity and acceleration."""
+        with self.loaded() as (planner, ctx):
+            for seed in range(5):
+                request = self.request(ctx, seed)
+                check_limits(planner.plan(request), request, ctx, self.samples)
+
+    def test_scaling_slows_down(self) -> None:
+        """Scaled limits are kept as the whole ones are."""
+        with self.loaded() as (planner, ctx):
+            whole = self.request(ctx, 3)
+            for velocity, acceleration in ((0.3, 1.0), (1.0, 0.3), (0.1, 0.1)):
+                slow = attrs.evolve(whole, velocity_scaling=velocity, acceleration_scaling=acceleration)
+                check_limits(planner.plan(slow), slow, ctx, self.samples)
+
+    def test_joints_not_named_stay(self) -> None:
+        """A goal for one joint moves no other."""
+        with self.loaded() as (planner, ctx):
+            request = self.request(ctx, 4)
+            assert isinstance(request.goal, JointGoal)
+            goal = JointGoal(request.joints[1:2], request.goal.positions[1:2])
+            for point in planner.plan(attrs.evolve(request, goal=goal)).points:
+                others = np.delete(point.positions - request.start, 1)
+                np.testing.assert_allclose(others, 0.0, atol=self.tolerance_rad)
+
+    def test_no_way_to_go_is_a_trajectory_too(self) -> None:
+        """A goal where the joints are gives a trajectory that stays there."""
+        with self.loaded() as (planner, ctx):
+            request = self.request(ctx, 5)
+            points = planner.plan(attrs.evolve(request, goal=JointGoal(request.joints, request.start))).points
+            assert points
+            for point in points:
+                np.testing.assert_allclose(point.positions, request.start, atol=self.tolerance_rad)
+
+    def test_refuses_a_goal_outside_the_limits(self) -> None:
+        """Such a goal is a PlanningError that names the joint."""
+        with self.loaded() as (planner, ctx):
+            request = self.request(ctx, 6)
+            assert isinstance(request.goal, JointGoal)
+            for i, joint in enumerate(request.joints):
+                positions = request.goal.positions.copy()
+                positions[i] = ctx.robot.upper[ctx.robot.indices([joint])[0]] + 0.1
+                with pytest.raises(PlanningError, match=joint):
+                    planner.plan(attrs.evolve(request, goal=JointGoal(request.joints, positions)))
+
+    def test_refuses_an_impossible_goal(self) -> None:
+        """A goal that is not finite, or for an unknown joint, is a PlanningError."""
+        with self.loaded() as (planner, ctx):
+            request = self.request(ctx, 7)
+            for goal in (
+                JointGoal(request.joints, np.full(len(request.joints), np.nan)),
+                JointGoal(("no_such_joint",), np.zeros(1)),
+            ):
+                with pytest.raises(PlanningError):
+                    planner.plan(attrs.evolve(request, goal=goal))
+
+    def test_leaves_the_request_alone(self) -> None:
+        """`plan` changes nothing in its request."""
+        with self.loaded() as (planner, ctx):
+            request = self.request(ctx, 8)
+            assert isinstance(request.goal, JointGoal)
+            start, goal = request.start.copy(), request.goal.positions.copy()
+            planner.plan(request)
+            np.testing.assert_array_equal(request.start, start)
+            np.testing.assert_array_equal(request.goal.positions, goal)
+
+    def test_close_is_safe_twice(self) -> None:
+        """`close` may come before `load` and twice."""
+        planner = self.make(self.context())
+        planner.close()
+        planner.load()
+        planner.close()
+        planner.close()
+
+
+def check_limits(trajectory: JointTrajectory, request: PlanRequest, ctx: Context, samples: int) -> None:
+    """Assert that a trajectory, splined by the fields that it gives, stays within the robot's scaled limits."""
+    order = ctx.robot.indices(request.joints)
+    lower, upper = ctx.robot.lower[order], ctx.robot.upper[order]
+    max_velocity = ctx.robot.max_velocity[order] * request.velocity_scaling
+    max_acceleration = ctx.robot.max_acceleration[order] * request.acceleration_scaling
+    for a, b in zip(trajectory.points, trajectory.points[1:], strict=False):
+        duration = seconds(b.time_from_start_ns - a.time_from_start_ns)
+        spline = _spline(a.positions, b.positions, a.velocities, b.velocities, duration)
+        shares = np.linspace(0.0, 1.0, samples)[:, None]
+        position = sum(c * shares**k for k, c in enumerate(spline))
+        velocity = sum(k * c * shares ** (k - 1) for k, c in enumerate(spline) if k) / duration
+        at = f"{seconds(a.time_from_start_ns):.3f} s"
+        assert (position >= lower - 1e-6).all(), f"below the limit near {at}"
+        assert (position <= upper + 1e-6).all(), f"above the limit near {at}"
+        assert (np.abs(velocity) <= max_velocity * 1.01 + 1e-6).all(), f"too fast near {at}"
+        if a.velocities.size:
+            # The mean over the segment: at a corner of the profile the cubic itself may overshoot a little.
+            mean = np.abs(b.velocities - a.velocities) / duration
+            assert (mean <= max_acceleration * 1.01 + 1e-6).all(), f"accelerates too much near {at}"
+
+
+def _spline(p0: Vector, p1: Vector, v0: Vector, v1: Vector, duration: float) -> list[Vector]:
+    """Coefficients over the share of the segment: linear without velocities, cubic with them."""
+    if not v0.size:
+        return [p0, p1 - p0]
+    d0, d1 = v0 * duration, v1 * duration
+    return [p0, d0, 3 * (p1 - p0) - 2 * d0 - d1, 2 * (p0 - p1) + d0 + d1]

@@ -1,0 +1,160 @@
+"""The conformance suite of policies."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import ClassVar
+
+import attrs
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from ibrobot_core.errors import PolicyError
+from ibrobot_core.interfaces import Context, Frame, Policy, Tensors
+from ibrobot_core.testing.suite import Suite
+
+
+class PolicySuite(Suite[Policy]):
+    """What every `Policy` must do."""
+
+    any_size: ClassVar[int] = 16
+    """What stands for -1 in the shapes of the frames that `frame` makes."""
+
+    def frame(self, policy: Policy, ctx: Context, seed: int) -> Frame:
+        """A frame with all that the policy's spec asks for; override where random numbers will not do."""
+        rng = np.random.default_rng(seed)
+        values: dict[str, NDArray[np.generic]] = {}
+        for key, shape in policy.spec.observations.items():
+            sizes = tuple(self.any_size if n == -1 else n for n in shape)
+            if len(sizes) == 3:  # an image
+                values[key] = rng.integers(0, 256, sizes, dtype=np.uint8)
+            else:
+                values[key] = rng.uniform(-1, 1, sizes).astype(np.float32)
+        return Frame(ctx.clock.now_ns(), values, prompt="pick up the cube" if policy.spec.prompt else "")
+
+    @contextmanager
+    def loaded(self) -> Iterator[tuple[Policy, Context]]:
+        """A loaded policy with its context, at the beginning of an episode."""
+        ctx = self.context()
+        policy = self.make(ctx)
+        try:
+            policy.load()
+            policy.reset(0)
+            yield policy, ctx
+        finally:
+            policy.close()
+
+    def _run(self, policy: Policy, ctx: Context, seed: int) -> list[NDArray[np.float64]]:
+        policy.reset(seed)
+        frames = [self.frame(policy, ctx, i) for i in range(3)]
+        return [policy.postprocess(policy.infer(policy.preprocess(frame))).copy() for frame in frames]
+
+    def test_spec_agrees_with_itself(self) -> None:
+        """Sizes are positive, names as many as actions, and shapes made of positive numbers and -1."""
+        with self.loaded() as (policy, _):
+            spec = policy.spec
+            assert spec.action_size > 0
+            assert spec.chunk_size > 0
+            if spec.actions is not None:
+                assert len(spec.actions) == len(set(spec.actions)) == spec.action_size
+            for key, shape in spec.observations.items():
+                assert shape, f"{key} has no shape"
+                assert all(n == -1 or n > 0 for n in shape), f"{key} has the shape {shape}"
+            assert spec.rate_hz is None or spec.rate_hz > 0
+
+    def test_chunks_are_as_specified(self) -> None:
+        """A chunk is (N, A) float64 with 1 <= N <= chunk_size, all finite."""
+        with self.loaded() as (policy, ctx):
+            for chunk in self._run(policy, ctx, 1):
+                assert chunk.ndim == 2
+                assert 1 <= chunk.shape[0] <= policy.spec.chunk_size, f"a chunk of {chunk.shape[0]}"
+                assert chunk.shape[1] == policy.spec.action_size
+                assert chunk.dtype == np.float64
+                assert np.isfinite(chunk).all()
+
+    def test_a_missing_key_is_refused(self) -> None:
+        """A frame without one of the keys that the spec names is a PolicyError that says which."""
+        with self.loaded() as (policy, ctx):
+            whole = self.frame(policy, ctx, 1)
+            for key in policy.spec.observations:
+                values = {k: v for k, v in whole.values.items() if k != key}
+                with pytest.raises(PolicyError, match=key):
+                    policy.preprocess(attrs.evolve(whole, values=values, missing=frozenset({key})))
+
+    def test_equal_seeds_act_alike(self) -> None:
+        """After `reset` with the same seed the same frames give the same bits, whatever happened before."""
+        with self.loaded() as (policy, ctx):
+            first = self._run(policy, ctx, 3)
+            self._run(policy, ctx, 4)
+            for a, b in zip(first, self._run(policy, ctx, 3), strict=True):
+                np.testing.assert_array_equal(a, b)
+
+    def test_inputs_stay_as_they_were(self) -> None:
+        """No step changes what it is given."""
+        with self.loaded() as (policy, ctx):
+            frame = self.frame(policy, ctx, 1)
+            before = _copy(frame.values)
+            inputs = policy.preprocess(frame)
+            assert _equal(frame.values, before), "preprocess changed the frame"
+            before = _copy(inputs)
+            outputs = policy.infer(inputs)
+            assert _equal(inputs, before), "infer changed its input"
+            before = _copy(outputs)
+            policy.postprocess(outputs)
+            assert _equal(outputs, before), "postprocess changed its input"
+
+    def test_outputs_stay_as_they_were(self) -> None:
+        """A chunk does not change when the next one is made."""
+        with self.loaded() as (policy, ctx):
+            chunk = policy.postprocess(policy.infer(policy.preprocess(self.frame(policy, ctx, 1))))
+            before = chunk.copy()
+            policy.postprocess(policy.infer(policy.preprocess(self.frame(policy, ctx, 2))))
+            np.testing.assert_array_equal(chunk, before)
+
+    def test_pre_and_postprocess_are_pure(self) -> None:
+        """Twice the same input gives twice the same output."""
+        with self.loaded() as (policy, ctx):
+            frame = self.frame(policy, ctx, 1)
+            inputs = policy.preprocess(frame)
+            assert _equal(inputs, policy.preprocess(frame))
+            outputs = policy.infer(inputs)
+            np.testing.assert_array_equal(policy.postprocess(outputs), policy.postprocess(outputs))
+
+    def test_tensors_survive_the_wire(self) -> None:
+        """Tensors are plain arrays, so that `infer` can run elsewhere with the same result."""
+        with self.loaded() as (policy, ctx):
+            frame = self.frame(policy, ctx, 1)
+            policy.reset(5)
+            here = policy.postprocess(policy.infer(policy.preprocess(frame))).copy()
+            policy.reset(5)
+            there = policy.postprocess(_wire(policy.infer(_wire(policy.preprocess(frame)))))
+            np.testing.assert_array_equal(here, there)
+
+    def test_close_is_safe_twice(self) -> None:
+        """`close` may come before `load` and twice."""
+        policy = self.make(self.context())
+        policy.close()
+        policy.load()
+        policy.close()
+        policy.close()
+
+
+def _copy(tensors: Tensors) -> dict[str, NDArray[np.generic]]:
+    return {key: np.array(value) for key, value in tensors.items()}
+
+
+def _equal(a: Tensors, b: Tensors) -> bool:
+    return a.keys() == b.keys() and all(np.array_equal(a[key], b[key]) for key in a)
+
+
+def _wire(tensors: Tensors) -> dict[str, NDArray[np.generic]]:
+    """Dtype, shape and bytes are all that crosses."""
+    received: dict[str, NDArray[np.generic]] = {}
+    for key, value in tensors.items():
+        assert isinstance(key, str)
+        assert type(value) is np.ndarray, f"{key} is a {type(value).__name__}, not an array"
+        assert value.dtype.kind in "biuf", f"{key} has dtype {value.dtype}"
+        received[key] = np.frombuffer(value.tobytes(), value.dtype).reshape(value.shape)
+    return received

@@ -1,0 +1,181 @@
+"""The conformance suite of recorders."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import ClassVar
+
+import attrs
+import numpy as np
+import pytest
+
+from ibrobot_core.errors import RecorderError
+from ibrobot_core.interfaces import Context, EpisodeEnd, EpisodeStart, Recorder
+from ibrobot_core.messages import Header, JointState, Message, String
+from ibrobot_core.testing.suite import Suite
+from ibrobot_core.units import NS_PER_S
+
+Record = tuple[int, Message]
+"""Receive stamp [ns] and message."""
+
+
+class RecorderSuite(Suite[Recorder]):
+    """What every `Recorder` must do. The subclass reads back what was written: `read_back` and `read_metadata`."""
+
+    topic: ClassVar[str] = "/joint_states"
+    """A topic of JointState that the recorder keeps."""
+    max_loss_s: ClassVar[float] = 1.0
+    """The most that a crash may cost [s]."""
+
+    def read_back(self, path: Path) -> Mapping[str, Sequence[Record]]:
+        """Topic -> records, in the order written; `path` may also be a copy of an unfinished episode."""
+        raise NotImplementedError(f"{type(self).__name__} must define read_back(self, path)")
+
+    def read_metadata(self, path: Path) -> Mapping[str, str]:
+        """What `EpisodeStart.metadata` became, and `outcome`."""
+        raise NotImplementedError(f"{type(self).__name__} must define read_metadata(self, path)")
+
+    def records(self, ctx: Context, count: int = 50) -> list[Record]:
+        """JointStates at 10 Hz with awkward numbers, as received a millisecond after their stamps."""
+        names = ctx.robot.joint_names
+        rng = np.random.default_rng(0)
+        start_ns = ctx.clock.now_ns()
+        stamps = [start_ns + i * NS_PER_S // 10 for i in range(count)]
+        return [(stamp + 1_000_000, JointState(Header(stamp), names, *rng.normal(size=(3, 6)))) for stamp in stamps]
+
+    @contextmanager
+    def recording(self, directory: Path) -> Iterator[tuple[Recorder, Context]]:
+        """A recorder with an episode begun in `directory`, and its context."""
+        ctx = self.context()
+        recorder = self.make(ctx)
+        try:
+            recorder.begin(self._start(ctx, directory))
+            yield recorder, ctx
+        finally:
+            recorder.close()
+
+    def _start(self, ctx: Context, directory: Path) -> EpisodeStart:
+        topics = {self.topic: JointState.ros_type}
+        return EpisodeStart(directory, ctx.clock.now_ns(), topics, {"prompt": "pick: the “cube”,\n'now'"})
+
+    def _end(self, ctx: Context, outcome: str) -> EpisodeEnd:
+        return EpisodeEnd(ctx.clock.now_ns() + 60 * NS_PER_S, outcome)
+
+    def _write(self, recorder: Recorder, records: Sequence[Record]) -> None:
+        for received_ns, message in records:
+            recorder.write(self.topic, message, received_ns)
+
+    def test_gives_back_what_was_written(self, tmp_path: Path) -> None:
+        """Every message comes back, to the bit, in order, with its receive stamp."""
+        with self.recording(tmp_path / "episode") as (recorder, ctx):
+            self._write(recorder, self.records(ctx))
+            path = recorder.end(self._end(ctx, "success"))
+            assert path is not None
+            assert path.is_relative_to(tmp_path / "episode")
+            assert path.exists()
+            assert list(self.read_back(path)[self.topic]) == self.records(ctx)
+
+    def test_keeps_metadata_and_outcome(self, tmp_path: Path) -> None:
+        """What was known at the beginning, and how it ended, are in the recording."""
+        with self.recording(tmp_path / "episode") as (recorder, ctx):
+            self._write(recorder, self.records(ctx))
+            path = recorder.end(self._end(ctx, "failure"))
+            assert path is not None
+            metadata = self.read_metadata(path)
+            assert metadata["prompt"] == "pick: the “cube”,\n'now'"
+            assert metadata["outcome"] == "failure"
+
+    def test_never_writes_over_anything(self, tmp_path: Path) -> None:
+        """A directory that exists is refused and left as it is."""
+        old = tmp_path / "episode" / "old.txt"
+        old.parent.mkdir()
+        old.write_text("old")
+        ctx = self.context()
+        recorder = self.make(ctx)
+        with pytest.raises(RecorderError):
+            recorder.begin(self._start(ctx, old.parent))
+        recorder.close()
+        assert [p.name for p in old.parent.iterdir()] == ["old.txt"]
+        assert old.read_text() == "old"
+
+    def test_a_discarded_episode_leaves_nothing(self, tmp_path: Path) -> None:
+        """With outcome `discarded`, `end` returns None and the directory is gone."""
+        with self.recording(tmp_path / "episode") as (recorder, ctx):
+            self._write(recorder, self.records(ctx))
+            assert recorder.end(self._end(ctx, "discarded")) is None
+        assert list(tmp_path.iterdir()) == []
+
+    def test_unknown_topics_are_passed_over(self, tmp_path: Path) -> None:
+        """A message on a topic that was not announced raises nothing and is not recorded."""
+        with self.recording(tmp_path / "episode") as (recorder, ctx):
+            records = self.records(ctx)
+            recorder.write("/unannounced", String("hello"), records[0][0])
+            self._write(recorder, records)
+            path = recorder.end(self._end(ctx, "success"))
+            assert path is not None
+            assert {topic for topic, kept in self.read_back(path).items() if kept} == {self.topic}
+
+    def test_episodes_follow_one_another(self, tmp_path: Path) -> None:
+        """A second episode is a recording of its own."""
+        with self.recording(tmp_path / "first") as (recorder, ctx):
+            records = self.records(ctx)
+            self._write(recorder, records[:20])
+            first = recorder.end(self._end(ctx, "success"))
+            recorder.begin(self._start(ctx, tmp_path / "second"))
+            self._write(recorder, records[20:])
+            second = recorder.end(self._end(ctx, "success"))
+            assert first is not None
+            assert second is not None
+            assert list(self.read_back(first)[self.topic]) == records[:20]
+            assert list(self.read_back(second)[self.topic]) == records[20:]
+
+    def test_refuses_calls_out_of_turn(self, tmp_path: Path) -> None:
+        """No `write` or `end` without an episode, and no second one before the first has ended."""
+        ctx = self.context()
+        recorder = self.make(ctx)
+        received_ns, message = self.records(ctx, 1)[0]
+        try:
+            with pytest.raises(RecorderError):
+                recorder.write(self.topic, message, received_ns)
+            with pytest.raises(RecorderError):
+                recorder.end(self._end(ctx, "success"))
+            recorder.begin(self._start(ctx, tmp_path / "first"))
+            with pytest.raises(RecorderError):
+                recorder.begin(self._start(ctx, tmp_path / "second"))
+            assert not (tmp_path / "second").exists()
+        finally:
+            recorder.close()
+
+    def test_close_ends_an_open_episode(self, tmp_path: Path) -> None:
+        """`close` keeps what was written, with outcome `unknown`; it is safe twice."""
+        with self.recording(tmp_path / "episode") as (recorder, ctx):
+            self._write(recorder, self.records(ctx))
+            recorder.close()
+            recorder.close()
+            assert list(self.read_back(tmp_path / "episode")[self.topic]) == self.records(ctx)
+            assert self.read_metadata(tmp_path / "episode")["outcome"] == "unknown"
+
+    def test_a_crash_costs_little(self, tmp_path: Path) -> None:
+        """What is on disk at any time is readable and lacks no more than the last `max_loss_s`."""
+        with self.recording(tmp_path / "episode") as (recorder, ctx):
+            records = self.records(ctx)
+            self._write(recorder, records)
+            shutil.copytree(tmp_path / "episode", tmp_path / "crashed")
+            found = list(self.read_back(tmp_path / "crashed")[self.topic])
+            kept = [r for r in records if r[0] <= records[-1][0] - self.max_loss_s * NS_PER_S]
+            assert found[: len(kept)] == kept
+
+    def test_messages_are_taken_as_they_were(self, tmp_path: Path) -> None:
+        """An array that changes after `write` does not change the recording."""
+        with self.recording(tmp_path / "episode") as (recorder, ctx):
+            received_ns, message = self.records(ctx, 1)[0]
+            assert isinstance(message, JointState)
+            copy = attrs.evolve(message, position=message.position.copy())
+            recorder.write(self.topic, message, received_ns)
+            message.position[:] = 0.0
+            path = recorder.end(self._end(ctx, "success"))
+            assert path is not None
+            assert list(self.read_back(path)[self.topic]) == [(received_ns, copy)]

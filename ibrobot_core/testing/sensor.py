@@ -1,0 +1,136 @@
+"""The conformance suite of sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+
+from ibrobot_core.errors import SensorError
+from ibrobot_core.interfaces import Context, Sensor
+from ibrobot_core.messages import MESSAGE_TYPES, CameraInfo, Image, Message
+from ibrobot_core.testing.suite import Suite
+
+_BYTES_PER_PIXEL = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1, "mono16": 2, "16UC1": 2, "32FC1": 4}
+
+
+class SensorSuite(Suite[Sensor]):
+    """What every `Sensor` must do. A driver runs it against a fake of its device."""
+
+    timeout_s: ClassVar[float] = 5.0
+    """How long a check waits for a message that must come [s]."""
+
+    def trigger(self, sensor: Sensor, ctx: Context) -> None:
+        """Make the device capture once more, at a later time; as it stands, one control period passes."""
+        ctx.clock.sleep_until(ctx.clock.now_ns() + ctx.period_ns)
+
+    def silence(self, sensor: Sensor) -> None:
+        """Make the device fall silent; override for a device that captures without `trigger`."""
+
+    @contextmanager
+    def opened(self) -> Iterator[tuple[Sensor, Context]]:
+        """An open sensor with its context."""
+        ctx = self.context()
+        sensor = self.make(ctx)
+        try:
+            sensor.open()
+            yield sensor, ctx
+        finally:
+            sensor.close()
+
+    def _next(self, sensor: Sensor, ctx: Context) -> Any:
+        self.trigger(sensor, ctx)
+        message = sensor.read(self.timeout_s)
+        assert message is not None, f"no message within {self.timeout_s} s"
+        return message
+
+    def test_topic_and_type_are_declared(self) -> None:
+        """`topic` begins with / and `message_type` is one of the messages, before `open`."""
+        sensor = self.make(self.context())
+        assert sensor.topic.startswith("/")
+        assert MESSAGE_TYPES.get(sensor.message_type.ros_type) is sensor.message_type
+
+    def test_messages_are_of_the_declared_type(self) -> None:
+        """Every message is a `message_type`."""
+        with self.opened() as (sensor, ctx):
+            for _ in range(3):
+                assert type(self._next(sensor, ctx)) is sensor.message_type
+
+    def test_stamps_strictly_increase(self) -> None:
+        """The stamp of capture is later for each message, and not in the future."""
+        with self.opened() as (sensor, ctx):
+            previous = -1
+            for _ in range(5):
+                stamp_ns = self._next(sensor, ctx).header.stamp_ns
+                assert type(stamp_ns) is int
+                assert previous < stamp_ns <= ctx.clock.now_ns()
+                previous = stamp_ns
+
+    def test_silence_gives_none(self) -> None:
+        """A device that captures nothing more gives None, never its last message under a new stamp."""
+        with self.opened() as (sensor, ctx):
+            self._next(sensor, ctx)
+            self.silence(sensor)
+            waiting = [sensor.read(0.01) for _ in range(3)]
+            assert waiting[-1] is None, "a message came though the device captured nothing"
+
+    def test_messages_stay_as_they_were(self) -> None:
+        """A message does not change when the next one is read."""
+        with self.opened() as (sensor, ctx):
+            first = self._next(sensor, ctx)
+            arrays = {name: value.copy() for name, value in _arrays(first).items()}
+            for _ in range(3):
+                self._next(sensor, ctx)
+            for name, value in _arrays(first).items():
+                np.testing.assert_array_equal(value, arrays[name], err_msg=f"{name} changed")
+
+    def test_images_are_whole(self) -> None:
+        """An image has `height` rows of `step` bytes, each with room for `width` pixels."""
+        with self.opened() as (sensor, ctx):
+            image = self._next(sensor, ctx)
+            if not isinstance(image, Image):
+                pytest.skip("gives no images")
+            assert image.encoding in _BYTES_PER_PIXEL
+            assert image.height > 0
+            assert image.step >= image.width * _BYTES_PER_PIXEL[image.encoding] > 0
+            assert image.data.shape == (image.height * image.step,)
+
+    def test_latched_messages_fit(self) -> None:
+        """Latched messages are messages on topics of their own; a CameraInfo has the size of the images."""
+        with self.opened() as (sensor, ctx):
+            message = self._next(sensor, ctx)
+            for topic, latched in sensor.latched():
+                assert topic.startswith("/")
+                assert topic != sensor.topic
+                assert isinstance(latched, Message)
+                if isinstance(latched, CameraInfo) and isinstance(message, Image):
+                    assert (latched.height, latched.width) == (message.height, message.width)
+
+    def test_close_is_safe_at_any_time(self) -> None:
+        """`close` may come before `open` and twice; `open` works again afterwards."""
+        ctx = self.context()
+        sensor = self.make(ctx)
+        sensor.close()
+        sensor.open()
+        sensor.close()
+        sensor.close()
+        try:
+            sensor.open()
+            self._next(sensor, ctx)
+        finally:
+            sensor.close()
+
+    def test_refuses_reading_while_closed(self) -> None:
+        """`read` raises SensorError once closed."""
+        with self.opened() as (sensor, _):
+            pass
+        with pytest.raises(SensorError):
+            sensor.read(0.01)
+
+
+def _arrays(message: Message) -> dict[str, Any]:
+    names = (name for name in dir(message) if not name.startswith("_"))
+    return {name: value for name in names if isinstance(value := getattr(message, name), np.ndarray)}

@@ -1,0 +1,57 @@
+"""What all conformance suites share: a context, `make`, and a way to run the checks without pytest."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from ibrobot_core.interfaces import Context
+from ibrobot_core.testing.contexts import host_context
+
+
+class Suite[T]:
+    """Base of the suites. A plugin's test subclasses one, under a name that begins with `Test`, and writes `make`."""
+
+    def make(self, ctx: Context) -> T:
+        """A new object under test, not yet connected, opened or loaded."""
+        raise NotImplementedError(f"{type(self).__name__} must define make(self, ctx)")
+
+    def context(self) -> Context:
+        """The context for `make`; override for another robot, clock or options."""
+        return host_context()
+
+
+def run_checks[T](suite: type[Suite[T]], directory: Path) -> dict[str, BaseException | None]:
+    """Run every check of `suite`, for tests of the suites themselves and for trying out wrong implementations.
+
+    Args:
+        suite: the suite, with its `make`.
+        directory: where checks that write files get a directory each.
+
+    Returns:
+        Name of the check -> what it raised, or None where it passed; checks that were skipped are left out.
+    """
+    results: dict[str, BaseException | None] = {}
+    for name, check in inspect.getmembers(suite, inspect.isfunction):
+        if not name.startswith("test_"):
+            continue
+        tmp_path = directory / name
+        tmp_path.mkdir(parents=True)
+        bound: Callable[..., None] = getattr(suite(), name)
+        try:
+            bound(tmp_path) if "tmp_path" in inspect.signature(check).parameters else bound()
+        except pytest.skip.Exception:
+            continue
+        except (Exception, pytest.fail.Exception) as error:  # noqa: BLE001 - what was raised is the result
+            results[name] = error
+        else:
+            results[name] = None
+    return results
+
+
+def failed_checks[T](suite: type[Suite[T]], directory: Path) -> set[str]:
+    """Names of the checks of `suite` that fail, without their `test_`; see `run_checks`."""
+    return {name.removeprefix("test_") for name, error in run_checks(suite, directory).items() if error is not None}

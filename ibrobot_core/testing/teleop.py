@@ -1,0 +1,145 @@
+"""The conformance suite of teleoperation devices."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+from ibrobot_core.errors import TeleopError
+from ibrobot_core.interfaces import Context, JointReading, Teleop, TeleopCommand
+from ibrobot_core.robot import Vector
+from ibrobot_core.testing.suite import Suite
+
+
+class TeleopSuite(Suite[Teleop]):
+    """What every `Teleop` must do. The subclass plays the operator: `engage`, `release` and `operate`."""
+
+    has_deadman: ClassVar[bool] = True
+    """Whether the device has a deadman that `release` lets go."""
+    tolerance_rad: ClassVar[float] = 1e-6
+    """How far the first positions may be from the measured ones [rad]."""
+
+    def engage(self, teleop: Teleop) -> None:
+        """The operator presses the deadman; leave it as it is for a device without one."""
+
+    def release(self, teleop: Teleop) -> None:
+        """The operator lets the deadman go."""
+        raise NotImplementedError(f"{type(self).__name__} must define release, or set has_deadman = False")
+
+    def operate(self, teleop: Teleop) -> None:
+        """The operator, with the deadman pressed, asks for motion."""
+        raise NotImplementedError(f"{type(self).__name__} must define operate(self, teleop)")
+
+    @contextmanager
+    def connected(self) -> Iterator[tuple[Teleop, Context]]:
+        """A connected device with its context."""
+        ctx = self.context()
+        teleop = self.make(ctx)
+        try:
+            teleop.connect()
+            yield teleop, ctx
+        finally:
+            teleop.disconnect()
+
+    def poses(self, ctx: Context) -> list[Vector]:
+        """Measured positions [rad], each shape (J,), that the checks begin from: none at zero, all within limits."""
+        lower, upper = ctx.robot.lower, ctx.robot.upper
+        return [lower + share * (upper - lower) for share in (0.3, 0.6)]
+
+    def _measure(self, ctx: Context, position: Vector) -> JointReading:
+        ctx.clock.sleep_until(ctx.clock.now_ns() + ctx.period_ns)
+        return JointReading(ctx.clock.now_ns(), position.copy(), np.zeros_like(position), np.zeros_like(position))
+
+    def _begin(self, teleop: Teleop, ctx: Context, position: Vector) -> TeleopCommand:
+        teleop.activate(self._measure(ctx, position))
+        self.engage(teleop)
+        return teleop.read(self._measure(ctx, position))
+
+    def test_begins_where_the_robot_is(self) -> None:
+        """The first positions after each `activate` are the measured ones."""
+        with self.connected() as (teleop, ctx):
+            for pose in self.poses(ctx):
+                command = self._begin(teleop, ctx, pose)
+                assert command.positions, "no positions with the deadman pressed"
+                for joint, position in command.positions.items():
+                    measured = pose[ctx.robot.joint_names.index(joint)]
+                    assert abs(position - measured) <= self.tolerance_rad, (
+                        f"{joint} jumps from {measured} to {position}"
+                    )
+
+    def test_positions_are_of_known_joints(self) -> None:
+        """Every position is a finite number of a joint of the robot."""
+        with self.connected() as (teleop, ctx):
+            pose = self.poses(ctx)[0]
+            commands = [self._begin(teleop, ctx, pose)]
+            self.operate(teleop)
+            commands += [teleop.read(self._measure(ctx, pose)) for _ in range(10)]
+            for command in commands:
+                for joint, position in (command.positions or {}).items():
+                    assert joint in ctx.robot.joint_names, f"{joint!r} is no joint of this robot"
+                    assert np.isfinite(position)
+
+    def test_operating_moves(self) -> None:
+        """Once the operator asks for motion, positions leave the first ones within a second."""
+        with self.connected() as (teleop, ctx):
+            pose = self.poses(ctx)[0]
+            first = self._begin(teleop, ctx, pose).positions or {}
+            self.operate(teleop)
+            for _ in range(100):
+                positions = teleop.read(self._measure(ctx, pose)).positions or {}
+                if any(abs(positions[j] - first.get(j, positions[j])) > self.tolerance_rad for j in positions):
+                    return
+            pytest.fail("the operator asked for motion and none came")
+
+    def test_released_deadman_gives_none(self) -> None:
+        """While the deadman is released, positions are None, before it was ever pressed and after."""
+        if not self.has_deadman:
+            pytest.skip("has no deadman")
+        with self.connected() as (teleop, ctx):
+            pose = self.poses(ctx)[0]
+            teleop.activate(self._measure(ctx, pose))
+            assert teleop.read(self._measure(ctx, pose)).positions is None
+            self.engage(teleop)
+            assert teleop.read(self._measure(ctx, pose)).positions is not None
+            self.release(teleop)
+            commands = [teleop.read(self._measure(ctx, pose)) for _ in range(2)]
+            assert commands[-1].positions is None
+
+    def test_leaves_the_measurement_alone(self) -> None:
+        """`activate` and `read` change nothing in `measured`, nor does a later change of it reach the device."""
+        with self.connected() as (teleop, ctx):
+            pose = self.poses(ctx)[0]
+            begin, now = self._measure(ctx, pose), self._measure(ctx, pose)
+            teleop.activate(begin)
+            np.testing.assert_array_equal(begin.position, pose)
+            begin.position[:] = 0.0
+            self.engage(teleop)
+            positions = teleop.read(now).positions or {}
+            np.testing.assert_array_equal(now.position, pose)
+            for joint, position in positions.items():
+                assert abs(position - pose[ctx.robot.joint_names.index(joint)]) <= self.tolerance_rad
+
+    def test_disconnect_is_safe_at_any_time(self) -> None:
+        """`disconnect` may come before `connect` and twice; `connect` works again afterwards."""
+        ctx = self.context()
+        teleop = self.make(ctx)
+        teleop.disconnect()
+        teleop.connect()
+        teleop.disconnect()
+        teleop.disconnect()
+        try:
+            teleop.connect()
+            assert isinstance(self._begin(teleop, ctx, self.poses(ctx)[0]), TeleopCommand)
+        finally:
+            teleop.disconnect()
+
+    def test_refuses_reading_while_disconnected(self) -> None:
+        """`read` raises TeleopError once disconnected."""
+        with self.connected() as (teleop, ctx):
+            pass
+        with pytest.raises(TeleopError):
+            teleop.read(self._measure(ctx, self.poses(ctx)[0]))

@@ -1,0 +1,227 @@
+"""The conformance suite of transports."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import ClassVar
+
+import pytest
+
+from ibrobot_core.errors import TransportError
+from ibrobot_core.interfaces import Context, Transport
+from ibrobot_core.testing.suite import Suite
+
+
+class TransportSuite(Suite[Transport]):
+    """What every `Transport` must do, between two ends."""
+
+    wait_s: ClassVar[float] = 10.0
+    """How long a check waits for what must come [s]."""
+    short_s: ClassVar[float] = 0.05
+    """How long a check waits for what must not come [s]."""
+
+    def make_pair(self, ctx: Context) -> tuple[Transport, Transport]:
+        """Two connected ends; one object twice for a transport within a process."""
+        transport = self.make(ctx)
+        return transport, transport
+
+    def settle(self, near: Transport, far: Transport) -> None:
+        """Wait until subscriptions and services of one end are known to the other."""
+
+    @contextmanager
+    def ends(self) -> Iterator[tuple[Transport, Transport]]:
+        """Two connected ends."""
+        near, far = self.make_pair(self.context())
+        try:
+            yield near, far
+        finally:
+            near.close()
+            far.close()
+
+    def test_delivers_in_order(self) -> None:
+        """Every payload arrives once, whole, in the order sent; empty and large ones too."""
+        payloads = [b"", b"\x00\xff" * 500_000, *(str(i).encode() for i in range(200))]
+        with self.ends() as (near, far):
+            arrived: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+            far.subscribe("topic", arrived.put)
+            self.settle(near, far)
+            for payload in payloads:
+                near.publish("topic", payload)
+            assert [arrived.get(timeout=self.wait_s) for _ in payloads] == payloads
+
+    def test_every_subscriber_gets_its_topic_only(self) -> None:
+        """Each subscriber of a topic gets every payload on it, and none of another."""
+        with self.ends() as (near, far):
+            first: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+            second: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+            far.subscribe("a", first.put)
+            far.subscribe("a", second.put)
+            self.settle(near, far)
+            near.publish("b", b"other")
+            near.publish("a", b"own")
+            assert first.get(timeout=self.wait_s) == second.get(timeout=self.wait_s) == b"own"
+
+    def test_an_ended_subscription_is_silent(self) -> None:
+        """After its end a subscriber gets nothing; others do."""
+        with self.ends() as (near, far):
+            ended: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+            going: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+            end = far.subscribe("topic", ended.put)
+            far.subscribe("topic", going.put)
+            self.settle(near, far)
+            end()
+            end()
+            near.publish("topic", b"x")
+            assert going.get(timeout=self.wait_s) == b"x"
+            with pytest.raises(queue.Empty):
+                ended.get(timeout=self.short_s)
+
+    def test_a_slow_subscriber_blocks_nobody(self) -> None:
+        """`publish` returns and others are served while one callback does not return."""
+        with self.ends() as (near, far):
+            release = threading.Event()
+            arrived: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+
+            def slow(payload: bytes) -> None:
+                release.wait(self.wait_s)
+
+            far.subscribe("topic", slow)
+            far.subscribe("topic", arrived.put)
+            self.settle(near, far)
+            publisher = threading.Thread(target=lambda: [near.publish("topic", b"x") for _ in range(3)], daemon=True)
+            publisher.start()
+            try:
+                publisher.join(self.wait_s / 2)
+                assert not publisher.is_alive(), "publish waits for a slow subscriber"
+                for _ in range(3):
+                    assert arrived.get(timeout=self.wait_s / 2) == b"x"
+            finally:
+                release.set()
+                publisher.join()
+
+    def test_a_failing_subscriber_harms_nobody(self) -> None:
+        """A callback that raises reaches neither the publisher nor other subscribers, and is called again."""
+        with self.ends() as (near, far):
+            calls: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+            arrived: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+
+            def failing(payload: bytes) -> None:
+                calls.put(payload)
+                raise ValueError("the callback failed")
+
+            far.subscribe("topic", failing)
+            far.subscribe("topic", arrived.put)
+            self.settle(near, far)
+            for payload in (b"1", b"2"):
+                near.publish("topic", payload)
+                assert arrived.get(timeout=self.wait_s) == payload
+                assert calls.get(timeout=self.wait_s) == payload
+
+    def test_each_request_gets_its_own_answer(self) -> None:
+        """Requests made at the same time are each answered with their own."""
+        with self.ends() as (near, far):
+            far.serve("echo", lambda payload: payload + b"!")
+            self.settle(near, far)
+            answers: dict[int, bytes] = {}
+
+            def ask(i: int) -> None:
+                answers[i] = near.request("echo", str(i).encode(), self.wait_s)
+
+            threads = [threading.Thread(target=ask, args=(i,)) for i in range(20)]
+            for thread in threads:
+                thread.start()
+            for thread in threads:
+                thread.join(self.wait_s)
+            assert answers == {i: f"{i}!".encode() for i in range(20)}
+
+    def test_a_late_answer_is_dropped(self) -> None:
+        """A request that is answered too late fails, and its answer is not given to the next one."""
+        with self.ends() as (near, far):
+            release, done = threading.Event(), threading.Event()
+
+            def answer(payload: bytes) -> bytes:
+                if payload == b"slow":
+                    release.wait(self.wait_s)
+                    done.set()
+                return payload
+
+            far.serve("echo", answer)
+            self.settle(near, far)
+            with pytest.raises(TransportError):
+                near.request("echo", b"slow", self.short_s)
+            release.set()
+            assert done.wait(self.wait_s)
+            for i in range(5):
+                assert near.request("echo", str(i).encode(), self.wait_s) == str(i).encode()
+
+    def test_a_servers_error_reaches_the_requester(self) -> None:
+        """An exception of the server is a TransportError with its text at the requester; the service goes on."""
+        with self.ends() as (near, far):
+
+            def answer(payload: bytes) -> bytes:
+                if payload == b"bad":
+                    raise ValueError("no such thing as bad")
+                return payload
+
+            far.serve("echo", answer)
+            self.settle(near, far)
+            with pytest.raises(TransportError, match="no such thing as bad"):
+                near.request("echo", b"bad", self.wait_s)
+            assert near.request("echo", b"good", self.wait_s) == b"good"
+
+    def test_nobody_serves(self) -> None:
+        """A request for a name that nobody serves, or serves no more, is a TransportError."""
+        with self.ends() as (near, far):
+            with pytest.raises(TransportError):
+                near.request("nobody", b"", self.short_s)
+            end = far.serve("echo", lambda payload: payload)
+            self.settle(near, far)
+            assert near.request("echo", b"x", self.wait_s) == b"x"
+            end()
+            with pytest.raises(TransportError):
+                near.request("echo", b"x", self.short_s)
+
+    def test_a_name_is_served_once(self) -> None:
+        """A second server of a name is refused until the first has ended."""
+        with self.ends() as (near, far):
+            end = far.serve("echo", lambda payload: b"first")
+            with pytest.raises(TransportError, match="echo"):
+                far.serve("echo", lambda payload: b"second")
+            self.settle(near, far)
+            assert near.request("echo", b"", self.wait_s) == b"first"
+            end()
+            far.serve("echo", lambda payload: b"third")
+            self.settle(near, far)
+            assert near.request("echo", b"", self.wait_s) == b"third"
+
+    def test_a_server_may_use_the_transport(self) -> None:
+        """Callbacks and servers may publish and request themselves."""
+        with self.ends() as (near, far):
+            arrived: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+
+            def answer(payload: bytes) -> bytes:
+                far.publish("asked", payload)
+                return payload
+
+            near.subscribe("asked", arrived.put)
+            far.serve("echo", answer)
+            self.settle(near, far)
+            assert near.request("echo", b"x", self.wait_s) == b"x"
+            assert arrived.get(timeout=self.wait_s) == b"x"
+
+    def test_a_closed_transport_refuses(self) -> None:
+        """After `close`, which is safe twice, every call is a TransportError."""
+        with self.ends() as (near, _):
+            near.close()
+            near.close()
+            with pytest.raises(TransportError):
+                near.publish("topic", b"")
+            with pytest.raises(TransportError):
+                near.subscribe("topic", lambda payload: None)
+            with pytest.raises(TransportError):
+                near.serve("name", lambda payload: payload)
+            with pytest.raises(TransportError):
+                near.request("name", b"", self.short_s)

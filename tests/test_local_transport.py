@@ -1,0 +1,55 @@
+"""The local transport passes the suite, and a subscriber's fault is logged."""
+
+from __future__ import annotations
+
+import threading
+from typing import override
+
+import pytest
+
+from ibrobot_core.interfaces import Context, Transport
+from ibrobot_core.local_transport import LocalTransport
+from ibrobot_core.plugins import discover
+from ibrobot_core.testing import TransportSuite, host_context
+
+
+class TestLocalTransport(TransportSuite):
+    @override
+    def make(self, ctx: Context) -> Transport:
+        descriptor = discover([]).find("transport", "local")
+        transport: Transport = descriptor.make(descriptor.options(), ctx)
+        return transport
+
+
+def test_a_failing_subscriber_is_logged(caplog: pytest.LogCaptureFixture) -> None:
+    transport = LocalTransport()
+    called = threading.Event()
+
+    def failing(payload: bytes) -> None:
+        called.set()
+        raise ValueError("cannot read this")
+
+    transport.subscribe("topic", failing)
+    transport.publish("topic", b"x")
+    assert called.wait(5)
+    transport.close()
+    assert "a subscriber of topic failed" in caplog.text
+    assert "cannot read this" in caplog.text
+
+
+def test_a_subscriber_may_end_itself() -> None:
+    transport = TestLocalTransport().make(host_context())
+    arrived: list[bytes] = []
+    done = threading.Event()
+
+    def once(payload: bytes) -> None:
+        arrived.append(payload)
+        end()
+        done.set()
+
+    end = transport.subscribe("topic", once)
+    transport.publish("topic", b"1")
+    transport.publish("topic", b"2")
+    assert done.wait(5)
+    transport.close()
+    assert arrived == [b"1"]
