@@ -41,11 +41,13 @@ class SafetyLayer:
         self._lower = robot.lower.astype(np.float64)
         self._upper = robot.upper.astype(np.float64)
         # Velocities are kept as steps [rad per tick], accelerations as changes of step: no rounding by dt comes in.
-        self._max_step = robot.max_velocity * self._period_s
-        self._max_change = robot.max_acceleration * self._period_s**2
-        # A plan that runs exactly at a limit exceeds it by rounding; that much is let through.
+        max_step = robot.max_velocity * self._period_s
+        self._change = robot.max_acceleration * self._period_s**2
+        # A plan that runs exactly at a limit exceeds it by rounding, and braking along the limit must make up for
+        # rounding: half of the slack is for what is commanded here, the whole of it for what is passed.
         largest = np.maximum(np.abs(self._lower), np.abs(self._upper))
-        self._slack = np.maximum(1e-10 * np.minimum(self._max_step, self._max_change), 8 * np.spacing(largest))
+        slack = np.maximum(1e-10 * np.minimum(max_step, self._change), 32 * np.spacing(largest))
+        self._max_step, self._max_change, self._half_slack = max_step + slack / 2, self._change + slack / 2, slack / 2
         size = len(self._names)
         self._nothing: Vector = np.full(size, np.nan)
         self._counts = np.zeros((len(KINDS), size), dtype=np.int64)
@@ -149,30 +151,32 @@ class SafetyLayer:
 
     def _next(self, wanted: Vector, follow: NDArray[np.bool_]) -> Vector:
         """Advance by a tick towards `wanted` [rad] where `follow`, to a stop elsewhere; shapes (J,)."""
-        position, change, slack = self._position, self._max_change, self._slack
+        position, slack = self._position, self._half_slack
         # A joint that started outside may come in, and then not go back out.
         lower, upper = np.minimum(self._lower, position), np.maximum(self._upper, position)
         target = np.clip(np.where(follow, wanted, position), lower, upper)
         ahead = target - position
         # Where the target moves smoothly it is expected to go on; otherwise to be a place to stop at.
         target_step = target - self._target
-        smooth = np.abs(target_step - self._target_step) <= change + slack
+        smooth = np.abs(target_step - self._target_step) <= self._max_change + slack
         expected = np.where(smooth, target_step, 0.0)
 
-        slowest = np.maximum(self._step - change, -self._max_step)
-        fastest = np.minimum(self._step + change, self._max_step)
-        room_below, room_above = _reach(np.stack((position - lower, upper - position)), change)
-        highest, lowest = np.minimum(fastest, room_above) + slack, np.maximum(slowest, -room_below) - slack
-        within = (lowest <= ahead) & (ahead <= highest)
+        slowest = np.maximum(self._step - self._max_change, -self._max_step)
+        fastest = np.minimum(self._step + self._max_change, self._max_step)
+        room_below, room_above = _reach(np.stack((position - lower, upper - position)), self._change)
+        # Beyond the room to brake by a quarter only: the next step has to make up for it within the slack.
+        within = (ahead <= np.minimum(fastest + slack, room_above + slack / 4)) & (
+            ahead >= np.maximum(slowest - slack, -room_below - slack / 4)
+        )
         # Arriving faster than the target goes would overshoot it; while already on it, it leads.
-        matched = (self._target == position) | (np.abs(ahead - expected) <= change + slack)
+        matched = (self._target == position) | (np.abs(ahead - expected) <= self._max_change + slack)
         passes = follow & within & matched
 
         if passes.all():
             command = target
         else:
             gap = ahead - expected
-            step = np.where(follow, expected + np.copysign(_reach(np.abs(gap), change), gap), 0.0)
+            step = np.where(follow, expected + np.copysign(_reach(np.abs(gap), self._change), gap), 0.0)
             step = np.minimum(np.maximum(step, slowest), fastest)
             # Last, since a position limit must hold even where rounding leaves no step that satisfies all.
             step = np.minimum(np.maximum(step, -room_below), room_above)
@@ -194,7 +198,7 @@ class SafetyLayer:
                 ~known,
                 self._fresh,
                 (wanted < lower) | (wanted > upper),
-                np.abs(step) > self._max_step + self._slack,
+                np.abs(step) > self._max_step + self._half_slack,
                 differs,
             )
         )
