@@ -1,0 +1,156 @@
+"""The joint-space planner: a straight line from rest to rest, in the least time that the limits allow."""
+
+from __future__ import annotations
+
+import math
+from typing import override
+
+import numpy as np
+from numpy.typing import NDArray
+from ruckig import InputParameter, Result, Ruckig, Trajectory  # type: ignore[import-not-found]  # ships no types
+
+from ibrobot_core.errors import PlanningError
+from ibrobot_core.interfaces import Context, JointGoal, Planner, PlanRequest, PoseGoal
+from ibrobot_core.messages import Header, JointTrajectory, JointTrajectoryPoint
+from ibrobot_core.robot import Joint, Vector
+from ibrobot_core.units import NS_PER_S, ns
+from ibrobot_planning.options import JointPlannerOptions
+
+_SHORTEST_PHASE_S = 1e-6
+"""Shorter phases of the profile get no point of their own: interpolation would divide by their time."""
+_AT_GOAL = 1e-9
+"""Greatest distance [rad] that counts as none."""
+
+
+class JointPlanner(Planner):
+    """Plans in joint space, past any obstacle: it knows limits, not shapes.
+
+    All joints move along one straight line, so the motion has one degree of freedom, the way along that line; the joint
+    with the tightest limit sets its pace.
+    """
+
+    def __init__(self, options: JointPlannerOptions, ctx: Context) -> None:
+        self._options = options
+        self._joints = {joint.name: joint for joint in ctx.robot.joints}
+        self._clock = ctx.clock
+
+    @override
+    def plan(self, request: PlanRequest) -> JointTrajectory:
+        joints = self._check_start(request)
+        delta = self._goal(request, joints) - request.start
+        velocity = self._options.velocity_scaling * _fraction("velocity_scaling", request.velocity_scaling)
+        acceleration = self._options.acceleration_scaling * _fraction(
+            "acceleration_scaling", request.acceleration_scaling
+        )
+        header = Header(stamp_ns=self._clock.now_ns())
+        distance = float(np.max(np.abs(delta), initial=0.0))
+        if distance < _AT_GOAL:
+            rest = np.zeros(len(joints))
+            return JointTrajectory(header, request.joints, (JointTrajectoryPoint(0, request.start, rest, rest),))
+        # Limits along the line, measured on the joint that moves farthest: the others move by a fraction of its way.
+        share = np.abs(delta) / distance
+        moving = share > _AT_GOAL
+
+        def along(values: list[float]) -> float:
+            return float(np.min(np.array(values)[moving] / share[moving]))
+
+        limits = [
+            along([joint.max_velocity * velocity for joint in joints]),
+            along([joint.max_acceleration * acceleration for joint in joints]),
+            self._options.max_jerk,
+        ]
+        direction = delta / distance
+        points = tuple(
+            JointTrajectoryPoint(stamp, request.start + way * direction, speed * direction, rate * direction)
+            for stamp, way, speed, rate in _profile(distance, limits, self._options.step)
+        )
+        return JointTrajectory(header, request.joints, points)
+
+    def _check_start(self, request: PlanRequest) -> list[Joint]:
+        """The joints of the request, once they and its start make sense."""
+        joints = [self._joint(name) for name in request.joints]
+        if np.shape(request.start) != (len(joints),):
+            raise PlanningError(f"start has shape {np.shape(request.start)}, must be ({len(joints)},): one per joint")
+        # A start outside the limits is let pass: an arm at rest may sag beyond them, and the way in must stay open.
+        for joint, value in zip(joints, request.start, strict=True):
+            if not math.isfinite(value):
+                raise PlanningError(f"start of joint {joint.name} is {value}, must be finite")
+        return joints
+
+    def _goal(self, request: PlanRequest, joints: list[Joint]) -> Vector:
+        """Where every joint of the request ends [rad], shape (J,)."""
+        goal = request.goal
+        if isinstance(goal, PoseGoal):
+            raise PlanningError(
+                "planner type 'joint' knows joint goals only, not poses of the tool: "
+                "name a pose of robot.description.poses, or use another type of planner, one for Cartesian goals"
+            )
+        self._check_goal(goal)
+        target = np.array(request.start, dtype=float)
+        for name, value in zip(goal.joints, goal.positions, strict=True):
+            if name not in request.joints:
+                raise PlanningError(f"goal names joint {name!r}, which is not planned: {', '.join(request.joints)}")
+            target[request.joints.index(name)] = value
+        return target
+
+    def _check_goal(self, goal: JointGoal) -> None:
+        if np.shape(goal.positions) != (len(goal.joints),):
+            raise PlanningError(f"goal has {len(goal.joints)} joints but positions of shape {np.shape(goal.positions)}")
+        for i, (name, value) in enumerate(zip(goal.joints, goal.positions, strict=True)):
+            joint = self._joint(name)
+            if name in goal.joints[:i]:
+                raise PlanningError(f"goal names joint {name!r} twice")
+            # Written so that NaN fails it.
+            if not joint.lower <= value <= joint.upper:
+                raise PlanningError(
+                    f"goal of joint {name} is {value} rad, must be within {joint.lower} .. {joint.upper} rad"
+                )
+
+    def _joint(self, name: str) -> Joint:
+        if name not in self._joints:
+            raise PlanningError(f"no joint {name!r}; the joints are: {', '.join(self._joints)}")
+        return self._joints[name]
+
+
+def _fraction(name: str, value: float) -> float:
+    if not 0 < value <= 1:
+        raise PlanningError(f"{name} is {value}, must be above 0 and at most 1")
+    return value
+
+
+def _profile(distance: float, limits: list[float], step: float) -> list[tuple[int, float, float, float]]:
+    """The fastest way from rest to rest over `distance` under `limits` on velocity, acceleration and jerk.
+
+    Jerk is constant in each phase of the profile, and every phase begins and ends on a point: an executor that
+    interpolates with positions, velocities and accelerations follows the profile exactly.
+
+    Returns:
+        Per point: time [ns], way, speed and its rate of change.
+    """
+    limit = InputParameter(1)
+    limit.target_position = [distance]
+    limit.max_velocity, limit.max_acceleration, limit.max_jerk = ([value] for value in limits)
+    trajectory = Trajectory(1)
+    result = Ruckig(1).calculate(limit, trajectory)
+    if result is not Result.Working:
+        raise PlanningError(f"no profile over {distance} rad within velocity, acceleration, jerk {limits}: {result}")
+    points = [(0, 0.0, 0.0, 0.0)]
+    for stamp in _stamps(np.cumsum(trajectory.profiles[0][0].t), step):
+        position, velocity, acceleration = trajectory.at_time(stamp / NS_PER_S)
+        points.append((stamp, position[0], velocity[0], acceleration[0]))
+    end = max(points[-1][0], 1)
+    points[-1] = (end, distance, 0.0, 0.0)
+    return points
+
+
+def _stamps(ends: NDArray[np.float64], step: float) -> list[int]:
+    """Times [ns] that cut each phase, ending at `ends` [s], into equal parts of at most `step` [s]; zero left out."""
+    stamps: list[int] = []
+    begin = 0.0
+    for end in ends:
+        if end - begin < _SHORTEST_PHASE_S:
+            continue
+        parts = math.ceil((end - begin) / step)
+        stamps += [ns(time) for time in np.linspace(begin, end, parts + 1)[1:]]
+        begin = float(end)
+    return stamps or [ns(float(ends[-1]))]
