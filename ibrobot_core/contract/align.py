@@ -1,0 +1,120 @@
+"""Alignment: which sample of a stream is its value at a tick. The one place that decides it, live and offline."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import attrs
+
+from ibrobot_core.config.schema import Align
+from ibrobot_core.units import NS_PER_S
+
+
+@attrs.frozen(eq=False)
+class Sample[T]:
+    """A value with the stamp that counts for alignment and the time of its receipt [ns]."""
+
+    stamp_ns: int
+    received_ns: int
+    value: T
+
+
+class Stream[T]:
+    """One topic's samples, and the one that counts at a tick.
+
+    At tick `t` only samples count whose stamp is `<= t` and that were received by `t`: what a live run could not
+    have seen yet, a conversion does not see either. Of these the newest by stamp is chosen, of equal stamps the one
+    received last; then `hold` gives it at any age, `asof` if `t - stamp <= tol_ms`, `drop` if `stamp > t - step`.
+
+    A jump of the stamps resets the stream: all earlier samples are forgotten, and `resets` counts it. With a limit of
+    `max(1 s, 2 steps)`, a jump is
+
+    - a stamp further than the limit ahead of the newest so far, or behind it. A smaller step back is a message
+      that came out of order, and has its place by its stamp. (A sender whose clock is set back by less than the limit
+      therefore goes unnoticed until it has caught up; `asof` and `drop` bound the age of what is used meanwhile.)
+    - a stamp further than the limit ahead of its own receipt: the sender's clock is not ours, and nobody knows at which
+      tick the sample would be due. It is not kept.
+
+    So what is kept is bounded: the chosen sample, those stamped ahead of the tick by the limit at most, and those
+    added but not yet received at the tick.
+
+    Args:
+        align: strategy, the stamp that counts, and for `asof` the greatest age.
+        step_ns: time from tick to tick [ns].
+    """
+
+    def __init__(self, align: Align, step_ns: int) -> None:
+        self.resets = 0
+        self._by_header = align.stamp == "header"
+        self._limit_ns = max(NS_PER_S, 2 * step_ns)
+        # The age up to which a sample counts [ns]; `stamp > t - step` is, in integers, an age of step - 1 at most.
+        tolerance_ns = round((align.tol_ms or 0.0) * 1e6)
+        self._max_age_ns = {"hold": None, "asof": tolerance_ns, "drop": step_ns - 1}[align.strategy]
+        self._unseen: deque[Sample[T]] = deque()
+        self._ahead: list[Sample[T]] = []
+        self._chosen: Sample[T] | None = None
+        self._newest_ns: int | None = None
+        self._received_ns: int | None = None
+        self._tick_ns: int | None = None
+
+    def add(self, stamp_header_ns: int | None, received_ns: int, value: T) -> None:
+        """Add a sample, in the order of receipt.
+
+        Args:
+            stamp_header_ns: the header's stamp [ns]; None for a message without a header.
+            received_ns: time of receipt [ns].
+            value: what `at` gives back, untouched.
+
+        Raises:
+            ValueError: when it was received before its predecessor, or lacks the header stamp that should count.
+        """
+        if self._received_ns is not None and received_ns < self._received_ns:
+            raise ValueError(f"samples come in the order of receipt, got {received_ns} after {self._received_ns} ns")
+        stamp_ns = stamp_header_ns if self._by_header else received_ns
+        if stamp_ns is None:
+            raise ValueError("a stream aligned by header stamps got a sample without one; align it by `stamp: receive`")
+        self._received_ns = received_ns
+        self._unseen.append(Sample(stamp_ns, received_ns, value))
+
+    def at(self, t_ns: int) -> Sample[T] | None:
+        """The sample that counts at tick `t_ns` [ns], or None where it is missing.
+
+        Raises:
+            ValueError: for a tick before the last one asked for.
+        """
+        if self._tick_ns is not None and t_ns < self._tick_ns:
+            raise ValueError(f"ticks must not go back, got {t_ns} ns after {self._tick_ns} ns")
+        self._tick_ns = t_ns
+        while self._unseen and self._unseen[0].received_ns <= t_ns:
+            self._take(self._unseen.popleft())
+        if self._ahead:
+            self._choose(t_ns)
+        if self._chosen is None:
+            return None
+        if self._max_age_ns is not None and t_ns - self._chosen.stamp_ns > self._max_age_ns:
+            return None
+        return self._chosen
+
+    def _take(self, sample: Sample[T]) -> None:
+        """See a sample at last: note a jump, and keep it until it is due."""
+        from_future = sample.stamp_ns - sample.received_ns > self._limit_ns
+        newest_ns = sample.stamp_ns if self._newest_ns is None else self._newest_ns
+        if from_future or abs(sample.stamp_ns - newest_ns) > self._limit_ns:
+            self.resets += 1
+            self._ahead.clear()
+            self._chosen = self._newest_ns = None
+            if from_future:
+                return
+            newest_ns = sample.stamp_ns
+        self._newest_ns = max(newest_ns, sample.stamp_ns)
+        self._ahead.append(sample)
+
+    def _choose(self, t_ns: int) -> None:
+        """Move the choice on to the newest sample that is due; `_ahead` is in the order of receipt."""
+        ahead = []
+        for sample in self._ahead:
+            if sample.stamp_ns > t_ns:
+                ahead.append(sample)
+            elif self._chosen is None or sample.stamp_ns >= self._chosen.stamp_ns:
+                self._chosen = sample
+        self._ahead = ahead

@@ -1,0 +1,229 @@
+"""Frames: all observations of a tick, sampled live from the bus or offline from recorded messages by the same code."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ibrobot_core.bus import Bus, Received
+from ibrobot_core.contract.align import Sample, Stream
+from ibrobot_core.contract.image import decode_image
+from ibrobot_core.contract.select import Selection
+from ibrobot_core.contract.specs import Contract, ObservationPart
+from ibrobot_core.errors import ContractError
+from ibrobot_core.interfaces.policy import Frame
+from ibrobot_core.messages import Message
+
+_IMAGE_DEPTH = 32
+_VECTOR_DEPTH = 256
+
+type _Array = NDArray[np.generic]
+
+
+class _Part:
+    """One topic's part of an observation: its stream, and the decoded value of the sample last chosen."""
+
+    def __init__(self, part: ObservationPart, step_ns: int) -> None:
+        self.part = part
+        self.stream: Stream[Message] = Stream(part.align, step_ns)
+        self._read: Callable[[Any], _Array] = (
+            Selection(part.type, part.select) if part.image is None else partial(decode_image, spec=part.image)
+        )
+        self._sample: Sample[Message] | None = None
+        self._value: _Array | None = None
+
+    def take(self, message: Message, received_ns: int) -> None:
+        if message.ros_type != self.part.type:
+            raise ContractError(f"{self.part.key}: {self.part.topic} is a {self.part.type}, got a {message.ros_type}")
+        stamp_ns = message.header.stamp_ns if hasattr(message, "header") else None
+        self.stream.add(stamp_ns, received_ns, message)
+
+    def at(self, t_ns: int) -> _Array | None:
+        sample = self.stream.at(t_ns)
+        if sample is None:
+            return None
+        if sample is not self._sample:
+            self._value = self._decode(sample.value)
+            self._sample = sample
+        return self._value
+
+    def _decode(self, message: Message) -> _Array | None:
+        """The message's value, read-only; None for a vector with something in it that was not measured."""
+        try:
+            value = self._read(message)
+        except ContractError as error:
+            raise ContractError(f"{self.part.key}: {self.part.topic}: {error}") from None
+        shape = self.part.feature.shape
+        if any(wanted not in (-1, found) for wanted, found in zip(shape, value.shape, strict=True)):
+            raise ContractError(f"{self.part.key}: {self.part.topic} gives {value.shape}, the contract says {shape}")
+        if self.part.image is None and not np.isfinite(value).all():
+            return None
+        value.flags.writeable = False
+        return value
+
+
+class FrameAssembler:
+    """Messages in, frames out. Live sampling and conversion differ only in where the messages come from.
+
+    Images are decoded once for each sample, and nothing is decoded that no frame asks for. Arrays in frames are
+    read-only, since the frames of several ticks may share them.
+
+    Args:
+        contract: what to assemble.
+        keys: the observations wanted; all when None.
+
+    Raises:
+        ContractError: for a key that the contract does not have.
+    """
+
+    def __init__(self, contract: Contract, keys: Collection[str] | None = None) -> None:
+        wanted = list(contract.observations) if keys is None else list(keys)
+        unknown = [key for key in wanted if key not in contract.observations]
+        if unknown:
+            has = ", ".join(contract.observations) or "none"
+            raise ContractError(f"the contract has no observation {unknown[0]!r}; it has: {has}")
+        self._keys = {key: [_Part(part, contract.step_ns) for part in contract.parts(key)] for key in wanted}
+        self._topics: dict[str, list[_Part]] = {}
+        for part in (part for parts in self._keys.values() for part in parts):
+            self._topics.setdefault(part.part.topic, []).append(part)
+
+    def topics(self) -> Mapping[str, bool]:
+        """The topics that it wants, and whether they carry images."""
+        return {topic: parts[0].part.image is not None for topic, parts in self._topics.items()}
+
+    def resets(self) -> dict[str, int]:
+        """How often the stamps of a topic jumped, per topic; topics without a jump left out."""
+        counts = {topic: max(part.stream.resets for part in parts) for topic, parts in self._topics.items()}
+        return {topic: count for topic, count in counts.items() if count}
+
+    def take(self, topic: str, message: Message, received_ns: int) -> None:
+        """Take a message in, each topic's in the order of receipt; those of other topics are passed over.
+
+        Raises:
+            ContractError: for a message of another type than the contract's.
+        """
+        for part in self._topics.get(topic, ()):
+            part.take(message, received_ns)
+
+    def advance(self, t_ns: int) -> None:
+        """Move on to tick `t_ns` [ns] without decoding; forget what no later tick can choose."""
+        for parts in self._keys.values():
+            for part in parts:
+                part.stream.at(t_ns)
+
+    def frame(self, t_ns: int) -> Frame:
+        """The frame at tick `t_ns` [ns]; ticks never go back.
+
+        Raises:
+            ContractError: for a chosen message that does not fit the contract, e.g. without a joint that is selected.
+        """
+        values = {}
+        for key, parts in self._keys.items():
+            pieces = [piece for part in parts if (piece := part.at(t_ns)) is not None]
+            if len(pieces) == len(parts):
+                values[key] = pieces[0] if len(pieces) == 1 else _concatenate(pieces)
+        return Frame(t_ns, values, frozenset(self._keys) - frozenset(values))
+
+
+class FrameSampler:
+    """Frames from the bus, live. One thread owns it.
+
+    A frame at `t` has what was received by `t`, so that the frame made from the recording is the same bit for bit.
+    It follows that `t` should be `Bus.snapshot_ns()`, or a tick a little before it. Queues hold the newest 32 images
+    or 256 other messages of a topic; where frames are asked for less often, call `advance` at every tick, or the
+    queues run over (`Bus.dropped` counts that).
+
+    Args:
+        contract: what to sample.
+        bus: where the messages are.
+        keys: the observations wanted; all when None.
+
+    Raises:
+        ContractError: for a key that the contract does not have.
+    """
+
+    def __init__(self, contract: Contract, bus: Bus, keys: Collection[str] | None = None) -> None:
+        self._assembler = FrameAssembler(contract, keys)
+        depths = {True: _IMAGE_DEPTH, False: _VECTOR_DEPTH}
+        topics = self._assembler.topics()
+        self._subscriptions = [bus.subscribe(topic, depths[is_image]) for topic, is_image in topics.items()]
+        self._early: dict[str, Received] = {}
+
+    def sample(self, t_ns: int) -> Frame:
+        """The frame at tick `t_ns` [ns]; ticks never go back.
+
+        Raises:
+            ContractError: for a message that does not fit the contract.
+        """
+        self._drain(t_ns)
+        return self._assembler.frame(t_ns)
+
+    def advance(self, t_ns: int) -> None:
+        """Take in what was received by tick `t_ns` [ns], decoding nothing; a few microseconds."""
+        self._drain(t_ns)
+        self._assembler.advance(t_ns)
+
+    def resets(self) -> dict[str, int]:
+        """How often the stamps of a topic jumped, per topic; topics without a jump left out."""
+        return self._assembler.resets()
+
+    def close(self) -> None:
+        """Leave the bus. Safe to call twice."""
+        for subscription in self._subscriptions:
+            subscription.close()
+
+    def _drain(self, t_ns: int) -> None:
+        """Move what was received by `t_ns` from the queues to the streams; the rest waits in the bounded queues."""
+        for subscription in self._subscriptions:
+            while (item := self._early.pop(subscription.topic, None) or subscription.get()) is not None:
+                if item.received_ns > t_ns:
+                    self._early[subscription.topic] = item
+                    break
+                self._assembler.take(item.topic, item.message, item.received_ns)
+
+
+def frames(
+    contract: Contract,
+    messages: Iterable[tuple[str, Message, int]],
+    ticks: Iterable[int],
+    keys: Collection[str] | None = None,
+) -> Iterator[Frame]:
+    """Frames from recorded messages: at each tick, bit for bit the frame that a live run would have had.
+
+    Args:
+        contract: what to assemble.
+        messages: topic, message and time of receipt [ns], in the order of receipt, over all topics.
+        ticks: the times of the frames [ns], ascending.
+        keys: the observations wanted; all when None.
+
+    Raises:
+        ContractError: for messages out of the order of receipt, or one that does not fit the contract.
+    """
+    return assemble(FrameAssembler(contract, keys), messages, ticks)
+
+
+def assemble(
+    assembler: FrameAssembler, messages: Iterable[tuple[str, Message, int]], ticks: Iterable[int]
+) -> Iterator[Frame]:
+    """As `frames`, with an assembler that the caller keeps, to read its `resets` afterwards."""
+    source = iter(messages)
+    coming, last_ns = next(source, None), None
+    for t_ns in ticks:
+        while coming is not None and coming[2] <= t_ns:
+            topic, message, received_ns = coming
+            if last_ns is not None and received_ns < last_ns:
+                came = f"{topic} at {received_ns} ns came after {last_ns} ns"
+                raise ContractError(f"messages must come in the order of receipt; {came}")
+            assembler.take(topic, message, received_ns)
+            coming, last_ns = next(source, None), received_ns
+        yield assembler.frame(t_ns)
+
+
+def _concatenate(pieces: list[_Array]) -> _Array:
+    joined = np.concatenate(pieces)
+    joined.flags.writeable = False
+    return joined

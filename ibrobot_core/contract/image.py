@@ -1,0 +1,166 @@
+"""Images: Image messages <-> numpy arrays, for the encodings of sensor_msgs, and resizing without a library."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import attrs
+import numpy as np
+from numpy.typing import NDArray
+
+from ibrobot_core.config.schema import ImageSpec
+from ibrobot_core.errors import ContractError
+from ibrobot_core.messages import Header, Image
+
+ENCODINGS: dict[str, tuple[type[np.generic], int]] = {
+    "rgb8": (np.uint8, 3),
+    "bgr8": (np.uint8, 3),
+    "rgba8": (np.uint8, 4),
+    "bgra8": (np.uint8, 4),
+    "mono8": (np.uint8, 1),
+    "mono16": (np.uint16, 1),
+    "16UC1": (np.uint16, 1),
+    "32FC1": (np.float32, 1),
+}
+"""Encoding -> element type and channels."""
+
+_LUMA = np.array([299, 587, 114], dtype=np.uint32)
+
+
+def pixels(message: Image) -> NDArray[np.generic]:
+    """The pixels of a message as it encodes them, shape (H, W, C), in native byte order; a view where that suffices.
+
+    Raises:
+        ContractError: for an unknown encoding, or fewer bytes than its size needs.
+    """
+    if message.encoding not in ENCODINGS:
+        raise ContractError(f"image encoding {message.encoding!r} is not one of: {', '.join(ENCODINGS)}")
+    element, channels = ENCODINGS[message.encoding]
+    dtype = np.dtype(element).newbyteorder(">" if message.is_bigendian else "<")
+    used = message.width * channels * dtype.itemsize
+    if message.step < used or message.data.size != message.height * message.step:
+        raise ContractError(
+            f"an image of {message.height}x{message.width} {message.encoding} needs rows of at least {used} bytes, and "
+            f"rows x step bytes in all; this one has a step of {message.step} and {message.data.size} bytes"
+        )
+    rows = message.data.reshape(message.height, message.step)[:, :used]
+    typed = rows.view(dtype).reshape(message.height, message.width, channels)
+    return typed.astype(element, copy=False)
+
+
+def decode_image(message: Image, spec: ImageSpec) -> NDArray[np.generic]:
+    """The array that the contract asks for: resized, then converted to its encoding.
+
+    Returns:
+        Shape (H, W, C): uint8 for rgb8, bgr8 and mono8; uint16 for 16UC1 [mm]; float32 for 32FC1 [m].
+
+    Raises:
+        ContractError: for a malformed message, or an encoding that does not become the one asked for.
+    """
+    array = pixels(message)
+    if spec.resize is not None and spec.resize != array.shape[:2]:
+        array = resize(array, *spec.resize)
+    return np.ascontiguousarray(_convert(array, message.encoding, spec.encoding))
+
+
+def encode_image(array: NDArray[Any], encoding: str, header: Header, *, padding: int = 0) -> Image:
+    """An Image message of `array`, little-endian.
+
+    Args:
+        array: shape (H, W, C), or (H, W) for one channel, of the encoding's element type.
+        encoding: one of `ENCODINGS`.
+        header: stamp and frame.
+        padding: bytes after each row.
+
+    Raises:
+        ContractError: for an unknown encoding, or an array that is not of it.
+    """
+    if encoding not in ENCODINGS:
+        raise ContractError(f"image encoding {encoding!r} is not one of: {', '.join(ENCODINGS)}")
+    element, channels = ENCODINGS[encoding]
+    array = array[..., None] if array.ndim == 2 else array
+    if array.dtype != element or array.ndim != 3 or array.shape[2] != channels:
+        wanted = f"{np.dtype(element).name} of shape (H, W, {channels})"
+        raise ContractError(f"{encoding} is {wanted}, got {array.dtype.name} of shape {array.shape}")
+    height, width = array.shape[:2]
+    little = np.ascontiguousarray(array, dtype=np.dtype(element).newbyteorder("<"))
+    rows = little.view(np.uint8).reshape(height, width * channels * little.itemsize)
+    if padding:
+        rows = np.pad(rows, ((0, 0), (0, padding)))
+    return Image(header, height, width, encoding, rows.shape[1], rows.reshape(-1))
+
+
+def resize(array: NDArray[np.generic], height: int, width: int) -> NDArray[np.generic]:
+    """An image of another size, the same bits on every machine.
+
+    Colours (uint8) are averaged over the area that each new pixel covers, in exact integer arithmetic, half rounded up;
+    enlarged, that repeats pixels. Depth (uint16, float32) is picked from the pixel under the new one's centre:
+    a mean over an edge, or with a pixel that has no reading, would be a surface that is not there.
+
+    Args:
+        array: shape (H, W, C).
+        height: new H, at least 1.
+        width: new W, at least 1.
+    """
+    if array.dtype != np.uint8:
+        return np.ascontiguousarray(array[_centres(array.shape[0], height)[:, None], _centres(array.shape[1], width)])
+    # Rows first: they are contiguous, and leave less to do for the columns.
+    rows = _Cover.of(array.shape[0], height)
+    columns = _Cover.of(array.shape[1], width)
+    total = rows.units * columns.units
+    narrow = rows.sums(array.reshape(array.shape[0], -1), 0, 255 * rows.units)
+    summed = columns.sums(narrow.reshape(height, array.shape[1], -1), 1, 255 * total + total // 2)
+    summed += summed.dtype.type(total // 2)
+    summed //= summed.dtype.type(total)
+    return summed.astype(np.uint8)
+
+
+@attrs.frozen
+class _Cover:
+    """What new pixels cover of the old ones along an axis, in whole units: `units` each, an old pixel being `unit`."""
+
+    new: int
+    units: int
+    unit: int
+
+    @classmethod
+    def of(cls, old: int, new: int) -> _Cover:
+        divisor = math.gcd(old, new)
+        return cls(new, old // divisor, new // divisor)
+
+    def sums(self, array: NDArray[Any], axis: int, most: int) -> NDArray[Any]:
+        """Sums along `axis`, each old pixel weighted with its covered units, of the least type that holds `most`."""
+        kind: Any = next(t for t in (np.uint16, np.uint32, np.uint64) if most <= np.iinfo(t).max)
+        result: NDArray[Any] = np.zeros([self.new if i == axis else n for i, n in enumerate(array.shape)], dtype=kind)
+        if self.unit == 1:  # whole pixels: neighbours are added, nothing is weighted
+            for k in range(self.units):
+                result += array[(slice(None),) * axis + (slice(k, None, self.units),)]
+            return result
+        begin = np.arange(self.new, dtype=np.int64) * self.units
+        for tap in range(-(-self.units // self.unit) + 1):
+            pixel = begin // self.unit + tap
+            shared = np.minimum(begin + self.units, (pixel + 1) * self.unit) - np.maximum(begin, pixel * self.unit)
+            weight = np.clip(shared, 0, None).astype(kind).reshape([-1 if i == axis else 1 for i in range(array.ndim)])
+            # Beyond the end the weight is zero.
+            result += np.take(array, np.minimum(pixel, array.shape[axis] - 1), axis) * weight
+        return result
+
+
+def _centres(old: int, new: int) -> NDArray[np.intp]:
+    """The old pixel under each new one's centre, shape (new,)."""
+    return ((2 * np.arange(new) + 1) * old // (2 * new)).astype(np.intp)
+
+
+def _convert(array: NDArray[Any], given: str, wanted: str) -> NDArray[Any]:
+    """Pixels of encoding `given` as `wanted`; colours are reordered, alpha goes, grey is BT.601 luma."""
+    if given == wanted or (given, wanted) == ("mono16", "16UC1"):
+        return array
+    if array.dtype != np.uint8 or wanted not in ("rgb8", "bgr8", "mono8"):
+        raise ContractError(f"an image encoded as {given} does not become {wanted}; see `image.encoding`")
+    if given == "mono8":
+        return np.repeat(array, 3, axis=2)
+    rgb = array[..., 2::-1] if given.startswith("bgr") else array[..., :3]
+    if wanted == "mono8":
+        return ((rgb @ _LUMA + np.uint32(500)) // np.uint32(1000)).astype(np.uint8)[..., None]
+    return rgb if wanted == "rgb8" else rgb[..., ::-1]

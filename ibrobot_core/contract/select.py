@@ -1,0 +1,183 @@
+"""Selection: dotted paths into a message -> a float32 vector; joints by name, array elements by number."""
+
+from __future__ import annotations
+
+import typing
+from collections.abc import Callable, Sequence
+from difflib import get_close_matches
+from functools import lru_cache
+from itertools import groupby
+from operator import attrgetter
+from typing import Any
+
+import attrs
+import numpy as np
+from numpy.typing import NDArray
+
+from ibrobot_core.errors import ContractError
+from ibrobot_core.messages import MESSAGE_TYPES, JointState, Message
+
+_WHOLE: dict[str, tuple[str, ...]] = {
+    "sensor_msgs/msg/Imu": ("orientation", "angular_velocity", "linear_acceleration"),
+    "sensor_msgs/msg/Joy": ("axes", "buttons"),
+    "geometry_msgs/msg/Pose": ("position", "orientation"),
+    "geometry_msgs/msg/PoseStamped": ("pose",),
+    "geometry_msgs/msg/Twist": ("linear", "angular"),
+    "geometry_msgs/msg/TransformStamped": ("translation", "rotation"),
+    **{f"std_msgs/msg/{name}": ("data",) for name in ("Bool", "Int32")},
+    **{f"std_msgs/msg/{name}MultiArray": ("data",) for name in ("Float32", "Float64", "Int32")},
+}
+_LEROBOT_SUFFIX = {"position": "pos", "velocity": "vel", "effort": "eff"}
+
+type _Read = Callable[[Any], NDArray[np.generic]]
+
+
+@attrs.frozen
+class _Leaf:
+    """One path, resolved: a number, an element of an array, a joint's element, or a whole array."""
+
+    field: str
+    kind: str
+    """`number`, `element`, `joint` or `array`."""
+    part: str = ""
+    """Element number or joint name."""
+
+    @property
+    def label(self) -> str:
+        """As LeRobot would name it: `shoulder_pan.pos`; else the path itself."""
+        if self.kind == "joint":
+            return f"{self.part}.{_LEROBOT_SUFFIX[self.field]}"
+        return f"{self.field}.{self.part}" if self.part else self.field
+
+
+class Selection:
+    """What a spec takes out of its messages, checked against the message's class when it is made.
+
+    `position.shoulder_pan` is looked up in the message's `name`, once for each order of names that is met.
+    `data.0` is an element, `data` the whole array, `orientation` all of its numbers. Without any path it is
+    the numbers of the whole message, or for a JointState the positions of the robot's joints in their order.
+
+    Args:
+        type_name: the ROS 2 message type, e.g. `sensor_msgs/msg/JointState`.
+        select: the paths, in the order of the vector.
+        joints: the robot's joints.
+
+    Raises:
+        ContractError: for an unknown type, or a path that leads to no number of it.
+    """
+
+    def __init__(self, type_name: str, select: Sequence[str] = (), joints: Sequence[str] = ()) -> None:
+        message_type = MESSAGE_TYPES.get(type_name)
+        if message_type is None:
+            raise ContractError(f"unknown message type {type_name!r}{_close(type_name, MESSAGE_TYPES)}")
+        self.paths = tuple(select) or _default(message_type, joints)
+        leaves = [leaf for path in self.paths for leaf in _resolve(message_type, path)]
+        unknown = any(leaf.kind == "array" for leaf in leaves)
+        self.size = -1 if unknown else len(leaves)
+        """Length of the vector; -1 where a whole array is taken, whose length only the messages know."""
+        self.names: tuple[str, ...] = () if unknown else tuple(leaf.label for leaf in leaves)
+        """One name per element; none where the length is unknown."""
+        runs = groupby(leaves, lambda leaf: (leaf.kind, leaf.field if leaf.kind != "number" else ""))
+        self._reads = [_reader(kind, list(run)) for (kind, _), run in runs]
+
+    def __call__(self, message: Message) -> NDArray[np.float32]:
+        """The vector, float32, shape (size,).
+
+        Raises:
+            ContractError: when the message lacks a joint or an element.
+        """
+        if len(self._reads) == 1:
+            return self._reads[0](message).astype(np.float32)
+        return np.concatenate([read(message) for read in self._reads], dtype=np.float32, casting="same_kind")
+
+
+def _default(message_type: type[Message], joints: Sequence[str]) -> tuple[str, ...]:
+    if message_type is JointState:
+        return tuple(f"position.{joint}" for joint in joints)
+    if message_type.ros_type not in _WHOLE:
+        first = attrs.fields(message_type)[0].name
+        raise ContractError(f"{message_type.ros_type} needs a select: paths to its numbers, e.g. {first}")
+    return _WHOLE[message_type.ros_type]
+
+
+def _resolve(message_type: type[Any], path: str) -> list[_Leaf]:
+    """The leaves that `path` leads to."""
+    owner: type[Any] = message_type
+    tokens = path.split(".")
+    for depth, token in enumerate(tokens):
+        kinds = {k: v for k, v in typing.get_type_hints(owner).items() if typing.get_origin(v) is not typing.ClassVar}
+        if token not in kinds:
+            raise ContractError(f"{path!r}: {owner.__name__} has no field {token!r}{_close(token, kinds)}")
+        kind, field, rest = kinds[token], ".".join(tokens[: depth + 1]), ".".join(tokens[depth + 1 :])
+        if attrs.has(kind):
+            owner = kind
+        elif kind in (int, float, bool) and not rest:
+            return [_Leaf(field, "number")]
+        elif "ndarray" in str(kind).lower():
+            return [_array_leaf(message_type, path, field, rest)]
+        else:
+            raise ContractError(f"{path!r} leads to no number of {message_type.__name__}")
+    return [leaf for name in attrs.fields_dict(owner) for leaf in _resolve(message_type, f"{path}.{name}")]
+
+
+def _array_leaf(message_type: type[Any], path: str, field: str, rest: str) -> _Leaf:
+    if message_type is JointState:
+        if not rest:
+            raise ContractError(f"{path!r} has the joints in the sender's order; name them, e.g. {path}.shoulder_pan")
+        return _Leaf(field, "joint", rest)
+    if not rest:
+        return _Leaf(field, "array")
+    if not (rest.isascii() and rest.isdigit()):
+        raise ContractError(f"{path!r}: {field} is an array, its elements go by number, e.g. {field}.0")
+    return _Leaf(field, "element", rest)
+
+
+def _reader(kind: str, leaves: list[_Leaf]) -> _Read:
+    """Reads a run of leaves of one kind, and one array where they are of arrays."""
+    field = leaves[0].field
+    if kind == "number":
+        reads = [attrgetter(leaf.field) for leaf in leaves]
+        return lambda message: np.array([read(message) for read in reads], dtype=np.float64)
+    if kind == "joint":
+        return _joint_reader(field, [leaf.part for leaf in leaves])
+    if kind == "array":
+        read = attrgetter(field)
+        return lambda message: np.concatenate([read(message)] * len(leaves))
+    return _element_reader(field, [int(leaf.part) for leaf in leaves])
+
+
+def _joint_reader(field: str, joints: list[str]) -> _Read:
+    read = attrgetter(field)
+
+    @lru_cache(maxsize=16)
+    def indices(order: tuple[str, ...]) -> NDArray[np.intp]:
+        missing = [joint for joint in joints if joint not in order]
+        if missing:
+            raise ContractError(f"the message has no joint {missing[0]!r}; it has: {', '.join(order) or 'none'}")
+        return np.array([order.index(joint) for joint in joints], dtype=np.intp)
+
+    def values(message: Any) -> NDArray[np.generic]:
+        array: NDArray[np.generic] = read(message)
+        if len(array) != len(message.name):
+            raise ContractError(f"the message has {len(array)} values in {field} for {len(message.name)} joints")
+        return array[indices(message.name)]
+
+    return values
+
+
+def _element_reader(field: str, elements: list[int]) -> _Read:
+    read, indices, most = attrgetter(field), np.array(elements, dtype=np.intp), max(elements)
+
+    def values(message: Any) -> NDArray[np.generic]:
+        array: NDArray[np.generic] = read(message)
+        if most >= len(array):
+            raise ContractError(f"the message has {len(array)} elements in {field}, element {most} is asked for")
+        return array[indices]
+
+    return values
+
+
+def _close(name: str, known: typing.Iterable[str]) -> str:
+    known = [k for k in known if k != "ros_type"]
+    close = get_close_matches(name, known, 1)
+    return f", did you mean {close[0]!r}?" if close else f"; there are: {', '.join(known)}"

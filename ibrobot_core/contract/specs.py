@@ -1,0 +1,246 @@
+"""The contract itself: which observations and actions there are, of what shape, and a stable hash of it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cached_property
+from typing import Any
+
+import attrs
+
+from ibrobot_core.config.schema import ActionSpec, Align, ImageSpec, ObservationSpec, RobotConfig
+from ibrobot_core.contract.select import Selection
+from ibrobot_core.errors import ContractError
+from ibrobot_core.interfaces.dataset import Feature
+from ibrobot_core.messages import MESSAGE_TYPES
+from ibrobot_core.units import NS_PER_S
+
+_KNOWN_TYPES = {"/joint_states": "sensor_msgs/msg/JointState"}
+_CAMERA_TYPE = "sensor_msgs/msg/Image"
+_COMPRESSED_TYPE = "sensor_msgs/msg/CompressedImage"
+_IMAGE_DTYPES = {"16UC1": "uint16", "32FC1": "float32"}
+
+
+@attrs.frozen
+class ObservationPart:
+    """One topic's part of an observation, with everything that the YAML leaves open filled in."""
+
+    key: str
+    topic: str
+    type: str
+    select: tuple[str, ...]
+    """Paths into the message; none for an image."""
+    image: ImageSpec | None
+    align: Align
+    """`stamp` is `receive` where the message type has no header."""
+    feature: Feature
+    """Of this part alone; a dimension is -1 where only the messages know it."""
+
+
+@attrs.frozen
+class ActionPart:
+    """The part of the action vector that one executor takes."""
+
+    executor: str
+    topic: str
+    type: str
+    safety_behavior: str
+    joints: tuple[str, ...]
+
+
+@attrs.frozen(slots=False)
+class Contract:
+    """Rate, observations and actions of a robot: what recorder, converter and inference share.
+
+    Units are SI: radians, metres, seconds; vectors are float32, images (H, W, C).
+    """
+
+    rate_hz: float
+    observation_parts: tuple[ObservationPart, ...]
+    """In file order; the parts of one key concatenate."""
+    action_parts: tuple[ActionPart, ...]
+    """In file order; their joints concatenate to the action vector."""
+
+    @classmethod
+    def from_config(cls, config: RobotConfig, extra: Sequence[ObservationSpec] = ()) -> Contract:
+        """The contract of a robot YAML.
+
+        Args:
+            config: the robot.
+            extra: further observations, under keys of their own, e.g. a model's `extra_observations`.
+
+        Raises:
+            ContractError: for a spec that cannot be met, e.g. a path that its message does not have.
+        """
+        specs = config.contract.observations
+        taken = {spec.key for spec in specs} & {spec.key for spec in extra}
+        if taken:
+            raise ContractError(f"extra observation {min(taken)!r} is in the contract already; use another key")
+        parts = tuple(_observation(spec, config) for spec in (*specs, *extra))
+        actions = tuple(_action(spec, config) for spec in config.contract.actions)
+        contract = cls(float(config.contract.rate_hz), parts, actions)
+        twice = [joint for joint in contract.action_joints if contract.action_joints.count(joint) > 1]
+        if twice:
+            raise ContractError(f"joint {twice[0]!r} is in two parts of the action; each joint has one executor")
+        for key in contract.observations:
+            if len(pieces := contract.parts(key)) > 1 and any(part.image for part in pieces):
+                raise ContractError(f"{key} has several specs and one is an image; only vectors concatenate")
+        return contract
+
+    @cached_property
+    def step_ns(self) -> int:
+        """Time from tick to tick [ns]."""
+        return round(NS_PER_S / self.rate_hz)
+
+    @cached_property
+    def observations(self) -> Mapping[str, Feature]:
+        """Observation key -> dtype, shape and names, parts concatenated, in file order."""
+        keys = dict.fromkeys(part.key for part in self.observation_parts)
+        return {key: _joined([part.feature for part in self.parts(key)]) for key in keys}
+
+    @cached_property
+    def action_joints(self) -> tuple[str, ...]:
+        """The joints of the action vector, in its order."""
+        return tuple(joint for part in self.action_parts for joint in part.joints)
+
+    @cached_property
+    def topics(self) -> Mapping[str, str]:
+        """Every topic of the contract, observations and actions: topic -> message type."""
+        parts: Iterable[ObservationPart | ActionPart] = (*self.observation_parts, *self.action_parts)
+        return {part.topic: part.type for part in parts}
+
+    def parts(self, key: str) -> tuple[ObservationPart, ...]:
+        """The parts of an observation key, in file order."""
+        return tuple(part for part in self.observation_parts if part.key == key)
+
+    def features(self) -> dict[str, Feature]:
+        """All columns of a dataset made by this contract, as LeRobot describes them: observations, then `action`."""
+        names = tuple(f"{joint}.pos" for joint in self.action_joints)
+        action = {"action": Feature("float32", (len(names),), names)} if names else {}
+        return {**self.observations, **action}
+
+    def canonical(self) -> dict[str, Any]:
+        """What shapes the data, as plain JSON values: what `fingerprint` hashes and `difference` compares.
+
+        Keys of observations are sorted, since their order shapes nothing; parts of one key and joints keep theirs.
+        """
+        return {
+            "version": 1,
+            "units": "SI",
+            "rate_hz": self.rate_hz,
+            "observations": {key: [_canonical(p) for p in self.parts(key)] for key in sorted(self.observations)},
+            "action": [{"topic": p.topic, "type": p.type, "joints": list(p.joints)} for p in self.action_parts],
+        }
+
+    def fingerprint(self) -> str:
+        """SHA-256, 64 hexadecimal digits, of `canonical`: equal if and only if the same messages give the same data."""
+        text = json.dumps(self.canonical(), sort_keys=True, separators=(",", ":"), ensure_ascii=True)
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    def difference(self, other: Contract | Mapping[str, Any], names: tuple[str, str] = ("this", "other")) -> str:
+        """What differs in shaping the data, both sides one above the other; empty where the fingerprints are equal.
+
+        Args:
+            other: a contract, or what its `canonical` gave, e.g. read back from a bag.
+            names: what to call the two sides.
+        """
+        sides = [_flat(self.canonical()), _flat(other.canonical() if isinstance(other, Contract) else other)]
+        width = max(len(name) for name in names)
+        lines = []
+        for row in dict.fromkeys((*sides[0], *sides[1])):
+            cells = [side.get(row, "(none)") for side in sides]
+            if cells[0] != cells[1]:
+                pairs = zip(names, cells, strict=True)
+                lines += [row, *(f"  {name.rjust(width)}: {cell}" for name, cell in pairs)]
+        return "\n".join(lines)
+
+
+def _observation(spec: ObservationSpec, config: RobotConfig) -> ObservationPart:
+    """Fill in topic, type and paths of a spec, and find its shape."""
+    topic, type_, camera = spec.topic, spec.type or _KNOWN_TYPES.get(spec.topic, ""), None
+    if spec.peripheral is not None:
+        peripheral = config.peripherals.get(spec.peripheral)
+        if peripheral is None:
+            known = ", ".join(config.peripherals) or "none"
+            raise ContractError(f"{spec.key}: no peripheral {spec.peripheral!r}; the peripherals are: {known}")
+        if peripheral.kind == "camera":
+            camera = peripheral.options
+            topic, type_ = topic or f"/camera/{peripheral.name}/image_raw", type_ or _CAMERA_TYPE
+    if not topic or not type_:
+        example = f"type: {_CAMERA_TYPE}" if topic else "topic: /imu"
+        raise ContractError(f"{spec.key}: nothing says where it comes from, add for example {example}")
+    if type_ not in MESSAGE_TYPES:
+        raise ContractError(f"{spec.key}: unknown message type {type_!r}; known: {', '.join(MESSAGE_TYPES)}")
+    if type_ == _COMPRESSED_TYPE:
+        raise ContractError(f"{spec.key}: there is no decoder for {type_}; take the topic with raw images")
+    has_header = "header" in attrs.fields_dict(MESSAGE_TYPES[type_])
+    align = spec.align if has_header else attrs.evolve(spec.align, stamp="receive")
+    if type_ == _CAMERA_TYPE:
+        image = spec.image or ImageSpec()
+        if spec.select:
+            raise ContractError(f"{spec.key}: select has no meaning for an image; leave it out")
+        return ObservationPart(spec.key, topic, type_, (), image, align, _image_feature(image, camera))
+    if spec.image is not None:
+        raise ContractError(f"{spec.key}: image has no meaning for {type_}; it belongs to {_CAMERA_TYPE}")
+    try:
+        selection = Selection(type_, spec.select, config.robot.joint_names)
+    except ContractError as error:
+        raise ContractError(f"{spec.key}: {error}") from None
+    feature = Feature("float32", (selection.size,), selection.names)
+    return ObservationPart(spec.key, topic, type_, selection.paths, None, align, feature)
+
+
+def _image_feature(image: ImageSpec, camera: Any) -> Feature:
+    height, width = image.resize or (getattr(camera, "height", -1), getattr(camera, "width", -1))
+    channels = 3 if image.encoding in ("rgb8", "bgr8") else 1
+    dtype = _IMAGE_DTYPES.get(image.encoding, "image")
+    return Feature(dtype, (height, width, channels), ("height", "width", "channels"))
+
+
+def _action(spec: ActionSpec, config: RobotConfig) -> ActionPart:
+    executor = config.executors.get(spec.executor)
+    if executor is None:
+        known = ", ".join(config.executors) or "none"
+        raise ContractError(f"{spec.key}: no executor {spec.executor!r}; the executors are: {known}")
+    if spec.key != "action":
+        raise ContractError(f"{spec.key}: there is one action vector, its key is 'action'")
+    return ActionPart(executor.name, spec.topic, spec.type, spec.safety_behavior, executor.joints)
+
+
+def _joined(features: list[Feature]) -> Feature:
+    if len(features) == 1:
+        return features[0]
+    sizes = [feature.shape[0] for feature in features]
+    if -1 in sizes:
+        return Feature("float32", (-1,))
+    return Feature("float32", (sum(sizes),), tuple(name for feature in features for name in feature.names))
+
+
+def _canonical(part: ObservationPart) -> dict[str, Any]:
+    tol_ms = None if part.align.tol_ms is None else float(part.align.tol_ms)
+    return {
+        "topic": part.topic,
+        "type": part.type,
+        "select": list(part.select),
+        "encoding": part.image.encoding if part.image else None,
+        "shape": list(part.feature.shape),
+        "align": {"strategy": part.align.strategy, "stamp": part.align.stamp, "tol_ms": tol_ms},
+    }
+
+
+def _flat(canonical: Mapping[str, Any]) -> dict[str, str]:
+    """One line for each observation and for the action, to print and to compare."""
+    rows = {name: str(canonical[name]) for name in ("version", "units", "rate_hz")}
+    for key, parts in canonical["observations"].items():
+        for i, part in enumerate(parts):
+            rows[f"{key}[{i}]" if len(parts) > 1 else key] = _line(part)
+    rows["action"] = "; ".join(_line(part) for part in canonical["action"]) or "(none)"
+    return rows
+
+
+def _line(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return ", ".join(f"{k}: {_line(v)}" for k, v in value.items() if v is not None and v != [])
+    return f"[{', '.join(_line(v) for v in value)}]" if isinstance(value, list) else str(value)
