@@ -1,0 +1,104 @@
+"""Plans a pick and place: the scene's ground truth -> waypoints by inverse kinematics -> timed joint segments."""
+
+from __future__ import annotations
+
+import attrs
+import numpy as np
+
+from ibrobot_core.robot import Vector
+from ibrobot_mujoco.ik import InverseKinematics, TipPose
+from ibrobot_mujoco.policy_options import ScriptedPickOptions
+from ibrobot_mujoco.trajectory import Limits, Segment, move, rest
+
+SETTLE_S = 0.2
+"""Rest after the gripper has closed or opened."""
+GRASP_TURN_RAD, HOVER_TURN_RAD = 0.35, 1.2
+"""How far the gripper may lean away from straight down, where the arm cannot do better."""
+
+
+@attrs.frozen(eq=False)
+class Scene:
+    """The ground truth: positions [m] in the base frame, shape (3,); the cube's axes as columns, shape (3, 3)."""
+
+    cube: Vector
+    cube_axes: Vector
+    bin: Vector
+
+    @classmethod
+    def parse(cls, values: Vector) -> Scene:
+        """From an observation, shape (SCENE_SIZE,)."""
+        w, x, y, z = values[3:7] / np.linalg.norm(values[3:7])
+        axes = np.array([
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ])  # fmt: skip
+        return cls(values[:3], axes, values[7:])
+
+
+@attrs.frozen(eq=False)
+class PickPlanner:
+    """Plans from the model of the robot alone; `gripper` is the index of the gripper's joint."""
+
+    ik: InverseKinematics
+    options: ScriptedPickOptions
+    limits: Limits
+    gripper: int
+
+    def plan(self, start: Vector, scene: Scene, home: Vector) -> list[Segment]:
+        """The segments that pick the cube from `start`, put it into the bin, and go `home`; both shape (J,) [rad].
+
+        Raises:
+            PlanningError: when the cube or the bin is out of reach.
+        """
+        opened, closed = self.options.gripper_open, self.options.gripper_closed
+        above = scene.cube + np.array([0.0, 0.0, self.options.hover_height])
+        down = _down(_heading(scene))
+        hover = self._solve(above, down, start, opened, HOVER_TURN_RAD)
+        grasp = self._solve(scene.cube, down, hover, opened, GRASP_TURN_RAD)
+        middle = self._solve((scene.cube + above) / 2, down, grasp, opened, HOVER_TURN_RAD)
+        over_bin = scene.bin + np.array([0.0, 0.0, self.options.release_height])
+        release = self._solve(over_bin, _down(_inward(scene.bin)), hover, closed, HOVER_TURN_RAD)
+        held, lifted, freed = self._at(grasp, closed), self._at(hover, closed), self._at(release, opened)
+        return [
+            move("hover", start, hover, self.limits),
+            move("descend", hover, grasp, self.limits, via=middle),
+            move("close", grasp, held, self.limits),
+            rest("close", held, SETTLE_S),
+            move("lift", held, lifted, self.limits, via=self._at(middle, closed)),
+            move("carry", lifted, release, self.limits),
+            move("open", release, freed, self.limits),
+            rest("open", freed, SETTLE_S),
+            move("return", freed, home, self.limits),
+        ]
+
+    def _solve(self, position: Vector, rotation: Vector, start: Vector, gripper: float, turn: float) -> Vector:
+        joints = self.ik.solve(TipPose(position, rotation), start, orientation_tolerance=turn)
+        return self._at(joints, gripper)
+
+    def _at(self, joints: Vector, gripper: float) -> Vector:
+        result = joints.copy()
+        result[self.gripper] = gripper
+        return result
+
+
+def _inward(position: Vector) -> float:
+    """Direction [rad] from `position`, shape (3,), to the base's origin, seen from above."""
+    return float(np.arctan2(-position[1], -position[0]))
+
+
+def _heading(scene: Scene) -> float:
+    """Direction [rad] in which the jaws close: across two faces of the cube, as nearly inward as these allow."""
+    across = scene.cube_axes[:2, np.argmin(np.abs(scene.cube_axes[2]))]
+    face, inward = np.arctan2(across[1], across[0]), _inward(scene.cube)
+    quarter = np.pi / 2
+    return float(face + quarter * np.round((inward - face) / quarter))
+
+
+def _down(heading: float) -> Vector:
+    """Axes of a tip that points straight down and whose jaws close along `heading` [rad], shape (3, 3)."""
+    return np.array([
+        [np.cos(heading), np.sin(heading), 0.0],
+        [np.sin(heading), -np.cos(heading), 0.0],
+        [0.0, 0.0, -1.0],
+    ])  # fmt: skip
