@@ -56,7 +56,7 @@ class HardwareDescriptor(Descriptor["Hardware"]):
 
 @attrs.frozen
 class SensorDescriptor(Descriptor["Sensor"]):
-    """A sensor of a kind: `camera`, `imu`, …"""
+    """A sensor of a kind, e.g. `camera` or `imu`."""
 
     kind: str = "camera"
 

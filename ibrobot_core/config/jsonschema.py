@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import enum
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, get_args
 
@@ -14,8 +14,8 @@ from ibrobot_core.config.keys import (
     ComponentKeys,
     ExecutorKeys,
     HardwareKeys,
-    ModelKeys,
     ModeKeys,
+    ModelKeys,
     PeripheralKeys,
     RecordingKeys,
     Sections,
@@ -37,28 +37,34 @@ _SCALARS: Mapping[Any, Schema] = {
 _BOUNDS = {"ge": "minimum", "gt": "exclusiveMinimum", "le": "maximum", "lt": "exclusiveMaximum"}
 
 
-def _of_type(kind: Any) -> Schema:
-    if kind in _SCALARS:
-        return dict(_SCALARS[kind])
-    if is_union(kind):
-        return {"anyOf": [_of_type(member) for member in get_args(kind)]}
-    if is_literal(kind):
-        return {"enum": list(get_args(kind))}
-    if is_sequence(kind):
-        args = [arg for arg in get_args(kind) if arg is not Ellipsis] or [Any]
-        if len(args) > 1:
-            return {
-                "type": "array",
-                "prefixItems": [_of_type(arg) for arg in args],
-                "items": False,
-                "minItems": len(args),
-            }
+def _of_union(kind: Any) -> Schema:
+    return {"anyOf": [_of_type(member) for member in get_args(kind)]}
+
+
+def _of_sequence(kind: Any) -> Schema:
+    args = [arg for arg in get_args(kind) if arg is not Ellipsis] or [Any]
+    if len(args) == 1:
         return {"type": "array", "items": _of_type(args[0])}
-    if is_mapping(kind):
-        return {"type": "object", "additionalProperties": _of_type((get_args(kind) or (str, Any))[1])}
-    if isinstance(kind, type) and issubclass(kind, enum.Enum):
-        return {"enum": [member.value for member in kind]}
-    return _of_class(kind) if attrs.has(kind) else {}
+    return {"type": "array", "prefixItems": [_of_type(arg) for arg in args], "items": False, "minItems": len(args)}
+
+
+def _of_mapping(kind: Any) -> Schema:
+    _, item = get_args(kind) or (str, Any)
+    return {"type": "object", "additionalProperties": _of_type(item)}
+
+
+def _of_type(kind: Any) -> Schema:
+    """The schema of a type annotation; `{}`, which allows everything, for `Any`."""
+    shapes: tuple[tuple[Callable[[Any], bool], Callable[[Any], Schema]], ...] = (
+        (lambda k: k in _SCALARS, lambda k: dict(_SCALARS[k])),
+        (is_union, _of_union),
+        (is_literal, lambda k: {"enum": list(get_args(k))}),
+        (is_sequence, _of_sequence),
+        (is_mapping, _of_mapping),
+        (lambda k: isinstance(k, type) and issubclass(k, enum.Enum), lambda k: {"enum": [m.value for m in k]}),
+        (attrs.has, _of_class),
+    )
+    return next((build(kind) for fits, build in shapes if fits(kind)), {})
 
 
 def _of_field(field: attrs.Attribute[Any]) -> Schema:
@@ -82,9 +88,8 @@ def _of_field(field: attrs.Attribute[Any]) -> Schema:
 
 def default_of(field: attrs.Attribute[Any]) -> Any:
     """A field's default, made where it is a factory; `attrs.NOTHING` where it is required."""
-    if isinstance(field.default, attrs.Factory):  # type: ignore[arg-type]
-        return attrs.NOTHING if field.default.takes_self else field.default.factory()
-    return field.default
+    default: Any = field.default
+    return default.factory() if isinstance(default, attrs.Factory) else default  # type: ignore[arg-type]
 
 
 def _of_class(*kinds: type) -> Schema:
@@ -110,7 +115,8 @@ def _component(registry: Registry, kind: str, keys: type, types: list[str] | Non
         then = _of_class(keys, descriptor.options)
         then["description"] = descriptor.summary
         branches.append({"if": {"properties": {"type": {"const": type_}}, "required": ["type"]}, "then": then})
-    return {"type": "object", "properties": own["properties"], "required": own["required"], "allOf": branches}
+    schema: Schema = {"type": "object", "properties": own["properties"], "required": own["required"]}
+    return {**schema, "allOf": branches} if branches else schema
 
 
 def _named(item: Schema) -> Schema:

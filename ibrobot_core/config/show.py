@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Mapping
+from functools import singledispatch
 from pathlib import Path
 from typing import Any
 
@@ -14,27 +15,49 @@ from ibrobot_core.config.schema import Component, ContractConfig, ControlMode, O
 from ibrobot_core.config.yaml_nodes import scalar
 
 
+@singledispatch
 def plain(value: Any) -> Any:
-    """attrs classes, tuples, paths and enums as what YAML and JSON know."""
-    if isinstance(value, ObservationSpec) and value.peripheral is not None:
-        # Its topic and type were filled in; a file says either these or the peripheral.
-        return {k: v for k, v in _fields(value).items() if k not in ("topic", "type")}
-    if isinstance(value, Component):
-        own = _fields(value)
-        return {**own, **own.pop("options")}
-    if attrs.has(type(value)):
-        return _fields(value)
-    if isinstance(value, Mapping):
-        return {name: plain(item) for name, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    if isinstance(value, enum.Enum):
-        return plain(value.value)
-    return str(value) if isinstance(value, Path) else value
+    """A config value as what YAML and JSON know: attrs classes as mappings, tuples as lists, paths as text."""
+    return _fields(value) if attrs.has(type(value)) else value
 
 
 def _fields(value: Any) -> dict[str, Any]:
     return {field.name: plain(getattr(value, field.name)) for field in attrs.fields(type(value)) if field.init}
+
+
+@plain.register
+def _(value: ObservationSpec) -> dict[str, Any]:
+    # The topic and type of a peripheral were filled in; a file says either these or the peripheral.
+    left_out = ("topic", "type") if value.peripheral is not None else ()
+    return {name: item for name, item in _fields(value).items() if name not in left_out}
+
+
+@plain.register
+def _(value: Component) -> dict[str, Any]:
+    own = _fields(value)
+    options = own.pop("options")
+    return {**own, **options}
+
+
+@plain.register
+def _(value: Mapping) -> dict[str, Any]:  # type: ignore[type-arg]
+    return {name: plain(item) for name, item in value.items()}
+
+
+@plain.register(list)
+@plain.register(tuple)
+def _(value: Any) -> list[Any]:
+    return [plain(item) for item in value]
+
+
+@plain.register
+def _(value: Path) -> str:
+    return str(value)
+
+
+@plain.register
+def _(value: enum.Enum) -> Any:
+    return value.value
 
 
 def _named(components: Mapping[str, Component], *left_out: str) -> dict[str, Any]:

@@ -1,0 +1,81 @@
+"""`ibrobot config check|show|schema`: what a robot YAML says, and what is wrong with it."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import attrs
+import click
+
+from ibrobot_core.errors import ConfigError
+
+
+def config_options(command: Callable[..., None]) -> Callable[..., None]:
+    """The argument and the options that say which config, and what to change in it."""
+    for decorate in (
+        click.option("--mode", metavar="MODE", help="Start in this control mode."),
+        click.option(
+            "--set", "overrides", multiple=True, metavar="PATH=VALUE", help="Override, e.g. control.rate_hz=50."
+        ),
+        click.option("--sim", is_flag=True, help="Use the simulation section in place of the hardware."),
+        click.argument("config", metavar="[CONFIG]", required=False),
+    ):
+        command = decorate(command)
+    return command
+
+
+@click.group()
+def config() -> None:
+    """Check and show robot YAMLs.
+
+    CONFIG is a file, or the name of a config that comes with ibrobot or a plugin; so101 where it is left out.
+    """
+
+
+@config.command()
+@config_options
+@click.option("--json", "as_json", is_flag=True, help="Print a list of {file, line, path, message}.")
+def check(config: str | None, sim: bool, overrides: tuple[str, ...], mode: str | None, as_json: bool) -> None:
+    """Tell everything that is wrong with CONFIG; exit 2 if anything is."""
+    from ibrobot_core.config import find_config, load
+    from ibrobot_core.plugins import installed
+
+    try:
+        path = find_config(config, installed())
+        found = load(path, overrides=overrides, mode=mode, sim=sim)
+    except ConfigError as error:
+        if not as_json:
+            raise
+        problems: list[dict[str, Any]] = [{**attrs.asdict(p), "file": str(p.file)} for p in error.problems]
+        click.echo(json.dumps(problems, indent=2))
+        sys.exit(error.exit_code)
+    if as_json:
+        click.echo("[]")
+        return
+    body = "simulation" if found.simulated else "hardware"
+    click.echo(f"{path}: ok ({found.robot.name}, {len(found.robot.joints)} joints, {body})")
+    click.echo(f"modes: {', '.join(found.control_modes)}; starts in {found.default_control_mode}")
+
+
+@config.command()
+@config_options
+def show(config: str | None, sim: bool, overrides: tuple[str, ...], mode: str | None) -> None:
+    """Print what a run of CONFIG would use, every default filled in, as a YAML that loads again."""
+    from ibrobot_core.config import find_config, load
+    from ibrobot_core.config.show import to_yaml
+    from ibrobot_core.plugins import installed
+
+    found = load(find_config(config, installed()), overrides=overrides, mode=mode, sim=sim)
+    click.echo(to_yaml(found), nl=False)
+
+
+@config.command()
+def schema() -> None:
+    """Print a JSON Schema of robot YAMLs for editors, with the options of every installed plugin."""
+    from ibrobot_core.config.jsonschema import json_schema
+    from ibrobot_core.plugins import installed
+
+    click.echo(json.dumps(json_schema(installed()), indent=2))

@@ -1,0 +1,119 @@
+"""`ibrobot doctor`: what this machine has and lacks, each with its remedy."""
+
+from __future__ import annotations
+
+import glob
+import json
+import os
+import resource
+import shutil
+import sys
+
+import attrs
+import click
+
+from ibrobot_core.descriptors import Check
+from ibrobot_core.plugins import Registry, installed
+
+MINIMUM_PYTHON = (3, 12)
+LEAST_FREE_BYTES = 2_000_000_000
+MLOCK_BYTES = 512 * 1024 * 1024
+"""What a control process with a simulation in it locks, with room to spare."""
+
+
+@attrs.frozen
+class Finding:
+    """A check and whether a run is impossible where it fails; otherwise it is a thing to know."""
+
+    check: Check
+    matters: bool
+
+
+@click.command()
+@click.option("--json", "as_json", is_flag=True, help="Print a list of {name, ok, matters, found, remedy}.")
+def doctor(as_json: bool) -> None:
+    """Check this machine, with the remedy for what it lacks; exit 1 if something fails that matters."""
+    findings = examine(installed())
+    if as_json:
+        click.echo(json.dumps([{**attrs.asdict(f.check), "matters": f.matters} for f in findings], indent=2))
+    else:
+        for finding in findings:
+            check = finding.check
+            word = "ok  " if check.ok else ("FAIL" if finding.matters else "note")
+            click.echo(f"{word}  {check.name}: {check.found}")
+            if not check.ok and check.remedy:
+                click.echo(f"      {check.remedy}")
+    if any(finding.matters and not finding.check.ok for finding in findings):
+        sys.exit(1)
+
+
+def examine(registry: Registry) -> list[Finding]:
+    """All checks: Python, plugins, those that plugins bring, serial ports, real-time permissions, disk."""
+    return [
+        Finding(python_version(), True),
+        *(Finding(check, True) for check in plugin_checks(registry)),
+        *(Finding(check, True) for check in registry.doctor()),
+        *(Finding(check, True) for check in serial_ports()),
+        Finding(realtime(), False),
+        Finding(memory_lock(), False),
+        Finding(disk("."), True),
+    ]
+
+
+def python_version() -> Check:
+    """The interpreter."""
+    found = ".".join(str(part) for part in sys.version_info[:3])
+    wanted = ".".join(str(part) for part in MINIMUM_PYTHON)
+    return Check("python", sys.version_info >= MINIMUM_PYTHON, found, f"install Python {wanted} or newer")
+
+
+def plugin_checks(registry: Registry) -> list[Check]:
+    """How many work, and one failed check for each that does not."""
+    working = sorted({entry.package for entry in registry.entries.values()})
+    broken = [
+        Check(f"plugin {failure.plugin}", False, str(failure), f"repair or remove it: pip uninstall {failure.package}")
+        for failure in registry.failures
+    ]
+    return [Check("plugins", True, ", ".join(working)), *broken]
+
+
+def serial_ports(patterns: tuple[str, ...] = ("/dev/ttyACM*", "/dev/ttyUSB*")) -> list[Check]:
+    """Every serial port, and whether this user may open it."""
+    ports = sorted(port for pattern in patterns for port in glob.glob(pattern))
+    if not ports:
+        return [Check("serial ports", True, "none; connect the arm if you expected one")]
+    remedy = "sudo usermod -aG dialout $USER, then log in again"
+    return [
+        Check(f"serial port {port}", ok, "readable and writable" if ok else "no permission", remedy)
+        for port in ports
+        for ok in (os.access(port, os.R_OK | os.W_OK),)
+    ]
+
+
+def realtime() -> Check:
+    """Whether the control process may ask for SCHED_FIFO."""
+    if os.geteuid() == 0:
+        return Check("real-time priority", True, "permitted (root)")
+    limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0] if hasattr(resource, "RLIMIT_RTPRIO") else 0
+    if limit > 0 or limit == resource.RLIM_INFINITY:
+        return Check("real-time priority", True, f"permitted up to {limit if limit > 0 else 99}")
+    remedy = "add '@realtime - rtprio 95' to /etc/security/limits.d/ibrobot.conf, join group realtime, log in again"
+    return Check("real-time priority", False, "not permitted; the control loop may be milliseconds late", remedy)
+
+
+def memory_lock() -> Check:
+    """Whether the control process may lock its memory."""
+    limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
+    if os.geteuid() == 0 or limit == resource.RLIM_INFINITY:
+        return Check("memory lock", True, "unlimited")
+    remedy = (
+        "add '@realtime - memlock unlimited' to /etc/security/limits.d/ibrobot.conf, join group realtime, log in again"
+    )
+    return Check("memory lock", limit >= MLOCK_BYTES, f"{limit / 1e6:.0f} MB", remedy)
+
+
+def disk(folder: str) -> Check:
+    """Room for recordings."""
+    free = shutil.disk_usage(folder).free
+    remedy = f"free at least {LEAST_FREE_BYTES / 1e9:.0f} GB, or record elsewhere with recording.root"
+    return Check("disk", free >= LEAST_FREE_BYTES, f"{free / 1e9:.1f} GB free in {os.path.abspath(folder)}", remedy)

@@ -1,0 +1,124 @@
+"""`ibrobot plugins` and `ibrobot plugins show TYPE`: what is installed, what is broken, what options there are."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import attrs
+import click
+
+from ibrobot_core.errors import PluginError
+from ibrobot_core.plugins import Entry, Registry, installed
+
+
+@click.group(invoke_without_command=True)
+@click.option("--json", "as_json", is_flag=True, help="Print {plugins: […], broken: […]}.")
+@click.pass_context
+def plugins(ctx: click.Context, as_json: bool) -> None:
+    """List what the installed plugins offer, and the plugins that are broken."""
+    if ctx.invoked_subcommand is not None:
+        return
+    registry = installed()
+    entries = [registry.entries[key] for key in sorted(registry.entries)]
+    if as_json:
+        broken = [attrs.asdict(failure) for failure in registry.failures]
+        click.echo(json.dumps({"plugins": [_row(entry) for entry in entries], "broken": broken}, indent=2))
+        return
+    columns = ("kind", "type", "package", "version", "summary")
+    _print_table(columns, [[str(_row(entry)[column]) for column in columns] for entry in entries])
+    for failure in registry.failures:
+        click.echo(f"broken: {failure}")
+
+
+@plugins.command()
+@click.argument("type_", metavar="TYPE")
+@click.option("--json", "as_json", is_flag=True, help="Print a list of {kind, type, …, options: […]}.")
+def show(type_: str, as_json: bool) -> None:
+    """Print the options of TYPE, of every kind that has a type of this name."""
+    registry = installed()
+    entries = [registry.entries[key] for key in sorted(registry.entries) if key[1] == type_]
+    if not entries:
+        raise PluginError(_unknown(registry, type_))
+    described = [{**_row(entry), "options": _options(entry)} for entry in entries]
+    if as_json:
+        click.echo(json.dumps(described, indent=2))
+        return
+    columns = ("name", "type", "unit", "default", "allowed", "help")
+    for one in described:
+        click.echo(f"{one['kind']} type {one['type']} ({one['package']} {one['version']}): {one['summary']}")
+        if one["options"]:
+            _print_table(columns, [[_text(option[column]) for column in columns] for option in one["options"]])
+        else:
+            click.echo("no options")
+
+
+def _row(entry: Entry) -> dict[str, Any]:
+    return {
+        "kind": entry.kind,
+        "type": entry.descriptor.type,
+        "package": entry.package,
+        "version": entry.version,
+        "summary": entry.descriptor.summary,
+    }
+
+
+def _unknown(registry: Registry, type_: str) -> str:
+    from ibrobot_core.config.convert import hint
+
+    broken = "".join(f"; {failure}" for failure in registry.failures)
+    return f"unknown type {type_!r}{hint(type_, sorted({t for _, t in registry.entries}), 'installed')}{broken}"
+
+
+def _options(entry: Entry) -> list[dict[str, Any]]:
+    from ibrobot_core.config.convert import fields
+    from ibrobot_core.config.jsonschema import default_of
+    from ibrobot_core.config.show import plain
+
+    rows = []
+    for name, field in fields(entry.descriptor.options).items():
+        default = default_of(field)
+        rows.append({
+            "name": name,
+            "type": _type_name(field.type),
+            "unit": field.metadata.get("unit", ""),
+            "required": default is attrs.NOTHING,
+            "default": "(required)" if default is attrs.NOTHING else plain(default),
+            "allowed": _allowed(field),
+            "help": field.metadata.get("help", ""),
+        })  # fmt: skip
+    return rows
+
+
+def _type_name(kind: Any) -> str:
+    return (
+        kind.__name__ if isinstance(kind, type) and not hasattr(kind, "__args__") else str(kind).replace("typing.", "")
+    )
+
+
+def _allowed(field: attrs.Attribute[Any]) -> str:
+    if field.metadata.get("choices") is not None:
+        return ", ".join(str(choice) for choice in field.metadata["choices"])
+    signs = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
+    bounds = [f"{sign} {field.metadata[name]}" for name, sign in signs.items() if field.metadata.get(name) is not None]
+    return ", ".join(bounds)
+
+
+def _text(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value, default=str)
+
+
+def _print_table(columns: tuple[str, ...], rows: list[list[str]]) -> None:
+    """A table as wide as the terminal; all of every cell where there is none to fit it into."""
+    import sys
+
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for column in columns:
+        table.add_column(column, no_wrap=column in ("kind", "name"), overflow="fold")
+    for row in rows:
+        table.add_row(*(Text(cell) for cell in row))
+    Console(width=None if sys.stdout.isatty() else 1000).print(table)
