@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
+from typing import override
 
 from ibrobot_core.units import NS_PER_S
 
@@ -30,9 +31,11 @@ class RealClock(Clock):
     def __init__(self, epoch_offset_ns: int | None = None) -> None:
         self.epoch_offset_ns = time.time_ns() - time.monotonic_ns() if epoch_offset_ns is None else epoch_offset_ns
 
+    @override
     def now_ns(self) -> int:
         return time.monotonic_ns() + self.epoch_offset_ns
 
+    @override
     def sleep_until(self, deadline_ns: int) -> None:
         remaining = deadline_ns - self.now_ns()
         if remaining > 0:
@@ -45,9 +48,11 @@ class SteppedClock(Clock):
     def __init__(self, start_ns: int = 0) -> None:
         self._now_ns = start_ns
 
+    @override
     def now_ns(self) -> int:
         return self._now_ns
 
+    @override
     def sleep_until(self, deadline_ns: int) -> None:
         """Move time to `deadline_ns` when that lies ahead."""
         self._now_ns = max(self._now_ns, deadline_ns)

@@ -23,7 +23,7 @@ class TrajectoryOptions:
 
     path_tolerance: float = option(0.0, unit="rad", ge=0, help="largest deviation on the way")
     goal_tolerance: float = option(0.02, unit="rad", ge=0, help="largest deviation at the end")
-    goal_time: float = option(1.0, unit="s", ge=0, help="time after the end to come within the goal tolerance; 0: no limit")
+    goal_time: float = option(1.0, unit="s", ge=0, help="time after the end to come within goal_tolerance; 0: no limit")
 
 
 @attrs.frozen

@@ -10,7 +10,7 @@ with functions marked `@ibrobot_core.hookimpl`, each yielding descriptors:
     @hookimpl
     def ibrobot_hardware():
         yield HardwareDescriptor(
-            type="feetech_so101", summary="SO-101 follower on a Feetech bus", options=FollowerOptions, make=_make_follower,
+            type="feetech_so101", summary="SO-101 follower", options=FollowerOptions, make=_make_follower
         )
 
 An implementation may leave out arguments that it does not need.

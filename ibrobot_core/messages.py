@@ -1,7 +1,8 @@
 """The ROS 2 message vocabulary as frozen classes; field names and order follow the `.msg` definitions.
 
 Sources: common_interfaces (std_msgs, sensor_msgs, geometry_msgs, trajectory_msgs, diagnostic_msgs), geometry2
-(tf2_msgs), and ibrobot_msgs. Differences from the wire: stamps and durations are integer nanoseconds, and arrays are numpy.
+(tf2_msgs), and ibrobot_msgs. Differences from the wire: stamps and durations are integer nanoseconds,
+and arrays are numpy.
 """
 
 from __future__ import annotations
@@ -17,8 +18,9 @@ def _array(dtype: Any, default: Any = attrs.NOTHING) -> Any:
     def convert(value: Any) -> NDArray[Any]:
         return np.asarray(value, dtype=dtype)
 
-    kind = {"factory": lambda: np.empty(0, dtype=dtype)} if default is not attrs.NOTHING else {}
-    return attrs.field(converter=convert, eq=attrs.cmp_using(eq=np.array_equal), **kind)
+    if default is not attrs.NOTHING:
+        default = attrs.Factory(lambda: np.empty(0, dtype=dtype))
+    return attrs.field(default=default, converter=convert, eq=attrs.cmp_using(eq=np.array_equal))
 
 
 @attrs.frozen
@@ -106,7 +108,7 @@ class Int32MultiArray(Message):
 
 @attrs.frozen
 class JointState(Message):
-    """sensor_msgs/msg/JointState: position [rad], velocity [rad/s], effort [Nm], each shape (J,) or (0,) where unknown."""
+    """sensor_msgs/msg/JointState: position [rad], velocity [rad/s], effort [Nm], shape (J,), or (0,) where unknown."""
 
     ros_type: ClassVar[str] = "sensor_msgs/msg/JointState"
     header: Header

@@ -66,7 +66,7 @@ class Executor(ABC):
         """Give the joints up; forget plans and goals."""
 
     def set_plan(self, plan: Plan) -> None:
-        """Replace the plan. Only where `accepts_plans`."""
+        """Replace the plan; only where `accepts_plans`. One that cannot be followed is counted, the old one stays."""
         raise NotImplementedError(f"{type(self).__name__} accepts no plans")
 
     def set_goal(self, goal_id: str, goal: Mapping[str, Any], measured: JointReading) -> None:

@@ -29,7 +29,7 @@ class JointReading:
 
 @attrs.frozen
 class Signal:
-    """A vector of numbers that hardware publishes beside its joints, e.g. servo temperatures or a scene's ground truth."""
+    """Numbers that hardware publishes beside its joints, e.g. servo temperatures or a scene's ground truth."""
 
     topic: str
     size: int
@@ -59,7 +59,7 @@ class Hardware(ABC):
         """Measure all joints, now.
 
         Raises:
-            HardwareError: when the hardware does not answer.
+            HardwareError: when the hardware does not answer, or is not connected.
         """
 
     @abstractmethod
@@ -67,7 +67,7 @@ class Hardware(ABC):
         """Command joint positions [rad], shape (J,), already checked and limited by the safety layer.
 
         Raises:
-            HardwareError: when the hardware does not take them.
+            HardwareError: when the hardware does not take them, is not connected, or the shape is wrong.
         """
 
     @abstractmethod

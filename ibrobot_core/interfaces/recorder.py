@@ -51,7 +51,7 @@ class Recorder(ABC):
         """Append one message. Topics that this recorder does not keep are passed over.
 
         Raises:
-            RecorderError: e.g. a full disk; what was written before stays readable.
+            RecorderError: e.g. no open episode, or a full disk; what was written before stays readable.
         """
 
     @abstractmethod

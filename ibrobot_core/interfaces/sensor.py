@@ -8,7 +8,7 @@ from ibrobot_core.messages import Message
 
 
 class Sensor(ABC):
-    """A source of messages. `open`, `read` and `close` are called from one thread, which may differ from the constructor's.
+    """A source of messages. One thread calls `open`, `read` and `close`; it may differ from the constructor's.
 
     `topic` is where its messages go: `/camera/NAME/image_raw` for a camera.
     """
@@ -31,7 +31,7 @@ class Sensor(ABC):
         Its header stamp is the time of capture. An old frame never comes under a new stamp.
 
         Raises:
-            SensorError: when the device is gone.
+            SensorError: when the device is gone or not open.
         """
 
     @abstractmethod

@@ -40,7 +40,7 @@ class Teleop(ABC):
             measured: the robot's joints in robot order, for devices that move relative to them.
 
         Raises:
-            TeleopError: when the device is gone.
+            TeleopError: when the device is gone or not connected.
         """
 
     @abstractmethod

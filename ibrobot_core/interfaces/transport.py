@@ -19,7 +19,10 @@ class Transport(ABC):
 
     @abstractmethod
     def subscribe(self, topic: str, callback: Callable[[bytes], None]) -> Callable[[], None]:
-        """Call `callback` with every payload on `topic`, in the order sent; returns a function that ends it."""
+        """Call `callback` with every payload on `topic`, in the order sent; returns a function that ends it.
+
+        An exception of `callback` is logged, and reaches neither the sender nor other subscribers.
+        """
 
     @abstractmethod
     def serve(self, name: str, handler: Callable[[bytes], bytes]) -> Callable[[], None]:
@@ -31,11 +34,13 @@ class Transport(ABC):
 
     @abstractmethod
     def request(self, name: str, payload: bytes, timeout_s: float) -> bytes:
-        """Ask the server of `name` and wait up to `timeout_s` [s]. A late answer is dropped, never given to a later request.
+        """Ask the server of `name` and wait up to `timeout_s` [s].
+
+        A late answer is dropped, never given to a later request.
 
         Raises:
             TransportError: when nobody serves it, the server failed, or no answer came in time.
         """
 
     def close(self) -> None:
-        """End all subscriptions and services. Safe to call twice."""
+        """End all subscriptions and services; every later call is a TransportError. Safe to call twice."""
