@@ -69,16 +69,12 @@ class Contract:
 
         Args:
             config: the robot.
-            extra: further observations, under keys of their own, e.g. a model's `extra_observations`.
+            extra: further observations, e.g. a model's `extra_observations`; under a key that is there they concatenate.
 
         Raises:
             ContractError: for a spec that cannot be met, e.g. a path that its message does not have.
         """
-        specs = config.contract.observations
-        taken = {spec.key for spec in specs} & {spec.key for spec in extra}
-        if taken:
-            raise ContractError(f"extra observation {min(taken)!r} is in the contract already; use another key")
-        parts = tuple(_observation(spec, config) for spec in (*specs, *extra))
+        parts = tuple(_observation(spec, config) for spec in (*config.contract.observations, *extra))
         actions = tuple(_action(spec, config) for spec in config.contract.actions)
         contract = cls(float(config.contract.rate_hz), parts, actions)
         twice = [joint for joint in contract.action_joints if contract.action_joints.count(joint) > 1]
