@@ -17,9 +17,7 @@ def config_options(command: Callable[..., None]) -> Callable[..., None]:
     """The argument and the options that say which config, and what to change in it."""
     for decorate in (
         click.option("--mode", metavar="MODE", help="Start in this control mode."),
-        click.option(
-            "--set", "overrides", multiple=True, metavar="PATH=VALUE", help="Override, e.g. control.rate_hz=50."
-        ),
+        click.option("--set", "overrides", multiple=True, metavar="PATH=VALUE", help="E.g. control.rate_hz=50."),
         click.option("--sim", is_flag=True, help="Use the simulation section in place of the hardware."),
         click.argument("config", metavar="[CONFIG]", required=False),
     ):

@@ -106,9 +106,7 @@ def memory_lock() -> Check:
     limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
     if os.geteuid() == 0 or limit == resource.RLIM_INFINITY:
         return Check("memory lock", True, "unlimited")
-    remedy = (
-        "add '@realtime - memlock unlimited' to /etc/security/limits.d/ibrobot.conf, join group realtime, log in again"
-    )
+    remedy = "add '@realtime - memlock unlimited' to the same file as the real-time priority"
     return Check("memory lock", limit >= MLOCK_BYTES, f"{limit / 1e6:.0f} MB", remedy)
 
 

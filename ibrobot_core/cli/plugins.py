@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from typing import Any
+import re
+from typing import Any, get_args
 
 import attrs
 import click
@@ -91,9 +92,8 @@ def _options(entry: Entry) -> list[dict[str, Any]]:
 
 
 def _type_name(kind: Any) -> str:
-    return (
-        kind.__name__ if isinstance(kind, type) and not hasattr(kind, "__args__") else str(kind).replace("typing.", "")
-    )
+    text = kind.__name__ if isinstance(kind, type) and not get_args(kind) else str(kind)
+    return re.sub(r"\w+\.(?=\w)", "", text)
 
 
 def _allowed(field: attrs.Attribute[Any]) -> str:
