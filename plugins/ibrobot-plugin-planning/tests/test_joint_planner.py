@@ -109,6 +109,11 @@ def test_the_tightest_acceleration_sets_the_pace_of_all():
     assert max(abs(p.accelerations[0]) for p in trajectory.points) == pytest.approx(2.0)
 
 
+def test_a_slow_joint_with_a_short_way_slows_nobody():
+    trajectory = planner().plan(request([-2, 0, 0], {"a": 2.0, "c": 0.1}))
+    assert max(abs(p.accelerations[0]) for p in trajectory.points) == pytest.approx(20.0)
+
+
 def test_scalings_of_the_options_and_of_the_request_multiply():
     slow = planner(velocity_scaling=0.5, acceleration_scaling=0.5)
     trajectory = slow.plan(request([0, -1, 0], {"b": 3.0}, velocity_scaling=0.5))

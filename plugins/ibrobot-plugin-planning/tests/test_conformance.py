@@ -1,0 +1,18 @@
+"""The joint planner passes the suite of planners."""
+
+from __future__ import annotations
+
+from typing import override
+
+from ibrobot_planning.joint import JointPlanner
+from ibrobot_planning.options import JointPlannerOptions
+
+from ibrobot_core.interfaces import Context
+from ibrobot_core.testing import PlannerSuite
+from ibrobot_core.testing.leaks import no_leaks  # noqa: F401
+
+
+class TestJointPlanner(PlannerSuite):
+    @override
+    def make(self, ctx: Context) -> JointPlanner:
+        return JointPlanner(JointPlannerOptions(), ctx)
