@@ -1,0 +1,152 @@
+"""The `gripper` executor: opens or closes to a position; what is in the way counts as grasped."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping
+from typing import Any, override
+
+import attrs
+import numpy as np
+
+from ibrobot_core.errors import GoalRejected, NotSupported
+from ibrobot_core.executor_options import GripperOptions
+from ibrobot_core.interfaces import Context, Executor, GoalState, GoalStatus, JointReading
+from ibrobot_core.robot import Vector
+from ibrobot_core.units import ns, seconds
+
+
+@attrs.define
+class _Running:
+    goal_id: str
+    moved_ns: int
+    """When the gripper last moved [ns]."""
+
+
+class GripperExecutor(Executor):
+    """Moves one joint's setpoint to the goal at `velocity`, and keeps it there whatever comes of the goal.
+
+    Reached: the measured position is within `goal_tolerance` of the goal. Stalled: the measured speed has been below
+    `stall_velocity` for `stall_time`; something is in the way. With `allow_stalling` that is a success (grasped) and
+    the setpoint goes on to the goal, so that the gripper keeps squeezing; without, the goal is aborted and the measured
+    position held, as it is by `cancel`. With `max_effort` the setpoint goes no further while the measured effort is at
+    or above it, also after the goal has ended.
+    """
+
+    def __init__(self, options: GripperOptions, ctx: Context) -> None:
+        if len(ctx.joints) != 1:
+            owned = ", ".join(ctx.joints)
+            raise NotSupported(
+                f"executor {ctx.name}: a gripper has one joint, this group has {len(ctx.joints)}: {owned}"
+            )
+        self.joints = ctx.joints
+        self._options = options
+        joint = ctx.robot.joints[int(ctx.robot.indices(ctx.joints)[0])]
+        self._lower, self._upper = joint.lower, joint.upper
+        self._stall_ns = ns(options.stall_time)
+        self._setpoint = self._target = math.nan
+        self._max_effort = 0.0
+        self._stamp_ns = 0
+        self._running: _Running | None = None
+        self._statuses: deque[GoalStatus] = deque()
+
+    @override
+    def activate(self, measured: JointReading) -> None:
+        self.deactivate()
+        self._setpoint = self._target = float(measured.position[0])
+        self._stamp_ns = measured.stamp_ns
+
+    @override
+    def deactivate(self) -> None:
+        self._end(GoalState.CANCELED, "the executor was deactivated")
+        self._setpoint = self._target = math.nan
+
+    @override
+    def set_goal(self, goal_id: str, goal: Mapping[str, Any], measured: JointReading) -> None:
+        """Begin to open or close.
+
+        Args:
+            goal_id: names it in `pop_status`.
+            goal: `position` [rad]; optionally `max_effort` [Nm], 0 for no limit.
+            measured: the joint now, shape (1,).
+
+        Raises:
+            GoalRejected: e.g. a position outside the joint's limits; the old goal goes on.
+        """
+        if math.isnan(self._setpoint):
+            raise GoalRejected("the executor is not active")
+        unknown = [key for key in goal if key not in {"position", "max_effort"}]
+        if unknown:
+            raise GoalRejected(f"the goal has an unknown key {unknown[0]!r}; known: position, max_effort")
+        position, max_effort = _number(goal, "position", None), _number(goal, "max_effort", 0.0)
+        if not self._lower <= position <= self._upper:
+            raise GoalRejected(
+                f"position {position:.6g} rad is outside the limits of {self.joints[0]}, "
+                f"{self._lower:.6g} to {self._upper:.6g}"
+            )
+        if max_effort < 0:
+            raise GoalRejected(f"max_effort is {max_effort:.6g} Nm; it must be at least 0")
+        if max_effort > 0 and not np.isfinite(measured.effort[0]):
+            raise GoalRejected(f"max_effort cannot be kept: {self.joints[0]} has no measured effort; leave it out")
+        self._end(GoalState.CANCELED, f"replaced by goal {goal_id}")
+        self._target = position
+        self._running = _Running(goal_id, moved_ns=measured.stamp_ns)
+        self._max_effort = max_effort
+        self._statuses.append(GoalStatus(goal_id, GoalState.EXECUTING))
+
+    @override
+    def update(self, measured: JointReading) -> Vector:
+        step = self._options.velocity * seconds(measured.stamp_ns - self._stamp_ns)
+        self._stamp_ns = measured.stamp_ns
+        if not (self._max_effort > 0 and abs(measured.effort[0]) >= self._max_effort):
+            self._setpoint = min(max(self._target, self._setpoint - step), self._setpoint + step)
+        if self._running is not None:
+            self._judge(self._running, measured)
+        return np.array([self._setpoint])
+
+    @override
+    def cancel(self, measured: JointReading) -> None:
+        if self._running is not None:
+            self._hold(measured)
+            self._end(GoalState.CANCELED, "cancelled", self._result(measured))
+
+    @override
+    def pop_status(self) -> GoalStatus | None:
+        return self._statuses.popleft() if self._statuses else None
+
+    def _judge(self, running: _Running, measured: JointReading) -> None:
+        """End the goal if it is reached or the gripper has stalled."""
+        # Written so that a NaN speed counts as moving: a stall must be seen.
+        if not abs(measured.velocity[0]) < self._options.stall_velocity:
+            running.moved_ns = measured.stamp_ns
+        if abs(measured.position[0] - self._target) <= self._options.goal_tolerance:
+            self._end(GoalState.SUCCEEDED, "", self._result(measured, reached_goal=True))
+        elif measured.stamp_ns - running.moved_ns >= self._stall_ns:
+            result = self._result(measured, stalled=True)
+            why = f"stalled at {measured.position[0]:.4g} rad on the way to {self._target:.6g}"
+            if self._options.allow_stalling:
+                self._end(GoalState.SUCCEEDED, why, result)
+            else:
+                self._hold(measured)
+                self._end(GoalState.ABORTED, why, result)
+
+    def _hold(self, measured: JointReading) -> None:
+        if np.isfinite(measured.position[0]):
+            self._setpoint = float(measured.position[0])
+        self._target = self._setpoint
+
+    def _result(self, measured: JointReading, *, stalled: bool = False, reached_goal: bool = False) -> dict[str, Any]:
+        return {"position": float(measured.position[0]), "stalled": stalled, "reached_goal": reached_goal}
+
+    def _end(self, state: GoalState, message: str, result: Mapping[str, Any] | None = None) -> None:
+        if self._running is not None:
+            self._statuses.append(GoalStatus(self._running.goal_id, state, message, result or {}))
+            self._running = None
+
+
+def _number(goal: Mapping[str, Any], key: str, default: float | None) -> float:
+    value = goal.get(key, default)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise GoalRejected(f"{key} must be a finite number, got {value!r}")
+    return float(value)

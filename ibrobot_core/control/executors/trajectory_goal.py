@@ -1,0 +1,165 @@
+"""What a trajectory goal may say: checked, ordered by the executor's joints, and made from a JointTrajectory."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import attrs
+import numpy as np
+from numpy.typing import NDArray
+
+from ibrobot_core.errors import GoalRejected
+from ibrobot_core.executor_options import TrajectoryOptions
+from ibrobot_core.messages import JointTrajectory
+from ibrobot_core.robot import Vector
+from ibrobot_core.units import ns
+
+_FIELDS = ("positions", "velocities", "accelerations")
+
+
+@attrs.frozen(eq=False)
+class TrajectoryGoal:
+    """A goal in the executor's joint order: N points of J joints."""
+
+    times_ns: NDArray[np.int64]
+    """[ns] from the start, strictly increasing, shape (N,)."""
+    positions: Vector
+    """[rad], shape (N, J)."""
+    velocities: Vector | None
+    """[rad/s], shape (N, J)."""
+    accelerations: Vector | None
+    """[rad/s^2], shape (N, J)."""
+    path_tolerance: Vector
+    """[rad], shape (J,); 0: not checked."""
+    goal_tolerance: Vector
+    """[rad], shape (J,); 0: not checked."""
+    goal_time_ns: int
+    """[ns]; 0: no limit."""
+
+
+def goal_from_message(message: JointTrajectory) -> dict[str, Any]:
+    """A goal of plain numbers, strings and lists. It starts when it is accepted: the message's stamp is not used.
+
+    Raises:
+        GoalRejected: for a point with efforts, which positions cannot follow.
+    """
+    points = []
+    for index, point in enumerate(message.points):
+        if point.effort.size:
+            raise GoalRejected(f"point {index} has efforts; only positions, velocities and accelerations are followed")
+        given = {name: getattr(point, name).tolist() for name in _FIELDS if getattr(point, name).size}
+        points.append({"time_from_start_ns": point.time_from_start_ns, **given})
+    return {"trajectory": {"joint_names": list(message.joint_names), "points": points}}
+
+
+def parse_goal(goal: Mapping[str, Any], joints: Sequence[str], options: TrajectoryOptions) -> TrajectoryGoal:
+    """Check a goal for the executor's `joints`.
+
+    Raises:
+        GoalRejected: with what is wrong, where, and what would be right.
+    """
+    _keys(goal, ("trajectory",), ("path_tolerance", "goal_tolerance", "goal_time"), "the goal")
+    trajectory = goal["trajectory"]
+    _keys(trajectory, ("joint_names", "points"), (), "the trajectory")
+    order = _order(trajectory["joint_names"], joints)
+    points = trajectory["points"]
+    if not isinstance(points, list | tuple) or not points:
+        raise GoalRejected("the trajectory has no points; it needs at least one")
+    for index, point in enumerate(points):
+        _keys(point, ("time_from_start_ns", "positions"), ("velocities", "accelerations"), f"point {index}")
+    times_ns = _times(points)
+    positions = _field(points, "positions", order)
+    velocities, accelerations = _field(points, "velocities", order), _field(points, "accelerations", order)
+    if positions is None:
+        raise GoalRejected("the points have no positions; every point needs them")
+    if accelerations is not None and velocities is None:
+        raise GoalRejected("the points have accelerations but no velocities; give both, or positions alone")
+    if velocities is not None and velocities[-1].any():
+        joint = int(np.abs(velocities[-1]).argmax())
+        raise GoalRejected(
+            f"the last point has {joints[joint]} at {velocities[-1, joint]:.6g} rad/s; it must be at rest"
+        )
+    return TrajectoryGoal(
+        times_ns,
+        positions,
+        velocities,
+        accelerations,
+        path_tolerance=_tolerance(goal, "path_tolerance", options.path_tolerance, joints),
+        goal_tolerance=_tolerance(goal, "goal_tolerance", options.goal_tolerance, joints),
+        goal_time_ns=ns(_setting(goal.get("goal_time", 0), options.goal_time, "goal_time")),
+    )
+
+
+def _keys(value: Any, required: Sequence[str], optional: Sequence[str], what: str) -> None:
+    if not isinstance(value, Mapping):
+        raise GoalRejected(f"{what} must be a mapping with {', '.join(required)}, got {value!r}")
+    for key in required:
+        if key not in value:
+            raise GoalRejected(f"{what} has no {key}")
+    for key in value:
+        if key not in required and key not in optional:
+            raise GoalRejected(f"{what} has an unknown key {key!r}; known: {', '.join((*required, *optional))}")
+
+
+def _order(names: Any, joints: Sequence[str]) -> list[int]:
+    """For each of `joints` its place in `names`."""
+    if not isinstance(names, list | tuple) or sorted(map(str, names)) != sorted(joints):
+        raise GoalRejected(f"joint_names must be, in any order, {', '.join(joints)}; got {names!r}")
+    return [names.index(joint) for joint in joints]
+
+
+def _times(points: Sequence[Mapping[str, Any]]) -> NDArray[np.int64]:
+    previous = -1
+    for index, point in enumerate(points):
+        time_ns = point["time_from_start_ns"]
+        if isinstance(time_ns, bool) or not isinstance(time_ns, int) or not 0 <= time_ns < 2**62:
+            raise GoalRejected(f"point {index} has time_from_start_ns {time_ns!r}; it must be an integer from 0 on")
+        if time_ns <= previous:
+            raise GoalRejected(f"point {index} is at {time_ns} ns, not after the point before it at {previous} ns")
+        previous = time_ns
+    if previous == 0:
+        raise GoalRejected("the last point is at time 0, which leaves no time to reach it")
+    return np.array([point["time_from_start_ns"] for point in points], dtype=np.int64)
+
+
+def _field(points: Sequence[Mapping[str, Any]], name: str, order: Sequence[int]) -> Vector | None:
+    """Field `name` of all points in the executor's order, shape (N, J); None where no point has it."""
+    rows = [point.get(name, ()) for point in points]
+    # An empty list is how ROS says that a field is not given.
+    given = [not (isinstance(row, list | tuple) and not row) for row in rows]
+    if not any(given):
+        return None
+    if not all(given):
+        raise GoalRejected(
+            f"point {given.index(False)} has no {name} but point {given.index(True)} has; all or none must"
+        )
+    for index, row in enumerate(rows):
+        if not isinstance(row, list | tuple) or len(row) != len(order):
+            raise GoalRejected(f"point {index} has {name} {row!r}; it must be a list of {len(order)} numbers")
+        for value in row:
+            if not _is_finite(value):
+                raise GoalRejected(f"point {index} has {value!r} among its {name}; each must be a finite number")
+    return np.array(rows, dtype=np.float64)[:, order]
+
+
+def _tolerance(goal: Mapping[str, Any], name: str, default: float, joints: Sequence[str]) -> Vector:
+    """Tolerance of each joint [rad], shape (J,); 0 where none is checked."""
+    value = goal.get(name, 0)
+    by_joint = value if isinstance(value, Mapping) else dict.fromkeys(joints, value)
+    for joint in by_joint:
+        if joint not in joints:
+            raise GoalRejected(f"{name} names {joint!r}, which is no joint here; the joints are {', '.join(joints)}")
+    return np.array([_setting(by_joint.get(joint, 0), default, name) for joint in joints], dtype=np.float64)
+
+
+def _setting(value: Any, default: float, name: str) -> float:
+    """0 stands for the default, -1 for none (returned as 0)."""
+    if not _is_finite(value) or (value < 0 and value != -1):
+        raise GoalRejected(f"{name} is {value!r}; it must be above 0, or 0 for the default, or -1 for none")
+    return default if value == 0 else max(float(value), 0.0)
+
+
+def _is_finite(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
