@@ -69,7 +69,7 @@ class Contract:
 
         Args:
             config: the robot.
-            extra: further observations, e.g. a model's `extra_observations`; under a key that is there they concatenate.
+            extra: further observations, e.g. a model's `extra_observations`; under a key that exists they concatenate.
 
         Raises:
             ContractError: for a spec that cannot be met, e.g. a path that its message does not have.

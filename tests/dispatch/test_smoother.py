@@ -114,11 +114,12 @@ def test_a_chunk_that_comes_after_the_plan_ran_dry_begins_at_the_action_of_now()
     np.testing.assert_array_equal(positions, late[17:])
 
 
-def test_a_chunk_observed_after_the_end_of_an_untrimmed_plan_starts_afresh() -> None:
+@pytest.mark.parametrize("begin", [11 * STEP, 12 * STEP + 7, 10**15])
+def test_a_chunk_observed_after_the_end_of_an_untrimmed_plan_starts_afresh(begin: int) -> None:
     smoother = TemporalSmoother(STEP, 3)
     smoother.update(chunk(1, 10), T0)
-    smoother.update(chunk(2, 5), T0 + 12 * STEP + 7)
-    assert smoother.plan()[0] == T0 + 12 * STEP + 7
+    smoother.update(chunk(2, 5), T0 + begin)
+    assert smoother.plan()[0] == T0 + begin
     np.testing.assert_array_equal(smoother.plan()[1], chunk(2, 5))
 
 
@@ -137,6 +138,7 @@ def test_a_chunk_wholly_past_changes_nothing() -> None:
     assert smoother.plan()[0] == T0 + 20 * STEP
     np.testing.assert_array_equal(smoother.plan()[1], chunk(1, 40)[20:])
     smoother.trim(T0 + 100 * STEP)
+    smoother.trim(T0 + 90 * STEP)
     assert smoother.update(chunk(3, 20), T0 + 80 * STEP) == 0
     assert smoother.plan()[1].shape == (0, 3)
 
