@@ -91,7 +91,7 @@ class Checks:
         several = len(self.parts.hardware) > 1
         for name, part in self.parts.hardware.items():
             if several and not part.keys.joints:
-                self.document.add(part.key, "joints: required where there is more than one hardware component")
+                self.document.add((*part.key, "joints"), "required where there is more than one hardware component")
             for i, joint in enumerate(part.keys.joints):
                 key: Key = (*part.key, "joints", i)
                 self._refer(key, joint, list(robot.joint_names), "joint")
@@ -146,7 +146,7 @@ class Checks:
             part = self.parts.executors.get(name)
             if part is None or name in mode.executors[:i]:
                 continue
-            for joint in robot.groups.get(part.keys.group, ()):
+            for joint in dict.fromkeys(robot.groups.get(part.keys.group, ())):
                 if joint in owners:
                     message = f"executors {owners[joint]!r} and {name!r} both claim joint {joint!r}"
                     self.document.add((*key, "executors", i), message)
@@ -159,7 +159,7 @@ class Checks:
             if part is None or streams(part) == (source != "planner"):
                 continue
             takes, sends, example = (
-                ("streams of setpoints", "goals", "trajectory") if streams(part) else ("goals", "setpoints", "position")
+                ("setpoints", "goals", "trajectory") if streams(part) else ("goals", "setpoints", "position")
             )
             message = f"executor {name!r} takes {takes}, but {source} sends {sends}; use one of type {example}, say"
             self.document.add((*key, "executors", i), message)

@@ -20,6 +20,7 @@ PERIPHERAL_TOPICS: Mapping[str, tuple[str, type[messages.Message]]] = {
 """Peripheral kind -> where its messages go, and their type."""
 
 _IMAGES = (messages.Image.ros_type, messages.CompressedImage.ros_type)
+_IMAGE_KEYS = "observation.images."
 _JOINT_FIELDS = ("position", "velocity", "effort")
 
 
@@ -38,7 +39,9 @@ class ContractChecks:
 
     def run(self) -> ContractConfig:
         """The contract, complete."""
-        contract = self.parts.plain.get("contract") or ContractConfig()
+        contract: ContractConfig = self.parts.plain.get("contract", ContractConfig())
+        if "contract" in self.document.root and "contract" not in self.parts.plain:
+            return contract
         key: Key = ("contract",)
         observations = self.observations((*key, "observations"), contract.observations)
         for name, part in self.parts.models.items():
@@ -46,9 +49,10 @@ class ContractChecks:
             self._same_kind(extra, self.observations(extra, part.keys.extra_observations), observations)
         self._same_kind((*key, "observations"), observations, ())
         given = contract.actions
+        before = len(self.document.problems)
         actions = tuple(self._action((*key, "actions", i), spec, given[:i]) for i, spec in enumerate(given))
         for mode_name, mode in (self.parts.plain.get("control_modes") or {}).items():
-            if mode.inference is not None:
+            if mode.inference is not None and len(self.document.problems) == before:
                 self._driven(("control_modes", mode_name), mode.executors, contract)
         control = self.parts.plain.get("control")
         if control is not None and contract.rate_hz > control.rate_hz:
@@ -88,7 +92,7 @@ class ContractChecks:
                 return spec
         written = self.document.root.get("peripherals")
         items = [item for item in written if isinstance(item, Mapping)] if isinstance(written, list) else []
-        kinds = {str(item.get("name")): str(item.get("kind")) for item in items}
+        kinds = {str(item.get("name")): str(item.get("kind")) for item in reversed(items)}
         if spec.peripheral not in kinds:
             remark = hint(str(spec.peripheral), list(kinds), "known")
             self.document.add((*key, "peripheral"), f"unknown peripheral {spec.peripheral!r}{remark}")
@@ -108,7 +112,7 @@ class ContractChecks:
         is_image = spec.type in _IMAGES
         if spec.image is not None and not is_image:
             self.document.add((*key, "image"), f"needs a camera; {spec.topic} carries {spec.type}")
-        if spec.key.startswith("observation.images.") and not is_image:
+        if spec.key.startswith(_IMAGE_KEYS) and not is_image:
             self.document.add((*key, "key"), f"{spec.key} needs a camera; {spec.topic} carries {spec.type}")
         for i, path in enumerate(spec.select):
             self._select((*key, "select", i), path, spec)
@@ -135,6 +139,8 @@ class ContractChecks:
         """Values under one key concatenate, which an image and a vector cannot."""
         kinds = {spec.key: spec.type in _IMAGES for spec in others if spec.type}
         for i, spec in enumerate(specs):
+            if spec.key.startswith(_IMAGE_KEYS) and spec.type not in _IMAGES:
+                continue  # told already
             if spec.type and kinds.setdefault(spec.key, spec.type in _IMAGES) != (spec.type in _IMAGES):
                 message = f"{spec.key} is an image in one observation and a vector in another; give them different keys"
                 self.document.add((*key, i, "key"), message)

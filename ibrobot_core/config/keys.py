@@ -88,14 +88,12 @@ class Sections:
     control_modes: Mapping[str, ModeKeys] = option(help="name -> the executors active in it, and what feeds them")
     default_control_mode: str = option(help="the mode to start in")
     hardware: Mapping[str, Any] = option(factory=dict, help="one component, or several by name, each with its joints")
-    simulation: Mapping[str, Any] | None = option(
-        None, help="stands for the hardware with --sim, or where there is none"
-    )
+    simulation: Mapping[str, Any] = option(None, help="stands for the hardware with --sim, or where there is none")
     peripherals: tuple[Mapping[str, Any], ...] = option((), help="cameras and other sensors")
     models: Mapping[str, Mapping[str, Any]] = option(factory=dict, help="policies by name")
     teleoperation: Mapping[str, Mapping[str, Any]] = option(factory=dict, help="devices by name")
     contract: ContractConfig = option(factory=ContractConfig, help="how topics become observations and actions")
-    recording: Mapping[str, Any] | None = option(None, help="how episodes are recorded")
-    transport: Mapping[str, Any] | None = option(None, help="how processes and machines talk")
-    viewer: Mapping[str, Any] | None = option(None, help="what shows the robot to a person")
+    recording: Mapping[str, Any] = option(None, help="how episodes are recorded")
+    transport: Mapping[str, Any] = option(None, help="how processes and machines talk")
+    viewer: Mapping[str, Any] = option(None, help="what shows the robot to a person")
     control: Control = option(factory=Control, help="the control loop")

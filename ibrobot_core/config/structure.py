@@ -10,7 +10,7 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.config.convert import Faults, fields, make_converter, shown, structure_fields, unknown_key
+from ibrobot_core.config.convert import Faults, fields, make_converter, structure_fields, unknown_key
 from ibrobot_core.config.keys import (
     ComponentKeys,
     ExecutorKeys,
@@ -142,8 +142,7 @@ class Structurer:
         """
         value = self.document.get(*key) if value is None else value
         if not isinstance(value, Mapping):
-            self.document.add(key, f"expected a mapping with a type, got {shown(value)}")
-            return None
+            return None  # told already, with the sections
         own = fields(keys_class)
         faults = Faults()
         if "type" not in value and (close := get_close_matches("type", [k for k in value if k not in own], 1)):

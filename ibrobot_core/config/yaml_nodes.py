@@ -21,6 +21,11 @@ from ibrobot_core.errors import ConfigError, Problem
 Key = tuple[str | int, ...]
 """Where a value is in a document: mapping keys and list indices from the top."""
 
+_DEFAULT_TAGS = (
+    BaseResolver.DEFAULT_SCALAR_TAG,
+    BaseResolver.DEFAULT_SEQUENCE_TAG,
+    BaseResolver.DEFAULT_MAPPING_TAG,
+)
 _BOOLS = {"true": True, "True": True, "TRUE": True, "false": False, "False": False, "FALSE": False}
 _NULLS = {"", "~", "null", "Null", "NULL"}
 _INT = re.compile(r"[-+]?[0-9]+")
@@ -162,8 +167,7 @@ class _Constructor:
         try:
             if isinstance(node, ScalarNode):
                 return self.scalar(node, key)
-            if node.tag not in (BaseResolver.DEFAULT_MAPPING_TAG, BaseResolver.DEFAULT_SEQUENCE_TAG):
-                self.fault(node, key, f"the tag {node.tag!r} is not known here; remove it")
+            self.refuse_tag(node, key)
             if isinstance(node, SequenceNode):
                 for i, item in enumerate(node.value):
                     self.document.places[*key, i] = self.place(item)
@@ -172,9 +176,13 @@ class _Constructor:
         finally:
             self._open.discard(id(node))
 
+    def refuse_tag(self, node: Node, key: Key) -> None:
+        if node.tag not in _DEFAULT_TAGS:
+            tag = node.tag.replace("tag:yaml.org,2002:", "!!")
+            self.fault(node, key, f"the tag {tag} is not known here; remove it")
+
     def scalar(self, node: ScalarNode, key: Key) -> Any:
-        if node.tag != BaseResolver.DEFAULT_SCALAR_TAG:
-            self.fault(node, key, f"the tag {node.tag!r} is not known here; remove it")
+        self.refuse_tag(node, key)
         try:
             text = expand(node.value)
         except ValueError as error:
