@@ -1,0 +1,219 @@
+"""Simulated cameras: conformance, which state becomes a picture, calibration, and that pictures show the scene."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from typing import override
+
+import numpy as np
+import pytest
+from ibrobot_mujoco import gl
+from ibrobot_mujoco.camera import MujocoCamera
+from ibrobot_mujoco.hardware import MujocoHardware
+from ibrobot_mujoco.model import build_spec
+from ibrobot_mujoco.options import CameraOptions, MujocoOptions
+from ibrobot_mujoco.render import Renderer
+from ibrobot_mujoco.so101 import so101
+from ibrobot_mujoco.state import PHYSICS_TOPIC, pose_scene
+
+from ibrobot_core.errors import SensorError
+from ibrobot_core.interfaces import Context, Episode, Sensor
+from ibrobot_core.messages import CameraInfo, Float64MultiArray, Image
+from ibrobot_core.robot import Vector
+from ibrobot_core.testing import SensorSuite, control_context, host_context
+
+pytestmark = pytest.mark.skipif(not gl.usable(), reason=f"no OpenGL backend; {gl.REMEDY}")
+
+ROBOT = so101()
+OPTIONS = MujocoOptions()
+SMALL = CameraOptions(width=64, height=48)
+TICK_NS = 10_000_000
+SLOT_NS = 33_333_333
+
+
+def scene_state(stamp_ns: int, cube: tuple[float, float] | None = None) -> Vector:
+    """The physics state of the scene as an episode begins, with the cube somewhere else if asked."""
+    ctx = control_context(robot=ROBOT)
+    ctx.clock.sleep_until(stamp_ns)
+    hardware = MujocoHardware(OPTIONS, ctx)
+    hardware.connect()
+    hardware.reset(Episode(0))
+    out = np.empty(hardware.signals[0].size)
+    hardware.read_signal(0, out)
+    out[:2] = divmod(stamp_ns, 1_000_000_000)
+    if cube is not None:
+        out[8:10] = cube
+    return out
+
+
+STATE = scene_state(0)
+
+
+def publish(ctx: Context, stamp_ns: int) -> None:
+    assert ctx.bus is not None
+    ctx.bus.publish(PHYSICS_TOPIC, Float64MultiArray(np.concatenate([divmod(stamp_ns, 1_000_000_000), STATE[2:]])))
+
+
+class TestConformance(SensorSuite):
+    @override
+    def context(self) -> Context:
+        return host_context("top", robot=ROBOT, simulation=OPTIONS)
+
+    @override
+    def make(self, ctx: Context) -> MujocoCamera:
+        return MujocoCamera(SMALL, ctx)
+
+    @override
+    def trigger(self, sensor: Sensor, ctx: Context) -> None:
+        for _ in range(4):
+            ctx.clock.sleep_until(ctx.clock.now_ns() + TICK_NS)
+            publish(ctx, ctx.clock.now_ns())
+
+
+@pytest.fixture
+def ctx() -> Context:
+    return host_context("top", robot=ROBOT, simulation=OPTIONS)
+
+
+@pytest.fixture
+def camera(ctx: Context) -> Iterator[MujocoCamera]:
+    camera = MujocoCamera(SMALL, ctx)
+    camera.open()
+    yield camera
+    camera.close()
+
+
+def test_reading_without_waiting(ctx: Context, camera: MujocoCamera) -> None:
+    assert camera.read(0) is None, "nothing was published"
+    publish(ctx, 10 * SLOT_NS)
+    image = camera.read(0)
+    assert image is not None
+    assert image.header.stamp_ns == 10 * SLOT_NS
+    assert camera.read(0) is None, "the same state twice"
+    publish(ctx, 11 * SLOT_NS - 1)
+    assert camera.read(0) is None, "the next picture is not due yet"
+    publish(ctx, 11 * SLOT_NS)
+    image = camera.read(0)
+    assert image is not None
+    assert image.header.stamp_ns == 11 * SLOT_NS
+
+
+def test_of_many_states_the_newest_is_drawn_and_the_others_are_counted(ctx: Context, camera: MujocoCamera) -> None:
+    for slot in (10, 11, 12, 15):
+        publish(ctx, slot * SLOT_NS)
+    image = camera.read(0)
+    assert image is not None
+    assert image.header.stamp_ns == 15 * SLOT_NS
+    assert camera.skipped == 0, "before the first picture none was due"
+    publish(ctx, 18 * SLOT_NS)
+    assert camera.read(0) is not None
+    assert camera.skipped == 2
+    assert ctx.bus is not None
+    assert ctx.bus.dropped() == {}
+
+
+def test_thirty_pictures_a_second_of_simulated_time(ctx: Context, camera: MujocoCamera) -> None:
+    stamps = []
+    for tick in range(1, 101):
+        publish(ctx, 1_700_000_000_000_000_000 + tick * TICK_NS)
+        image = camera.read(0)
+        if image is not None:
+            stamps.append(image.header.stamp_ns)
+    assert len(stamps) in (30, 31)
+    assert set(np.diff(stamps)) <= {3 * TICK_NS, 4 * TICK_NS}
+    assert camera.skipped == 0
+
+
+def test_waits_for_a_state_that_is_due(ctx: Context, camera: MujocoCamera) -> None:
+    publish(ctx, 10 * SLOT_NS)
+    assert camera.read(0) is not None
+    publish(ctx, 10 * SLOT_NS + 1)  # too early: read must wait on
+    later = threading.Timer(0.02, publish, (ctx, 11 * SLOT_NS))
+    later.start()
+    image = camera.read(5.0)
+    later.join()
+    assert image is not None
+    assert image.header.stamp_ns == 11 * SLOT_NS
+
+
+def test_calibration_follows_the_field_of_view(camera: MujocoCamera) -> None:
+    ((topic, info),) = camera.latched()
+    assert topic == "/camera/top/camera_info"
+    assert isinstance(info, CameraInfo)
+    k = info.k.reshape(3, 3)
+    assert 2 * np.degrees(np.arctan(24 / k[1, 1])) == pytest.approx(42.0)
+    np.testing.assert_allclose(k[:2, 2], [31.5, 23.5])
+
+
+def test_calibration_projects_the_cube_to_where_it_is_seen(ctx: Context) -> None:
+    """From directly above, forward (x) is up in the image and left (y) is left."""
+    camera = MujocoCamera(CameraOptions(), ctx)
+    camera.open()
+    try:
+        assert ctx.bus is not None
+        x, y = 0.2, -0.1
+        ctx.bus.publish(PHYSICS_TOPIC, Float64MultiArray(scene_state(SLOT_NS, cube=(x, y))))
+        image = camera.read(0)
+        ((_, info),) = camera.latched()
+    finally:
+        camera.close()
+    assert image is not None
+    assert isinstance(info, CameraInfo)
+    pixels = image.data.reshape(480, 640, 3).astype(int)
+    red = (pixels[..., 0] > 2 * pixels[..., 1]) & (pixels[..., 0] > 2 * pixels[..., 2])
+    rows, columns = np.nonzero(red)
+    focal, depth = info.k[0], 0.80 - 0.025  # the camera's height less the cube's top
+    assert columns.mean() == pytest.approx(319.5 - focal * (y - 0.04) / depth, abs=3)
+    assert rows.mean() == pytest.approx(239.5 - focal * (x - 0.16) / depth, abs=3)
+
+
+def test_the_wrist_camera_is_found_by_its_peripherals_name() -> None:
+    ctx = host_context("wrist", robot=ROBOT, simulation=OPTIONS)
+    camera = MujocoCamera(SMALL, ctx)
+    camera.open()
+    try:
+        publish(ctx, SLOT_NS)
+        image = camera.read(0)
+    finally:
+        camera.close()
+    assert image is not None
+    assert camera.topic == "/camera/wrist/image_raw"
+    assert image.header.frame_id == "wrist_optical_frame"
+
+
+def test_an_unknown_camera_is_named(ctx: Context) -> None:
+    camera = MujocoCamera(CameraOptions(camera="bottom"), ctx)
+    with pytest.raises(SensorError, match=r"camera 'top': no bottom in the scene; its cameras are: .*wrist_cam"):
+        camera.open()
+
+
+@pytest.mark.parametrize("simulation", [None, "other"])
+def test_needs_a_simulation(simulation: object) -> None:
+    camera = MujocoCamera(SMALL, host_context("top", robot=ROBOT, simulation=simulation))
+    with pytest.raises(SensorError, match=r"camera 'top': type mujoco needs a running simulation: \{type: mujoco\}"):
+        camera.open()
+
+
+def test_low_poly_looks_like_the_full_meshes(ctx: Context, camera: MujocoCamera) -> None:
+    publish(ctx, SLOT_NS)
+    image = camera.read(0)
+    assert isinstance(image, Image)
+    spec = build_spec(OPTIONS, ROBOT)
+    spec.visual.quality.offsamples = 0
+    full = spec.compile()
+    import mujoco
+
+    drawn = mujoco.MjData(full)
+    pose_scene(full, drawn, STATE)
+    renderer = Renderer(full, full.camera("top").id, 64, 48, shadows=False)
+    try:
+        expected = renderer.render(drawn).astype(int)
+    finally:
+        renderer.close()
+    low_poly = image.data.reshape(48, 64, 3).astype(int)
+    yellow = [(p[..., 0] > 1.5 * p[..., 2]) & (p[..., 1] > 1.3 * p[..., 2]) for p in (low_poly, expected)]
+    assert yellow[1].sum() > 50, "no arm in the picture"
+    overlap = (yellow[0] & yellow[1]).sum() / (yellow[0] | yellow[1]).sum()
+    assert overlap > 0.9
+    assert np.abs(low_poly - expected).mean() < 4

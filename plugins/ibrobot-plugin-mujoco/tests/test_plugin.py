@@ -1,0 +1,102 @@
+"""What the plugin registers, its options, and its line in `ibrobot doctor`."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+from ibrobot_mujoco import gl
+from ibrobot_mujoco.hardware import MujocoHardware
+from ibrobot_mujoco.options import Fault, MujocoOptions, SceneCamera
+from ibrobot_mujoco.so101 import so101
+
+from ibrobot_core.errors import SensorError
+from ibrobot_core.plugins import installed
+from ibrobot_core.testing import control_context
+
+
+def test_importing_the_plugin_imports_nothing_heavy() -> None:
+    code = "import sys, ibrobot_mujoco; print(sorted({'mujoco', 'mink', 'numpy', 'OpenGL'} & set(sys.modules)))"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("kind", ["hardware", "sensor", "policy", "viewer"])
+def test_is_found_by_discovery(kind: str) -> None:
+    name = "scripted_pick" if kind == "policy" else "mujoco"
+    assert installed().entries[kind, name].package == "ibrobot-plugin-mujoco"
+
+
+def test_stands_for_the_robot_and_its_cameras() -> None:
+    descriptor = installed().find("hardware", "mujoco")
+    assert descriptor.simulated  # type: ignore[attr-defined]
+    assert descriptor.sensors == {"camera": "mujoco"}  # type: ignore[attr-defined]
+    assert isinstance(descriptor.make(MujocoOptions(), control_context(robot=so101())), MujocoHardware)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Fault(at=1.0, kind="freeze_joint"), "a fault of kind freeze_joint needs joint"),
+        (lambda: Fault(at=1.0, kind="silent", joint="gripper"), "a fault of kind silent takes no joint"),
+        (lambda: Fault(at=1.0, kind="explode"), "'explode' is not one of: silent, freeze_joint, read_error"),
+        (lambda: MujocoOptions(scene="kitchen"), "'kitchen' is not one of: empty, pick_cube"),
+        (lambda: MujocoOptions(cube_distance=(0.3, 0.2)), r"\[0.3, 0.2\] is no range, the first must not exceed"),
+        (lambda: MujocoOptions(timestep=1.0), "1.0 is too large, must be at most 0.02 s"),
+        (lambda: SceneCamera(name="c", pos=(0, 0, 1), lookat=(0, 0, 1)), "lookat must differ from pos"),
+    ],
+)
+def test_options_refuse_what_makes_no_sense(make: object, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make()  # type: ignore[operator]
+
+
+class TestOpenGl:
+    """The choice of a backend, with the machine's libraries and display made up."""
+
+    @pytest.fixture(autouse=True)
+    def bare_machine(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        for name in ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY"):
+            monkeypatch.delenv(name, raising=False)
+        monkeypatch.setattr(sys, "platform", "linux")
+        self.have(monkeypatch)
+
+    @staticmethod
+    def have(monkeypatch: pytest.MonkeyPatch, *libraries: str) -> None:
+        monkeypatch.setattr(gl, "_loads", lambda name: name in libraries)
+
+    def test_nothing_there_is_an_error_with_the_remedy(self) -> None:
+        with pytest.raises(SensorError, match="apt install libegl1 libgl1-mesa-dri"):
+            gl.choose()
+        check = gl.check()
+        assert not check.ok
+        assert check.remedy == "apt install libegl1 libgl1-mesa-dri (or: apt install libosmesa6)"
+
+    def test_egl_comes_first(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.have(monkeypatch, "libEGL.so.1", "libGL.so.1", "libOSMesa.so.8")
+        monkeypatch.setenv("DISPLAY", ":0")
+        assert gl.usable() == ("egl", "osmesa", "glfw")
+        assert gl.choose() == "egl"
+        assert gl.check().ok
+
+    def test_egl_needs_opengl_too(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.have(monkeypatch, "libEGL.so.1", "libOSMesa.so.8")
+        assert gl.choose() == "osmesa"
+
+    def test_a_display_is_the_last_resort(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setenv("WAYLAND_DISPLAY", "wayland-0")
+        assert gl.choose() == "glfw"
+
+    def test_the_environment_decides(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.have(monkeypatch, "libEGL.so.1", "libGL.so.1")
+        monkeypatch.setenv("MUJOCO_GL", "OSMesa")
+        assert gl.choose() == "osmesa"
+        check = gl.check()
+        assert not check.ok
+        assert check.found == "MUJOCO_GL=osmesa, whose libraries do not load"
+
+    def test_an_unknown_backend_is_refused(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setenv("MUJOCO_GL", "vulkan")
+        with pytest.raises(SensorError, match="MUJOCO_GL is 'vulkan', must be one of: egl, osmesa, glfw"):
+            gl.choose()
