@@ -137,7 +137,7 @@ class TrajectoryExecutor(Executor):
                 joint = int(off.argmax())
                 raise GoalRejected(
                     f"the trajectory starts with {self.joints[joint]} at {positions[0, joint]:.6g} rad but it is at "
-                    f"{position[joint]:.6g}; it must start within {START_TOLERANCE_RAD} rad, or at a time above 0"
+                    f"{position[joint]:.6g}; it must start within {START_TOLERANCE_RAD} rad, or above time 0"
                 )
             times_ns, positions = times_ns[1:], positions[1:]
             velocities = None if velocities is None else velocities[1:]

@@ -1,0 +1,378 @@
+"""The trajectory executor in stepped time: splines, splices, tolerances, refusals."""
+
+from __future__ import annotations
+
+import copy
+import logging
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ibrobot_core.clock import SteppedClock
+from ibrobot_core.control.executors.trajectory import TrajectoryExecutor
+from ibrobot_core.control.executors.trajectory_goal import goal_from_message
+from ibrobot_core.errors import GoalRejected
+from ibrobot_core.executor_options import TrajectoryOptions
+from ibrobot_core.interfaces import Context, GoalState, GoalStatus, JointReading
+from ibrobot_core.messages import Header, JointTrajectory, JointTrajectoryPoint
+from ibrobot_core.robot import Joint, Robot, Vector
+from ibrobot_core.units import ns
+
+MS = 1_000_000
+ROBOT = Robot(
+    name="robot",
+    joints=tuple(Joint(name=n, lower=-3, upper=3, max_velocity=1, max_acceleration=1) for n in ("pan", "lift", "roll")),
+)
+
+
+def point(time_s: float, positions: Any, velocities: Any = None, accelerations: Any = None) -> dict[str, Any]:
+    given = {"positions": positions, "velocities": velocities, "accelerations": accelerations}
+    return {"time_from_start_ns": ns(time_s)} | {key: list(row) for key, row in given.items() if row is not None}
+
+
+def goal(*points: dict[str, Any], joint_names: Any = ("pan", "roll"), **more: Any) -> dict[str, Any]:
+    return {"trajectory": {"joint_names": list(joint_names), "points": list(points)}, **more}
+
+
+class Arm:
+    """Two joints that stand, at each tick, where the last setpoint told them to be, plus `off`."""
+
+    def __init__(self, start: tuple[float, float] = (0.0, 0.0), **options: Any) -> None:
+        context = Context(
+            name="arm", clock=SteppedClock(), log=logging.getLogger("test"), robot=ROBOT, joints=("pan", "roll")
+        )
+        self.executor = TrajectoryExecutor(TrajectoryOptions(**options), context)
+        self.now_ns, self.setpoint, self.off = 0, np.array(start), np.zeros(2)
+        self.executor.activate(self.reading())
+
+    def reading(self) -> JointReading:
+        return JointReading(self.now_ns, self.setpoint + self.off, np.zeros(2), np.full(2, np.nan))
+
+    def go(self, wanted: dict[str, Any], goal_id: str = "goal") -> None:
+        self.executor.set_goal(goal_id, wanted, self.reading())
+
+    def at(self, time_s: float) -> list[float]:
+        """Tick at `time_s`."""
+        self.now_ns = ns(time_s)
+        before = self.reading()
+        self.setpoint = self.executor.update(before)
+        return self.setpoint.tolist()
+
+    def statuses(self) -> list[GoalStatus]:
+        return list(iter(self.executor.pop_status, None))
+
+
+def test_it_holds_the_measured_position_after_activation() -> None:
+    arm = Arm((0.3, -0.2))
+    assert arm.at(5.0) == [0.3, -0.2]
+    assert arm.statuses() == []
+
+
+def test_positions_alone_make_straight_lines_from_the_present_setpoint() -> None:
+    arm = Arm((0.0, 1.0))
+    arm.go(goal(point(1.0, (1.0, 1.0)), point(2.0, (1.0, 0.0))))
+    assert arm.at(0.0) == [0.0, 1.0]
+    assert arm.at(0.25) == pytest.approx([0.25, 1.0])
+    assert arm.at(1.0) == [1.0, 1.0]
+    assert arm.at(1.5) == pytest.approx([1.0, 0.5])
+    assert arm.at(2.0) == [1.0, 0.0]
+    assert arm.at(9.0) == [1.0, 0.0]
+    assert [s.state for s in arm.statuses()] == [GoalState.EXECUTING, GoalState.SUCCEEDED]
+
+
+def test_joint_names_may_come_in_any_order() -> None:
+    arm = Arm()
+    arm.go(goal(point(1.0, (0.5, -0.5), (0.0, 0.0)), joint_names=("roll", "pan")))
+    assert arm.at(1.0) == [-0.5, 0.5]
+
+
+def test_velocities_make_cubics() -> None:
+    arm = Arm()
+    arm.go(goal(point(1.0, (1.0, 0.0), (0.0, 0.0))))
+    assert arm.at(0.25) == pytest.approx([3 * 0.25**2 - 2 * 0.25**3, 0.0])
+
+
+def test_accelerations_make_quintics() -> None:
+    arm = Arm()
+    arm.go(goal(point(1.0, (1.0, 0.0), (0.0, 0.0), (0.0, 0.0))))
+    s = 0.25
+    assert arm.at(s) == pytest.approx([10 * s**3 - 15 * s**4 + 6 * s**5, 0.0])
+
+
+rows = st.tuples(st.floats(-2, 2), st.floats(-2, 2))
+
+
+fields: dict[str, Callable[[Any], tuple[Any, ...]]] = {
+    "linear": lambda p: (p,),
+    "cubic": lambda p: (p, (0.0, 0.0)),
+    "quintic": lambda p: (p, (0.0, 0.0), (0.0, 0.0)),
+}
+
+
+@settings(max_examples=40)
+@given(rows, rows, st.floats(0.05, 1.5), st.sampled_from(list(fields)), st.sampled_from(list(fields)))
+def test_a_new_goal_replaces_a_running_one_without_a_step(
+    first: Any, second: Any, when: float, old: str, new: str
+) -> None:
+    def drive(replace: bool) -> list[Vector]:
+        arm = Arm()
+        arm.go(goal(point(1.0, *fields[old](first))))
+        arm.at(when - 0.001)
+        arm.at(when)
+        if replace:
+            arm.go(goal(point(1.0, *fields[new](second))), "second")
+        return [np.array(arm.at(when + k * 0.0001)) for k in range(3)]
+
+    went_on, replaced = drive(False), drive(True)
+    np.testing.assert_allclose(replaced[0], went_on[0], atol=1e-12)
+    if new != "linear" and not (old == "linear" and abs(when - 1.0) < 0.01):
+        speeds = [(path[1] - path[0]) / 0.0001 for path in (went_on, replaced)]
+        np.testing.assert_allclose(speeds[1], speeds[0], atol=0.01)
+
+
+def test_a_replaced_goal_is_reported_as_cancelled() -> None:
+    arm = Arm()
+    arm.go(goal(point(1.0, (1.0, 1.0))), "first")
+    arm.at(0.5)
+    arm.go(goal(point(1.0, (0.0, 0.0))), "second")
+    arm.at(1.5)
+    arm.at(1.51)
+    assert arm.statuses() == [
+        GoalStatus("first", GoalState.EXECUTING),
+        GoalStatus("first", GoalState.CANCELED, "replaced by goal second"),
+        GoalStatus("second", GoalState.EXECUTING),
+        GoalStatus("second", GoalState.SUCCEEDED),
+    ]
+
+
+def test_a_point_at_time_zero_gives_way_to_the_present_setpoint_near_it() -> None:
+    arm = Arm((0.0, 0.0))
+    arm.go(goal(point(0.0, (0.05, 0.0)), point(1.0, (1.0, 0.0))))
+    assert arm.at(0.0) == [0.0, 0.0]
+    assert arm.at(0.5) == [0.5, 0.0]
+
+
+def test_a_path_violation_aborts_and_holds_the_measured_position() -> None:
+    arm = Arm(path_tolerance=0.1)
+    arm.go(goal(point(1.0, (1.0, 0.0))))
+    arm.at(0.05)
+    arm.off = np.array([0.0, -0.2])
+    arm.at(0.06)
+    *_, status = arm.statuses()
+    assert status.state is GoalState.ABORTED
+    assert status.message == "roll is 0.2 rad off its path (tolerance 0.1)"
+    assert arm.setpoint.tolist() == pytest.approx([0.05, -0.2])
+    held = arm.setpoint.tolist()
+    arm.off = np.zeros(2)
+    assert arm.at(2.0) == held
+
+
+def test_the_goal_tolerance_is_waited_for_up_to_goal_time() -> None:
+    arm = Arm(goal_tolerance=0.02, goal_time=0.5)
+    arm.go(goal(point(1.0, (1.0, 0.0))))
+    arm.at(0.99)
+    arm.off = np.array([-0.1, 0.0])
+    arm.at(1.0)
+    arm.at(1.4)
+    assert [s.state for s in arm.statuses()] == [GoalState.EXECUTING]
+    arm.off = np.array([-0.01, 0.0])
+    assert arm.at(1.41) == [1.0, 0.0]
+    assert [s.state for s in arm.statuses()] == [GoalState.SUCCEEDED]
+
+
+def test_a_goal_not_reached_within_goal_time_aborts_and_holds_the_measured_position() -> None:
+    arm = Arm(goal_tolerance=0.02, goal_time=0.5)
+    arm.go(goal(point(1.0, (1.0, 0.0))))
+    arm.off = np.array([-0.1, 0.0])
+    for time_s in (1.0, 1.49, 1.5):
+        arm.at(time_s)
+    status = arm.statuses()[-1]
+    assert status.state is GoalState.ABORTED
+    assert status.message == "pan is 0.1 rad off its goal (tolerance 0.02) 0.5 s after the end"
+    assert arm.setpoint.tolist() == [0.9, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("options", "more", "off", "ends"),
+    [
+        ({"path_tolerance": 0.1}, {}, 0.2, GoalState.ABORTED),
+        ({"path_tolerance": 0.0}, {}, 0.2, GoalState.EXECUTING),  # 0 in the options: not checked
+        ({"path_tolerance": 0.1}, {"path_tolerance": 0}, 0.2, GoalState.ABORTED),  # 0 in the goal: the options'
+        ({"path_tolerance": 0.1}, {"path_tolerance": -1}, 0.2, GoalState.EXECUTING),  # -1 erases
+        ({"path_tolerance": 0.1}, {"path_tolerance": 0.3}, 0.2, GoalState.EXECUTING),
+        ({}, {"path_tolerance": 0.1}, 0.2, GoalState.ABORTED),
+        ({}, {"path_tolerance": {"pan": 0.1}}, 0.2, GoalState.ABORTED),
+        ({}, {"path_tolerance": {"roll": 0.1}}, 0.2, GoalState.EXECUTING),
+        ({"path_tolerance": 0.1}, {"path_tolerance": {"pan": -1}}, 0.2, GoalState.EXECUTING),
+    ],
+)
+def test_path_tolerances_of_options_and_goal(options: Any, more: Any, off: float, ends: GoalState) -> None:
+    arm = Arm(**options)
+    arm.go(goal(point(1.0, (0.5, 0.5)), **more))
+    arm.off = np.array([off, 0.0])
+    arm.at(0.01)
+    assert arm.statuses()[-1].state is ends
+
+
+@pytest.mark.parametrize(
+    ("more", "after_end_s", "ends"),
+    [
+        ({}, 0.0, GoalState.EXECUTING),
+        ({}, 1.0, GoalState.ABORTED),
+        ({"goal_time": 0}, 1.0, GoalState.ABORTED),
+        ({"goal_time": 2.0}, 1.0, GoalState.EXECUTING),
+        ({"goal_time": -1}, 3600.0, GoalState.EXECUTING),
+        ({"goal_tolerance": -1}, 0.0, GoalState.SUCCEEDED),
+        ({"goal_tolerance": 0.3}, 0.0, GoalState.SUCCEEDED),
+        ({"goal_tolerance": 0}, 1.0, GoalState.ABORTED),
+        ({"goal_tolerance": {"pan": 0.3}}, 0.0, GoalState.SUCCEEDED),
+    ],
+)
+def test_goal_tolerances_and_goal_time_of_a_goal(more: Any, after_end_s: float, ends: GoalState) -> None:
+    arm = Arm(goal_tolerance=0.02, goal_time=1.0)
+    arm.go(goal(point(1.0, (0.5, 0.5)), **more))
+    arm.at(0.99)
+    arm.off = np.array([0.2, 0.0])
+    arm.at(1.0 + after_end_s)
+    assert arm.statuses()[-1].state is ends
+
+
+def test_an_unmeasured_joint_is_within_no_tolerance_and_is_held_where_it_was_told_to_be() -> None:
+    arm = Arm(path_tolerance=0.1)
+    arm.go(goal(point(1.0, (1.0, 1.0))))
+    arm.off = np.array([np.nan, 0.0])
+    assert arm.at(0.01) == [0.01, 0.0]
+    assert arm.statuses()[-1].state is GoalState.ABORTED
+
+
+def test_cancelling_holds_the_measured_position() -> None:
+    arm = Arm()
+    arm.go(goal(point(1.0, (1.0, 0.0))))
+    arm.at(0.5)
+    arm.off = np.array([-0.02, 0.01])
+    arm.executor.cancel(arm.reading())
+    assert arm.at(0.51) == [0.48, 0.01]
+    assert arm.statuses()[-1] == GoalStatus("goal", GoalState.CANCELED, "cancelled")
+    arm.executor.cancel(arm.reading())
+    assert arm.statuses() == []
+
+
+def test_deactivation_ends_the_goal() -> None:
+    arm = Arm()
+    arm.go(goal(point(1.0, (1.0, 0.0))))
+    arm.executor.deactivate()
+    assert arm.statuses()[-1] == GoalStatus("goal", GoalState.CANCELED, "the executor was deactivated")
+    with pytest.raises(GoalRejected, match="not active"):
+        arm.go(goal(point(1.0, (1.0, 0.0))))
+
+
+AT_REST = (0.0, 0.0)
+BAD = {
+    "the trajectory has no points; it needs at least one": goal(),
+    "the goal has no trajectory": {},
+    "the trajectory has no joint_names": {"trajectory": {"points": []}},
+    "the goal must be a mapping with trajectory, got 'up'": "up",
+    "the goal has an unknown key 'tolerance'; known: trajectory, path_tolerance, goal_tolerance, goal_time": goal(
+        point(1, AT_REST), tolerance=1
+    ),
+    "point 0 has an unknown key 'effort'; known: time_from_start_ns, positions, velocities, accelerations": goal(
+        point(1, AT_REST) | {"effort": [1.0, 1.0]}
+    ),
+    "joint_names must be, in any order, pan, roll; got ['pan']": goal(point(1, AT_REST), joint_names=["pan"]),
+    "joint_names must be, in any order, pan, roll; got ['pan', 'roll', 'lift']": goal(
+        point(1, AT_REST), joint_names=["pan", "roll", "lift"]
+    ),
+    "joint_names must be, in any order, pan, roll; got ['pan', 'pan']": goal(
+        point(1, AT_REST), joint_names=["pan", "pan"]
+    ),
+    "point 1 is at 500000000 ns, not after the point before it at 1000000000 ns": goal(
+        point(1, AT_REST), point(0.5, AT_REST)
+    ),
+    "point 1 is at 1000000000 ns, not after the point before it at 1000000000 ns": goal(
+        point(1, AT_REST), point(1, AT_REST)
+    ),
+    "point 0 has time_from_start_ns -1000000000; it must be an integer from 0 on": goal(point(-1, AT_REST)),
+    "point 0 has time_from_start_ns 0.5; it must be an integer from 0 on": goal(
+        {"time_from_start_ns": 0.5, "positions": [0, 0]}
+    ),
+    "the last point is at time 0, which leaves no time to reach it": goal(point(0, AT_REST)),
+    "the last point has roll at 0.1 rad/s; it must be at rest": goal(point(1, AT_REST, (0.0, 0.1))),
+    "point 0 has positions [0.0]; it must be a list of 2 numbers": goal(point(1, (0.0,))),
+    "point 0 has positions 'home'; it must be a list of 2 numbers": goal(
+        {"time_from_start_ns": 1, "positions": "home"}
+    ),
+    "point 1 has velocities [0.0, 0.0, 0.0]; it must be a list of 2 numbers": goal(
+        point(1, AT_REST, AT_REST), point(2, AT_REST, (0.0, 0.0, 0.0))
+    ),
+    "point 0 has nan among its positions; each must be a finite number": goal(point(1, (0.0, float("nan")))),
+    "point 0 has inf among its velocities; each must be a finite number": goal(
+        point(1, AT_REST, (float("inf"), 0.0)), point(2, AT_REST, AT_REST)
+    ),
+    "point 0 has '1' among its positions; each must be a finite number": goal(point(1, ("1", 0.0))),
+    "point 1 has no velocities but point 0 has; all or none must": goal(point(1, AT_REST, AT_REST), point(2, AT_REST)),
+    "the points have accelerations but no velocities; give both, or positions alone": goal(
+        point(1, AT_REST, None, AT_REST)
+    ),
+    "the points have no positions; every point needs them": goal(point(1, ())),
+    "the last point has pan at 3.5 rad, outside its limits -3 to 3": goal(point(1, (3.5, 0.0))),
+    "the trajectory starts with pan at 0.5 rad but it is at 0; it must start within 0.1 rad, or above time 0": goal(
+        point(0, (0.5, 0.0)), point(1, AT_REST)
+    ),
+    "path_tolerance is -2; it must be above 0, or 0 for the default, or -1 for none": goal(
+        point(1, AT_REST), path_tolerance=-2
+    ),
+    "goal_time is 'soon'; it must be above 0, or 0 for the default, or -1 for none": goal(
+        point(1, AT_REST), goal_time="soon"
+    ),
+    "goal_tolerance names 'lift', which is no joint here; the joints are pan, roll": goal(
+        point(1, AT_REST), goal_tolerance={"lift": 1}
+    ),
+}
+
+
+@pytest.mark.parametrize("message", BAD)
+def test_a_bad_goal_is_rejected_precisely_and_the_old_one_goes_on(message: str) -> None:
+    arm = Arm()
+    arm.go(goal(point(1.0, (1.0, 0.0))))
+    with pytest.raises(GoalRejected) as caught:
+        arm.go(copy.deepcopy(BAD[message]), "bad")
+    assert str(caught.value) == message
+    assert arm.at(0.5) == [0.5, 0.0]
+    arm.at(1.0)
+    arm.at(1.01)
+    assert [(s.goal_id, s.state) for s in arm.statuses()] == [
+        ("goal", GoalState.EXECUTING),
+        ("goal", GoalState.SUCCEEDED),
+    ]
+
+
+def test_a_goal_is_made_of_a_message() -> None:
+    def message(**more: Any) -> JointTrajectory:
+        end = JointTrajectoryPoint(ns(1.0), np.array([0.5, 0.25]), np.zeros(2), **more)
+        return JointTrajectory(Header(), ("roll", "pan"), (end,))
+
+    made = goal_from_message(message())
+    assert made == goal(point(1.0, (0.5, 0.25), AT_REST), joint_names=("roll", "pan"))
+    arm = Arm()
+    arm.go(made)
+    assert arm.at(1.0) == [0.25, 0.5]
+    with pytest.raises(GoalRejected, match="point 0 has efforts"):
+        goal_from_message(message(effort=np.ones(2)))
+
+
+def test_fields_given_as_empty_lists_are_not_given() -> None:
+    arm = Arm()
+    arm.go(goal(point(1.0, (1.0, 0.0), (), ())))
+    assert arm.at(0.25) == [0.25, 0.0]
+
+
+def test_what_is_given_out_is_the_callers_to_change() -> None:
+    arm = Arm()
+    arm.go(goal(point(1.0, (1.0, 0.0))))
+    for time_s in (0.5, 1.0, 1.1, 1.2):
+        arm.executor.update(JointReading(ns(time_s), np.array([1.0, 0.0]), np.zeros(2), np.zeros(2)))[:] = 9.0
+    assert arm.at(1.3) == [1.0, 0.0]
