@@ -24,7 +24,9 @@ def apply(document: Document, overrides: Sequence[str]) -> None:
         except ConfigError as error:
             document.problems += [(place, Problem(place.file, 0, path, p.message)) for p in error.problems]
             continue
-        document.problems += [(place, Problem(place.file, 0, path, p.message)) for _, p in value.problems]
+        for _, problem in value.problems:
+            inner = f"{path}.{problem.path}" if problem.path else path
+            document.problems.append((place, Problem(place.file, 0, inner, problem.message)))
         put(document, path, value, place)
 
 

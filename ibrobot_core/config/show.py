@@ -113,6 +113,11 @@ def _text(dumper: yaml.SafeDumper, value: str) -> yaml.ScalarNode:
 _Dumper.add_representer(str, _text)
 
 
+def dump(value: Any) -> str:
+    """Plain values as YAML text that the config reader reads back as they are."""
+    return yaml.dump(value, Dumper=_Dumper, sort_keys=False, width=120, allow_unicode=True)
+
+
 def to_yaml(config: RobotConfig) -> str:
     """The whole config as YAML text."""
-    return yaml.dump(document(config), Dumper=_Dumper, sort_keys=False, width=120, allow_unicode=True)
+    return dump(document(config))

@@ -1,0 +1,196 @@
+"""What the contract may say: observations, selections, alignment, actions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+# What is wrong, the text of the base YAML that is replaced, what stands there instead, and all that is told.
+CASES = {
+    "contract_unknown_peripheral": (
+        "peripheral: top,",
+        "peripheral: tpo,",
+        "robot.yaml:36: contract.observations.1.peripheral: unknown peripheral 'tpo', did you mean 'top'?",
+    ),
+    "contract_peripheral_and_topic": (
+        "peripheral: top,",
+        "peripheral: top, topic: /x,",
+        "robot.yaml:36: contract.observations.1.topic: comes from peripheral 'top'; give one or the other",
+    ),
+    "contract_neither": (
+        "peripheral: top,",
+        "",
+        "robot.yaml:36: contract.observations.1: needs a topic, or a peripheral",
+    ),
+    "contract_peripheral_kind": (
+        "peripheral: top,",
+        "peripheral: chest,",
+        (
+            "robot.yaml:36: contract.observations.1.peripheral: the topic of a peripheral of kind 'imu' is not "
+            "known by itself; give topic and type instead"
+        ),
+    ),
+    "contract_type_needed": (
+        "peripheral: top,",
+        "topic: /other,",
+        "robot.yaml:36: contract.observations.1: needs a type, since that of /other is not known by itself",
+    ),
+    "contract_unknown_message": (
+        "peripheral: top,",
+        "topic: /other, type: sensor_msgs/msg/Imag,",
+        (
+            "robot.yaml:36: contract.observations.1.type: unknown message type 'sensor_msgs/msg/Imag', did you "
+            "mean 'sensor_msgs/msg/Image'?"
+        ),
+    ),
+    "contract_joint_states_type": (
+        "topic: /joint_states,",
+        "topic: /joint_states, type: sensor_msgs/msg/Imu,",
+        (
+            "robot.yaml:35: contract.observations.0.type: /joint_states carries sensor_msgs/msg/JointState, not "
+            "sensor_msgs/msg/Imu"
+        ),
+    ),
+    "contract_select_unknown_joint": (
+        "position.grip]",
+        "position.grp]",
+        "robot.yaml:35: contract.observations.0.select.2: unknown joint 'grp', did you mean 'grip'?",
+    ),
+    "contract_select_form": (
+        "position.grip]",
+        "2]",
+        "robot.yaml:35: contract.observations.0.select.2: expected text, got 2 (quote it: '2')",
+    ),
+    "contract_select_index": (
+        "position.grip]",
+        "position]",
+        (
+            "robot.yaml:35: contract.observations.0.select.2: expected position.JOINT or velocity.JOINT or "
+            "effort.JOINT, got 'position'"
+        ),
+    ),
+    "contract_select_image": (
+        "peripheral: top,",
+        "peripheral: top, select: [data],",
+        "robot.yaml:36: contract.observations.1.select.0: nothing can be selected from an image",
+    ),
+    "contract_select_field": (
+        "topic: /joint_states, select: [position.pan, position.lift, position.grip]",
+        "topic: /imu, type: sensor_msgs/msg/Imu, select: [linear_aceleration.x]",
+        (
+            "robot.yaml:35: contract.observations.0.select.0: sensor_msgs/msg/Imu has no field "
+            "'linear_aceleration', did you mean 'linear_acceleration'?"
+        ),
+    ),
+    "contract_image_of_joints": (
+        "topic: /joint_states,",
+        "topic: /joint_states, image: {},",
+        (
+            "robot.yaml:35: contract.observations.0.image: needs a camera; /joint_states carries "
+            "sensor_msgs/msg/JointState"
+        ),
+    ),
+    "contract_image_key": (
+        "key: observation.state",
+        "key: observation.images.state",
+        (
+            "robot.yaml:35: contract.observations.0.key: observation.images.state needs a camera; /joint_states "
+            "carries sensor_msgs/msg/JointState"
+        ),
+    ),
+    "contract_mixed_kinds": (
+        "key: observation.images.top",
+        "key: observation.state",
+        (
+            "robot.yaml:36: contract.observations.1.key: observation.state is an image in one observation and a "
+            "vector in another; give them different keys"
+        ),
+    ),
+    "contract_asof": (
+        "tol_ms: 100",
+        "stamp: header",
+        "robot.yaml:36: contract.observations.1.align: strategy asof needs tol_ms, e.g. tol_ms: 100",
+    ),
+    "contract_tol": (
+        "strategy: asof, ",
+        "",
+        ("robot.yaml:36: contract.observations.1.align: tol_ms has no meaning for strategy hold; it belongs to asof"),
+    ),
+    "contract_align_strategy": (
+        "strategy: asof",
+        "strategy: newest",
+        "robot.yaml:36: contract.observations.1.align.strategy: 'newest' is not one of: hold, asof, drop",
+    ),
+    "contract_action_executor": (
+        "executor: arm_position, topic",
+        "executor: arm_positon, topic",
+        ("robot.yaml:38: contract.actions.0.executor: unknown executor 'arm_positon', did you mean 'arm_position'?"),
+    ),
+    "contract_action_of_goals": (
+        "executor: arm_position, topic",
+        "executor: arm_trajectory, topic",
+        (
+            "robot.yaml:38: contract.actions.0.executor: executor 'arm_trajectory' takes goals; an action needs "
+            "one that streams, such as type position"
+        ),
+    ),
+    "contract_action_twice": (
+        "executor: grip_position, topic",
+        "executor: arm_position, topic",
+        "robot.yaml:39: contract.actions.1.executor: executor 'arm_position' has an action already",
+    ),
+    "contract_topic": (
+        "topic: /arm/commands",
+        "topic: arm/commands",
+        "robot.yaml:38: contract.actions.0.topic: a topic starts with /, got 'arm/commands'",
+    ),
+    "contract_safety": (
+        "topic: /arm/commands",
+        "topic: /arm/commands, safety_behavior: hodl",
+        "robot.yaml:38: contract.actions.0.safety_behavior: 'hodl' is not one of: hold, relax",
+    ),
+    "contract_rate": (
+        "rate_hz: 30",
+        "rate_hz: 200",
+        "robot.yaml:33: contract.rate_hz: 200.0 Hz is faster than the control loop, 100.0 Hz",
+    ),
+    "extra_observation_kind": (
+        "net: {type: net}",
+        (
+            "net: {type: net, extra_observations: [{key: observation.images.top, topic: /s, type: "
+            "std_msgs/msg/Float64MultiArray}]}"
+        ),
+        (
+            "robot.yaml:22: models.net.extra_observations.0.key: observation.images.top needs a camera; /s "
+            "carries std_msgs/msg/Float64MultiArray"
+        ),
+    ),
+    "no_contract": (
+        (
+            "contract:\n"
+            "  rate_hz: 30\n"
+            "  observations:\n"
+            "    - {key: observation.state, topic: /joint_states, select: [position.pan, position.lift, "
+            "position.grip]}\n"
+            "    - {key: observation.images.top, peripheral: top, align: {strategy: asof, tol_ms: 100}}\n"
+            "  actions:\n"
+            "    - {executor: arm_position, topic: /arm/commands}\n"
+            "    - {executor: grip_position, topic: /grip/commands}\n"
+        ),
+        "",
+        (
+            "robot.yaml:25: control_modes.policy.executors.0: no action of the contract drives executor "
+            "'arm_position'; add one under contract.actions\n"
+            "robot.yaml:25: control_modes.policy.executors.1: no action of the contract drives executor "
+            "'grip_position'; add one under contract.actions"
+        ),
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_message(case: str, faults_of_edit: Callable[[str, str], str]) -> None:
+    old, new, expected = CASES[case]
+
+    assert faults_of_edit(old, new) == expected

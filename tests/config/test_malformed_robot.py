@@ -1,0 +1,262 @@
+"""What must hold between sections: joints, groups, hardware, peripherals, executors, modes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+# What is wrong, the text of the base YAML that is replaced, what stands there instead, and all that is told.
+CASES = {
+    "package_missing": (
+        "    poses:",
+        "    urdf: package://no_such_robot/arm.urdf\n    poses:",
+        (
+            "robot.yaml:11: robot.description.urdf: the Python package 'no_such_robot' is not installed: pip "
+            "install no-such-robot"
+        ),
+    ),
+    "package_file_missing": (
+        "    poses:",
+        "    urdf: package://ibrobot_core/arm.urdf\n    poses:",
+        (
+            "robot.yaml:11: robot.description.urdf: the Python package 'ibrobot_core' has no file 'arm.urdf'; "
+            "check its version and the path"
+        ),
+    ),
+    "package_form": (
+        "    poses:",
+        "    urdf: package://ibrobot_core\n    poses:",
+        ("robot.yaml:11: robot.description.urdf: expected package://PACKAGE/path, got 'package://ibrobot_core'"),
+    ),
+    "file_missing": (
+        "    poses:",
+        "    mjcf: arm.xml\n    poses:",
+        (
+            "robot.yaml:11: robot.description.mjcf: no such file: FOLDER/arm.xml; a relative path starts at the "
+            "folder of the YAML file"
+        ),
+    ),
+    "limits_swapped": (
+        "pan, lower: -1.0, upper: 1.0",
+        "pan, lower: 1.0, upper: -1.0",
+        "robot.yaml:4: robot.joints.pan: lower (1.0) must be below upper (-1.0)",
+    ),
+    "no_joint_velocity": (
+        "pan, lower: -1.0, upper: 1.0, max_velocity: 2.0",
+        "pan, lower: -1.0, upper: 1.0, max_velocity: 0",
+        "robot.yaml:4: robot.joints.pan.max_velocity: 0.0 is too small, must be above 0 rad/s",
+    ),
+    "joint_twice": (
+        "name: lift",
+        "name: pan",
+        (
+            "robot.yaml:5: robot.joints.pan.name: a second joint named 'pan'\n"
+            "robot.yaml:8: robot.groups.arm.1: unknown joint 'lift'; known: pan, pan, grip\n"
+            "robot.yaml:35: contract.observations.0.select.1: unknown joint 'lift'; known: pan, pan, grip"
+        ),
+    ),
+    "joint_in_no_group": (
+        "    arm: [pan, lift]",
+        "    arm: [pan]",
+        (
+            "robot.yaml:5: robot.joints.lift: joint 'lift' is in no group, so no executor can own it; add it to "
+            "one under robot.groups"
+        ),
+    ),
+    "group_unknown_joint": (
+        "    arm: [pan, lift]",
+        "    arm: [pan, lift, gripp]",
+        "robot.yaml:8: robot.groups.arm.2: unknown joint 'gripp', did you mean 'grip'?",
+    ),
+    "group_joint_twice": (
+        "    arm: [pan, lift]",
+        "    arm: [pan, lift, pan]",
+        "robot.yaml:8: robot.groups.arm.2: joint 'pan' is given twice",
+    ),
+    "pose_length": (
+        "home: [0, 0, 0]",
+        "home: [0, 0]",
+        "robot.yaml:11: robot.description.poses.home: expected 3 positions, one for each joint, got 2",
+    ),
+    "pose_outside": (
+        "home: [0, 0, 0]",
+        "home: [0, 0, -0.5]",
+        "robot.yaml:11: robot.description.poses.home.2: -0.5 rad is outside the limits of grip, 0.0 to 1.0",
+    ),
+    "executor_unknown_group": (
+        "grip_position: {type: position, group: gripper}",
+        "grip_position: {type: position, group: griper}",
+        "robot.yaml:19: executors.grip_position.group: unknown group 'griper', did you mean 'gripper'?",
+    ),
+    "mode_unknown_executor": (
+        "plan: {executors: [arm_trajectory]",
+        "plan: {executors: [arm_trajectry]",
+        (
+            "robot.yaml:28: control_modes.plan.executors.0: unknown executor 'arm_trajectry', did you mean "
+            "'arm_trajectory'?"
+        ),
+    ),
+    "mode_claims_twice": (
+        "teleop: {executors: [arm_position, grip_position]",
+        "teleop: {executors: [arm_position, arm_trajectory]",
+        (
+            "robot.yaml:27: control_modes.teleop.executors.1: executors 'arm_position' and 'arm_trajectory' both "
+            "claim joint 'pan'\n"
+            "robot.yaml:27: control_modes.teleop.executors.1: executor 'arm_trajectory' takes goals, but teleop "
+            "sends setpoints; use one of type position, say"
+        ),
+    ),
+    "mode_executor_twice": (
+        "plan: {executors: [arm_trajectory]",
+        "plan: {executors: [arm_trajectory, arm_trajectory]",
+        "robot.yaml:28: control_modes.plan.executors.1: executor 'arm_trajectory' is given twice",
+    ),
+    "mode_without_executors": (
+        "plan: {executors: [arm_trajectory]",
+        "plan: {executors: []",
+        "robot.yaml:28: control_modes.plan.executors: a mode needs at least one executor",
+    ),
+    "mode_unknown_teleop": (
+        "teleop: stick}",
+        "teleop: stik}",
+        ("robot.yaml:27: control_modes.teleop.teleop: unknown teleoperation device 'stik', did you mean 'stick'?"),
+    ),
+    "mode_unknown_model": (
+        "{model: net}",
+        "{model: nets}",
+        "robot.yaml:26: control_modes.policy.inference.model: unknown model 'nets', did you mean 'net'?",
+    ),
+    "mode_goal_executor_for_teleop": (
+        "[arm_position, grip_position], teleop: stick",
+        "[arm_trajectory, grip_position], teleop: stick",
+        (
+            "robot.yaml:27: control_modes.teleop.executors.0: executor 'arm_trajectory' takes goals, but teleop "
+            "sends setpoints; use one of type position, say"
+        ),
+    ),
+    "mode_stream_executor_for_planner": (
+        "plan: {executors: [arm_trajectory]",
+        "plan: {executors: [arm_position]",
+        (
+            "robot.yaml:28: control_modes.plan.executors.0: executor 'arm_position' takes setpoints, but planner "
+            "sends goals; use one of type trajectory, say"
+        ),
+    ),
+    "mode_two_sources": (
+        "teleop: stick}",
+        "teleop: stick, planner: {type: straight}}",
+        "robot.yaml:27: control_modes.teleop.planner: teleop drives this mode already; make a mode for each",
+    ),
+    "mode_dispatch_alone": (
+        "teleop: stick}",
+        "teleop: stick, dispatch: {watermark: 5}}",
+        "robot.yaml:27: control_modes.teleop.dispatch: has a meaning only beside inference",
+    ),
+    "mode_planner_missing": (
+        "planner: {type: straight}",
+        "planner: {type: ompll}",
+        "robot.yaml:28: control_modes.plan.planner.type: unknown planner type 'ompll'; installed: straight",
+    ),
+    "execution_mode": (
+        "{model: net}",
+        "{model: net, execution_mode: cloud}",
+        "robot.yaml:26: control_modes.policy.inference.execution_mode: 'cloud' is not one of: monolithic",
+    ),
+    "default_mode": (
+        "default_control_mode: teleop",
+        "default_control_mode: telop",
+        "robot.yaml:29: default_control_mode: unknown control mode 'telop', did you mean 'teleop'?",
+    ),
+    "stop": (
+        "stop: hold}",
+        "stop: halt}",
+        "robot.yaml:41: control.stop: 'halt' is not one of: hold, relax, pose NAME",
+    ),
+    "stop_pose": (
+        "stop: hold}",
+        "stop: pose hme}",
+        "robot.yaml:41: control.stop: unknown pose 'hme', did you mean 'home'?",
+    ),
+    "peripheral_twice": (
+        "name: chest",
+        "name: top",
+        "robot.yaml:16: peripherals.top.name: a second peripheral named 'top', first in line 15",
+    ),
+    "peripheral_name": (
+        "name: chest",
+        "name: my chest",
+        "robot.yaml:16: peripherals.my chest.name: a name has letters, digits, _ and - only, got 'my chest'",
+    ),
+    "peripheral_kind": (
+        "kind: imu, type: gyro",
+        "kind: camera, type: gyro",
+        "robot.yaml:16: peripherals.chest.kind: sensor type 'gyro' is of kind 'imu'",
+    ),
+    "peripheral_simulated": (
+        "type: webcam, fps",
+        "type: virtual, fps",
+        (
+            "robot.yaml:15: peripherals.top.type: 'virtual' exists only in simulation; run with --sim, or name a "
+            "real sensor"
+        ),
+    ),
+    "simulation_in_hardware": (
+        "hardware: {type: bus, port: /dev/null}",
+        "hardware: {type: world}",
+        "robot.yaml:12: hardware.type: 'world' is a simulation; it belongs in the simulation section",
+    ),
+    "hardware_in_simulation": (
+        "simulation: {type: world}",
+        "simulation: {type: bus, port: /dev/null}",
+        "robot.yaml:13: simulation.type: 'bus' is no simulation; it belongs in the hardware section",
+    ),
+    "hardware_joint_unowned": (
+        "port: /dev/null}",
+        "port: /dev/null, joints: [pan, lift]}",
+        "robot.yaml:12: hardware: no hardware owns: grip",
+    ),
+    "hardware_joint_twice": (
+        "hardware: {type: bus, port: /dev/null}",
+        (
+            "hardware: {left: {type: bus, port: a, joints: [pan, lift]}, right: {type: bus, port: b, joints: "
+            "[lift, grip]}}"
+        ),
+        "robot.yaml:12: hardware.right.joints.0: joint 'lift' is owned by hardware 'left' already",
+    ),
+    "hardware_joints_needed": (
+        "hardware: {type: bus, port: /dev/null}",
+        "hardware: {left: {type: bus, port: a}, right: {type: bus, port: b, joints: [grip]}}",
+        "robot.yaml:12: hardware.left.joints: required where there is more than one hardware component",
+    ),
+    "hardware_unknown_joint": (
+        "port: /dev/null}",
+        "port: /dev/null, joints: [pan, lift, grp]}",
+        (
+            "robot.yaml:12: hardware: no hardware owns: grip\n"
+            "robot.yaml:12: hardware.joints.2: unknown joint 'grp', did you mean 'grip'?"
+        ),
+    ),
+    "no_body": (
+        "hardware: {type: bus, port: /dev/null}\nsimulation: {type: world}\n",
+        "",
+        "robot.yaml: needs a hardware section, a simulation section, or both",
+    ),
+    "norm_mode": (
+        "net: {type: net}",
+        "net: {type: net, norm_mode: degree}",
+        "robot.yaml:22: models.net.norm_mode: 'degree' is not one of: radians, degrees, range_m100_100",
+    ),
+    "recording_topics": (
+        "recording: {type: log}",
+        "recording: {type: log, topics: everything}",
+        "robot.yaml:40: recording.topics: 'everything' is not one of: contract, all, or a list of topics",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_message(case: str, faults_of_edit: Callable[[str, str], str]) -> None:
+    old, new, expected = CASES[case]
+
+    assert faults_of_edit(old, new) == expected
