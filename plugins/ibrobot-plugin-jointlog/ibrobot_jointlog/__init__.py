@@ -1,1 +1,53 @@
-"""Joint logs for ibrobot: record them to CSV, replay them, and NPZ datasets."""
+"""The plugin's hooks: teleop `replay`, recorder `joint_log`, dataset writer `npz`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+from ibrobot_core.descriptors import DatasetDescriptor, RecorderDescriptor, TeleopDescriptor
+from ibrobot_core.hookspecs import hookimpl
+from ibrobot_jointlog.options import ReplayOptions
+
+if TYPE_CHECKING:
+    from ibrobot_core.interfaces import Context, DatasetWriter, Recorder, Teleop
+
+
+def _replay(options: Any, ctx: Context) -> Teleop:
+    from ibrobot_jointlog.replay import ReplayTeleop
+
+    return ReplayTeleop(options, ctx)
+
+
+def _joint_log(options: Any, ctx: Context) -> Recorder:
+    from ibrobot_jointlog.recorder import JointLogRecorder
+
+    return JointLogRecorder(ctx)
+
+
+def _npz(options: Any, ctx: Context) -> DatasetWriter:
+    from ibrobot_jointlog.npz import NpzDatasetWriter
+
+    return NpzDatasetWriter()
+
+
+@hookimpl
+def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
+    """What plays a joint log."""
+    yield TeleopDescriptor(
+        type="replay", options=ReplayOptions, make=_replay, summary="plays a recorded joint log (CSV)"
+    )
+
+
+@hookimpl
+def ibrobot_recorders() -> Iterable[RecorderDescriptor]:
+    """What writes a joint log."""
+    yield RecorderDescriptor(
+        type="joint_log", make=_joint_log, summary="joint positions of an episode as CSV, for replay"
+    )
+
+
+@hookimpl
+def ibrobot_datasets() -> Iterable[DatasetDescriptor]:
+    """What writes frames as arrays."""
+    yield DatasetDescriptor(type="npz", make=_npz, summary="one NumPy .npz file an episode")

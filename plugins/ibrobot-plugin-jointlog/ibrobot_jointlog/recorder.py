@@ -1,0 +1,154 @@
+"""Recorder `joint_log`: the joint positions of an episode, as a CSV that `replay` plays."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shutil
+from pathlib import Path
+from typing import Any, override
+
+import attrs
+
+from ibrobot_core.errors import RecorderError
+from ibrobot_core.interfaces import Context, EpisodeEnd, EpisodeStart, Recorder
+from ibrobot_core.messages import JointState, Message
+from ibrobot_core.units import NS_PER_S
+from ibrobot_jointlog.files import replace_file
+from ibrobot_jointlog.log import header, row
+
+TOPIC = "/joint_states"
+FLUSH_NS = NS_PER_S
+"""Rows wait no longer than this, by their own stamps, before they are written."""
+
+
+@attrs.define
+class _Episode:
+    """An open episode. Rows are written in whole lines, so that a process killed at any time leaves a valid log."""
+
+    start: EpisodeStart
+    descriptor: int
+    size: int = 0
+    rows: list[str] = attrs.field(factory=list)
+    oldest_ns: int = 0
+    newest_ns: int | None = None
+    samples: int = 0
+    repeated: int = 0
+
+    def flush(self) -> None:
+        block = "".join(self.rows).encode()
+        self.rows.clear()
+        try:
+            written = os.write(self.descriptor, block)
+            if written != len(block):
+                raise OSError(f"only {written} of {len(block)} bytes were written")
+        except OSError as error:
+            os.ftruncate(self.descriptor, self.size)
+            raise RecorderError(f"{self.start.directory / 'joints.csv'}: {error}") from error
+        self.size += len(block)
+
+
+class JointLogRecorder(Recorder):
+    """Writes `joints.csv` and `metadata.json`; times count from the episode's start, by the messages' header stamps."""
+
+    def __init__(self, ctx: Context) -> None:
+        self._joints = ctx.robot.joint_names
+        self._episode: _Episode | None = None
+
+    @override
+    def begin(self, episode: EpisodeStart) -> None:
+        if self._episode is not None:
+            raise RecorderError(f"the episode in {self._episode.start.directory} has not ended")
+        if TOPIC not in episode.topics:
+            raise RecorderError(f"joint_log records {TOPIC}, which is not among: {', '.join(sorted(episode.topics))}")
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND
+        try:
+            episode.directory.mkdir()
+            opened = _Episode(episode, os.open(episode.directory / "joints.csv", flags, 0o644))
+        except OSError as error:
+            raise RecorderError(f"cannot record into {episode.directory}: {error}") from error
+        try:
+            opened.rows.append(header(self._joints))
+            opened.flush()
+            self._write_metadata(opened, {"outcome": "unfinished"})
+        except RecorderError:
+            os.close(opened.descriptor)
+            raise
+        self._episode = opened
+
+    @override
+    def write(self, topic: str, message: Message, received_ns: int) -> None:
+        episode = self._open()
+        if topic != TOPIC:
+            return
+        if not isinstance(message, JointState):
+            raise RecorderError(f"{TOPIC} carries {message.ros_type}, must be {JointState.ros_type}")
+        stamp_ns = message.header.stamp_ns
+        if episode.newest_ns is not None and stamp_ns <= episode.newest_ns:
+            # A reading that was lost on the bus is published again under its old stamp: nothing new in it.
+            episode.repeated += 1
+            return
+        line = row(stamp_ns - episode.start.stamp_ns, self._positions(message))
+        if not episode.rows:
+            episode.oldest_ns = stamp_ns
+        episode.rows.append(line)
+        episode.newest_ns = stamp_ns
+        episode.samples += 1
+        if stamp_ns - episode.oldest_ns >= FLUSH_NS:
+            episode.flush()
+
+    @override
+    def end(self, episode: EpisodeEnd) -> Path | None:
+        ended = self._open()
+        self._episode = None
+        directory = ended.start.directory
+        try:
+            if episode.outcome != "discarded":
+                ended.flush()
+        finally:
+            os.close(ended.descriptor)
+        if episode.outcome == "discarded":
+            shutil.rmtree(directory)
+            return None
+        closing = {"outcome": episode.outcome, "end_stamp_ns": episode.stamp_ns, "dropped": dict(episode.dropped)}
+        self._write_metadata(ended, closing)
+        return directory
+
+    @override
+    def close(self) -> None:
+        if self._episode is not None:
+            stamp_ns = self._episode.newest_ns
+            self.end(EpisodeEnd(self._episode.start.stamp_ns if stamp_ns is None else stamp_ns, "unknown"))
+
+    def _open(self) -> _Episode:
+        if self._episode is None:
+            raise RecorderError("no episode has begun")
+        return self._episode
+
+    def _positions(self, message: JointState) -> list[float]:
+        """Positions in robot order."""
+        if len(message.position) != len(message.name):
+            raise RecorderError(f"{TOPIC} has {len(message.name)} joints but {len(message.position)} positions")
+        positions = dict(zip(message.name, message.position.tolist(), strict=True))
+        for joint in self._joints:
+            if joint not in positions:
+                raise RecorderError(f"{TOPIC} lacks joint {joint!r}; it has: {', '.join(message.name)}")
+            if not math.isfinite(positions[joint]):
+                raise RecorderError(f"{TOPIC}: position of joint {joint!r} is {positions[joint]}, must be finite")
+        return [positions[joint] for joint in self._joints]
+
+    def _write_metadata(self, episode: _Episode, closing: dict[str, Any]) -> None:
+        start = episode.start
+        facts = {
+            "format": "joint_log",
+            "start_stamp_ns": start.stamp_ns,
+            "metadata": dict(start.metadata),
+            "samples": episode.samples,
+            "repeated": episode.repeated,
+            **closing,
+        }
+        try:
+            replace_file(start.directory / "metadata.json", json.dumps(facts, indent=2, ensure_ascii=False).encode())
+        except OSError as error:
+            raise RecorderError(f"{start.directory / 'metadata.json'}: {error}") from error
