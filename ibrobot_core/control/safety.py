@@ -154,7 +154,7 @@ class SafetyLayer:
         position, slack = self._position, self._half_slack
         # A joint that started outside may come in, and then not go back out.
         lower, upper = np.minimum(self._lower, position), np.maximum(self._upper, position)
-        target = np.clip(np.where(follow, wanted, position), lower, upper)
+        target = _limited(np.where(follow, wanted, position), lower, upper)
         ahead = target - position
         # Where the target moves smoothly it is expected to go on; otherwise to be a place to stop at.
         target_step = target - self._target
@@ -163,7 +163,7 @@ class SafetyLayer:
 
         slowest = np.maximum(self._step - self._max_change, -self._max_step)
         fastest = np.minimum(self._step + self._max_change, self._max_step)
-        room_below, room_above = _reach(np.stack((position - lower, upper - position)), self._change)
+        room_below, room_above = _reach(np.array((position - lower, upper - position)), self._change)
         # Beyond the room to brake by a quarter only: the next step has to make up for it within the slack.
         within = (ahead <= np.minimum(fastest + slack, room_above + slack / 4)) & (
             ahead >= np.maximum(slowest - slack, -room_below - slack / 4)
@@ -177,10 +177,10 @@ class SafetyLayer:
         else:
             gap = ahead - expected
             step = np.where(follow, expected + np.copysign(_reach(np.abs(gap), self._change), gap), 0.0)
-            step = np.minimum(np.maximum(step, slowest), fastest)
+            step = _limited(step, slowest, fastest)
             # Last, since a position limit must hold even where rounding leaves no step that satisfies all.
-            step = np.minimum(np.maximum(step, -room_below), room_above)
-            command = np.where(passes, target, np.clip(position + step, lower, upper))
+            step = _limited(step, -room_below, room_above)
+            command = np.where(passes, target, _limited(position + step, lower, upper))
         self._step = command - position
         self._position = command
         self._target = np.where(follow, target, np.nan)
@@ -190,10 +190,10 @@ class SafetyLayer:
     def _count(self, differs: NDArray[np.bool_], wanted: Vector, known: NDArray[np.bool_], before: Vector) -> None:
         """Count the joints that `differs` marks, each under the first of `KINDS` that applies."""
         lower, upper = np.minimum(self._lower, before), np.maximum(self._upper, before)
-        step = np.clip(wanted, lower, upper) - before
-        reasons = np.stack(
+        step = _limited(wanted, lower, upper) - before
+        reasons = np.array(
             (
-                np.full_like(differs, self._estopped),
+                differs & self._estopped,
                 ~np.isfinite(wanted),
                 ~known,
                 self._fresh,
@@ -211,6 +211,12 @@ def _vector(value: object, size: int) -> Vector | None:
     if isinstance(value, np.ndarray) and value.shape == (size,) and value.dtype.kind in "fiu" and value.itemsize <= 8:
         return value.astype(np.float64, copy=False)
     return None
+
+
+def _limited(value: Vector, lower: Vector, upper: Vector) -> Vector:
+    """`value` within `lower` and `upper`; np.clip takes twice the time for a handful of joints."""
+    result: Vector = np.minimum(np.maximum(value, lower), upper)
+    return result
 
 
 def _reach(distance: Vector, change: Vector) -> Vector:
