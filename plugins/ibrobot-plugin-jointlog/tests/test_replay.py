@@ -113,13 +113,19 @@ def test_the_way_to_the_first_sample_is_bounded_in_speed_and_acceleration(tmp_pa
     np.testing.assert_allclose(shares[:, moving], np.repeat(shares[:, :1], moving.sum(), axis=1), atol=1e-9)
 
 
-def test_a_slow_joint_bounds_the_way_to_the_first_sample(tmp_path):
-    # The pan joint of the test robot may move at 2 rad/s, whatever the option says.
-    far = [1.5, 0.0, 0.3, 0.0, 0.0, 0.5]
-    teleop = replay(write_log(tmp_path / "log.csv", [WAVE[0]]), far, approach_speed=50.0)
-    path = [vector(teleop.read(reading(0.01 * i, far)))[0] for i in range(1, 400)]
-    assert np.abs(np.diff(path)).max() / 0.01 <= 2.0 + 1e-9
-    assert path[-1] == 0.0
+@pytest.mark.parametrize(("way", "peak_speed", "peak_acceleration"), [(3.7, 2.0, None), (0.5, None, 5.0)])
+def test_the_joints_own_limits_bound_the_way_too(tmp_path, way, peak_speed, peak_acceleration):
+    # The pan joint of the test robot may move at 2 rad/s and accelerate at 10 rad/s^2, of which half is used.
+    first = [-1.9, *WAVE[0][1:]]
+    far = [-1.9 + way, *WAVE[0][1:]]
+    teleop = replay(write_log(tmp_path / "log.csv", [first]), far, approach_speed=50.0)
+    path = [vector(teleop.read(reading(0.001 * i, far)))[0] for i in range(5000)]
+    speeds = np.diff(path) / 0.001
+    if peak_speed:
+        assert np.abs(speeds).max() == pytest.approx(peak_speed, rel=1e-3)
+    if peak_acceleration:
+        assert np.abs(np.diff(speeds)).max() / 0.001 == pytest.approx(peak_acceleration, rel=0.01)
+    assert path[-1] == -1.9
 
 
 def test_every_activation_begins_anew_from_where_the_robot_is(tmp_path):
