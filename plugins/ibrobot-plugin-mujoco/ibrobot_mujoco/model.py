@@ -124,16 +124,19 @@ def _add_surroundings(spec: mujoco.MjSpec) -> None:
         name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
         rgb1=[0.75, 0.82, 0.9], rgb2=[0.4, 0.48, 0.58], width=64, height=384,
     )  # fmt: skip
+    # The part of the scene that matters; shadows and the near plane of cameras are scaled by it.
+    spec.stat.center, spec.stat.extent = [0.15, 0.0, 0.1], 0.6
+    spec.visual.map.shadowclip = 2
     spec.visual.headlight.ambient = [0.4, 0.4, 0.4]
     spec.visual.headlight.diffuse = [0.25, 0.25, 0.25]
     spec.visual.headlight.specular = [0.0, 0.0, 0.0]
     world.add_light(
-        name="lamp", type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, pos=[0.3, -0.5, 1.3], dir=[-0.3, 0.4, -1.0],
+        name="lamp", type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, pos=[0.45, -0.4, 1.1], dir=[-0.3, 0.4, -1.0],
         diffuse=[0.6, 0.6, 0.58], specular=[0.15, 0.15, 0.15], castshadow=True,
     )  # fmt: skip
     # A plane bears contacts wherever it is looked at; its size is only what is drawn.
     world.add_geom(
-        name=TABLE, type=mujoco.mjtGeom.mjGEOM_PLANE, pos=[0.2, 0, 0], size=[0.6, 0.6, 0.05],
+        name=TABLE, type=mujoco.mjtGeom.mjGEOM_PLANE, pos=[0.15, 0, 0], size=[0.6, 0.6, 0.05],
         rgba=[0.72, 0.70, 0.66, 1], friction=[1, 0.005, 0.0001],
     )  # fmt: skip
 

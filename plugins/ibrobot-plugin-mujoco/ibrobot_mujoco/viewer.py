@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import os
-import sys
+import threading
+import warnings
 from typing import Any, override
 
 import mujoco
@@ -16,6 +16,7 @@ from ibrobot_mujoco.options import MujocoOptions
 from ibrobot_mujoco.state import PHYSICS_TOPIC, newest, pose_scene
 
 _QUEUE = 100
+_CLOSING_S = 5.0
 
 
 class MujocoViewer(Viewer):
@@ -31,15 +32,24 @@ class MujocoViewer(Viewer):
         simulation, bus = self._ctx.simulation, self._ctx.bus
         if not isinstance(simulation, MujocoOptions) or bus is None:
             raise IbrobotError("viewer type mujoco needs a running simulation: {type: mujoco}")
-        if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-            raise IbrobotError("no display for the viewer's window: DISPLAY and WAYLAND_DISPLAY are not set")
-        # Imported here: it opens the window system, which only this viewer needs.
+        # Imported here: they open the window system, which only this viewer needs.
+        import glfw
         from mujoco import viewer
 
+        with warnings.catch_warnings(record=True) as reasons:
+            warnings.simplefilter("always")
+            # Asked first, since MuJoCo's viewer would wait for ever for a window that cannot come.
+            if not glfw.init():
+                why = "; ".join(str(reason.message) for reason in reasons)
+                raise IbrobotError(f"no display for the viewer's window, see DISPLAY and WAYLAND_DISPLAY: {why}")
         self._model = build_model(simulation, self._ctx.robot, visual=True)
         self._drawn = mujoco.MjData(self._model)
-        mujoco.mj_forward(self._model, self._drawn)
+        others = set(threading.enumerate())
         self._window = viewer.launch_passive(self._model, self._drawn, show_left_ui=False, show_right_ui=False)
+        self._threads = [t for t in threading.enumerate() if t not in others and "_launch_internal" in t.name]
+        with self._window.lock():
+            self._window.cam.lookat[:] = 0.16, 0.05, 0.08
+            self._window.cam.distance, self._window.cam.azimuth, self._window.cam.elevation = 0.9, 150, -25
         self._states = bus.subscribe(PHYSICS_TOPIC, _QUEUE)
 
     @override
@@ -60,6 +70,9 @@ class MujocoViewer(Viewer):
             self._states = None
         if self._window is not None:
             self._window.close()
+            # A process that ends while the window is still closing crashes.
+            for thread in self._threads:
+                thread.join(_CLOSING_S)
             self._window = None
 
     @override
