@@ -8,7 +8,7 @@ from ibrobot_core.testing.planner import PlannerSuite
 from ibrobot_core.testing.policy import PolicySuite
 from ibrobot_core.testing.recorder import RecorderSuite
 from ibrobot_core.testing.sensor import SensorSuite
-from ibrobot_core.testing.suite import Suite, failed_checks, run_checks
+from ibrobot_core.testing.suite import Suite, checks, failed_checks, run_checks
 from ibrobot_core.testing.teleop import TeleopSuite
 from ibrobot_core.testing.transport import TransportSuite
 from ibrobot_core.testing.viewer import ViewerSuite
@@ -26,6 +26,7 @@ __all__ = [
     "TeleopSuite",
     "TransportSuite",
     "ViewerSuite",
+    "checks",
     "control_context",
     "failed_checks",
     "host_context",

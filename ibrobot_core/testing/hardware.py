@@ -55,9 +55,13 @@ class HardwareSuite(Suite[Hardware]):
 
         Without this a check for holding would pass hardware that always goes to zero.
         """
-        hardware.write(self._target(hardware, ctx))
+        start = hardware.read().position.copy()
+        goal = self._target(hardware, ctx)
+        hardware.write(goal)
         self.elapse(hardware, ctx, 2 * self.settle_s)
-        return hardware.read().position.copy()
+        reached = hardware.read().position.copy()
+        assert (np.abs(reached - goal) < 0.5 * np.abs(start - goal)).all(), "the joints did not stay at the command"
+        return reached
 
     def _target(self, hardware: Hardware, ctx: Context) -> Vector:
         position = hardware.read().position

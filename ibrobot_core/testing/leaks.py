@@ -11,6 +11,7 @@ import gc
 import os
 import threading
 from collections.abc import Iterator
+from contextlib import suppress
 from multiprocessing import resource_tracker
 from pathlib import Path
 
@@ -41,8 +42,9 @@ def child_processes() -> dict[int, str]:
     """Process id -> command line of every child, ended ones that nobody waited for included."""
     found: dict[int, str] = {}
     for children in Path("/proc/self/task").glob("*/children"):
-        for pid in children.read_text().split():
-            found[int(pid)] = Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
+        with suppress(FileNotFoundError, ProcessLookupError):  # threads and processes end while this looks at them
+            for pid in children.read_text().split():
+                found[int(pid)] = Path(f"/proc/{pid}/cmdline").read_text(errors="replace").replace("\0", " ")
     return found
 
 

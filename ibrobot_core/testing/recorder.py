@@ -95,9 +95,11 @@ class RecorderSuite(Suite[Recorder]):
         old.write_text("old")
         ctx = self.context()
         recorder = self.make(ctx)
-        with pytest.raises(RecorderError):
-            recorder.begin(self._start(ctx, old.parent))
-        recorder.close()
+        try:
+            with pytest.raises(RecorderError):
+                recorder.begin(self._start(ctx, old.parent))
+        finally:
+            recorder.close()
         assert [p.name for p in old.parent.iterdir()] == ["old.txt"]
         assert old.read_text() == "old"
 

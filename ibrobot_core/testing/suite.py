@@ -55,3 +55,8 @@ def run_checks[T](suite: type[Suite[T]], directory: Path) -> dict[str, BaseExcep
 def failed_checks[T](suite: type[Suite[T]], directory: Path) -> set[str]:
     """Names of the checks of `suite` that fail, without their `test_`; see `run_checks`."""
     return {name.removeprefix("test_") for name, error in run_checks(suite, directory).items() if error is not None}
+
+
+def checks[T](suite: type[Suite[T]]) -> set[str]:
+    """Names of all checks of `suite`, without their `test_`."""
+    return {name.removeprefix("test_") for name in dir(suite) if name.startswith("test_")}

@@ -1,0 +1,109 @@
+"""Every check of this repository: `nox` runs all, `nox -l` lists them, `nox -s core` runs one."""
+
+from __future__ import annotations
+
+import ctypes.util
+import os
+import sys
+from pathlib import Path
+
+import nox
+
+nox.needs_version = ">=2024.10.9"
+nox.options.default_venv_backend = "uv"
+nox.options.reuse_venv = "yes"
+
+PROJECT = nox.project.load_toml("pyproject.toml")
+PLUGINS = sorted(path.name.removeprefix("ibrobot-plugin-") for path in Path("plugins").glob("ibrobot-plugin-*"))
+PYTEST = ("pytest", "--config-file=pyproject.toml", "--rootdir=.")
+
+
+def packages(*plugins: str) -> list[str]:
+    """Install arguments for core and some plugins, as they are in this folder."""
+    return ["-e", ".", *(argument for name in plugins for argument in ("-e", f"plugins/ibrobot-plugin-{name}"))]
+
+
+def install(
+    session: nox.Session, *plugins: str, groups: tuple[str, ...] = ("test",), options: tuple[str, ...] = ()
+) -> None:
+    """Install core, some plugins and some dependency groups."""
+    requirements = nox.project.dependency_groups(PROJECT, *groups)
+    session.install("-c", "constraints.txt", *options, *packages(*plugins), *requirements)
+
+
+def render_off_screen(session: nox.Session) -> None:
+    """See to the libraries that MuJoCo renders with where there is no display."""
+    if not sys.platform.startswith("linux"):
+        return
+    session.env.setdefault("MUJOCO_GL", "egl")
+    if ctypes.util.find_library("EGL"):
+        return
+    if os.geteuid() != 0:
+        session.error("off-screen rendering needs: sudo apt-get install libegl1 libgl1-mesa-dri")
+    session.run("apt-get", "update", "-qq", external=True)
+    session.run("apt-get", "install", "-qq", "-y", "libegl1", "libgl1-mesa-dri", external=True)
+
+
+@nox.session
+def lint(session: nox.Session) -> None:
+    """Style, formatting, docstrings."""
+    session.install("-c", "constraints.txt", *nox.project.dependency_groups(PROJECT, "lint"))
+    session.run("ruff", "check", ".")
+    session.run("ruff", "format", "--check", ".")
+
+
+@nox.session
+def types(session: nox.Session) -> None:
+    """Types of core and of every plugin, strictly."""
+    install(session, *PLUGINS, groups=("lint", "test"))
+    session.run("mypy", "--strict", "ibrobot_core")
+    for name in PLUGINS:
+        session.run("mypy", "--strict", f"plugins/ibrobot-plugin-{name}/ibrobot_{name}")
+
+
+@nox.session
+def layers(session: nox.Session) -> None:
+    """Which module may import which: the contracts in pyproject.toml."""
+    install(session, *PLUGINS, groups=("lint",))
+    session.run("lint-imports")
+
+
+@nox.session
+def core(session: nox.Session) -> None:
+    """Core's tests with no plugin installed."""
+    install(session)
+    session.run(*PYTEST, "-m", "not integration", "tests", *session.posargs)
+
+
+@nox.session
+@nox.parametrize("name", PLUGINS, ids=PLUGINS)
+def plugin(session: nox.Session, name: str) -> None:
+    """A plugin's tests with that plugin and core alone."""
+    install(session, name)
+    if name == "mujoco":
+        render_off_screen(session)
+    session.run(*PYTEST, f"plugins/ibrobot-plugin-{name}/tests", *session.posargs)
+
+
+@nox.session
+def integration(session: nox.Session) -> None:
+    """What needs every plugin, or starts processes."""
+    install(session, *PLUGINS)
+    render_off_screen(session)
+    session.run(*PYTEST, "-m", "integration", "tests", *session.posargs)
+
+
+@nox.session
+def docs(session: nox.Session) -> None:
+    """The documentation: every warning is an error, every example runs."""
+    install(session, *PLUGINS, groups=("docs",))
+    session.run("sphinx-build", "-W", "--keep-going", "-n", "-b", "html", "docs", "docs/_build/html")
+    session.run("sphinx-build", "-W", "--keep-going", "-b", "doctest", "docs", "docs/_build/doctest")
+
+
+@nox.session
+def minimums(session: nox.Session) -> None:
+    """Core's and the plugins' tests with the oldest versions that they allow."""
+    install(session, *PLUGINS, options=("--resolution=lowest-direct",))
+    render_off_screen(session)
+    session.run(*PYTEST, "-m", "not integration", "tests", "plugins", *session.posargs)

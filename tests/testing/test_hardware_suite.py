@@ -1,0 +1,217 @@
+"""The hardware suites pass the fakes, and each of their checks catches something wrong."""
+
+from __future__ import annotations
+
+from typing import ClassVar, override
+
+import numpy as np
+import pytest
+
+from ibrobot_core.errors import HardwareError
+from ibrobot_core.interfaces import Episode, JointReading, Signal
+from ibrobot_core.testing import HardwareSuite, SimulatedHardwareSuite, checks, failed_checks
+from ibrobot_core.testing.fakes import FakeHardware, FakeRealHardware
+
+
+class TestRealHardware(HardwareSuite):
+    @override
+    def make(self, ctx):
+        return FakeRealHardware(ctx)
+
+
+class TestSimulatedHardware(SimulatedHardwareSuite):
+    @override
+    def make(self, ctx):
+        return FakeHardware(ctx)
+
+
+class OtherJoints(FakeHardware):
+    def __init__(self, ctx):
+        super().__init__(ctx)
+        self.joints = ctx.joints[::-1]
+
+
+class ShortVelocity(FakeHardware):
+    def read(self):
+        r = super().read()
+        return JointReading(r.stamp_ns, r.position, r.velocity[1:], r.effort)
+
+
+class NotANumber(FakeHardware):
+    def read(self):
+        r = super().read()
+        return JointReading(r.stamp_ns, np.full_like(r.position, np.nan), r.velocity, r.effort)
+
+
+class StampsStandStill(FakeHardware):
+    def read(self):
+        r = super().read()
+        return JointReading(1, r.position, r.velocity, r.effort)
+
+
+class StampsAhead(FakeHardware):
+    def read(self):
+        r = super().read()
+        return JointReading(r.stamp_ns + 10**9, r.position, r.velocity, r.effort)
+
+
+class DriftsToZero(FakeHardware):
+    def advance(self, step_ns):
+        super().advance(step_ns)
+        self._command = self._command * 0.98
+
+
+class HomesOnConnect(FakeHardware):
+    def connect(self):
+        super().connect()
+        self._command = np.zeros_like(self._command)
+
+
+class IgnoresCommands(FakeHardware):
+    def write(self, position):
+        command = self._command
+        super().write(position)
+        self._command = command
+
+
+class SwapsJoints(FakeHardware):
+    def write(self, position):
+        super().write(position[::-1] if position.shape == self._position.shape else position)
+
+
+class Degrees(FakeHardware):
+    def read(self):
+        r = super().read()
+        return JointReading(r.stamp_ns, np.degrees(r.position), np.degrees(r.velocity), r.effort)
+
+
+class BroadcastsCommands(FakeHardware):
+    def write(self, position):
+        super().write(np.resize(position, self._position.shape))
+
+
+class KeepsTheCommand(FakeHardware):
+    def write(self, position):
+        super().write(position)
+        self._command = position
+
+
+class ReusesItsReading(FakeHardware):
+    def read(self):
+        r = super().read()
+        self._buffer = getattr(self, "_buffer", r.position)
+        self._buffer[:] = r.position
+        return JointReading(r.stamp_ns, self._buffer, r.velocity, r.effort)
+
+
+class DisconnectsOnce(FakeHardware):
+    def disconnect(self):
+        self._check_open()
+        super().disconnect()
+
+
+class ReadsWhileDisconnected(FakeHardware):
+    def _check_open(self):
+        pass
+
+
+class StaysRelaxed(FakeHardware):
+    def write(self, position):
+        relaxed = self.relaxed
+        super().write(position)
+        self.relaxed = relaxed
+
+
+class ResetFaultsHomes(FakeHardware):
+    def reset_faults(self):
+        self._command = np.zeros_like(self._command)
+
+
+class ShortSignal(FakeHardware):
+    signals = (Signal("/fake/command", 3),)
+
+    def read_signal(self, index, out):
+        out[0] = 1.0
+
+
+class MovesWithoutAdvance(FakeHardware):
+    def read(self):
+        self.advance(1_000_000)
+        return super().read()
+
+
+class RandomFriction(FakeHardware):
+    random: ClassVar = np.random.default_rng()
+
+    def advance(self, step_ns):
+        super().advance(step_ns)
+        self._position = self._position + self.random.normal(0, 1e-9, self._position.shape)
+
+
+class SeedFromTheObject(FakeHardware):
+    def reset(self, episode):
+        super().reset(Episode(episode.seed + id(self)))
+
+
+class RemembersTheCommand(FakeHardware):
+    def reset(self, episode):
+        command = getattr(self, "_command", None)
+        super().reset(episode)
+        if command is not None:
+            self._command = command
+
+
+class AlwaysSucceeds(FakeHardware):
+    def success(self):
+        return True
+
+
+class LimitsItself(FakeHardware):
+    """Correct in all but this: it raises for what the safety layer let pass."""
+
+    def write(self, position):
+        if np.abs(position).max() > 0.01:
+            raise HardwareError("too far")
+        super().write(position)
+
+
+WRONG = {
+    OtherJoints: "owns_the_joints_it_was_given",
+    ShortVelocity: "reading_is_complete",
+    NotANumber: "reading_is_complete",
+    StampsStandStill: "stamps_follow_the_clock",
+    StampsAhead: "stamps_follow_the_clock",
+    DriftsToZero: "holds_where_it_is",
+    HomesOnConnect: "connecting_moves_nothing",
+    IgnoresCommands: "write_moves_each_joint_towards_its_command",
+    SwapsJoints: "write_moves_each_joint_towards_its_command",
+    Degrees: "write_moves_each_joint_towards_its_command",
+    LimitsItself: "write_moves_each_joint_towards_its_command",
+    BroadcastsCommands: "refuses_a_command_of_wrong_shape",
+    KeepsTheCommand: "keeps_no_hold_of_the_callers_arrays",
+    ReusesItsReading: "keeps_no_hold_of_the_callers_arrays",
+    DisconnectsOnce: "disconnect_is_safe_at_any_time",
+    ReadsWhileDisconnected: "refuses_use_while_disconnected",
+    StaysRelaxed: "relax_ends_with_the_next_write",
+    ResetFaultsHomes: "reset_faults_moves_nothing",
+    ShortSignal: "signals_fill_their_vectors",
+    MovesWithoutAdvance: "time_passes_only_by_advance",
+    RandomFriction: "equal_seeds_run_alike",
+    SeedFromTheObject: "equal_seeds_run_alike_in_another_object",
+    RemembersTheCommand: "reset_holds",
+    AlwaysSucceeds: "success_is_a_verdict",
+}
+
+
+@pytest.mark.parametrize(("wrong", "caught_by"), WRONG.items(), ids=lambda v: getattr(v, "__name__", v))
+def test_catches(wrong, caught_by, tmp_path):
+    class Suite(TestSimulatedHardware):
+        @override
+        def make(self, ctx):
+            return wrong(ctx)
+
+    assert caught_by in failed_checks(Suite, tmp_path)
+
+
+def test_every_check_catches_something():
+    assert checks(SimulatedHardwareSuite) == set(WRONG.values())

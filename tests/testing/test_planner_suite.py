@@ -1,0 +1,144 @@
+"""The planner suite passes the fake, and each of its checks catches something wrong."""
+
+from __future__ import annotations
+
+from typing import override
+
+import attrs
+import numpy as np
+import pytest
+
+from ibrobot_core.errors import PlanningError
+from ibrobot_core.interfaces import JointGoal
+from ibrobot_core.testing import PlannerSuite, checks, failed_checks
+from ibrobot_core.testing.fakes import FakePlanner
+
+
+class TestPlanner(PlannerSuite):
+    @override
+    def make(self, ctx):
+        return FakePlanner(ctx)
+
+
+class StopsShort(FakePlanner):
+    def plan(self, request):
+        trajectory = super().plan(request)
+        return attrs.evolve(trajectory, points=trajectory.points[:-1])
+
+
+class BeginsLate(FakePlanner):
+    def plan(self, request):
+        trajectory = super().plan(request)
+        later = (attrs.evolve(p, time_from_start_ns=p.time_from_start_ns + 10**9) for p in trajectory.points)
+        return attrs.evolve(trajectory, points=tuple(later))
+
+
+class RobotOrder(FakePlanner):
+    def plan(self, request):
+        return attrs.evolve(super().plan(request), joint_names=self._robot.joint_names)
+
+
+class RunsThroughTheGoal(FakePlanner):
+    def plan(self, request):
+        trajectory = super().plan(request)
+        last = attrs.evolve(trajectory.points[-1], velocities=np.full(len(request.joints), 0.5))
+        return attrs.evolve(trajectory, points=(*trajectory.points[:-1], last))
+
+
+class TwiceAsFast(FakePlanner):
+    def plan(self, request):
+        trajectory = super().plan(request)
+        fast = (
+            attrs.evolve(p, time_from_start_ns=p.time_from_start_ns // 2, velocities=p.velocities * 2)
+            for p in trajectory.points
+        )
+        return attrs.evolve(trajectory, points=tuple(fast))
+
+
+class LeavesTheLimitsOnTheWay(FakePlanner):
+    def plan(self, request):
+        trajectory = super().plan(request)
+        middle = len(trajectory.points) // 2
+        far = attrs.evolve(trajectory.points[middle], positions=trajectory.points[middle].positions + 10)
+        return attrs.evolve(trajectory, points=(*trajectory.points[:middle], far, *trajectory.points[middle + 1 :]))
+
+
+class IgnoresScaling(FakePlanner):
+    def plan(self, request):
+        return super().plan(attrs.evolve(request, velocity_scaling=1.0, acceleration_scaling=1.0))
+
+
+class OthersGoToZero(FakePlanner):
+    def plan(self, request):
+        goal = np.zeros(len(request.joints))
+        for joint, position in zip(request.goal.joints, request.goal.positions, strict=True):
+            if joint in request.joints:
+                goal[request.joints.index(joint)] = position
+        return super().plan(attrs.evolve(request, goal=JointGoal(request.joints, goal)))
+
+
+class NoPointsWithoutAWay(FakePlanner):
+    def plan(self, request):
+        trajectory = super().plan(request)
+        way = np.abs(trajectory.points[-1].positions - request.start).max()
+        return trajectory if way > 0 else attrs.evolve(trajectory, points=())
+
+
+class ClampsTheGoal(FakePlanner):
+    def plan(self, request):
+        order = self._robot.indices(request.goal.joints)
+        inside = np.clip(request.goal.positions, self._robot.lower[order], self._robot.upper[order])
+        return super().plan(attrs.evolve(request, goal=attrs.evolve(request.goal, positions=inside)))
+
+
+class IgnoresUnknownJoints(FakePlanner):
+    def plan(self, request):
+        known = tuple(joint for joint in request.goal.joints if joint in request.joints)
+        return super().plan(attrs.evolve(request, goal=JointGoal(known, request.goal.positions[: len(known)])))
+
+
+class ChangesTheRequest(FakePlanner):
+    def plan(self, request):
+        trajectory = super().plan(request)
+        request.start[:] = 0.0
+        return trajectory
+
+
+class ClosesOnce(FakePlanner):
+    closed = False
+
+    def close(self):
+        if self.closed:
+            raise PlanningError("closed already")
+        self.closed = True
+
+
+WRONG = {
+    StopsShort: "goes_from_start_to_goal",
+    BeginsLate: "goes_from_start_to_goal",
+    RobotOrder: "names_the_joints_asked_for",
+    RunsThroughTheGoal: "begins_and_ends_at_rest",
+    TwiceAsFast: "keeps_the_limits",
+    LeavesTheLimitsOnTheWay: "keeps_the_limits",
+    IgnoresScaling: "scaling_slows_down",
+    OthersGoToZero: "joints_not_named_stay",
+    NoPointsWithoutAWay: "no_way_to_go_is_a_trajectory_too",
+    ClampsTheGoal: "refuses_a_goal_outside_the_limits",
+    IgnoresUnknownJoints: "refuses_an_impossible_goal",
+    ChangesTheRequest: "leaves_the_request_alone",
+    ClosesOnce: "close_is_safe_twice",
+}
+
+
+@pytest.mark.parametrize(("wrong", "caught_by"), WRONG.items(), ids=lambda v: getattr(v, "__name__", v))
+def test_catches(wrong, caught_by, tmp_path):
+    class Suite(TestPlanner):
+        @override
+        def make(self, ctx):
+            return wrong(ctx)
+
+    assert caught_by in failed_checks(Suite, tmp_path)
+
+
+def test_every_check_catches_something():
+    assert checks(PlannerSuite) == set(WRONG.values())

@@ -1,0 +1,133 @@
+"""The policy suite passes the fake, and each of its checks catches something wrong."""
+
+from __future__ import annotations
+
+from typing import override
+
+import attrs
+import numpy as np
+import pytest
+
+from ibrobot_core.errors import PolicyError
+from ibrobot_core.testing import PolicySuite, checks, failed_checks
+from ibrobot_core.testing.fakes import FakePolicy
+
+
+class TestPolicy(PolicySuite):
+    @override
+    def make(self, ctx):
+        return FakePolicy(ctx)
+
+
+class MiscountsItsActions(FakePolicy):
+    def __init__(self, ctx):
+        super().__init__(ctx)
+        self.spec = attrs.evolve(self.spec, actions=self.spec.actions[1:])
+
+
+class LongChunks(FakePolicy):
+    def postprocess(self, tensors):
+        return np.repeat(super().postprocess(tensors), 2, axis=0)
+
+
+class SingleActions(FakePolicy):
+    def postprocess(self, tensors):
+        return super().postprocess(tensors)[0]
+
+
+class SinglePrecision(FakePolicy):
+    def postprocess(self, tensors):
+        return super().postprocess(tensors).astype(np.float32)
+
+
+class ZerosForMissing(FakePolicy):
+    def preprocess(self, frame):
+        state = np.zeros(6, np.float32)
+        return super().preprocess(attrs.evolve(frame, values={"observation.state": state, **frame.values}))
+
+
+class RandomWithoutSeed(FakePolicy):
+    def reset(self, seed):
+        self._goal = np.random.default_rng().uniform(-0.5, 0.5, 6)
+
+
+class RemembersTheLastEpisode(FakePolicy):
+    episodes = 0
+
+    def reset(self, seed):
+        self.episodes += 1
+        super().reset(self.episodes)
+
+
+class ChangesTheFrame(FakePolicy):
+    def preprocess(self, frame):
+        tensors = super().preprocess(frame)
+        frame.values["observation.state"][:] = 0.0
+        return tensors
+
+
+class NormalisesInPlace(FakePolicy):
+    def infer(self, tensors):
+        tensors["state"][:] /= 2.0
+        return super().infer(tensors)
+
+
+class ReusesItsChunk(FakePolicy):
+    chunk = np.zeros((10, 6))
+
+    def postprocess(self, tensors):
+        self.chunk[:] = super().postprocess(tensors)
+        return self.chunk
+
+
+class CountsPreprocess(FakePolicy):
+    count = 0
+
+    def preprocess(self, frame):
+        self.count += 1
+        return {**super().preprocess(frame), "count": np.array([self.count])}
+
+
+class SendsObjects(FakePolicy):
+    def preprocess(self, frame):
+        return {**super().preprocess(frame), "prompt": np.array([{"prompt": frame.prompt}], dtype=object)}
+
+
+class ClosesOnce(FakePolicy):
+    closed = False
+
+    def close(self):
+        if self.closed:
+            raise PolicyError("closed already")
+        self.closed = True
+
+
+WRONG = {
+    MiscountsItsActions: "spec_agrees_with_itself",
+    LongChunks: "chunks_are_as_specified",
+    SingleActions: "chunks_are_as_specified",
+    SinglePrecision: "chunks_are_as_specified",
+    ZerosForMissing: "a_missing_key_is_refused",
+    RandomWithoutSeed: "equal_seeds_act_alike",
+    RemembersTheLastEpisode: "equal_seeds_act_alike",
+    ChangesTheFrame: "inputs_stay_as_they_were",
+    NormalisesInPlace: "inputs_stay_as_they_were",
+    ReusesItsChunk: "outputs_stay_as_they_were",
+    CountsPreprocess: "pre_and_postprocess_are_pure",
+    SendsObjects: "tensors_survive_the_wire",
+    ClosesOnce: "close_is_safe_twice",
+}
+
+
+@pytest.mark.parametrize(("wrong", "caught_by"), WRONG.items(), ids=lambda v: getattr(v, "__name__", v))
+def test_catches(wrong, caught_by, tmp_path):
+    class Suite(TestPolicy):
+        @override
+        def make(self, ctx):
+            return wrong(ctx)
+
+    assert caught_by in failed_checks(Suite, tmp_path)
+
+
+def test_every_check_catches_something():
+    assert checks(PolicySuite) == set(WRONG.values())

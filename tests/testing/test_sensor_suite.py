@@ -1,0 +1,122 @@
+"""The sensor suite passes the fake, and each of its checks catches something wrong."""
+
+from __future__ import annotations
+
+from typing import override
+
+import attrs
+import numpy as np
+import pytest
+
+from ibrobot_core.errors import SensorError
+from ibrobot_core.messages import CameraInfo, CompressedImage, Header
+from ibrobot_core.testing import SensorSuite, checks, failed_checks
+from ibrobot_core.testing.fakes import FakeSensor
+
+
+class TestSensor(SensorSuite):
+    @override
+    def make(self, ctx):
+        return FakeSensor(ctx)
+
+
+class RelativeTopic(FakeSensor):
+    def __init__(self, ctx):
+        super().__init__(ctx)
+        self.topic = "camera/image_raw"
+
+
+class OtherType(FakeSensor):
+    message_type = CompressedImage
+
+
+class StampsStandStill(FakeSensor):
+    def read(self, timeout_s):
+        image = super().read(timeout_s)
+        return image and attrs.evolve(image, header=Header(1))
+
+
+class StampsAhead(FakeSensor):
+    def read(self, timeout_s):
+        image = super().read(timeout_s)
+        return image and attrs.evolve(image, header=Header(image.header.stamp_ns + 10**9))
+
+
+class RepeatsTheLastImage(FakeSensor):
+    def read(self, timeout_s):
+        self._last_ns = -1
+        return super().read(timeout_s)
+
+
+class ReusesItsBuffer(FakeSensor):
+    buffer = np.zeros(8 * 6 * 3, np.uint8)
+
+    def read(self, timeout_s):
+        image = super().read(timeout_s)
+        if image is None:
+            return None
+        self.buffer[:] = image.data
+        return attrs.evolve(image, data=self.buffer)
+
+
+class ShortRows(FakeSensor):
+    def read(self, timeout_s):
+        image = super().read(timeout_s)
+        return image and attrs.evolve(image, step=image.width)
+
+
+class OtherCameraInfo(FakeSensor):
+    def latched(self):
+        return (("/camera/subject/camera_info", CameraInfo(Header(), height=480, width=640)),)
+
+
+class ClosesOnce(FakeSensor):
+    def close(self):
+        if not self._open:
+            raise SensorError("not open")
+        super().close()
+
+
+class OpensOnce(FakeSensor):
+    opened = False
+
+    def open(self):
+        if self.opened:
+            raise SensorError("busy")
+        self.opened = True
+        super().open()
+
+
+class ReadsWhileClosed(FakeSensor):
+    def read(self, timeout_s):
+        self._open = True
+        return super().read(timeout_s)
+
+
+WRONG = {
+    RelativeTopic: "topic_and_type_are_declared",
+    OtherType: "messages_are_of_the_declared_type",
+    StampsStandStill: "stamps_strictly_increase",
+    StampsAhead: "stamps_strictly_increase",
+    RepeatsTheLastImage: "silence_gives_none",
+    ReusesItsBuffer: "messages_stay_as_they_were",
+    ShortRows: "images_are_whole",
+    OtherCameraInfo: "latched_messages_fit",
+    ClosesOnce: "close_is_safe_at_any_time",
+    OpensOnce: "close_is_safe_at_any_time",
+    ReadsWhileClosed: "refuses_reading_while_closed",
+}
+
+
+@pytest.mark.parametrize(("wrong", "caught_by"), WRONG.items(), ids=lambda v: getattr(v, "__name__", v))
+def test_catches(wrong, caught_by, tmp_path):
+    class Suite(TestSensor):
+        @override
+        def make(self, ctx):
+            return wrong(ctx)
+
+    assert caught_by in failed_checks(Suite, tmp_path)
+
+
+def test_every_check_catches_something():
+    assert checks(SensorSuite) == set(WRONG.values())

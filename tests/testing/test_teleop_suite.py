@@ -1,0 +1,125 @@
+"""The teleop suite passes the fake, and each of its checks catches something wrong."""
+
+from __future__ import annotations
+
+from typing import override
+
+import attrs
+import numpy as np
+import pytest
+
+from ibrobot_core.errors import TeleopError
+from ibrobot_core.testing import TeleopSuite, checks, failed_checks
+from ibrobot_core.testing.fakes import FakeTeleop
+
+
+class TestTeleop(TeleopSuite):
+    @override
+    def make(self, ctx):
+        return FakeTeleop(ctx)
+
+    @override
+    def engage(self, teleop):
+        teleop.deadman = True
+
+    @override
+    def release(self, teleop):
+        teleop.deadman = False
+
+    @override
+    def operate(self, teleop):
+        teleop.velocity = 0.1
+
+
+class BeginsAtZero(FakeTeleop):
+    def activate(self, measured):
+        super().activate(measured)
+        self._positions = np.zeros_like(self._positions)
+
+
+class ActivatesOnce(FakeTeleop):
+    active = False
+
+    def activate(self, measured):
+        if not self.active:
+            super().activate(measured)
+        self.active = True
+
+
+class UnknownJoint(FakeTeleop):
+    def read(self, measured):
+        command = super().read(measured)
+        positions = command.positions and {f"leader_{joint}": p for joint, p in command.positions.items()}
+        return attrs.evolve(command, positions=positions)
+
+
+class NotANumber(FakeTeleop):
+    def read(self, measured):
+        command = super().read(measured)
+        return attrs.evolve(command, positions=command.positions and dict.fromkeys(command.positions, np.nan))
+
+
+class NeverMoves(FakeTeleop):
+    def read(self, measured):
+        self.velocity = 0.0
+        return super().read(measured)
+
+
+class IgnoresTheDeadman(FakeTeleop):
+    def read(self, measured):
+        self.deadman = True
+        return super().read(measured)
+
+
+class KeepsTheMeasurement(FakeTeleop):
+    def activate(self, measured):
+        super().activate(measured)
+        self._positions = measured.position
+
+
+class ChangesTheMeasurement(FakeTeleop):
+    def read(self, measured):
+        command = super().read(measured)
+        measured.position[:] = 0.0
+        return command
+
+
+class DisconnectsOnce(FakeTeleop):
+    def disconnect(self):
+        if not self._open:
+            raise TeleopError("not connected")
+        super().disconnect()
+
+
+class ReadsWhileDisconnected(FakeTeleop):
+    def read(self, measured):
+        self._open = True
+        return super().read(measured)
+
+
+WRONG = {
+    BeginsAtZero: "begins_where_the_robot_is",
+    ActivatesOnce: "begins_where_the_robot_is",
+    UnknownJoint: "positions_are_of_known_joints",
+    NotANumber: "positions_are_of_known_joints",
+    NeverMoves: "operating_moves",
+    IgnoresTheDeadman: "released_deadman_gives_none",
+    KeepsTheMeasurement: "leaves_the_measurement_alone",
+    ChangesTheMeasurement: "leaves_the_measurement_alone",
+    DisconnectsOnce: "disconnect_is_safe_at_any_time",
+    ReadsWhileDisconnected: "refuses_reading_while_disconnected",
+}
+
+
+@pytest.mark.parametrize(("wrong", "caught_by"), WRONG.items(), ids=lambda v: getattr(v, "__name__", v))
+def test_catches(wrong, caught_by, tmp_path):
+    class Suite(TestTeleop):
+        @override
+        def make(self, ctx):
+            return wrong(ctx)
+
+    assert caught_by in failed_checks(Suite, tmp_path)
+
+
+def test_every_check_catches_something():
+    assert checks(TeleopSuite) == set(WRONG.values())

@@ -1,0 +1,174 @@
+"""Each check of the transport suite catches something wrong; the local transport's own tests run the suite itself."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from typing import override
+
+import pytest
+
+from ibrobot_core.errors import TransportError
+from ibrobot_core.local_transport import LocalTransport
+from ibrobot_core.testing import TransportSuite, checks, failed_checks
+
+
+class ShortSuite(TransportSuite):
+    """Waits less long for what the wrong ones never send."""
+
+    wait_s = 0.2
+
+
+class LosesEmptyPayloads(LocalTransport):
+    def publish(self, topic, payload):
+        if payload:
+            super().publish(topic, payload)
+
+
+class Reorders(LocalTransport):
+    waiting = None
+
+    def publish(self, topic, payload):
+        if payload == b"7":
+            self.waiting = payload
+            return
+        super().publish(topic, payload)
+        if self.waiting is not None:
+            super().publish(topic, self.waiting)
+            self.waiting = None
+
+
+class OneTopic(LocalTransport):
+    def publish(self, topic, payload):
+        for known in tuple(self._subscribers):
+            super().publish(known, payload)
+
+
+class NeverEnds(LocalTransport):
+    def subscribe(self, topic, callback):
+        super().subscribe(topic, callback)
+        return lambda: None
+
+
+class CallsInTheSendersThread(LocalTransport):
+    def subscribe(self, topic, callback):
+        self.callbacks = [*getattr(self, "callbacks", []), callback]
+        return lambda: self.callbacks.remove(callback)
+
+    def publish(self, topic, payload):
+        for callback in self.callbacks:
+            callback(payload)
+
+
+class DropsFailingSubscribers(LocalTransport):
+    def subscribe(self, topic, callback):
+        def once(payload):
+            try:
+                callback(payload)
+            except ValueError:
+                threading.Thread(target=end).start()
+
+        end = super().subscribe(topic, once)
+        return end
+
+
+class SharesAnswers(LocalTransport):
+    """Answers come through one queue: whoever asks takes what is there."""
+
+    def __init__(self):
+        super().__init__()
+        self.answers = queue.SimpleQueue()
+
+    def request(self, name, payload, timeout_s):
+        handler = self._servers.get(name)
+        if self._closed or handler is None:
+            raise TransportError(f"nobody serves {name}")
+        threading.Thread(target=lambda: self.answers.put(handler(payload)), daemon=True).start()
+        try:
+            return self.answers.get(timeout=timeout_s)
+        except queue.Empty:
+            raise TransportError("late") from None
+
+
+class MixesAnswers(LocalTransport):
+    last = b""
+
+    def request(self, name, payload, timeout_s):
+        answer, self.last = self.last or super().request(name, payload, timeout_s), payload
+        return answer
+
+
+class EmptyForErrors(LocalTransport):
+    def request(self, name, payload, timeout_s):
+        try:
+            return super().request(name, payload, timeout_s)
+        except TransportError as error:
+            if error.__cause__ is None:
+                raise
+            return b""
+
+
+class EmptyForNobody(LocalTransport):
+    def request(self, name, payload, timeout_s):
+        with self._lock:
+            self._check_open()
+        return super().request(name, payload, timeout_s) if name in self._servers else b""
+
+
+class LastServerWins(LocalTransport):
+    def serve(self, name, handler):
+        self._servers.pop(name, None)
+        return super().serve(name, handler)
+
+
+class OneCallAtATime(LocalTransport):
+    def __init__(self):
+        super().__init__()
+        self.busy = threading.Lock()
+
+    def publish(self, topic, payload):
+        if not self.busy.acquire(timeout=0.05):
+            raise TransportError("busy")
+        self.busy.release()
+        super().publish(topic, payload)
+
+    def request(self, name, payload, timeout_s):
+        with self.busy:
+            return super().request(name, payload, timeout_s)
+
+
+class WorksWhileClosed(LocalTransport):
+    def _check_open(self):
+        pass
+
+
+WRONG = {
+    LosesEmptyPayloads: "delivers_in_order",
+    Reorders: "delivers_in_order",
+    OneTopic: "every_subscriber_gets_its_topic_only",
+    NeverEnds: "an_ended_subscription_is_silent",
+    CallsInTheSendersThread: "a_slow_subscriber_blocks_nobody",
+    DropsFailingSubscribers: "a_failing_subscriber_harms_nobody",
+    MixesAnswers: "each_request_gets_its_own_answer",
+    SharesAnswers: "a_late_answer_is_dropped",
+    EmptyForErrors: "a_servers_error_reaches_the_requester",
+    EmptyForNobody: "nobody_serves",
+    LastServerWins: "a_name_is_served_once",
+    OneCallAtATime: "a_server_may_use_the_transport",
+    WorksWhileClosed: "a_closed_transport_refuses",
+}
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+@pytest.mark.parametrize(("wrong", "caught_by"), WRONG.items(), ids=lambda v: getattr(v, "__name__", v))
+def test_catches(wrong, caught_by, tmp_path):
+    class Suite(ShortSuite):
+        @override
+        def make(self, ctx):
+            return wrong()
+
+    assert caught_by in failed_checks(Suite, tmp_path)
+
+
+def test_every_check_catches_something():
+    assert checks(TransportSuite) == set(WRONG.values())
