@@ -42,7 +42,7 @@ def action_messages(contract: Contract, action: NDArray[Any]) -> dict[str, Float
     Raises:
         ContractError: for an action of another length.
     """
-    split = split_action(contract, np.atleast_1d(action).reshape(-1))
+    split = split_action(contract, np.ravel(action))
     return {part.topic: Float64MultiArray(split[part.executor].copy()) for part in contract.action_parts}
 
 

@@ -200,8 +200,6 @@ def _action(spec: ActionSpec, config: RobotConfig) -> ActionPart:
     if executor is None:
         known = ", ".join(config.executors) or "none"
         raise ContractError(f"{spec.key}: no executor {spec.executor!r}; the executors are: {known}")
-    if spec.key != "action":
-        raise ContractError(f"{spec.key}: there is one action vector, its key is 'action'")
     return ActionPart(executor.name, spec.topic, spec.type, spec.safety_behavior, executor.joints)
 
 

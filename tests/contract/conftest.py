@@ -1,0 +1,65 @@
+"""A robot of six joints with two executors and two cameras, and contracts of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from ibrobot_core.config.schema import (
+    ActionSpec,
+    Align,
+    ContractConfig,
+    ControlMode,
+    ExecutorComponent,
+    ImageSpec,
+    ObservationSpec,
+    Peripheral,
+    RobotConfig,
+)
+from ibrobot_core.options import NoOptions
+from ibrobot_core.testing.contexts import ARM, GRIPPER, make_robot
+
+STATE = ObservationSpec("observation.state", topic="/joint_states")
+TOP = ObservationSpec(
+    "observation.images.top",
+    peripheral="top",
+    image=ImageSpec(resize=(2, 3)),
+    align=Align("asof", "header", 100.0),
+)
+ACTIONS = (
+    ActionSpec(executor="arm_position", topic="/arm/commands"),
+    ActionSpec(executor="gripper_position", topic="/gripper/commands"),
+)
+
+
+def make_config(
+    observations: Sequence[ObservationSpec] = (STATE, TOP),
+    actions: Sequence[ActionSpec] = ACTIONS,
+    rate_hz: float = 30.0,
+) -> RobotConfig:
+    executors = {
+        "arm_position": ExecutorComponent("position", NoOptions(), "arm_position", "arm", ARM),
+        "gripper_position": ExecutorComponent("position", NoOptions(), "gripper_position", "gripper", GRIPPER),
+        "whole_position": ExecutorComponent("position", NoOptions(), "whole_position", "all", GRIPPER + ARM),
+    }
+    peripherals = {
+        "top": Peripheral("webcam", SimpleNamespace(width=6, height=4), "top", "camera"),
+        "wrist": Peripheral("webcam", NoOptions(), "wrist", "camera"),
+        "chest": Peripheral("gyro", NoOptions(), "chest", "imu"),
+    }
+    return RobotConfig(
+        robot=make_robot(),
+        executors=executors,
+        control_modes={"idle": ControlMode("idle", ())},
+        default_control_mode="idle",
+        peripherals=peripherals,
+        contract=ContractConfig(rate_hz=rate_hz, observations=tuple(observations), actions=tuple(actions)),
+    )
+
+
+@pytest.fixture(name="make_config", scope="session")
+def make_config_fixture() -> Callable[..., Any]:
+    return make_config

@@ -1,0 +1,256 @@
+"""Frames live and offline: equal bit by bit, over streams that jitter, come late, twice, out of order or not at all."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ibrobot_core.bus import Bus
+from ibrobot_core.clock import SteppedClock
+from ibrobot_core.config.schema import Align, ImageSpec, ObservationSpec
+from ibrobot_core.contract import frames as frames_module
+from ibrobot_core.contract.frames import FrameAssembler, FrameSampler, assemble, frames
+from ibrobot_core.contract.image import encode_image
+from ibrobot_core.contract.specs import Contract
+from ibrobot_core.errors import ContractError
+from ibrobot_core.interfaces.policy import Frame
+from ibrobot_core.messages import Float64MultiArray, Header, Imu, JointState, Message, Vector3
+from ibrobot_core.testing.contexts import ARM, GRIPPER, START_NS
+
+Make = Callable[..., Any]
+MS = 1_000_000
+NAMES = GRIPPER + ARM
+
+OBSERVATIONS = (
+    ObservationSpec("observation.state", topic="/joint_states"),
+    ObservationSpec("observation.motion", topic="/joint_states", select=("velocity.gripper",), align=Align("drop")),
+    ObservationSpec(
+        "observation.motion",
+        topic="/imu",
+        type="sensor_msgs/msg/Imu",
+        select=("angular_velocity",),
+        align=Align("asof", "header", 80.0),
+    ),
+    ObservationSpec(
+        "observation.images.top",
+        peripheral="top",
+        image=ImageSpec(resize=(2, 3)),
+        align=Align("asof", "header", 60.0),
+    ),
+    ObservationSpec("observation.scene", topic="/scene", type="std_msgs/msg/Float64MultiArray", align=Align("drop")),
+)
+
+
+def joint_state(stamp_ns: int, value: float) -> JointState:
+    return JointState(Header(stamp_ns), NAMES, np.arange(6) + value, np.full(6, value), np.full(6, np.nan))
+
+
+def image(stamp_ns: int, value: float) -> Message:
+    pixels = np.random.default_rng(int(value)).integers(0, 256, (4, 6, 3), dtype=np.uint8)
+    return encode_image(pixels, "rgb8", Header(stamp_ns), padding=int(value) % 3)
+
+
+MAKERS: dict[str, Callable[[int, float], Message]] = {
+    "/joint_states": joint_state,
+    "/imu": lambda stamp_ns, value: Imu(Header(stamp_ns), angular_velocity=Vector3(value, 0, -value)),
+    "/camera/top/image_raw": image,
+    "/scene": lambda stamp_ns, value: Float64MultiArray([value] * 3),
+    "/elsewhere": lambda stamp_ns, value: Float64MultiArray([value]),
+}
+
+
+@pytest.fixture(scope="module")
+def contract(make_config: Make) -> Contract:
+    return Contract.from_config(make_config(OBSERVATIONS))
+
+
+def equal(one: Frame, other: Frame) -> bool:
+    same = (one.stamp_ns, one.missing, list(one.values)) == (other.stamp_ns, other.missing, list(other.values))
+    arrays = ((one.values[key], other.values[key]) for key in one.values) if same else ()
+    return same and all(a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes() for a, b in arrays)
+
+
+latency = st.one_of(st.integers(-20, 90), st.sampled_from([0, 0, 0, 500, 1500, -1500, 5000]))
+publications = st.tuples(st.just("publish"), st.sampled_from(list(MAKERS)), st.integers(0, 40), latency, st.booleans())
+samplings = st.tuples(st.sampled_from(["sample", "advance"]), st.integers(0, 60))
+
+
+@settings(max_examples=200)
+@given(events=st.lists(st.one_of(publications, publications, publications, samplings), max_size=80))
+def test_live_and_offline_are_equal_bit_by_bit(contract: Contract, events: list[Any]) -> None:
+    """Ticks lie behind the clock by up to 60 ms: what came meanwhile is in the queues, and must not count."""
+    clock = SteppedClock(START_NS)
+    bus = Bus(clock)
+    sampler = FrameSampler(contract, bus)
+    bag: list[tuple[str, Message, int]] = []
+    live: list[Frame] = []
+    tick_ns = 0
+    for number, (kind, *event) in enumerate(events):
+        if kind == "publish":
+            topic, wait, late, twice = event
+            clock.advance(wait * MS)
+            message = MAKERS[topic](clock.now_ns() - late * MS, float(number))
+            for _ in range(1 + twice):
+                bus.publish(topic, message)
+                bag.append((topic, message, clock.now_ns()))
+            continue
+        tick_ns = max(tick_ns, bus.snapshot_ns() - event[0] * MS)
+        if kind == "sample":
+            live.append(sampler.sample(tick_ns))
+        else:
+            sampler.advance(tick_ns)
+        clock.advance(1)
+    assert bus.dropped() == {}
+    ticks = [frame.stamp_ns for frame in live]
+    offline = list(frames(contract, bag, ticks))
+    assert len(offline) == len(live)
+    assert all(equal(a, b) for a, b in zip(live, offline, strict=True))
+    # Which other ticks there are makes no difference either.
+    between = sorted({*ticks, *range(START_NS, clock.now_ns(), 7 * MS)})
+    denser = {frame.stamp_ns: frame for frame in frames(contract, bag, between)}
+    assert all(equal(denser[frame.stamp_ns], frame) for frame in live)
+
+
+def offline(contract: Contract, messages: Iterable[tuple[str, Message, int]], *ticks: int) -> list[Frame]:
+    return list(frames(contract, messages, ticks))
+
+
+def test_a_frame_has_what_is_there_and_names_what_is_not(contract: Contract) -> None:
+    bag = [("/joint_states", joint_state(10 * MS, 1.0), 11 * MS), ("/imu", MAKERS["/imu"](12 * MS, 2.0), 13 * MS)]
+    before, first, both = offline(contract, bag, 10 * MS, 11 * MS, 14 * MS)
+    assert before.values == {}
+    assert before.missing == set(contract.observations)
+    assert list(first.values) == ["observation.state"]
+    state = first.values["observation.state"]
+    assert state.dtype == np.float32
+    np.testing.assert_array_equal(state, [2, 3, 4, 5, 6, 1])  # the robot's order, not the sender's
+    np.testing.assert_array_equal(both.values["observation.motion"], [1, 2, 0, -2])
+    assert both.missing == {"observation.images.top", "observation.scene"}
+    assert both.stamp_ns == 14 * MS
+
+
+def test_a_key_is_missing_when_any_of_its_parts_is(contract: Contract) -> None:
+    imu = ("/imu", MAKERS["/imu"](10 * MS, 2.0), 10 * MS)
+    state = ("/joint_states", joint_state(10 * MS, 1.0), 10 * MS)
+    assert "observation.motion" in offline(contract, [imu], 11 * MS)[0].missing
+    assert "observation.motion" in offline(contract, [state], 11 * MS)[0].missing
+    there, gone = offline(contract, [imu, state], 11 * MS, 10 * MS + contract.step_ns)
+    assert "observation.motion" in there.values
+    assert "observation.motion" in gone.missing
+
+
+def test_a_vector_with_something_not_measured_is_missing(make_config: Make) -> None:
+    spec = ObservationSpec("observation.effort", topic="/joint_states", select=("effort.gripper", "position.gripper"))
+    contract = Contract.from_config(make_config([spec]))
+    frame = offline(contract, [("/joint_states", joint_state(0, 1.0), 0)], 0)[0]
+    assert frame.missing == {"observation.effort"}
+
+
+def test_only_the_keys_asked_for_are_sampled(contract: Contract) -> None:
+    bus = Bus(SteppedClock(START_NS))
+    sampler = FrameSampler(contract, bus, keys=["observation.scene"])
+    for topic, make in MAKERS.items():
+        bus.publish(topic, make(START_NS, 1.0))
+    frame = sampler.sample(START_NS)
+    assert list(frame.values) == ["observation.scene"]
+    assert frame.missing == frozenset()
+    with pytest.raises(ContractError, match=r"no observation 'observation.sta'; it has: observation.state, "):
+        FrameSampler(contract, bus, keys=["observation.sta"])
+
+
+def test_samples_are_decoded_once_and_only_when_a_frame_asks(
+    contract: Contract, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    decoded: list[int] = []
+    decode = frames_module.decode_image
+
+    def counting(message: Any, spec: ImageSpec) -> Any:
+        decoded.append(message.header.stamp_ns)
+        return decode(message, spec)
+
+    monkeypatch.setattr(frames_module, "decode_image", counting)
+    assembler = FrameAssembler(contract, keys=["observation.images.top"])
+    for k in range(10):
+        assembler.take("/camera/top/image_raw", image(k * 10 * MS, k), k * 10 * MS)
+        assembler.advance(k * 10 * MS)
+    assert decoded == []
+    first, second = assembler.frame(95 * MS), assembler.frame(100 * MS)
+    assert decoded == [90 * MS]
+    assert first.values["observation.images.top"] is second.values["observation.images.top"]
+
+
+def test_arrays_of_frames_are_read_only_and_messages_are_not_touched(contract: Contract) -> None:
+    message = image(0, 0.0)
+    bag = [("/camera/top/image_raw", message, 0), ("/joint_states", joint_state(0, 1.0), 0)]
+    bag.append(("/imu", MAKERS["/imu"](0, 1.0), 0))
+    frame = offline(contract, bag, 1)[0]
+    assert len(frame.values) == 3
+    assert not any(array.flags.writeable for array in frame.values.values())
+    assert message.data.flags.writeable
+
+
+def test_queues_are_bounded_and_loss_is_counted(contract: Contract) -> None:
+    clock = SteppedClock(START_NS)
+    bus = Bus(clock)
+    sampler = FrameSampler(contract, bus)
+    for k in range(40):
+        bus.publish("/camera/top/image_raw", image(clock.advance(MS), k))
+    assert bus.dropped() == {"/camera/top/image_raw": 8}
+    newest = sampler.sample(clock.now_ns()).values["observation.images.top"]
+    sampler.close()
+    sampler.close()
+    bus.publish("/camera/top/image_raw", image(clock.advance(MS), 41))
+    np.testing.assert_array_equal(sampler.sample(clock.now_ns()).values["observation.images.top"], newest)
+
+
+def test_advancing_at_every_tick_loses_nothing(contract: Contract) -> None:
+    clock = SteppedClock(START_NS)
+    bus = Bus(clock)
+    sampler = FrameSampler(contract, bus)
+    for k in range(600):
+        bus.publish("/camera/top/image_raw", image(clock.advance(5 * MS), k))
+        bus.publish("/joint_states", joint_state(clock.now_ns(), k))
+        if k % 6 == 0:
+            sampler.advance(clock.now_ns())
+    assert bus.dropped() == {}
+
+
+def test_jumps_are_counted_per_topic(contract: Contract) -> None:
+    stamps_s = (5, 6, 2, 3)
+    bag = [
+        ("/joint_states", joint_state(stamp * 1000 * MS, 1.0), (7 + i) * 1000 * MS) for i, stamp in enumerate(stamps_s)
+    ]
+    assembler = FrameAssembler(contract)
+    assert assembler.resets() == {}
+    list(assemble(assembler, bag, [20_000 * MS]))
+    assert assembler.resets() == {"/joint_states": 1}
+
+
+def test_messages_that_do_not_fit_are_refused(contract: Contract, make_config: Make) -> None:
+    with pytest.raises(ContractError, match=r"images.top: /camera/top/image_raw is a sensor_msgs/msg/Image, got a std"):
+        offline(contract, [("/camera/top/image_raw", Float64MultiArray([1.0]), 0)], 1)
+    without = JointState(Header(0), ARM, np.zeros(5))
+    with pytest.raises(ContractError, match=r"observation.state: /joint_states: the message has no joint 'gripper'"):
+        offline(contract, [("/joint_states", without, 0)], 1)
+    spec = ObservationSpec("observation.images.top", peripheral="top")
+    whole = Contract.from_config(make_config([spec]))
+    small = encode_image(np.zeros((2, 3, 3), np.uint8), "rgb8", Header(0))
+    with pytest.raises(ContractError, match=r"gives \(2, 3, 3\), the contract says \(4, 6, 3\)"):
+        offline(whole, [("/camera/top/image_raw", small, 0)], 1)
+
+
+def test_offline_messages_must_be_in_the_order_of_receipt(contract: Contract) -> None:
+    bag = [("/joint_states", joint_state(0, 1.0), 5), ("/imu", MAKERS["/imu"](0, 1.0), 4)]
+    with pytest.raises(ContractError, match="in the order of receipt; /imu at 4 ns came after 5 ns"):
+        offline(contract, bag, 10)
+
+
+def test_ticks_may_go_on_for_ever(contract: Contract) -> None:
+    endless = frames(contract, [("/joint_states", joint_state(0, 1.0), 0)], itertools.count(0, contract.step_ns))
+    assert [len(frame.values) for frame in itertools.islice(endless, 3)] == [1, 1, 1]
