@@ -133,8 +133,10 @@ class Registry:
 
 
 def _reason(error: BaseException) -> str:
-    first_line = str(error).strip().splitlines()[0] if str(error).strip() else ""
-    return f"{type(error).__name__}: {first_line}" if first_line else type(error).__name__
+    lines = str(error).strip().splitlines()
+    if isinstance(error, pluggy.PluginValidationError):
+        return f"{lines[0]}: {lines[-1]}"  # what is wrong comes last
+    return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
 
 
 def _manager() -> pluggy.PluginManager:

@@ -2,4 +2,49 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Iterator
+from importlib.metadata import EntryPoint, distributions
+from pathlib import Path
+
+import attrs
+import pytest
+
+from ibrobot_core.plugins import installed
 from ibrobot_core.testing.leaks import no_leaks  # noqa: F401
+
+
+@attrs.define
+class Site:
+    """A folder on the import path, with made-up distributions that are plugins."""
+
+    folder: Path
+    modules: list[str] = attrs.field(factory=list)
+
+    def add(self, distribution: str, source: str) -> None:
+        """Install version 1.0 of `distribution`: one module with `source`, named in its entry point."""
+        module = distribution.replace("-", "_")
+        (self.folder / f"{module}.py").write_text(source)
+        metadata = self.folder / f"{module}-1.0.dist-info"
+        metadata.mkdir()
+        (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {distribution}\nVersion: 1.0\n")
+        (metadata / "entry_points.txt").write_text(f"[ibrobot]\n{module} = {module}\n")
+        self.modules.append(module)
+
+    def entry_points(self) -> list[EntryPoint]:
+        """The entry points of what was added, and of nothing else."""
+        return [entry for found in distributions(path=[str(self.folder)]) for entry in found.entry_points]
+
+
+@pytest.fixture
+def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
+    """An empty site, seen by this process and by those that it starts; `installed()` is discovered anew."""
+    made = Site(tmp_path / "site")
+    made.folder.mkdir()
+    monkeypatch.syspath_prepend(str(made.folder))
+    monkeypatch.setenv("PYTHONPATH", str(made.folder))
+    installed.cache_clear()
+    yield made
+    installed.cache_clear()
+    for module in made.modules:
+        sys.modules.pop(module, None)

@@ -1,0 +1,165 @@
+"""The in-process bus: order, bounded queues, latching, types, services, and its promise about stamps."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ibrobot_core.bus import Bus
+from ibrobot_core.clock import RealClock, SteppedClock
+from ibrobot_core.errors import TransportError
+from ibrobot_core.messages import Int32, String
+
+
+@pytest.fixture
+def clock() -> SteppedClock:
+    return SteppedClock(1000)
+
+
+@pytest.fixture
+def bus(clock: SteppedClock) -> Bus:
+    return Bus(clock)
+
+
+def test_every_subscriber_gets_every_message_in_order(bus: Bus, clock: SteppedClock) -> None:
+    first, second = bus.subscribe("/a"), bus.subscribe("/a")
+
+    bus.publish("/a", Int32(1))
+    clock.advance(5)
+    bus.publish("/a", Int32(2))
+    bus.publish("/b", Int32(3))
+
+    for subscription in (first, second):
+        items = subscription.drain()
+        assert [(item.topic, item.message, item.received_ns) for item in items] == [
+            ("/a", Int32(1), 1000),
+            ("/a", Int32(2), 1005),
+        ]
+        assert subscription.drain() == []
+
+
+@given(depth=st.integers(1, 8), count=st.integers(0, 30))
+def test_a_full_queue_drops_the_oldest_and_counts_them(depth: int, count: int) -> None:
+    bus = Bus(SteppedClock())
+    subscription = bus.subscribe("/a", depth)
+
+    for value in range(count):
+        bus.publish("/a", Int32(value))
+
+    kept = list(range(count))[-depth:]
+    assert subscription.dropped == count - len(kept)
+    assert bus.dropped() == ({"/a": subscription.dropped} if subscription.dropped else {})
+    assert [item.message for item in subscription.drain()] == [Int32(value) for value in kept]
+    assert bus.topics() == ({"/a": ("std_msgs/msg/Int32", count)} if count else {})
+
+
+def test_a_slow_subscriber_costs_the_others_nothing(bus: Bus) -> None:
+    slow, quick = bus.subscribe("/a", 1), bus.subscribe("/a", 10)
+
+    for value in range(5):
+        bus.publish("/a", Int32(value))
+
+    assert (slow.dropped, quick.dropped) == (4, 0)
+
+
+def test_latched_messages_reach_later_subscribers(bus: Bus) -> None:
+    bus.publish("/info", String("old"), latched=True)
+    bus.publish("/info", String("new"), latched=True)
+    bus.publish("/other", String("gone"))
+
+    assert [item.message for item in bus.subscribe("/info").drain()] == [String("new")]
+    assert [item.message for item in bus.subscribe(None).drain()] == [String("new")]
+    assert bus.subscribe("/other").drain() == []
+
+
+def test_a_subscription_to_everything(bus: Bus) -> None:
+    everything = bus.subscribe(None, 1)
+
+    bus.publish("/a", Int32(1))
+    bus.publish("/b", Int32(2))
+
+    assert [item.topic for item in everything.drain()] == ["/b"]
+    assert bus.dropped() == {"*": 1}
+
+
+def test_a_closed_subscription_gets_nothing_more(bus: Bus) -> None:
+    one, everything = bus.subscribe("/a"), bus.subscribe(None)
+    one.close()
+    everything.close()
+    one.close()
+
+    bus.publish("/a", Int32(1))
+
+    assert one.get() is None
+    assert everything.get() is None
+
+
+def test_a_topic_keeps_its_type(bus: Bus) -> None:
+    bus.publish("/a", Int32(1))
+
+    with pytest.raises(TransportError, match=r"^topic /a carries std_msgs/msg/Int32, not std_msgs/msg/String$"):
+        bus.publish("/a", String("x"))
+
+
+def test_a_depth_below_one_is_refused(bus: Bus) -> None:
+    with pytest.raises(ValueError, match="depth must be at least 1, got 0"):
+        bus.subscribe("/a", 0)
+
+
+def test_get_waits_for_a_message_and_gives_up_in_time(bus: Bus) -> None:
+    subscription = bus.subscribe("/a")
+    assert subscription.get() is None
+    assert subscription.get(0.001) is None
+    got: list[object] = []
+    waiting = threading.Thread(target=lambda: got.append(subscription.get(None)))
+    waiting.start()
+
+    bus.publish("/a", Int32(7))
+    waiting.join(10.0)
+
+    assert [item.message for item in got] == [Int32(7)]
+
+
+def test_what_was_received_by_the_snapshot_is_in_the_queues() -> None:
+    bus = Bus(RealClock())
+    subscription = bus.subscribe("/a", 10_000)
+    everything = bus.subscribe(None, 10_000)
+
+    def publish() -> None:
+        for value in range(2000):
+            bus.publish("/a", Int32(value))
+
+    publisher = threading.Thread(target=publish)
+    publisher.start()
+    snapshots = []
+    while publisher.is_alive() or not snapshots:
+        now_ns = bus.snapshot_ns()
+        snapshots.append((now_ns, len(subscription._queue)))
+    publisher.join()
+
+    stamps = [item.received_ns for item in everything.drain()]
+    assert len(stamps) == 2000
+    for now_ns, queued in snapshots:
+        assert sum(stamp <= now_ns for stamp in stamps) <= queued
+
+
+def test_services_answer_and_their_absence_is_told(bus: Bus) -> None:
+    bus.serve("/add", lambda request: request + 1)
+
+    assert bus.call("/add", 2) == 3
+    with pytest.raises(TransportError, match=r"^service /add is served already$"):
+        bus.serve("/add", lambda request: request)
+    with pytest.raises(TransportError, match=r"^nobody serves /sub; served: /add$"):
+        bus.call("/sub", 2)
+
+
+def test_a_service_may_publish(bus: Bus) -> None:
+    subscription = bus.subscribe("/a")
+    bus.serve("/shout", lambda value: bus.publish("/a", Int32(value)))
+
+    bus.call("/shout", 4)
+
+    assert [item.message for item in subscription.drain()] == [Int32(4)]

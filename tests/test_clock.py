@@ -1,0 +1,70 @@
+"""The clocks."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ibrobot_core.clock import RealClock, SteppedClock
+from ibrobot_core.units import degrees, ns, radians, seconds
+
+
+def test_real_time_is_the_date_and_never_runs_backwards() -> None:
+    clock = RealClock()
+    stamps = [clock.now_ns() for _ in range(1000)]
+
+    assert stamps == sorted(stamps)
+    assert abs(stamps[0] - time.time_ns()) < ns(10.0)
+
+
+def test_clocks_of_one_run_agree() -> None:
+    host = RealClock()
+    control = RealClock(host.epoch_offset_ns)
+    before, between, after = host.now_ns(), control.now_ns(), host.now_ns()
+
+    assert before <= between <= after
+
+
+def test_real_sleep_ends_at_the_deadline_and_not_before() -> None:
+    clock = RealClock()
+    deadline = clock.now_ns() + ns(0.002)
+
+    clock.sleep_until(deadline)
+    assert clock.now_ns() >= deadline
+    clock.sleep_until(deadline - ns(3600.0))  # long past: returns
+
+
+@given(st.lists(st.integers(0, 10**12)))
+def test_stepped_time_moves_by_what_it_is_told(steps: list[int]) -> None:
+    clock = SteppedClock(5)
+
+    for step in steps:
+        before = clock.now_ns()
+        assert clock.advance(step) == before + step
+    assert clock.now_ns() == 5 + sum(steps)
+
+
+def test_stepped_sleep_moves_forwards_only() -> None:
+    clock = SteppedClock(100)
+
+    clock.sleep_until(150)
+    assert clock.now_ns() == 150
+    clock.sleep_until(120)
+    assert clock.now_ns() == 150
+    with pytest.raises(ValueError, match="must not be negative, got -1"):
+        clock.advance(-1)
+    assert clock.now_ns() == 150
+
+
+@given(st.integers(0, 2**52))
+def test_nanoseconds_survive_the_way_through_seconds(stamp: int) -> None:
+    assert ns(seconds(stamp)) == pytest.approx(stamp, abs=1)
+
+
+@given(st.floats(-1e6, 1e6))
+def test_degrees_and_radians_are_inverse(angle: float) -> None:
+    assert radians(degrees(angle)) == pytest.approx(angle)
+    assert degrees(3.141592653589793) == 180.0

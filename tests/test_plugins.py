@@ -1,0 +1,210 @@
+"""Discovery: good plugins work beside broken ones, and every failure is told where it matters."""
+
+from __future__ import annotations
+
+import logging
+import subprocess
+import sys
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ibrobot_core.errors import PluginError
+from ibrobot_core.plugins import KINDS, Registry, discover
+
+if TYPE_CHECKING:
+    from conftest import Site
+
+GOOD = """
+import attrs
+from ibrobot_core import hookimpl
+from ibrobot_core.descriptors import Check, ConfigFile, HardwareDescriptor
+from ibrobot_core.options import option
+
+@attrs.frozen
+class Options:
+    port: str = option(help="serial port")
+
+@hookimpl
+def ibrobot_hardware():
+    yield HardwareDescriptor("good_arm", lambda options, ctx: None, "an arm that works", Options)
+
+@hookimpl
+def ibrobot_configs():
+    yield ConfigFile("good", "good.yaml")
+
+@hookimpl
+def ibrobot_doctor():
+    yield Check("good arm", True, "present")
+
+@hookimpl
+def ibrobot_mode_changed(mode):
+    events.append(mode)
+
+events = []
+"""
+RAISES_AT_IMPORT = "raise ImportError('libarm.so: cannot open shared object file')"
+MISSPELT_HOOK = """
+from ibrobot_core import hookimpl
+
+@hookimpl
+def ibrobot_hardwear():
+    return []
+"""
+RAISING_HOOK = """
+from ibrobot_core import hookimpl
+
+@hookimpl
+def ibrobot_sensors():
+    raise RuntimeError("no driver")
+"""
+DUPLICATE = GOOD.replace("an arm that works", "another of that name").replace('ConfigFile("good"', 'ConfigFile("other"')
+WRONG_ARGUMENT = """
+from ibrobot_core import hookimpl
+
+@hookimpl
+def ibrobot_mode_changed(moed):
+    pass
+"""
+NO_DESCRIPTOR = """
+from ibrobot_core import hookimpl
+
+@hookimpl
+def ibrobot_policies():
+    return ["act"]
+"""
+RAISING_LATER = """
+from ibrobot_core import hookimpl
+
+@hookimpl
+def ibrobot_doctor():
+    raise OSError("no bus")
+
+@hookimpl
+def ibrobot_mode_changed():
+    raise ValueError("not now")
+"""
+EXITS = "import sys; sys.exit(3)"
+
+
+@pytest.fixture
+def registry(site: Site) -> Registry:
+    site.add("fake-exits", EXITS)
+    site.add("fake-good", GOOD)
+    site.add("fake-import", RAISES_AT_IMPORT)
+    site.add("fake-later", RAISING_LATER)
+    site.add("fake-misspelt", MISSPELT_HOOK)
+    site.add("fake-nothing", NO_DESCRIPTOR)
+    site.add("fake-raising", RAISING_HOOK)
+    site.add("fake-twin", DUPLICATE)
+    site.add("fake-wrong", WRONG_ARGUMENT)
+    return discover(site.entry_points())
+
+
+def test_a_good_plugin_works_beside_broken_ones(registry: Registry) -> None:
+    entry = registry.entries["hardware", "good_arm"]
+
+    assert (entry.package, entry.version, entry.plugin) == ("fake-good", "1.0", "fake_good")
+    assert registry.find("hardware", "good_arm").summary == "an arm that works"
+    assert [config.name for config in registry.configs] == ["good", "other"]
+    assert registry.types("executor") == ["gripper", "position", "trajectory"]
+
+
+def test_every_failure_is_told_with_its_cause(registry: Registry) -> None:
+    assert [str(failure) for failure in registry.failures] == [
+        "plugin 'fake_exits' (fake-exits) failed to import: SystemExit: 3",
+        "plugin 'fake_import' (fake-import) failed to import: "
+        "ImportError: libarm.so: cannot open shared object file",
+        "plugin 'fake_misspelt' (fake-misspelt) has a wrong hook: "
+        "ValueError: unknown hook 'ibrobot_hardwear', did you mean 'ibrobot_hardware'?",
+        "plugin 'fake_nothing' (fake-nothing) failed in ibrobot_policies: "
+        "TypeError: expected a Descriptor, got 'act'",
+        "plugin 'fake_raising' (fake-raising) failed in ibrobot_sensors: RuntimeError: no driver",
+        "plugin 'fake_twin' (fake-twin) failed in ibrobot_hardware: "
+        "hardware type 'good_arm' is offered by fake-good already",
+        "plugin 'fake_wrong' (fake-wrong) has a wrong hook: "
+        "Plugin 'fake_wrong' for hook 'ibrobot_mode_changed': "
+        "Argument(s) {'moed'} are declared in the hookimpl but can not be found in the hookspec",
+    ]  # fmt: skip
+
+
+def test_a_missing_type_names_the_nearest_and_what_is_broken(registry: Registry) -> None:
+    with pytest.raises(PluginError, match=r"unknown hardware type 'god_arm', did you mean 'good_arm'\?; plugin 'fake_"):
+        registry.find("hardware", "god_arm")
+
+
+def test_a_known_type_of_a_broken_plugin_names_that_plugin(site: Site) -> None:
+    site.add("ibrobot-plugin-keyboard", "raise ImportError('no terminal')")
+
+    with pytest.raises(PluginError) as told:
+        discover(site.entry_points()).find("teleop", "keyboard")
+
+    assert str(told.value) == (
+        "teleop type 'keyboard' is not available: plugin 'ibrobot_plugin_keyboard' (ibrobot-plugin-keyboard) "
+        "failed to import: ImportError: no terminal"
+    )
+
+
+def test_a_known_type_that_is_not_installed_says_what_to_install() -> None:
+    with pytest.raises(PluginError, match=r"^teleop type 'keyboard' needs .*: pip install ibrobot-plugin-keyboard$"):
+        discover([]).find("teleop", "keyboard")
+
+
+def test_a_raising_doctor_check_is_a_failed_check(registry: Registry) -> None:
+    checks = {check.name: check for check in registry.doctor()}
+
+    assert checks["good arm"].ok
+    assert not checks["plugin fake_later"].ok
+    assert checks["plugin fake_later"].found == "its doctor check failed: OSError: no bus"
+
+
+def test_events_reach_all_though_one_raises(registry: Registry, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.ERROR):
+        registry.emit("ibrobot_mode_changed", robot="r", mode="teleop", previous="idle", stamp_ns=1)
+
+    assert sys.modules["fake_good"].events == ["teleop"]
+    assert caplog.messages == ["plugin 'fake_later' failed in ibrobot_mode_changed: ValueError: not now"]
+
+
+def test_every_kind_has_a_hook() -> None:
+    from ibrobot_core import hookspecs
+
+    assert all(hasattr(hookspecs, hook) for hook in KINDS.values())
+
+
+def _ibrobot(*arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", "from ibrobot_core.cli.main import main; main()", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+
+
+def test_the_command_shows_the_failures_and_still_works(registry: Registry) -> None:
+    shown = _ibrobot("plugins")
+
+    assert shown.returncode == 0, shown.stderr
+    for failure in registry.failures:
+        assert f"broken: {failure}\n" in shown.stdout
+    assert "good_arm" in shown.stdout
+
+
+def test_config_check_names_the_broken_plugin(registry: Registry, site: Site) -> None:
+    config = site.folder / "robot.yaml"
+    config.write_text("hardware: {type: libarm}\n")
+
+    told = _ibrobot("config", "check", str(config))
+
+    assert told.returncode == 2
+    assert f"{config}:1: hardware.type: unknown hardware type 'libarm'" in told.stderr
+    assert "plugin 'fake_import' (fake-import) failed to import: ImportError: libarm.so" in told.stderr
+
+
+def test_the_listing_imports_nothing_heavy() -> None:
+    code = (
+        "import sys\n"
+        "sys.argv = ['ibrobot', 'plugins']\n"
+        "from ibrobot_core.cli.main import main\n"
+        "try:\n    main()\nexcept SystemExit:\n    pass\n"
+        "print('heavy:', [name for name in ('torch', 'cv2', 'mujoco', 'mink', 'scipy') if name in sys.modules])\n"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+
+    assert ran.stdout.splitlines()[-1] == "heavy: []"
