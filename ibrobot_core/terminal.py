@@ -1,0 +1,179 @@
+"""The terminal's keys: one owner of standard input, which decodes what is typed and gives it to all who subscribed."""
+
+from __future__ import annotations
+
+import os
+import queue
+import re
+import select
+import termios
+import threading
+import tty
+import weakref
+from contextlib import suppress
+from types import TracebackType
+from typing import Any
+
+from ibrobot_core.errors import TeleopError
+
+_ESCAPE_S = 0.05
+"""Time [s] after which an escape that nothing followed was the key and not the beginning of a sequence."""
+
+_NAMED = {" ": "space", "\r": "enter", "\n": "enter", "\t": "tab", "\x7f": "backspace", "\b": "backspace"}
+_LETTERS = {
+    "A": "up", "B": "down", "C": "right", "D": "left", "H": "home", "F": "end",
+    "P": "f1", "Q": "f2", "R": "f3", "S": "f4",
+}  # fmt: skip
+"""Last letter of a sequence -> key."""
+_NUMBERS = {
+    "1": "home", "2": "insert", "3": "delete", "4": "end", "5": "page_up", "6": "page_down", "7": "home", "8": "end",
+    "11": "f1", "12": "f2", "13": "f3", "14": "f4", "15": "f5", "17": "f6", "18": "f7", "19": "f8", "20": "f9",
+    "21": "f10", "23": "f11", "24": "f12",
+}  # fmt: skip
+"""First parameter of a sequence that ends with `~` -> key."""
+
+_SEQUENCE = re.compile(rb"\x1b(?:\[\[([A-E])|\[([0-?]*)[ -/]*([@-Z\\-~])|O([A-Za-z]))")
+"""An escape sequence: the Linux console's f1 to f5, a control sequence, or one in application mode."""
+_BEGINNING = re.compile(rb"\x1b(?:\[(?:\[|[0-?]*[ -/]*)|O)?")
+"""What may yet become one."""
+
+
+def decode(typed: bytes, *, final: bool) -> tuple[list[str], bytes]:
+    """Turn what a terminal sent into keys.
+
+    Keys are printable characters as they are, and `space`, `enter`, `tab`, `backspace`, `esc`, `up`, `down`, `left`,
+    `right`, `home`, `end`, `insert`, `delete`, `page_up`, `page_down`, `f1` to `f12`; modifiers of the named ones are
+    ignored. Unknown sequences, control characters and what is no UTF-8 are passed over. An escape is never lost: where
+    it begins no sequence it is `esc`.
+
+    Args:
+        typed: the bytes, beginning at a key.
+        final: True when nothing follows for now, so that a lone escape is the key.
+
+    Returns:
+        The keys, and the bytes of an incomplete last one, to which the next ones belong; none when `final`.
+    """
+    keys: list[str] = []
+    while typed:
+        if typed[0] != 0x1B:
+            length = _character_length(typed[0])
+            if len(typed) < length and not final:
+                break
+            try:
+                character = typed[:length].decode()
+            except UnicodeDecodeError:
+                typed = typed[1:]
+                continue
+            typed = typed[length:]
+            if character in _NAMED or character.isprintable():
+                keys.append(_NAMED.get(character, character))
+        elif sequence := _SEQUENCE.match(typed):
+            typed = typed[sequence.end() :]
+            keys += _sequence_key(*(group.decode() if group else "" for group in sequence.groups()))
+        elif _BEGINNING.fullmatch(typed):
+            if not final:
+                break
+            keys.append("esc")
+            typed = b""
+        else:
+            keys.append("esc")
+            typed = typed[1:]
+    return keys, typed
+
+
+def _character_length(first: int) -> int:
+    """Bytes of a UTF-8 character by its first one; 1 for what cannot begin one."""
+    return 2 if 0xC2 <= first < 0xE0 else 3 if 0xE0 <= first < 0xF0 else 4 if 0xF0 <= first < 0xF5 else 1
+
+
+def _sequence_key(console: str, parameters: str, last: str, application: str) -> list[str]:
+    """The key of a sequence, from the groups of `_SEQUENCE`, or none."""
+    if console:
+        return [f"f{ord(console) - ord('A') + 1}"]
+    key = _NUMBERS.get(parameters.partition(";")[0]) if last == "~" else _LETTERS.get(last or application)
+    return [key] if key else []
+
+
+class Keys:
+    """Reads keys from a terminal while open, and gives each to every subscriber.
+
+    The terminal shows no typed characters meanwhile; Ctrl-C and its like remain signals. Use it as a context manager:
+    the terminal is put back as it was however the block is left.
+
+    Args:
+        fd: the terminal; standard input by default.
+    """
+
+    def __init__(self, fd: int = 0) -> None:
+        self._fd = fd
+        self._lock = threading.Lock()
+        self._subscribers: weakref.WeakSet[queue.SimpleQueue[str]] = weakref.WeakSet()
+        self._thread: threading.Thread | None = None
+        self._saved: list[Any] = []
+        self._wake: tuple[int, int] = (-1, -1)
+
+    def open(self) -> None:
+        """Begin to read.
+
+        Raises:
+            TeleopError: when there is no terminal.
+        """
+        if not os.isatty(self._fd):
+            raise TeleopError(
+                "keys need a terminal, but standard input is none: start it in one, without a pipe or a '<'"
+            )
+        self._saved = termios.tcgetattr(self._fd)
+        self._wake = os.pipe()
+        tty.setcbreak(self._fd)
+        self._thread = threading.Thread(target=self._read, name="keys", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop reading and put the terminal back as it was; typed keys not yet read are dropped. Safe to call twice."""
+        if self._thread is None:
+            return
+        thread, self._thread = self._thread, None
+        try:
+            os.write(self._wake[1], b"x")
+            thread.join()
+        finally:
+            with suppress(termios.error):  # the terminal is gone
+                termios.tcsetattr(self._fd, termios.TCSAFLUSH, self._saved)
+            for end in self._wake:
+                os.close(end)
+
+    def subscribe(self) -> queue.SimpleQueue[str]:
+        """A new queue of the keys typed from now on; it is fed as long as somebody keeps it."""
+        subscriber: queue.SimpleQueue[str] = queue.SimpleQueue()
+        with self._lock:
+            self._subscribers.add(subscriber)
+        return subscriber
+
+    def __enter__(self) -> Keys:
+        self.open()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _read(self) -> None:
+        typed = b""
+        while True:
+            ready, _, _ = select.select([self._fd, self._wake[0]], [], [], _ESCAPE_S if typed else None)
+            if self._wake[0] in ready:
+                return
+            if ready:
+                try:
+                    read = os.read(self._fd, 1024)
+                except OSError:  # the terminal is gone
+                    return
+                if not read:
+                    return
+                typed += read
+            keys, typed = decode(typed, final=not ready)
+            with self._lock:
+                for subscriber in self._subscribers:
+                    for key in keys:
+                        subscriber.put(key)

@@ -1,0 +1,187 @@
+"""Keys typed in a terminal: their decoding, and a pseudo-terminal that types them."""
+
+from __future__ import annotations
+
+import gc
+import os
+import termios
+import threading
+import weakref
+from collections.abc import Iterator
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ibrobot_core.errors import TeleopError
+from ibrobot_core.terminal import Keys, decode
+
+TIMEOUT_S = 10
+
+SENT = {
+    b"a": "a", b"Z": "Z", b"+": "+", "ü".encode(): "ü", "€".encode(): "€", "🤖".encode(): "🤖",
+    b" ": "space", b"\r": "enter", b"\n": "enter", b"\t": "tab", b"\x7f": "backspace",
+    b"\x1b[A": "up", b"\x1bOA": "up", b"\x1b[1;5A": "up", b"\x1b[B": "down", b"\x1b[C": "right", b"\x1bOD": "left",
+    b"\x1b[H": "home", b"\x1bOH": "home", b"\x1b[1~": "home", b"\x1b[7~": "home", b"\x1b[F": "end", b"\x1b[4~": "end",
+    b"\x1b[2~": "insert", b"\x1b[3~": "delete", b"\x1b[5~": "page_up", b"\x1b[6;2~": "page_down",
+    b"\x1bOP": "f1", b"\x1bOS": "f4", b"\x1b[11~": "f1", b"\x1b[[A": "f1", b"\x1b[[E": "f5", b"\x1b[15~": "f5",
+    b"\x1b[17~": "f6", b"\x1b[21~": "f10", b"\x1b[23~": "f11", b"\x1b[24;5~": "f12", b"\x1b[1;2P": "f1",
+}  # fmt: skip
+"""What terminals send -> the key: xterm, rxvt, the Linux console; with modifiers; in application mode."""
+PASSED_OVER = [b"\x00", b"\x01", b"\xff", b"\xc2\x80", b"\xe2\x82", b"\x1b[200~", b"\x1b[?1;2c", b"\x1b[Z", b"\x1bOx"]
+
+
+@pytest.mark.parametrize(("typed", "key"), SENT.items())
+def test_a_key_is_known_by_what_terminals_send(typed, key):
+    assert decode(typed, final=True) == ([key], b"")
+
+
+@pytest.mark.parametrize("typed", PASSED_OVER)
+def test_what_is_no_key_is_passed_over(typed):
+    assert decode(typed + b"a", final=True) == (["a"], b"")
+
+
+@given(st.lists(st.sampled_from(list(SENT.items()))))
+def test_keys_typed_at_once_come_in_order(keys):
+    assert decode(b"".join(typed for typed, _ in keys), final=False) == ([key for _, key in keys], b"")
+
+
+pieces = st.sampled_from([*SENT, *PASSED_OVER, b"\x1b", b"\x1b[", b"\x1b[1;", b"\x1bO", b"\xf0\x9f"]) | st.binary(
+    max_size=4
+)
+
+
+@given(st.lists(pieces).map(b"".join), st.lists(st.integers(1, 5)))
+def test_it_does_not_matter_how_the_bytes_arrive(typed, sizes):
+    keys, rest, remaining = [], b"", typed
+    for size in [*sizes, len(typed)]:
+        found, rest = decode(rest + remaining[:size], final=False)
+        keys += found
+        remaining = remaining[size:]
+    found, rest = decode(rest, final=True)
+    assert (keys + found, rest) == decode(typed, final=True)
+    assert rest == b""
+
+
+@given(st.lists(pieces).map(b"".join))
+def test_every_key_has_a_name_and_none_is_made_up(typed):
+    keys, _ = decode(typed, final=True)
+    for key in keys:
+        assert key in {*SENT.values(), "esc"} or (len(key) == 1 and key.isprintable() and key.encode() in typed)
+
+
+@given(st.lists(pieces).map(b"".join))
+def test_an_escape_at_the_end_is_never_lost(typed):
+    keys, rest = decode(typed + b"\x1b", final=True)
+    assert (keys[-1], rest) == ("esc", b"")
+
+
+@pytest.mark.parametrize(
+    ("typed", "keys"),
+    [
+        (b"\x1b", ["esc"]),
+        (b"\x1b\x1b", ["esc", "esc"]),
+        (b"\x1ba", ["esc", "a"]),
+        (b"\x1b\x1b[A", ["esc", "up"]),
+        (b"\x1b[", ["esc"]),
+        (b"\x1b[1;5", ["esc"]),
+        (b"\x1b[[x", ["esc", "[", "[", "x"]),
+        (b"\x1b[" + b"9" * 5000 + b"~a", ["a"]),
+    ],
+)
+def test_an_escape_that_begins_no_sequence_is_the_key(typed, keys):
+    assert decode(typed, final=True) == (keys, b"")
+
+
+@pytest.fixture
+def terminal() -> Iterator[tuple[int, int]]:
+    """Two ends of a pseudo-terminal: where a person types, and where the program reads."""
+    person, program = os.openpty()
+    yield person, program
+    os.close(person)
+    os.close(program)
+
+
+def test_what_is_typed_reaches_every_subscriber(terminal):
+    person, program = terminal
+    with Keys(program) as keys:
+        first, second = keys.subscribe(), keys.subscribe()
+        os.write(person, b"w\x1b[A \x1bOP")
+        for subscriber in (first, second):
+            assert [subscriber.get(timeout=TIMEOUT_S) for _ in range(4)] == ["w", "up", "space", "f1"]
+
+
+def test_a_lone_escape_comes_without_a_further_key(terminal):
+    person, program = terminal
+    with Keys(program) as keys:
+        subscriber = keys.subscribe()
+        os.write(person, b"\x1b")
+        assert subscriber.get(timeout=TIMEOUT_S) == "esc"
+
+
+def test_later_subscribers_get_later_keys_only(terminal):
+    person, program = terminal
+    with Keys(program) as keys:
+        first = keys.subscribe()
+        os.write(person, b"a")
+        assert first.get(timeout=TIMEOUT_S) == "a"
+        second = keys.subscribe()
+        os.write(person, b"b")
+        assert second.get(timeout=TIMEOUT_S) == "b"
+
+
+def test_a_queue_that_nobody_keeps_is_fed_no_more(terminal):
+    _, program = terminal
+    keys = Keys(program)
+    subscriber = weakref.ref(keys.subscribe())
+    gc.collect()
+    assert subscriber() is None
+
+
+def test_keys_come_unechoed_without_enter_and_the_terminal_is_restored(terminal):
+    _, program = terminal
+    before = termios.tcgetattr(program)
+    threads = threading.active_count()
+    keys = Keys(program)
+
+    def fail_while_open() -> None:
+        with keys:
+            local = termios.tcgetattr(program)[3]
+            assert not local & (termios.ECHO | termios.ICANON)
+            assert local & termios.ISIG
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail_while_open()
+    assert termios.tcgetattr(program) == before
+    assert threading.active_count() == threads
+    keys.close()
+
+
+def test_it_can_be_opened_again(terminal):
+    person, program = terminal
+    keys = Keys(program)
+    subscriber = keys.subscribe()
+    for character in "ab":
+        with keys:
+            os.write(person, character.encode())
+            assert subscriber.get(timeout=TIMEOUT_S) == character
+
+
+def test_a_terminal_that_goes_away_ends_quietly():
+    person, program = os.openpty()
+    try:
+        with Keys(program):
+            os.close(person)
+    finally:
+        os.close(program)
+
+
+def test_without_a_terminal_it_says_what_to_do():
+    out, into = os.pipe()
+    try:
+        with pytest.raises(TeleopError, match="need a terminal, but standard input is none: start it in one"):
+            Keys(out).open()
+    finally:
+        os.close(out)
+        os.close(into)
