@@ -1,0 +1,131 @@
+"""`ibrobot doctor`."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ibrobot_core.cli import doctor
+from ibrobot_core.plugins import discover
+
+if TYPE_CHECKING:
+    from cli.conftest import Ran
+    from conftest import Site
+
+Ibrobot = Callable[..., "Ran"]
+FAILING_CHECK = """
+from ibrobot_core import hookimpl
+from ibrobot_core.descriptors import Check
+
+@hookimpl
+def ibrobot_doctor():
+    yield Check("GL", False, "no context", "apt install libegl1")
+"""
+
+
+def test_a_failing_check_of_a_plugin_is_told_with_its_remedy(ibrobot: Ibrobot, site: Site) -> None:
+    site.add("fake-gl", FAILING_CHECK)
+
+    ran = ibrobot("doctor")
+
+    assert ran.code == 1
+    assert "FAIL  GL: no context\n      apt install libegl1\n" in ran.out
+    assert "ok    python: " in ran.out
+
+
+def test_as_json(ibrobot: Ibrobot, site: Site) -> None:
+    site.add("fake-broken", "raise ImportError('no library')")
+
+    found = {check["name"]: check for check in json.loads(ibrobot("doctor", "--json").out)}
+
+    assert found["plugin fake_broken"] == {
+        "name": "plugin fake_broken",
+        "ok": False,
+        "found": "plugin 'fake_broken' (fake-broken) failed to import: ImportError: no library",
+        "remedy": "repair or remove it: pip uninstall fake-broken",
+        "matters": True,
+    }
+    assert not found["real-time priority"]["matters"]
+
+
+def test_a_sound_machine_passes(ibrobot: Ibrobot, site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "examine", lambda registry: [doctor.Finding(doctor.python_version(), True)])
+
+    assert ibrobot("doctor").code == 0
+
+
+def test_what_is_only_worth_knowing_fails_nothing(ibrobot: Ibrobot, monkeypatch: pytest.MonkeyPatch) -> None:
+    _as_user(monkeypatch, rtprio=0, memlock=8_388_608)
+    monkeypatch.setattr(doctor, "examine", lambda registry: [doctor.Finding(doctor.realtime(), False)])
+
+    ran = ibrobot("doctor")
+
+    assert ran.code == 0
+    assert ran.out.startswith("note  real-time priority: not permitted")
+    assert "rtprio 95" in ran.out
+
+
+def _as_user(monkeypatch: pytest.MonkeyPatch, *, rtprio: int, memlock: int) -> None:
+    limits = {resource.RLIMIT_RTPRIO: (rtprio, rtprio), resource.RLIMIT_MEMLOCK: (memlock, memlock)}
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    monkeypatch.setattr(resource, "getrlimit", limits.__getitem__)
+
+
+@pytest.mark.parametrize(("rtprio", "ok"), [(0, False), (95, True), (resource.RLIM_INFINITY, True)])
+def test_real_time_permission(monkeypatch: pytest.MonkeyPatch, rtprio: int, ok: bool) -> None:
+    _as_user(monkeypatch, rtprio=rtprio, memlock=0)
+
+    assert doctor.realtime().ok is ok
+
+
+@pytest.mark.parametrize(("memlock", "ok"), [(8_388_608, False), (2**30, True), (resource.RLIM_INFINITY, True)])
+def test_memory_lock(monkeypatch: pytest.MonkeyPatch, memlock: int, ok: bool) -> None:
+    _as_user(monkeypatch, rtprio=0, memlock=memlock)
+
+    assert doctor.memory_lock().ok is ok
+
+
+def test_root_may_do_both(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "geteuid", lambda: 0)
+
+    assert doctor.realtime().ok
+    assert doctor.memory_lock().ok
+
+
+def test_serial_ports_and_their_permissions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for port in ("ttyACM0", "ttyACM1"):
+        (tmp_path / port).touch()
+    monkeypatch.setattr(os, "access", lambda path, mode: path.endswith("0"))
+
+    free, locked = doctor.serial_ports((f"{tmp_path}/ttyACM*", f"{tmp_path}/ttyUSB*"))
+
+    assert (free.ok, free.found) == (True, "readable and writable")
+    assert (locked.ok, locked.name) == (False, f"serial port {tmp_path}/ttyACM1")
+    assert "dialout" in locked.remedy
+    assert [check.found for check in doctor.serial_ports((f"{tmp_path}/ttyUSB*",))] == [
+        "none; connect the arm if you expected one"
+    ]
+
+
+@pytest.mark.parametrize(("free", "ok"), [(1_000_000, False), (5_000_000_000, True)])
+def test_disk(monkeypatch: pytest.MonkeyPatch, free: int, ok: bool) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=free))
+
+    assert doctor.disk(".").ok is ok
+
+
+def test_all_checks_are_made(site: Site) -> None:
+    site.add("fake-gl", FAILING_CHECK)
+
+    names = [finding.check.name for finding in doctor.examine(discover(site.entry_points()))]
+
+    assert names[:3] == ["python", "plugins", "GL"]
+    assert names[-3:] == ["real-time priority", "memory lock", "disk"]

@@ -1,0 +1,69 @@
+"""`ibrobot --help`, `--version`, and what the command line does with errors."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ibrobot_core import __version__
+from ibrobot_core.cli.main import COMMANDS
+
+if TYPE_CHECKING:
+    from cli.conftest import Ran
+
+Ibrobot = Callable[..., "Ran"]
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["-h"]])
+def test_help_lists_every_command_and_those_of_plugins(ibrobot: Ibrobot, robot: Path, arguments: list[str]) -> None:
+    ran = ibrobot(*arguments)
+
+    lines = [line.split(maxsplit=1) for line in ran.out.splitlines()]
+    assert ran.code == 0
+    for name, (_, summary) in COMMANDS.items():
+        assert [name, summary] in lines
+    assert ["greet", "Say hello."] in lines
+
+
+def test_help_imports_nothing_slow() -> None:
+    code = (
+        "import sys\n"
+        "sys.argv = ['ibrobot', '--help']\n"
+        "from ibrobot_core.cli.main import main\n"
+        "try:\n    main()\nexcept SystemExit:\n    pass\n"
+        "slow = ('numpy', 'rich', 'yaml', 'cattrs', 'mujoco', 'torch', 'cv2', 'ibrobot_core.config')\n"
+        "print('slow:', [name for name in slow if name in sys.modules])\n"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+
+    assert ran.stdout.splitlines()[-1] == "slow: []"
+
+
+def test_version(ibrobot: Ibrobot) -> None:
+    assert ibrobot("--version").out == f"ibrobot, version {__version__}\n"
+
+
+def test_an_error_of_a_plugins_command_is_one_line_and_its_code(ibrobot: Ibrobot, robot: Path) -> None:
+    ran = ibrobot("greet")
+
+    assert (ran.code, ran.out, ran.err) == (1, "", "error: nobody there\n")
+
+
+def test_wrong_usage_exits_with_2(ibrobot: Ibrobot) -> None:
+    ran = ibrobot("lunch")
+
+    assert ran.code == 2
+    assert "No such command 'lunch'" in ran.err
+
+
+@pytest.mark.parametrize("command", ["config", "plugins", "doctor"])
+def test_every_command_explains_itself(ibrobot: Ibrobot, command: str) -> None:
+    ran = ibrobot(command, "--help")
+
+    assert ran.code == 0
+    assert ran.out.startswith(f"Usage: ibrobot {command}")
