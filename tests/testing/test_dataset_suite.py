@@ -72,7 +72,8 @@ class SavesWhenFinalized(FakeDataset):
         return len(self._waiting) - 1
 
     def finalize(self):
-        for self._frames in self._waiting:
+        for frames in self._waiting:
+            self._frames = frames
             super().save_episode()
         self._waiting = []
         super().finalize()

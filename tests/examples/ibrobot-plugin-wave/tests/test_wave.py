@@ -1,0 +1,22 @@
+"""The wave is a correct teleoperation device."""
+
+from typing import override
+
+from ibrobot_wave import Wave, WaveOptions
+
+from ibrobot_core.interfaces import Context, Teleop
+from ibrobot_core.testing import TeleopSuite
+
+
+class TestWave(TeleopSuite):
+    """Runs every check of the suite on the wave."""
+
+    has_deadman = False
+
+    @override
+    def make(self, ctx: Context) -> Teleop:
+        return Wave(WaveOptions(), ctx)
+
+    @override
+    def operate(self, teleop: Teleop) -> None:
+        pass  # it waves by itself
