@@ -120,13 +120,13 @@ class Contract:
     def canonical(self) -> dict[str, Any]:
         """What shapes the data, as plain JSON values: what `fingerprint` hashes and `difference` compares.
 
-        Keys of observations are sorted, since their order shapes nothing; parts of one key and joints keep theirs.
+        The order of observation keys shapes nothing and is not hashed; that of the parts of a key and of joints is.
         """
         return {
             "version": 1,
             "units": "SI",
             "rate_hz": self.rate_hz,
-            "observations": {key: [_canonical(p) for p in self.parts(key)] for key in sorted(self.observations)},
+            "observations": {key: [_canonical(p) for p in self.parts(key)] for key in self.observations},
             "action": [{"topic": p.topic, "type": p.type, "joints": list(p.joints)} for p in self.action_parts],
         }
 

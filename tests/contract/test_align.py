@@ -150,6 +150,14 @@ def test_a_jump_counts_from_its_receipt_on_and_no_sooner() -> None:
     assert stream.resets == 1
 
 
+def test_a_sender_ahead_of_us_is_followed_sample_by_sample() -> None:
+    stream: Stream[int] = Stream(Align(), 33 * MS)
+    for k in range(300):
+        stream.add(k * 10 * MS + 500 * MS, k * 10 * MS, k)
+        chosen = stream.at(k * 10 * MS)
+        assert (None if chosen is None else chosen.value) == (k - 50 if k >= 50 else None)
+
+
 class Payload:
     """Something that can be watched."""
 

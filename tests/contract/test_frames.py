@@ -209,6 +209,16 @@ def test_queues_are_bounded_and_loss_is_counted(contract: Contract) -> None:
     np.testing.assert_array_equal(sampler.sample(clock.now_ns()).values["observation.images.top"], newest)
 
 
+def test_ticks_far_behind_the_clock_still_keep_no_more_than_the_queues_hold(contract: Contract) -> None:
+    clock = SteppedClock(START_NS)
+    bus = Bus(clock)
+    sampler = FrameSampler(contract, bus)
+    for k in range(100):
+        bus.publish("/camera/top/image_raw", image(clock.advance(MS), k))
+        sampler.advance(START_NS)
+    assert bus.dropped() == {"/camera/top/image_raw": 100 - 32 - 1}
+
+
 def test_advancing_at_every_tick_loses_nothing(contract: Contract) -> None:
     clock = SteppedClock(START_NS)
     bus = Bus(clock)

@@ -119,6 +119,7 @@ def test_resizing_colours_is_the_exact_mean_over_the_area(
 def test_large_reductions_do_not_overflow() -> None:
     for height, width in ((480, 640), (1080, 1921), (2160, 3840)):
         assert (resize(np.full((height, width, 1), 255, np.uint8), 1, 7) == 255).all()
+    assert resize(np.full((257, 1, 1), 255, np.uint8), 1, 1) == 255, "255 * 257 is all that 16 bits hold"
 
 
 @pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
