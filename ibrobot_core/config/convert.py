@@ -19,6 +19,11 @@ from ibrobot_core.config.yaml_nodes import Key
 _YAML_1_1_BOOLS = {"on", "off", "yes", "no", "y", "n", "true", "false"}
 
 
+def said(error: Exception) -> str:
+    """An error's message; attrs' own validators put more than it into their errors."""
+    return str(error.args[0]) if error.args else str(error)
+
+
 @attrs.define(slots=False)
 class Faults(ValueError):
     """What is wrong with a value: keys below it, each with a message."""
@@ -37,7 +42,7 @@ class Faults(ValueError):
         except Faults as inner:
             self.found += [((part, *key), message) for key, message in inner.found]
         except (ValueError, TypeError) as error:
-            self.found.append(((part,), str(error)))
+            self.found.append(((part,), said(error)))
 
     def raise_any(self) -> None:
         """Raise this if anything was noted."""

@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import attrs
+from cattrs import Converter
 
-from ibrobot_core.config.convert import Faults, fields, make_converter, structure_fields, unknown_key
+from ibrobot_core.config.convert import Faults, fields, make_converter, said, structure_fields, unknown_key
 from ibrobot_core.config.keys import (
     ComponentKeys,
     ExecutorKeys,
@@ -73,10 +74,10 @@ class Structurer:
     base: Path
     sim: bool
 
+    _converter: Converter = attrs.field(init=False)
+
     def __attrs_post_init__(self) -> None:
         self._converter = make_converter(self.base)
-
-    _converter: Any = attrs.field(init=False)
 
     def parts(self) -> Parts:
         """All sections."""
@@ -181,7 +182,7 @@ class Structurer:
         try:
             return descriptor.options(**arguments)
         except (ValueError, TypeError) as error:
-            faults.add((), str(error))
+            faults.add((), said(error))
             return None
 
     def _named(self, kind: str, section: str, keys_class: type) -> dict[str, Part]:
@@ -242,7 +243,7 @@ class Structurer:
                     message = f"a second peripheral named {name!r}, first in line {lines[name]}"
                     self.document.add((*key, "name"), message)
                 lines.setdefault(name, self.document.place((*key, "name")).line)
-            stand_in = stand_ins.get(item.get("kind", ""))
+            stand_in = stand_ins.get(str(item.get("kind")))
             needed = not parts.simulated or (parts.simulation is not None and stand_in is None)
             part = self._peripheral(key, item, stand_in, needed=needed, simulated=parts.simulated)
             if part is not None:

@@ -7,14 +7,15 @@ from typing import Any
 
 import pytest
 import yaml
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ibrobot_core.config import RobotConfig
+from ibrobot_core.config import RobotConfig, from_document
 from ibrobot_core.config.overrides import apply
 from ibrobot_core.config.show import dump
 from ibrobot_core.config.yaml_nodes import Document, parse, scalar
 from ibrobot_core.errors import ConfigError
+from ibrobot_core.plugins import Registry
 
 Load = Callable[..., RobotConfig]
 
@@ -114,6 +115,27 @@ def test_any_value_goes_in_and_comes_out(path: list[str], value: Any) -> None:
 
     assert not document.problems
     assert document.get(*path) == value
+
+
+def _paths(value: Any) -> list[list[str]]:
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    return [path for name, item in items for path in ([str(name)], *([str(name), *rest] for rest in _paths(item)))]
+
+
+@settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(change=st.tuples(st.integers(0, 10_000), values), sim=st.booleans())
+def test_any_value_anywhere_is_taken_or_told(
+    load_text: Load, base: str, registry: Registry, change: tuple[int, Any], sim: bool
+) -> None:
+    choice, value = change
+    paths = _paths(parse(base, "robot.yaml").root)
+    override = f"{'.'.join(paths[choice % len(paths)])}={dump(value)}"
+
+    try:
+        config = load_text(base, overrides=[override], sim=sim)
+    except ConfigError:
+        return  # told; any other exception fails this test
+    assert from_document(config.document, source=config.source, sim=sim, registry=registry) == config
 
 
 @given(values.filter(_without_expansion))
