@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 from ibrobot_core import hookimpl
 from ibrobot_core.descriptors import Check, HardwareDescriptor, PolicyDescriptor, SensorDescriptor, ViewerDescriptor
-from ibrobot_mujoco.options import CameraOptions, MujocoOptions, ScriptedPickOptions
+from ibrobot_mujoco.options import CameraOptions, MujocoOptions
+from ibrobot_mujoco.policy_options import ScriptedPickOptions
 
 if TYPE_CHECKING:
     from ibrobot_core.interfaces import Context, Hardware, Policy, Sensor, Viewer

@@ -43,7 +43,7 @@ class InverseKinematics:
         self._lower, self._upper = ranges[:, 0] + LIMIT_MARGIN_RAD, ranges[:, 1] - LIMIT_MARGIN_RAD
         self._configuration = mink.Configuration(self._model)
         # A centimetre weighs as much as a radian: where both cannot be had the position is, and the orientation nearly.
-        self._task = mink.FrameTask(self._tip, "site", position_cost=100.0, orientation_cost=1.0, lm_damping=1e-3)
+        self._task = mink.FrameTask(self._tip, "site", position_cost=100.0, orientation_cost=1.0, lm_damping=1.0)
         self._limits = [mink.ConfigurationLimit(self._model, gain=1.0, min_distance_from_limits=LIMIT_MARGIN_RAD)]
 
     def forward(self, joints: Vector) -> TipPose:
@@ -53,13 +53,13 @@ class InverseKinematics:
         return TipPose(site.xpos.copy(), site.xmat.reshape(3, 3).copy())
 
     def solve(self, target: TipPose, start: Vector, *, orientation_tolerance: float = 0.01) -> Vector:
-        """Joint positions [rad], shape (J,), that bring the tip to `target`, searched from `start`, shape (J,).
+        """Joint positions [rad], shape (J,), that bring the tip to `target`.
 
-        Joints that do not move the tip (the gripper's jaw) stay as in `start`.
+        Joints that do not move the tip (the gripper's jaw) stay where the search began.
 
         Args:
             target: where to bring the tip.
-            start: where to begin, moved inside the limits.
+            start: where the search begins, shape (J,); it begins again in the middle of the limits where that fails.
             orientation_tolerance: how far [rad] the tip may turn away from `target` where the arm cannot do better.
 
         Raises:
@@ -67,21 +67,26 @@ class InverseKinematics:
         """
         rotation = mink.SO3.from_matrix(target.rotation)
         self._task.set_target(mink.SE3.from_rotation_and_translation(rotation, target.position))
+        for begin in (start, (self._lower + self._upper) / 2):
+            self._descend(begin)
+            error = self._task.compute_error(self._configuration)
+            off, turned = np.linalg.norm(error[:3]), np.linalg.norm(error[3:])
+            if off <= POSITION_TOLERANCE_M and turned <= orientation_tolerance:
+                return np.asarray(self._configuration.q[self._joints])
+        x, y, z = target.position
+        raise PlanningError(
+            f"{self._tip} cannot reach ({x:.3f}, {y:.3f}, {z:.3f}) m as asked within the joint limits;"
+            f" the nearest found is {1000 * off:.0f} mm and {np.degrees(turned):.0f} degrees off"
+        )
+
+    def _descend(self, start: Vector) -> None:
+        """Bring the configuration from `start` as near to the task's target as it gets."""
         self._place(np.clip(start, self._lower, self._upper))
         for _ in range(ITERATIONS):
             step = mink.solve_ik(self._configuration, [self._task], 1.0, "daqp", damping=1e-9, limits=self._limits)
             self._configuration.integrate_inplace(step, 1.0)
             if np.abs(step).max() < CONVERGED_RAD:
-                break
-        error = self._task.compute_error(self._configuration)
-        position_error, orientation_error = np.linalg.norm(error[:3]), np.linalg.norm(error[3:])
-        if position_error > POSITION_TOLERANCE_M or orientation_error > orientation_tolerance:
-            x, y, z = target.position
-            raise PlanningError(
-                f"{self._tip} cannot reach ({x:.3f}, {y:.3f}, {z:.3f}) m as asked within the joint limits;"
-                f" the nearest is {1000 * position_error:.0f} mm and {np.degrees(orientation_error):.0f} degrees off"
-            )
-        return np.asarray(self._configuration.q[self._joints])
+                return
 
     def _place(self, joints: Vector) -> None:
         q = self._configuration.q

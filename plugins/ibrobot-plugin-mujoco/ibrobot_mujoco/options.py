@@ -88,8 +88,3 @@ class CameraOptions:
     height: int = option(480, unit="px", ge=1, le=8192, help="height of the image")
     fps: float = option(30.0, unit="Hz", gt=0, le=1000, help="images a second of simulated time")
     shadows: bool = option(False, help="whether to render shadows (three times the cost)")
-
-
-@attrs.frozen
-class ScriptedPickOptions:
-    """Options of the scripted pick."""

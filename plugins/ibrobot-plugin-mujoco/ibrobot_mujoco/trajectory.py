@@ -43,7 +43,9 @@ class Limits:
 
 def move(name: str, start: Vector, end: Vector, limits: Limits, *, via: Vector | None = None) -> Segment:
     """The fastest segment from `start` to `end`, through `via` halfway where given; all shape (J,) [rad]."""
-    bow = np.zeros_like(start) if via is None else via - (start + end) / 2
+    # A joint that goes straight on to its end never leaves the range between the two, which is within its limits.
+    most = np.abs(end - start) / 4
+    bow = np.zeros_like(start) if via is None else np.clip(via - (start + end) / 2, -most, most)
     slope = (end - start) + 4 * bow * (1 - 2 * _S)
     velocity = np.abs(slope * _DS) / limits.velocity
     acceleration = np.abs(slope * _DDS - 8 * bow * _DS**2) / limits.acceleration

@@ -1,0 +1,185 @@
+"""The scripted pick: it succeeds within all limits, in chunks that agree, and tries again where something went wrong."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import override
+
+import attrs
+import numpy as np
+import pytest
+from ibrobot_mujoco.ik import InverseKinematics
+from ibrobot_mujoco.options import Fault, MujocoOptions
+from ibrobot_mujoco.policy_options import ScriptedPickOptions
+from ibrobot_mujoco.scripted_pick import SCENE, STATE, ScriptedPick
+from ibrobot_mujoco.so101 import so101
+
+from ibrobot_core.errors import PolicyError
+from ibrobot_core.interfaces import Context, Frame
+from ibrobot_core.robot import Vector
+from ibrobot_core.testing import PolicySuite, host_context
+from ibrobot_core.units import ns, seconds
+
+from .pick_loop import PERIOD_NS, RATE_HZ, Outcome, PickLoop
+
+ROBOT = so101()
+CUBE = (0.24, 0.03, 0.0125)
+BIN = (0.10, 0.24, 0.025)
+
+
+def frame(time_s: float, cube: tuple[float, float, float] = CUBE, state: Vector | None = None) -> Frame:
+    scene = np.array([*cube, 1, 0, 0, 0, *BIN], dtype=np.float32)
+    position = ROBOT.pose("rest") if state is None else state
+    return Frame(ns(100 + time_s), {STATE: position.astype(np.float32), SCENE: scene})
+
+
+def chunk(policy: ScriptedPick, *args: object) -> Vector:
+    return policy.postprocess(policy.infer(policy.preprocess(frame(*args))))  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def policy() -> ScriptedPick:
+    made = ScriptedPick(ScriptedPickOptions(), host_context(robot=ROBOT))
+    made.load()
+    made.reset(0)
+    return made
+
+
+@pytest.fixture(scope="module")
+def loop() -> PickLoop:
+    return PickLoop()
+
+
+def assert_chunks_agree(outcome: Outcome) -> None:
+    for (earlier_s, earlier), (later_s, later) in pairwise(outcome.chunks):
+        shift = round(later_s * RATE_HZ) - round(earlier_s * RATE_HZ)
+        assert 0 < shift < len(earlier)
+        np.testing.assert_allclose(later[: len(earlier) - shift], earlier[shift:], rtol=0, atol=1e-12)
+
+
+def assert_within_limits(outcome: Outcome) -> None:
+    commands, period_s = np.array(outcome.commands), seconds(PERIOD_NS)
+    velocity = np.diff(commands, axis=0) / period_s
+    assert np.all(commands >= ROBOT.lower)
+    assert np.all(commands <= ROBOT.upper)
+    assert np.all(np.abs(velocity) <= ROBOT.max_velocity)
+    assert np.all(np.abs(np.diff(velocity, axis=0)) / period_s <= ROBOT.max_acceleration)
+
+
+class TestConformance(PolicySuite):
+    @override
+    def make(self, ctx: Context) -> ScriptedPick:
+        return ScriptedPick(ScriptedPickOptions(), ctx)
+
+    @override
+    def context(self) -> Context:
+        return host_context(robot=ROBOT)
+
+    @override
+    def frame(self, policy: object, ctx: Context, seed: int) -> Frame:
+        bearing = -0.5 + 0.3 * (seed % 4)
+        cube = (0.23 * np.cos(bearing), 0.23 * np.sin(bearing), 0.0125)
+        return attrs.evolve(frame(0.0, cube), stamp_ns=ctx.clock.now_ns())
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_puts_the_cube_into_the_bin(loop: PickLoop, seed: int) -> None:
+    outcome = loop.run(seed)
+    assert outcome.success
+    assert outcome.interventions == {}
+    assert outcome.bumps == set()
+    assert_within_limits(outcome)
+    assert_chunks_agree(outcome)
+
+
+def test_begins_from_home_as_well() -> None:
+    outcome = PickLoop(MujocoOptions(start_pose="home")).run(3)
+    assert outcome.success
+    assert outcome.interventions == {}
+    assert outcome.bumps == set()
+
+
+def test_tries_again_when_the_gripper_did_not_close() -> None:
+    loop = PickLoop(MujocoOptions(faults=(Fault(at=1.5, kind="freeze_joint", joint="gripper", duration=3.0),)))
+    outcome = loop.run(1, 13.0)
+    assert outcome.success
+    assert outcome.success_s is not None
+    assert outcome.success_s > 7.0, "the first attempt succeeded: the fault came to nothing"
+    assert outcome.interventions == {}
+    assert outcome.bumps == set()
+    assert_chunks_agree(outcome)
+
+
+def test_equal_seeds_give_equal_commands(loop: PickLoop) -> None:
+    first = loop.run(5, 3.0)
+    loop.run(6, 1.0)
+    again = loop.run(5, 3.0)
+    np.testing.assert_array_equal(first.commands, again.commands)
+
+
+def test_rests_where_it_is_then_moves_and_ends_where_it_began(policy: ScriptedPick) -> None:
+    first = chunk(policy, 0.0)
+    rest = ROBOT.pose("rest").astype(np.float32).astype(np.float64)
+    np.testing.assert_array_equal(first[:6], np.tile(rest, (6, 1)))
+    assert np.abs(first[-1] - rest).max() > 0.5
+    np.testing.assert_allclose(chunk(policy, 60.0, BIN), np.tile(rest, (50, 1)), atol=1e-12)
+
+
+@pytest.mark.parametrize("jitter_s", [-0.016, 0.0, 0.009, 0.016])
+def test_chunks_agree_whatever_the_jitter_of_the_stamps(policy: ScriptedPick, jitter_s: float) -> None:
+    first = chunk(policy, 0.0)
+    np.testing.assert_array_equal(chunk(policy, 30 / RATE_HZ + jitter_s)[:20], first[30:])
+
+
+def test_a_cube_pushed_away_is_followed_from_where_it_is_clear(policy: ScriptedPick) -> None:
+    undisturbed = [chunk(policy, float(second)) for second in range(4)]
+    policy.reset(0)
+    pushed = [chunk(policy, 0.0), *(chunk(policy, float(second), (0.20, -0.12, 0.0125)) for second in range(1, 6))]
+    for earlier, later in pairwise(pushed):
+        np.testing.assert_allclose(later[:20], earlier[30:], rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(pushed[1], undisturbed[1])  # down, closed on nothing, and up again
+    assert np.abs(pushed[3] - undisturbed[3]).max() > 0.2
+    tip = InverseKinematics(ROBOT).forward
+    there = [tip(action).position for action in pushed[5]]
+    assert min(np.linalg.norm(position - (0.20, -0.12, 0.0125)) for position in there) < 0.002
+
+
+def test_a_reset_forgets_the_episode(policy: ScriptedPick) -> None:
+    first = chunk(policy, 0.0)
+    chunk(policy, 1.0)
+    policy.reset(0)
+    np.testing.assert_array_equal(chunk(policy, 7.0), first)
+
+
+def test_a_cube_out_of_reach_is_named(policy: ScriptedPick) -> None:
+    message = r"cannot pick the cube at \(0.600, 0.000, 0.013\) m: gripperframe cannot reach \(0.600, 0.000, 0.083\) m"
+    with pytest.raises(PolicyError, match=message):
+        chunk(policy, 0.0, (0.6, 0.0, 0.0125))
+
+
+def test_a_frame_that_is_not_finite_is_refused(policy: ScriptedPick) -> None:
+    with pytest.raises(PolicyError, match=r"needs observation.environment_state with 10 finite numbers, got \[nan"):
+        policy.preprocess(frame(0.0, (np.nan, 0.0, 0.0)))
+
+
+def test_a_vector_of_another_length_is_refused(policy: ScriptedPick) -> None:
+    with pytest.raises(PolicyError, match=r"needs observation.state with 6 finite numbers, got \[0.0, 0.0\]"):
+        policy.preprocess(frame(0.0, state=np.zeros(2)))
+
+
+def test_infer_before_load_is_refused() -> None:
+    policy = ScriptedPick(ScriptedPickOptions(), host_context(robot=ROBOT))
+    with pytest.raises(PolicyError, match="is not loaded"):
+        chunk(policy, 0.0)
+
+
+def test_a_robot_without_a_gripper_is_refused() -> None:
+    robot = attrs.evolve(ROBOT, groups={"arm": ROBOT.joint_names})
+    with pytest.raises(PolicyError, match=r"one joint in robot.groups.gripper, got \[\]"):
+        ScriptedPick(ScriptedPickOptions(), host_context(robot=robot))
+
+
+def test_a_robot_without_a_model_is_refused() -> None:
+    robot = attrs.evolve(ROBOT, description=attrs.evolve(ROBOT.description, mjcf=None))
+    with pytest.raises(PolicyError, match=r"scripted_pick cannot be loaded: robot 'so101' has no description.mjcf"):
+        ScriptedPick(ScriptedPickOptions(), host_context(robot=robot)).load()
