@@ -133,16 +133,18 @@ def parse(text: str, file: str) -> Document:
     Raises:
         ConfigError: e.g. an unclosed bracket.
     """
+    document = Document(None, {}, [], file)
     try:
         node = _Composer(text).get_single_node()
+        document.root = None if node is None else _Constructor(document).value(node, ())
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = mark.line + 1 if mark else 0
         raise ConfigError([Problem(file, line, "", f"not valid YAML: {error.problem}")]) from None
+    except RecursionError:
+        raise ConfigError([Problem(file, 0, "", "nested too deeply")]) from None
     except yaml.YAMLError as error:
         raise ConfigError([Problem(file, 0, "", f"not valid YAML: {str(error).splitlines()[0]}")]) from None
-    document = Document(None, {}, [], file)
-    document.root = None if node is None else _Constructor(document).value(node, ())
     return document
 
 
