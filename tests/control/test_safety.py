@@ -92,6 +92,7 @@ def streams(draw: st.DrawFn) -> tuple[Robot, int, Vector, list[tuple[str, Any, i
         st.tuples(st.just("command"), vector, st.integers(1, 30)),
         st.tuples(st.just("command"), tame, st.integers(1, 30)),
         st.tuples(st.just("step"), tame, st.integers(1, 30)),
+        st.tuples(st.just("push"), tame, st.integers(1, 80)),
         st.tuples(st.just("command"), garbage, st.integers(1, 5)),
         st.tuples(st.just("command"), st.none(), st.integers(1, 30)),
         st.tuples(st.just("blind"), tame, st.integers(1, 5)),
@@ -103,6 +104,18 @@ def streams(draw: st.DrawFn) -> tuple[Robot, int, Vector, list[tuple[str, Any, i
     )
     start = draw(st.one_of(tame, outside))
     return robot, draw(periods), start, draw(st.lists(event, min_size=1, max_size=8))
+
+
+def wish(kind: str, value: Any, layer: SafetyLayer, robot: Robot, period_ns: int) -> Any:
+    """What is asked for in an event of a stream."""
+    dt = period_ns / 1e9
+    if kind == "step":  # a small move from where the command is
+        return layer.current + np.clip(value - layer.current, -0.002, 0.002)
+    if kind == "push":  # speed up as fast as allowed, smoothly, towards a side and on into its limit
+        side = np.where(value > (robot.lower + robot.upper) / 2, 1, -1)
+        velocity = layer.velocity + side * robot.max_acceleration * dt
+        return layer.current + np.clip(velocity, -robot.max_velocity, robot.max_velocity) * dt
+    return value
 
 
 @settings(max_examples=60, deadline=None)
@@ -125,10 +138,7 @@ def test_whatever_is_asked_for_the_limits_hold_and_every_intervention_is_counted
             assert not watched.layer.estopped
             continue
         for _ in range(repeats):
-            if kind == "step":  # a small move from where the command is: mostly feasible
-                desired = watched.layer.current + np.clip(value - watched.layer.current, -0.002, 0.002)
-            else:
-                desired = value
+            desired = wish(kind, value, watched.layer, robot, period_ns)
             measured = np.full(size, np.nan) if kind == "blind" else None
             command = watched.tick(desired, measured)
             if desired is None:
@@ -181,9 +191,9 @@ def test_after_any_stream_a_stop_ends_at_a_target_that_there_is_room_to_stop_at(
     watched = Watched(robot, period_ns)
     watched.start(start)
     for kind, value, repeats in events:
-        if kind in {"command", "step"}:
+        if kind in {"command", "step", "push"}:
             for _ in range(repeats):
-                watched.tick(value)
+                watched.tick(wish(kind, value, watched.layer, robot, period_ns))
     target = np.clip(robot.lower + end * (robot.upper - robot.lower), robot.lower, robot.upper)
     watched.tick(target)
     # Where each joint would stop by itself from here: past the target only if there was no room.
@@ -196,10 +206,17 @@ def test_after_any_stream_a_stop_ends_at_a_target_that_there_is_room_to_stop_at(
         remaining -= change
     rest = position + np.copysign(braking, step)
     slack = 1e-9 + 1e-9 * np.abs(rest)
-    for _ in range(100):
+    # To brake, to go back, and to make up for what was overshot.
+    way = np.abs(target - rest) + 2 * robot.max_velocity**2 / robot.max_acceleration
+    needed_s = np.max(way / robot.max_velocity + 4 * robot.max_velocity / robot.max_acceleration + 2 * watched.dt)
+    ticks = int(needed_s / watched.dt) + 10
+    for _ in range(min(ticks, 1000)):
         command = watched.tick(target)
         assert (command <= np.maximum(target, np.maximum(rest, position)) + slack).all()
         assert (command >= np.minimum(target, np.minimum(rest, position)) - slack).all()
+        if watched.layer.at_rest and (command == target).all():
+            break
+    assert ticks > 1000 or (command == target).all()
 
 
 @settings(max_examples=60, deadline=None)
@@ -213,11 +230,37 @@ def test_any_motion_within_the_limits_passes_bit_by_bit_and_counts_nothing(
     limiting.activate(start)
     passing.activate(start)
     for kind, value, repeats in events:
-        for _ in range(repeats if kind in {"command", "step"} else 0):
+        for _ in range(repeats if kind in {"command", "step", "push"} else 0):
             # What one layer gives out is a motion within the limits, often right at them.
-            motion = limiting.apply(value, start)
+            motion = limiting.apply(wish(kind, value, limiting, robot, period_ns), start)
             np.testing.assert_array_equal(passing.apply(motion, start), motion)
     assert set(passing.counters().values()) == {0}
+
+
+@pytest.mark.parametrize("ticks", range(1, 70, 3))
+@pytest.mark.parametrize("jump", [0.01, 0.05])
+def test_a_target_that_jumps_on_while_it_is_approached_is_not_overshot(ticks: int, jump: float) -> None:
+    watched = Watched(one_joint(), PERIOD_NS)
+    watched.start(ZERO)
+    for index in range(150):
+        target = 0.2 if index < ticks else 0.2 + jump
+        assert watched.tick(np.array([target]))[0] <= target
+    assert watched.layer.current[0] == target
+
+
+def test_a_motion_that_runs_into_a_limit_is_braked_before_it() -> None:
+    watched = Watched(one_joint(), PERIOD_NS)
+    watched.start(ZERO)
+    wanted, speed = 0.0, 0.0
+    for _ in range(150):
+        speed = min(speed + 0.2, 4.0)
+        wanted += speed * 0.01
+        command = watched.tick(np.array([wanted]))
+        if command[0] < 1.55:  # 4 rad/s stop within 0.4 rad
+            assert command[0] == wanted
+    assert command[0] == 2.0
+    assert watched.layer.counters()["acceleration"] > 0
+    assert watched.layer.counters()["position"] > 0
 
 
 def rest_to_rest(start: float, end: float, velocity: float, acceleration: float, dt: float) -> Vector:
@@ -385,9 +428,13 @@ def test_activation_needs_finite_positions_of_every_joint() -> None:
         SafetyLayer(one_joint(), 0)
 
 
-def test_what_is_returned_is_the_callers_to_change() -> None:
-    watched = Watched(one_joint(), PERIOD_NS)
-    watched.start(ZERO)
-    watched.tick(ZERO)[:] = 1.0
-    watched.layer.current[:] = 1.0
-    np.testing.assert_array_equal(watched.layer.current, ZERO)
+def test_what_is_given_and_returned_is_the_callers_to_change() -> None:
+    layer = SafetyLayer(one_joint(), PERIOD_NS)
+    start = np.zeros(1)
+    layer.activate(start)
+    start[:] = 1.0
+    wanted = np.array([0.001])
+    layer.apply(wanted, ZERO)[:] = 1.0
+    wanted[:] = 1.0
+    layer.current[:] = 1.0
+    np.testing.assert_array_equal(layer.current, [0.001])
