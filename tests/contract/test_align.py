@@ -54,8 +54,6 @@ def oracle(samples: list[tuple[int, int, int]], align: Align, step_ns: int, t_ns
 deltas = st.one_of(st.integers(0, 60), st.sampled_from([0, 0, 999, 1000, 1001, 2500]))
 OFTEN_AT_A_LIMIT = [0, 0, -999, -1000, -1001, 990, 1001, 1400, 1401, 100_000]
 latencies = st.one_of(st.integers(-40, 120), st.sampled_from(OFTEN_AT_A_LIMIT))
-    st.integers(-40, 120), st.sampled_from([0, 0, -999, -1000, -1001, 990, 1001, 1400, 1401, 100_000])
-)
 clock_steps = st.sampled_from([0, 0, 0, 0, 0, 0, -1500, 1500, -900, 3000, -3000])
 streams = st.lists(st.tuples(deltas, latencies, clock_steps), max_size=40)
 
