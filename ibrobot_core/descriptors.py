@@ -38,7 +38,7 @@ class Descriptor[T]:
     """
 
     type: str
-    """What the YAML says after `type:`."""
+    """What the YAML gives as `type`."""
     make: Callable[[Any, Context], T]
     summary: str
     options: builtins.type[Any] = NoOptions
@@ -51,7 +51,7 @@ class HardwareDescriptor(Descriptor["Hardware"]):
 
     simulated: bool = False
     sensors: Mapping[str, str] = attrs.field(factory=dict)
-    """For simulated hardware: sensor kind -> the sensor type that stands for it, e.g. `{"camera": "mujoco"}`."""
+    """For simulated hardware, sensor kind -> the sensor type that stands for it, e.g. camera -> mujoco."""
 
 
 @attrs.frozen

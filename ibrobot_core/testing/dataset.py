@@ -28,7 +28,7 @@ class DatasetSuite(Suite[DatasetWriter]):
     """Features whose values come back to the bit."""
 
     def read_back(self, root: Path) -> Sequence[Values]:
-        """The saved episodes in order: key -> its frames, shape (frames, *feature shape); also before `finalize`."""
+        """The saved episodes in order: key -> all its frames, stacked along the first axis; also before `finalize`."""
         raise NotImplementedError(f"{type(self).__name__} must define read_back(self, root)")
 
     def created(self, root: Path) -> DatasetWriter:

@@ -1,0 +1,30 @@
+"""Sphinx configuration. Pages are Markdown; the sections follow Diátaxis."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from ibrobot_core import __version__
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+import generate
+
+generate.write(Path(__file__).parent / "reference")
+
+project = "ibrobot"
+author = "the ibrobot authors"
+project_copyright = "2026, the ibrobot authors"
+version = release = __version__
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.doctest", "sphinx.ext.napoleon"]
+myst_heading_anchors = 3
+exclude_patterns = ["_build"]
+html_theme = "furo"
+html_title = "ibrobot"
+
+autodoc_member_order = "bysource"
+autodoc_default_options = {"members": True, "show-inheritance": True}
+# Names of other projects, of type parameters, and of what has no page of its own.
+nitpick_ignore_regex = [("py:.*", r"(?!ibrobot_core\.interfaces\.\w+\.[A-Z]).*")]
