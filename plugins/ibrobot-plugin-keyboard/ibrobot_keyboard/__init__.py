@@ -1,1 +1,27 @@
-"""Jog a robot from the terminal: joint and Cartesian teleoperation for ibrobot."""
+"""The plugin's hooks: teleop `keyboard`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+from ibrobot_core.descriptors import TeleopDescriptor
+from ibrobot_core.hookspecs import hookimpl
+from ibrobot_keyboard.options import KeyboardOptions
+
+if TYPE_CHECKING:
+    from ibrobot_core.interfaces import Context, Teleop
+
+
+def _keyboard(options: Any, ctx: Context) -> Teleop:
+    from ibrobot_keyboard.teleop import KeyboardTeleop
+
+    return KeyboardTeleop(options, ctx)
+
+
+@hookimpl
+def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
+    """Jog from the terminal."""
+    yield TeleopDescriptor(
+        type="keyboard", options=KeyboardOptions, make=_keyboard, summary="joint and Cartesian jog from the terminal"
+    )

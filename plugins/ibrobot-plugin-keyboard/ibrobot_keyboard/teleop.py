@@ -1,0 +1,161 @@
+"""Teleop `keyboard`: jogs joints or the tool while keys are held down."""
+
+from __future__ import annotations
+
+import queue
+from typing import TYPE_CHECKING, override
+
+import numpy as np
+
+from ibrobot_core.errors import TeleopError
+from ibrobot_core.interfaces import Context, JointReading, Teleop, TeleopCommand
+from ibrobot_core.robot import Vector
+from ibrobot_core.units import ns, seconds
+from ibrobot_keyboard.keymap import CARTESIAN_AXES, Mode, make_keymap
+from ibrobot_keyboard.options import KeyboardOptions
+
+if TYPE_CHECKING:
+    from ibrobot_keyboard.cartesian import CartesianJog
+
+_SPEED_STEP = 1.25
+_SLOWEST, _FASTEST = 0.1, 4.0
+"""Bounds of the factor that the speed keys change."""
+
+_GRIPPER, _HOME = "<gripper>", "<home>"
+"""Axes beside the joints' names and the tool's."""
+_MOTIONS = {"gripper_open": (_GRIPPER, 1), "gripper_close": (_GRIPPER, -1), "home": (_HOME, 1)}
+
+
+class KeyboardTeleop(Teleop):
+    """Moves while keys keep coming; a terminal tells of presses and repeats only, never of releases.
+
+    Each press moves for `hold` seconds from the tick that saw it. Time is that of the measurements.
+    """
+
+    def __init__(self, options: KeyboardOptions, ctx: Context) -> None:
+        self._options = options
+        self._ctx = ctx
+        robot = ctx.robot
+        gripper = robot.groups.get(options.gripper, ())
+        self._gripper = robot.indices(gripper)
+        self._arm = tuple(name for name in robot.joint_names if name not in gripper)
+        self._home = robot.pose("home") if "home" in robot.description.poses else None
+        self._keymap = make_keymap(
+            self._arm,
+            cartesian=options.cartesian,
+            gripper=bool(gripper),
+            home=self._home is not None,
+            overrides=options.keys,
+        )
+        self._keys: queue.SimpleQueue[str] | None = None
+        self._jog: CartesianJog | None = None
+        self._mode: Mode = "joints"
+        self._speed = 1.0
+        self._setpoint: Vector | None = None
+        self._held: dict[str, tuple[int, int]] = {}
+        """Axis -> direction, and when its key counts as released [ns]."""
+        self._moved_ns: int | None = None
+        """When the last motion was computed [ns]; None while at rest."""
+
+    @override
+    def connect(self) -> None:
+        if self._ctx.keys is None:
+            raise TeleopError(
+                f"{self._ctx.name}: the keyboard needs a terminal: start ibrobot in one, its input not redirected, "
+                "or choose another teleop"
+            )
+        if self._options.cartesian:
+            from ibrobot_keyboard.cartesian import CartesianJog
+
+            self._jog = CartesianJog(self._ctx.robot, self._arm)
+        self._keys = self._ctx.keys()
+
+    @override
+    def activate(self, measured: JointReading) -> None:
+        self._setpoint = measured.position.copy()
+        self._held.clear()
+        self._moved_ns = None
+        while self._next_key() is not None:  # typed for something else
+            pass
+
+    @override
+    def read(self, measured: JointReading) -> TeleopCommand:
+        if self._keys is None:
+            raise TeleopError(f"{self._ctx.name}: the keyboard is not connected: connect comes before read")
+        now_ns = measured.stamp_ns
+        self._held = {axis: held for axis, held in self._held.items() if now_ns < held[1]}
+        if not self._held:
+            # What is pressed now begins to move now: a host that stood still does not make up for it in one leap.
+            self._moved_ns = None
+        while (key := self._next_key()) is not None:
+            action = self._keymap.action(self._mode, key)
+            if action == "estop":
+                self._held.clear()
+                return TeleopCommand(None, estop=True)
+            if action is not None:
+                self._press(action, now_ns)
+        if not self._held:
+            return TeleopCommand(None)
+        if self._setpoint is None:
+            self._setpoint = measured.position.copy()
+        if self._moved_ns is not None and now_ns > self._moved_ns:
+            self._setpoint = self._move(self._setpoint, seconds(now_ns - self._moved_ns))
+        self._moved_ns = now_ns
+        return TeleopCommand(dict(zip(self._ctx.robot.joint_names, self._setpoint.tolist(), strict=True)))
+
+    @override
+    def disconnect(self) -> None:
+        self._keys = self._jog = self._setpoint = None
+
+    @override
+    def help(self) -> str:
+        return self._keymap.help()
+
+    def _next_key(self) -> str | None:
+        if self._keys is None:
+            return None
+        try:
+            return self._keys.get_nowait()
+        except queue.Empty:
+            return None
+
+    def _press(self, action: str, now_ns: int) -> None:
+        if action == "toggle":
+            self._mode = "cartesian" if self._mode == "joints" else "joints"
+            self._held.clear()
+            self._ctx.log.info("%s: jogs %s", self._ctx.name, "joints" if self._mode == "joints" else "the tool")
+        elif action in ("faster", "slower"):
+            factor = _SPEED_STEP if action == "faster" else 1 / _SPEED_STEP
+            self._speed = min(max(self._speed * factor, _SLOWEST), _FASTEST)
+            self._ctx.log.info("%s: speed %.0f %%", self._ctx.name, 100 * self._speed)
+        else:
+            axis, direction = _MOTIONS.get(action) or (action[:-1], 1 if action[-1] == "+" else -1)
+            if axis == _HOME:
+                self._held.clear()
+            self._held.pop(_HOME, None)
+            self._held[axis] = direction, now_ns + ns(self._options.hold)
+
+    def _move(self, before: Vector, dt: float) -> Vector:
+        """The setpoint `dt` [s] after `before`, both [rad], shape (J,)."""
+        robot = self._ctx.robot
+        reach = np.minimum(self._options.joint_speed * self._speed, robot.max_velocity) * dt
+        after = before.copy()
+        if _HOME in self._held and self._home is not None:
+            way = self._home - before
+            after += way * min(1.0, float(np.min(reach / np.maximum(np.abs(way), 1e-9))))
+        elif self._mode == "joints":
+            for i, name in zip(robot.indices(self._arm), self._arm, strict=True):
+                after[i] += self._direction(name) * reach[i]
+        elif self._jog is not None and any(axis in self._held for axis in CARTESIAN_AXES):
+            x, y, z, pitch, roll = (self._direction(axis) for axis in CARTESIAN_AXES)
+            move = np.array([x, y, z]) * self._options.cartesian_speed * self._speed
+            turn = np.array([pitch, roll]) * self._options.joint_speed * self._speed
+            after = self._jog.step(before, move, turn, dt)
+        for i in self._gripper:
+            opening = min(self._options.gripper_speed * self._speed, robot.max_velocity[i]) * dt
+            after[i] += self._direction(_GRIPPER) * opening
+        # An arm that rests outside its limits may come in, no joint may go out.
+        return np.clip(after, np.minimum(robot.lower, before), np.maximum(robot.upper, before))
+
+    def _direction(self, axis: str) -> int:
+        return self._held[axis][0] if axis in self._held else 0

@@ -1,0 +1,318 @@
+"""The keyboard as an operator finds it: keys in, joint positions out, by the clock of the measurements."""
+
+from __future__ import annotations
+
+import os
+import queue
+from typing import override
+
+import attrs
+import numpy as np
+import pytest
+from ibrobot_keyboard import ibrobot_teleop
+from ibrobot_keyboard.options import KeyboardOptions
+from ibrobot_keyboard.teleop import KeyboardTeleop
+
+from ibrobot_core.errors import TeleopError
+from ibrobot_core.interfaces import Context, JointReading, Teleop, TeleopCommand
+from ibrobot_core.robot import Description, Joint, Robot
+from ibrobot_core.terminal import Keys
+from ibrobot_core.testing import TeleopSuite, host_context, make_robot
+from ibrobot_core.units import ns
+
+JOINTS = make_robot().joint_names
+MIDDLE = np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
+TICK_S = 0.01
+
+
+@attrs.define
+class Desk:
+    """An operator at a keyboard, and a robot that goes where it is told."""
+
+    robot: Robot = attrs.field(factory=make_robot)
+    options: KeyboardOptions = KeyboardOptions(cartesian=False)
+    position: np.ndarray = attrs.field(factory=MIDDLE.copy)
+    time_s: float = 1000.0
+    typed: queue.SimpleQueue[str] = attrs.field(factory=queue.SimpleQueue)
+    teleop: KeyboardTeleop = attrs.field(init=False)
+
+    def __attrs_post_init__(self) -> None:
+        ctx = host_context("keyboard", robot=self.robot, keys=lambda: self.typed)
+        self.teleop = KeyboardTeleop(self.options, ctx)
+        self.teleop.connect()
+        self.teleop.activate(self.measured())
+
+    def measured(self) -> JointReading:
+        return JointReading(ns(self.time_s), self.position.copy(), np.zeros(6), np.zeros(6))
+
+    def tick(self, *keys: str, seconds: float = TICK_S) -> TeleopCommand:
+        for key in keys:
+            self.typed.put(key)
+        self.time_s += seconds
+        command = self.teleop.read(self.measured())
+        if command.positions is not None:
+            self.position = np.array([command.positions[joint] for joint in self.robot.joint_names])
+        return command
+
+    def hold(self, key: str, seconds: float) -> None:
+        """Keep a key down: it repeats every 30 ms."""
+        for i in range(round(seconds / TICK_S) + 1):
+            self.tick(*([key] if i % 3 == 0 else []))
+
+    def rest(self) -> None:
+        """Let go of all keys until nothing moves."""
+        while self.tick().positions is not None:
+            pass
+
+    def moved(self) -> dict[str, float]:
+        way = self.position - MIDDLE
+        return {joint: way[i] for i, joint in enumerate(self.robot.joint_names) if abs(way[i]) > 1e-9}
+
+
+class TestKeyboard(TeleopSuite):
+    @override
+    def context(self) -> Context:
+        self.typed: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self.ctx = host_context(keys=lambda: self.typed)
+        return self.ctx
+
+    @override
+    def make(self, ctx: Context) -> Teleop:
+        return KeyboardTeleop(KeyboardOptions(cartesian=False), ctx)
+
+    @override
+    def engage(self, teleop: Teleop) -> None:
+        self.typed.put("w")
+
+    @override
+    def operate(self, teleop: Teleop) -> None:
+        self.typed.put("w")
+
+    @override
+    def release(self, teleop: Teleop) -> None:
+        self.ctx.clock.sleep_until(self.ctx.clock.now_ns() + ns(KeyboardOptions().hold))
+
+
+PAIRS = [("w", "s"), ("e", "d"), ("r", "f"), ("t", "g"), ("y", "h")]
+
+
+@pytest.mark.parametrize(("joint", "keys"), list(zip(JOINTS, PAIRS, strict=False)))
+def test_each_joint_has_a_key_up_and_a_key_down(joint, keys):
+    for key, sign in zip(keys, (1, -1), strict=True):
+        desk = Desk()
+        desk.hold(key, 0.4)
+        assert desk.moved() == pytest.approx({joint: sign * 0.5 * 0.4})
+
+
+def test_a_tap_moves_for_the_hold_time_and_not_longer():
+    desk = Desk()
+    commands = [desk.tick("w"), *(desk.tick() for _ in range(30))]
+    moving = [c.positions is not None for c in commands]
+    assert moving == [True] * 15 + [False] * 16
+    assert desk.moved() == pytest.approx({"shoulder_pan": 0.5 * 0.14})
+
+
+def test_a_held_key_moves_without_a_break():
+    desk = Desk()
+    for i in range(100):
+        assert desk.tick(*(["w"] if i % 9 == 0 else [])).positions is not None
+
+
+def test_without_keys_there_are_no_positions():
+    assert Desk().tick() == TeleopCommand(None)
+
+
+def test_motion_goes_on_from_the_last_setpoint_and_not_from_where_the_arm_sags():
+    desk = Desk()
+    desk.hold("w", 0.2)
+    desk.rest()
+    reached = desk.position[0]
+    desk.position[0] -= 0.05
+    assert desk.tick("w").positions["shoulder_pan"] == reached
+
+
+def test_activation_begins_where_the_robot_is_and_forgets_what_was_typed():
+    desk = Desk()
+    desk.tick("w")
+    desk.position = np.zeros(6)
+    for key in ("w", "space"):
+        desk.typed.put(key)
+    desk.teleop.activate(desk.measured())
+    assert desk.tick() == TeleopCommand(None)
+    assert desk.tick("e").positions == dict.fromkeys(JOINTS, 0.0)
+
+
+def test_two_keys_move_two_joints_and_the_newer_of_opposite_keys_wins():
+    desk = Desk()
+    desk.tick("w", "e")
+    desk.tick(seconds=0.1)
+    assert desk.moved() == pytest.approx({"shoulder_pan": 0.05, "shoulder_lift": 0.05})
+    desk.tick("s")
+    desk.tick(seconds=0.1)
+    assert desk.moved()["shoulder_pan"] < 0.05
+
+
+def test_no_key_drives_a_joint_out_of_its_limits():
+    desk = Desk()
+    desk.hold("w", 10)
+    assert desk.position[0] == 1.8
+    desk.hold("s", 10)
+    assert desk.position[0] == -1.9
+
+
+def test_a_joint_outside_its_limits_may_only_come_in():
+    desk = Desk(position=np.array([2.0, 0, 0, 0, 0, 0]))
+    desk.hold("w", 0.3)
+    assert desk.position[0] == 2.0
+    desk.rest()
+    desk.hold("s", 0.3)
+    assert desk.position[0] == pytest.approx(2.0 - 0.15)
+
+
+def test_gripper_keys_open_and_close_it():
+    desk = Desk()
+    desk.hold("o", 0.3)
+    assert desk.moved() == pytest.approx({"gripper": 0.3})
+    desk.hold("c", 3)
+    assert desk.position[5] == -0.2
+
+
+def test_the_home_key_goes_straight_home_at_joint_speed_while_it_is_held():
+    desk = Desk()
+    desk.hold("0", 0.4)
+    np.testing.assert_allclose(desk.position, MIDDLE * (1 - 0.5 * 0.4 / 0.6))
+    desk.tick("w")
+    before = desk.position.copy()
+    desk.tick(seconds=0.1)
+    np.testing.assert_allclose(desk.position - before, [0.05, 0, 0, 0, 0, 0], atol=1e-12)
+    desk.hold("0", 2)
+    np.testing.assert_array_equal(desk.position, np.zeros(6))
+
+
+def test_speed_keys_change_the_speed_within_bounds():
+    desk = Desk()
+    desk.tick("+", "+")
+    desk.hold("w", 0.2)
+    assert desk.moved() == pytest.approx({"shoulder_pan": 0.5 * 1.25**2 * 0.2})
+    slow = Desk()
+    slow.tick(*["-"] * 50)
+    slow.hold("w", 0.2)
+    assert slow.moved() == pytest.approx({"shoulder_pan": 0.5 * 0.1 * 0.2})
+
+
+def test_no_joint_goes_faster_than_its_own_limit():
+    desk = Desk(options=KeyboardOptions(cartesian=False, joint_speed=50.0, gripper_speed=50.0))
+    path = []
+    for _ in range(20):
+        desk.tick("w", "o")
+        path.append(desk.position.copy())
+    speeds = np.diff(path, axis=0).max(axis=0) / TICK_S
+    assert speeds[0] == pytest.approx(2.0)
+    assert speeds[5] == pytest.approx(3.25)
+
+
+def test_a_host_that_stood_still_makes_no_leap():
+    desk = Desk()
+    desk.tick("w")
+    desk.tick("w", seconds=5.0)
+    assert desk.moved() == {}
+    desk.tick("w", seconds=0.14)
+    assert desk.moved() == pytest.approx({"shoulder_pan": 0.5 * 0.14})
+
+
+def test_the_emergency_key_asks_for_a_stop_once_and_ends_all_motion():
+    desk = Desk()
+    desk.tick("w")
+    assert desk.tick("space", "e") == TeleopCommand(None, estop=True)
+    desk.teleop.activate(desk.measured())
+    assert desk.tick() == TeleopCommand(None)
+
+
+def test_keys_of_the_runtime_and_unknown_ones_do_nothing():
+    desk = Desk()
+    for key in ("q", "esc", "tab", "f1", "f10", "ü", "m"):
+        assert desk.tick(key) == TeleopCommand(None)
+
+
+def test_keys_can_be_given_other_actions():
+    keys = {"shoulder_pan+": "right", "shoulder_pan-": "left", "gripper_open": "w", "estop": "x"}
+    desk = Desk(options=KeyboardOptions(cartesian=False, keys=keys))
+    desk.hold("left", 0.2)
+    desk.hold("w", 0.2)
+    # The hold time of the first key runs on for a while beside the second.
+    assert set(desk.moved()) == {"shoulder_pan", "gripper"}
+    assert desk.moved()["shoulder_pan"] < 0 < desk.moved()["gripper"]
+    assert desk.tick("x").estop
+
+
+WRONG_KEYS = {
+    "unknown action": ({"shoulder_pam+": "1"}, "keys: no action 'shoulder_pam+', did you mean 'shoulder_pan+'?"),
+    "nothing like it": (
+        {"zzz": "1"},
+        "keys: no action 'zzz', the actions are: elbow_flex+, elbow_flex-, estop, faster",
+    ),
+    "taken": ({"shoulder_pan+": "o"}, "keys: 'o' is both shoulder_pan+ and gripper_open, must be one of them"),
+}
+
+
+@pytest.mark.parametrize(("keys", "message"), WRONG_KEYS.values(), ids=WRONG_KEYS.keys())
+def test_keys_that_make_no_sense_are_refused(keys, message):
+    with pytest.raises(TeleopError) as refused:
+        Desk(options=KeyboardOptions(cartesian=False, keys=keys))
+    assert str(refused.value).startswith(message)
+
+
+def test_keys_of_the_runtime_cannot_be_given_away():
+    with pytest.raises(ValueError, match=r"estop: key 'q' is taken by ibrobot itself; so are q, esc, tab, f1, .*f12$"):
+        KeyboardOptions(keys={"estop": "q"})
+
+
+def test_more_joints_than_keys_need_keys_of_their_own():
+    robot = Robot("long", tuple(Joint(f"j{i}", -1, 1, 1, 1) for i in range(8)))
+    with pytest.raises(TeleopError, match=r"no key is left for j7\+: give it one under keys, e\.g\. j7\+: '1'"):
+        KeyboardTeleop(KeyboardOptions(cartesian=False), host_context(robot=robot))
+    options = KeyboardOptions(cartesian=False, keys={"j7+": "1", "j7-": "2"})
+    assert "1/2 j7" in KeyboardTeleop(options, host_context(robot=robot)).help()
+
+
+def test_help_is_a_table_of_the_keys_that_there_are():
+    assert Desk().teleop.help().splitlines() == [
+        "joints     w/s shoulder_pan  e/d shoulder_lift  r/f elbow_flex  t/g wrist_flex  y/h wrist_roll",
+        "always     o gripper_open  c gripper_close  0 home  + faster  - slower  space estop",
+    ]
+    bare = attrs.evolve(make_robot(), groups={}, description=Description())
+    assert Desk(robot=bare).teleop.help().splitlines() == [
+        "joints     w/s shoulder_pan  e/d shoulder_lift  r/f elbow_flex  t/g wrist_flex  y/h wrist_roll  u/j gripper",
+        "always     + faster  - slower  space estop",
+    ]
+
+
+def test_without_a_terminal_it_says_what_to_do():
+    with pytest.raises(TeleopError, match="the keyboard needs a terminal: start ibrobot in one"):
+        KeyboardTeleop(KeyboardOptions(cartesian=False), host_context()).connect()
+
+
+def test_typing_in_a_terminal_moves_a_joint():
+    person, program = os.openpty()
+    try:
+        with Keys(program) as keys:
+            seen = keys.subscribe()
+            teleop = KeyboardTeleop(KeyboardOptions(cartesian=False), host_context(keys=keys.subscribe))
+            teleop.connect()
+            os.write(person, b"w")
+            assert seen.get(timeout=10) == "w"
+            # The reader feeds its subscribers one after another under one lock; subscribing again waits for that.
+            keys.subscribe()
+            first, second = (
+                teleop.read(JointReading(ns(t), MIDDLE.copy(), np.zeros(6), np.zeros(6))) for t in (1.0, 1.1)
+            )
+    finally:
+        os.close(person)
+        os.close(program)
+    assert first.positions["shoulder_pan"] == 0.1
+    assert second.positions["shoulder_pan"] == pytest.approx(0.15)
+
+
+def test_the_hook_offers_the_keyboard():
+    (descriptor,) = ibrobot_teleop()
+    assert isinstance(descriptor.make(descriptor.options(), host_context()), KeyboardTeleop)
