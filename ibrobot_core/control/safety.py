@@ -139,6 +139,15 @@ class SafetyLayer:
         """Whether the last command moved no joint: a stop is complete."""
         return not self._step.any()
 
+    def towards(self, target: Vector, speed: float) -> Vector:
+        """What to ask for in this tick [rad], shape (J,), on a gentle way to rest at `target` [rad], shape (J,).
+
+        It speeds up, goes at `speed` (0..1) times the velocity limits, and brakes, all within the limits.
+        """
+        gap = target - self._position
+        step = np.copysign(np.minimum(_reach(np.abs(gap), self._change), speed * self._max_step), gap)
+        return self._position + _limited(step, self._step - self._change, self._step + self._change)
+
     def counters(self) -> Mapping[str, int]:
         """Counts since construction: joint-ticks for each of `KINDS`; `outside` joints; refused and missing vectors."""
         return dict(zip(KINDS, self._counts.sum(axis=1).tolist(), strict=True)) | self._events

@@ -248,6 +248,20 @@ def test_a_target_that_jumps_on_while_it_is_approached_is_not_overshot(ticks: in
     assert watched.layer.current[0] == target
 
 
+def test_a_gentle_way_to_a_target_keeps_its_speed_and_needs_no_intervention() -> None:
+    watched = Watched(one_joint(), PERIOD_NS)
+    watched.start(ZERO)
+    target, speeds = np.array([1.0]), []
+    while not speeds or not watched.layer.at_rest:
+        command = watched.tick(watched.layer.towards(target, 0.25))
+        assert command[0] <= 1.0
+        speeds.append(watched.layer.velocity[0])
+    assert command[0] == pytest.approx(1.0, abs=1e-9)
+    assert max(speeds) == pytest.approx(1.0)
+    assert len(speeds) == pytest.approx(105, abs=3)  # 1 s at speed, and speeding up and braking
+    assert sum(watched.layer.counters().values()) == 0
+
+
 def test_a_motion_that_runs_into_a_limit_is_braked_before_it() -> None:
     watched = Watched(one_joint(), PERIOD_NS)
     watched.start(ZERO)
