@@ -163,7 +163,7 @@ class FrameSampler:
         return self._assembler.frame(t_ns)
 
     def advance(self, t_ns: int) -> None:
-        """Take in what was received by tick `t_ns` [ns], decoding nothing; a few microseconds."""
+        """Take in what was received by tick `t_ns` [ns], decoding nothing."""
         self._drain(t_ns)
         self._assembler.advance(t_ns)
 

@@ -39,10 +39,10 @@ def pixels(message: Image) -> NDArray[np.generic]:
     element, channels = ENCODINGS[message.encoding]
     dtype = np.dtype(element).newbyteorder(">" if message.is_bigendian else "<")
     used = message.width * channels * dtype.itemsize
-    if message.step < used or message.data.size != message.height * message.step:
+    if not used or not message.height or message.step < used or message.data.size != message.height * message.step:
         raise ContractError(
             f"an image of {message.height}x{message.width} {message.encoding} needs rows of at least {used} bytes, and "
-            f"rows x step bytes in all; this one has a step of {message.step} and {message.data.size} bytes"
+            f"rows x step bytes in all, not zero; this one has a step of {message.step} and {message.data.size} bytes"
         )
     rows = message.data.reshape(message.height, message.step)[:, :used]
     typed = rows.view(dtype).reshape(message.height, message.width, channels)
@@ -137,13 +137,14 @@ class _Cover:
             for k in range(self.units):
                 result += array[(slice(None),) * axis + (slice(k, None, self.units),)]
             return result
+        term = np.empty_like(result)  # fresh pages for every product would cost more than the products
         begin = np.arange(self.new, dtype=np.int64) * self.units
         for tap in range(-(-self.units // self.unit) + 1):
             pixel = begin // self.unit + tap
             shared = np.minimum(begin + self.units, (pixel + 1) * self.unit) - np.maximum(begin, pixel * self.unit)
             weight = np.clip(shared, 0, None).astype(kind).reshape([-1 if i == axis else 1 for i in range(array.ndim)])
             # Beyond the end the weight is zero.
-            result += np.take(array, np.minimum(pixel, array.shape[axis] - 1), axis) * weight
+            result += np.multiply(np.take(array, pixel, axis, mode="clip"), weight, out=term)
         return result
 
 

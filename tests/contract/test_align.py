@@ -6,7 +6,7 @@ import gc
 import weakref
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ibrobot_core.config.schema import Align
@@ -58,6 +58,7 @@ clock_steps = st.sampled_from([0, 0, 0, 0, 0, 0, -1500, 1500, -900, 3000, -3000]
 streams = st.lists(st.tuples(deltas, latencies, clock_steps), max_size=40)
 
 
+@settings(deadline=None)
 @given(
     sends=streams,
     ticks=st.lists(st.integers(0, 90), min_size=1, max_size=40),

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ibrobot_core.contract.encode import action_messages, decode_action, split_action
@@ -29,6 +29,7 @@ def test_a_chunk_is_split_in_file_order(contract: Contract) -> None:
     np.testing.assert_array_equal(split["gripper_position"], chunk[:, 5:])
 
 
+@settings(deadline=None)
 @given(values=st.lists(st.floats(-4, 4), min_size=6, max_size=6))
 def test_messages_and_back(contract: Contract, values: list[float]) -> None:
     messages = action_messages(contract, np.array(values))

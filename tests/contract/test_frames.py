@@ -81,7 +81,7 @@ publications = st.tuples(st.just("publish"), st.sampled_from(list(MAKERS)), st.i
 samplings = st.tuples(st.sampled_from(["sample", "advance"]), st.integers(0, 60))
 
 
-@settings(max_examples=200)
+@settings(max_examples=200, deadline=None)
 @given(events=st.lists(st.one_of(publications, publications, publications, samplings), max_size=80))
 def test_live_and_offline_are_equal_bit_by_bit(contract: Contract, events: list[Any]) -> None:
     """Ticks lie behind the clock by up to 60 ms: what came meanwhile is in the queues, and must not count."""

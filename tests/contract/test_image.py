@@ -7,7 +7,7 @@ from fractions import Fraction
 import attrs
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ibrobot_core.config.schema import ImageSpec
@@ -26,6 +26,7 @@ def picture(encoding: str, height: int, width: int, seed: int = 0) -> np.ndarray
     return rng.integers(0, np.iinfo(element).max + 1, (height, width, channels), dtype=element)
 
 
+@settings(deadline=None)
 @given(
     encoding=st.sampled_from(list(ENCODINGS)),
     height=st.integers(1, 9),
@@ -97,6 +98,7 @@ def shares(old: int, new: int) -> list[list[Fraction]]:
 sizes = st.integers(1, 12)
 
 
+@settings(deadline=None)
 @given(height=sizes, width=sizes, rows=sizes, columns=sizes, white=st.booleans())
 def test_resizing_colours_is_the_exact_mean_over_the_area(
     height: int, width: int, rows: int, columns: int, white: bool
@@ -135,6 +137,8 @@ def test_resizing_depth_picks_and_never_mixes(encoding: str) -> None:
         (Image(HEADER, 2, 2, "yuv422", 4, np.zeros(8)), "rgb8", "encoding 'yuv422' is not one of: rgb8, bgr8"),
         (Image(HEADER, 2, 2, "rgb8", 5, np.zeros(10)), "rgb8", "rows of at least 6 bytes.*step of 5 and 10 bytes"),
         (Image(HEADER, 2, 2, "rgb8", 6, np.zeros(11)), "rgb8", "step of 6 and 11 bytes"),
+        (Image(HEADER, 0, 2, "rgb8", 6, np.zeros(0)), "rgb8", "an image of 0x2 rgb8 .* not zero"),
+        (Image(HEADER, 2, 0, "rgb8", 6, np.zeros(12)), "rgb8", "an image of 2x0 rgb8 .* not zero"),
         (encode_image(picture("16UC1", 2, 2), "16UC1", HEADER), "rgb8", "encoded as 16UC1 does not become rgb8"),
         (encode_image(picture("rgb8", 2, 2), "rgb8", HEADER), "32FC1", "encoded as rgb8 does not become 32FC1"),
         (encode_image(picture("32FC1", 2, 2), "32FC1", HEADER), "16UC1", "encoded as 32FC1 does not become 16UC1"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ibrobot_core.contract.select import Selection
@@ -31,6 +31,7 @@ NAMES = ("shoulder_pan", "left.elbow", "gripper", "joint/4")
 QUATERNION = Quaternion(0.1, 0.2, 0.3, 0.9)
 
 
+@settings(deadline=None)
 @given(
     order=st.permutations((*NAMES, "extra")),
     later=st.permutations((*NAMES, "extra")),

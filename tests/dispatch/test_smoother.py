@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ibrobot_core.dispatch.smoother import TemporalSmoother
@@ -47,6 +47,7 @@ class StepwiseEnsemble:
 coefficients = st.sampled_from([0.01, 0.0, 0.1, 1.0, -0.05, -2.0, 50.0])
 
 
+@settings(deadline=None)
 @given(coeff=coefficients, length=st.integers(2, 40), updates=st.integers(1, 60), seed=st.integers(0, 999))
 def test_one_chunk_a_step_is_the_stepwise_ensemble(coeff: float, length: int, updates: int, seed: int) -> None:
     smoother, ensemble = TemporalSmoother(STEP, 3, coeff=coeff), StepwiseEnsemble(coeff, length)
@@ -62,6 +63,7 @@ def test_one_chunk_a_step_is_the_stepwise_ensemble(coeff: float, length: int, up
 requests = st.tuples(st.integers(0, 30), st.integers(1, 40), st.integers(0, 25), st.floats(0, 0.999))
 
 
+@settings(deadline=None)
 @given(coeff=coefficients, events=st.lists(requests, min_size=1, max_size=25), seed=st.integers(0, 999))
 def test_any_use_is_the_mean_of_the_predictions_for_each_time(
     coeff: float, events: list[tuple[int, int, int, float]], seed: int
