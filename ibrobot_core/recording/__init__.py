@@ -1,0 +1,1 @@
+"""The life of an episode: begun, written, ended, with its metadata."""
