@@ -155,6 +155,11 @@ class Bus:
                 raise TransportError(f"service {name} is served already")
             self._services[name] = handler
 
+    def unserve(self, name: str) -> None:
+        """Serve `name` no more; nothing happens where nobody did."""
+        with self._lock:
+            self._services.pop(name, None)
+
     def call(self, name: str, request: Any) -> Any:
         """Call service `name`.
 

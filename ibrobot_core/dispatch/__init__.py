@@ -1,0 +1,1 @@
+"""Dispatch: keeps the plan filled with chunks, and smooth."""

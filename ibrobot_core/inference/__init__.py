@@ -1,0 +1,1 @@
+"""Inference: from frames to chunks of actions, wherever the model runs."""

@@ -1,0 +1,200 @@
+"""`ibrobot launch`: run a robot, real or simulated, from its YAML."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import queue
+import signal
+import sys
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import click
+
+from ibrobot_core.config import find_config, load
+from ibrobot_core.errors import IbrobotError
+from ibrobot_core.launch.runtime import Runtime
+from ibrobot_core.launch.session import Request, Session
+from ibrobot_core.plugins import installed
+
+NOT_ALL_SUCCEEDED = 3
+_INTERRUPTED_TWICE = 130
+_PANEL_HZ = 8
+_PLAIN_PERIOD_S = 2.0
+
+
+@click.command()
+@click.argument("config", required=False)
+@click.option("--sim", is_flag=True, help="Use the simulation section in place of hardware.")
+@click.option("--lockstep", is_flag=True, help="Simulated time, as fast as the machine goes; equal seeds, equal runs.")
+@click.option("--seed", type=int, default=0, show_default=True, help="Of the first episode; later ones count up.")
+@click.option("--mode", help="In place of default_control_mode.")
+@click.option(
+    "--set", "overrides", multiple=True, metavar="PATH=VALUE", help="Override a key, e.g. control.rate_hz=50."
+)
+@click.option("--duration", type=click.FloatRange(min=0), metavar="S", help="Stop after so many seconds.")
+@click.option("--episodes", type=click.IntRange(min=1), metavar="N", help="Stop after so many simulated episodes.")
+@click.option("--goal", "goals", multiple=True, metavar="GOAL", help="For planning modes: a pose, or joint=rad,…")
+@click.option("--window", is_flag=True, help="Show the simulation in a desktop window.")
+@click.option("--headless", is_flag=True, help="No window, no viewer, no panel: plain lines.")
+@click.option("--dry-run", is_flag=True, help="Print the plan and start nothing.")
+@click.option("--json", "as_json", is_flag=True, help="Print a summary as JSON, in the last line.")
+def launch(config: str | None, **options: Any) -> None:
+    """Run a robot.
+
+    CONFIG is a robot YAML: a path, or the name of one that comes with ibrobot or a plugin; so101 when left out.
+
+    Exits with 0 when the run ended well, 1 when a component failed, 2 for a wrong command line or YAML, 3 when not
+    every episode or goal succeeded, 130 on a second Ctrl-C.
+    """
+    if options["window"] and options["headless"]:
+        raise click.UsageError("--window and --headless exclude each other")
+    if options["window"]:
+        options["overrides"] = (*options["overrides"], "viewer={type: mujoco}")
+    registry = installed()
+    path = find_config(config, registry)
+    robot = load(path, overrides=options["overrides"], mode=options["mode"], sim=options["sim"], registry=registry)
+    if options["lockstep"] and not robot.simulated:
+        raise click.UsageError("--lockstep is for simulation: add --sim")
+    if options["headless"] and robot.viewer is not None:
+        import attrs
+
+        robot = attrs.evolve(robot, viewer=None)
+    with ExitStack() as stack:
+        keys = None if options["headless"] or options["dry_run"] else _terminal_keys(stack)
+        request = Request(
+            options["lockstep"], options["seed"], options["duration"], options["episodes"], options["goals"], keys
+        )  # fmt: skip
+        runtime = Runtime(Session(robot, registry, request))
+        if options["dry_run"]:
+            click.echo("\n".join(runtime.plan.lines()))
+            return
+        status = _run(runtime, path, live=not options["headless"] and sys.stdout.isatty())
+    _tell(runtime, options["as_json"])
+    runtime.raise_failure()
+    sys.exit(status)
+
+
+def _terminal_keys(stack: ExitStack) -> Callable[[], queue.SimpleQueue[str]] | None:
+    """The terminal's keys, restored when `stack` unwinds; None where standard input is no terminal."""
+    if not sys.stdin.isatty():
+        return None
+    from ibrobot_core.terminal import Keys
+
+    return stack.enter_context(Keys()).subscribe
+
+
+def _run(runtime: Runtime, path: Path, *, live: bool) -> int:
+    """Start, run and stop; returns the exit status of a run in which nothing failed."""
+    session = runtime.session
+    _stop_on_signals(session)
+    where = "simulation" if session.config.simulated else "hardware"
+    with ExitStack() as stack:
+        show = _live(runtime, stack) if live else _plain(session)
+        session.log.info("%s from %s: %s, mode %s", session.config.robot.name, path, where, session.mode)
+        runtime.start()
+        stack.callback(runtime.stop)
+        if session.request.lockstep:
+            while not runtime.step():
+                pass
+        else:
+            while not runtime.wait(1.0 / _PANEL_HZ):
+                show()
+    outcome = session.outcome
+    return NOT_ALL_SUCCEEDED if outcome.successes < outcome.episodes or outcome.goals_failed else 0
+
+
+def _stop_on_signals(session: Session) -> None:
+    """The first Ctrl-C (or SIGTERM) stops in order; a second Ctrl-C ends the host, and control stops the robot."""
+
+    def stop(number: int, frame: object) -> None:
+        if session.finished.is_set() and number == signal.SIGINT:
+            os._exit(_INTERRUPTED_TWICE)
+        session.log.info("stopping; Ctrl-C again stops at once")
+        session.finish()
+
+    signal.signal(signal.SIGINT, stop)
+    signal.signal(signal.SIGTERM, stop)
+
+
+def _plain(session: Session) -> Callable[[], None]:
+    from ibrobot_core.cli.panel import plain_line
+
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(logging.Formatter("%(levelname).1s %(message)s"))
+    _log_to(handler)
+    next_s = time.monotonic() + _PLAIN_PERIOD_S
+
+    def show() -> None:
+        nonlocal next_s
+        if time.monotonic() >= next_s:
+            next_s += _PLAIN_PERIOD_S
+            click.echo(plain_line(session))
+
+    return show
+
+
+def _live(runtime: Runtime, stack: ExitStack) -> Callable[[], None]:
+    from rich.live import Live
+
+    from ibrobot_core.cli.panel import RecentLog, panel
+
+    session = runtime.session
+    log = RecentLog()
+    _log_to(log)
+    keys = session.request.keys() if session.request.keys is not None else None
+    display = stack.enter_context(Live(auto_refresh=False, screen=False))
+
+    def show() -> None:
+        while keys is not None and not keys.empty():
+            _press(runtime, keys.get())
+        help_text = session.feeder.help() if session.feeder is not None else ""
+        display.update(panel(session, log, help_text), refresh=True)
+
+    return show
+
+
+def _log_to(handler: logging.Handler) -> None:
+    """Our own words from INFO on, those of libraries from WARNING on."""
+    logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
+    logging.getLogger("ibrobot").setLevel(logging.INFO)
+
+
+def _press(runtime: Runtime, key: str) -> None:
+    """The runtime's own keys: F1..F9 modes, Esc emergency stop, F10 reset."""
+    session = runtime.session
+    modes = list(session.config.control_modes)
+    try:
+        if key == "esc":
+            session.control.call("estop")
+        elif key == "f10":
+            runtime.reset()
+        elif key.startswith("f") and key[1:].isdigit() and int(key[1:]) <= len(modes):
+            runtime.switch_mode(modes[int(key[1:]) - 1])
+    except IbrobotError as error:
+        session.log.error("%s", error)
+
+
+def _tell(runtime: Runtime, as_json: bool) -> None:
+    """The summary of a run."""
+    summary = runtime.summary()
+    if as_json:
+        click.echo(json.dumps(summary))
+        return
+    loop = summary["loop"]
+    click.echo(f"{summary['robot']}: {summary['mode']} for {summary['duration_s']:.1f} s")
+    if summary["episodes"]:
+        click.echo(f"episodes   {summary['episodes']}, of which {summary['successes']} succeeded")
+    if summary["lockstep"]:
+        click.echo(f"loop       {loop['ticks']} ticks in lockstep")
+    elif loop["ticks"]:
+        click.echo(
+            f"loop       {loop['rate_hz']:.2f} Hz, lateness p50 {loop['lateness_p50_us']:.0f} us, "
+            f"p99 {loop['lateness_p99_us']:.0f} us, missed {loop['missed']}"
+        )
+    click.echo(f"faults     {'; '.join(summary['faults']) or 'none'}")

@@ -1,0 +1,102 @@
+"""The live status panel in the terminal, and the same facts as plain lines where there is no terminal."""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from typing import override
+
+import numpy as np
+from rich.console import Group, RenderableType
+from rich.panel import Panel
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
+
+from ibrobot_core.launch.session import Session
+
+_LOG_LINES = 6
+
+
+class RecentLog(logging.Handler):
+    """Keeps the last log lines for the panel."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.lines: deque[Text] = deque(maxlen=_LOG_LINES)
+
+    @override
+    def emit(self, record: logging.LogRecord) -> None:
+        style = {logging.WARNING: "yellow", logging.ERROR: "bold red"}.get(record.levelno, "dim")
+        self.lines.append(Text(record.getMessage(), style=style, overflow="ellipsis", no_wrap=True))
+
+
+def _loop_text(session: Session) -> str:
+    loop = session.control.report["loop"]
+    return (
+        f"{loop['rate_hz']:.1f} Hz, late p50 {loop['lateness_p50_us']:.0f} us, "
+        f"p99 {loop['lateness_p99_us']:.0f} us, missed {loop['missed']}"
+    )
+
+
+def plain_line(session: Session) -> str:
+    """One line of status."""
+    outcome, stats = session.outcome, session.stats
+    pieces = [f"mode {session.mode}", f"loop {_loop_text(session)}"]
+    if stats is not None:
+        pieces.append(f"plan {stats.plan_length}, latency {stats.latency_ms:.0f} ms")
+    pieces += [f"{name} {rate:.1f} Hz" for name, rate in session.rates.items()]
+    pieces.append(f"episodes {outcome.episodes}, successes {outcome.successes}")
+    if outcome.faults:
+        pieces.append(f"FAULTS {len(outcome.faults)}")
+    return " | ".join(pieces)
+
+
+def panel(session: Session, log: RecentLog, help_text: str) -> RenderableType:
+    """The whole panel."""
+    outcome, stats = session.outcome, session.stats
+    facts = Table.grid(padding=(0, 2))
+    facts.add_column(style="bold")
+    facts.add_column()
+    where = "simulation" if session.config.simulated else "hardware"
+    modes = "  ".join(
+        f"F{i} [reverse]{name}[/]" if name == session.mode else f"F{i} {name}"
+        for i, name in enumerate(session.config.control_modes, 1)
+    )
+    facts.add_row("mode", modes)
+    facts.add_row("loop", _loop_text(session))
+    if stats is not None:
+        facts.add_row(
+            "plan", f"{stats.plan_length} actions, latency {stats.latency_ms:.0f} ms, "
+            f"holds {stats.holds}, failures {stats.failures + stats.timeouts}",
+        )  # fmt: skip
+    if session.rates:
+        facts.add_row("sensors", "  ".join(f"{name} {rate:.1f} Hz" for name, rate in session.rates.items()))
+    facts.add_row("episodes", f"{outcome.episodes} done, {outcome.successes} successful")
+    state = session.state
+    estop = state is not None and state.estop
+    faults = Text("; ".join(outcome.faults[-3:]), "bold red") if outcome.faults else Text("none", "green")
+    facts.add_row("faults", faults)
+    pieces: list[RenderableType] = [facts, Text(), _joints(session)]
+    if help_text:
+        pieces += [Text(), Text(help_text, style="cyan")]
+    pieces += [Text(), *log.lines]
+    title = f"{session.config.robot.name} ({where})" + (" EMERGENCY STOP: F10 resets" if estop else "")
+    return Panel(
+        Group(*pieces),
+        title=title,
+        subtitle="Esc emergency stop   F10 reset   Ctrl-C stop",
+        border_style="red" if estop else "blue",
+    )
+
+
+def _joints(session: Session) -> Table:
+    table = Table.grid(padding=(0, 2))
+    state, robot = session.state, session.config.robot
+    if state is None:
+        return table
+    for i, joint in enumerate(robot.joints):
+        done = float(np.clip((state.position[i] - joint.lower) / (joint.upper - joint.lower), 0.0, 1.0))
+        bar = ProgressBar(total=1.0, completed=done, width=30)
+        table.add_row(joint.name, bar, f"{state.position[i]:+.3f}", Text(f"told {state.command[i]:+.3f} rad", "dim"))
+    return table

@@ -1,0 +1,323 @@
+"""One tick of control: read, executors, safety, write; modes, goals, faults and stop behaviours around it."""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import attrs
+import numpy as np
+from numpy.typing import NDArray
+
+from ibrobot_core.clock import Clock
+from ibrobot_core.config import RobotConfig
+from ibrobot_core.control.link import ControlState, PlanRecord
+from ibrobot_core.control.parts import HardwareParts
+from ibrobot_core.control.safety import SafetyLayer
+from ibrobot_core.errors import GoalRejected, HardwareError, IbrobotError, NotSupported
+from ibrobot_core.interfaces import Episode, Executor, JointReading, Plan, Signal
+from ibrobot_core.robot import Vector
+from ibrobot_core.units import ns
+
+_POSE_SPEED = 0.25
+"""Fraction of the velocity limits at which the stop behaviour `pose` moves."""
+_POSE_TIMEOUT_S = 10.0
+
+
+@attrs.frozen(eq=False)
+class _Owned:
+    """An executor and the robot's columns that it owns."""
+
+    name: str
+    executor: Executor
+    columns: NDArray[np.intp]
+
+    def reading(self, measured: JointReading) -> JointReading:
+        columns = self.columns
+        return JointReading(
+            measured.stamp_ns, measured.position[columns], measured.velocity[columns], measured.effort[columns],
+            measured.stale,
+        )  # fmt: skip
+
+
+class ControlCore:
+    """The control loop's work, without its timing: `tick` once a period, `handle` for commands, `events` to be told.
+
+    Args:
+        config: the robot YAML.
+        hardware: all of the robot's hardware; connected by `start`.
+        executors: name -> executor.
+        clock: where stamps come from.
+    """
+
+    def __init__(
+        self, config: RobotConfig, hardware: HardwareParts, executors: Mapping[str, Executor], clock: Clock
+    ) -> None:
+        self._config = config
+        self._robot = config.robot
+        self._hardware = hardware
+        self._clock = clock
+        self.period_ns = ns(1.0 / config.control.rate_hz)
+        self._safety = SafetyLayer(config.robot, self.period_ns)
+        self._owned = {n: _Owned(n, e, self._robot.indices(e.joints)) for n, e in executors.items()}
+        self._active: list[_Owned] = []
+        self._state_timeout_ns = ns(config.control.state_timeout)
+        self._counts = {"read_errors": 0, "write_errors": 0, "stale_states": 0, "old_plans": 0}
+        self._relaxed = False
+        self._stop_target: Vector | None = None
+        self._tick = 0
+        self._commands: dict[str, Callable[..., Mapping[str, Any] | None]] = {
+            "switch_mode": self._switch_mode,
+            "reset_episode": self._reset_episode,
+            "estop": self._estop,
+            "reset": self._reset,
+            "goal": self._goal,
+            "cancel": self._cancel,
+            "counters": self.counters,
+        }
+        self.mode = ""
+        self.epoch = 0
+        self.fault = ""
+        self.events: deque[dict[str, Any]] = deque()
+        """What the host is to be told: `goal` and `fault` events."""
+        self.state: ControlState | None = None
+        """After a tick, what it found and did."""
+        self._log = logging.getLogger("ibrobot.control")
+
+    def start(self, mode: str) -> None:
+        """Connect, take the joints over where they are, and enter `mode`.
+
+        Raises:
+            HardwareError: when the hardware does not connect or its first reading is no position.
+        """
+        if self._config.control.stop == "relax":
+            self._hardware.require_relax()
+        self._hardware.connect()
+        self._measured = self._hardware.read()
+        self._safety.activate(self._measured.position)
+        self._switch_mode(mode)
+
+    def tick(self, late_ns: int = 0, periods: int = 1) -> ControlState:
+        """One cycle.
+
+        Args:
+            late_ns: how late the cycle begins [ns], noted in the state.
+            periods: periods since the last tick; more than one after missed ticks, so that simulated time keeps up.
+        """
+        self._read()
+        signals = self._hardware.read_signals()
+        success = self._hardware.success()
+        command = self._safety.apply(self._desired(), self._measured.position)
+        self._write(command)
+        self._hardware.advance(periods * self.period_ns)
+        self._tick += 1
+        measured = self._measured
+        self.state = ControlState(
+            tick=self._tick, stamp_ns=measured.stamp_ns, late_ns=late_ns, epoch=self.epoch,
+            estop=self._safety.estopped, stale=measured.stale, success=success, position=measured.position,
+            velocity=measured.velocity, effort=measured.effort, command=command, signals=signals,
+        )  # fmt: skip
+        return self.state
+
+    def set_plan(self, plan: PlanRecord) -> None:
+        """Give a plan to the active executors of its joints; one from before a mode switch or reset is counted."""
+        if plan.epoch != self.epoch or self.fault:
+            self._counts["old_plans"] += 1
+            return
+        for owned in self._active:
+            if owned.executor.accepts_plans and plan.mask[owned.columns].all():
+                owned.executor.set_plan(Plan(plan.start_ns, plan.step_ns, plan.positions[:, owned.columns]))
+
+    def handle(self, command: Mapping[str, Any]) -> dict[str, Any]:
+        """Carry out a command of the host and answer it; a refused one is answered with `error`."""
+        arguments = {key: value for key, value in command.items() if key not in ("do", "id")}
+        try:
+            result = self._commands[command["do"]](**arguments) or {}
+        except IbrobotError as error:
+            return {"reply": command["id"], "error": str(error)}
+        return {"reply": command["id"], "epoch": self.epoch, **result}
+
+    def counters(self) -> dict[str, Any]:
+        """Every intervention and refusal so far: of the safety layer, of the executors, of the loop."""
+        return {
+            "safety": dict(self._safety.counters()),
+            "joints": dict(self._safety.interventions),
+            "executors": {name: dict(owned.executor.counters()) for name, owned in self._owned.items()},
+            "loop": dict(self._counts),
+        }
+
+    def begin_stop(self) -> None:
+        """Start the configured stop behaviour; tick until `stopped`."""
+        self._leave()
+        behaviour, _, pose = self._config.control.stop.partition(" ")
+        self._stop_deadline = self._clock.now_ns() + ns(_POSE_TIMEOUT_S)
+        if behaviour == "relax":
+            self._relax("stop")
+        elif behaviour == "pose" and not self.fault and not self._safety.estopped:
+            self._stop_target = self._robot.pose(pose.strip())
+
+    @property
+    def signals(self) -> tuple[Signal, ...]:
+        """The hardware's signals, in the order of `ControlState.signals`."""
+        return self._hardware.signals
+
+    @property
+    def signal_size(self) -> int:
+        """Numbers in all signals together."""
+        return sum(signal.size for signal in self.signals)
+
+    @property
+    def stopped(self) -> bool:
+        """Whether the stop behaviour is done."""
+        if self._relaxed:
+            return True
+        if self._stop_target is not None and self._clock.now_ns() < self._stop_deadline:
+            return self._safety.at_rest and bool(np.allclose(self._safety.current, self._stop_target, atol=1e-6))
+        return self._safety.at_rest
+
+    def abandon(self) -> None:
+        """After a bug in the loop, when it cannot tick any more: torque off if that is the stop behaviour."""
+        if self._config.control.stop == "relax":
+            self._relax("the control loop failed")
+
+    def close(self) -> None:
+        """Release the hardware."""
+        self._hardware.disconnect()
+
+    def _read(self) -> None:
+        try:
+            measured = self._hardware.read()
+        except HardwareError as error:
+            self._counts["read_errors"] += 1
+            measured = attrs.evolve(self._measured, stale=True)
+            self._lost(str(error))
+        else:
+            if measured.stale:
+                self._counts["stale_states"] += 1
+                self._lost("the joints do not answer")
+        self._measured = measured
+
+    def _lost(self, why: str) -> None:
+        """A tick without a new state: a fault once that has lasted for `state_timeout`."""
+        age_ns = self._clock.now_ns() - self._measured.stamp_ns
+        if age_ns >= self._state_timeout_ns:
+            self._raise_fault(f"{why}: no state for {age_ns / 1e6:.0f} ms")
+
+    def _write(self, command: Vector) -> None:
+        if self._relaxed:
+            return
+        try:
+            self._hardware.write(command)
+        except HardwareError as error:
+            self._counts["write_errors"] += 1
+            self._raise_fault(str(error))
+
+    def _desired(self) -> Vector | None:
+        """What is asked for in this tick; None to brake and hold."""
+        if self._stop_target is not None:
+            stride = _POSE_SPEED * self._robot.max_velocity * self.period_ns * 1e-9
+            current = self._safety.current
+            return current + np.clip(self._stop_target - current, -stride, stride)
+        if not self._active:
+            return None
+        desired = self._safety.current
+        relax = False
+        for owned in self._active:
+            desired[owned.columns] = owned.executor.update(owned.reading(self._measured))
+            relax = relax or bool(getattr(owned.executor, "wants_relax", False))
+            self._report_goals(owned)
+        if relax != self._relaxed:
+            if relax:
+                self._relax("the setpoints are stale")
+            else:
+                self._retake()
+        return desired
+
+    def _report_goals(self, owned: _Owned) -> None:
+        while (status := owned.executor.pop_status()) is not None:
+            self.events.append(
+                {
+                    "event": "goal", "executor": owned.name, "goal": status.goal_id, "state": str(status.state),
+                    "message": status.message, "result": dict(status.result),
+                }
+            )  # fmt: skip
+
+    def _relax(self, why: str) -> None:
+        try:
+            self._hardware.relax()
+        except (HardwareError, NotSupported) as error:
+            self._raise_fault(f"torque cannot be taken off: {error}")
+            return
+        self._relaxed = True
+        self._log.warning("torque off (%s): the arm may fall", why)
+
+    def _retake(self) -> None:
+        """Torque comes back: start from where the joints lie."""
+        self._relaxed = False
+        self._safety.activate(self._measured.position)
+
+    def _raise_fault(self, fault: str) -> None:
+        if self.fault:
+            return
+        self.fault = fault
+        self.events.append({"event": "fault", "fault": fault, "stamp_ns": self._clock.now_ns()})
+        self._leave()
+        if self._config.control.stop == "relax" and not self._relaxed:
+            self._relax("fault")
+
+    def _leave(self) -> None:
+        """Deactivate all executors; without one, every joint brakes and holds."""
+        for owned in self._active:
+            owned.executor.cancel(owned.reading(self._measured))
+            self._report_goals(owned)
+            owned.executor.deactivate()
+        self._active = []
+        self.epoch += 1
+
+    def _enter(self) -> None:
+        self._active = [self._owned[name] for name in self._config.control_modes[self.mode].executors]
+        for owned in self._active:
+            owned.executor.activate(owned.reading(self._measured))
+        self.epoch += 1
+
+    def _switch_mode(self, mode: str) -> None:
+        if mode not in self._config.control_modes:
+            raise NotSupported(f"no mode {mode!r}; the modes are: {', '.join(self._config.control_modes)}")
+        if self.fault:
+            raise HardwareError(f"cannot enter mode {mode} before a reset: {self.fault}")
+        self._leave()
+        self.mode = mode
+        self._enter()
+
+    def _reset_episode(self, seed: int) -> None:
+        self._leave()
+        self._hardware.reset_episode(Episode(seed))
+        self._reset()
+
+    def _estop(self) -> None:
+        self._safety.estop()
+        self._raise_fault("emergency stop")
+
+    def _reset(self) -> None:
+        """Clear faults and the emergency stop, and enter the mode anew from where the joints are."""
+        self._leave()
+        self._hardware.reset_faults()
+        self._measured = self._hardware.read()
+        if self._measured.stale:
+            raise HardwareError("the joints do not answer yet")
+        self._relaxed = False
+        self._safety.reset(self._measured.position)
+        self.fault = ""
+        self._enter()
+
+    def _goal(self, executor: str, goal_id: str, goal: Mapping[str, Any]) -> None:
+        active = {owned.name: owned for owned in self._active}
+        if executor not in active:
+            raise GoalRejected(f"executor {executor!r} is not active; active: {', '.join(active) or 'none'}")
+        active[executor].executor.set_goal(goal_id, goal, active[executor].reading(self._measured))
+
+    def _cancel(self) -> None:
+        for owned in self._active:
+            owned.executor.cancel(owned.reading(self._measured))

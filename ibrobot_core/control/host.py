@@ -1,0 +1,298 @@
+"""The host's side of control: the same calls whether the loop runs in its own process or, in lockstep, in this one."""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import os
+import queue
+import select
+import socket
+import subprocess
+import sys
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from typing import Any, override
+
+from ibrobot_core.clock import RealClock, SteppedClock
+from ibrobot_core.config import RobotConfig
+from ibrobot_core.control.build import build_core
+from ibrobot_core.control.link import (
+    Channel,
+    ControlState,
+    Layout,
+    PlanRecord,
+    SharedMemory,
+    create_memory,
+    raise_error,
+)
+from ibrobot_core.control.timing import Punctuality
+from ibrobot_core.errors import ComponentFailed, HardwareError, IbrobotError
+from ibrobot_core.plugins import Registry
+
+_START_TIMEOUT_S = 60.0
+_REPLY_TIMEOUT_S = 5.0
+_STOP_TIMEOUT_S = 15.0
+
+OnState = Callable[[ControlState], None]
+OnEvent = Callable[[Mapping[str, Any]], None]
+
+
+class ControlHost(ABC):
+    """Starts control, hands it plans and commands, and passes its states and events on.
+
+    Attributes:
+        signals: topic and size of each of the hardware's signals; known once `start` returned.
+        report: the last `loop` and `counters` that control gave.
+        refused: real-time settings that the machine refused, a line each.
+    """
+
+    def __init__(self, on_state: OnState, on_event: OnEvent) -> None:
+        self._on_state = on_state
+        self._on_event = on_event
+        self.signals: list[tuple[str, int]] = []
+        self.report: dict[str, Any] = {"loop": Punctuality().summary(), "counters": {}}
+        self.refused: list[str] = []
+
+    @abstractmethod
+    def start(self) -> None:
+        """Connect the hardware and begin to tick.
+
+        Raises:
+            IbrobotError: e.g. when the hardware does not connect.
+        """
+
+    @abstractmethod
+    def call(self, do: str, **arguments: Any) -> Mapping[str, Any]:
+        """Have a command carried out; returns its answer, with the `epoch` that holds from now on.
+
+        Raises:
+            HardwareError: when it is refused.
+            ComponentFailed: when control is gone.
+        """
+
+    @abstractmethod
+    def write_plan(self, plan: PlanRecord) -> None:
+        """Replace the plan."""
+
+    @abstractmethod
+    def stop(self) -> None:
+        """Stop the robot by the configured behaviour, and end control. Safe to call twice."""
+
+
+class InlineControl(ControlHost):
+    """Control within this thread, for lockstep: `step` is one tick."""
+
+    def __init__(
+        self,
+        config: RobotConfig,
+        registry: Registry,
+        clock: SteppedClock,
+        seed: int,
+        on_state: OnState,
+        on_event: OnEvent,
+    ) -> None:
+        super().__init__(on_state, on_event)
+        self._core = build_core(config, registry, clock, seed)
+        self._clock = clock
+        self._mode = config.default_control_mode
+        self._punctuality = Punctuality()
+        self._started = False
+
+    @override
+    def start(self) -> None:
+        self._core.start(self._mode)
+        self.signals = [(signal.topic, signal.size) for signal in self._core.signals]
+        self._started = True
+
+    def step(self) -> None:
+        """One tick at the clock's time."""
+        self._on_state(self._core.tick())
+        self._punctuality.tick(self._clock.now_ns(), 0, 0)
+        while self._core.events:
+            self._on_event(self._core.events.popleft())
+
+    @override
+    def call(self, do: str, **arguments: Any) -> Mapping[str, Any]:
+        return raise_error(self._core.handle({"do": do, "id": 0, **arguments}))
+
+    @override
+    def write_plan(self, plan: PlanRecord) -> None:
+        self._core.set_plan(plan)
+
+    @override
+    def stop(self) -> None:
+        if not self._started:
+            return
+        self._started = False
+        self._core.begin_stop()
+        while not self._core.stopped:
+            self._clock.advance(self._core.period_ns)
+            self._on_state(self._core.tick())
+        self.report = {"loop": self._punctuality.summary(), "counters": self._core.counters()}
+        self._core.close()
+
+
+class ControlClient(ControlHost):
+    """Control in a process of its own. A thread here receives its states and events and notices its death."""
+
+    def __init__(
+        self, config: RobotConfig, clock: RealClock, seed: int, on_state: OnState, on_event: OnEvent,
+        on_death: Callable[[ComponentFailed], None],
+    ) -> None:  # fmt: skip
+        super().__init__(on_state, on_event)
+        self._config = config
+        self._order = {
+            "document": config.document, "source": str(config.source), "sim": config.simulated, "seed": seed,
+            "mode": config.default_control_mode, "epoch_offset_ns": clock.epoch_offset_ns,
+        }  # fmt: skip
+        self._on_death = on_death
+        self._replies: dict[int, queue.SimpleQueue[Mapping[str, Any]]] = {}
+        self._ids = itertools.count(1)
+        self._lock = threading.Lock()
+        self._stopping = False
+        self._failure = ""
+        self._process: subprocess.Popen[bytes] | None = None
+        self._thread: threading.Thread | None = None
+
+    @property
+    def pid(self) -> int | None:
+        """The process id of control, None before `start`."""
+        return self._process.pid if self._process is not None else None
+
+    @override
+    def start(self) -> None:
+        ours, theirs = socket.socketpair()
+        memory = create_memory()
+        self._wake, wake = os.pipe()
+        command = [sys.executable, "-m", "ibrobot_core.control.process", str(theirs.fileno()), str(memory), str(wake)]
+        # A session of its own: Ctrl-C in the terminal is for the host, which then stops control in order.
+        self._process = subprocess.Popen(
+            command, pass_fds=(theirs.fileno(), memory, wake), stdin=subprocess.DEVNULL, start_new_session=True
+        )
+        theirs.close()
+        os.close(wake)
+        self._channel = Channel(ours)
+        self._memory: SharedMemory | None = None
+        self._descriptor = memory
+        self._channel.send(self._order)
+        try:
+            self._await_ready()
+        except IbrobotError:
+            self._end()
+            raise
+        self._thread = threading.Thread(target=self._receive, name="control link", daemon=True)
+        self._thread.start()
+
+    def _await_ready(self) -> None:
+        while self._memory is None:
+            try:
+                messages = self._channel.wait(_START_TIMEOUT_S)
+            except ComponentFailed:
+                raise ComponentFailed(f"the control process died while starting ({self._exit()})") from None
+            if not messages:
+                raise ComponentFailed(f"the control process was not ready after {_START_TIMEOUT_S:.0f} s")
+            for message in messages:
+                if message["event"] == "failed":
+                    failure = HardwareError(message["error"])
+                    failure.exit_code = message["exit_code"]
+                    raise failure
+                if message["event"] == "ready":
+                    self.signals = [(topic, size) for topic, size in message["signals"]]
+                    self.refused = message["refused"]
+                    layout = Layout(len(self._config.robot.joints), sum(size for _, size in self.signals))
+                    self._memory = SharedMemory(self._descriptor, layout)
+                else:
+                    self._take(message)
+
+    @override
+    def call(self, do: str, **arguments: Any) -> Mapping[str, Any]:
+        number = next(self._ids)
+        answer: queue.SimpleQueue[Mapping[str, Any]] = queue.SimpleQueue()
+        self._replies[number] = answer
+        with self._lock:
+            self._channel.send({"do": do, "id": number, **arguments})
+        try:
+            return raise_error(answer.get(timeout=_REPLY_TIMEOUT_S))
+        except queue.Empty:
+            raise ComponentFailed(f"control did not answer {do!r} within {_REPLY_TIMEOUT_S:.0f} s") from None
+        finally:
+            del self._replies[number]
+
+    @override
+    def write_plan(self, plan: PlanRecord) -> None:
+        if self._memory is not None:
+            self._memory.write_plan(plan)
+
+    @override
+    def stop(self) -> None:
+        if self._process is None:
+            return
+        self._stopping = True
+        with self._lock:
+            self._channel.send({"do": "stop", "id": 0})
+        self._end()
+
+    def _end(self) -> None:
+        """Wait for the process, and let go of all that was shared with it."""
+        assert self._process is not None
+        try:
+            self._process.wait(_STOP_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join()
+        self._channel.close()
+        os.close(self._wake)
+        if self._memory is not None:
+            self._memory.close()
+            self._memory = None
+        else:
+            os.close(self._descriptor)
+        self._process = None
+
+    def _exit(self) -> str:
+        assert self._process is not None
+        status = self._process.wait(_STOP_TIMEOUT_S)
+        return f"signal {-status}" if status < 0 else f"exit status {status}"
+
+    def _receive(self) -> None:
+        assert self._memory is not None
+        while not self._channel.closed:
+            ready, _, _ = select.select([self._wake, self._channel], [], [])
+            if self._wake in ready:
+                os.read(self._wake, 65536)
+            # States after the socket: all that was measured before an answer is published before the answer is seen.
+            messages = self._channel.receive()
+            for state in self._memory.read_states():
+                self._on_state(state)
+            for message in messages:
+                self._take(message)
+        for state in self._memory.read_states():
+            self._on_state(state)
+        for answer in list(self._replies.values()):
+            answer.put({"error": "the control process is gone"})
+        if not self._stopping:
+            why = self._failure or self._exit()
+            self._on_death(ComponentFailed(f"the control process died ({why})"))
+
+    def _take(self, message: Mapping[str, Any]) -> None:
+        if "reply" in message:
+            waiting = self._replies.get(message["reply"])
+            if waiting is not None:
+                waiting.put(message)
+        elif message["event"] == "log":
+            logging.getLogger(message["logger"]).log(message["level"], message["message"])
+        elif message["event"] in ("report", "stopped"):
+            self.report = {"loop": message["loop"], "counters": message["counters"]}
+        elif message["event"] == "failed":
+            self._failure = message["error"]
+        else:
+            self._on_event(message)
+
+    @property
+    def lost_states(self) -> int:
+        """States that this side came too late for."""
+        return self._memory.lost if self._memory is not None else 0

@@ -1,0 +1,308 @@
+"""Where host and control process meet: shared memory for states and plans, a socket for rare commands and events.
+
+The memory is an unnamed file passed by descriptor, so that nothing is left behind however the two end, and there is no
+lock that a dead peer could hold: each record carries its sequence number and a checksum, and a torn one is passed over.
+"""
+
+from __future__ import annotations
+
+import json
+import mmap
+import os
+import select
+import socket
+import tempfile
+from collections.abc import Mapping
+from typing import Any
+from zlib import crc32
+
+import attrs
+import numpy as np
+from numpy.typing import NDArray
+
+from ibrobot_core.errors import ComponentFailed, HardwareError
+from ibrobot_core.robot import Vector
+
+STATE_SLOTS = 256
+"""States kept for the host: 2.5 s at 100 Hz."""
+PLAN_ROWS = 2048
+"""The longest plan, in setpoints."""
+_SEQUENCE_BYTES = 8
+
+
+@attrs.frozen(eq=False)
+class ControlState:
+    """What the control loop knows after a tick; arrays in robot order."""
+
+    tick: int
+    stamp_ns: int
+    late_ns: int
+    """How late the tick began [ns]."""
+    epoch: int
+    """Counts mode switches and resets; a plan made before one is not followed after it."""
+    estop: bool
+    stale: bool
+    """Whether the reading repeats an older one."""
+    success: bool | None
+    position: Vector
+    velocity: Vector
+    effort: Vector
+    command: Vector
+    """What the hardware was told [rad], shape (J,)."""
+    signals: Vector
+    """All signals of the hardware, one after the other, shape (S,)."""
+
+
+@attrs.frozen(eq=False)
+class PlanRecord:
+    """Setpoints for the joints in `mask`, by time."""
+
+    epoch: int
+    start_ns: int
+    step_ns: int
+    mask: NDArray[np.bool_]
+    """Shape (J,)."""
+    positions: Vector
+    """[rad], shape (N, J); columns outside the mask mean nothing."""
+
+
+@attrs.frozen
+class Layout:
+    """The sizes that both sides agree on."""
+
+    joints: int
+    signals: int
+
+    @property
+    def state(self) -> np.dtype[Any]:
+        """One slot of the ring of states."""
+        vector = ("f8", (self.joints,))
+        integers = [(name, "i8") for name in ("tick", "stamp", "late", "epoch", "estop", "stale", "success")]
+        arrays = [(name, *vector) for name in ("position", "velocity", "effort", "command")]
+        return np.dtype([("seq", "i8"), *integers, *arrays, ("signals", "f8", (self.signals,)), ("crc", "i8")])
+
+    @property
+    def plan(self) -> np.dtype[Any]:
+        """One of the two plan slots."""
+        integers = [(name, "i8") for name in ("epoch", "start", "step", "rows")]
+        arrays = [("mask", "i8", (self.joints,)), ("positions", "f8", (PLAN_ROWS, self.joints))]
+        return np.dtype([("seq", "i8"), *integers, ("crc", "i8"), *arrays])
+
+    @property
+    def size(self) -> int:
+        """Bytes of shared memory."""
+        return STATE_SLOTS * self.state.itemsize + 2 * self.plan.itemsize
+
+
+def create_memory() -> int:
+    """The descriptor of an empty unnamed file."""
+    if hasattr(os, "memfd_create"):
+        return os.memfd_create("ibrobot-link")
+    with tempfile.TemporaryFile() as file:
+        return os.dup(file.fileno())
+
+
+class SharedMemory:
+    """The ring of states (written by the control process) and the newest plan (written by the host).
+
+    Args:
+        descriptor: of a file from `create_memory`; grown to size here, closed by `close`.
+        layout: the sizes that both sides agree on.
+    """
+
+    def __init__(self, descriptor: int, layout: Layout) -> None:
+        os.ftruncate(descriptor, layout.size)
+        self._map = mmap.mmap(descriptor, layout.size)
+        self._descriptor = descriptor
+        split = STATE_SLOTS * layout.state.itemsize
+        self._bytes = memoryview(self._map)
+        self._states = np.frombuffer(self._bytes[:split], layout.state)
+        self._plans = np.frombuffer(self._bytes[split:], layout.plan)
+        self._state_size = layout.state.itemsize
+        self._plan_size = layout.plan.itemsize
+        self._split = split
+        self._body = np.zeros(1, layout.state)
+        self._plan_head = layout.plan.fields["positions"][1] if layout.plan.fields else 0
+        self._row = 8 * layout.joints
+        self._written = 0
+        self._read = 0
+        self._plan_seq = 0
+        self._seen_plan = 0
+        self.lost = 0
+        """States that the reader came too late for."""
+        self.torn = 0
+        """Records that were being written while they were read, and read again later."""
+
+    def write_state(self, state: ControlState) -> None:
+        """Append a state; the oldest makes room."""
+        self._written += 1
+        body = self._body
+        success = -1 if state.success is None else int(state.success)
+        body[0] = (
+            self._written, state.tick, state.stamp_ns, state.late_ns, state.epoch, state.estop, state.stale, success,
+            state.position, state.velocity, state.effort, state.command, state.signals, 0,
+        )  # fmt: skip
+        raw = body.view(np.uint8)
+        body["crc"][0] = crc32(raw[: self._state_size - _SEQUENCE_BYTES])
+        slot = self._states[self._written % STATE_SLOTS : self._written % STATE_SLOTS + 1]
+        slot["seq"] = -1
+        slot.view(np.uint8)[_SEQUENCE_BYTES:] = raw[_SEQUENCE_BYTES:]
+        slot["seq"] = self._written
+
+    def read_states(self) -> list[ControlState]:
+        """The states since the last call, oldest first."""
+        states = []
+        while True:
+            wanted = self._read + 1
+            raw = self._states[wanted % STATE_SLOTS : wanted % STATE_SLOTS + 1].copy()
+            seq = int(raw["seq"][0])
+            if 0 <= seq < wanted:
+                return states
+            if seq > wanted:
+                # Overtaken: go on with the oldest that cannot be overwritten at once.
+                resume = seq - STATE_SLOTS // 2
+                self.lost += resume - wanted
+                self._read = resume - 1
+                continue
+            body = raw.view(np.uint8)
+            if seq != wanted or crc32(body[: self._state_size - _SEQUENCE_BYTES]) != int(raw["crc"][0]):
+                self.torn += 1
+                return states
+            self._read = wanted
+            states.append(_state(raw[0]))
+
+    def write_plan(self, plan: PlanRecord) -> None:
+        """Replace the plan.
+
+        Raises:
+            ValueError: when it has no row, or more than `PLAN_ROWS`.
+        """
+        rows = len(plan.positions)
+        if not 0 < rows <= PLAN_ROWS:
+            raise ValueError(f"a plan has 1 to {PLAN_ROWS} setpoints, got {rows}")
+        self._plan_seq += 1
+        slot = self._plans[self._plan_seq % 2]
+        slot["seq"] = -1
+        slot["epoch"], slot["start"], slot["step"], slot["rows"] = plan.epoch, plan.start_ns, plan.step_ns, rows
+        slot["mask"] = plan.mask
+        slot["positions"][:rows] = plan.positions
+        slot["crc"] = self._plan_checksum(self._plan_seq % 2, rows)
+        slot["seq"] = self._plan_seq
+
+    def read_plan(self) -> PlanRecord | None:
+        """The newest plan, or None when it was read already."""
+        sequences = self._plans["seq"]
+        index = int(np.argmax(sequences))
+        seq = int(sequences[index])
+        if seq <= self._seen_plan:
+            return None
+        slot = self._plans[index]
+        rows = int(slot["rows"])
+        plan = PlanRecord(
+            int(slot["epoch"]), int(slot["start"]), int(slot["step"]), slot["mask"].astype(bool),
+            slot["positions"][:rows].copy(),
+        )  # fmt: skip
+        if self._plan_checksum(index, rows) != int(slot["crc"]) or int(self._plans["seq"][index]) != seq:
+            self.torn += 1
+            return None
+        self._seen_plan = seq
+        return plan
+
+    def _plan_checksum(self, index: int, rows: int) -> int:
+        # From the first integer after `seq` up to `crc`, and the positions in use.
+        begin = self._split + index * self._plan_size
+        head = crc32(self._bytes[begin + 8 : begin + 40])
+        body = begin + self._plan_head - self._row
+        return crc32(self._bytes[body : body + self._row * (1 + max(0, min(rows, PLAN_ROWS)))], head)
+
+    def close(self) -> None:
+        """Unmap; the memory is gone when both sides have."""
+        del self._states, self._plans
+        self._bytes.release()
+        self._map.close()
+        os.close(self._descriptor)
+
+
+def _state(record: Any) -> ControlState:
+    success = int(record["success"])
+    return ControlState(
+        tick=int(record["tick"]), stamp_ns=int(record["stamp"]), late_ns=int(record["late"]),
+        epoch=int(record["epoch"]), estop=bool(record["estop"]), stale=bool(record["stale"]),
+        success=None if success < 0 else bool(success), position=record["position"], velocity=record["velocity"],
+        effort=record["effort"], command=record["command"], signals=record["signals"],
+    )  # fmt: skip
+
+
+class Channel:
+    """JSON objects, a line each, over a stream socket; sending never blocks for long and never raises for a dead peer."""
+
+    def __init__(self, connection: socket.socket) -> None:
+        connection.setblocking(False)
+        self._socket = connection
+        self._partial = bytearray()
+        self.closed = False
+        """Whether the peer is gone."""
+
+    def fileno(self) -> int:
+        """For `select`."""
+        return self._socket.fileno()
+
+    def send(self, message: Mapping[str, Any]) -> None:
+        """Send an object; where the peer is gone, `closed` becomes True."""
+        payload = memoryview(json.dumps(message, separators=(",", ":")).encode() + b"\n")
+        while payload and not self.closed:
+            try:
+                payload = payload[self._socket.send(payload) :]
+            except BlockingIOError:
+                select.select([], [self._socket], [], 1.0)
+            except OSError:
+                self.closed = True
+
+    def receive(self) -> list[dict[str, Any]]:
+        """The objects that have arrived whole."""
+        while not self.closed:
+            try:
+                received = self._socket.recv(65536)
+            except BlockingIOError:
+                break
+            except OSError:
+                received = b""
+            if not received:
+                self.closed = True
+            self._partial += received
+        if b"\n" not in self._partial:
+            return []
+        *lines, rest = bytes(self._partial).split(b"\n")
+        self._partial = bytearray(rest)
+        return [json.loads(line) for line in lines]
+
+    def wait(self, timeout_s: float) -> list[dict[str, Any]]:
+        """The objects that arrive within `timeout_s`, as soon as there is one.
+
+        Raises:
+            ComponentFailed: when the peer is gone.
+        """
+        while True:
+            messages = self.receive()
+            if messages:
+                return messages
+            if self.closed:
+                raise ComponentFailed("the control process died")
+            if not select.select([self._socket], [], [], timeout_s)[0]:
+                return []
+
+    def close(self) -> None:
+        """Hang up."""
+        self.closed = True
+        self._socket.close()
+
+
+def raise_error(reply: Mapping[str, Any]) -> Mapping[str, Any]:
+    """A reply, unless it says that its command failed.
+
+    Raises:
+        HardwareError: with the words of the control loop.
+    """
+    if "error" in reply:
+        raise HardwareError(str(reply["error"]))
+    return reply

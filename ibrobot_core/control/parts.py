@@ -1,0 +1,147 @@
+"""The hardware of a robot as one: several components, each owning joints, read and written in parallel in a tick."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+
+from ibrobot_core.errors import HardwareError, IbrobotError, NotSupported
+from ibrobot_core.interfaces import Episode, Hardware, JointReading, Signal, SimulatedHardware
+from ibrobot_core.robot import Robot, Vector
+
+
+class HardwareParts:
+    """All the hardware of a robot, in robot order.
+
+    Args:
+        robot: the joints.
+        parts: name -> hardware; together they own every joint once.
+    """
+
+    def __init__(self, robot: Robot, parts: dict[str, Hardware]) -> None:
+        self._parts = parts
+        self._indices = {name: robot.indices(part.joints) for name, part in parts.items()}
+        self._size = len(robot.joints)
+        self._pool = ThreadPoolExecutor(len(parts)) if len(parts) > 1 else None
+        self.signals: tuple[Signal, ...] = tuple(s for part in parts.values() for s in part.signals)
+        self._signal_values: Vector = np.full(sum(s.size for s in self.signals), np.nan)
+        # One part that owns every joint in order: no gathering in the tick.
+        only = next(iter(parts.values()))
+        self._single = only if len(parts) == 1 and only.joints == robot.joint_names else None
+
+    def connect(self) -> None:
+        """Connect all; where one fails, those before it are disconnected again."""
+        try:
+            for name, part in self._parts.items():
+                _named(name, part.connect)
+        except IbrobotError:
+            self.disconnect()
+            raise
+
+    def disconnect(self) -> None:
+        """Release all."""
+        for part in self._parts.values():
+            part.disconnect()
+        if self._pool is not None:
+            self._pool.shutdown()
+
+    def read(self) -> JointReading:
+        """Measure every joint; the stamp is the oldest of the parts'.
+
+        Raises:
+            HardwareError: with the name of the part that failed.
+        """
+        if self._single is not None:
+            return self._single.read()
+        readings: list[JointReading] = list(self._each(lambda part: part.read()))
+        position, velocity, effort = np.empty(self._size), np.empty(self._size), np.empty(self._size)
+        for index, reading in zip(self._indices.values(), readings, strict=True):
+            position[index], velocity[index], effort[index] = reading.position, reading.velocity, reading.effort
+        stamp_ns = min(reading.stamp_ns for reading in readings)
+        return JointReading(stamp_ns, position, velocity, effort, any(reading.stale for reading in readings))
+
+    def write(self, command: Vector) -> None:
+        """Command every joint [rad], shape (J,).
+
+        Raises:
+            HardwareError: with the name of the part that failed.
+        """
+        if self._single is not None:
+            self._single.write(command)
+            return
+        commands = {id(part): command[self._indices[name]] for name, part in self._parts.items()}
+        self._each(lambda part: part.write(commands[id(part)]))
+
+    def relax(self) -> None:
+        """Take torque off.
+
+        Raises:
+            NotSupported: where a part cannot.
+        """
+        self._each(lambda part: part.relax())
+
+    def require_relax(self) -> None:
+        """Raise where a part cannot take torque off.
+
+        Raises:
+            NotSupported: naming the part.
+        """
+        for name, part in self._parts.items():
+            if type(part).relax is Hardware.relax:
+                raise NotSupported(f"control.stop: relax: hardware {name!r} cannot take torque off; use hold or a pose")
+
+    def reset_faults(self) -> None:
+        """Clear the faults that parts have latched."""
+        self._each(lambda part: part.reset_faults())
+
+    def read_signals(self) -> Vector:
+        """The signals of all parts one after the other, shape (S,); the array is reused by the next call."""
+        begin = 0
+        for part in self._parts.values():
+            for index, signal in enumerate(part.signals):
+                part.read_signal(index, self._signal_values[begin : begin + signal.size])
+                begin += signal.size
+        return self._signal_values
+
+    def advance(self, step_ns: int) -> None:
+        """Advance those that are simulated."""
+        for part in self._parts.values():
+            if isinstance(part, SimulatedHardware):
+                part.advance(step_ns)
+
+    def reset_episode(self, episode: Episode) -> None:
+        """Set simulated scenes up anew.
+
+        Raises:
+            NotSupported: where no part is simulated.
+        """
+        simulated = [part for part in self._parts.values() if isinstance(part, SimulatedHardware)]
+        if not simulated:
+            raise NotSupported("only a simulation can be set up anew")
+        for part in simulated:
+            part.reset(episode)
+
+    def success(self) -> bool | None:
+        """Whether the scene's task is done; None where there is none."""
+        for part in self._parts.values():
+            if isinstance(part, SimulatedHardware):
+                return part.success()
+        return None
+
+    def _each(self, act: Callable[[Hardware], Any]) -> Sequence[Any]:
+        calls: Iterable[tuple[str, Hardware]] = self._parts.items()
+        if self._pool is None:
+            return [_named(name, lambda part=part: act(part)) for name, part in calls]
+        futures = [(name, self._pool.submit(act, part)) for name, part in calls]
+        return [_named(name, future.result) for name, future in futures]
+
+
+def _named(name: str, act: Callable[[], Any]) -> Any:
+    try:
+        return act()
+    except HardwareError as error:
+        text = str(error)
+        raise HardwareError(text if name in text else f"{name}: {text}") from error

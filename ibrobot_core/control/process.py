@@ -1,0 +1,153 @@
+"""The control process: owns the hardware and nothing else, and stops the robot when the host is gone.
+
+Started by `ibrobot_core.control.host` as `python -m ibrobot_core.control.process SOCKET MEMORY WAKE` with three inherited
+descriptors; the first line on the socket says which robot.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import socket
+import sys
+import traceback
+from pathlib import Path
+from typing import Any, override
+
+from ibrobot_core.clock import RealClock
+from ibrobot_core.config import from_document
+from ibrobot_core.control.build import build_core
+from ibrobot_core.control.core import ControlCore
+from ibrobot_core.control.link import Channel, Layout, SharedMemory
+from ibrobot_core.control.realtime import go_real_time
+from ibrobot_core.control.timing import Punctuality
+from ibrobot_core.errors import IbrobotError
+from ibrobot_core.plugins import installed
+
+_STARTUP_TIMEOUT_S = 30.0
+_REPORT_TICKS = 20
+"""Ticks between reports of punctuality and counters to the host."""
+
+
+class _ToHost(logging.Handler):
+    """Sends log records to the host, which owns the terminal."""
+
+    def __init__(self, channel: Channel) -> None:
+        super().__init__()
+        self._channel = channel
+
+    @override
+    def emit(self, record: logging.LogRecord) -> None:
+        event = {"event": "log", "logger": record.name, "level": record.levelno, "message": record.getMessage()}
+        self._channel.send(event)
+
+
+class ControlProcess:
+    """The loop on its absolute deadlines, and the link to the host."""
+
+    def __init__(self, core: ControlCore, clock: RealClock, channel: Channel, memory: SharedMemory, wake: int) -> None:
+        self._core = core
+        self._clock = clock
+        self._channel = channel
+        self._memory = memory
+        self._wake = wake
+        self._punctuality = Punctuality()
+        self._stopping = False
+        self._terminated = False
+
+    def run(self) -> None:
+        """Tick until stopped: by the host's command, by its death, or by SIGTERM; each ends in the stop behaviour."""
+        signal.signal(signal.SIGTERM, self._terminate)
+        period = self._core.period_ns
+        deadline = self._clock.now_ns() + period
+        periods = 1
+        while not (self._stopping and self._core.stopped):
+            self._clock.sleep_until(deadline)
+            late = self._clock.now_ns() - deadline
+            self._cycle(deadline, late, periods)
+            deadline += period
+            behind = (self._clock.now_ns() - deadline) // period
+            periods = 1 + max(0, behind)
+            deadline += max(0, behind) * period
+        self._report("stopped")
+
+    def _cycle(self, deadline: int, late: int, periods: int) -> None:
+        plan = self._memory.read_plan()
+        if plan is not None:
+            self._core.set_plan(plan)
+        self._memory.write_state(self._core.tick(late, periods))
+        self._punctuality.tick(deadline, late, periods - 1)
+        self._tell_host()
+        for command in self._channel.receive():
+            if command["do"] == "stop":
+                self._begin_stop("told to stop")
+            else:
+                self._channel.send(self._core.handle(command))
+        if self._channel.closed:
+            self._begin_stop("the host is gone")
+        elif self._terminated:
+            self._begin_stop("terminated")
+
+    def _tell_host(self) -> None:
+        try:
+            os.write(self._wake, b".")
+        except OSError:
+            pass  # a full pipe wakes the host as well as one more byte would; a closed one shows on the socket
+        while self._core.events:
+            self._channel.send(self._core.events.popleft())
+        if self._core.state is not None and self._core.state.tick % _REPORT_TICKS == 0:
+            self._report("report")
+
+    def _report(self, event: str) -> None:
+        self._channel.send({"event": event, "loop": self._punctuality.summary(), "counters": self._core.counters()})
+
+    def _begin_stop(self, why: str) -> None:
+        if not self._stopping:
+            self._stopping = True
+            logging.getLogger("ibrobot.control").info("stopping: %s", why)
+            self._core.begin_stop()
+
+    def _terminate(self, number: int, frame: Any) -> None:
+        self._terminated = True
+
+
+def main(descriptors: list[int]) -> int:
+    """Run with the host's socket, memory and wake descriptors; returns the exit status."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    channel = Channel(socket.socket(fileno=descriptors[0]))
+    root = logging.getLogger("ibrobot")
+    root.setLevel(logging.INFO)
+    root.propagate = False
+    root.addHandler(_ToHost(channel))
+    core = None
+    try:
+        order = channel.wait(_STARTUP_TIMEOUT_S)[0]
+        clock = RealClock(order["epoch_offset_ns"])
+        config = from_document(order["document"], source=Path(order["source"]), sim=order["sim"])
+        core = build_core(config, installed(), clock, order["seed"])
+        core.start(order["mode"])
+        memory = SharedMemory(descriptors[1], Layout(len(config.robot.joints), core.signal_size))
+        os.set_blocking(descriptors[2], False)
+        refused = go_real_time(config.control.priority)
+        signals = [[signal.topic, signal.size] for signal in core.signals]
+        channel.send({"event": "ready", "signals": signals, "refused": refused, "epoch": core.epoch})
+        ControlProcess(core, clock, channel, memory, descriptors[2]).run()
+    except IbrobotError as error:
+        channel.send({"event": "failed", "error": str(error), "exit_code": error.exit_code})
+        return 1
+    except Exception as error:
+        # The host tells it in one line; the traceback goes where a bug's belongs.
+        traceback.print_exc()
+        if core is not None:
+            core.abandon()
+        channel.send({"event": "failed", "error": f"{type(error).__name__}: {error}", "exit_code": 1})
+        return 1
+    finally:
+        if core is not None:
+            core.close()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main([int(argument) for argument in sys.argv[1:]]))

@@ -1,0 +1,128 @@
+"""Inference: what takes a frame and gives back a chunk, wherever the model runs; here in the host process."""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+from abc import ABC, abstractmethod
+from typing import override
+
+import attrs
+
+from ibrobot_core.interfaces import Frame, Policy
+from ibrobot_core.robot import Vector
+
+
+@attrs.frozen(eq=False)
+class DispatchInfer:
+    """A request for a chunk: the observations, stamped, and an id that its answer carries."""
+
+    id: int
+    frame: Frame
+
+
+@attrs.frozen(eq=False)
+class Chunk:
+    """The answer to a request: actions, shape (N, A), the first of which belongs to `start_ns`; or why there are none."""
+
+    id: int
+    start_ns: int
+    actions: Vector | None
+    error: str = ""
+
+
+class InferenceClient(ABC):
+    """One request in flight at a time."""
+
+    @abstractmethod
+    def submit(self, request: DispatchInfer) -> None:
+        """Begin; returns at once."""
+
+    @abstractmethod
+    def poll(self, timeout_s: float = 0.0) -> Chunk | None:
+        """An answer that came, waiting for one up to `timeout_s` [s]."""
+
+    @abstractmethod
+    def reset(self, seed: int) -> None:
+        """A new episode begins: the policy forgets the last before it sees a later request."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """End; safe to call twice."""
+
+
+def run_policy(policy: Policy, request: DispatchInfer) -> Chunk:
+    """The three steps, one after the other. A policy that raises gives a chunk with its error: the arm holds."""
+    stamp_ns = request.frame.stamp_ns
+    try:
+        actions = policy.postprocess(policy.infer(policy.preprocess(request.frame)))
+    except Exception as error:
+        logging.getLogger("ibrobot.inference").exception("the policy failed")
+        return Chunk(request.id, stamp_ns, None, f"{type(error).__name__}: {error}")
+    return Chunk(request.id, stamp_ns, actions)
+
+
+class LockstepClient(InferenceClient):
+    """Runs the policy in `submit`, so that a chunk costs no simulated time: for lockstep."""
+
+    def __init__(self, policy: Policy) -> None:
+        self._policy = policy
+        self._chunk: Chunk | None = None
+
+    @override
+    def submit(self, request: DispatchInfer) -> None:
+        self._chunk = run_policy(self._policy, request)
+
+    @override
+    def poll(self, timeout_s: float = 0.0) -> Chunk | None:
+        chunk, self._chunk = self._chunk, None
+        return chunk
+
+    @override
+    def reset(self, seed: int) -> None:
+        self._chunk = None
+        self._policy.reset(seed)
+
+    @override
+    def close(self) -> None:
+        self._chunk = None
+
+
+class MonolithicClient(InferenceClient):
+    """Runs the policy in a thread of the host process, with no serialisation between the steps."""
+
+    def __init__(self, policy: Policy) -> None:
+        self._policy = policy
+        self._work: queue.SimpleQueue[DispatchInfer | int | None] = queue.SimpleQueue()
+        self._chunks: queue.SimpleQueue[Chunk] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._run, name="inference", daemon=True)
+        self._thread.start()
+
+    @override
+    def submit(self, request: DispatchInfer) -> None:
+        self._work.put(request)
+
+    @override
+    def poll(self, timeout_s: float = 0.0) -> Chunk | None:
+        try:
+            return self._chunks.get(timeout_s > 0, timeout_s or None)
+        except queue.Empty:
+            return None
+
+    @override
+    def reset(self, seed: int) -> None:
+        self._work.put(seed)
+
+    @override
+    def close(self) -> None:
+        self._work.put(None)
+        # A model that hangs must not keep the robot from stopping; the thread is a daemon.
+        self._thread.join(timeout=1.0)
+
+    def _run(self) -> None:
+        while (work := self._work.get()) is not None:
+            if isinstance(work, DispatchInfer):
+                self._chunks.put(run_policy(self._policy, work))
+            else:
+                self._policy.reset(work)

@@ -1,0 +1,102 @@
+"""Control: the process (or, in lockstep, the loop here) that owns the hardware; its states become messages."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, override
+
+import numpy as np
+
+from ibrobot_core.clock import RealClock, SteppedClock
+from ibrobot_core.control.host import ControlClient, ControlHost, InlineControl
+from ibrobot_core.control.link import ControlState
+from ibrobot_core.errors import HardwareError
+from ibrobot_core.launch.component import Component
+from ibrobot_core.launch.session import Session
+from ibrobot_core.messages import Float64MultiArray, Header, JointState
+
+NAME = "control"
+
+
+class Control(Component):
+    """Starts control and publishes what it tells: joint states, what the joints were told, and signals."""
+
+    def __init__(self, session: Session, needs: tuple[str, ...]) -> None:
+        config = session.config
+        where = "in this process, in lockstep" if session.request.lockstep else "in a process of its own"
+        simulation = config.simulation
+        parts = (
+            simulation.type if config.simulated and simulation else ", ".join(h.type for h in config.hardware.values())
+        )
+        super().__init__(NAME, f"{parts} at {config.control.rate_hz:g} Hz, {where}", needs)
+        self._session = session
+        self._joints = config.robot.joint_names
+        self._actions = [
+            (spec.executor, spec.topic, config.robot.indices(config.executors[spec.executor].joints))
+            for spec in config.contract.actions
+        ]
+
+    @override
+    def start(self) -> None:
+        session = self._session
+        host: ControlHost
+        if isinstance(session.clock, SteppedClock):
+            host = InlineControl(
+                session.config, session.registry, session.clock, session.request.seed, self._publish, self._take
+            )
+        else:
+            assert isinstance(session.clock, RealClock)
+            host = ControlClient(
+                session.config, session.clock, session.request.seed, self._publish, self._take,
+                lambda error: session.fail(NAME, error),
+            )  # fmt: skip
+        session.control = host
+        host.start()
+        for line in host.refused:
+            session.log.warning(line)
+
+    @override
+    def step(self, now_ns: int) -> None:
+        host = self._session.control
+        assert isinstance(host, InlineControl)
+        host.step()
+
+    @override
+    def stop(self) -> None:
+        if self._session.has_control:
+            self._session.control.stop()
+
+    def _publish(self, state: ControlState) -> None:
+        session = self._session
+        session.state = state
+        bus = session.bus
+        header = Header(state.stamp_ns)
+        effort = state.effort if np.isfinite(state.effort).all() else np.empty(0)
+        bus.publish("/joint_states", JointState(header, self._joints, state.position, state.velocity, effort))
+        executors = session.config.control_modes[session.mode].executors
+        for executor, topic, columns in self._actions:
+            if executor in executors:
+                bus.publish(topic, Float64MultiArray(state.command[columns]))
+        begin = 0
+        for topic, size in session.control.signals:
+            bus.publish(topic, Float64MultiArray(state.signals[begin : begin + size].copy()))
+            begin += size
+
+    def _take(self, event: Mapping[str, Any]) -> None:
+        session = self._session
+        if event["event"] == "goal":
+            if session.feeder is not None:
+                session.feeder.take_goal(event)
+        elif event["event"] == "fault":
+            fault = str(event["fault"])
+            session.outcome.faults.append(fault)
+            session.log.error("fault: %s; the robot %s", fault, _stopped_by(session))
+            session.registry.emit(
+                "ibrobot_fault_raised", robot=session.config.robot.name, fault=fault, stamp_ns=int(event["stamp_ns"])
+            )
+        else:
+            raise HardwareError(f"control sent an unknown event {event['event']!r}")
+
+
+def _stopped_by(session: Session) -> str:
+    return "relaxes" if session.config.control.stop == "relax" else "holds"

@@ -1,0 +1,122 @@
+"""Execution: the model of an inference mode, and the dispatcher that keeps the plan filled from it."""
+
+from __future__ import annotations
+
+from typing import override
+
+from ibrobot_core.config.schema import ControlMode, Inference
+from ibrobot_core.contract.check import check_policy
+from ibrobot_core.contract.specs import Contract
+from ibrobot_core.dispatch.dispatcher import Dispatcher
+from ibrobot_core.errors import ContractError
+from ibrobot_core.inference.client import InferenceClient, LockstepClient, MonolithicClient
+from ibrobot_core.interfaces import Policy
+from ibrobot_core.launch.component import Component
+from ibrobot_core.launch.feeder import Feeder
+from ibrobot_core.launch.session import Session
+from ibrobot_core.robot import Vector
+from ibrobot_core.units import NS_PER_S
+
+
+class Model(Component):
+    """Loads a policy and compares it with the contract, before anything is powered."""
+
+    def __init__(self, session: Session, name: str) -> None:
+        model = session.config.models[name]
+        super().__init__(f"model:{name}", f"policy {model.type}")
+        self._session = session
+        self._model = model
+        self.contract = Contract.from_config(session.config, model.extra_observations)
+        self._policy: Policy | None = None
+
+    @property
+    def policy(self) -> Policy:
+        """The policy, loaded."""
+        assert self._policy is not None
+        return self._policy
+
+    @override
+    def start(self) -> None:
+        model, session = self._model, self._session
+        policy = session.registry.find("policy", model.type).make(model.options, session.context(model.name))
+        try:
+            check_policy(self.contract, policy.spec)
+        except ContractError as error:
+            raise ContractError(
+                f"model {model.name!r} does not fit the contract of {session.config.source}\n{error}"
+            ) from None
+        policy.load()
+        self._policy = policy
+
+    @override
+    def stop(self) -> None:
+        if self._policy is not None:
+            self._policy.close()
+            self._policy = None
+
+
+class InferenceFeeder(Feeder):
+    """The dispatcher on the contract's ticks, fed by a model."""
+
+    def __init__(
+        self, session: Session, mode: ControlMode, inference: Inference, model: Model, needs: tuple[str, ...]
+    ) -> None:
+        summary = f"{inference.model} through the dispatcher at {session.config.contract.rate_hz:g} Hz"
+        super().__init__(session, mode, summary, (*needs, model.name))
+        self._inference = inference
+        self._model = model
+        self._client: InferenceClient | None = None
+        self._dispatcher: Dispatcher | None = None
+
+    @property
+    def dispatcher(self) -> Dispatcher:
+        """The dispatcher, once set up."""
+        assert self._dispatcher is not None
+        return self._dispatcher
+
+    @override
+    def setup(self) -> None:
+        policy, contract = self._model.policy, self._model.contract
+        self._client = LockstepClient(policy) if self.session.request.lockstep else MonolithicClient(policy)
+        self._dispatcher = Dispatcher(
+            contract, policy.spec, self.mode.dispatch, self.session.bus, self._client, self._send,
+            self._inference.request_timeout, self._inference.prompt,
+        )  # fmt: skip
+        self._step_ns = contract.step_ns
+
+    @override
+    def begin_feeding(self, seed: int) -> None:
+        self.session.stats = self.dispatcher.stats
+        self._next_ns = self.session.bus.snapshot_ns() + self._step_ns
+        self.dispatcher.begin(seed)
+
+    @override
+    def end_feeding(self) -> None:
+        self.dispatcher.end()
+        self.session.stats = None
+
+    @override
+    def work(self, timeout_s: float) -> None:
+        assert self._client is not None
+        clock = self.session.clock
+        wait_s = min(timeout_s, max(0.0, (self._next_ns - clock.now_ns()) / NS_PER_S)) if self.active else timeout_s
+        chunk = self._client.poll(wait_s)
+        with self.lock:
+            now_ns = self.session.bus.snapshot_ns()
+            if chunk is not None:
+                self.dispatcher.accept(chunk, now_ns)
+            if self.active and now_ns >= self._next_ns:
+                behind = (now_ns - self._next_ns) // self._step_ns
+                self.dispatcher.tick(self._next_ns + behind * self._step_ns)
+                self._next_ns += (behind + 1) * self._step_ns
+                # In lockstep the answer is there already.
+                if self.session.request.lockstep and (chunk := self._client.poll()) is not None:
+                    self.dispatcher.accept(chunk, now_ns)
+
+    @override
+    def teardown(self) -> None:
+        if self._client is not None:
+            self._client.close()
+
+    def _send(self, start_ns: int, step_ns: int, positions: Vector) -> None:
+        self.session.send_plan(start_ns, step_ns, self._model.contract.action_joints, positions)

@@ -1,0 +1,64 @@
+"""Perception: a worker for each peripheral, which publishes what its sensor gives."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import override
+
+from ibrobot_core.config.schema import Peripheral
+from ibrobot_core.interfaces import Sensor
+from ibrobot_core.launch.component import Worker
+from ibrobot_core.launch.session import Session
+from ibrobot_core.units import seconds
+
+_READY_TIMEOUT_S = 30.0
+_RATE_WINDOW = 31
+"""Messages that the measured rate looks back on."""
+
+
+class SensorWorker(Worker):
+    """Opens a sensor and publishes its messages; ready when the first has come."""
+
+    def __init__(self, session: Session, peripheral: Peripheral, needs: tuple[str, ...]) -> None:
+        super().__init__(
+            f"sensor:{peripheral.name}", f"{peripheral.kind} {peripheral.type}", needs,
+            on_failure=session.fail, lockstep=session.request.lockstep, ready_timeout_s=_READY_TIMEOUT_S,
+        )  # fmt: skip
+        self._session = session
+        self._peripheral = peripheral
+        self._sensor: Sensor | None = None
+        self._stamps: deque[int] = deque(maxlen=_RATE_WINDOW)
+
+    @override
+    def setup(self) -> None:
+        session, peripheral = self._session, self._peripheral
+        descriptor = session.registry.find("sensor", peripheral.type)
+        sensor = self._sensor = descriptor.make(peripheral.options, session.context(peripheral.name))
+        sensor.open()
+        for topic, message in sensor.latched():
+            session.bus.publish(topic, message, latched=True)
+
+    @override
+    def work(self, timeout_s: float) -> None:
+        assert self._sensor is not None
+        message = self._sensor.read(timeout_s)
+        if message is None:
+            return
+        self._session.bus.publish(self._sensor.topic, message)
+        self._stamps.append(self._session.clock.now_ns())
+        elapsed_s = seconds(self._stamps[-1] - self._stamps[0])
+        if elapsed_s > 0:
+            self._session.rates[self._peripheral.name] = (len(self._stamps) - 1) / elapsed_s
+
+    @override
+    def teardown(self) -> None:
+        if self._sensor is not None:
+            self._sensor.close()
+
+    @override
+    def is_ready(self) -> bool:
+        return bool(self._stamps)
+
+    @override
+    def not_ready(self) -> str:
+        return f"no message on {self._sensor.topic if self._sensor else 'its topic'}"

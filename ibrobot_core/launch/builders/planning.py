@@ -1,0 +1,185 @@
+"""Planning: goals, named or joint by joint, become trajectories for the executors of a planning mode."""
+
+from __future__ import annotations
+
+import itertools
+import queue
+from collections.abc import Mapping
+from typing import Any, override
+
+import attrs
+import numpy as np
+
+from ibrobot_core.config.schema import Component as ConfigComponent
+from ibrobot_core.config.schema import ControlMode
+from ibrobot_core.control.executors.trajectory_goal import goal_from_message
+from ibrobot_core.errors import HardwareError, IbrobotError, PlanningError
+from ibrobot_core.interfaces import JointGoal, Planner, PlanRequest
+from ibrobot_core.launch.feeder import Feeder
+from ibrobot_core.launch.session import Session
+from ibrobot_core.robot import Robot
+
+GO_TO = "/planning/go_to"
+
+
+@attrs.define
+class _Motion:
+    """A goal under way: what each executor still has to say."""
+
+    text: str
+    waiting: set[str]
+    failures: list[str] = attrs.field(factory=list)
+
+
+class PlanningFeeder(Feeder):
+    """Plans from where the robot is to each goal in turn; service `/planning/go_to` takes goals too."""
+
+    def __init__(self, session: Session, mode: ControlMode, planner: ConfigComponent, needs: tuple[str, ...]) -> None:
+        super().__init__(session, mode, f"planner {planner.type}", needs)
+        self._component = planner
+        self._planner: Planner | None = None
+        self._goals: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self._events: queue.SimpleQueue[Mapping[str, Any]] = queue.SimpleQueue()
+        self._motion: _Motion | None = None
+        self._numbers = itertools.count(1)
+        self._asked = len(session.request.goals)
+        self._done = 0
+        for goal in session.request.goals:
+            parse_goal(goal, session.config.robot)
+            self._goals.put(goal)
+
+    @override
+    def setup(self) -> None:
+        session = self.session
+        descriptor = session.registry.find("planner", self._component.type)
+        self._planner = descriptor.make(self._component.options, session.context(self._component.type))
+        self._planner.load()
+        session.bus.serve(GO_TO, self.go_to)
+
+    def go_to(self, goal: str) -> None:
+        """Queue a goal: a pose's name, or `joint=radians,joint=radians`.
+
+        Raises:
+            PlanningError: for one that names no pose or joint of this robot.
+        """
+        parse_goal(goal, self.session.config.robot)
+        self._goals.put(goal)
+
+    @override
+    def begin_feeding(self, seed: int) -> None:
+        self._motion = None
+
+    @override
+    def take_goal(self, event: Mapping[str, Any]) -> None:
+        self._events.put(event)
+
+    @override
+    def work(self, timeout_s: float) -> None:
+        try:
+            event = self._events.get(timeout_s > 0, timeout_s or None)
+        except queue.Empty:
+            event = None
+        with self.lock:
+            if event is not None:
+                self._advance(event)
+            if self.active and self._motion is None and not self._goals.empty():
+                self._begin(self._goals.get())
+
+    def _begin(self, text: str) -> None:
+        session, number = self.session, next(self._numbers)
+        try:
+            goals = self._plan(text)
+            self._motion = _Motion(text, set(goals))
+            for executor, goal in goals.items():
+                session.control.call("goal", executor=executor, goal_id=f"{number}:{executor}", goal=goal)
+        except (PlanningError, HardwareError) as error:
+            self._finish(text, [str(error)])
+
+    def _plan(self, text: str) -> dict[str, Mapping[str, Any]]:
+        """Executor -> its goal."""
+        session = self.session
+        robot, measured = session.config.robot, session.measured()
+        goal = parse_goal(text, robot)
+        # From what the joints were told, not from where they sag to: the setpoint makes no step.
+        told = session.state.command if session.state is not None else measured.position
+        goals: dict[str, Mapping[str, Any]] = {}
+        for name in self.mode.executors:
+            executor = session.config.executors[name]
+            mine = [joint for joint in executor.joints if joint in goal]
+            if not mine:
+                continue
+            if executor.type == "gripper":
+                goals[name] = {"position": goal[mine[0]]}
+                continue
+            assert self._planner is not None
+            request = PlanRequest(
+                executor.joints, told[robot.indices(executor.joints)],
+                JointGoal(tuple(mine), np.array([goal[joint] for joint in mine])),
+            )  # fmt: skip
+            goals[name] = goal_from_message(self._planner.plan(request))
+        if not goals:
+            raise PlanningError(f"goal {text!r}: no executor of mode {self.mode.name} has these joints")
+        return goals
+
+    def _advance(self, event: Mapping[str, Any]) -> None:
+        motion = self._motion
+        if motion is None or event["state"] == "executing":
+            return
+        motion.waiting.discard(str(event["executor"]))
+        if event["state"] != "succeeded":
+            motion.failures.append(f"{event['executor']} {event['state']}: {event['message']}")
+        if not motion.waiting:
+            self._finish(motion.text, motion.failures)
+
+    def _finish(self, text: str, failures: list[str]) -> None:
+        self._motion = None
+        self._done += 1
+        if failures:
+            self.session.outcome.goals_failed += 1
+            self.session.log.error("goal %s failed: %s", text, "; ".join(failures))
+        else:
+            self.session.log.info("goal %s reached", text)
+        if self._asked and self._done >= self._asked:
+            self.session.finish()
+
+    @override
+    def teardown(self) -> None:
+        if self._planner is not None:
+            self._planner.close()
+        self.session.bus.unserve(GO_TO)
+
+
+def parse_goal(text: str, robot: Robot) -> dict[str, float]:
+    """Joint -> position [rad] of a goal: a pose's name, or `joint=radians,joint=radians`.
+
+    Raises:
+        PlanningError: for one that names no pose or joint of this robot.
+    """
+    if "=" not in text:
+        try:
+            return dict(zip(robot.joint_names, robot.pose(text).tolist(), strict=True))
+        except KeyError as error:
+            raise PlanningError(f"goal {text!r}: {error.args[0]}; or give joints, e.g. wrist_flex=0.5") from None
+    goal = {}
+    for part in text.split(","):
+        joint, _, value = (piece.strip() for piece in part.partition("="))
+        if joint not in robot.joint_names:
+            raise PlanningError(f"goal {text!r}: no joint {joint!r}; the joints are: {', '.join(robot.joint_names)}")
+        try:
+            goal[joint] = float(value)
+        except ValueError:
+            raise PlanningError(f"goal {text!r}: {value!r} is no angle in radians") from None
+    return goal
+
+
+def raise_unless_planning(session: Session) -> None:
+    """Refuse `--goal` where the mode has no planner.
+
+    Raises:
+        IbrobotError: naming the modes that have one.
+    """
+    if session.request.goals and session.config.control_modes[session.mode].planner is None:
+        planning = [name for name, mode in session.config.control_modes.items() if mode.planner]
+        error = IbrobotError(f"--goal needs a mode with a planner: --mode {' or '.join(planning) or '(there is none)'}")
+        error.exit_code = 2
+        raise error

@@ -1,0 +1,67 @@
+"""Simulation: sets episodes up, one after the other, and judges them by the scene's own predicate."""
+
+from __future__ import annotations
+
+from typing import override
+
+from ibrobot_core.launch.component import Worker
+from ibrobot_core.launch.episodes import Episodes
+from ibrobot_core.launch.session import Session
+from ibrobot_core.units import NS_PER_S, ns
+
+
+class SimulatedEpisodes(Worker):
+    """Episodes of a policy in a simulated scene; seeds count up from the run's."""
+
+    def __init__(self, session: Session, episodes: Episodes, needs: tuple[str, ...]) -> None:
+        wanted = session.request.episodes
+        summary = f"{wanted if wanted is not None else 'endless'} episodes from seed {session.request.seed}"
+        super().__init__("episodes", summary, needs, on_failure=session.fail, lockstep=session.request.lockstep)
+        self._session = session
+        self._episodes = episodes
+        self._wanted = wanted
+        self._longest_ns = ns(session.config.contract.max_duration_s)
+        self._begun_ns: int | None = None
+
+    @override
+    def setup(self) -> None:
+        pass
+
+    @override
+    def work(self, timeout_s: float) -> None:
+        session = self._session
+        if session.finished.is_set():
+            return
+        if self._begun_ns is None:
+            self._begin_episode()
+        elif session.state is not None and session.state.epoch == session.epoch:
+            age_ns = session.state.stamp_ns - self._begun_ns
+            if session.state.success:
+                self._end_episode("success")
+            elif age_ns > self._longest_ns:
+                session.log.info("episode %d: no success within %.1f s", self._episodes.number, age_ns / NS_PER_S)
+                self._end_episode("failure")
+        if timeout_s > 0:
+            session.finished.wait(min(timeout_s, session.config.control.rate_hz**-1))
+
+    def _begin_episode(self) -> None:
+        session = self._session
+        seed = session.request.seed + self._episodes.number
+        session.command("reset_episode", seed=seed)
+        self._begun_ns = session.clock.now_ns()
+        self._episodes.begin()
+        if session.feeder is not None:
+            session.feeder.begin(seed)
+
+    def _end_episode(self, outcome: str) -> None:
+        session = self._session
+        if session.feeder is not None:
+            session.feeder.end()
+        self._begun_ns = None
+        self._episodes.end(outcome)
+        if self._wanted is not None and self._episodes.number >= self._wanted:
+            session.finish()
+
+    @override
+    def teardown(self) -> None:
+        pass

@@ -1,0 +1,77 @@
+"""Status: publishes what the robot is doing on `/robot_status` and every count on `/diagnostics`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, override
+
+import attrs
+
+from ibrobot_core.launch.component import Worker
+from ibrobot_core.launch.session import Session
+from ibrobot_core.messages import DiagnosticArray, DiagnosticStatus, Header, KeyValue, RobotStatus
+from ibrobot_core.units import NS_PER_S
+
+_PERIOD_NS = NS_PER_S // 5
+
+
+class Status(Worker):
+    """Five times a second, from what control and the dispatcher report."""
+
+    def __init__(self, session: Session, needs: tuple[str, ...]) -> None:
+        super().__init__(
+            "status", "/robot_status and /diagnostics", needs, on_failure=session.fail,
+            lockstep=session.request.lockstep,
+        )  # fmt: skip
+        self._session = session
+        self._next_ns = 0
+
+    @override
+    def setup(self) -> None:
+        self._next_ns = self._session.clock.now_ns()
+
+    @override
+    def work(self, timeout_s: float) -> None:
+        session = self._session
+        now_ns = session.clock.now_ns()
+        if now_ns >= self._next_ns:
+            self._next_ns = now_ns + _PERIOD_NS
+            session.bus.publish("/robot_status", self._status(now_ns))
+            session.bus.publish("/diagnostics", self._diagnostics(now_ns))
+        if timeout_s > 0:
+            session.finished.wait(timeout_s)
+
+    @override
+    def teardown(self) -> None:
+        pass
+
+    def _status(self, now_ns: int) -> RobotStatus:
+        session, stats = self._session, self._session.stats
+        return RobotStatus(
+            Header(now_ns), session.config.robot.name, session.mode,
+            active_executors=session.config.control_modes[session.mode].executors,
+            estop=session.state is not None and session.state.estop, faults=tuple(session.outcome.faults),
+            episode=session.outcome.episodes + 1, plan_length=stats.plan_length if stats else 0,
+            latency_ms=stats.latency_ms if stats else 0.0,
+        )  # fmt: skip
+
+    def _diagnostics(self, now_ns: int) -> DiagnosticArray:
+        session = self._session
+        report = session.control.report
+        counters: Mapping[str, Any] = report["counters"]
+        groups = {"loop": {**report["loop"], **counters.get("loop", {})}, "safety": counters.get("safety", {})}
+        groups |= {f"executor {name}": counts for name, counts in counters.get("executors", {}).items()}
+        if session.stats is not None:
+            groups["dispatch"] = attrs.asdict(session.stats)
+        groups["bus drops"] = session.bus.dropped()
+        level = DiagnosticStatus.ERROR if session.outcome.faults else DiagnosticStatus.OK
+        return DiagnosticArray(
+            Header(now_ns),
+            tuple(
+                DiagnosticStatus(
+                    level if name == "loop" else DiagnosticStatus.OK, name, "", session.config.robot.name,
+                    tuple(KeyValue(key, str(value)) for key, value in counts.items()),
+                )
+                for name, counts in groups.items()
+            ),
+        )  # fmt: skip

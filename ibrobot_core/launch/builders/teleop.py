@@ -1,0 +1,71 @@
+"""Teleop: reads the device with every joint state, and gives control plans of length one."""
+
+from __future__ import annotations
+
+from typing import override
+
+import numpy as np
+
+from ibrobot_core.bus import Subscription
+from ibrobot_core.config.schema import ControlMode
+from ibrobot_core.interfaces import Teleop
+from ibrobot_core.launch.feeder import Feeder
+from ibrobot_core.launch.session import Session
+
+
+class TeleopFeeder(Feeder):
+    """A teleoperation device. It joins at the plan: there is one way to the motors."""
+
+    def __init__(self, session: Session, mode: ControlMode, device: str, needs: tuple[str, ...]) -> None:
+        component = session.config.teleoperation[device]
+        super().__init__(session, mode, f"teleop {device} ({component.type})", needs)
+        self._device_name = device
+        self._component = component
+        self._device: Teleop | None = None
+        self._states: Subscription | None = None
+
+    @override
+    def setup(self) -> None:
+        session = self.session
+        descriptor = session.registry.find("teleop", self._component.type)
+        device = self._device = descriptor.make(self._component.options, session.context(self._device_name))
+        device.connect()
+        self._states = session.bus.subscribe("/joint_states", 1)
+
+    @override
+    def begin_feeding(self, seed: int) -> None:
+        assert self._device is not None
+        self._device.activate(self.session.measured())
+
+    @override
+    def work(self, timeout_s: float) -> None:
+        assert self._device is not None
+        assert self._states is not None
+        if self._states.get(timeout_s) is None:
+            return
+        with self.lock:
+            if self.active:
+                self._follow(self._device)
+
+    def _follow(self, device: Teleop) -> None:
+        session = self.session
+        command = device.read(session.measured())
+        if command.estop:
+            session.control.call("estop")
+        elif command.positions:
+            joints = tuple(command.positions)
+            setpoint = np.array([list(command.positions.values())])
+            session.send_plan(session.clock.now_ns(), 1, joints, setpoint)
+        if command.finished:
+            session.finish()
+
+    @override
+    def teardown(self) -> None:
+        if self._states is not None:
+            self._states.close()
+        if self._device is not None:
+            self._device.disconnect()
+
+    @override
+    def help(self) -> str:
+        return self._device.help() if self._device is not None else ""

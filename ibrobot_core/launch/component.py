@@ -1,0 +1,140 @@
+"""Components: what a run is made of; each starts, becomes ready, works, and stops, in a thread or in lockstep."""
+
+from __future__ import annotations
+
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import override
+
+from ibrobot_core.errors import ComponentFailed, IbrobotError
+
+_POLL_S = 0.1
+"""The longest that a unit of work may wait, so that a stop is seen."""
+
+
+class Component(ABC):
+    """One part of a run.
+
+    Attributes:
+        name: unique within the run, e.g. `sensor:top`.
+        needs: names of the components that must be ready before this one starts.
+        summary: one line for `--dry-run`.
+    """
+
+    def __init__(self, name: str, summary: str, needs: tuple[str, ...] = ()) -> None:
+        self.name = name
+        self.summary = summary
+        self.needs = needs
+
+    @abstractmethod
+    def start(self) -> None:
+        """Begin, and return when ready.
+
+        Raises:
+            IbrobotError: when it cannot.
+        """
+
+    @abstractmethod
+    def stop(self) -> None:
+        """End. Safe to call twice, and after a failed `start`."""
+
+    def step(self, now_ns: int) -> None:
+        """Lockstep: do what is due at `now_ns` [ns]."""
+
+
+class Worker(Component):
+    """A component that repeats one unit of work: in a thread of its own, or once a tick in lockstep.
+
+    Args:
+        on_failure: told of an exception in the thread, which ends it.
+        lockstep: no thread; `step` works.
+        ready_timeout_s: how long `start` waits to be ready.
+    """
+
+    def __init__(
+        self, name: str, summary: str, needs: tuple[str, ...] = (), *,
+        on_failure: Callable[[str, Exception], None], lockstep: bool, ready_timeout_s: float = 60.0,
+    ) -> None:  # fmt: skip
+        super().__init__(name, summary, needs)
+        self._on_failure = on_failure
+        self._lockstep = lockstep
+        self._ready_timeout_s = ready_timeout_s
+        self._thread: threading.Thread | None = None
+        self._set_up = False
+        self._end = threading.Event()
+        self._ready = threading.Event()
+        self._failure: Exception | None = None
+
+    @abstractmethod
+    def setup(self) -> None:
+        """Make and open what is needed."""
+
+    @abstractmethod
+    def work(self, timeout_s: float) -> None:
+        """Do one unit of work, waiting for it no longer than `timeout_s` [s]."""
+
+    @abstractmethod
+    def teardown(self) -> None:
+        """Close what `setup` opened; also called when it failed."""
+
+    def is_ready(self) -> bool:
+        """Whether dependants may start; asked after `setup` and each unit of work."""
+        return True
+
+    def not_ready(self) -> str:
+        """Why it is not ready, for the error when it does not become so."""
+        return "not ready"
+
+    @override
+    def start(self) -> None:
+        if self._lockstep:
+            self._set_up = True
+            self.setup()
+            return
+        self._end.clear()
+        self._ready.clear()
+        self._failure = None
+        self._thread = threading.Thread(target=self._run, name=self.name, daemon=True)
+        self._thread.start()
+        if not self._ready.wait(self._ready_timeout_s):
+            raise ComponentFailed(f"{self.name}: {self.not_ready()} after {self._ready_timeout_s:g} s")
+        if self._failure is not None:
+            raise self._failure
+
+    @override
+    def step(self, now_ns: int) -> None:
+        self.work(0.0)
+
+    @override
+    def stop(self) -> None:
+        self._end.set()
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join()
+            self._thread = None
+        if self._lockstep and self._set_up:
+            self._set_up = False
+            self.teardown()
+
+    def _run(self) -> None:
+        try:
+            try:
+                self.setup()
+                while not self._end.is_set():
+                    if not self._ready.is_set() and self.is_ready():
+                        self._ready.set()
+                    self.work(_POLL_S)
+            finally:
+                self.teardown()
+        except Exception as error:
+            was_ready = self._ready.is_set()
+            self._failure = error
+            self._ready.set()
+            if was_ready:
+                self._on_failure(self.name, error)
+
+
+def cause(error: BaseException) -> str:
+    """An error on one line."""
+    text = str(error).strip().replace("\n", "; ")
+    return text if isinstance(error, IbrobotError) else f"{type(error).__name__}: {text}"

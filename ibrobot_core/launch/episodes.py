@@ -1,0 +1,50 @@
+"""The life of episodes: numbered, counted, told to plugins, and recorded where a recorder is there."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ibrobot_core.launch.session import Session
+
+if TYPE_CHECKING:
+    from ibrobot_core.launch.builders.recording import Recording
+
+
+class Episodes:
+    """Begins and ends episodes. One thread at a time uses it."""
+
+    def __init__(self, session: Session, recording: Recording | None) -> None:
+        self._session = session
+        self._recording = recording
+        self.number = 0
+        """Of the present episode, from 1; 0 before the first."""
+        self.running = False
+
+    def begin(self) -> None:
+        """The next episode begins."""
+        session = self._session
+        self.number += 1
+        self.running = True
+        if self._recording is not None:
+            self._recording.begin(self.number)
+        session.registry.emit(
+            "ibrobot_episode_started", robot=session.config.robot.name, episode=self.number, mode=session.mode,
+            stamp_ns=session.clock.now_ns(),
+        )  # fmt: skip
+
+    def end(self, outcome: str) -> None:
+        """The present episode, if any, ends as `success`, `failure` or `unknown`."""
+        if not self.running:
+            return
+        session = self._session
+        self.running = False
+        if self._recording is not None:
+            self._recording.end(outcome)
+        if outcome != "unknown":
+            session.outcome.episodes += 1
+            session.outcome.successes += outcome == "success"
+            session.log.info("episode %d: %s", self.number, outcome)
+        session.registry.emit(
+            "ibrobot_episode_ended", robot=session.config.robot.name, episode=self.number, outcome=outcome,
+            stamp_ns=session.clock.now_ns(),
+        )  # fmt: skip

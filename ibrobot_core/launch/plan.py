@@ -1,0 +1,103 @@
+"""The plan of a run: its components, what each needs, and the order in which they start; stopping reverses it."""
+
+from __future__ import annotations
+
+import attrs
+
+from ibrobot_core.errors import ComponentFailed
+from ibrobot_core.launch.builders.control import NAME as CONTROL
+from ibrobot_core.launch.builders.control import Control
+from ibrobot_core.launch.builders.execution import InferenceFeeder, Model
+from ibrobot_core.launch.builders.perception import SensorWorker
+from ibrobot_core.launch.builders.planning import PlanningFeeder
+from ibrobot_core.launch.builders.recording import Recording
+from ibrobot_core.launch.builders.simulation import SimulatedEpisodes
+from ibrobot_core.launch.builders.status import Status
+from ibrobot_core.launch.builders.teleop import TeleopFeeder
+from ibrobot_core.launch.builders.viewer import ViewerWorker
+from ibrobot_core.launch.component import Component
+from ibrobot_core.launch.episodes import Episodes
+from ibrobot_core.launch.feeder import Feeder
+from ibrobot_core.launch.session import Session
+
+
+@attrs.frozen
+class LaunchPlan:
+    """Components in starting order."""
+
+    components: tuple[Component, ...]
+    feeder: Feeder | None
+    """What feeds the first mode."""
+    episodes: Episodes
+    episodes_worker: SimulatedEpisodes | None
+
+    def lines(self) -> list[str]:
+        """The plan as `--dry-run` prints it."""
+        width = max(len(c.name) for c in self.components)
+        lines = [
+            f"{number:2}. {c.name:{width}}  {c.summary}" + (f"  (needs {', '.join(c.needs)})" if c.needs else "")
+            for number, c in enumerate(self.components, 1)
+        ]
+        return [*lines, "stops in reverse order"]
+
+
+@attrs.frozen
+class ModeParts:
+    """What a mode adds to a run."""
+
+    models: tuple[Model, ...]
+    feeder: Feeder | None
+
+
+def mode_parts(session: Session, name: str, sensors: tuple[str, ...]) -> ModeParts:
+    """The components of a mode; nothing is loaded yet."""
+    mode = session.config.control_modes[name]
+    needs = (CONTROL, *sensors)
+    if mode.inference is not None:
+        model = Model(session, mode.inference.model)
+        return ModeParts((model,), InferenceFeeder(session, mode, mode.inference, model, needs))
+    if mode.teleop is not None:
+        return ModeParts((), TeleopFeeder(session, mode, mode.teleop, (CONTROL,)))
+    if mode.planner is not None:
+        return ModeParts((), PlanningFeeder(session, mode, mode.planner, (CONTROL,)))
+    return ModeParts((), None)
+
+
+def build_plan(session: Session) -> LaunchPlan:
+    """All components of a run, in the order in which they can start."""
+    config = session.config
+    names = tuple(f"sensor:{name}" for name in config.peripherals)
+    parts = mode_parts(session, session.mode, names)
+    components: list[Component] = [*parts.models]
+    components.append(Control(session, tuple(model.name for model in parts.models)))
+    components += [SensorWorker(session, p, (CONTROL,)) for p in config.peripherals.values()]
+    recording = Recording(session, config.recording) if config.recording is not None else None
+    if recording is not None:
+        components.append(recording)
+    episodes = Episodes(session, recording)
+    worker = None
+    if parts.feeder is not None:
+        # Ahead of the feeder in lockstep, so that an episode's first tick is fed.
+        if config.simulated and config.control_modes[session.mode].inference is not None:
+            worker = SimulatedEpisodes(session, episodes, (parts.feeder.name,))
+        components.append(parts.feeder)
+    components.append(Status(session, (CONTROL,)))
+    if config.viewer is not None:
+        components.append(ViewerWorker(session, config.viewer, (CONTROL,)))
+    if worker is not None:
+        components.append(worker)
+    return LaunchPlan(tuple(_ordered(components)), parts.feeder, episodes, worker)
+
+
+def _ordered(components: list[Component]) -> list[Component]:
+    """In the order given, but nothing before what it needs."""
+    remaining, ordered, started = list(components), [], set[str]()
+    while remaining:
+        ready = next((c for c in remaining if set(c.needs) <= started), None)
+        if ready is None:
+            stuck = "; ".join(f"{c.name} needs {', '.join(set(c.needs) - started)}" for c in remaining)
+            raise ComponentFailed(f"components wait for one another: {stuck}")
+        remaining.remove(ready)
+        ordered.append(ready)
+        started.add(ready.name)
+    return ordered

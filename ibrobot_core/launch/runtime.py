@@ -1,0 +1,201 @@
+"""The runtime: starts a plan's components in order, runs them until something ends the run, and stops them in reverse."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ibrobot_core.clock import SteppedClock
+from ibrobot_core.errors import ComponentFailed, HardwareError, IbrobotError, NotSupported
+from ibrobot_core.launch.builders.control import Control
+from ibrobot_core.launch.builders.planning import raise_unless_planning
+from ibrobot_core.launch.component import Component, cause
+from ibrobot_core.launch.plan import LaunchPlan, build_plan, mode_parts
+from ibrobot_core.launch.session import Session
+from ibrobot_core.units import ns
+
+SET_MODE = "/set_mode"
+RESET = "/reset"
+ESTOP = "/estop"
+
+
+class Runtime:
+    """One run. `start`, then `run_lockstep` or `wait`, then `stop`; `summary` at any time.
+
+    Services on the bus: `/set_mode` (a mode's name), `/reset`, `/estop`.
+    """
+
+    def __init__(self, session: Session) -> None:
+        raise_unless_planning(session)
+        self.session = session
+        self.plan: LaunchPlan = build_plan(session)
+        self._started: list[Component] = []
+        self._begun_ns = 0
+
+    def start(self) -> None:
+        """Start every component, each when all it needs is ready. Where one fails, those before it are stopped.
+
+        Raises:
+            IbrobotError: the cause, with the component's name.
+        """
+        session = self.session
+        try:
+            for component in self.plan.components:
+                self._started.append(component)
+                component.start()
+                if isinstance(component, Control) and session.request.lockstep:
+                    component.step(session.clock.now_ns())
+            self._begun_ns = session.clock.now_ns()
+            if session.feeder is None:
+                self._await_state()
+                session.feeder = self.plan.feeder
+            if self.plan.episodes_worker is None:
+                self._begin_mode()
+        except BaseException:
+            self.stop()
+            raise
+        session.bus.serve(SET_MODE, self.switch_mode)
+        session.bus.serve(RESET, lambda _=None: self.reset())
+        session.bus.serve(ESTOP, lambda _=None: session.control.call("estop"))
+
+    def wait(self, timeout_s: float) -> bool:
+        """Wait up to `timeout_s` [s] for the end of the run; True when it has come."""
+        duration = self.session.request.duration_s
+        if duration is not None and self.session.clock.now_ns() - self._begun_ns >= ns(duration):
+            self.session.finish()
+        return self.session.finished.wait(timeout_s)
+
+    def step(self) -> bool:
+        """Lockstep: advance by one control period, with all of the tick's work; True when the run has ended."""
+        session = self.session
+        clock = session.clock
+        assert isinstance(clock, SteppedClock)
+        now_ns = clock.advance(ns(1.0 / session.config.control.rate_hz))
+        for component in self._started:
+            try:
+                component.step(now_ns)
+            except Exception as error:
+                session.fail(component.name, error)
+        return self.wait(0.0)
+
+    def switch_mode(self, name: str) -> None:
+        """Enter another mode: its parts become ready first, then ownership of the joints changes within one tick.
+
+        Raises:
+            IbrobotError: when there is no such mode or its parts do not start; the present mode goes on.
+        """
+        session = self.session
+        if name not in session.config.control_modes:
+            raise NotSupported(f"no mode {name!r}; the modes are: {', '.join(session.config.control_modes)}")
+        if name == session.mode:
+            return
+        if self.plan.episodes_worker is not None:
+            self.plan.episodes_worker.stop()
+            self._started = [c for c in self._started if c is not self.plan.episodes_worker]
+            self.plan.episodes.end("unknown")
+        parts = mode_parts(session, name, tuple(f"sensor:{p}" for p in session.config.peripherals))
+        new: list[Component] = [*parts.models, *([parts.feeder] if parts.feeder is not None else [])]
+        begun: list[Component] = []
+        try:
+            for component in new:
+                begun.append(component)
+                component.start()
+        except BaseException:
+            for component in reversed(begun):
+                component.stop()
+            raise
+        previous, old = session.mode, session.feeder
+        if old is not None:
+            old.end()
+        session.command("switch_mode", mode=name)
+        session.mode, session.feeder = name, parts.feeder
+        if parts.feeder is not None:
+            parts.feeder.begin(session.request.seed)
+        if old is not None:
+            old.stop()
+            self._started = [c for c in self._started if c is not old]
+        self._started += new
+        session.registry.emit(
+            "ibrobot_mode_changed", robot=session.config.robot.name, mode=name, previous=previous,
+            stamp_ns=session.clock.now_ns(),
+        )  # fmt: skip
+
+    def reset(self) -> None:
+        """Clear faults and the emergency stop; the mode begins anew from where the joints are.
+
+        Raises:
+            HardwareError: when the hardware does not answer yet.
+        """
+        session = self.session
+        if session.feeder is not None:
+            session.feeder.end()
+        session.command("reset")
+        if session.feeder is not None:
+            session.feeder.begin(session.request.seed)
+
+    def stop(self) -> None:
+        """Stop every component, the last started first. Errors are logged, so that all are stopped."""
+        self.session.finish()
+        while self._started:
+            component = self._started.pop()
+            try:
+                component.stop()
+            except Exception as error:
+                self.session.log.error("%s did not stop well: %s", component.name, cause(error))
+                if isinstance(component, Control):
+                    raise
+
+    def raise_failure(self) -> None:
+        """Raise what ended the run, if something failed.
+
+        Raises:
+            ComponentFailed: component and cause on one line.
+        """
+        if self.session.failure is not None:
+            component, error = self.session.failure
+            failure = ComponentFailed(f"{component}: {cause(error)}")
+            failure.exit_code = error.exit_code if isinstance(error, IbrobotError) else 1
+            raise failure
+
+    def summary(self) -> dict[str, Any]:
+        """What `--json` prints."""
+        session = self.session
+        outcome = session.outcome
+        report = session.control.report if session.has_control else {"loop": {}, "counters": {}}
+        return {
+            "robot": session.config.robot.name,
+            "mode": session.mode,
+            "simulated": session.config.simulated,
+            "lockstep": session.request.lockstep,
+            "seed": session.request.seed,
+            "duration_s": round((session.clock.now_ns() - self._begun_ns) * 1e-9, 3)
+            if self._begun_ns or session.request.lockstep
+            else 0.0,
+            "episodes": outcome.episodes,
+            "successes": outcome.successes,
+            "goals_failed": outcome.goals_failed,
+            "faults": outcome.faults,
+            "loop": report["loop"],
+            "counters": report["counters"],
+            "rates_hz": {name: round(rate, 2) for name, rate in session.rates.items()},
+            "drops": session.bus.dropped(),
+        }
+
+    def _await_state(self) -> None:
+        session = self.session
+        states = session.bus.subscribe("/joint_states", 1)
+        try:
+            while session.state is None:
+                if states.get(1.0) is None and session.state is None:
+                    self.raise_failure()
+                    raise HardwareError("control is ready but gives no joint states")
+        finally:
+            states.close()
+
+    def _begin_mode(self) -> None:
+        """A mode without simulated episodes: it begins where the robot is, as one open-ended episode."""
+        session = self.session
+        assert session.state is not None
+        session.epoch = session.state.epoch
+        if session.feeder is not None:
+            session.feeder.begin(session.request.seed)
+        self.plan.episodes.begin()

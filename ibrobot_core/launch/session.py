@@ -1,0 +1,139 @@
+"""A run's shared state: config, clock, bus, control, faults, and the mode that is active."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import attrs
+import numpy as np
+
+from ibrobot_core.bus import Bus
+from ibrobot_core.clock import Clock, RealClock, SteppedClock
+from ibrobot_core.config import RobotConfig
+from ibrobot_core.control.link import ControlState, PlanRecord
+from ibrobot_core.errors import ComponentFailed
+from ibrobot_core.interfaces import Context, JointReading
+from ibrobot_core.plugins import Registry
+from ibrobot_core.robot import Vector
+from ibrobot_core.units import ns
+
+if TYPE_CHECKING:
+    from ibrobot_core.control.host import ControlHost
+    from ibrobot_core.dispatch.dispatcher import DispatchStats
+    from ibrobot_core.launch.feeder import Feeder
+
+
+@attrs.frozen
+class Request:
+    """What a user asks of a run; the options of `ibrobot launch`."""
+
+    lockstep: bool = False
+    seed: int = 0
+    duration_s: float | None = None
+    episodes: int | None = None
+    goals: tuple[str, ...] = ()
+    keys: Callable[[], Any] | None = None
+
+
+@attrs.define
+class Outcome:
+    """What came of a run."""
+
+    episodes: int = 0
+    successes: int = 0
+    faults: list[str] = attrs.field(factory=list)
+    goals_failed: int = 0
+
+
+class Session:
+    """What the components of a run share. Everything here is safe to read from any thread."""
+
+    def __init__(self, config: RobotConfig, registry: Registry, request: Request) -> None:
+        self.config = config
+        self.registry = registry
+        self.request = request
+        # Lockstep begins at a fixed time, so that equal seeds give equal stamps.
+        self.clock: Clock = SteppedClock(0) if request.lockstep else RealClock()
+        self.bus = Bus(self.clock)
+        self.outcome = Outcome()
+        self.mode = config.default_control_mode
+        self.epoch = 0
+        self.feeder: Feeder | None = None
+        self.state: ControlState | None = None
+        self.stats: DispatchStats | None = None
+        self.rates: dict[str, float] = {}
+        """Measured rate of each sensor [Hz]."""
+        self.failure: tuple[str, Exception] | None = None
+        self.finished = threading.Event()
+        """Set when the run should stop."""
+        self.log = logging.getLogger("ibrobot")
+        self._control: ControlHost | None = None
+
+    @property
+    def control(self) -> ControlHost:
+        """The host's side of control.
+
+        Raises:
+            ComponentFailed: before it was made.
+        """
+        if self._control is None:
+            raise ComponentFailed("control is not there yet")
+        return self._control
+
+    @control.setter
+    def control(self, control: ControlHost) -> None:
+        self._control = control
+
+    @property
+    def has_control(self) -> bool:
+        """Whether control was made."""
+        return self._control is not None
+
+    def context(self, name: str, *, seed: int | None = None) -> Context:
+        """The context for a plugin's `make` in the host."""
+        config = self.config
+        simulation = config.simulation.options if config.simulated and config.simulation is not None else None
+        return Context(
+            name=name, clock=self.clock, log=logging.getLogger(f"ibrobot.{name}"), robot=config.robot,
+            joints=config.robot.joint_names, period_ns=ns(1.0 / config.control.rate_hz),
+            seed=self.request.seed if seed is None else seed, bus=self.bus, simulation=simulation,
+            keys=self.request.keys,
+        )  # fmt: skip
+
+    def measured(self) -> JointReading:
+        """The newest state.
+
+        Raises:
+            ComponentFailed: before the first.
+        """
+        state = self.state
+        if state is None:
+            raise ComponentFailed("no joint state has come yet")
+        return JointReading(state.stamp_ns, state.position, state.velocity, state.effort, state.stale)
+
+    def send_plan(self, start_ns: int, step_ns: int, joints: tuple[str, ...], positions: Vector) -> None:
+        """Give control a plan: positions [rad], shape (N, len(joints)), the first at `start_ns` [ns]."""
+        robot = self.config.robot
+        columns = robot.indices(joints)
+        mask = np.zeros(len(robot.joints), dtype=bool)
+        mask[columns] = True
+        full = np.zeros((len(positions), len(robot.joints)))
+        full[:, columns] = positions
+        self.control.write_plan(PlanRecord(self.epoch, start_ns, step_ns, mask, full))
+
+    def command(self, do: str, **arguments: Any) -> None:
+        """Have control carry out a command that begins a new epoch: a mode switch, a reset."""
+        self.epoch = int(self.control.call(do, **arguments)["epoch"])
+
+    def finish(self) -> None:
+        """End the run in good order."""
+        self.finished.set()
+
+    def fail(self, component: str, error: Exception) -> None:
+        """End the run because `component` died; the first cause is the one that is told."""
+        if self.failure is None and not self.finished.is_set():
+            self.failure = (component, error)
+        self.finished.set()
