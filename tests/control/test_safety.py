@@ -118,7 +118,7 @@ def wish(kind: str, value: Any, layer: SafetyLayer, robot: Robot, period_ns: int
     return value
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(streams())
 def test_whatever_is_asked_for_the_limits_hold_and_every_intervention_is_counted(
     stream: tuple[Robot, int, Vector, list[tuple[str, Any, int]]],
@@ -154,7 +154,7 @@ def test_whatever_is_asked_for_the_limits_hold_and_every_intervention_is_counted
     assert list(watched.layer.interventions.values()) == (expected + wrong).tolist()
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(limits, periods, st.floats(0, 1), st.floats(0, 1))
 def test_a_stationary_target_is_reached_exactly_and_never_overshot(
     limit: tuple[float, float, float, float], period_ns: int, start: float, end: float
@@ -182,7 +182,7 @@ def test_a_stationary_target_is_reached_exactly_and_never_overshot(
         assert watched.layer.at_rest
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(streams(), st.floats(0, 1))
 def test_after_any_stream_a_stop_ends_at_a_target_that_there_is_room_to_stop_at(
     stream: tuple[Robot, int, Vector, list[tuple[str, Any, int]]], end: float
@@ -210,16 +210,16 @@ def test_after_any_stream_a_stop_ends_at_a_target_that_there_is_room_to_stop_at(
     way = np.abs(target - rest) + 2 * robot.max_velocity**2 / robot.max_acceleration
     needed_s = np.max(way / robot.max_velocity + 4 * robot.max_velocity / robot.max_acceleration + 2 * watched.dt)
     ticks = int(needed_s / watched.dt) + 10
-    for _ in range(min(ticks, 1000)):
+    for _ in range(min(ticks, 500)):
         command = watched.tick(target)
         assert (command <= np.maximum(target, np.maximum(rest, position)) + slack).all()
         assert (command >= np.minimum(target, np.minimum(rest, position)) - slack).all()
         if watched.layer.at_rest and (command == target).all():
             break
-    assert ticks > 1000 or (command == target).all()
+    assert ticks > 500 or (command == target).all()
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(streams())
 def test_any_motion_within_the_limits_passes_bit_by_bit_and_counts_nothing(
     stream: tuple[Robot, int, Vector, list[tuple[str, Any, int]]],
@@ -285,7 +285,7 @@ def rest_to_rest(start: float, end: float, velocity: float, acceleration: float,
     return np.append(start + amplitude * (1 - np.cos(omega * time)), end)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(limits, periods, st.floats(0, 1), st.floats(0, 1))
 def test_a_plan_at_the_limits_from_rest_to_rest_passes_unchanged(
     limit: tuple[float, float, float, float], period_ns: int, start: float, end: float
