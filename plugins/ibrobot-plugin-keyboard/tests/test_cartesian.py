@@ -139,11 +139,19 @@ def test_no_joint_goes_faster_than_it_may(robot):
         positions = moved
 
 
-def test_an_arm_outside_its_limits_does_not_jump(robot):
+def test_an_arm_outside_its_limits_moves_without_a_jump(robot):
     start = bent(robot)
     start[0] = 1.8
     moved = CartesianJog(robot, robot.joint_names[:-1]).step(start, np.array([0, 0, 0.1]), np.zeros(2), DT)
-    assert np.abs(moved - start).max() <= 3.0 * DT
+    assert 0 < np.abs(moved - start).max() <= 3.0 * DT
+    assert tool(robot, moved)[0][2] - tool(robot, start)[0][2] == pytest.approx(0.1 * DT, rel=0.1)
+
+
+def test_a_joint_of_the_model_that_is_not_the_robots_is_not_counted_on(tmp_path):
+    whole = make_robot(tmp_path, *(name for name in LINKS if name != "heading"))
+    robot = attrs.evolve(whole, joints=whole.joints[1:])
+    start = np.zeros(5)
+    np.testing.assert_array_equal(jogged(robot, start, np.array([0, 0.1, 0]), np.zeros(2), 5), start)
 
 
 def test_the_toggle_key_changes_between_joints_and_tool(robot):
