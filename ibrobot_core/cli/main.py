@@ -61,7 +61,7 @@ def main() -> None:
     from ibrobot_core.errors import IbrobotError
 
     try:
-        cli()
+        cli(prog_name="ibrobot")
     except IbrobotError as error:
         for line in str(error).splitlines():
             click.echo(f"error: {line}", err=True)

@@ -79,6 +79,11 @@ CASES = {
         "home: [0, 0]",
         "robot.yaml:11: robot.description.poses.home: expected 3 positions, one for each joint, got 2",
     ),
+    "pose_above": (
+        "home: [0, 0, 0]",
+        "home: [1.5, 0, 0]",
+        "robot.yaml:11: robot.description.poses.home.0: 1.5 rad is outside the limits of pan, -1.0 to 1.0",
+    ),
     "pose_outside": (
         "home: [0, 0, 0]",
         "home: [0, 0, -0.5]",

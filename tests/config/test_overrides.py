@@ -43,6 +43,16 @@ def test_the_last_override_of_a_key_counts(load_text: Load, base: str) -> None:
     assert load_text(base, overrides=["control.rate_hz=50", "control.rate_hz=60"]).control.rate_hz == 60.0
 
 
+def test_a_fault_below_an_override_is_told_as_the_overrides(load_text: Load, base: str) -> None:
+    with pytest.raises(ConfigError) as told:
+        load_text(base, overrides=["contract.observations.1.align={strategy: asof, tol_ms: soon}"])
+
+    assert str(told.value) == (
+        "--set contract.observations.1.align={strategy: asof, tol_ms: soon}: "
+        "contract.observations.1.align.tol_ms: expected a number, got 'soon'"
+    )
+
+
 def test_mode_overrides_the_default(load_text: Load, base: str) -> None:
     assert load_text(base, mode="plan").default_control_mode == "plan"
 
