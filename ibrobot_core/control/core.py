@@ -174,7 +174,7 @@ class ControlCore:
         if self._relaxed:
             return True
         if self._stop_target is not None and self._clock.now_ns() < self._stop_deadline:
-            return self._safety.at_rest and bool(np.allclose(self._safety.current, self._stop_target, atol=1e-6))
+            return self._safety.at_rest and bool(np.allclose(self._safety.current, self._stop_target, atol=1e-4))
         return self._safety.at_rest
 
     def abandon(self) -> None:
@@ -217,9 +217,7 @@ class ControlCore:
     def _desired(self) -> Vector | None:
         """What is asked for in this tick; None to brake and hold."""
         if self._stop_target is not None:
-            stride = _POSE_SPEED * self._robot.max_velocity * self.period_ns * 1e-9
-            current = self._safety.current
-            return current + np.clip(self._stop_target - current, -stride, stride)
+            return self._safety.towards(self._stop_target, _POSE_SPEED)
         if not self._active:
             return None
         desired = self._safety.current

@@ -261,7 +261,7 @@ class ControlClient(ControlHost):
     def _receive(self) -> None:
         assert self._memory is not None
         while not self._channel.closed:
-            ready, _, _ = select.select([self._wake, self._channel], [], [])
+            ready, _, _ = select.select([self._wake, self._channel.fileno()], [], [])
             if self._wake in ready:
                 os.read(self._wake, 65536)
             # States after the socket: all that was measured before an answer is published before the answer is seen.

@@ -151,7 +151,7 @@ class SharedMemory:
 
     def read_states(self) -> list[ControlState]:
         """The states since the last call, oldest first."""
-        states = []
+        states: list[ControlState] = []
         while True:
             wanted = self._read + 1
             raw = self._states[wanted % STATE_SLOTS : wanted % STATE_SLOTS + 1].copy()

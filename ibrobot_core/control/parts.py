@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -132,10 +133,9 @@ class HardwareParts:
         return None
 
     def _each(self, act: Callable[[Hardware], Any]) -> Sequence[Any]:
-        calls: Iterable[tuple[str, Hardware]] = self._parts.items()
         if self._pool is None:
-            return [_named(name, lambda part=part: act(part)) for name, part in calls]
-        futures = [(name, self._pool.submit(act, part)) for name, part in calls]
+            return [_named(name, partial(act, part)) for name, part in self._parts.items()]
+        futures = [(name, self._pool.submit(act, part)) for name, part in self._parts.items()]
         return [_named(name, future.result) for name, future in futures]
 
 

@@ -59,6 +59,7 @@ class ControlProcess:
     def run(self) -> None:
         """Tick until stopped: by the host's command, by its death, or by SIGTERM; each ends in the stop behaviour."""
         signal.signal(signal.SIGTERM, self._terminate)
+        self._report("report")  # the first call of anything is slow: here no tick waits for it
         period = self._core.period_ns
         deadline = self._clock.now_ns() + period
         periods = 1

@@ -24,7 +24,7 @@ class DispatchInfer:
 
 @attrs.frozen(eq=False)
 class Chunk:
-    """The answer to a request: actions, shape (N, A), the first of which belongs to `start_ns`; or why there are none."""
+    """The answer to a request: actions, shape (N, A), the first for `start_ns`; or why there are none."""
 
     id: int
     start_ns: int

@@ -126,7 +126,7 @@ class Worker(Component):
                     self.work(_POLL_S)
             finally:
                 self.teardown()
-        except Exception as error:
+        except Exception as error:  # noqa: BLE001 - told to the run, which ends with it as the cause
             was_ready = self._ready.is_set()
             self._failure = error
             self._ready.set()

@@ -1,4 +1,4 @@
-"""The runtime: starts a plan's components in order, runs them until something ends the run, and stops them in reverse."""
+"""The runtime: starts a plan's components in order, runs them until the run ends, and stops them in reverse."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Runtime:
         self.session = session
         self.plan: LaunchPlan = build_plan(session)
         self._started: list[Component] = []
-        self._begun_ns = 0
+        self._begun_ns = session.clock.now_ns()
 
     def start(self) -> None:
         """Start every component, each when all it needs is ready. Where one fails, those before it are stopped.
@@ -54,8 +54,8 @@ class Runtime:
             self.stop()
             raise
         session.bus.serve(SET_MODE, self.switch_mode)
-        session.bus.serve(RESET, lambda _=None: self.reset())
-        session.bus.serve(ESTOP, lambda _=None: session.control.call("estop"))
+        session.bus.serve(RESET, lambda _: self.reset())
+        session.bus.serve(ESTOP, lambda _: session.control.call("estop"))
 
     def wait(self, timeout_s: float) -> bool:
         """Wait up to `timeout_s` [s] for the end of the run; True when it has come."""
@@ -73,7 +73,7 @@ class Runtime:
         for component in self._started:
             try:
                 component.step(now_ns)
-            except Exception as error:
+            except Exception as error:  # noqa: BLE001 - a component that dies ends the run, with its cause told
                 session.fail(component.name, error)
         return self.wait(0.0)
 
@@ -167,9 +167,7 @@ class Runtime:
             "simulated": session.config.simulated,
             "lockstep": session.request.lockstep,
             "seed": session.request.seed,
-            "duration_s": round((session.clock.now_ns() - self._begun_ns) * 1e-9, 3)
-            if self._begun_ns or session.request.lockstep
-            else 0.0,
+            "duration_s": round((session.clock.now_ns() - self._begun_ns) * 1e-9, 3),
             "episodes": outcome.episodes,
             "successes": outcome.successes,
             "goals_failed": outcome.goals_failed,
