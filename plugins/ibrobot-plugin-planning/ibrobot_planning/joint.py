@@ -16,7 +16,7 @@ from ibrobot_core.robot import Joint, Vector
 from ibrobot_core.units import NS_PER_S, ns
 from ibrobot_planning.options import JointPlannerOptions
 
-_SHORTEST_PHASE_S = 1e-6
+_SHORTEST_PHASE_S = 1e-5
 """Shorter phases of the profile get no point of their own: interpolation would divide by their time."""
 _AT_GOAL = 1e-9
 """Greatest distance [rad] that counts as none."""
@@ -33,6 +33,7 @@ class JointPlanner(Planner):
         self._options = options
         self._joints = {joint.name: joint for joint in ctx.robot.joints}
         self._clock = ctx.clock
+        self._period_ns = ctx.period_ns
 
     @override
     def plan(self, request: PlanRequest) -> JointTrajectory:
@@ -46,7 +47,9 @@ class JointPlanner(Planner):
         distance = float(np.max(np.abs(delta), initial=0.0))
         if distance < _AT_GOAL:
             rest = np.zeros(len(joints))
-            return JointTrajectory(header, request.joints, (JointTrajectoryPoint(0, request.start, rest, rest),))
+            # Two points and not one: an executor needs some time to be there.
+            stay = tuple(JointTrajectoryPoint(stamp, request.start, rest, rest) for stamp in (0, self._period_ns))
+            return JointTrajectory(header, request.joints, stay)
         # Limits along the line, measured on the joint that moves farthest: the others move by a fraction of its way.
         share = np.abs(delta) / distance
         moving = share > _AT_GOAL

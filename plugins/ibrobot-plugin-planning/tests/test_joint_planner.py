@@ -87,7 +87,8 @@ def test_a_plan_runs_from_rest_to_rest_on_a_straight_line_within_limits(start, g
     position, speed, rate, _ = sampled(trajectory).swapaxes(0, 1)
     way = np.array(goal) - start
     assert np.all(np.abs(speed) <= ROBOT.max_velocity * velocity * (1 + 1e-6))
-    assert np.all(np.abs(rate) <= ROBOT.max_acceleration * acceleration * (1 + 1e-6) + 1e-6)
+    # A phase too short for points of its own (10 us) lets the acceleration stray by what the jerk makes of that time.
+    assert np.all(np.abs(rate) <= ROBOT.max_acceleration * acceleration + JERK * 1e-5)
     assert np.all((position >= np.minimum(start, goal) - 1e-9) & (position <= np.maximum(start, goal) + 1e-9))
     off_line = (position - start) * (way @ way) - np.outer((position - start) @ way, way)
     np.testing.assert_allclose(off_line, 0, atol=1e-8)
@@ -132,11 +133,11 @@ def test_joints_that_the_goal_does_not_name_stay():
         assert (point.positions[0], point.positions[2]) == (0.3, 0.7)
 
 
-def test_a_goal_that_is_the_start_is_reached_at_once():
+def test_a_goal_that_is_the_start_stays_there_for_a_tick():
     trajectory = planner().plan(request([0.3, 0.5, 0.7], {"a": 0.3}))
-    (point,) = trajectory.points
-    assert point.time_from_start_ns == 0
-    np.testing.assert_array_equal(point.positions, [0.3, 0.5, 0.7])
+    assert [point.time_from_start_ns for point in trajectory.points] == [0, CONTEXT.period_ns]
+    for point in trajectory.points:
+        np.testing.assert_array_equal(point.positions, [0.3, 0.5, 0.7])
 
 
 def test_a_start_outside_the_limits_may_move_inwards():
