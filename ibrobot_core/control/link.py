@@ -234,7 +234,7 @@ def _state(record: Any) -> ControlState:
 
 
 class Channel:
-    """JSON objects, a line each, over a stream socket; sending never blocks for long and never raises for a dead peer."""
+    """JSON objects, a line each, over a stream socket; a dead peer is no exception, it shows in `closed`."""
 
     def __init__(self, connection: socket.socket) -> None:
         connection.setblocking(False)

@@ -1,11 +1,12 @@
 """The control process: owns the hardware and nothing else, and stops the robot when the host is gone.
 
-Started by `ibrobot_core.control.host` as `python -m ibrobot_core.control.process SOCKET MEMORY WAKE` with three inherited
+Started by `ibrobot_core.control.host` as `python -m ibrobot_core.control.process SOCKET MEMORY WAKE`, three inherited
 descriptors; the first line on the socket says which robot.
 """
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import signal
@@ -91,10 +92,9 @@ class ControlProcess:
             self._begin_stop("terminated")
 
     def _tell_host(self) -> None:
-        try:
+        # A full pipe wakes the host as well as one more byte would; a closed one shows on the socket.
+        with contextlib.suppress(OSError):
             os.write(self._wake, b".")
-        except OSError:
-            pass  # a full pipe wakes the host as well as one more byte would; a closed one shows on the socket
         while self._core.events:
             self._channel.send(self._core.events.popleft())
         if self._core.state is not None and self._core.state.tick % _REPORT_TICKS == 0:
@@ -137,7 +137,7 @@ def main(descriptors: list[int]) -> int:
     except IbrobotError as error:
         channel.send({"event": "failed", "error": str(error), "exit_code": error.exit_code})
         return 1
-    except Exception as error:
+    except Exception as error:  # noqa: BLE001 - a bug here must still stop the robot
         # The host tells it in one line; the traceback goes where a bug's belongs.
         traceback.print_exc()
         if core is not None:
