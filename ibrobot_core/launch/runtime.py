@@ -7,7 +7,7 @@ from typing import Any
 from ibrobot_core.clock import SteppedClock
 from ibrobot_core.errors import ComponentFailed, HardwareError, IbrobotError, NotSupported
 from ibrobot_core.launch.builders.control import Control
-from ibrobot_core.launch.builders.planning import raise_unless_planning
+from ibrobot_core.launch.builders.planning import check_goals
 from ibrobot_core.launch.component import Component, cause
 from ibrobot_core.launch.plan import LaunchPlan, build_plan, mode_parts
 from ibrobot_core.launch.session import Session
@@ -25,7 +25,7 @@ class Runtime:
     """
 
     def __init__(self, session: Session) -> None:
-        raise_unless_planning(session)
+        check_goals(session)
         self.session = session
         self.plan: LaunchPlan = build_plan(session)
         self._started: list[Component] = []

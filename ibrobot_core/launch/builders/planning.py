@@ -13,7 +13,7 @@ import numpy as np
 from ibrobot_core.config.schema import Component as ConfigComponent
 from ibrobot_core.config.schema import ControlMode
 from ibrobot_core.control.executors.trajectory_goal import goal_from_message
-from ibrobot_core.errors import HardwareError, IbrobotError, PlanningError
+from ibrobot_core.errors import HardwareError, PlanningError
 from ibrobot_core.interfaces import JointGoal, Planner, PlanRequest
 from ibrobot_core.launch.feeder import Feeder
 from ibrobot_core.launch.session import Session
@@ -45,7 +45,6 @@ class PlanningFeeder(Feeder):
         self._asked = len(session.request.goals)
         self._done = 0
         for goal in session.request.goals:
-            parse_goal(goal, session.config.robot)
             self._goals.put(goal)
 
     @override
@@ -172,14 +171,19 @@ def parse_goal(text: str, robot: Robot) -> dict[str, float]:
     return goal
 
 
-def raise_unless_planning(session: Session) -> None:
-    """Refuse `--goal` where the mode has no planner.
+def check_goals(session: Session) -> None:
+    """Refuse goals that cannot be meant, before anything starts.
 
     Raises:
-        IbrobotError: naming the modes that have one.
+        PlanningError: for goals in a mode without a planner, and for one that names no pose or joint of this robot.
     """
-    if session.request.goals and session.config.control_modes[session.mode].planner is None:
-        planning = [name for name, mode in session.config.control_modes.items() if mode.planner]
-        error = IbrobotError(f"--goal needs a mode with a planner: --mode {' or '.join(planning) or '(there is none)'}")
+    try:
+        if session.request.goals and session.config.control_modes[session.mode].planner is None:
+            planning = [name for name, mode in session.config.control_modes.items() if mode.planner]
+            remedy = f"--mode {' or --mode '.join(planning)}" if planning else "and this robot has none"
+            raise PlanningError(f"--goal needs a mode with a planner: {remedy}")
+        for goal in session.request.goals:
+            parse_goal(goal, session.config.robot)
+    except PlanningError as error:
         error.exit_code = 2
-        raise error
+        raise
