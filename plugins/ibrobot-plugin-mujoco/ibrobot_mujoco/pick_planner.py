@@ -56,16 +56,15 @@ class PickPlanner:
         down = _down(_heading(scene))
         hover = self._solve(above, down, start, opened, HOVER_TURN_RAD)
         grasp = self._solve(scene.cube, down, hover, opened, GRASP_TURN_RAD)
-        middle = self._solve((scene.cube + above) / 2, down, grasp, opened, HOVER_TURN_RAD)
         over_bin = scene.bin + np.array([0.0, 0.0, self.options.release_height])
         release = self._solve(over_bin, _down(_inward(scene.bin)), hover, closed, HOVER_TURN_RAD)
         held, lifted, freed = self._at(grasp, closed), self._at(hover, closed), self._at(release, opened)
         return [
             move("hover", start, hover, self.limits),
-            move("descend", hover, grasp, self.limits, via=middle),
+            move("descend", hover, grasp, self.limits),
             move("close", grasp, held, self.limits),
             rest("close", held, SETTLE_S),
-            move("lift", held, lifted, self.limits, via=self._at(middle, closed)),
+            move("lift", held, lifted, self.limits),
             move("carry", lifted, release, self.limits),
             move("open", release, freed, self.limits),
             rest("open", freed, SETTLE_S),

@@ -72,7 +72,15 @@ def test_joints_come_in_the_order_of_the_robot() -> None:
     np.testing.assert_allclose(solution[::-1], IK.solve(target, HOME, orientation_tolerance=1.0), atol=1e-6)
 
 
+def test_the_search_begins_again_where_it_was_led_astray() -> None:
+    position, astray = np.array([0.150, -0.060, 0.017]), np.array([-0.87, 0.71, 1.50, -1.24, 2.00, -0.06])
+    solution = IK.solve(TipPose(position, DOWN), astray, orientation_tolerance=0.5)
+    np.testing.assert_allclose(IK.forward(solution).position, position, atol=1e-3)
+
+
 def test_out_of_reach_says_how_far() -> None:
+    with pytest.raises(PlanningError, match=r"nearest found is \d+ mm"):
+        IK.solve(TipPose(np.array([0.7, 0.0, 0.1]), DOWN), HOME, orientation_tolerance=7.0)
     with pytest.raises(PlanningError, match=r"cannot reach \(0.700, 0.000, 0.100\) m .* nearest found is \d+ mm"):
         IK.solve(TipPose(np.array([0.7, 0.0, 0.1]), DOWN), HOME)
 

@@ -1,4 +1,4 @@
-"""The scripted pick: it succeeds within all limits, in chunks that agree, and tries again where something went wrong."""
+"""The scripted pick: succeeds within all limits, in chunks that agree, and tries again where something went wrong."""
 
 from __future__ import annotations
 
@@ -142,6 +142,28 @@ def test_a_cube_pushed_away_is_followed_from_where_it_is_clear(policy: ScriptedP
     tip = InverseKinematics(ROBOT).forward
     there = [tip(action).position for action in pushed[5]]
     assert min(np.linalg.norm(position - (0.20, -0.12, 0.0125)) for position in there) < 0.002
+
+
+def test_a_cube_taken_out_again_is_picked_again(policy: ScriptedPick) -> None:
+    chunk(policy, 0.0)
+    held, taken = chunk(policy, 60.0, BIN), [chunk(policy, 61.0 + second) for second in range(3)]
+    np.testing.assert_allclose(taken[0][:20], held[30:], rtol=0, atol=1e-12)
+    way = np.concatenate([held[:30], *(each[:30] for each in taken)])
+    assert np.abs(np.diff(way, axis=0)).max() < 4.0 / RATE_HZ
+    assert np.abs(np.diff(way, 2, axis=0)).max() < 40.0 / RATE_HZ**2
+    assert np.abs(way[-1] - held[0]).max() > 0.5
+
+
+def test_a_cube_lost_on_the_way_is_not_carried_on(policy: ScriptedPick) -> None:
+    ends = []
+    for lost in (False, True):
+        policy.reset(0)
+        chunks = [chunk(policy, float(second)) for second in range(4)]
+        above_bin = chunks[-1][30]
+        cube = CUBE if lost else tuple(InverseKinematics(ROBOT).forward(above_bin).position)
+        ends.append(chunk(policy, 4.0, cube, above_bin))
+    np.testing.assert_allclose(ends[1][:20], ends[0][:20], rtol=0, atol=1e-12)
+    assert np.abs(ends[1][-1] - ends[0][-1]).max() > 0.1
 
 
 def test_a_reset_forgets_the_episode(policy: ScriptedPick) -> None:
