@@ -6,6 +6,7 @@ from itertools import pairwise
 from typing import override
 
 import attrs
+import mujoco
 import numpy as np
 import pytest
 from ibrobot_mujoco.ik import InverseKinematics
@@ -164,6 +165,22 @@ def test_a_cube_lost_on_the_way_is_not_carried_on(policy: ScriptedPick) -> None:
         ends.append(chunk(policy, 4.0, cube, above_bin))
     np.testing.assert_allclose(ends[1][:20], ends[0][:20], rtol=0, atol=1e-12)
     assert np.abs(ends[1][-1] - ends[0][-1]).max() > 0.1
+
+
+def test_jaws_close_on_faces_whichever_face_the_cube_lies_on(policy: ScriptedPick) -> None:
+    half = np.pi / 4
+    yaw = np.array([np.cos(0.15), 0, 0, np.sin(0.15)])
+    ways = []
+    for roll in ([1, 0, 0, 0], [np.cos(half), np.sin(half), 0, 0], [np.cos(half), 0, np.sin(half), 0], [0, 1, 0, 0]):
+        lying = np.empty(4)
+        mujoco.mju_mulQuat(lying, yaw, np.array(roll, dtype=float))
+        seen = frame(0.0)
+        scene = np.array([*CUBE, *lying, *BIN])
+        policy.reset(0)
+        tensors = policy.preprocess(attrs.evolve(seen, values={**seen.values, SCENE: scene}))
+        ways.append(policy.postprocess(policy.infer(tensors)))
+    for way in ways[1:]:
+        np.testing.assert_allclose(way, ways[0], atol=1e-6)
 
 
 def test_a_reset_forgets_the_episode(policy: ScriptedPick) -> None:
