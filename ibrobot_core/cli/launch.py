@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 import os
-import queue
 import signal
 import sys
 import time
@@ -21,6 +20,7 @@ from ibrobot_core.errors import IbrobotError
 from ibrobot_core.launch.runtime import Runtime
 from ibrobot_core.launch.session import Request, Session
 from ibrobot_core.plugins import installed
+from ibrobot_core.terminal import Keys
 
 NOT_ALL_SUCCEEDED = 3
 _INTERRUPTED_TWICE = 130
@@ -68,31 +68,30 @@ def launch(config: str | None, **options: Any) -> None:
     with ExitStack() as stack:
         keys = None if options["headless"] or options["dry_run"] else _terminal_keys(stack)
         request = Request(
-            options["lockstep"], options["seed"], options["duration"], options["episodes"], options["goals"], keys
+            options["lockstep"], options["seed"], options["duration"], options["episodes"], options["goals"],
+            keys.subscribe if keys is not None else None,
         )  # fmt: skip
         runtime = Runtime(Session(robot, registry, request))
         if options["dry_run"]:
             click.echo("\n".join(runtime.plan.lines()))
             return
+        _stop_on_signals(runtime.session, keys)
         status = _run(runtime, path, live=not options["headless"] and sys.stdout.isatty())
     _tell(runtime, options["as_json"])
     runtime.raise_failure()
     sys.exit(status)
 
 
-def _terminal_keys(stack: ExitStack) -> Callable[[], queue.SimpleQueue[str]] | None:
-    """The terminal's keys, restored when `stack` unwinds; None where standard input is no terminal."""
+def _terminal_keys(stack: ExitStack) -> Keys | None:
+    """The terminal's keys, given back when `stack` unwinds; None where standard input is no terminal."""
     if not sys.stdin.isatty():
         return None
-    from ibrobot_core.terminal import Keys
-
-    return stack.enter_context(Keys()).subscribe
+    return stack.enter_context(Keys())
 
 
 def _run(runtime: Runtime, path: Path, *, live: bool) -> int:
     """Start, run and stop; returns the exit status of a run in which nothing failed."""
     session = runtime.session
-    _stop_on_signals(session)
     where = "simulation" if session.config.simulated else "hardware"
     with ExitStack() as stack:
         show = _live(runtime, stack) if live else _plain(session)
@@ -109,11 +108,13 @@ def _run(runtime: Runtime, path: Path, *, live: bool) -> int:
     return NOT_ALL_SUCCEEDED if outcome.successes < outcome.episodes or outcome.goals_failed else 0
 
 
-def _stop_on_signals(session: Session) -> None:
+def _stop_on_signals(session: Session, keys: Keys | None) -> None:
     """The first Ctrl-C (or SIGTERM) stops in order; a second Ctrl-C ends the host, and control stops the robot."""
 
     def stop(number: int, frame: object) -> None:
         if session.finished.is_set() and number == signal.SIGINT:
+            if keys is not None:
+                keys.close()
             os._exit(_INTERRUPTED_TWICE)
         session.log.info("stopping; Ctrl-C again stops at once")
         session.finish()

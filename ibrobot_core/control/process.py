@@ -27,6 +27,7 @@ from ibrobot_core.errors import IbrobotError
 from ibrobot_core.plugins import installed
 
 _STARTUP_TIMEOUT_S = 30.0
+_TOLD = "told to stop"
 _REPORT_TICKS = 20
 """Ticks between reports of punctuality and counters to the host."""
 
@@ -83,7 +84,7 @@ class ControlProcess:
         self._tell_host()
         for command in self._channel.receive():
             if command["do"] == "stop":
-                self._begin_stop("told to stop")
+                self._begin_stop(_TOLD)
             else:
                 self._channel.send(self._core.handle(command))
         if self._channel.closed:
@@ -106,7 +107,9 @@ class ControlProcess:
     def _begin_stop(self, why: str) -> None:
         if not self._stopping:
             self._stopping = True
-            logging.getLogger("ibrobot.control").info("stopping: %s", why)
+            logging.getLogger("ibrobot.control").log(
+                logging.DEBUG if why == _TOLD else logging.WARNING, "stopping: %s", why
+            )
             self._core.begin_stop()
 
     def _terminate(self, number: int, frame: Any) -> None:

@@ -14,6 +14,7 @@ from ibrobot_core.launch.builders.recording import Recording
 from ibrobot_core.launch.builders.simulation import SimulatedEpisodes
 from ibrobot_core.launch.builders.status import Status
 from ibrobot_core.launch.builders.teleop import TeleopFeeder
+from ibrobot_core.launch.builders.transforms import Transforms
 from ibrobot_core.launch.builders.viewer import ViewerWorker
 from ibrobot_core.launch.component import Component
 from ibrobot_core.launch.episodes import Episodes
@@ -82,6 +83,8 @@ def build_plan(session: Session) -> LaunchPlan:
             worker = SimulatedEpisodes(session, episodes, (parts.feeder.name,))
         components.append(parts.feeder)
     components.append(Status(session, (CONTROL,)))
+    if (urdf := config.robot.description.urdf) is not None:
+        components.append(Transforms(session, urdf, (CONTROL,)))
     if config.viewer is not None:
         components.append(ViewerWorker(session, config.viewer, (CONTROL,)))
     if worker is not None:
