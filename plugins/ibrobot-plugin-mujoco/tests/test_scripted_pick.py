@@ -181,6 +181,8 @@ def test_jaws_close_on_faces_whichever_face_the_cube_lies_on(policy: ScriptedPic
         ways.append(policy.postprocess(policy.infer(tensors)))
     for way in ways[1:]:
         np.testing.assert_allclose(way, ways[0], atol=1e-6)
+    policy.reset(0)
+    assert np.abs(chunk(policy, 0.0)[-1] - ways[0][-1])[4] > 0.2, "the wrist does not turn with the cube"
 
 
 def test_a_reset_forgets_the_episode(policy: ScriptedPick) -> None:
