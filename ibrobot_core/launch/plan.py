@@ -23,12 +23,24 @@ from ibrobot_core.launch.session import Session
 
 
 @attrs.frozen
+class ModeParts:
+    """What a mode adds to a run."""
+
+    models: tuple[Model, ...]
+    feeder: Feeder | None
+
+    def components(self) -> list[Component]:
+        """In starting order."""
+        return [*self.models, *([self.feeder] if self.feeder is not None else [])]
+
+
+@attrs.frozen
 class LaunchPlan:
     """Components in starting order."""
 
     components: tuple[Component, ...]
-    feeder: Feeder | None
-    """What feeds the first mode."""
+    mode: ModeParts
+    """What the first mode brings; among `components` too."""
     episodes: Episodes
     episodes_worker: SimulatedEpisodes | None
 
@@ -40,14 +52,6 @@ class LaunchPlan:
             for number, c in enumerate(self.components, 1)
         ]
         return [*lines, "stops in reverse order"]
-
-
-@attrs.frozen
-class ModeParts:
-    """What a mode adds to a run."""
-
-    models: tuple[Model, ...]
-    feeder: Feeder | None
 
 
 def mode_parts(session: Session, name: str, sensors: tuple[str, ...]) -> ModeParts:
@@ -89,7 +93,7 @@ def build_plan(session: Session) -> LaunchPlan:
         components.append(ViewerWorker(session, config.viewer, (CONTROL,)))
     if worker is not None:
         components.append(worker)
-    return LaunchPlan(tuple(_ordered(components)), parts.feeder, episodes, worker)
+    return LaunchPlan(tuple(_ordered(components)), parts, episodes, worker)
 
 
 def _ordered(components: list[Component]) -> list[Component]:

@@ -28,6 +28,8 @@ class Runtime:
         check_goals(session)
         self.session = session
         self.plan: LaunchPlan = build_plan(session)
+        self._mode_parts = self.plan.mode
+        session.feeder = self.plan.mode.feeder
         self._started: list[Component] = []
         self._begun_ns = session.clock.now_ns()
 
@@ -45,9 +47,6 @@ class Runtime:
                 if isinstance(component, Control) and session.request.lockstep:
                     component.step(session.clock.now_ns())
             self._begun_ns = session.clock.now_ns()
-            if session.feeder is None:
-                self._await_state()
-                session.feeder = self.plan.feeder
             if self.plan.episodes_worker is None:
                 self._begin_mode()
         except BaseException:
@@ -88,32 +87,27 @@ class Runtime:
             raise NotSupported(f"no mode {name!r}; the modes are: {', '.join(session.config.control_modes)}")
         if name == session.mode:
             return
-        if self.plan.episodes_worker is not None:
-            self.plan.episodes_worker.stop()
-            self._started = [c for c in self._started if c is not self.plan.episodes_worker]
-            self.plan.episodes.end("unknown")
-        parts = mode_parts(session, name, tuple(f"sensor:{p}" for p in session.config.peripherals))
-        new: list[Component] = [*parts.models, *([parts.feeder] if parts.feeder is not None else [])]
-        begun: list[Component] = []
+        parts = mode_parts(session, name, tuple(f"sensor:{sensor}" for sensor in session.config.peripherals))
+        new = parts.components()
         try:
             for component in new:
-                begun.append(component)
                 component.start()
         except BaseException:
-            for component in reversed(begun):
+            for component in reversed(new):
                 component.stop()
             raise
-        previous, old = session.mode, session.feeder
-        if old is not None:
-            old.end()
+        self._end_episodes()
+        previous = session.mode
+        if session.feeder is not None:
+            session.feeder.end()
         session.command("switch_mode", mode=name)
         session.mode, session.feeder = name, parts.feeder
         if parts.feeder is not None:
             parts.feeder.begin(session.request.seed)
-        if old is not None:
-            old.stop()
-            self._started = [c for c in self._started if c is not old]
-        self._started += new
+        old, self._mode_parts = self._mode_parts.components(), parts
+        self._started = [component for component in self._started if component not in old] + new
+        for component in reversed(old):
+            component.stop()
         session.registry.emit(
             "ibrobot_mode_changed", robot=session.config.robot.name, mode=name, previous=previous,
             stamp_ns=session.clock.now_ns(),
@@ -178,6 +172,14 @@ class Runtime:
             "drops": session.bus.dropped(),
         }
 
+    def _end_episodes(self) -> None:
+        """Simulated episodes belong to the mode in which the run began."""
+        worker = self.plan.episodes_worker
+        if worker in self._started:
+            worker.stop()
+            self._started.remove(worker)
+        self.plan.episodes.end("unknown")
+
     def _await_state(self) -> None:
         session = self.session
         states = session.bus.subscribe("/joint_states", 1)
@@ -192,6 +194,7 @@ class Runtime:
     def _begin_mode(self) -> None:
         """A mode without simulated episodes: it begins where the robot is, as one open-ended episode."""
         session = self.session
+        self._await_state()
         assert session.state is not None
         session.epoch = session.state.epoch
         if session.feeder is not None:

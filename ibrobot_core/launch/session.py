@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import attrs
@@ -23,7 +24,6 @@ from ibrobot_core.units import ns
 if TYPE_CHECKING:
     from ibrobot_core.control.host import ControlHost
     from ibrobot_core.dispatch.dispatcher import DispatchStats
-    from ibrobot_core.launch.feeder import Feeder
 
 
 @attrs.frozen
@@ -48,6 +48,29 @@ class Outcome:
     goals_failed: int = 0
 
 
+class Feed(ABC):
+    """What gives the active executors something to do in a mode. It is quiet until `begin`, and after `end`."""
+
+    @abstractmethod
+    def begin(self, seed: int) -> None:
+        """The mode was entered, or control was reset: start afresh."""
+
+    @abstractmethod
+    def end(self) -> None:
+        """The mode is left."""
+
+    @abstractmethod
+    def stop(self) -> None:
+        """Release what it took."""
+
+    def take_goal(self, event: Mapping[str, Any]) -> None:
+        """A goal of an executor changed its state."""
+
+    def help(self) -> str:
+        """What an operator must know in this mode."""
+        return ""
+
+
 class Session:
     """What the components of a run share. Everything here is safe to read from any thread."""
 
@@ -61,7 +84,7 @@ class Session:
         self.outcome = Outcome()
         self.mode = config.default_control_mode
         self.epoch = 0
-        self.feeder: Feeder | None = None
+        self.feeder: Feed | None = None
         self.state: ControlState | None = None
         self.stats: DispatchStats | None = None
         self.rates: dict[str, float] = {}

@@ -1,1 +1,1 @@
-"""The life of an episode: begun, written, ended, with its metadata."""
+"""Recording: where episodes are kept, and what is written beside their messages."""

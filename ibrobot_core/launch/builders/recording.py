@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import queue
-from pathlib import Path
 from typing import override
 
-import ibrobot_core
 from ibrobot_core.bus import Subscription
 from ibrobot_core.config.schema import Recording as RecordingConfig
-from ibrobot_core.contract.specs import Contract
-from ibrobot_core.errors import RecorderError
 from ibrobot_core.interfaces import EpisodeEnd, EpisodeStart, Recorder
 from ibrobot_core.launch.component import Worker
 from ibrobot_core.launch.session import Session
+from ibrobot_core.recording.episode import episode_start
 
 _DEPTH = 4096
 """Messages that may wait for the recorder."""
@@ -43,26 +40,13 @@ class Recording(Worker):
 
     def begin(self, number: int) -> None:
         """From here on messages belong to a new episode."""
-        session, config = self._session, self._config
-        root = Path(config.root) / config.dataset / "episodes"
-        try:
-            root.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise RecorderError(f"recording.root: {root} cannot be made: {error.strerror}") from None
-        taken = [int(path.name.removeprefix("episode_")) for path in root.glob("episode_[0-9]*") if path.is_dir()]
-        contract = Contract.from_config(session.config)
-        metadata = {
-            "robot": session.config.robot.name, "mode": session.mode, "fingerprint": contract.fingerprint(),
-            "ibrobot_version": ibrobot_core.__version__, "seed": str(session.request.seed + number - 1),
-        }  # fmt: skip
-        topics = {topic: type_ for topic, (type_, _) in session.bus.topics().items() if self._keeps(topic, contract)}
-        directory = root / f"episode_{max(taken, default=0) + 1:06d}"
-        self._orders.put(EpisodeStart(directory, session.clock.now_ns(), topics, metadata))
-
-    def _keeps(self, topic: str, contract: Contract) -> bool:
-        if self._config.topics == "contract":
-            return topic in contract.topics
-        return self._config.topics == "all" or topic in self._config.topics
+        session = self._session
+        topics = {topic: type_ for topic, (type_, _) in session.bus.topics().items()}
+        seed = session.request.seed + number - 1
+        start = episode_start(
+            session.config, self._config, topics, mode=session.mode, seed=seed, stamp_ns=session.clock.now_ns()
+        )
+        self._orders.put(start)
 
     def end(self, outcome: str) -> None:
         """Messages up to here belong to the episode."""

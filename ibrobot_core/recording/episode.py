@@ -1,0 +1,56 @@
+"""Where an episode is recorded and what is known of it: `ROOT/DATASET/episodes/episode_000001`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import ibrobot_core
+from ibrobot_core.config import RobotConfig
+from ibrobot_core.config.schema import Recording
+from ibrobot_core.contract.specs import Contract
+from ibrobot_core.errors import RecorderError
+from ibrobot_core.interfaces import EpisodeStart
+
+_PREFIX = "episode_"
+
+
+def episode_start(
+    config: RobotConfig, recording: Recording, topics: Mapping[str, str], *, mode: str, seed: int, stamp_ns: int
+) -> EpisodeStart:
+    """The start of the next episode of the dataset.
+
+    Args:
+        config: the robot.
+        recording: its `recording` section.
+        topics: every topic on the bus: topic -> message type; those that the section asks for are kept.
+        mode: the control mode.
+        seed: of the scene.
+        stamp_ns: when it begins [ns].
+
+    Raises:
+        RecorderError: when the folder cannot be made.
+    """
+    contract = Contract.from_config(config)
+    root = recording.root / recording.dataset / "episodes"
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RecorderError(f"recording.root: {root} cannot be made: {error.strerror}") from None
+    metadata = {
+        "robot": config.robot.name, "robot_type": config.robot.robot_type, "mode": mode,
+        "fingerprint": contract.fingerprint(), "ibrobot_version": ibrobot_core.__version__, "seed": str(seed),
+    }  # fmt: skip
+    kept = {topic: type_ for topic, type_ in topics.items() if _keeps(recording, topic, contract)}
+    return EpisodeStart(root / f"{_PREFIX}{_next_number(root):06d}", stamp_ns, kept, metadata)
+
+
+def _next_number(root: Path) -> int:
+    numbers = [path.name.removeprefix(_PREFIX) for path in root.glob(f"{_PREFIX}*")]
+    return max((int(number) for number in numbers if number.isdigit()), default=0) + 1
+
+
+def _keeps(recording: Recording, topic: str, contract: Contract) -> bool:
+    if recording.topics == "contract":
+        return topic in contract.topics
+    return recording.topics == "all" or topic in recording.topics
