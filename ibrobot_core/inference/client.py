@@ -9,7 +9,9 @@ from abc import ABC, abstractmethod
 from typing import override
 
 import attrs
+import numpy as np
 
+from ibrobot_core.errors import PolicyError
 from ibrobot_core.interfaces import Frame, Policy
 from ibrobot_core.robot import Vector
 
@@ -41,7 +43,11 @@ class InferenceClient(ABC):
 
     @abstractmethod
     def poll(self, timeout_s: float = 0.0) -> Chunk | None:
-        """An answer that came, waiting for one up to `timeout_s` [s]."""
+        """An answer that came, waiting for one up to `timeout_s` [s].
+
+        Raises:
+            PolicyError: when the policy could not be reset, so that nothing it says can be trusted.
+        """
 
     @abstractmethod
     def reset(self, seed: int) -> None:
@@ -56,7 +62,7 @@ def run_policy(policy: Policy, request: DispatchInfer) -> Chunk:
     """The three steps, one after the other. A policy that raises gives a chunk with its error: the arm holds."""
     stamp_ns = request.frame.stamp_ns
     try:
-        actions = policy.postprocess(policy.infer(policy.preprocess(request.frame)))
+        actions = np.asarray(policy.postprocess(policy.infer(policy.preprocess(request.frame))), dtype=np.float64)
     except Exception as error:
         logging.getLogger("ibrobot.inference").exception("the policy failed")
         return Chunk(request.id, stamp_ns, None, f"{type(error).__name__}: {error}")
@@ -90,12 +96,16 @@ class LockstepClient(InferenceClient):
 
 
 class MonolithicClient(InferenceClient):
-    """Runs the policy in a thread of the host process, with no serialisation between the steps."""
+    """Runs the policy in a thread of the host process, with no serialisation between the steps.
+
+    A request that waits behind a slow one is not run at all when a newer one, or a reset, waits behind it: nobody
+    waits for its answer any more.
+    """
 
     def __init__(self, policy: Policy) -> None:
         self._policy = policy
         self._work: queue.SimpleQueue[DispatchInfer | int | None] = queue.SimpleQueue()
-        self._chunks: queue.SimpleQueue[Chunk] = queue.SimpleQueue()
+        self._chunks: queue.SimpleQueue[Chunk | PolicyError] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name="inference", daemon=True)
         self._thread.start()
 
@@ -106,9 +116,12 @@ class MonolithicClient(InferenceClient):
     @override
     def poll(self, timeout_s: float = 0.0) -> Chunk | None:
         try:
-            return self._chunks.get(timeout_s > 0, timeout_s or None)
+            answer = self._chunks.get(timeout_s > 0, timeout_s or None)
         except queue.Empty:
             return None
+        if isinstance(answer, PolicyError):
+            raise answer
+        return answer
 
     @override
     def reset(self, seed: int) -> None:
@@ -123,6 +136,11 @@ class MonolithicClient(InferenceClient):
     def _run(self) -> None:
         while (work := self._work.get()) is not None:
             if isinstance(work, DispatchInfer):
-                self._chunks.put(run_policy(self._policy, work))
-            else:
+                if self._work.empty():
+                    self._chunks.put(run_policy(self._policy, work))
+                continue
+            try:
                 self._policy.reset(work)
+            except Exception as error:
+                logging.getLogger("ibrobot.inference").exception("the policy failed")
+                self._chunks.put(PolicyError(f"the policy's reset failed: {type(error).__name__}: {error}"))

@@ -11,6 +11,8 @@ from ibrobot_core.errors import ComponentFailed, IbrobotError
 
 _POLL_S = 0.1
 """The longest that a unit of work may wait, so that a stop is seen."""
+_STOP_TIMEOUT_S = 5.0
+"""How long a unit of work may go on after a stop."""
 
 
 class Component(ABC):
@@ -78,6 +80,10 @@ class Worker(Component):
     def teardown(self) -> None:
         """Close what `setup` opened; also called when it failed."""
 
+    def pause(self, timeout_s: float) -> None:
+        """Wait `timeout_s` [s], or until the stop."""
+        self._end.wait(timeout_s)
+
     def is_ready(self) -> bool:
         """Whether dependants may start; asked after `setup` and each unit of work."""
         return True
@@ -110,7 +116,9 @@ class Worker(Component):
     def stop(self) -> None:
         self._end.set()
         if self._thread is not None and self._thread is not threading.current_thread():
-            self._thread.join()
+            self._thread.join(_STOP_TIMEOUT_S)
+            if self._thread.is_alive():
+                raise ComponentFailed(f"{self.name} hangs: still at work {_STOP_TIMEOUT_S:g} s after it was to end")
             self._thread = None
         if self._lockstep and self._set_up:
             self._set_up = False

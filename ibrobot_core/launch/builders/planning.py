@@ -26,6 +26,7 @@ GO_TO = "/planning/go_to"
 class _Motion:
     """A goal under way: what each executor still has to say."""
 
+    number: int
     text: str
     waiting: set[str]
     failures: list[str] = attrs.field(factory=list)
@@ -53,7 +54,6 @@ class PlanningFeeder(Feeder):
         descriptor = session.registry.find("planner", self._component.type)
         self._planner = descriptor.make(self._component.options, session.context(self._component.type))
         self._planner.load()
-        session.bus.serve(GO_TO, self.go_to)
 
     def go_to(self, goal: str) -> None:
         """Queue a goal: a pose's name, or `joint=radians,joint=radians`.
@@ -66,7 +66,13 @@ class PlanningFeeder(Feeder):
 
     @override
     def begin_feeding(self, seed: int) -> None:
-        self._motion = None
+        if self._motion is not None:
+            self._finish(self._motion.text, ["control was reset"])
+        self.session.bus.serve(GO_TO, self.go_to)
+
+    @override
+    def end_feeding(self) -> None:
+        self.session.bus.unserve(GO_TO)
 
     @override
     def take_goal(self, event: Mapping[str, Any]) -> None:
@@ -88,10 +94,15 @@ class PlanningFeeder(Feeder):
         session, number = self.session, next(self._numbers)
         try:
             goals = self._plan(text)
-            self._motion = _Motion(text, set(goals))
+        except PlanningError as error:
+            self._finish(text, [str(error)])
+            return
+        self._motion = _Motion(number, text, set(goals))
+        try:
             for executor, goal in goals.items():
                 session.control.call("goal", executor=executor, goal_id=f"{number}:{executor}", goal=goal)
-        except (PlanningError, HardwareError) as error:
+        except HardwareError as error:
+            session.control.call("cancel")  # those that took their goal already
             self._finish(text, [str(error)])
 
     def _plan(self, text: str) -> dict[str, Mapping[str, Any]]:
@@ -122,7 +133,7 @@ class PlanningFeeder(Feeder):
 
     def _advance(self, event: Mapping[str, Any]) -> None:
         motion = self._motion
-        if motion is None or event["state"] == "executing":
+        if motion is None or event["state"] == "executing" or event["goal"] != f"{motion.number}:{event['executor']}":
             return
         motion.waiting.discard(str(event["executor"]))
         if event["state"] != "succeeded":
@@ -145,7 +156,6 @@ class PlanningFeeder(Feeder):
     def teardown(self) -> None:
         if self._planner is not None:
             self._planner.close()
-        self.session.bus.unserve(GO_TO)
 
 
 def parse_goal(text: str, robot: Robot) -> dict[str, float]:

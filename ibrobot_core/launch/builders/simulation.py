@@ -30,19 +30,22 @@ class SimulatedEpisodes(Worker):
     @override
     def work(self, timeout_s: float) -> None:
         session = self._session
-        if session.finished.is_set():
-            return
-        if self._begun_ns is None:
-            self._begin_episode()
-        elif session.state is not None and session.state.epoch == session.epoch:
-            age_ns = session.state.stamp_ns - self._begun_ns
-            if session.state.success:
-                self._end_episode("success")
-            elif age_ns > self._longest_ns:
-                session.log.info("episode %d: no success within %.1f s", self._episodes.number, age_ns / NS_PER_S)
-                self._end_episode("failure")
+        if not session.finished.is_set():
+            self._judge(session)
         if timeout_s > 0:
-            session.finished.wait(min(timeout_s, session.config.control.rate_hz**-1))
+            self.pause(min(timeout_s, session.config.control.rate_hz**-1))
+
+    def _judge(self, session: Session) -> None:
+        state = session.state
+        if self._begun_ns is None:
+            # Setting the scene up anew would clear an emergency stop, which is for a person to do.
+            if state is None or not state.estop:
+                self._begin_episode()
+        elif state is not None and state.epoch == session.epoch and state.success:
+            self._end_episode("success")
+        elif (age_ns := session.clock.now_ns() - self._begun_ns) > self._longest_ns:
+            session.log.info("episode %d: no success within %.1f s", self._episodes.number, age_ns / NS_PER_S)
+            self._end_episode("failure")
 
     def _begin_episode(self) -> None:
         session = self._session

@@ -39,7 +39,7 @@ class Status(Worker):
             session.bus.publish("/robot_status", self._status(now_ns))
             session.bus.publish("/diagnostics", self._diagnostics(now_ns))
         if timeout_s > 0:
-            session.finished.wait(timeout_s)
+            self.pause(timeout_s)
 
     @override
     def teardown(self) -> None:

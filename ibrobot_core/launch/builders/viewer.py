@@ -40,7 +40,7 @@ class ViewerWorker(Worker):
         if not self._viewer.update():
             self._session.finish()
         if timeout_s > 0:
-            self._session.finished.wait(max(0.0, 1.0 / _RATE_HZ - (time.monotonic() - begun)))
+            self.pause(max(0.0, 1.0 / _RATE_HZ - (time.monotonic() - begun)))
 
     @override
     def teardown(self) -> None:
