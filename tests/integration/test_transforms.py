@@ -1,0 +1,50 @@
+"""The URDF's transforms against MuJoCo's kinematics of the MJCF."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from ibrobot_core.config import load
+from ibrobot_core.launch.builders.transforms import read_urdf
+from ibrobot_core.messages import Quaternion, Vector3
+
+pytestmark = pytest.mark.integration
+
+CONFIG = Path(__file__).parents[2] / "configs" / "so101_blind.yaml"
+BODIES = {"shoulder_link": "shoulder", "lower_arm_link": "lower_arm", "gripper_link": "gripper"}
+
+
+def matrix(translation: Vector3, rotation: Quaternion) -> np.ndarray:
+    x, y, z, w = rotation.x, rotation.y, rotation.z, rotation.w
+    result = np.eye(4)
+    result[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    result[:3, 3] = translation.x, translation.y, translation.z
+    return result
+
+
+def test_links_stand_where_mujoco_has_them() -> None:
+    robot = load(CONFIG, sim=True).robot
+    assert robot.description.urdf is not None
+    position = np.array([0.3, -0.5, 0.7, 0.2, 0.9, 0.4])
+    links = read_urdf(robot.description.urdf)
+    at = dict(zip(robot.joint_names, position, strict=True))
+    poses = {"base_link": np.eye(4)}
+    while len(poses) <= len(links):
+        for link in links:
+            if link.parent in poses and link.child not in poses:
+                transform = link.transform(float(at.get(link.joint, 0.0)), 0)
+                poses[link.child] = poses[link.parent] @ matrix(transform.translation, transform.rotation)
+    model = mujoco.MjModel.from_xml_path(str(robot.description.mjcf))
+    physics = mujoco.MjData(model)
+    physics.qpos[:] = position
+    mujoco.mj_kinematics(model, physics)
+    for link_name, body in BODIES.items():
+        np.testing.assert_allclose(poses[link_name][:3, 3], physics.body(body).xpos, atol=2e-4)
