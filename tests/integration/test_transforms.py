@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import mujoco
 import numpy as np
 import pytest
 
@@ -31,6 +30,8 @@ def matrix(translation: Vector3, rotation: Quaternion) -> np.ndarray:
 
 
 def test_links_stand_where_mujoco_has_them() -> None:
+    import mujoco
+
     robot = load(CONFIG, sim=True).robot
     assert robot.description.urdf is not None
     position = np.array([0.3, -0.5, 0.7, 0.2, 0.9, 0.4])
