@@ -16,6 +16,7 @@ from typing import Any
 import click
 
 from ibrobot_core.config import find_config, load
+from ibrobot_core.control.core import EMERGENCY_STOP
 from ibrobot_core.errors import IbrobotError
 from ibrobot_core.launch.runtime import Runtime
 from ibrobot_core.launch.session import Request, Session
@@ -23,6 +24,7 @@ from ibrobot_core.plugins import installed
 from ibrobot_core.terminal import Keys
 
 NOT_ALL_SUCCEEDED = 3
+_FAULTED = 1
 _INTERRUPTED_TWICE = 130
 _PANEL_HZ = 8
 _PLAIN_PERIOD_S = 2.0
@@ -49,8 +51,8 @@ def launch(config: str | None, **options: Any) -> None:
 
     CONFIG is a robot YAML: a path, or the name of one that comes with ibrobot or a plugin; so101 when left out.
 
-    Exits with 0 when the run ended well, 1 when a component failed, 2 for a wrong command line or YAML, 3 when not
-    every episode or goal succeeded, 130 on a second Ctrl-C.
+    Exits with 0 when the run ended well, 1 when a component failed or a fault was raised, 2 for a wrong command line
+    or YAML, 3 when not every episode or goal succeeded, 130 on a second Ctrl-C.
     """
     if options["window"] and options["headless"]:
         raise click.UsageError("--window and --headless exclude each other")
@@ -105,6 +107,8 @@ def _run(runtime: Runtime, path: Path, *, live: bool) -> int:
             while not runtime.wait(1.0 / _PANEL_HZ):
                 show()
     outcome = session.outcome
+    if any(fault != EMERGENCY_STOP for fault in outcome.faults):
+        return _FAULTED
     return NOT_ALL_SUCCEEDED if outcome.successes < outcome.episodes or outcome.goals_failed else 0
 
 

@@ -21,6 +21,8 @@ from ibrobot_core.interfaces import Episode, Executor, JointReading, Plan, Signa
 from ibrobot_core.robot import Vector
 from ibrobot_core.units import ns
 
+EMERGENCY_STOP = "emergency stop"
+"""The fault that a person raises."""
 _POSE_SPEED = 0.25
 """Fraction of the velocity limits at which the stop behaviour `pose` moves."""
 _POSE_TIMEOUT_S = 10.0
@@ -296,7 +298,7 @@ class ControlCore:
 
     def _estop(self) -> None:
         self._safety.estop()
-        self._raise_fault("emergency stop")
+        self._raise_fault(EMERGENCY_STOP)
 
     def _reset(self) -> None:
         """Clear faults and the emergency stop, and enter the mode anew from where the joints are."""

@@ -142,7 +142,16 @@ class Worker(Component):
                 self._on_failure(self.name, error)
 
 
+def told(error: BaseException) -> str:
+    """An error in words, in as many lines as it has."""
+    return str(error).strip() if isinstance(error, IbrobotError) else f"{type(error).__name__}: {error}".strip()
+
+
 def cause(error: BaseException) -> str:
     """An error on one line."""
-    text = str(error).strip().replace("\n", "; ")
-    return text if isinstance(error, IbrobotError) else f"{type(error).__name__}: {text}"
+    return told(error).replace("\n", "; ")
+
+
+def exit_code(error: BaseException) -> int:
+    """The exit status of a run that `error` ended."""
+    return error.exit_code if isinstance(error, IbrobotError) else 1

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 from ibrobot_core.clock import SteppedClock
-from ibrobot_core.errors import ComponentFailed, HardwareError, IbrobotError, NotSupported
+from ibrobot_core.errors import ComponentFailed, HardwareError, NotSupported
 from ibrobot_core.launch.builders.control import Control
 from ibrobot_core.launch.builders.planning import check_goals
-from ibrobot_core.launch.component import Component, cause
+from ibrobot_core.launch.component import Component, cause, exit_code, told
 from ibrobot_core.launch.plan import LaunchPlan, build_plan, mode_parts
 from ibrobot_core.launch.session import Session
 from ibrobot_core.units import ns
@@ -43,9 +43,7 @@ class Runtime:
         try:
             for component in self.plan.components:
                 self._started.append(component)
-                component.start()
-                if isinstance(component, Control) and session.request.lockstep:
-                    component.step(session.clock.now_ns())
+                self._start(component)
             self._begun_ns = session.clock.now_ns()
             if self.plan.episodes_worker is None:
                 self._begin_mode()
@@ -91,27 +89,24 @@ class Runtime:
         new = parts.components()
         try:
             for component in new:
-                component.start()
+                self._start(component)
+            self._change_owner(name)
         except BaseException:
-            for component in reversed(new):
-                component.stop()
+            self._stop_all(new)
             raise
-        self._end_episodes()
+        self.plan.episodes.end("unknown")
         previous = session.mode
-        if session.feeder is not None:
-            session.feeder.end()
-        session.command("switch_mode", mode=name)
         session.mode, session.feeder = name, parts.feeder
         if parts.feeder is not None:
             parts.feeder.begin(session.request.seed)
         old, self._mode_parts = self._mode_parts.components(), parts
         self._started = [component for component in self._started if component not in old] + new
-        for component in reversed(old):
-            component.stop()
+        self._stop_all(old)
         session.registry.emit(
             "ibrobot_mode_changed", robot=session.config.robot.name, mode=name, previous=previous,
             stamp_ns=session.clock.now_ns(),
         )  # fmt: skip
+        self.plan.episodes.begin()
 
     def reset(self) -> None:
         """Clear faults and the emergency stop; the mode begins anew from where the joints are.
@@ -128,15 +123,17 @@ class Runtime:
 
     def stop(self) -> None:
         """Stop every component, the last started first. Errors are logged, so that all are stopped."""
-        self.session.finish()
-        while self._started:
-            component = self._started.pop()
-            try:
-                component.stop()
-            except Exception as error:
-                self.session.log.error("%s did not stop well: %s", component.name, cause(error))
-                if isinstance(component, Control):
-                    raise
+        session = self.session
+        session.finish()
+        session.bus.unserve(SET_MODE)
+        session.bus.unserve(RESET)
+        session.bus.unserve(ESTOP)
+        started, self._started = self._started, []
+        if (worker := self.plan.episodes_worker) in started:
+            started.remove(worker)
+            self._stop_all([worker])
+        self.plan.episodes.end("unknown")
+        self._stop_all(started)
 
     def raise_failure(self) -> None:
         """Raise what ended the run, if something failed.
@@ -147,7 +144,7 @@ class Runtime:
         if self.session.failure is not None:
             component, error = self.session.failure
             failure = ComponentFailed(f"{component}: {cause(error)}")
-            failure.exit_code = error.exit_code if isinstance(error, IbrobotError) else 1
+            failure.exit_code = exit_code(error)
             raise failure
 
     def summary(self) -> dict[str, Any]:
@@ -172,13 +169,48 @@ class Runtime:
             "drops": session.bus.dropped(),
         }
 
-    def _end_episodes(self) -> None:
-        """Simulated episodes belong to the mode in which the run began."""
+    def _start(self, component: Component) -> None:
+        try:
+            component.start()
+            if isinstance(component, Control) and self.session.request.lockstep:
+                component.step(self.session.clock.now_ns())
+        except Exception as error:
+            failure = ComponentFailed(f"{component.name}: {told(error)}")
+            failure.exit_code = exit_code(error)
+            raise failure from error
+
+    def _stop_all(self, components: list[Component]) -> None:
+        """Stop `components`, the last first; what one raises is logged, so that all are stopped."""
+        for component in reversed(components):
+            try:
+                component.stop()
+            except Exception as error:  # noqa: BLE001 - contained: the others must be stopped all the same
+                self.session.log.error("%s did not stop well: %s", component.name, cause(error))
+                if isinstance(component, Control) and self.session.failure is None:
+                    self.session.failure = component.name, error
+
+    def _change_owner(self, mode: str) -> None:
+        """Have control switch; where it refuses, the present mode goes on.
+
+        Simulated episodes belong to the mode in which the run began: they end with it.
+        """
+        session = self.session
         worker = self.plan.episodes_worker
-        if worker in self._started:
+        judged = worker is not None and worker in self._started
+        if worker is not None and judged:
             worker.stop()
+        if session.feeder is not None:
+            session.feeder.end()
+        try:
+            session.command("switch_mode", mode=mode)
+        except BaseException:
+            if session.feeder is not None:
+                session.feeder.begin(session.request.seed)
+            if worker is not None and judged:
+                worker.start()
+            raise
+        if worker is not None and judged:
             self._started.remove(worker)
-        self.plan.episodes.end("unknown")
 
     def _await_state(self) -> None:
         session = self.session

@@ -94,6 +94,7 @@ class Session:
         """Set when the run should stop."""
         self.log = logging.getLogger("ibrobot")
         self._control: ControlHost | None = None
+        self._commanding = threading.Lock()
 
     @property
     def control(self) -> ControlHost:
@@ -149,7 +150,8 @@ class Session:
 
     def command(self, do: str, **arguments: Any) -> None:
         """Have control carry out a command that begins a new epoch: a mode switch, a reset."""
-        self.epoch = int(self.control.call(do, **arguments)["epoch"])
+        with self._commanding:  # the epoch of the last command must be the one that stays
+            self.epoch = int(self.control.call(do, **arguments)["epoch"])
 
     def finish(self) -> None:
         """End the run in good order."""

@@ -23,7 +23,8 @@ def episode_start(
     Args:
         config: the robot.
         recording: its `recording` section.
-        topics: every topic on the bus: topic -> message type; those that the section asks for are kept.
+        topics: every topic on the bus: topic -> message type; those that the section asks for are kept. Where it
+            asks for the contract's, they are all there from the start, also the ones that nobody published yet.
         mode: the control mode.
         seed: of the scene.
         stamp_ns: when it begins [ns].
@@ -41,16 +42,15 @@ def episode_start(
         "robot": config.robot.name, "robot_type": config.robot.robot_type, "mode": mode,
         "fingerprint": contract.fingerprint(), "ibrobot_version": ibrobot_core.__version__, "seed": str(seed),
     }  # fmt: skip
-    kept = {topic: type_ for topic, type_ in topics.items() if _keeps(recording, topic, contract)}
+    if recording.topics == "contract":
+        kept = contract.topics
+    else:
+        kept = {
+            topic: type_ for topic, type_ in topics.items() if recording.topics == "all" or topic in recording.topics
+        }
     return EpisodeStart(root / f"{_PREFIX}{_next_number(root):06d}", stamp_ns, kept, metadata)
 
 
 def _next_number(root: Path) -> int:
     numbers = [path.name.removeprefix(_PREFIX) for path in root.glob(f"{_PREFIX}*")]
     return max((int(number) for number in numbers if number.isdigit()), default=0) + 1
-
-
-def _keeps(recording: Recording, topic: str, contract: Contract) -> bool:
-    if recording.topics == "contract":
-        return topic in contract.topics
-    return recording.topics == "all" or topic in recording.topics

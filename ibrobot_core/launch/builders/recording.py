@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import queue
+import threading
+from collections import deque
 from typing import override
 
 from ibrobot_core.bus import Subscription
@@ -27,9 +28,13 @@ class Recording(Worker):
         self._session = session
         self._config = config
         self._recorder: Recorder | None = None
-        self._orders: queue.SimpleQueue[EpisodeStart | EpisodeEnd] = queue.SimpleQueue()
+        self._orders: deque[EpisodeStart | EpisodeEnd] = deque()
+        self._order = threading.Lock()
+        """Held while an order is stamped and queued, and while orders and messages are taken: neither overtakes."""
         self._incoming: Subscription | None = None
-        self._recording = False
+        self._kept: frozenset[str] | None = None
+        """Topics of the open episode; None outside of one."""
+        self._dropped = 0
 
     @override
     def setup(self) -> None:
@@ -43,46 +48,51 @@ class Recording(Worker):
         session = self._session
         topics = {topic: type_ for topic, (type_, _) in session.bus.topics().items()}
         seed = session.request.seed + number - 1
-        start = episode_start(
-            session.config, self._config, topics, mode=session.mode, seed=seed, stamp_ns=session.clock.now_ns()
-        )
-        self._orders.put(start)
+        with self._order:
+            start = episode_start(
+                session.config, self._config, topics, mode=session.mode, seed=seed, stamp_ns=session.bus.snapshot_ns()
+            )
+            self._orders.append(start)
 
     def end(self, outcome: str) -> None:
         """Messages up to here belong to the episode."""
-        dropped = {"*": self._incoming.dropped} if self._incoming and self._incoming.dropped else {}
-        self._orders.put(EpisodeEnd(self._session.clock.now_ns(), outcome, dropped))
+        assert self._incoming is not None
+        with self._order:
+            dropped, self._dropped = self._incoming.dropped - self._dropped, self._incoming.dropped
+            lost = {"*": dropped} if dropped else {}
+            self._orders.append(EpisodeEnd(self._session.bus.snapshot_ns(), outcome, lost))
 
     @override
     def work(self, timeout_s: float) -> None:
         assert self._recorder is not None
         assert self._incoming is not None
-        item = self._incoming.get(timeout_s)
-        while not self._orders.empty():
-            order = self._orders.get()
-            if isinstance(order, EpisodeStart):
-                self._recorder.begin(order)
-                self._kept = set(order.topics)
-                self._recording = True
-            elif self._recording:
-                self._drain(self._recorder, order.stamp_ns)
-                self._recorder.end(order)
-                self._recording = False
-        if item is not None and self._recording and item.topic in self._kept:
-            self._recorder.write(item.topic, item.message, item.received_ns)
-        self._drain(self._recorder, None)
+        first = self._incoming.get(timeout_s)
+        with self._order:
+            orders, self._orders = self._orders, deque()
+            items = [*([first] if first is not None else []), *self._incoming.drain()]
+        for item in items:
+            while orders and orders[0].stamp_ns < item.received_ns:
+                self._obey(self._recorder, orders.popleft())
+            if self._kept is not None and item.topic in self._kept:
+                self._recorder.write(item.topic, item.message, item.received_ns)
+        for order in orders:
+            self._obey(self._recorder, order)
 
-    def _drain(self, recorder: Recorder, until_ns: int | None) -> None:
-        """Write what waits, up to `until_ns`; what came outside an episode is let go."""
-        assert self._incoming is not None
-        for item in self._incoming.drain():
-            if self._recording and item.topic in self._kept and (until_ns is None or item.received_ns <= until_ns):
-                recorder.write(item.topic, item.message, item.received_ns)
+    def _obey(self, recorder: Recorder, order: EpisodeStart | EpisodeEnd) -> None:
+        if isinstance(order, EpisodeStart):
+            recorder.begin(order)
+            self._kept = frozenset(order.topics)
+        elif self._kept is not None:
+            self._kept = None
+            recorder.end(order)
 
     @override
     def teardown(self) -> None:
-        if self._incoming is not None:
-            if self._recorder is not None:
+        try:
+            if self._incoming is not None:
                 self.work(0.0)
+        finally:
+            if self._recorder is not None:
                 self._recorder.close()
-            self._incoming.close()
+            if self._incoming is not None:
+                self._incoming.close()
