@@ -36,11 +36,11 @@ class _Owned:
     executor: Executor
     columns: NDArray[np.intp]
 
-    def reading(self, measured: JointReading) -> JointReading:
+    def reading(self, measured: JointReading, now_ns: int | None = None) -> JointReading:
         columns = self.columns
         return JointReading(
-            measured.stamp_ns, measured.position[columns], measured.velocity[columns], measured.effort[columns],
-            measured.stale,
+            measured.stamp_ns if now_ns is None else now_ns, measured.position[columns],
+            measured.velocity[columns], measured.effort[columns], measured.stale,
         )  # fmt: skip
 
 
@@ -66,8 +66,9 @@ class ControlCore:
         self._owned = {n: _Owned(n, e, self._robot.indices(e.joints)) for n, e in executors.items()}
         self._active: list[_Owned] = []
         self._state_timeout_ns = ns(config.control.state_timeout)
-        self._counts = {"read_errors": 0, "write_errors": 0, "stale_states": 0, "old_plans": 0}
+        self._counts = {"read_errors": 0, "write_errors": 0, "signal_errors": 0, "stale_states": 0, "old_plans": 0}
         self._relaxed = False
+        self._stopping = False
         self._stop_target: Vector | None = None
         self._tick = 0
         self._commands: dict[str, Callable[..., Mapping[str, Any] | None]] = {
@@ -93,11 +94,12 @@ class ControlCore:
 
         Raises:
             HardwareError: when the hardware does not connect or its first reading is no position.
+            NotSupported: where the stop behaviour is `relax` and a part has no such thing.
         """
         if self._config.control.stop == "relax":
             self._hardware.require_relax()
         self._hardware.connect()
-        self._measured = self._hardware.read()
+        self._measured = self._first_reading()
         self._safety.activate(self._measured.position)
         self._switch_mode(mode)
 
@@ -109,7 +111,7 @@ class ControlCore:
             periods: periods since the last tick; more than one after missed ticks, so that simulated time keeps up.
         """
         self._read()
-        signals = self._hardware.read_signals()
+        signals = self._read_signals()
         success = self._hardware.success()
         command = self._safety.apply(self._desired(), self._measured.position)
         self._write(command)
@@ -134,6 +136,8 @@ class ControlCore:
 
     def handle(self, command: Mapping[str, Any]) -> dict[str, Any]:
         """Carry out a command of the host and answer it; a refused one is answered with `error`."""
+        if self._stopping:
+            return {"reply": command["id"], "error": f"{command['do']}: refused, the robot is stopping"}
         arguments = {key: value for key, value in command.items() if key not in ("do", "id")}
         try:
             result = self._commands[command["do"]](**arguments) or {}
@@ -152,6 +156,7 @@ class ControlCore:
 
     def begin_stop(self) -> None:
         """Start the configured stop behaviour; tick until `stopped`."""
+        self._stopping = True
         self._leave()
         behaviour, _, pose = self._config.control.stop.partition(" ")
         self._stop_deadline = self._clock.now_ns() + ns(_POSE_TIMEOUT_S)
@@ -175,18 +180,30 @@ class ControlCore:
         """Whether the stop behaviour is done."""
         if self._relaxed:
             return True
-        if self._stop_target is not None and self._clock.now_ns() < self._stop_deadline:
-            return self._safety.at_rest and bool(np.allclose(self._safety.current, self._stop_target, atol=1e-4))
-        return self._safety.at_rest
+        if not self._safety.at_rest:
+            return False
+        target = self._stop_target
+        return target is None or self._late_to_pose or bool(np.allclose(self._safety.current, target, atol=1e-4))
 
     def abandon(self) -> None:
         """After a bug in the loop, when it cannot tick any more: torque off if that is the stop behaviour."""
-        if self._config.control.stop == "relax":
+        if self.state is not None and self._config.control.stop == "relax":
             self._relax("the control loop failed")
 
     def close(self) -> None:
         """Release the hardware."""
         self._hardware.disconnect()
+
+    def _first_reading(self) -> JointReading:
+        measured = self._hardware.read()
+        if measured.stale:
+            raise HardwareError("the joints do not answer yet")
+        self._answered_ns = measured.stamp_ns
+        return measured
+
+    @property
+    def _late_to_pose(self) -> bool:
+        return self._clock.now_ns() >= self._stop_deadline
 
     def _read(self) -> None:
         try:
@@ -199,11 +216,21 @@ class ControlCore:
             if measured.stale:
                 self._counts["stale_states"] += 1
                 self._lost("the joints do not answer")
+            else:
+                self._answered_ns = measured.stamp_ns
         self._measured = measured
+
+    def _read_signals(self) -> Vector:
+        try:
+            return self._hardware.read_signals()
+        except HardwareError:
+            # Unlike the joints, no reason to stop for; missing is missing.
+            self._counts["signal_errors"] += 1
+            return np.full(self.signal_size, np.nan)
 
     def _lost(self, why: str) -> None:
         """A tick without a new state: a fault once that has lasted for `state_timeout`."""
-        age_ns = self._clock.now_ns() - self._measured.stamp_ns
+        age_ns = self._clock.now_ns() - self._answered_ns
         if age_ns >= self._state_timeout_ns:
             self._raise_fault(f"{why}: no state for {age_ns / 1e6:.0f} ms")
 
@@ -219,20 +246,24 @@ class ControlCore:
     def _desired(self) -> Vector | None:
         """What is asked for in this tick; None to brake and hold."""
         if self._stop_target is not None:
-            return self._safety.towards(self._stop_target, _POSE_SPEED)
+            return None if self._late_to_pose else self._safety.towards(self._stop_target, _POSE_SPEED)
         if not self._active:
             return None
-        desired = self._safety.current
+        # A plan goes on by time where a single reply was lost.
+        now_ns = self._clock.now_ns() if self._measured.stale else None
+        setpoints = []
         relax = False
         for owned in self._active:
-            desired[owned.columns] = owned.executor.update(owned.reading(self._measured))
+            setpoints.append((owned.columns, owned.executor.update(owned.reading(self._measured, now_ns))))
             relax = relax or bool(getattr(owned.executor, "wants_relax", False))
             self._report_goals(owned)
-        if relax != self._relaxed:
-            if relax:
-                self._relax("the setpoints are stale")
-            else:
-                self._retake()
+        if relax and not self._relaxed:
+            self._relax("the setpoints are stale")
+        elif self._relaxed and not relax and not self._retake():
+            return None
+        desired = self._safety.current
+        for columns, setpoint in setpoints:
+            desired[columns] = setpoint
         return desired
 
     def _report_goals(self, owned: _Owned) -> None:
@@ -253,10 +284,17 @@ class ControlCore:
         self._relaxed = True
         self._log.warning("torque off (%s): the arm may fall", why)
 
-    def _retake(self) -> None:
-        """Torque comes back: start from where the joints lie."""
+    def _retake(self) -> bool:
+        """Torque comes back: start from where the joints lie. False where that is not known: a fault."""
+        try:
+            if self._measured.stale:
+                raise HardwareError("the joints do not answer")
+            self._safety.activate(self._measured.position)
+        except HardwareError as error:
+            self._raise_fault(f"torque stays off: {error}")
+            return False
         self._relaxed = False
-        self._safety.activate(self._measured.position)
+        return True
 
     def _raise_fault(self, fault: str) -> None:
         if self.fault:
@@ -264,6 +302,7 @@ class ControlCore:
         self.fault = fault
         self.events.append({"event": "fault", "fault": fault, "stamp_ns": self._clock.now_ns()})
         self._leave()
+        self._stop_target = None
         if self._config.control.stop == "relax" and not self._relaxed:
             self._relax("fault")
 
@@ -294,7 +333,7 @@ class ControlCore:
     def _reset_episode(self, seed: int) -> None:
         self._leave()
         self._hardware.reset_episode(Episode(seed))
-        self._reset()
+        self._begin_anew()
 
     def _estop(self) -> None:
         self._safety.estop()
@@ -302,11 +341,18 @@ class ControlCore:
 
     def _reset(self) -> None:
         """Clear faults and the emergency stop, and enter the mode anew from where the joints are."""
-        self._leave()
+        if not self._safety.at_rest and not self._relaxed:
+            if self.fault:
+                raise HardwareError("the robot still brakes: reset it when it stands")
+            # It moves as it was told: only the executors begin anew, and the commands go on within the limits.
+            self._switch_mode(self.mode)
+            return
+        self._begin_anew()
+
+    def _begin_anew(self) -> None:
         self._hardware.reset_faults()
-        self._measured = self._hardware.read()
-        if self._measured.stale:
-            raise HardwareError("the joints do not answer yet")
+        self._measured = self._first_reading()
+        self._leave()
         self._relaxed = False
         self._safety.reset(self._measured.position)
         self.fault = ""

@@ -34,6 +34,7 @@ from ibrobot_core.plugins import Registry
 _START_TIMEOUT_S = 60.0
 _REPLY_TIMEOUT_S = 5.0
 _STOP_TIMEOUT_S = 15.0
+_GONE = "the control process is gone"
 
 OnState = Callable[[ControlState], None]
 OnEvent = Callable[[Mapping[str, Any]], None]
@@ -102,7 +103,11 @@ class InlineControl(ControlHost):
 
     @override
     def start(self) -> None:
-        self._core.start(self._mode)
+        try:
+            self._core.start(self._mode)
+        except BaseException:
+            self._core.close()
+            raise
         self.signals = [(signal.topic, signal.size) for signal in self._core.signals]
         self._started = True
 
@@ -145,12 +150,11 @@ class ControlClient(ControlHost):
         self._config = config
         self._order = {
             "document": config.document, "source": str(config.source), "sim": config.simulated, "seed": seed,
-            "mode": config.default_control_mode, "epoch_offset_ns": clock.epoch_offset_ns,
+            "mode": config.default_control_mode, "epoch_offset_ns": clock.epoch_offset_ns, "host": os.getpid(),
         }  # fmt: skip
         self._on_death = on_death
         self._replies: dict[int, queue.SimpleQueue[Mapping[str, Any]]] = {}
         self._ids = itertools.count(1)
-        self._lock = threading.Lock()
         self._stopping = False
         self._failure = ""
         self._process: subprocess.Popen[bytes] | None = None
@@ -180,6 +184,7 @@ class ControlClient(ControlHost):
         try:
             self._await_ready()
         except IbrobotError:
+            self._channel.close()  # one that is not ready yet stops for it as soon as it is
             self._end()
             raise
         self._thread = threading.Thread(target=self._receive, name="control link", daemon=True)
@@ -211,10 +216,14 @@ class ControlClient(ControlHost):
         number = next(self._ids)
         answer: queue.SimpleQueue[Mapping[str, Any]] = queue.SimpleQueue()
         self._replies[number] = answer
-        with self._lock:
-            self._channel.send({"do": do, "id": number, **arguments})
         try:
-            return raise_error(answer.get(timeout=_REPLY_TIMEOUT_S))
+            self._channel.send({"do": do, "id": number, **arguments})
+            if self._channel.closed:
+                raise ComponentFailed(_GONE)
+            reply = answer.get(timeout=_REPLY_TIMEOUT_S)
+            if reply.get("error") == _GONE:
+                raise ComponentFailed(_GONE)
+            return raise_error(reply)
         except queue.Empty:
             raise ComponentFailed(f"control did not answer {do!r} within {_REPLY_TIMEOUT_S:.0f} s") from None
         finally:
@@ -230,8 +239,7 @@ class ControlClient(ControlHost):
         if self._process is None:
             return
         self._stopping = True
-        with self._lock:
-            self._channel.send({"do": "stop", "id": 0})
+        self._channel.send({"do": "stop", "id": 0})
         self._end()
 
     def _end(self) -> None:
@@ -259,6 +267,20 @@ class ControlClient(ControlHost):
         return f"signal {-status}" if status < 0 else f"exit status {status}"
 
     def _receive(self) -> None:
+        try:
+            self._pass_on()
+        except Exception as error:  # noqa: BLE001 - told to the run, which cannot go on without states
+            self._on_death(ComponentFailed(f"control's states cannot be passed on ({type(error).__name__}: {error})"))
+            return
+        if not self._stopping:
+            why = self._failure or self._exit()
+            self._on_death(ComponentFailed(f"the control process died ({why})"))
+        # Only then those that wait for an answer, so that the cause is told and not its consequence.
+        for number in list(self._replies):
+            self._take({"reply": number, "error": _GONE})
+
+    def _pass_on(self) -> None:
+        """Pass on what control says, until it is gone."""
         assert self._memory is not None
         while not self._channel.closed:
             ready, _, _ = select.select([self._wake, self._channel.fileno()], [], [])
@@ -272,11 +294,6 @@ class ControlClient(ControlHost):
                 self._take(message)
         for state in self._memory.read_states():
             self._on_state(state)
-        for answer in list(self._replies.values()):
-            answer.put({"error": "the control process is gone"})
-        if not self._stopping:
-            why = self._failure or self._exit()
-            self._on_death(ComponentFailed(f"the control process died ({why})"))
 
     def _take(self, message: Mapping[str, Any]) -> None:
         if "reply" in message:

@@ -12,6 +12,8 @@ import os
 import select
 import socket
 import tempfile
+import threading
+import time
 from collections.abc import Mapping
 from typing import Any
 from zlib import crc32
@@ -234,12 +236,17 @@ def _state(record: Any) -> ControlState:
 
 
 class Channel:
-    """JSON objects, a line each, over a stream socket; a dead peer is no exception, it shows in `closed`."""
+    """JSON objects, a line each, over a stream socket; a dead peer is no exception, it shows in `closed`.
+
+    Nothing here waits for a peer that does not read, so that a stopped host cannot stop the control loop.
+    """
 
     def __init__(self, connection: socket.socket) -> None:
         connection.setblocking(False)
         self._socket = connection
         self._partial = bytearray()
+        self._unsent = bytearray()
+        self._sending = threading.Lock()
         self.closed = False
         """Whether the peer is gone."""
 
@@ -248,18 +255,39 @@ class Channel:
         return self._socket.fileno()
 
     def send(self, message: Mapping[str, Any]) -> None:
-        """Send an object; where the peer is gone, `closed` becomes True."""
-        payload = memoryview(json.dumps(message, separators=(",", ":")).encode() + b"\n")
-        while payload and not self.closed:
+        """Send an object, at once or with a later call as the peer reads; `closed` shows where the peer is gone."""
+        line = json.dumps(message, separators=(",", ":")).encode() + b"\n"
+        with self._sending:
+            self._unsent += line
+            self._flush()
+
+    def flush(self, timeout_s: float) -> None:
+        """Wait up to `timeout_s` [s] for the peer to read what is yet unsent."""
+        deadline = time.monotonic() + timeout_s
+        while self.backlog and not self.closed and (left := deadline - time.monotonic()) > 0:
+            select.select([], [self._socket], [], left)
+            with self._sending:
+                self._flush()
+
+    @property
+    def backlog(self) -> int:
+        """Bytes that the peer was not ready to take yet."""
+        return len(self._unsent)
+
+    def _flush(self) -> None:
+        while self._unsent and not self.closed:
             try:
-                payload = payload[self._socket.send(payload) :]
+                del self._unsent[: self._socket.send(self._unsent)]
             except BlockingIOError:
-                select.select([], [self._socket], [], 1.0)
+                return
             except OSError:
                 self.closed = True
 
     def receive(self) -> list[dict[str, Any]]:
         """The objects that have arrived whole."""
+        if self._unsent:
+            with self._sending:
+                self._flush()
         while not self.closed:
             try:
                 received = self._socket.recv(65536)
@@ -287,8 +315,9 @@ class Channel:
             if messages:
                 return messages
             if self.closed:
-                raise ComponentFailed("the control process died")
-            if not select.select([self._socket], [], [], timeout_s)[0]:
+                raise ComponentFailed("the other end of the control link is gone")
+            unsent = [self._socket] if self._unsent else []
+            if not any(select.select([self._socket], unsent, [], timeout_s)):
                 return []
 
     def close(self) -> None:

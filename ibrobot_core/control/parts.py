@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from functools import partial
 from typing import Any
 
@@ -136,6 +136,7 @@ class HardwareParts:
         if self._pool is None:
             return [_named(name, partial(act, part)) for name, part in self._parts.items()]
         futures = [(name, self._pool.submit(act, part)) for name, part in self._parts.items()]
+        wait([future for _, future in futures])  # also where one fails: no part is called twice at once
         return [_named(name, future.result) for name, future in futures]
 
 

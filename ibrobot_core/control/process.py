@@ -27,13 +27,15 @@ from ibrobot_core.errors import IbrobotError
 from ibrobot_core.plugins import installed
 
 _STARTUP_TIMEOUT_S = 30.0
+_FAREWELL_S = 1.0
+"""How long the last words wait for a host that does not read."""
 _TOLD = "told to stop"
 _REPORT_TICKS = 20
 """Ticks between reports of punctuality and counters to the host."""
 
 
 class _ToHost(logging.Handler):
-    """Sends log records to the host, which owns the terminal."""
+    """Sends log records to the host, which owns the terminal; a host that does not read misses them."""
 
     def __init__(self, channel: Channel) -> None:
         super().__init__()
@@ -41,19 +43,23 @@ class _ToHost(logging.Handler):
 
     @override
     def emit(self, record: logging.LogRecord) -> None:
-        event = {"event": "log", "logger": record.name, "level": record.levelno, "message": record.getMessage()}
-        self._channel.send(event)
+        if not self._channel.backlog:
+            event = {"event": "log", "logger": record.name, "level": record.levelno, "message": record.getMessage()}
+            self._channel.send(event)
 
 
 class ControlProcess:
     """The loop on its absolute deadlines, and the link to the host."""
 
-    def __init__(self, core: ControlCore, clock: RealClock, channel: Channel, memory: SharedMemory, wake: int) -> None:
+    def __init__(
+        self, core: ControlCore, clock: RealClock, channel: Channel, memory: SharedMemory, wake: int, host: int
+    ) -> None:
         self._core = core
         self._clock = clock
         self._channel = channel
         self._memory = memory
         self._wake = wake
+        self._host = host
         self._punctuality = Punctuality()
         self._stopping = False
         self._terminated = False
@@ -87,7 +93,8 @@ class ControlProcess:
                 self._begin_stop(_TOLD)
             else:
                 self._channel.send(self._core.handle(command))
-        if self._channel.closed:
+        # A process that the host forked keeps the socket open beyond the host's death.
+        if self._channel.closed or os.getppid() != self._host:
             self._begin_stop("the host is gone")
         elif self._terminated:
             self._begin_stop("terminated")
@@ -98,7 +105,7 @@ class ControlProcess:
             os.write(self._wake, b".")
         while self._core.events:
             self._channel.send(self._core.events.popleft())
-        if self._core.state is not None and self._core.state.tick % _REPORT_TICKS == 0:
+        if self._core.state is not None and self._core.state.tick % _REPORT_TICKS == 0 and not self._channel.backlog:
             self._report("report")
 
     def _report(self, event: str) -> None:
@@ -136,8 +143,10 @@ def main(descriptors: list[int]) -> int:
         refused = go_real_time(config.control.priority)
         signals = [[signal.topic, signal.size] for signal in core.signals]
         channel.send({"event": "ready", "signals": signals, "refused": refused, "epoch": core.epoch})
-        ControlProcess(core, clock, channel, memory, descriptors[2]).run()
+        ControlProcess(core, clock, channel, memory, descriptors[2], order["host"]).run()
     except IbrobotError as error:
+        if core is not None:
+            core.abandon()
         channel.send({"event": "failed", "error": str(error), "exit_code": error.exit_code})
         return 1
     except Exception as error:  # noqa: BLE001 - a bug here must still stop the robot
@@ -150,6 +159,7 @@ def main(descriptors: list[int]) -> int:
     finally:
         if core is not None:
             core.close()
+        channel.flush(_FAREWELL_S)
     return 0
 
 

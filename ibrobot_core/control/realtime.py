@@ -5,12 +5,13 @@ from __future__ import annotations
 import ctypes
 import gc
 import os
+import threading
 
 _MCL_CURRENT_AND_FUTURE = 3
 
 
 def go_real_time(priority: int) -> list[str]:
-    """SCHED_FIFO, locked memory, no garbage collection in the loop.
+    """SCHED_FIFO for every thread, locked memory, no garbage collection in the loop.
 
     Args:
         priority: of SCHED_FIFO, 1..99.
@@ -23,7 +24,8 @@ def go_real_time(priority: int) -> list[str]:
     gc.freeze()
     gc.disable()
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+        for thread in threading.enumerate():
+            os.sched_setscheduler(thread.native_id or 0, os.SCHED_FIFO, os.sched_param(priority))
     except (AttributeError, OSError) as error:
         refused.append(
             f"no real-time priority ({error}): the loop may be milliseconds late under load; allow it with "
