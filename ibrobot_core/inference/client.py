@@ -15,6 +15,8 @@ from ibrobot_core.errors import PolicyError
 from ibrobot_core.interfaces import Frame, Policy
 from ibrobot_core.robot import Vector
 
+_CLOSE_TIMEOUT_S = 1.0
+
 
 @attrs.frozen(eq=False)
 class DispatchInfer:
@@ -131,7 +133,7 @@ class MonolithicClient(InferenceClient):
     def close(self) -> None:
         self._work.put(None)
         # A model that hangs must not keep the robot from stopping; the thread is a daemon.
-        self._thread.join(timeout=1.0)
+        self._thread.join(_CLOSE_TIMEOUT_S)
 
     def _run(self) -> None:
         while (work := self._work.get()) is not None:

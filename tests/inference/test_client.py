@@ -1,0 +1,177 @@
+"""Inference clients in the host: one policy call at a time, order kept, a hanging policy does not keep the host."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+
+from ibrobot_core.errors import PolicyError
+from ibrobot_core.inference import client as module
+from ibrobot_core.inference.client import Chunk, DispatchInfer, InferenceClient, LockstepClient, MonolithicClient
+from ibrobot_core.interfaces import Frame
+from ibrobot_core.testing import host_context
+from ibrobot_core.testing.fakes import FakePolicy
+
+PATIENCE_S = 10.0
+
+
+class GatedPolicy(FakePolicy):
+    """Notes its calls; `infer` waits for the gate."""
+
+    def __init__(self) -> None:
+        super().__init__(host_context())
+        self.calls: list[str] = []
+        self.running = 0
+        self.most = 0
+        self.entered = threading.Semaphore(0)
+        self.gate = threading.Semaphore(0)
+        self.error: Exception | None = None
+
+    def reset(self, seed: int) -> None:
+        self.calls.append(f"reset {seed}")
+        if seed < 0:
+            raise ValueError("seed must not be negative")
+
+    def infer(self, tensors):
+        self.running += 1
+        self.most = max(self.most, self.running)
+        self.calls.append(f"infer {tensors['state'][0]:g}")
+        self.entered.release()
+        assert self.gate.acquire(timeout=PATIENCE_S)
+        self.running -= 1
+        if self.error is not None:
+            raise self.error
+        return super().infer(tensors)
+
+
+def request(number: int) -> DispatchInfer:
+    return DispatchInfer(number, Frame(1000 + number, {"observation.state": np.full(6, number, np.float32)}))
+
+
+@pytest.fixture
+def policy() -> GatedPolicy:
+    return GatedPolicy()
+
+
+@pytest.fixture
+def monolithic(policy: GatedPolicy) -> Iterator[MonolithicClient]:
+    client = MonolithicClient(policy)
+    yield client
+    policy.gate.release(100)
+    client.close()
+
+
+def test_the_answer_carries_the_id_and_the_observations_time(policy: GatedPolicy, monolithic: MonolithicClient):
+    monolithic.submit(request(3))
+    assert monolithic.poll() is None, "submit does not wait for the policy"
+    policy.gate.release()
+    chunk = monolithic.poll(PATIENCE_S)
+    assert chunk is not None
+    assert (chunk.id, chunk.start_ns, chunk.error) == (3, 1003, "")
+    assert chunk.actions is not None
+    assert chunk.actions.shape == (10, 6)
+    assert monolithic.poll() is None
+
+
+def test_the_policy_never_runs_twice_at_once_and_only_the_newest_of_those_waiting_runs(
+    policy: GatedPolicy, monolithic: MonolithicClient
+):
+    monolithic.submit(request(1))
+    assert policy.entered.acquire(timeout=PATIENCE_S)
+    for number in (2, 3, 4):
+        monolithic.submit(request(number))
+    policy.gate.release(2)
+    answers = [monolithic.poll(PATIENCE_S), monolithic.poll(PATIENCE_S)]
+    assert [chunk and chunk.id for chunk in answers] == [1, 4]
+    assert policy.calls == ["infer 1", "infer 4"]
+    assert policy.most == 1
+
+
+def test_the_policy_is_reset_before_it_sees_a_later_request(policy: GatedPolicy, monolithic: MonolithicClient):
+    monolithic.submit(request(1))
+    assert policy.entered.acquire(timeout=PATIENCE_S)
+    monolithic.submit(request(2))
+    monolithic.reset(5)
+    monolithic.submit(request(3))
+    policy.gate.release(2)
+    answers = [monolithic.poll(PATIENCE_S), monolithic.poll(PATIENCE_S)]
+    assert [chunk and chunk.id for chunk in answers] == [1, 3]
+    assert policy.calls == ["infer 1", "reset 5", "infer 3"]
+
+
+def test_closing_returns_while_the_policy_hangs(policy: GatedPolicy, monkeypatch: pytest.MonkeyPatch):
+    client = MonolithicClient(policy)
+    client.submit(request(1))
+    assert policy.entered.acquire(timeout=PATIENCE_S)
+    monkeypatch.setattr(module, "_CLOSE_TIMEOUT_S", 0.01)
+    client.submit(request(2))
+    client.close()
+    client.close()
+    assert policy.running == 1, "it still hangs"
+    policy.gate.release()
+    assert client.poll(PATIENCE_S) is not None
+    monkeypatch.setattr(module, "_CLOSE_TIMEOUT_S", PATIENCE_S)
+    client.close()
+    assert policy.calls == ["infer 1"], "what waited behind is never run"
+
+
+def test_a_reset_that_fails_is_told_at_the_next_poll(policy: GatedPolicy, monolithic: MonolithicClient, caplog):
+    with caplog.at_level(logging.CRITICAL):
+        monolithic.reset(-1)
+        with pytest.raises(PolicyError, match="reset failed: ValueError: seed must not be negative"):
+            monolithic.poll(PATIENCE_S)
+
+
+def test_lockstep_answers_within_submit(policy: GatedPolicy):
+    client = LockstepClient(policy)
+    policy.gate.release()
+    client.submit(request(1))
+    chunk = client.poll()
+    assert chunk is not None
+    assert (chunk.id, chunk.start_ns) == (1, 1001)
+    assert client.poll() is None
+
+
+@pytest.mark.parametrize("end", [lambda client: client.reset(2), lambda client: client.close()], ids=["reset", "close"])
+def test_lockstep_forgets_an_answer_at_reset_and_close(policy: GatedPolicy, end: Callable[[InferenceClient], None]):
+    client = LockstepClient(policy)
+    policy.gate.release()
+    client.submit(request(1))
+    end(client)
+    assert client.poll() is None
+
+
+@pytest.mark.parametrize("kind", [LockstepClient, MonolithicClient])
+def test_a_policy_that_raises_answers_with_its_error(kind: type[InferenceClient], policy: GatedPolicy, caplog):
+    policy.error = RuntimeError("out of memory")
+    policy.gate.release()
+    assert _answer(kind, policy).error == "RuntimeError: out of memory"
+    assert "the policy failed" in caplog.text
+
+
+@pytest.mark.parametrize("kind", [LockstepClient, MonolithicClient])
+@pytest.mark.parametrize("actions", [{"action": 1}, "nonsense", [[1, 2], [3]]], ids=["mapping", "text", "ragged"])
+def test_a_policy_that_gives_no_numbers_answers_with_an_error(
+    kind: type[InferenceClient], policy: GatedPolicy, actions: object, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(policy, "postprocess", lambda tensors: actions)
+    policy.gate.release()
+    chunk = _answer(kind, policy)
+    assert chunk.actions is None
+    assert chunk.error.startswith(("TypeError: ", "ValueError: "))
+
+
+def _answer(kind: type[InferenceClient], policy: GatedPolicy) -> Chunk:
+    client = kind(policy)  # type: ignore[call-arg]
+    try:
+        client.submit(request(1))
+        chunk = client.poll(PATIENCE_S)
+    finally:
+        client.close()
+    assert chunk is not None
+    assert chunk.id == 1
+    return chunk
