@@ -18,6 +18,9 @@ from ibrobot_core.robot import Vector
 from ibrobot_core.units import NS_PER_S
 
 
+TOGGLE_SMOOTHING = "/action_dispatcher/toggle_smoothing"
+
+
 class Model(Component):
     """Loads a policy and compares it with the contract, before anything is powered."""
 
@@ -84,14 +87,21 @@ class InferenceFeeder(Feeder):
         )  # fmt: skip
         self._step_ns = contract.step_ns
 
+    def toggle_smoothing(self, enabled: bool) -> None:
+        """Service: switch the blending of chunks on or off, from the next chunk on."""
+        with self.lock:
+            self.dispatcher.toggle_smoothing(enabled)
+
     @override
     def begin_feeding(self, seed: int) -> None:
         self.session.stats = self.dispatcher.stats
         self._next_ns = self.session.bus.snapshot_ns() + self._step_ns
         self.dispatcher.begin(seed)
+        self.session.bus.serve(TOGGLE_SMOOTHING, self.toggle_smoothing)
 
     @override
     def end_feeding(self) -> None:
+        self.session.bus.unserve(TOGGLE_SMOOTHING)
         self.dispatcher.end()
         self.session.stats = None
 
