@@ -1,0 +1,239 @@
+"""Runs of a robot whose every part is a fake, offered by one made-up distribution."""
+
+from __future__ import annotations
+
+import sys
+import textwrap
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import attrs
+import pytest
+
+from ibrobot_core.config import load
+from ibrobot_core.launch.runtime import Runtime
+from ibrobot_core.launch.session import Request, Session
+from ibrobot_core.plugins import discover
+
+if TYPE_CHECKING:
+    from conftest import Site
+
+PARTS = '''
+import attrs
+from ibrobot_core import hookimpl
+from ibrobot_core.descriptors import (
+    HardwareDescriptor, PlannerDescriptor, PolicyDescriptor, RecorderDescriptor, SensorDescriptor, TeleopDescriptor,
+)
+from ibrobot_core.errors import HardwareError, PolicyError, SensorError
+from ibrobot_core.interfaces import Hardware
+from ibrobot_core.testing.fakes import (
+    FakeHardware, FakePlanner, FakePolicy, FakeRealHardware, FakeRecorder, FakeSensor, FakeTeleop,
+)
+
+EVENTS, CALLS, MADE = [], [], {}
+
+class Scene(FakeHardware):
+    """Done after half a second, but never with seed 13; `broken` makes it silent."""
+    broken = False
+    def reset(self, episode):
+        super().reset(episode)
+        self.ticks, self.seed = 0, episode.seed
+    def advance(self, step_ns):
+        super().advance(step_ns)
+        self.ticks += 1
+    def success(self):
+        return self.seed != 13 and self.ticks >= 25
+    def read(self):
+        if self.broken:
+            raise HardwareError("the bus is silent")
+        return super().read()
+    def reset_faults(self):
+        self.broken = False
+
+class Camera(FakeSensor):
+    def open(self):
+        CALLS.append("open " + self._ctx.name)
+        super().open()
+    def close(self):
+        CALLS.append("close " + self._ctx.name)
+        super().close()
+
+class Absent(Camera):
+    def open(self):
+        raise SensorError("no such device")
+
+class Buggy(Camera):
+    def open(self):
+        raise ZeroDivisionError("one over nothing")
+
+class Dying(Camera):
+    """Unplugged at its sixth frame."""
+    frames = 0
+    def read(self, timeout_s):
+        self.frames += 1
+        if self.frames > 5:
+            raise SensorError("unplugged")
+        return super().read(timeout_s)
+
+class Stick(FakeTeleop):
+    """Pushed forward, all the time."""
+    def __init__(self, ctx):
+        super().__init__(ctx)
+        self.deadman, self.velocity = True, 0.2
+    def connect(self):
+        CALLS.append("connect stick")
+        super().connect()
+    def disconnect(self):
+        CALLS.append("disconnect stick")
+        super().disconnect()
+
+class Net(FakePolicy):
+    seeds = ()
+    def load(self):
+        CALLS.append("load net")
+    def close(self):
+        CALLS.append("close net")
+    def reset(self, seed):
+        super().reset(seed)
+        self.seeds = (*self.seeds, seed)
+
+class Lost(Net):
+    def load(self):
+        raise PolicyError("no such checkpoint")
+
+def make(kind):
+    def make_it(options, ctx):
+        MADE[ctx.name] = kind(ctx)
+        return MADE[ctx.name]
+    return make_it
+
+@hookimpl
+def ibrobot_hardware():
+    yield HardwareDescriptor("scene", make(Scene), "a scene", simulated=True, sensors={"camera": "camera"})
+    yield HardwareDescriptor("arm", make(FakeRealHardware), "an arm")
+
+@hookimpl
+def ibrobot_sensors():
+    for kind in (Camera, Absent, Buggy, Dying):
+        yield SensorDescriptor(kind.__name__.lower(), make(kind), "a camera")
+
+@hookimpl
+def ibrobot_policies():
+    yield PolicyDescriptor("net", make(Net), "a network")
+    yield PolicyDescriptor("lost", make(Lost), "a network that is not there")
+
+@hookimpl
+def ibrobot_teleop():
+    yield TeleopDescriptor("stick", make(Stick), "a stick")
+
+@hookimpl
+def ibrobot_planners():
+    yield PlannerDescriptor("cubic", make(FakePlanner), "cubics")
+
+@hookimpl
+def ibrobot_recorders():
+    yield RecorderDescriptor("lines", make(FakeRecorder), "lines of JSON")
+
+@hookimpl
+def ibrobot_episode_started(episode, mode):
+    EVENTS.append(("started", episode, mode))
+
+@hookimpl
+def ibrobot_episode_ended(episode, outcome):
+    EVENTS.append(("ended", episode, outcome))
+
+@hookimpl
+def ibrobot_mode_changed(mode, previous):
+    EVENTS.append(("mode", previous, mode))
+
+@hookimpl
+def ibrobot_fault_raised(fault):
+    EVENTS.append(("fault", fault))
+'''
+ROBOT = textwrap.dedent("""\
+    robot:
+      name: mini
+      joints:
+        - {name: pan, lower: -1.0, upper: 1.0, max_velocity: 2.0, max_acceleration: 10.0}
+        - {name: grip, lower: -1.0, upper: 1.0, max_velocity: 2.0, max_acceleration: 10.0}
+      groups: {arm: [pan], gripper: [grip]}
+      description:
+        poses: {home: [0, 0], up: [0.4, 0.2]}
+    hardware: {type: arm}
+    simulation: {type: scene}
+    peripherals:
+      - {name: top, kind: camera, type: camera}
+      - {name: side, kind: camera, type: camera}
+    executors:
+      arm_position: {type: position, group: arm}
+      grip_position: {type: position, group: gripper}
+      arm_trajectory: {type: trajectory, group: arm}
+    models:
+      net: {type: net}
+      lost: {type: lost}
+    control_modes:
+      policy:
+        executors: [arm_position, grip_position]
+        inference: {model: net}
+        dispatch: {watermark: 5}
+      lost: {executors: [arm_position, grip_position], inference: {model: lost}}
+      teleop: {executors: [arm_position, grip_position], teleop: stick}
+      plan: {executors: [arm_trajectory], planner: {type: cubic}}
+      replan: {executors: [arm_trajectory], planner: {type: cubic}}
+      idle: {executors: [arm_position]}
+    default_control_mode: policy
+    teleoperation:
+      stick: {type: stick}
+    contract:
+      rate_hz: 25
+      max_duration_s: 1
+      observations:
+        - {key: observation.state, topic: /joint_states, select: [position.pan, position.grip]}
+        - {key: observation.images.top, peripheral: top, align: {strategy: asof, tol_ms: 100}}
+      actions:
+        - {executor: arm_position, topic: /arm/commands}
+        - {executor: grip_position, topic: /grip/commands}
+    control: {rate_hz: 50, stop: hold}
+    """)
+
+
+@attrs.define
+class Runs:
+    """Makes runs, and stops those that a test leaves running. `parts` is the module of the fakes."""
+
+    folder: Path
+    site: Site
+    made: list[Runtime] = attrs.field(factory=list)
+
+    @property
+    def parts(self) -> Any:
+        return sys.modules["fake_parts"]
+
+    def make(
+        self, *overrides: str, mode: str | None = None, sim: bool = True, edit: Callable[[str], str] = str, **asked: Any
+    ) -> Runtime:
+        """A run in lockstep, unless `asked` says otherwise; not started."""
+        path = self.folder / "mini.yaml"
+        path.write_text(edit(ROBOT))
+        registry = discover(self.site.entry_points())
+        config = load(path, overrides=overrides, mode=mode, sim=sim, registry=registry)
+        runtime = Runtime(Session(config, registry, Request(**{"lockstep": True, **asked})))
+        self.made.append(runtime)
+        return runtime
+
+    def start(self, *overrides: str, **asked: Any) -> Runtime:
+        """As `make`, and started."""
+        runtime = self.make(*overrides, **asked)
+        runtime.start()
+        return runtime
+
+
+@pytest.fixture
+def runs(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Runs]:
+    monkeypatch.chdir(tmp_path)
+    site.add("fake-parts", PARTS)
+    made = Runs(tmp_path, site)
+    yield made
+    for runtime in made.made:
+        runtime.stop()
