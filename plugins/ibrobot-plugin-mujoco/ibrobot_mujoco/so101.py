@@ -21,8 +21,7 @@ _RANGES = {
 def so101() -> Robot:
     """The robot of `configs/so101.yaml`."""
     joints = tuple(
-        Joint(name, lower, upper, max_velocity=4.0, max_acceleration=40.0 if name == "gripper" else 20.0)
-        for name, (lower, upper) in _RANGES.items()
+        Joint(name, lower, upper, max_velocity=3.0, max_acceleration=40.0) for name, (lower, upper) in _RANGES.items()
     )
     return Robot(
         name="so101",

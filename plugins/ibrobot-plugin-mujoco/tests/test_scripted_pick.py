@@ -160,9 +160,9 @@ def test_a_cube_lost_on_the_way_is_not_carried_on(policy: ScriptedPick) -> None:
     for lost in (False, True):
         policy.reset(0)
         chunks = [chunk(policy, float(second)) for second in range(4)]
-        above_bin = chunks[-1][30]
-        cube = CUBE if lost else tuple(InverseKinematics(ROBOT).forward(above_bin).position)
-        ends.append(chunk(policy, 4.0, cube, above_bin))
+        on_the_way = chunks[-1][20]
+        cube = CUBE if lost else tuple(InverseKinematics(ROBOT).forward(on_the_way).position)
+        ends.append(chunk(policy, 3.0 + 20 / RATE_HZ, cube, on_the_way))
     np.testing.assert_allclose(ends[1][:20], ends[0][:20], rtol=0, atol=1e-12)
     assert np.abs(ends[1][-1] - ends[0][-1]).max() > 0.1
 
