@@ -27,6 +27,7 @@ class Feeder(Worker, Feed):
     @override
     def begin(self, seed: int) -> None:
         with self.lock:
+            self.end()
             self.begin_feeding(seed)
             self.active = True
 

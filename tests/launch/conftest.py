@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import textwrap
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,7 +31,7 @@ from ibrobot_core.testing.fakes import (
     FakeHardware, FakePlanner, FakePolicy, FakeRealHardware, FakeRecorder, FakeSensor, FakeTeleop,
 )
 
-EVENTS, CALLS, MADE = [], [], {}
+EVENTS, CALLS, MADE, TROUBLE = [], [], {}, {}
 
 class Scene(FakeHardware):
     """Done after half a second, but never with seed 13; `broken` makes it silent."""
@@ -52,29 +52,24 @@ class Scene(FakeHardware):
         self.broken = False
 
 class Camera(FakeSensor):
+    """`TROUBLE` says which one is missing, has a bug, or is unplugged at its sixth frame."""
+    frames = 0
     def open(self):
+        trouble = TROUBLE.get(self._ctx.name)
+        if trouble == "missing":
+            raise SensorError("no such device")
+        if trouble == "bug":
+            raise ZeroDivisionError("one over nothing")
         CALLS.append("open " + self._ctx.name)
         super().open()
+    def read(self, timeout_s):
+        self.frames += 1
+        if self.frames > 5 and TROUBLE.get(self._ctx.name) == "unplugged":
+            raise SensorError("unplugged")
+        return super().read(timeout_s)
     def close(self):
         CALLS.append("close " + self._ctx.name)
         super().close()
-
-class Absent(Camera):
-    def open(self):
-        raise SensorError("no such device")
-
-class Buggy(Camera):
-    def open(self):
-        raise ZeroDivisionError("one over nothing")
-
-class Dying(Camera):
-    """Unplugged at its sixth frame."""
-    frames = 0
-    def read(self, timeout_s):
-        self.frames += 1
-        if self.frames > 5:
-            raise SensorError("unplugged")
-        return super().read(timeout_s)
 
 class Stick(FakeTeleop):
     """Pushed forward, all the time."""
@@ -110,13 +105,13 @@ def make(kind):
 
 @hookimpl
 def ibrobot_hardware():
-    yield HardwareDescriptor("scene", make(Scene), "a scene", simulated=True, sensors={"camera": "camera"})
+    yield HardwareDescriptor("scene", make(Scene), "a scene", simulated=True, sensors={"camera": "drawn"})
     yield HardwareDescriptor("arm", make(FakeRealHardware), "an arm")
 
 @hookimpl
 def ibrobot_sensors():
-    for kind in (Camera, Absent, Buggy, Dying):
-        yield SensorDescriptor(kind.__name__.lower(), make(kind), "a camera")
+    yield SensorDescriptor("webcam", make(Camera), "a camera")
+    yield SensorDescriptor("drawn", make(Camera), "a camera in the scene")
 
 @hookimpl
 def ibrobot_policies():
@@ -163,8 +158,8 @@ ROBOT = textwrap.dedent("""\
     hardware: {type: arm}
     simulation: {type: scene}
     peripherals:
-      - {name: top, kind: camera, type: camera}
-      - {name: side, kind: camera, type: camera}
+      - {name: top, kind: camera, type: webcam}
+      - {name: side, kind: camera, type: webcam}
     executors:
       arm_position: {type: position, group: arm}
       grip_position: {type: position, group: gripper}
@@ -210,12 +205,10 @@ class Runs:
     def parts(self) -> Any:
         return sys.modules["fake_parts"]
 
-    def make(
-        self, *overrides: str, mode: str | None = None, sim: bool = True, edit: Callable[[str], str] = str, **asked: Any
-    ) -> Runtime:
+    def make(self, *overrides: str, mode: str | None = None, sim: bool = True, **asked: Any) -> Runtime:
         """A run in lockstep, unless `asked` says otherwise; not started."""
         path = self.folder / "mini.yaml"
-        path.write_text(edit(ROBOT))
+        path.write_text(ROBOT)
         registry = discover(self.site.entry_points())
         config = load(path, overrides=overrides, mode=mode, sim=sim, registry=registry)
         runtime = Runtime(Session(config, registry, Request(**{"lockstep": True, **asked})))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import queue
 from collections.abc import Mapping
 from typing import Any, override
@@ -177,6 +178,8 @@ def parse_goal(text: str, robot: Robot) -> dict[str, float]:
         try:
             goal[joint] = float(value)
         except ValueError:
+            goal[joint] = math.nan
+        if not math.isfinite(goal[joint]):
             raise PlanningError(f"goal {text!r}: {value!r} is no angle in radians") from None
     return goal
 

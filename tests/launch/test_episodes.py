@@ -1,0 +1,186 @@
+"""Episodes: counted, judged, told to plugins, and recorded each in a folder of its own."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ibrobot_core.launch.runtime import ESTOP, RESET, Runtime
+
+if TYPE_CHECKING:
+    from conftest import Runs, Site
+
+RECORDING = "recording={type: lines, root: kept, dataset: picks}"
+
+
+def finish(runtime: Runtime) -> None:
+    while not runtime.step():
+        pass
+    runtime.stop()
+
+
+def seconds(runtime: Runtime, duration: float) -> None:
+    for _ in range(round(duration * runtime.session.config.control.rate_hz)):
+        runtime.step()
+
+
+def records(folder: Path) -> list[dict]:
+    return [json.loads(line) for line in (folder / "records.jsonl").read_text().splitlines()]
+
+
+def test_episodes_count_up_their_seeds_and_are_told_to_plugins(runs: Runs):
+    runtime = runs.start(episodes=3, seed=5)
+    finish(runtime)
+    summary = runtime.summary()
+    assert (summary["episodes"], summary["successes"]) == (3, 3)
+    assert [
+        event
+        for number in (1, 2, 3)
+        for event in (("started", number, "policy"), ("ended", number, "success"))
+    ] == runs.parts.EVENTS  # fmt: skip
+    assert runs.parts.MADE["net"].seeds == (5, 6, 7)
+
+
+def test_one_that_is_not_done_in_time_fails(runs: Runs):
+    runtime = runs.start(episodes=3, seed=12)
+    finish(runtime)
+    summary = runtime.summary()
+    assert (summary["episodes"], summary["successes"]) == (3, 2)
+    assert [event[2] for event in runs.parts.EVENTS if event[0] == "ended"] == ["success", "failure", "success"]
+
+
+def test_one_fails_in_time_though_the_hardware_is_silent(runs: Runs):
+    runtime = runs.start(episodes=1)
+    seconds(runtime, 0.2)
+    runs.parts.MADE["simulation"].broken = True
+    finish(runtime)
+    assert runtime.summary()["successes"] == 0
+    assert [event[0] for event in runs.parts.EVENTS] == ["started", "fault", "ended"]
+
+
+def test_the_next_episode_waits_for_the_reset_of_an_emergency_stop(runs: Runs):
+    runtime = runs.start(episodes=2)
+    seconds(runtime, 0.2)
+    runtime.session.bus.call(ESTOP, None)
+    seconds(runtime, 3.0)
+    assert runtime.session.state is not None
+    assert runtime.session.state.estop
+    assert [event for event in runs.parts.EVENTS if event[0] != "fault"] == [
+        ("started", 1, "policy"), ("ended", 1, "failure"),
+    ]  # fmt: skip
+    runtime.session.bus.call(RESET, None)
+    finish(runtime)
+    assert runtime.summary()["successes"] == 1
+
+
+def test_a_mode_without_simulated_episodes_is_one_that_ends_with_the_run(runs: Runs):
+    runtime = runs.start(mode="teleop", duration_s=0.2)
+    assert runs.parts.EVENTS == [("started", 1, "teleop")]
+    finish(runtime)
+    assert runs.parts.EVENTS == [("started", 1, "teleop"), ("ended", 1, "unknown")]
+    assert runtime.summary()["episodes"] == 0
+
+
+def test_an_episode_that_the_end_of_the_run_cuts_short_is_unknown(runs: Runs):
+    runtime = runs.start(duration_s=0.2)
+    finish(runtime)
+    assert runs.parts.EVENTS == [("started", 1, "policy"), ("ended", 1, "unknown")]
+
+
+def test_a_mode_switch_begins_an_episode(runs: Runs):
+    runtime = runs.start()
+    seconds(runtime, 0.2)
+    runtime.switch_mode("teleop")
+    runtime.stop()
+    assert runs.parts.EVENTS == [
+        ("started", 1, "policy"), ("ended", 1, "unknown"), ("mode", "policy", "teleop"),
+        ("started", 2, "teleop"), ("ended", 2, "unknown"),
+    ]  # fmt: skip
+
+
+def test_an_observer_that_raises_stops_nothing(runs: Runs, site: Site, caplog: pytest.LogCaptureFixture):
+    site.add(
+        "angry-observer",
+        "from ibrobot_core import hookimpl\n"
+        "@hookimpl\ndef ibrobot_episode_started():\n    raise ValueError('not again')\n"
+        "@hookimpl\ndef ibrobot_episode_ended():\n    raise ValueError('not again')\n",
+    )
+    runtime = runs.start(episodes=2)
+    finish(runtime)
+    assert runtime.summary()["successes"] == 2
+    assert len(runs.parts.EVENTS) == 4
+    assert caplog.text.count("'angry_observer' failed in ibrobot_episode_started: ValueError: not again") == 2
+
+
+def test_each_episode_is_recorded_in_a_folder_of_its_own(runs: Runs, tmp_path: Path):
+    runtime = runs.start(RECORDING, episodes=2, seed=12)
+    finish(runtime)
+    root = tmp_path / "kept" / "picks" / "episodes"
+    assert sorted(path.name for path in root.iterdir()) == ["episode_000001", "episode_000002"]
+    for number, outcome in ((1, "success"), (2, "failure")):
+        metadata = json.loads((root / f"episode_{number:06d}" / "metadata.json").read_text())
+        assert metadata["outcome"] == outcome
+        assert metadata["seed"] == str(11 + number)
+        assert (metadata["robot"], metadata["mode"]) == ("mini", "policy")
+    again = runs.start(RECORDING, episodes=1)
+    finish(again)
+    assert (root / "episode_000003" / "metadata.json").exists()
+
+
+def test_a_recording_has_its_episode_and_nothing_else(runs: Runs, tmp_path: Path):
+    runtime = runs.start(RECORDING, episodes=3)
+    states = runtime.session.bus.subscribe("/joint_states", 10_000)
+    spans: list[list[int]] = []
+    while not runtime.step():
+        episodes, now_ns = runtime.plan.episodes, runtime.session.clock.now_ns()
+        if episodes.running and episodes.number > len(spans):
+            spans.append([now_ns, now_ns])
+        elif not episodes.running and spans:
+            spans[-1][1] = max(spans[-1][1], now_ns) if spans[-1][1] == spans[-1][0] else spans[-1][1]
+    spans[-1][1] = runtime.session.clock.now_ns()
+    published = [item.received_ns for item in states.drain()]
+    states.close()
+    runtime.stop()
+    assert len(spans) == 3
+    for number, (begin, end) in enumerate(spans, 1):
+        lines = records(tmp_path / "kept" / "picks" / "episodes" / f"episode_{number:06d}")
+        assert [line["received_ns"] for line in lines] == [t for t in published if begin < t <= end]
+
+
+@pytest.mark.parametrize(
+    ("topics", "kept"),
+    [
+        ("contract", {"/joint_states", "/camera/top/image_raw", "/arm/commands", "/grip/commands"}),
+        ("[/joint_states]", {"/joint_states"}),
+    ],
+)
+def test_the_topics_asked_for_are_recorded(runs: Runs, topics: str, kept: set[str], monkeypatch: pytest.MonkeyPatch):
+    runtime = runs.start(f"recording={{type: lines, topics: {topics}}}", mode="teleop")
+    recorder = runs.parts.MADE["recording"]
+    seen: set[str] = set()
+    monkeypatch.setattr(recorder, "write", lambda topic, message, received_ns: seen.add(topic))
+    seconds(runtime, 0.5)
+    assert seen == kept
+
+
+def test_all_topics_may_be_recorded(runs: Runs, monkeypatch: pytest.MonkeyPatch):
+    runtime = runs.start("recording={type: lines, topics: all}")
+    seen: set[str] = set()
+    monkeypatch.setattr(runs.parts.MADE["recording"], "write", lambda topic, message, received_ns: seen.add(topic))
+    seconds(runtime, 0.5)
+    assert seen >= {"/joint_states", "/arm/commands", "/camera/side/image_raw", "/fake/command"}
+
+
+def test_a_recorder_that_fails_ends_the_run_with_its_cause(runs: Runs, monkeypatch: pytest.MonkeyPatch):
+    runtime = runs.start(RECORDING, mode="teleop")
+
+    def full(topic: str, message: object, received_ns: int) -> None:
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(runs.parts.MADE["recording"], "write", full)
+    finish(runtime)
+    with pytest.raises(Exception, match=r"^recording: OSError: no space left on device$"):
+        runtime.raise_failure()

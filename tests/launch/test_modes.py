@@ -1,0 +1,188 @@
+"""Switching modes at run time: new parts first, ownership within a tick, and a mode that fails changes nothing."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from ibrobot_core.errors import ComponentFailed, HardwareError, NotSupported
+from ibrobot_core.launch.builders.planning import GO_TO
+from ibrobot_core.launch.runtime import SET_MODE, Runtime
+
+if TYPE_CHECKING:
+    from conftest import Runs
+
+
+def seconds(runtime: Runtime, duration: float) -> None:
+    for _ in range(round(duration * runtime.session.config.control.rate_hz)):
+        runtime.step()
+
+
+def position(runtime: Runtime) -> list[float]:
+    assert runtime.session.state is not None
+    return runtime.session.state.position.tolist()
+
+
+def names(runtime: Runtime) -> list[str]:
+    """What runs, in starting order."""
+    return [component.name for component in runtime._started]
+
+
+def test_from_mode_to_mode_and_back(runs: Runs):
+    runtime = runs.start(mode="teleop")
+    seconds(runtime, 0.5)
+    pan, grip = position(runtime)
+    runtime.session.bus.call(SET_MODE, "plan")
+    assert runtime.session.mode == "plan"
+    seconds(runtime, 1.0)
+    assert position(runtime)[0] == pytest.approx(pan, abs=0.05), "it holds where it was"
+    runtime.session.bus.call(GO_TO, "up")
+    seconds(runtime, 2.0)
+    assert position(runtime)[0] == pytest.approx(0.4, abs=0.02)
+    assert position(runtime)[1] == pytest.approx(grip, abs=0.05), "no executor of this mode owns it"
+    runtime.switch_mode("teleop")
+    seconds(runtime, 1.0)
+    assert position(runtime)[0] > 0.5
+    assert runtime.summary()["mode"] == "teleop"
+    assert [event for event in runs.parts.EVENTS if event[0] == "mode"] == [
+        ("mode", "teleop", "plan"), ("mode", "plan", "teleop"),
+    ]  # fmt: skip
+
+
+def test_new_parts_are_ready_before_ownership_changes_and_old_ones_go_after(
+    runs: Runs, monkeypatch: pytest.MonkeyPatch
+):
+    runtime = runs.start(mode="teleop")
+    calls: list[str] = runs.parts.CALLS
+    calls.clear()
+    control = runtime.session.control
+    real = control.call
+
+    def call(do: str, **arguments: Any) -> Any:
+        calls.append(do)
+        return real(do, **arguments)
+
+    monkeypatch.setattr(control, "call", call)
+    runtime.switch_mode("policy")
+    assert calls == ["load net", "switch_mode", "disconnect stick"]
+    calls.clear()
+    runtime.switch_mode("teleop")
+    assert calls == ["connect stick", "switch_mode", "close net"]
+
+
+def test_what_runs_is_what_the_mode_needs(runs: Runs):
+    runtime = runs.start(mode="policy")
+    fixed = ["control", "sensor:top", "sensor:side", "status"]
+    assert sorted(names(runtime)) == sorted([*fixed, "model:net", "mode:policy", "episodes"])
+    runtime.switch_mode("teleop")
+    assert sorted(names(runtime)) == sorted([*fixed, "mode:teleop"])
+    runtime.switch_mode("idle")
+    assert sorted(names(runtime)) == sorted(fixed)
+    runtime.switch_mode("policy")
+    assert sorted(names(runtime)) == sorted([*fixed, "model:net", "mode:policy"])
+    seconds(runtime, 1.0)
+    assert runtime.session.stats is not None
+    assert runtime.session.stats.chunks > 0
+
+
+def test_a_planning_mode_takes_over_the_goal_service_of_another(runs: Runs):
+    runtime = runs.start(mode="plan")
+    runtime.switch_mode("replan")
+    runtime.session.bus.call(GO_TO, "pan=0.2")
+    seconds(runtime, 2.0)
+    assert position(runtime)[0] == pytest.approx(0.2, abs=0.02)
+    runtime.switch_mode("idle")
+    with pytest.raises(Exception, match="nobody serves /planning/go_to"):
+        runtime.session.bus.call(GO_TO, "up")
+
+
+def test_a_mode_that_cannot_start_leaves_the_old_one_running(runs: Runs):
+    runtime = runs.start(mode="teleop")
+    seconds(runtime, 0.2)
+    before, running = position(runtime)[0], names(runtime)
+    with pytest.raises(ComponentFailed, match=r"^model:lost: no such checkpoint$"):
+        runtime.switch_mode("lost")
+    assert (runtime.session.mode, names(runtime)) == ("teleop", running)
+    seconds(runtime, 0.5)
+    assert position(runtime)[0] > before + 0.05
+    assert not any(event[0] == "mode" for event in runs.parts.EVENTS)
+
+
+def test_simulated_episodes_go_on_when_another_mode_cannot_start(runs: Runs):
+    runtime = runs.start(mode="policy", episodes=2)
+    seconds(runtime, 0.2)
+    with pytest.raises(ComponentFailed):
+        runtime.switch_mode("lost")
+    while not runtime.step():
+        pass
+    assert runtime.summary()["successes"] == 2
+
+
+def test_control_that_refuses_leaves_the_old_mode_which_a_reset_revives(runs: Runs):
+    runtime = runs.start(mode="teleop")
+    seconds(runtime, 0.2)
+    running = names(runtime)
+    runtime.session.control.call("estop")
+    with pytest.raises(HardwareError, match="cannot enter mode policy before a reset: emergency stop"):
+        runtime.switch_mode("policy")
+    assert (runtime.session.mode, names(runtime)) == ("teleop", running)
+    assert runs.parts.CALLS[-1] == "close net"
+    seconds(runtime, 0.5)
+    before = position(runtime)[0]
+    runtime.reset()
+    seconds(runtime, 0.5)
+    assert position(runtime)[0] > before + 0.05
+
+
+def test_an_unknown_mode_is_refused_with_those_that_there_are(runs: Runs):
+    runtime = runs.start(mode="teleop")
+    with pytest.raises(NotSupported, match="no mode 'tele'; the modes are: policy, lost, teleop, plan, replan, idle"):
+        runtime.switch_mode("tele")
+
+
+def test_entering_the_present_mode_changes_nothing(runs: Runs):
+    runtime = runs.start(mode="teleop")
+    runs.parts.CALLS.clear()
+    runtime.switch_mode("teleop")
+    assert runs.parts.CALLS == []
+    assert runs.parts.EVENTS == [("started", 1, "teleop")]
+
+
+def test_goals_one_after_the_other_end_the_run(runs: Runs):
+    runtime = runs.start(mode="plan", goals=("up", "pan=-0.3"))
+    while not runtime.step():
+        pass
+    assert position(runtime)[0] == pytest.approx(-0.3, abs=0.03)
+    assert runtime.summary()["goals_failed"] == 0
+
+
+@pytest.mark.parametrize("goal", ["pan=5", "grip=0.1"], ids=["outside limits", "no executor"])
+def test_a_goal_that_cannot_be_reached_is_counted_and_the_next_one_tried(
+    runs: Runs, goal: str, caplog: pytest.LogCaptureFixture
+):
+    runtime = runs.start(mode="plan", goals=(goal, "up"))
+    while not runtime.step():
+        pass
+    assert runtime.summary()["goals_failed"] == 1
+    assert f"goal {goal} failed: " in caplog.text
+    assert position(runtime)[0] == pytest.approx(0.4, abs=0.03)
+
+
+def test_an_emergency_stop_fails_the_goal_under_way(runs: Runs):
+    runtime = runs.start(mode="plan", goals=("up",))
+    seconds(runtime, 0.1)
+    runtime.session.control.call("estop")
+    while not runtime.step():
+        pass
+    assert runtime.summary()["goals_failed"] == 1
+
+
+def test_a_reset_fails_the_goal_under_way_and_the_next_is_tried(runs: Runs):
+    runtime = runs.start(mode="plan", goals=("up", "pan=-0.3"))
+    seconds(runtime, 0.1)
+    runtime.reset()
+    while not runtime.step():
+        pass
+    assert runtime.summary()["goals_failed"] == 1
+    assert position(runtime)[0] == pytest.approx(-0.3, abs=0.03)

@@ -1,0 +1,223 @@
+"""A run as a whole: the order of its plan, starting and stopping, what dies, services, emergency stop and reset."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ibrobot_core.errors import ComponentFailed, PlanningError
+from ibrobot_core.launch.runtime import ESTOP, RESET, Runtime
+
+if TYPE_CHECKING:
+    from conftest import Runs
+
+
+def steps(runtime: Runtime, count: int) -> None:
+    for _ in range(count):
+        runtime.step()
+
+
+def seconds(runtime: Runtime, duration: float) -> None:
+    steps(runtime, round(duration * runtime.session.config.control.rate_hz))
+
+
+def position(runtime: Runtime) -> float:
+    assert runtime.session.state is not None
+    return float(runtime.session.state.position[0])
+
+
+def watch(runtime: Runtime, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """What starts and stops, as it happens."""
+    happened: list[str] = []
+
+    def note(what: str, real: Callable[[], None]) -> None:
+        happened.append(what)
+        real()
+
+    for component in runtime.plan.components:
+        for name in ("start", "stop"):
+            call = partial(note, f"{name} {component.name}", getattr(component, name))
+            monkeypatch.setattr(component, name, call)
+    return happened
+
+
+@pytest.mark.parametrize("mode", ["policy", "teleop", "plan", "idle"])
+def test_nothing_stands_in_the_plan_before_what_it_needs(runs: Runs, mode: str):
+    runtime = runs.make("recording={type: lines}", mode=mode)
+    begun: set[str] = set()
+    for component in runtime.plan.components:
+        assert set(component.needs) <= begun, component.name
+        begun.add(component.name)
+    assert {"control", "sensor:top", "sensor:side", "recording", "status"} <= begun
+    assert (f"mode:{mode}" in begun) == (mode != "idle")
+    assert ("model:net" in begun) == ("episodes" in begun) == (mode == "policy")
+
+
+def test_the_plan_in_words(runs: Runs):
+    runtime = runs.make(episodes=2, seed=5)
+    assert [line.strip() for line in runtime.plan.lines()] == [
+        "1. model:net    policy net",
+        "2. control      scene at 50 Hz, in this process, in lockstep  (needs model:net)",
+        "3. sensor:top   camera drawn  (needs control)",
+        "4. sensor:side  camera drawn  (needs control)",
+        "5. mode:policy  net through the dispatcher at 25 Hz  (needs control, sensor:top, sensor:side, model:net)",
+        "6. status       /robot_status and /diagnostics  (needs control)",
+        "7. episodes     2 episodes from seed 5  (needs mode:policy)",
+        "stops in reverse order",
+    ]
+    assert runs.parts.MADE == {}, "a plan makes nothing"
+
+
+def test_all_start_in_order_and_stop_in_reverse(runs: Runs, monkeypatch: pytest.MonkeyPatch):
+    runtime = runs.make("recording={type: lines}")
+    names = [component.name for component in runtime.plan.components]
+    happened = watch(runtime, monkeypatch)
+    runtime.start()
+    assert happened == [f"start {name}" for name in names]
+    happened.clear()
+    runtime.stop()
+    assert happened == [f"stop {name}" for name in reversed(names)]
+    happened.clear()
+    runtime.stop()
+    assert happened == []
+
+
+@pytest.mark.parametrize(
+    ("trouble", "told"),
+    [
+        ("missing", "sensor:side: no such device"),
+        ("bug", "sensor:side: ZeroDivisionError: one over nothing"),
+    ],
+)
+@pytest.mark.parametrize("lockstep", [True, False], ids=["lockstep", "real"])
+def test_one_that_cannot_start_is_named_and_those_before_it_stop(
+    runs: Runs, trouble: str, told: str, lockstep: bool, monkeypatch: pytest.MonkeyPatch
+):
+    runtime = runs.make(lockstep=lockstep, sim=lockstep, mode="teleop")
+    runs.parts.TROUBLE["side"] = trouble
+    happened = watch(runtime, monkeypatch)
+    with pytest.raises(ComponentFailed) as failure:
+        runtime.start()
+    assert str(failure.value) == told
+    assert failure.value.exit_code == 1
+    assert happened == [
+        "start control", "start sensor:top", "start sensor:side",
+        "stop sensor:side", "stop sensor:top", "stop control",
+    ]  # fmt: skip
+    assert runs.parts.CALLS == ["open top", "close side", "close top"]
+
+
+def test_a_missing_model_is_told_before_anything_is_powered(runs: Runs, monkeypatch: pytest.MonkeyPatch):
+    runtime = runs.make(mode="lost")
+    happened = watch(runtime, monkeypatch)
+    with pytest.raises(ComponentFailed, match=r"^model:lost: no such checkpoint$"):
+        runtime.start()
+    assert happened == ["start model:lost", "stop model:lost"]
+
+
+def test_one_that_dies_ends_the_run_with_its_cause(runs: Runs):
+    runtime = runs.start(mode="teleop")
+    runs.parts.TROUBLE["top"] = "unplugged"
+    done = [runtime.step() for _ in range(6)]
+    assert done[0] is False
+    assert done[-1] is True
+    runtime.stop()
+    with pytest.raises(ComponentFailed, match=r"^sensor:top: unplugged$"):
+        runtime.raise_failure()
+    assert "close top" in runs.parts.CALLS
+    assert "disconnect stick" in runs.parts.CALLS
+
+
+def test_only_the_first_cause_is_told(runs: Runs):
+    runtime = runs.start(mode="teleop")
+    runtime.session.fail("sensor:top", ComponentFailed("first\nand foremost"))
+    runtime.session.fail("sensor:side", ComponentFailed("second"))
+    with pytest.raises(ComponentFailed, match=r"^sensor:top: first; and foremost$"):
+        runtime.raise_failure()
+
+
+def test_one_that_does_not_stop_well_keeps_no_other_from_stopping(
+    runs: Runs, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+):
+    runtime = runs.start(mode="teleop")
+
+    def fail() -> None:
+        raise OSError("the port is gone")
+
+    monkeypatch.setattr(runs.parts.MADE["side"], "close", fail)
+    runtime.stop()
+    assert "sensor:side did not stop well: OSError: the port is gone" in caplog.text
+    assert "close top" in runs.parts.CALLS
+    runtime.raise_failure()
+
+
+def test_the_duration_ends_the_run(runs: Runs):
+    runtime = runs.start(mode="teleop", duration_s=0.5)
+    count = 0
+    while not runtime.step():
+        count += 1
+    assert count == 24
+    assert runtime.summary()["duration_s"] == 0.5
+
+
+def test_emergency_stop_holds_until_the_reset(runs: Runs):
+    runtime = runs.start(mode="teleop")
+    bus = runtime.session.bus
+    seconds(runtime, 0.4)
+    before = position(runtime)
+    bus.call(ESTOP, None)
+    seconds(runtime, 0.6)
+    stopped = position(runtime)
+    assert stopped - before < 0.06
+    seconds(runtime, 1.0)
+    assert position(runtime) == pytest.approx(stopped, abs=1e-3)
+    assert runtime.session.state is not None
+    assert runtime.session.state.estop
+    assert runtime.summary()["faults"] == ["emergency stop"]
+    assert ("fault", "emergency stop") in runs.parts.EVENTS
+    bus.call(RESET, None)
+    seconds(runtime, 0.5)
+    assert not runtime.session.state.estop
+    assert 0.03 < position(runtime) - stopped < 0.15, "it goes on from where it stood, with no jump"
+
+
+def test_hardware_that_falls_silent_is_a_fault_and_a_reset_goes_on(runs: Runs):
+    runtime = runs.start(mode="teleop")
+    seconds(runtime, 0.2)
+    runs.parts.MADE["simulation"].broken = True
+    seconds(runtime, 0.4)
+    (fault,) = runtime.summary()["faults"]
+    assert fault.startswith("the bus is silent: no state for ")
+    assert ("fault", fault) in runs.parts.EVENTS
+    stuck = position(runtime)
+    runtime.reset()
+    seconds(runtime, 0.5)
+    assert position(runtime) > stuck + 0.03
+    assert runtime.summary()["faults"] == [fault], "what happened is not forgotten"
+
+
+def test_services_end_with_the_run(runs: Runs):
+    runtime = runs.start(mode="teleop")
+    runtime.stop()
+    with pytest.raises(Exception, match="nobody serves /reset"):
+        runtime.session.bus.call(RESET, None)
+
+
+@pytest.mark.parametrize(
+    ("mode", "goal", "told"),
+    [
+        ("teleop", "home", "--goal needs a mode with a planner: --mode plan or --mode replan"),
+        ("plan", "hom", "goal 'hom': no pose 'hom'; the poses are: home, up; or give joints, e.g. wrist_flex=0.5"),
+        ("plan", "tilt=1", "goal 'tilt=1': no joint 'tilt'; the joints are: pan, grip"),
+        ("plan", "pan=1,grip=wide", "goal 'pan=1,grip=wide': 'wide' is no angle in radians"),
+        ("plan", "pan=nan", "goal 'pan=nan': 'nan' is no angle in radians"),
+    ],
+)
+def test_a_goal_that_cannot_be_meant_is_refused_before_anything_starts(runs: Runs, mode: str, goal: str, told: str):
+    with pytest.raises(PlanningError) as failure:
+        runs.make(mode=mode, goals=(goal,))
+    assert str(failure.value) == told
+    assert failure.value.exit_code == 2
