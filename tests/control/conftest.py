@@ -1,0 +1,165 @@
+"""A small robot of three joints on fake hardware, and its control core, ticked by hand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, override
+
+import attrs
+import numpy as np
+import pytest
+import yaml
+
+from ibrobot_core.clock import SteppedClock
+from ibrobot_core.config import RobotConfig, from_document
+from ibrobot_core.control.build import build_core
+from ibrobot_core.control.core import ControlCore
+from ibrobot_core.control.link import ControlState, PlanRecord
+from ibrobot_core.descriptors import HardwareDescriptor
+from ibrobot_core.errors import HardwareError
+from ibrobot_core.interfaces import Context, JointReading
+from ibrobot_core.plugins import Entry, Registry, discover
+from ibrobot_core.robot import Vector
+from ibrobot_core.testing.contexts import START_NS
+from ibrobot_core.testing.fakes import FakeHardware, FakeRealHardware
+
+DOCUMENT = """
+robot:
+  name: mini
+  joints:
+    - {name: pan, lower: -1.0, upper: 1.0, max_velocity: 3.0, max_acceleration: 40.0}
+    - {name: lift, lower: -1.5, upper: 1.5, max_velocity: 3.0, max_acceleration: 40.0}
+    - {name: grip, lower: 0.0, upper: 1.0, max_velocity: 3.0, max_acceleration: 40.0}
+  groups: {arm: [pan, lift], gripper: [grip]}
+  description:
+    poses: {rest: [-0.8, 1.0, 0.1]}
+hardware: {type: scripted}
+simulation: {type: scripted}
+executors:
+  arm_position: {type: position, group: arm}
+  gripper_position: {type: position, group: gripper}
+  arm_trajectory: {type: trajectory, group: arm}
+  gripper_action: {type: gripper, group: gripper}
+control_modes:
+  stream: {executors: [arm_position, gripper_position]}
+  plan: {executors: [arm_trajectory, gripper_action]}
+default_control_mode: stream
+control: {rate_hz: 100, stop: hold, state_timeout: 0.05}
+"""
+
+
+class ScriptedHardware(FakeHardware):
+    """Fails as told, and keeps what it was written."""
+
+    def __init__(self, ctx: Context) -> None:
+        super().__init__(ctx)
+        self.written: list[Vector] = []
+        self.silent = False
+        self.stale = False
+        self.write_error = ""
+        self.signal_error = ""
+        self._last: JointReading | None = None
+
+    @override
+    def read(self) -> JointReading:
+        if self.silent:
+            raise HardwareError("the bus is silent")
+        if self.stale and self._last is not None:
+            return attrs.evolve(self._last, stamp_ns=self._ctx.clock.now_ns(), stale=True)
+        self._last = super().read()
+        return self._last
+
+    @override
+    def write(self, position: Vector) -> None:
+        if self.write_error:
+            raise HardwareError(self.write_error)
+        super().write(position)
+        self.written.append(position.copy())
+
+    @override
+    def read_signal(self, index: int, out: Vector) -> None:
+        if self.signal_error:
+            raise HardwareError(self.signal_error)
+        super().read_signal(index, out)
+
+    @override
+    def reset_faults(self) -> None:
+        self.silent = self.stale = False
+
+
+class Rig:
+    """A control core with its clock and its hardware."""
+
+    def __init__(self, edits: Mapping[str, Any], *, sim: bool = False) -> None:
+        self.parts: dict[str, ScriptedHardware] = {}
+        self.clock = SteppedClock(START_NS)
+        document = yaml.safe_load(DOCUMENT) | dict(edits)
+        registry = self._registry()
+        self.config: RobotConfig = from_document(document, source=Path("mini.yaml"), sim=sim, registry=registry)
+        self.core: ControlCore = build_core(self.config, registry, self.clock, 0)
+
+    def _registry(self) -> Registry:
+        def scripted(options: object, ctx: Context) -> ScriptedHardware:
+            self.parts[ctx.name] = ScriptedHardware(ctx)
+            return self.parts[ctx.name]
+
+        registry = discover([])
+        for descriptor in (
+            HardwareDescriptor("scripted", scripted, "fails as told", simulated=True),
+            HardwareDescriptor("stiff", lambda _, ctx: FakeRealHardware(ctx), "cannot relax"),
+        ):
+            registry.entries["hardware", descriptor.type] = Entry("hardware", descriptor, "fake", "fake", "1.0")
+        return registry
+
+    @property
+    def hardware(self) -> ScriptedHardware:
+        """The only part."""
+        (part,) = self.parts.values()
+        return part
+
+    def start(self, mode: str = "stream") -> Rig:
+        """Start, and tick once."""
+        self.core.start(mode)
+        self.tick()
+        return self
+
+    def tick(self, count: int = 1) -> ControlState:
+        """So many ticks, a period apart."""
+        for _ in range(count):
+            self.clock.advance(self.core.period_ns)
+            state = self.core.tick()
+        return state
+
+    def plan(self, end: list[float], seconds: float = 0.5, joints: tuple[bool, ...] = (True, True, True)) -> None:
+        """Send a straight plan from where the robot is told to be, to `end` [rad], shape (J,)."""
+        assert self.core.state is not None
+        rows = round(seconds * 100) + 1
+        positions = np.linspace(self.core.state.command, end, rows)
+        now_ns = self.clock.now_ns()
+        record = PlanRecord(self.core.epoch, now_ns, self.core.period_ns, np.array(joints), positions)
+        self.core.set_plan(record)
+
+    def call(self, do: str, **arguments: Any) -> dict[str, Any]:
+        """Have a command carried out; returns the answer."""
+        return self.core.handle({"do": do, "id": 7, **arguments})
+
+    def stop(self, longest: int = 1000) -> int:
+        """Stop; returns after how many ticks the robot had stopped."""
+        self.core.begin_stop()
+        for count in range(longest):
+            if self.core.stopped:
+                return count
+            self.tick()
+        raise AssertionError(f"the robot has not stopped after {longest} ticks")
+
+    def events(self, kind: str) -> list[dict[str, Any]]:
+        """Events of a kind so far, each once."""
+        found = [event for event in self.core.events if event["event"] == kind]
+        self.core.events.clear()
+        return found
+
+
+@pytest.fixture
+def make_rig() -> Callable[..., Rig]:
+    return Rig
