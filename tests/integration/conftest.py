@@ -1,0 +1,80 @@
+"""`ibrobot launch` as a user runs it: in a process of its own, with the simulated SO-101."""
+
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import attrs
+import numpy as np
+import pytest
+
+IBROBOT = (sys.executable, "-c", "from ibrobot_core.cli.main import main; main()")
+JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
+
+
+@attrs.frozen
+class Ran:
+    """What a run printed, and its exit code."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """The last line of a run with `--json`."""
+        summary = json.loads(self.out.splitlines()[-1])
+        assert isinstance(summary, dict)
+        return summary
+
+
+@attrs.frozen
+class Log:
+    """A joint log: times [s] and positions [rad], shape (N, 6)."""
+
+    times: np.ndarray
+    positions: np.ndarray
+    text: str
+
+    @classmethod
+    def read(cls, path: Path) -> Log:
+        text = path.read_text()
+        header, *rows = csv.reader(text.splitlines())
+        assert tuple(header) == ("time_s", *JOINTS)
+        numbers = np.array(rows, dtype=float)
+        return cls(numbers[:, 0], numbers[:, 1:], text)
+
+    def joint(self, name: str) -> np.ndarray:
+        """Positions of one joint [rad], shape (N,)."""
+        return self.positions[:, JOINTS.index(name)]
+
+
+@pytest.fixture
+def launch(tmp_path: Path) -> Callable[..., Ran]:
+    """Run `ibrobot launch so101_blind --sim --headless --json …` (without cameras) in a folder of its own."""
+
+    def run(*arguments: str, robot: str = "so101_blind") -> Ran:
+        command = [*IBROBOT, "launch", robot, "--sim", "--headless", "--json", *arguments]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
+        return Ran(done.returncode, done.stdout, done.stderr)
+
+    return run
+
+
+@pytest.fixture
+def recorded(launch: Callable[..., Ran], tmp_path: Path) -> Callable[..., tuple[Ran, list[Log]]]:
+    """As `launch`, with the joint log of each episode."""
+
+    def run(*arguments: str, dataset: str = "default") -> tuple[Ran, list[Log]]:
+        recording = f"recording={{type: joint_log, root: kept, dataset: {dataset}}}"
+        ran = launch("--set", recording, *arguments)
+        folders = sorted((tmp_path / "kept" / dataset / "episodes").iterdir()) if ran.code in (0, 3) else []
+        return ran, [Log.read(folder / "joints.csv") for folder in folders]
+
+    return run
