@@ -24,6 +24,7 @@ from ibrobot_core.robot import Vector
 from ibrobot_core.testing.contexts import START_NS
 from ibrobot_core.testing.fakes import FakeHardware, FakeRealHardware
 
+PERIOD_S = 0.01
 DOCUMENT = """
 robot:
   name: mini
@@ -35,7 +36,7 @@ robot:
   description:
     poses: {rest: [-0.8, 1.0, 0.1]}
 hardware: {type: scripted}
-simulation: {type: scripted}
+simulation: {type: scene}
 executors:
   arm_position: {type: position, group: arm}
   gripper_position: {type: position, group: gripper}
@@ -106,7 +107,8 @@ class Rig:
 
         registry = discover([])
         for descriptor in (
-            HardwareDescriptor("scripted", scripted, "fails as told", simulated=True),
+            HardwareDescriptor("scripted", scripted, "fails as told"),
+            HardwareDescriptor("scene", scripted, "fails as told, and can be set up anew", simulated=True),
             HardwareDescriptor("stiff", lambda _, ctx: FakeRealHardware(ctx), "cannot relax"),
         ):
             registry.entries["hardware", descriptor.type] = Entry("hardware", descriptor, "fake", "fake", "1.0")
@@ -152,6 +154,18 @@ class Rig:
                 return count
             self.tick()
         raise AssertionError(f"the robot has not stopped after {longest} ticks")
+
+    @property
+    def interventions(self) -> int:
+        """How often a joint was not given what was asked for."""
+        return sum(self.core.counters()["joints"].values())
+
+    def assert_within_limits(self) -> None:
+        """All that was written since the start moves within the limits of the joints."""
+        written = np.array([self.hardware.written[0], *self.hardware.written])
+        steps = np.diff(written, axis=0)
+        assert np.abs(steps).max() <= 3.0 * PERIOD_S * (1 + 1e-9)
+        assert np.abs(np.diff(steps, axis=0)).max() <= 40.0 * PERIOD_S**2 * (1 + 1e-9)
 
     def events(self, kind: str) -> list[dict[str, Any]]:
         """Events of a kind so far, each once."""

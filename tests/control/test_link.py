@@ -57,7 +57,6 @@ def sides() -> Iterator[tuple[SharedMemory, SharedMemory]]:
         side.close()
 
 
-
 class TestStates:
     def test_come_once_and_in_order(self, sides):
         control, host = sides

@@ -1,0 +1,136 @@
+"""The control loop's work, tick by tick: modes, plans and goals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ibrobot_core.control.link import PlanRecord
+from ibrobot_core.errors import ConfigError, HardwareError, NotSupported
+
+POINTS = {"joint_names": ["pan", "lift"], "points": [{"time_from_start_ns": 400_000_000, "positions": [0.3, 0.2]}]}
+GOAL = {"executor": "arm_trajectory", "goal_id": "one", "goal": {"trajectory": POINTS}}
+
+
+class TestStart:
+    def test_holds_where_it_is(self, make_rig):
+        rig = make_rig({})
+        measured = rig.hardware._position.copy()
+        rig.start()
+
+        np.testing.assert_array_equal(rig.tick(5).command, measured)
+
+    def test_refuses_to_start_from_nowhere(self, make_rig):
+        rig = make_rig({})
+        rig.hardware._position[1] = np.nan
+
+        with pytest.raises(HardwareError, match="joint lift is measured at nan"):
+            rig.core.start("stream")
+
+    def test_refuses_a_reading_that_is_no_measurement(self, make_rig):
+        rig = make_rig({})
+        rig.hardware.connect()
+        rig.hardware.read()
+        rig.hardware.stale = True
+
+        with pytest.raises(HardwareError, match="do not answer"):
+            rig.core.start("stream")
+
+    def test_refuses_to_promise_torque_off_where_there_is_no_such_thing(self, make_rig):
+        rig = make_rig({"hardware": {"type": "stiff"}, "control": {"stop": "relax"}})
+
+        with pytest.raises(NotSupported, match=r"control.stop: relax: hardware 'hardware' cannot take torque off"):
+            rig.core.start("stream")
+
+    def test_needs_something_to_control(self, make_rig):
+        with pytest.raises(ConfigError, match="hardware"):
+            make_rig({"hardware": {}})
+
+
+class TestModes:
+    def test_a_switch_changes_owners_within_a_tick_and_holds_what_is_measured(self, make_rig):
+        rig = make_rig({}).start()
+        rig.plan([0.4, 0.5, 0.6])
+        rig.tick(60)
+        rig.tick(100)
+        rig.hardware._position[1] -= 0.05  # it sags
+        rig.tick()
+        answer = rig.call("switch_mode", mode="plan")
+
+        assert answer["epoch"] == rig.core.epoch
+        rig.tick(60)
+        sagged = rig.hardware._position[1]
+        np.testing.assert_allclose(rig.core.state.command[1], 0.45, atol=0.01)
+        assert sagged == pytest.approx(0.45, abs=0.01)
+
+    def test_a_switch_on_the_move_stays_within_the_limits(self, make_rig):
+        rig = make_rig({}).start()
+        rig.plan([0.9, 1.0, 0.9], 0.4)
+        rig.tick(20)
+        rig.call("switch_mode", mode="plan")
+        rig.tick(50)
+
+        rig.assert_within_limits()
+        np.testing.assert_array_equal(rig.tick().command, rig.core.state.command)
+
+    def test_plans_from_before_a_switch_are_counted_and_not_followed(self, make_rig):
+        rig = make_rig({}).start()
+        before = rig.tick().command
+        epoch = rig.core.epoch
+        rig.call("switch_mode", mode="plan")
+        rig.call("switch_mode", mode="stream")
+        old = PlanRecord(epoch, rig.clock.now_ns(), rig.core.period_ns, np.ones(3, bool), np.full((50, 3), 0.9))
+        rig.core.set_plan(old)
+
+        np.testing.assert_allclose(rig.tick(30).command, before, atol=1e-6)
+        assert rig.core.counters()["loop"]["old_plans"] == 1
+
+    def test_an_unknown_mode_is_refused_and_the_present_one_goes_on(self, make_rig):
+        rig = make_rig({}).start()
+        rig.plan([0.2, 0.2, 0.5])
+
+        assert rig.call("switch_mode", mode="dance")["error"] == "no mode 'dance'; the modes are: stream, plan"
+        np.testing.assert_allclose(rig.tick(70).command, [0.2, 0.2, 0.5], atol=1e-9)
+
+    def test_a_plan_for_some_joints_moves_no_others(self, make_rig):
+        rig = make_rig({}).start()
+        before = rig.tick().command
+        rig.plan([0.4, 0.4, 0.9], joints=(True, True, False))
+
+        np.testing.assert_allclose(rig.tick(70).command, [0.4, 0.4, before[2]], atol=1e-9)
+
+
+class TestGoals:
+    def test_reach_their_executor_and_report(self, make_rig):
+        rig = make_rig({}).start("plan")
+        assert "error" not in rig.call("goal", **GOAL)
+        rig.tick(150)
+
+        goals = rig.events("goal")
+        assert [(goal["executor"], goal["goal"], goal["state"]) for goal in goals] == [
+            ("arm_trajectory", "one", "executing"), ("arm_trajectory", "one", "succeeded"),
+        ]  # fmt: skip
+        np.testing.assert_allclose(rig.core.state.command[:2], [0.3, 0.2])
+
+    def test_for_an_executor_that_is_not_active_are_refused(self, make_rig):
+        rig = make_rig({}).start("stream")
+
+        refused = "executor 'arm_trajectory' is not active; active: arm_position, gripper_position"
+        assert rig.call("goal", **GOAL)["error"] == refused
+
+    def test_that_are_malformed_are_refused(self, make_rig):
+        rig = make_rig({}).start("plan")
+        assert "error" in rig.call("goal", **GOAL | {"goal": {"trajectory": {"joint_names": ["nose"], "points": []}}})
+        assert rig.events("goal") == []
+
+    def test_end_with_the_mode_or_a_cancel(self, make_rig):
+        rig = make_rig({}).start("plan")
+        for end, arguments in (("cancel", {}), ("switch_mode", {"mode": "stream"})):
+            rig.call("switch_mode", mode="plan")
+            rig.events("goal")
+            rig.call("goal", **GOAL)
+            rig.tick(10)
+            rig.call(end, **arguments)
+            rig.tick()
+
+            assert [goal["state"] for goal in rig.events("goal")] == ["executing", "canceled"]
