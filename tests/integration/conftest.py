@@ -56,6 +56,12 @@ class Log:
 
 
 @pytest.fixture
+def ibrobot() -> tuple[str, ...]:
+    """The command `ibrobot`, of the interpreter that runs the tests."""
+    return IBROBOT
+
+
+@pytest.fixture
 def launch(tmp_path: Path) -> Callable[..., Ran]:
     """Run `ibrobot launch so101_blind --sim --headless --json …` (without cameras) in a folder of its own."""
 
