@@ -107,6 +107,8 @@ class _Dumper(yaml.SafeDumper):
 
 def _text(dumper: yaml.SafeDumper, value: str) -> yaml.ScalarNode:
     style = None if isinstance(scalar(value), str) else "'"
+    if not value.isprintable():
+        style = '"'  # the only one with escapes: the others fold line breaks such as U+0085
     return dumper.represent_scalar("tag:yaml.org,2002:str", value, style=style)
 
 

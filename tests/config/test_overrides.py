@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import yaml
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from ibrobot_core.config import RobotConfig, from_document
@@ -148,6 +148,7 @@ def test_any_value_anywhere_is_taken_or_told(
     assert from_document(config.document, source=config.source, sim=sim, registry=registry) == config
 
 
+@example("\x85")
 @given(values.filter(_without_expansion))
 def test_yaml_text_reads_back_with_equal_types(value: Any) -> None:
     document = parse(dump({"key": value}), "robot.yaml")

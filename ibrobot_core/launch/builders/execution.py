@@ -17,7 +17,6 @@ from ibrobot_core.launch.session import Session
 from ibrobot_core.robot import Vector
 from ibrobot_core.units import NS_PER_S
 
-
 TOGGLE_SMOOTHING = "/action_dispatcher/toggle_smoothing"
 
 
