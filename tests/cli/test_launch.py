@@ -1,0 +1,209 @@
+"""`ibrobot launch` with a made-up robot: options that exclude each other, summary, exit codes, the first Ctrl-C."""
+
+from __future__ import annotations
+
+import json
+import logging
+import signal
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+if TYPE_CHECKING:
+    from conftest import Ran, Site
+
+PARTS = '''
+import signal
+from ibrobot_core import hookimpl
+from ibrobot_core.descriptors import HardwareDescriptor, PlannerDescriptor, PolicyDescriptor, TeleopDescriptor
+from ibrobot_core.errors import HardwareError, TeleopError
+from ibrobot_core.testing.fakes import FakeHardware, FakePlanner, FakePolicy, FakeRealHardware, FakeTeleop
+
+class Scene(FakeHardware):
+    """Done after half a second, but never with seed 13; silent after two seconds with seed 66."""
+    def reset(self, episode):
+        super().reset(episode)
+        self.ticks, self.seed = 0, episode.seed
+    def advance(self, step_ns):
+        super().advance(step_ns)
+        self.ticks += 1
+    def success(self):
+        return self.seed not in (13, 66) and self.ticks >= 25
+    def read(self):
+        if self.seed == 66 and self.ticks > 100:
+            raise HardwareError("the bus is silent")
+        return super().read()
+
+class Stick(FakeTeleop):
+    """Pulled out after a second."""
+    reads = 0
+    def read(self, measured):
+        self.reads += 1
+        if self.reads > 50:
+            raise TeleopError("the stick is gone")
+        return super().read(measured)
+
+class Person(FakeTeleop):
+    """Presses Ctrl-C after a second."""
+    reads = 0
+    def read(self, measured):
+        self.reads += 1
+        if self.reads == 50:
+            signal.raise_signal(signal.SIGINT)
+        return super().read(measured)
+
+@hookimpl
+def ibrobot_hardware():
+    yield HardwareDescriptor("scene", lambda options, ctx: Scene(ctx), "a scene", simulated=True)
+    yield HardwareDescriptor("arm", lambda options, ctx: FakeRealHardware(ctx), "an arm")
+
+@hookimpl
+def ibrobot_policies():
+    yield PolicyDescriptor("net", lambda options, ctx: FakePolicy(ctx), "a network")
+
+@hookimpl
+def ibrobot_teleop():
+    yield TeleopDescriptor("stick", lambda options, ctx: Stick(ctx), "a stick")
+    yield TeleopDescriptor("person", lambda options, ctx: Person(ctx), "a person")
+
+@hookimpl
+def ibrobot_planners():
+    yield PlannerDescriptor("cubic", lambda options, ctx: FakePlanner(ctx), "cubics")
+'''
+ROBOT = """\
+robot:
+  name: mini
+  joints:
+    - {name: pan, lower: -1.0, upper: 1.0, max_velocity: 2.0, max_acceleration: 10.0}
+  groups: {arm: [pan]}
+  description:
+    poses: {home: [0], up: [0.4]}
+hardware: {type: arm}
+simulation: {type: scene}
+executors:
+  position: {type: position, group: arm}
+  trajectory: {type: trajectory, group: arm}
+models:
+  net: {type: net}
+control_modes:
+  policy: {executors: [position], inference: {model: net}}
+  stick: {executors: [position], teleop: stick}
+  person: {executors: [position], teleop: person}
+  plan: {executors: [trajectory], planner: {type: cubic}}
+default_control_mode: policy
+teleoperation:
+  stick: {type: stick}
+  person: {type: person}
+contract:
+  rate_hz: 25
+  max_duration_s: 1
+  observations:
+    - {key: observation.state, topic: /joint_states, select: [position.pan]}
+  actions:
+    - {executor: position, topic: /commands}
+control: {rate_hz: 50}
+"""
+
+
+@pytest.fixture
+def launch(
+    site: Site, ibrobot: Callable[..., Ran], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Callable[..., Ran]]:
+    """Run `ibrobot launch mini.yaml …` in this process, and put back what it sets for the whole process."""
+    site.add("fake-parts", PARTS)
+    monkeypatch.chdir(tmp_path)
+    Path("mini.yaml").write_text(ROBOT)
+    root, ours = logging.getLogger(), logging.getLogger("ibrobot")
+    handlers, levels = list(root.handlers), (root.level, ours.level)
+    signals = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield lambda *arguments: ibrobot("launch", "mini.yaml", *arguments)
+    root.handlers[:] = handlers
+    root.setLevel(levels[0])
+    ours.setLevel(levels[1])
+    for number, handler in signals.items():
+        signal.signal(number, handler)
+
+
+LOCKSTEP = ("--sim", "--lockstep", "--headless")
+
+
+def test_the_summary_in_words(launch: Callable[..., Ran]):
+    ran = launch(*LOCKSTEP, "--episodes", "2")
+    assert ran.code == 0, ran.err
+    assert ran.out.splitlines() == [
+        "mini: policy for 1.1 s",
+        "episodes   2, of which 2 succeeded",
+        "loop       55 ticks in lockstep",
+        "faults     none",
+    ]
+
+
+def test_the_summary_as_json_is_the_last_line(launch: Callable[..., Ran]):
+    ran = launch(*LOCKSTEP, "--episodes", "2", "--seed", "5", "--json")
+    assert ran.code == 0, ran.err
+    summary = json.loads(ran.out.splitlines()[-1])
+    assert summary.items() >= {"robot": "mini", "seed": 5, "episodes": 2, "successes": 2, "faults": []}.items()
+    assert summary["loop"].keys() >= {"rate_hz", "lateness_p50_us", "lateness_p99_us", "missed"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code"),
+    [
+        (("--episodes", "1"), 0),
+        (("--duration", "0.2"), 0),
+        (("--episodes", "2", "--seed", "12"), 3),
+        (("--episodes", "1", "--seed", "66", "--set", "contract.max_duration_s=4"), 1),
+        (("--mode", "stick"), 1),
+        (("--mode", "person"), 0),
+        (("--mode", "plan", "--goal", "up"), 0),
+        (("--mode", "plan", "--goal", "pan=3"), 3),
+        (("--mode", "plan", "--goal", "down"), 2),
+        (("--mode", "climb"), 2),
+        (("--set", "control.rate_hz=fast"), 2),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, tuple) else None,
+)
+def test_exit_codes(launch: Callable[..., Ran], arguments: tuple[str, ...], code: int):
+    ran = launch(*LOCKSTEP, "--json", *arguments)
+    assert ran.code == code, ran.err
+    assert bool(ran.out) == (code != 2), "a summary, unless nothing ran"
+    assert "Traceback" not in ran.err
+
+
+def test_what_died_is_told_after_the_summary(launch: Callable[..., Ran]):
+    ran = launch(*LOCKSTEP, "--mode", "stick", "--json")
+    assert ran.err.splitlines()[-1] == "error: mode:stick: the stick is gone"
+    assert json.loads(ran.out)["mode"] == "stick"
+
+
+def test_the_first_ctrl_c_ends_the_run_in_order(launch: Callable[..., Ran]):
+    ran = launch(*LOCKSTEP, "--mode", "person", "--json")
+    assert ran.code == 0, ran.err
+    assert "stopping; Ctrl-C again stops at once" in ran.err
+    assert 45 <= json.loads(ran.out)["loop"]["ticks"] <= 55
+
+
+def test_dry_run_prints_the_plan(launch: Callable[..., Ran]):
+    ran = launch(*LOCKSTEP, "--dry-run")
+    assert (ran.code, ran.err) == (0, "")
+    assert [line.split()[1] for line in ran.out.splitlines()[:-1]] == [
+        "model:net", "control", "mode:policy", "status", "episodes",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("--sim", "--window", "--headless"), "--window and --headless exclude each other"),
+        (("--lockstep",), "--lockstep is for simulation: add --sim"),
+        (("--sim", "--episodes", "0"), "'--episodes'"),
+        (("--sim", "--duration", "-1"), "'--duration'"),
+    ],
+)
+def test_options_that_make_no_sense_are_refused(launch: Callable[..., Ran], arguments: tuple[str, ...], told: str):
+    ran = launch(*arguments)
+    assert ran.code == 2
+    assert told in ran.err
+    assert ran.out == ""
