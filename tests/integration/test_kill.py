@@ -1,0 +1,371 @@
+"""Whole runs on a made-up arm that logs every command: what is left, and how the arm stops, however processes end."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import attrs
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from conftest import Site
+
+pytestmark = pytest.mark.integration
+
+PATIENCE_S = 30.0
+STOP_NS = 100_000_000
+
+PLUGIN = '''
+import math, os, time
+import attrs
+from ibrobot_core import hookimpl
+from ibrobot_core.descriptors import HardwareDescriptor, PolicyDescriptor, SensorDescriptor, TeleopDescriptor
+from ibrobot_core.errors import PolicyError, SensorError
+from ibrobot_core.interfaces import TeleopCommand
+from ibrobot_core.options import option
+from ibrobot_core.testing.fakes import FakePolicy, FakeRealHardware, FakeSensor, FakeTeleop
+
+class Arm(FakeRealHardware):
+    """Logs every command with the time; `trouble` is a bug after a second."""
+    def __init__(self, options, ctx):
+        super().__init__(ctx)
+        self._options = options
+        self._log = os.open(options.log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+        self._reads = 0
+    def read(self):
+        self._reads += 1
+        if self._options.trouble and self._reads > 100:
+            return 1 / 0
+        return super().read()
+    def write(self, position):
+        super().write(position)
+        self._note("write", *map(repr, position.tolist()))
+    def relax(self):
+        self._note("relax")
+    def _note(self, *words):
+        os.write(self._log, (" ".join([words[0], str(time.monotonic_ns()), *words[1:]]) + "\\n").encode())
+
+@attrs.frozen
+class ArmOptions:
+    log: str = option(help="file")
+    trouble: bool = option(False, help="whether it has a bug")
+
+class Swing(FakeTeleop):
+    """Swings every joint about its start; with `fork`, a child of the host outlives it."""
+    def __init__(self, options, ctx):
+        super().__init__(ctx)
+        self._options = options
+    def connect(self):
+        super().connect()
+        if self._options.fork and os.fork() == 0:
+            time.sleep(60)
+            os._exit(0)
+    def activate(self, measured):
+        super().activate(measured)
+        self._start = (measured.stamp_ns, measured.position.copy())
+    def read(self, measured):
+        begun_ns, middle = self._start
+        swung = middle + 0.6 * math.sin(4.0 * (measured.stamp_ns - begun_ns) * 1e-9)
+        return TeleopCommand(dict(zip(self._names, swung.tolist())))
+
+@attrs.frozen
+class SwingOptions:
+    fork: bool = option(False, help="whether a child outlives the host")
+
+class Camera(FakeSensor):
+    frames = 0
+    def read(self, timeout_s):
+        self.frames += 1
+        if self.frames > 200:
+            raise SensorError("the camera was unplugged")
+        time.sleep(0.002)
+        return super().read(timeout_s)
+
+class Lost(FakePolicy):
+    def load(self):
+        raise PolicyError("no such checkpoint: lost.pt")
+
+@hookimpl
+def ibrobot_hardware():
+    yield HardwareDescriptor("logged", Arm, "an arm that logs", ArmOptions)
+
+@hookimpl
+def ibrobot_teleop():
+    yield TeleopDescriptor("swing", Swing, "swings", SwingOptions)
+
+@hookimpl
+def ibrobot_sensors():
+    yield SensorDescriptor("brittle", lambda options, ctx: Camera(ctx), "breaks")
+
+@hookimpl
+def ibrobot_policies():
+    yield PolicyDescriptor("lost", lambda options, ctx: Lost(ctx), "is not there")
+'''
+
+ROBOT = """
+robot:
+  name: mini
+  joints:
+    - {name: pan, lower: -1.5, upper: 1.5, max_velocity: 3.0, max_acceleration: 40.0}
+    - {name: lift, lower: -1.5, upper: 1.5, max_velocity: 3.0, max_acceleration: 40.0}
+  groups: {arm: [pan, lift]}
+  description:
+    poses: {rest: [-1.2, 1.2]}
+hardware: {type: logged, log: commands.log}
+executors:
+  arm_position: {type: position, group: arm}
+models:
+  lost: {type: lost}
+control_modes:
+  teleop: {executors: [arm_position], teleop: swing}
+  policy: {executors: [arm_position], inference: {model: lost}}
+default_control_mode: teleop
+teleoperation:
+  swing: {type: swing}
+contract:
+  rate_hz: 30
+  observations:
+    - {key: observation.state, topic: /joint_states, select: [position.pan, position.lift]}
+  actions:
+    - {executor: arm_position, topic: /arm/commands}
+control: {rate_hz: 100, stop: hold}
+"""
+REST = np.array([-1.2, 1.2])
+
+
+def wait_for(condition: Callable[[], bool], what: str) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline, f"{what}: not within {PATIENCE_S:.0f} s"
+        time.sleep(0.005)
+
+
+def is_alive(pid: int) -> bool:
+    """Whether a process runs; one that has ended and waits for its parent does not."""
+    try:
+        return pid > 0 and Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+def memories(pids: list[int]) -> set[tuple[int, int]]:
+    """Device and inode of each memory shared between host and control that these processes have open."""
+    found = set()
+    for pid in pids:
+        with suppress(OSError):
+            for entry in Path(f"/proc/{pid}/fd").iterdir():
+                with suppress(OSError):
+                    if "ibrobot-link" in os.readlink(entry):
+                        status = entry.stat()
+                        found.add((status.st_dev, status.st_ino))
+    return found
+
+
+@attrs.define
+class Run:
+    """A launched robot."""
+
+    folder: Path
+    host: subprocess.Popen[bytes]
+    control: int = 0
+    children: list[int] = attrs.field(factory=list)
+
+    @property
+    def log(self) -> list[list[str]]:
+        """What the arm was told so far: word, monotonic time [ns], positions [rad]; whole lines only."""
+        path = self.folder / "commands.log"
+        text = path.read_text() if path.exists() else ""
+        return [line.split() for line in text.rpartition("\n")[0].splitlines()]
+
+    def commands(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Times [ns], shape (N,), and positions [rad], shape (N, 2), of all commands."""
+        written = [line for line in self.log if line[0] == "write"]
+        return np.array([int(w[1]) for w in written]), np.array([[float(p) for p in w[2:]] for w in written])
+
+    def is_swinging(self) -> bool:
+        """Whether the arm is told to move fast now."""
+        _, positions = self.commands()
+        return len(positions) > 20 and bool(np.abs(np.diff(positions[-3:], axis=0)).min() > 0.02)
+
+    def find_control(self) -> None:
+        """Learn the process ids of the host's children."""
+        children = Path(f"/proc/{self.host.pid}/task/{self.host.pid}/children")
+        wait_for(lambda: bool(children.read_text()), "the control process starts")
+        wait_for(lambda: len(self.log) > 10, "the arm is told something")
+        tasks = Path(f"/proc/{self.host.pid}/task")
+        self.children = [int(pid) for each in tasks.glob("*/children") for pid in each.read_text().split()]
+        (self.control,) = (
+            pid for pid in self.children if b"ibrobot_core.control.process" in Path(f"/proc/{pid}/cmdline").read_bytes()
+        )
+
+    def kill_host(self) -> int:
+        """Kill the host; returns when that was [ns]."""
+        killed_ns = time.monotonic_ns()
+        self.host.kill()
+        self.host.wait(PATIENCE_S)
+        return killed_ns
+
+    def end(self) -> tuple[int, str]:
+        """Wait for the host to exit; its status and standard error."""
+        status = self.host.wait(PATIENCE_S)
+        wait_for(lambda: not is_alive(self.control), "the control process exits")
+        return status, (self.folder / "errors.txt").read_text()
+
+
+@pytest.fixture
+def launch(site: Site, tmp_path: Path) -> Iterator[Callable[..., Run]]:
+    site.add("ibrobot-plugin-logged", PLUGIN)
+    (tmp_path / "mini.yaml").write_text(ROBOT)
+    runs: list[Run] = []
+
+    def start(*overrides: str, mode: str = "teleop", awaited: bool = True) -> Run:
+        command = [sys.executable, "-c", "from ibrobot_core.cli.main import main; main()", "launch", "mini.yaml"]
+        command += ["--headless", "--mode", mode, *(word for each in overrides for word in ("--set", each))]
+        # Files and no pipes: these stay open as long as any child lives.
+        with (tmp_path / "output.txt").open("w") as output, (tmp_path / "errors.txt").open("w") as errors:
+            host = subprocess.Popen(command, cwd=tmp_path, stdin=subprocess.DEVNULL, stdout=output, stderr=errors)
+        run = Run(tmp_path, host)
+        runs.append(run)
+        if awaited:
+            run.find_control()
+            wait_for(run.is_swinging, "the arm swings")
+        return run
+
+    yield start
+    for run in runs:
+        for pid in (run.host.pid, *run.children):
+            with suppress(ProcessLookupError):
+                if is_alive(pid):
+                    os.kill(pid, signal.SIGKILL)
+        run.host.wait()
+
+
+def told(error: str) -> list[str]:
+    return [line for line in error.splitlines() if line.startswith("error: ")]
+
+
+class TestKilledHost:
+    def test_hold_stops_the_arm_within_100_ms(self, launch):
+        run = launch()
+        killed_ns = run.kill_host()
+        wait_for(lambda: not is_alive(run.control), "the control process exits")
+
+        times, positions = run.commands()
+        moved = np.flatnonzero(np.abs(np.diff(positions, axis=0)).max(axis=1) > 0) + 1
+        assert times[moved[-1]] > killed_ns  # the arm was moving
+        assert times[moved[-1]] <= killed_ns + STOP_NS
+
+    def test_relax_takes_torque_off_within_100_ms(self, launch):
+        run = launch("control.stop=relax")
+        killed_ns = run.kill_host()
+        wait_for(lambda: not is_alive(run.control), "the control process exits")
+
+        word, stamp_ns = run.log[-1]
+        assert word == "relax"
+        assert killed_ns < int(stamp_ns) <= killed_ns + STOP_NS
+
+    def test_pose_is_on_its_way_within_100_ms_and_reached(self, launch):
+        run = launch("control.stop=pose rest")
+        killed_ns = run.kill_host()
+        wait_for(lambda: not is_alive(run.control), "the control process exits")
+
+        times, positions = run.commands()
+        distances = np.abs(positions - REST)[times > killed_ns + STOP_NS]
+        assert (np.diff(distances, axis=0) <= 1e-9).all()
+        assert (np.diff(distances[:5], axis=0) < 0).all()
+        np.testing.assert_allclose(positions[-1], REST, atol=1e-4)
+
+    def test_a_child_of_the_host_that_lives_on_changes_nothing(self, launch):
+        run = launch("teleoperation.swing.fork=true")
+        killed_ns = run.kill_host()
+        assert len(run.children) == 2
+        wait_for(lambda: not is_alive(run.control), "the control process exits")
+
+        times, positions = run.commands()
+        moved = np.flatnonzero(np.abs(np.diff(positions, axis=0)).max(axis=1) > 0) + 1
+        assert times[moved[-1]] <= killed_ns + STOP_NS
+
+    @pytest.mark.parametrize("both", [False, True], ids=["host", "both"])
+    def test_no_shared_memory_is_left(self, launch, both):
+        run = launch()
+        pids = [run.host.pid, run.control]
+        shared = memories(pids)
+        assert len(shared) == 1
+        for pid in pids:  # nothing with a name, which could outlive them
+            assert "/dev/shm" not in Path(f"/proc/{pid}/maps").read_text()
+        if both:
+            os.kill(run.control, signal.SIGKILL)
+        run.kill_host()
+        wait_for(lambda: not is_alive(run.control), "the control process exits")
+
+        everybody = [int(path.name) for path in Path("/proc").iterdir() if path.name.isdigit()]
+        assert not shared & memories(everybody)
+
+
+class TestInterrupt:
+    def test_the_first_stops_in_order(self, launch):
+        run = launch("control.stop=pose rest")
+        run.host.send_signal(signal.SIGINT)
+        status, error = run.end()
+
+        assert status == 0
+        assert told(error) == []
+        np.testing.assert_allclose(run.commands()[1][-1], REST, atol=1e-4)
+
+    def test_the_second_ends_the_host_at_once_and_the_arm_stops_all_the_same(self, launch):
+        run = launch("control.stop=pose rest")
+        run.host.send_signal(signal.SIGINT)
+        count = len(run.log)
+        wait_for(lambda: len(run.log) > count + 20, "the arm is on its way to the pose")
+        run.host.send_signal(signal.SIGINT)
+
+        assert run.host.wait(PATIENCE_S) == 130
+        assert is_alive(run.control)
+        wait_for(lambda: not is_alive(run.control), "the control process exits")
+        np.testing.assert_allclose(run.commands()[1][-1], REST, atol=1e-4)
+
+
+class TestDeath:
+    def test_of_the_control_process_is_told_on_one_line(self, launch):
+        run = launch()
+        os.kill(run.control, signal.SIGKILL)
+        status, error = run.end()
+
+        assert status == 1
+        assert told(error) == ["error: control: the control process died (signal 9)"]
+
+    def test_of_the_control_loop_by_a_bug_is_told_on_one_line(self, launch):
+        run = launch("hardware.trouble=true", awaited=False)
+        run.find_control()
+        status, error = run.end()
+
+        assert status == 1
+        assert told(error) == ["error: control: the control process died (ZeroDivisionError: division by zero)"]
+
+    def test_of_a_sensor_stops_the_robot(self, launch):
+        run = launch("peripherals=[{name: top, kind: camera, type: brittle}]", "control.stop=pose rest", awaited=False)
+        run.find_control()
+        status, error = run.end()
+
+        assert status == 1
+        assert told(error) == ["error: sensor:top: the camera was unplugged"]
+        np.testing.assert_allclose(run.commands()[1][-1], REST, atol=1e-4)
+
+    def test_of_a_policy_that_does_not_load_comes_before_anything_is_powered(self, launch):
+        run = launch(mode="policy", awaited=False)
+        status, error = run.end()
+
+        assert status == 1
+        assert [re.sub(r"^error: (model:lost: )?", "", line) for line in told(error)] == ["no such checkpoint: lost.pt"]
+        assert run.log == []
