@@ -361,3 +361,23 @@ def test_a_policy_of_another_rate_gives_a_plan_of_its_own_step():
     assert len(rig.requests) == 1
     rig.tick()
     assert (rig.stats.plan_length, len(rig.requests)) == (3, 2)
+
+
+def test_a_chunk_that_comes_between_ticks_is_cut_at_the_time_of_its_arrival():
+    rig = Rig()
+    t_ns = rig.tick()
+    rig.clock.advance(2 * STEP + STEP // 2)
+    rig.answer(ramp(10))
+    ((start_ns, _, positions),) = rig.plans
+    assert start_ns == t_ns + 2 * STEP
+    np.testing.assert_array_equal(positions, ramp(8, first=2))
+
+
+def test_a_new_episode_does_not_blend_with_the_old_one():
+    rig = Rig(enabled=True)
+    rig.tick()
+    rig.answer(ramp(10) * 0)
+    rig.dispatcher.begin(8)
+    rig.tick()
+    rig.answer(ramp(5) * 0 + 1)
+    np.testing.assert_array_equal(rig.plans[-1][2], np.ones((5, SIZE)))

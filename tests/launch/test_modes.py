@@ -135,6 +135,30 @@ def test_control_that_refuses_leaves_the_old_mode_which_a_reset_revives(runs: Ru
     assert position(runtime)[0] > before + 0.05
 
 
+def test_the_old_mode_goes_on_when_control_refuses_the_new_one(runs: Runs, monkeypatch: pytest.MonkeyPatch):
+    runtime = runs.start(mode="policy", episodes=3)
+    seconds(runtime, 0.2)
+    control = runtime.session.control
+    real = control.call
+
+    def call(do: str, **arguments: Any) -> Any:
+        if do == "switch_mode":
+            raise HardwareError("not now")
+        return real(do, **arguments)
+
+    monkeypatch.setattr(control, "call", call)
+    with pytest.raises(HardwareError, match="not now"):
+        runtime.switch_mode("teleop")
+    assert runtime.session.stats is not None
+    chunks = runtime.session.stats.chunks
+    seconds(runtime, 0.2)
+    assert runtime.session.stats.chunks > chunks, "the policy goes on within the episode"
+    while not runtime.step():
+        pass
+    assert runtime.summary()["successes"] == 3
+    assert runs.parts.CALLS[-1] == "disconnect stick"
+
+
 def test_an_unknown_mode_is_refused_with_those_that_there_are(runs: Runs):
     runtime = runs.start(mode="teleop")
     with pytest.raises(NotSupported, match="no mode 'tele'; the modes are: policy, lost, teleop, plan, replan, idle"):
@@ -176,6 +200,19 @@ def test_an_emergency_stop_fails_the_goal_under_way(runs: Runs):
     while not runtime.step():
         pass
     assert runtime.summary()["goals_failed"] == 1
+
+
+def test_what_an_executor_tells_of_an_earlier_goal_does_not_end_the_present_one(runs: Runs):
+    runtime = runs.start(mode="plan", goals=("up",))
+    seconds(runtime, 0.1)
+    assert runtime.session.feeder is not None
+    runtime.session.feeder.take_goal(
+        {"executor": "arm_trajectory", "goal": "0:arm_trajectory", "state": "canceled", "message": "", "result": {}}
+    )
+    while not runtime.step():
+        pass
+    assert runtime.summary()["goals_failed"] == 0
+    assert position(runtime)[0] == pytest.approx(0.4, abs=0.03)
 
 
 def test_a_reset_fails_the_goal_under_way_and_the_next_is_tried(runs: Runs):
