@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from ibrobot_core import hookimpl
 from ibrobot_core.descriptors import Check, HardwareDescriptor, PolicyDescriptor, SensorDescriptor, ViewerDescriptor
+from ibrobot_mujoco.gl import check, check_asked
 from ibrobot_mujoco.options import CameraOptions, MujocoOptions
 from ibrobot_mujoco.policy_options import ScriptedPickOptions
 
@@ -15,24 +16,28 @@ if TYPE_CHECKING:
 
 
 def _hardware(options: Any, ctx: Context) -> Hardware:
+    check_asked()
     from ibrobot_mujoco.hardware import MujocoHardware
 
     return MujocoHardware(options, ctx)
 
 
 def _camera(options: Any, ctx: Context) -> Sensor:
+    check_asked()
     from ibrobot_mujoco.camera import MujocoCamera
 
     return MujocoCamera(options, ctx)
 
 
 def _scripted_pick(options: Any, ctx: Context) -> Policy:
+    check_asked()
     from ibrobot_mujoco.scripted_pick import ScriptedPick
 
     return ScriptedPick(options, ctx)
 
 
 def _viewer(options: Any, ctx: Context) -> Viewer:
+    check_asked()
     from ibrobot_mujoco.viewer import MujocoViewer
 
     return MujocoViewer(ctx)
@@ -73,6 +78,4 @@ def ibrobot_viewers() -> Iterable[ViewerDescriptor]:
 @hookimpl
 def ibrobot_doctor() -> Iterable[Check]:
     """Whether cameras can render here."""
-    from ibrobot_mujoco.gl import check
-
     yield check()

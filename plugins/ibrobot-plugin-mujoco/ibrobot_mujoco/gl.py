@@ -39,17 +39,31 @@ def usable() -> tuple[str, ...]:
     return tuple(found)
 
 
+def check_asked() -> str:
+    """The backend that `MUJOCO_GL` asks for, empty where it asks for none.
+
+    To be called ahead of importing MuJoCo, whose import fails obscurely on one that does not load.
+
+    Raises:
+        SensorError: when there is no such backend, or its libraries do not load.
+    """
+    asked = os.environ.get("MUJOCO_GL", "").strip().lower()
+    known = ("cgl",) if sys.platform == "darwin" else ("egl", "osmesa", "glfw")
+    if asked and asked not in known:
+        raise SensorError(f"MUJOCO_GL is {asked!r}, must be one of: {', '.join(known)}")
+    if asked in _LIBRARIES and asked not in usable():
+        raise SensorError(f"MUJOCO_GL={asked}, whose libraries do not load here; {REMEDY}, or unset MUJOCO_GL")
+    return asked
+
+
 def choose() -> str:
     """The backend to render with: what `MUJOCO_GL` says, or else the best that is usable.
 
     Raises:
         SensorError: when there is none.
     """
-    asked = os.environ.get("MUJOCO_GL", "").strip().lower()
-    known = ("cgl",) if sys.platform == "darwin" else ("egl", "osmesa", "glfw")
+    asked = check_asked()
     if asked:
-        if asked not in known:
-            raise SensorError(f"MUJOCO_GL is {asked!r}, must be one of: {', '.join(known)}")
         return asked
     found = usable()
     if not found:
@@ -63,7 +77,4 @@ def check() -> Check:
         chosen = choose()
     except SensorError as error:
         return Check("simulated cameras", False, str(error), REMEDY)
-    found = usable()
-    if chosen not in found:
-        return Check("simulated cameras", False, f"MUJOCO_GL={chosen}, whose libraries do not load", REMEDY)
-    return Check("simulated cameras", True, f"renders with {chosen} (usable: {', '.join(found)})")
+    return Check("simulated cameras", True, f"renders with {chosen} (usable: {', '.join(usable())})")

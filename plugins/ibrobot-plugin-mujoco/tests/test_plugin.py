@@ -9,6 +9,7 @@ import pytest
 from ibrobot_mujoco import gl
 from ibrobot_mujoco.hardware import MujocoHardware
 from ibrobot_mujoco.options import Fault, MujocoOptions, SceneCamera
+from ibrobot_mujoco.policy_options import ScriptedPickOptions
 from ibrobot_mujoco.so101 import so101
 
 from ibrobot_core.errors import SensorError
@@ -89,12 +90,20 @@ class TestOpenGl:
         assert gl.choose() == "glfw"
 
     def test_the_environment_decides(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.have(monkeypatch, "libEGL.so.1", "libGL.so.1")
+        self.have(monkeypatch, "libEGL.so.1", "libGL.so.1", "libOSMesa.so.8")
         monkeypatch.setenv("MUJOCO_GL", "OSMesa")
         assert gl.choose() == "osmesa"
-        check = gl.check()
-        assert not check.ok
-        assert check.found == "MUJOCO_GL=osmesa, whose libraries do not load"
+
+    def test_a_backend_that_does_not_load_is_told_before_mujoco_is_imported(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        self.have(monkeypatch, "libEGL.so.1", "libGL.so.1")
+        monkeypatch.setenv("MUJOCO_GL", "osmesa")
+        told = "MUJOCO_GL=osmesa, whose libraries do not load here; apt install libegl1"
+        policy = installed().find("policy", "scripted_pick")
+        with pytest.raises(SensorError, match=told):
+            policy.make(ScriptedPickOptions(), control_context("pick"))
+        assert gl.check().found.startswith(told)
 
     def test_an_unknown_backend_is_refused(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setenv("MUJOCO_GL", "vulkan")
