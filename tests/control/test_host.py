@@ -1,0 +1,238 @@
+"""The host's side of control: in a process of its own, and within the caller's thread."""
+
+from __future__ import annotations
+
+import os
+import queue
+import signal
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import attrs
+import numpy as np
+import pytest
+import yaml
+
+from ibrobot_core.clock import RealClock, SteppedClock
+from ibrobot_core.config import from_document
+from ibrobot_core.control.host import ControlClient, ControlHost, InlineControl
+from ibrobot_core.control.link import ControlState, PlanRecord
+from ibrobot_core.errors import ComponentFailed, HardwareError
+from ibrobot_core.plugins import installed
+
+if TYPE_CHECKING:
+    from conftest import Site
+
+PATIENCE_S = 20.0
+PLUGIN = """
+import attrs
+from ibrobot_core import hookimpl
+from ibrobot_core.descriptors import HardwareDescriptor
+from ibrobot_core.errors import HardwareError
+from ibrobot_core.options import option
+from ibrobot_core.testing.fakes import FakeHardware
+
+class Arm(FakeHardware):
+    def __init__(self, options, ctx):
+        super().__init__(ctx)
+        self.options = options
+    def connect(self):
+        if self.options.trouble == "connect":
+            raise HardwareError("servo 3 does not answer: check its cable")
+        super().connect()
+    def disconnect(self):
+        super().disconnect()
+        if self.options.closed:
+            open(self.options.closed, "w").close()
+
+@attrs.frozen
+class Options:
+    trouble: str = option("", help="when it fails")
+    closed: str = option("", help="file made when it is released")
+
+@hookimpl
+def ibrobot_hardware():
+    yield HardwareDescriptor("arm", Arm, "an arm", Options, simulated=True)
+"""
+DOCUMENT = """
+robot:
+  name: mini
+  joints:
+    - {name: pan, lower: -1.0, upper: 1.0, max_velocity: 3.0, max_acceleration: 40.0}
+    - {name: grip, lower: 0.0, upper: 1.0, max_velocity: 3.0, max_acceleration: 40.0}
+  groups: {arm: [pan, grip]}
+simulation: {type: arm}
+executors:
+  position: {type: position, group: arm}
+  trajectory: {type: trajectory, group: arm}
+control_modes:
+  stream: {executors: [position]}
+  plan: {executors: [trajectory]}
+default_control_mode: stream
+"""
+
+
+@attrs.define
+class Told:
+    """What control told its host."""
+
+    states: queue.SimpleQueue[ControlState] = attrs.field(factory=queue.SimpleQueue)
+    events: queue.SimpleQueue[Mapping[str, Any]] = attrs.field(factory=queue.SimpleQueue)
+    deaths: queue.SimpleQueue[ComponentFailed] = attrs.field(factory=queue.SimpleQueue)
+
+    def state(self, wanted: Callable[[ControlState], bool]) -> ControlState:
+        """The next state that is as `wanted`."""
+        while not wanted(found := self.states.get(timeout=PATIENCE_S)):
+            pass
+        return found
+
+
+@pytest.fixture(params=[pytest.param("process", marks=pytest.mark.integration), "inline"])
+def kind(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+@pytest.fixture
+def told() -> Told:
+    return Told()
+
+
+@pytest.fixture
+def make(site: Site, told: Told) -> Iterator[Callable[..., ControlHost]]:
+    site.add("ibrobot-plugin-arm", PLUGIN)
+    made: list[ControlHost] = []
+
+    def make_host(kind: str = "process", **options: Any) -> ControlHost:
+        document = yaml.safe_load(DOCUMENT)
+        document["simulation"] |= options
+        config = from_document(document, source=Path("mini.yaml"), sim=True)
+        host: ControlHost
+        if kind == "process":
+            host = ControlClient(config, RealClock(), 0, told.states.put, told.events.put, told.deaths.put)
+        else:
+            host = InlineControl(config, installed(), SteppedClock(), 0, told.states.put, told.events.put)
+        made.append(host)
+        return host
+
+    yield make_host
+    for host in made:
+        host.stop()
+
+
+class TestBoth:
+    def test_start_tells_signals_and_stop_releases_the_hardware(self, make, kind, tmp_path):
+        host = make(kind, closed=str(tmp_path / "closed"))
+        host.start()
+        assert host.signals == [("/fake/command", 1)]
+        host.stop()
+
+        assert (tmp_path / "closed").exists()
+        host.stop()
+
+    def test_hardware_that_does_not_connect_is_told_and_released(self, make, kind, tmp_path):
+        host = make(kind, trouble="connect", closed=str(tmp_path / "closed"))
+        with pytest.raises(HardwareError, match="servo 3 does not answer: check its cable"):
+            host.start()
+
+        assert (tmp_path / "closed").exists()
+
+    def test_commands_are_answered_with_the_epoch_and_refused_with_the_reason(self, make, kind):
+        host = make(kind)
+        host.start()
+        first = host.call("switch_mode", mode="plan")["epoch"]
+
+        assert host.call("switch_mode", mode="stream")["epoch"] > first
+        with pytest.raises(HardwareError, match="no mode 'dance'; the modes are: stream, plan"):
+            host.call("switch_mode", mode="dance")
+
+
+@pytest.mark.integration
+class TestProcess:
+    def test_states_come_in_order_and_plans_are_followed(self, make, told):
+        host = make()
+        host.start()
+        first = told.state(lambda state: True)
+        positions = np.linspace(first.command, [0.3, 0.9], 50)
+        host.write_plan(PlanRecord(first.epoch, first.stamp_ns, 10_000_000, np.ones(2, dtype=bool), positions))
+
+        ticks = [first.tick]
+        while not np.allclose((state := told.state(lambda state: True)).command, [0.3, 0.9]):
+            ticks.append(state.tick)
+        assert ticks == list(range(first.tick, first.tick + len(ticks)))
+        assert host.lost_states == 0
+
+    def test_a_fault_is_told_and_reset(self, make, told):
+        host = make()
+        host.start()
+        host.call("estop")
+        assert told.events.get(timeout=PATIENCE_S)["fault"] == "emergency stop"
+        assert told.state(lambda state: state.estop)
+
+        resting = told.state(lambda state: state.estop)
+        assert host.call("reset")["epoch"] > resting.epoch
+        assert told.state(lambda state: not state.estop)
+
+    def test_its_report_has_the_whole_run_at_the_end(self, make, told):
+        host = make()
+        host.start()
+        told.state(lambda state: state.tick >= 5)
+        host.stop()
+
+        assert host.report["loop"]["ticks"] >= 5
+        assert host.report["counters"]["loop"]["read_errors"] == 0
+
+    def test_its_death_is_told_and_commands_fail_from_then_on(self, make, told):
+        host = make()
+        host.start()
+        os.kill(host.pid, signal.SIGKILL)
+
+        assert str(told.deaths.get(timeout=PATIENCE_S)) == "the control process died (signal 9)"
+        with pytest.raises(ComponentFailed, match="control process is gone"):
+            host.call("estop")
+
+    def test_sigterm_stops_it_in_order(self, make, told, tmp_path):
+        host = make(closed=str(tmp_path / "closed"))
+        host.start()
+        os.kill(host.pid, signal.SIGTERM)
+
+        assert str(told.deaths.get(timeout=PATIENCE_S)) == "the control process died (exit status 0)"
+        assert (tmp_path / "closed").exists()
+
+    def test_a_host_that_cannot_take_states_is_told_so(self, make, told):
+        host = make()
+        host._on_state = lambda state: 1 / 0
+        host.start()
+
+        assert "division by zero" in str(told.deaths.get(timeout=PATIENCE_S))
+
+
+class TestInline:
+    def test_a_step_is_a_tick_at_the_clocks_time(self, make, told):
+        host = make("inline")
+        host.start()
+        for _ in range(3):
+            host._clock.advance(10_000_000)
+            host.step()
+
+        states = [told.states.get_nowait() for _ in range(3)]
+        assert [state.tick for state in states] == [1, 2, 3]
+        assert [state.stamp_ns for state in states] == [10_000_000, 20_000_000, 30_000_000]
+
+    def test_stopping_takes_as_many_ticks_as_braking(self, make, told):
+        host = make("inline")
+        host.start()
+        host.step()
+        state = told.states.get_nowait()
+        far = np.linspace(state.command, state.command + 0.5, 20)
+        host.write_plan(PlanRecord(state.epoch, 0, 10_000_000, np.ones(2, dtype=bool), far))
+        for _ in range(10):
+            host._clock.advance(10_000_000)
+            host.step()
+        host.stop()
+
+        commands = []
+        while not told.states.empty():
+            commands.append(told.states.get_nowait().command)
+        assert len(commands) > 12
+        np.testing.assert_array_equal(commands[-1], commands[-2])
