@@ -27,7 +27,7 @@ from ibrobot_core.control.link import (
     create_memory,
     raise_error,
 )
-from ibrobot_core.control.timing import Punctuality
+from ibrobot_core.control.timing import REPORT_TICKS, Punctuality
 from ibrobot_core.errors import ComponentFailed, HardwareError, IbrobotError
 from ibrobot_core.plugins import Registry
 
@@ -113,8 +113,11 @@ class InlineControl(ControlHost):
 
     def step(self) -> None:
         """One tick at the clock's time."""
-        self._on_state(self._core.tick())
+        state = self._core.tick()
+        self._on_state(state)
         self._punctuality.tick(self._clock.now_ns(), 0, 0)
+        if state.tick % REPORT_TICKS == 0:
+            self._report()
         while self._core.events:
             self._on_event(self._core.events.popleft())
 
@@ -135,8 +138,11 @@ class InlineControl(ControlHost):
         while not self._core.stopped:
             self._clock.advance(self._core.period_ns)
             self._on_state(self._core.tick())
-        self.report = {"loop": self._punctuality.summary(), "counters": self._core.counters()}
+        self._report()
         self._core.close()
+
+    def _report(self) -> None:
+        self.report = {"loop": self._punctuality.summary(), "counters": self._core.counters()}
 
 
 class ControlClient(ControlHost):

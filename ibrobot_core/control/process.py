@@ -22,7 +22,7 @@ from ibrobot_core.control.build import build_core
 from ibrobot_core.control.core import ControlCore
 from ibrobot_core.control.link import Channel, Layout, SharedMemory
 from ibrobot_core.control.realtime import go_real_time
-from ibrobot_core.control.timing import Punctuality
+from ibrobot_core.control.timing import REPORT_TICKS, Punctuality
 from ibrobot_core.errors import IbrobotError
 from ibrobot_core.plugins import installed
 
@@ -30,8 +30,6 @@ _STARTUP_TIMEOUT_S = 30.0
 _FAREWELL_S = 1.0
 """How long the last words wait for a host that does not read."""
 _TOLD = "told to stop"
-_REPORT_TICKS = 20
-"""Ticks between reports of punctuality and counters to the host."""
 
 
 class _ToHost(logging.Handler):
@@ -105,7 +103,7 @@ class ControlProcess:
             os.write(self._wake, b".")
         while self._core.events:
             self._channel.send(self._core.events.popleft())
-        if self._core.state is not None and self._core.state.tick % _REPORT_TICKS == 0 and not self._channel.backlog:
+        if self._core.state is not None and self._core.state.tick % REPORT_TICKS == 0 and not self._channel.backlog:
             self._report("report")
 
     def _report(self, event: str) -> None:

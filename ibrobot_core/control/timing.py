@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+REPORT_TICKS = 20
+"""Ticks between two reports of punctuality and counters to the host."""
 _BINS = 20_001
 """Microseconds of lateness told apart; what is later counts as 20 ms."""
 

@@ -80,18 +80,16 @@ def build_plan(session: Session) -> LaunchPlan:
     if recording is not None:
         components.append(recording)
     episodes = Episodes(session, recording)
-    worker = None
     if parts.feeder is not None:
-        # Ahead of the feeder in lockstep, so that an episode's first tick is fed.
-        if config.simulated and config.control_modes[session.mode].inference is not None:
-            worker = SimulatedEpisodes(session, episodes, (parts.feeder.name,))
         components.append(parts.feeder)
     components.append(Status(session, (CONTROL,)))
     if (urdf := config.robot.description.urdf) is not None:
         components.append(Transforms(session, urdf, (CONTROL,)))
     if config.viewer is not None:
         components.append(ViewerWorker(session, config.viewer, (CONTROL,)))
-    if worker is not None:
+    worker = None
+    if config.simulated and isinstance(parts.feeder, InferenceFeeder):
+        worker = SimulatedEpisodes(session, episodes, (parts.feeder.name,))
         components.append(worker)
     return LaunchPlan(tuple(_ordered(components)), parts, episodes, worker)
 

@@ -28,6 +28,11 @@ class Runtime:
         check_goals(session)
         self.session = session
         self.plan: LaunchPlan = build_plan(session)
+        if session.request.episodes is not None and self.plan.episodes_worker is None:
+            raise NotSupported(
+                "--episodes counts a policy's episodes in simulation: it needs --sim and a mode with inference; "
+                f"mode {session.mode} ends with --duration, --goal or Ctrl-C"
+            )
         self._mode_parts = self.plan.mode
         session.feeder = self.plan.mode.feeder
         self._started: list[Component] = []

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from ibrobot_core.errors import NotSupported
 from ibrobot_core.launch.runtime import ESTOP, RESET, Runtime
 
 if TYPE_CHECKING:
@@ -184,3 +185,17 @@ def test_a_recorder_that_fails_ends_the_run_with_its_cause(runs: Runs, monkeypat
     finish(runtime)
     with pytest.raises(Exception, match=r"^recording: OSError: no space left on device$"):
         runtime.raise_failure()
+
+
+@pytest.mark.parametrize(("mode", "sim"), [("teleop", True), (None, False)])
+def test_a_count_of_episodes_is_refused_where_there_are_none(runs: Runs, mode: str | None, sim: bool):
+    with pytest.raises(NotSupported, match="--episodes counts a policy's episodes in simulation"):
+        runs.make(mode=mode, sim=sim, lockstep=sim, episodes=1)
+
+
+def test_counters_are_reported_during_a_run_in_lockstep(runs: Runs):
+    runtime = runs.start(episodes=1)
+    seconds(runtime, 0.5)
+    report = runtime.session.control.report
+    assert report["loop"]["ticks"] > 0
+    assert "safety" in report["counters"]
