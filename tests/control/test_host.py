@@ -41,6 +41,10 @@ class Arm(FakeHardware):
         if self.options.trouble == "connect":
             raise HardwareError("servo 3 does not answer: check its cable")
         super().connect()
+    def read(self):
+        if self.options.trouble == "read":
+            raise HardwareError("servo 3 does not answer: check its cable")
+        return super().read()
     def disconnect(self):
         super().disconnect()
         if self.options.closed:
@@ -130,8 +134,9 @@ class TestBoth:
         assert (tmp_path / "closed").exists()
         host.stop()
 
-    def test_hardware_that_does_not_connect_is_told_and_released(self, make, kind, tmp_path):
-        host = make(kind, trouble="connect", closed=str(tmp_path / "closed"))
+    @pytest.mark.parametrize("trouble", ["connect", "read"])
+    def test_hardware_that_does_not_answer_is_told_and_released(self, make, kind, tmp_path, trouble):
+        host = make(kind, trouble=trouble, closed=str(tmp_path / "closed"))
         with pytest.raises(HardwareError, match="servo 3 does not answer: check its cable"):
             host.start()
 
