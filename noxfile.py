@@ -98,8 +98,8 @@ def integration(session: nox.Session) -> None:
 def docs(session: nox.Session) -> None:
     """The documentation: every warning is an error, every example runs."""
     install(session, *PLUGINS, groups=("docs", "test"))
-    session.run("sphinx-build", "-W", "--keep-going", "-n", "-b", "html", "docs", "docs/_build/html")
-    session.run("sphinx-build", "-W", "--keep-going", "-b", "doctest", "docs", "docs/_build/doctest")
+    session.run("sphinx-build", "-q", "-W", "--keep-going", "-n", "-b", "html", "docs", "docs/_build/html")
+    session.run("sphinx-build", "-q", "-W", "--keep-going", "-b", "doctest", "docs", "docs/_build/doctest")
 
 
 @nox.session
