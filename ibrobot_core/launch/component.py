@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import override
@@ -67,6 +68,8 @@ class Worker(Component):
         self._end = threading.Event()
         self._ready = threading.Event()
         self._failure: Exception | None = None
+        self.given_up = threading.Event()
+        """Set when the run ends, so that `start` waits no longer."""
 
     @abstractmethod
     def setup(self) -> None:
@@ -103,8 +106,12 @@ class Worker(Component):
         self._failure = None
         self._thread = threading.Thread(target=self._run, name=self.name, daemon=True)
         self._thread.start()
-        if not self._ready.wait(self._ready_timeout_s):
-            raise ComponentFailed(f"{self.name}: {self.not_ready()} after {self._ready_timeout_s:g} s")
+        deadline = time.monotonic() + self._ready_timeout_s
+        while not self._ready.wait(min(_POLL_S, self._ready_timeout_s)):
+            if self.given_up.is_set():
+                raise ComponentFailed(f"{self.not_ready()} when the run ended")
+            if time.monotonic() >= deadline:
+                raise ComponentFailed(f"{self.not_ready()} after {self._ready_timeout_s:g} s")
         if self._failure is not None:
             raise self._failure
 

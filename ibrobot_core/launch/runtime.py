@@ -8,7 +8,7 @@ from ibrobot_core.clock import SteppedClock
 from ibrobot_core.errors import ComponentFailed, HardwareError, NotSupported
 from ibrobot_core.launch.builders.control import Control
 from ibrobot_core.launch.builders.planning import check_goals
-from ibrobot_core.launch.component import Component, cause, exit_code, told
+from ibrobot_core.launch.component import Component, Worker, cause, exit_code, told
 from ibrobot_core.launch.plan import LaunchPlan, build_plan, mode_parts
 from ibrobot_core.launch.session import Session
 from ibrobot_core.units import ns
@@ -41,6 +41,8 @@ class Runtime:
     def start(self) -> None:
         """Start every component, each when all it needs is ready. Where one fails, those before it are stopped.
 
+        When the run is ended meanwhile, by Ctrl-C, what was started is stopped again and nothing is raised.
+
         Raises:
             IbrobotError: the cause, with the component's name.
         """
@@ -52,8 +54,12 @@ class Runtime:
             self._begun_ns = session.clock.now_ns()
             if self.plan.episodes_worker is None:
                 self._begin_mode()
-        except BaseException:
+        except BaseException as error:
+            ended = session.finished.is_set()
             self.stop()
+            self.raise_failure()  # e.g. control, which died while a camera started
+            if ended and isinstance(error, ComponentFailed):
+                return
             raise
         session.bus.serve(SET_MODE, self.switch_mode)
         session.bus.serve(RESET, lambda _: self.reset())
@@ -176,6 +182,8 @@ class Runtime:
 
     def _start(self, component: Component) -> None:
         try:
+            if isinstance(component, Worker):
+                component.given_up = self.session.finished
             component.start()
             if isinstance(component, Control) and self.session.request.lockstep:
                 component.step(self.session.clock.now_ns())

@@ -92,6 +92,10 @@ class Camera(FakeSensor):
         time.sleep(0.002)
         return super().read(timeout_s)
 
+class Dark(FakeSensor):
+    def read(self, timeout_s):
+        time.sleep(timeout_s)
+
 class Lost(FakePolicy):
     def load(self):
         raise PolicyError("no such checkpoint: lost.pt")
@@ -107,6 +111,7 @@ def ibrobot_teleop():
 @hookimpl
 def ibrobot_sensors():
     yield SensorDescriptor("brittle", lambda options, ctx: Camera(ctx), "breaks")
+    yield SensorDescriptor("dark", lambda options, ctx: Dark(ctx), "gives nothing")
 
 @hookimpl
 def ibrobot_policies():
@@ -313,7 +318,19 @@ class TestKilledHost:
         assert not shared & memories(everybody)
 
 
+DARK = "peripherals=[{name: top, kind: camera, type: dark}]"
+
+
 class TestInterrupt:
+    def test_while_a_sensor_is_awaited_stops_in_order(self, launch):
+        run = launch(DARK, awaited=False)
+        run.find_control()
+        run.host.send_signal(signal.SIGINT)
+        status, error = run.end()
+
+        assert status == 0
+        assert told(error) == []
+
     def test_the_first_stops_in_order(self, launch):
         run = launch("control.stop=pose rest")
         run.host.send_signal(signal.SIGINT)
@@ -339,6 +356,15 @@ class TestInterrupt:
 class TestDeath:
     def test_of_the_control_process_is_told_on_one_line(self, launch):
         run = launch()
+        os.kill(run.control, signal.SIGKILL)
+        status, error = run.end()
+
+        assert status == 1
+        assert told(error) == ["error: control: the control process died (signal 9)"]
+
+    def test_of_the_control_process_while_a_sensor_is_awaited_is_what_is_told(self, launch):
+        run = launch(DARK, awaited=False)
+        run.find_control()
         os.kill(run.control, signal.SIGKILL)
         status, error = run.end()
 

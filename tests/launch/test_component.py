@@ -79,7 +79,7 @@ def test_start_returns_when_it_is_ready(probe: Probe):
 
 def test_one_that_does_not_become_ready_is_told():
     probe = Probe(ready_after=1, ready_timeout_s=0.01)
-    with pytest.raises(ComponentFailed, match=r"^probe: no sign of life after 0\.01 s$"):
+    with pytest.raises(ComponentFailed, match=r"^no sign of life after 0\.01 s$"):
         probe.start()
     probe.stop()
     assert probe.calls == ["setup", "teardown"]
