@@ -5,16 +5,20 @@ from __future__ import annotations
 import json
 import logging
 import os
+import queue
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+import attrs
 import click
 
+from ibrobot_core.cli.panel import RecentLog, panel, plain_line
 from ibrobot_core.config import find_config, load
 from ibrobot_core.control.core import EMERGENCY_STOP
 from ibrobot_core.errors import IbrobotError
@@ -64,8 +68,6 @@ def launch(config: str | None, **options: Any) -> None:
     if options["lockstep"] and not robot.simulated:
         raise click.UsageError("--lockstep is for simulation: add --sim")
     if options["headless"] and robot.viewer is not None:
-        import attrs
-
         robot = attrs.evolve(robot, viewer=None)
     with ExitStack() as stack:
         keys = None if options["headless"] or options["dry_run"] else _terminal_keys(stack)
@@ -96,16 +98,16 @@ def _run(runtime: Runtime, path: Path, *, live: bool) -> int:
     session = runtime.session
     where = "simulation" if session.config.simulated else "hardware"
     with ExitStack() as stack:
-        show = _live(runtime, stack) if live else _plain(session)
+        display = _Panel(runtime, stack) if live else _Lines(session)
         session.log.info("%s from %s: %s, mode %s", session.config.robot.name, path, where, session.mode)
-        runtime.start()
+        runtime.start(display.starting)
         stack.callback(runtime.stop)
         if session.request.lockstep:
             while not runtime.step():
-                pass
+                display.show()
         else:
             while not runtime.wait(1.0 / _PANEL_HZ):
-                show()
+                display.show()
     outcome = session.outcome
     if any(fault != EMERGENCY_STOP for fault in outcome.faults):
         return _FAULTED
@@ -127,62 +129,84 @@ def _stop_on_signals(session: Session, keys: Keys | None) -> None:
     signal.signal(signal.SIGTERM, stop)
 
 
-def _plain(session: Session) -> Callable[[], None]:
-    from ibrobot_core.cli.panel import plain_line
+class _Lines:
+    """Plain lines of status, where standard output is no terminal."""
 
-    handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(logging.Formatter("%(levelname).1s %(message)s"))
-    _log_to(handler)
-    next_s = time.monotonic() + _PLAIN_PERIOD_S
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._next_s = time.monotonic() + _PLAIN_PERIOD_S
+        handler = logging.StreamHandler(sys.stderr)
+        handler.setFormatter(logging.Formatter("%(levelname).1s %(message)s"))
+        _log_to(handler)
 
-    def show() -> None:
-        nonlocal next_s
-        if time.monotonic() >= next_s:
-            next_s += _PLAIN_PERIOD_S
-            click.echo(plain_line(session))
+    def starting(self, component: str) -> None:
+        """Nothing is said of a component that starts."""
 
-    return show
+    def show(self) -> None:
+        """Print a line, now and then."""
+        if time.monotonic() >= self._next_s:
+            self._next_s += _PLAIN_PERIOD_S
+            click.echo(plain_line(self._session))
 
 
-def _live(runtime: Runtime, stack: ExitStack) -> Callable[[], None]:
-    from rich.live import Live
+class _Panel:
+    """The live panel, and the runtime's own keys: F1..F9 modes, Esc emergency stop, F10 reset."""
 
-    from ibrobot_core.cli.panel import RecentLog, panel
+    def __init__(self, runtime: Runtime, stack: ExitStack) -> None:
+        from rich.live import Live
 
-    session = runtime.session
-    log = RecentLog()
-    _log_to(log)
-    keys = session.request.keys() if session.request.keys is not None else None
-    display = stack.enter_context(Live(auto_refresh=False, screen=False))
+        self._runtime = runtime
+        self._log = RecentLog()
+        _log_to(self._log)
+        self._display = stack.enter_context(Live(auto_refresh=False, screen=False))
+        self._next_s = 0.0
+        self._pressed: queue.SimpleQueue[str] = queue.SimpleQueue()
+        keys = runtime.session.request.keys
+        if keys is not None:
+            threading.Thread(target=self._listen, args=(keys(),), name="runtime keys", daemon=True).start()
 
-    def show() -> None:
-        while keys is not None and not keys.empty():
-            _press(runtime, keys.get())
+    def starting(self, component: str) -> None:
+        """Say which component starts."""
+        self._display.update(f"starting {component} …", refresh=True)
+
+    def show(self) -> None:
+        """Obey the keys pressed, and draw the panel anew."""
+        if time.monotonic() < self._next_s:
+            return
+        self._next_s = time.monotonic() + 1.0 / _PANEL_HZ
+        while not self._pressed.empty():
+            self._obey(self._pressed.get())
+        session = self._runtime.session
         help_text = session.feeder.help() if session.feeder is not None else ""
-        display.update(panel(session, log, help_text), refresh=True)
+        self._display.update(panel(session, self._log, help_text), refresh=True)
 
-    return show
+    def _listen(self, keys: queue.SimpleQueue[str]) -> None:
+        """In a thread of its own, so that the emergency stop waits for nothing, e.g. not for a mode that loads."""
+        while True:
+            key = keys.get()
+            if key == "esc":
+                self._try(lambda: self._runtime.session.control.call("estop"))
+            else:
+                self._pressed.put(key)
+
+    def _obey(self, key: str) -> None:
+        modes = list(self._runtime.session.config.control_modes)
+        if key == "f10":
+            self._try(self._runtime.reset)
+        elif key.startswith("f") and key[1:].isdigit() and 0 < int(key[1:]) <= min(len(modes), 9):
+            self._try(lambda: self._runtime.switch_mode(modes[int(key[1:]) - 1]))
+
+    def _try(self, act: Callable[[], object]) -> None:
+        try:
+            act()
+        except IbrobotError as error:
+            self._runtime.session.log.error("%s", error)
 
 
 def _log_to(handler: logging.Handler) -> None:
     """Our own words from INFO on, those of libraries from WARNING on."""
     logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
     logging.getLogger("ibrobot").setLevel(logging.INFO)
-
-
-def _press(runtime: Runtime, key: str) -> None:
-    """The runtime's own keys: F1..F9 modes, Esc emergency stop, F10 reset."""
-    session = runtime.session
-    modes = list(session.config.control_modes)
-    try:
-        if key == "esc":
-            session.control.call("estop")
-        elif key == "f10":
-            runtime.reset()
-        elif key.startswith("f") and key[1:].isdigit() and int(key[1:]) <= len(modes):
-            runtime.switch_mode(modes[int(key[1:]) - 1])
-    except IbrobotError as error:
-        session.log.error("%s", error)
 
 
 def _tell(runtime: Runtime, as_json: bool) -> None:

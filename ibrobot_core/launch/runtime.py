@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from ibrobot_core.clock import SteppedClock
@@ -19,7 +20,7 @@ ESTOP = "/estop"
 
 
 class Runtime:
-    """One run. `start`, then `run_lockstep` or `wait`, then `stop`; `summary` at any time.
+    """One run. `start`, then `step` (lockstep) or `wait` until it has ended, then `stop`; `summary` at any time.
 
     Services on the bus: `/set_mode` (a mode's name), `/reset`, `/estop`.
     """
@@ -38,10 +39,13 @@ class Runtime:
         self._started: list[Component] = []
         self._begun_ns = session.clock.now_ns()
 
-    def start(self) -> None:
+    def start(self, on_start: Callable[[str], None] = lambda name: None) -> None:
         """Start every component, each when all it needs is ready. Where one fails, those before it are stopped.
 
         When the run is ended meanwhile, by Ctrl-C, what was started is stopped again and nothing is raised.
+
+        Args:
+            on_start: told the name of each component before it starts.
 
         Raises:
             IbrobotError: the cause, with the component's name.
@@ -49,6 +53,7 @@ class Runtime:
         session = self.session
         try:
             for component in self.plan.components:
+                on_start(component.name)
                 self._started.append(component)
                 self._start(component)
             self._begun_ns = session.clock.now_ns()
