@@ -170,8 +170,7 @@ def test_relaxed_arm_falls_until_the_next_command() -> None:
     assert abs(fallen[-1].position).max() > 0.3
     held = fallen[-1].position
     back = positions(rig.run(1.0, held))
-    np.testing.assert_allclose(back[-1], held, atol=0.05)
-    assert abs(np.diff(back, axis=0)).max() < 4.7 * 0.012, "torque came back with a jump"
+    np.testing.assert_allclose(back, np.tile(held, (100, 1)), atol=0.05, err_msg="torque came back with a jump")
 
 
 def test_relaxing_ends_with_the_episode() -> None:
