@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
+import attrs
 import pytest
+import yaml
 from ibrobot_mujoco import gl
 from ibrobot_mujoco.hardware import MujocoHardware
 from ibrobot_mujoco.options import Fault, MujocoOptions, SceneCamera
 from ibrobot_mujoco.policy_options import ScriptedPickOptions
-from ibrobot_mujoco.so101 import so101
+from ibrobot_mujoco.so101 import MJCF, so101
 
 from ibrobot_core.errors import SensorError
 from ibrobot_core.plugins import installed
@@ -34,6 +37,15 @@ def test_stands_for_the_robot_and_its_cameras() -> None:
     assert descriptor.simulated  # type: ignore[attr-defined]
     assert descriptor.sensors == {"camera": "mujoco"}  # type: ignore[attr-defined]
     assert isinstance(descriptor.make(MujocoOptions(), control_context(robot=so101())), MujocoHardware)
+
+
+def test_the_so101_of_scripts_is_that_of_the_robot_yaml() -> None:
+    document = yaml.safe_load((Path(__file__).parents[3] / "configs" / "so101.yaml").read_text())["robot"]
+    robot = so101()
+    assert [attrs.asdict(joint) for joint in robot.joints] == document["joints"]
+    assert {name: list(joints) for name, joints in robot.groups.items()} == document["groups"]
+    assert {name: list(pose) for name, pose in robot.description.poses.items()} == document["description"]["poses"]
+    assert document["description"]["mjcf"] == MJCF
 
 
 @pytest.mark.parametrize(
