@@ -52,9 +52,7 @@ class ModelKeys:
     """Keys of a policy."""
 
     type: str = option(help="which plugin; `ibrobot plugins` lists them")
-    norm_mode: str = option(
-        "radians", choices=("radians", "degrees", "range_m100_100"), help="unit of the joints in its vectors"
-    )
+    norm_mode: str = option("radians", choices=("radians",), help="unit of the joints in its vectors")
     extra_observations: tuple[ObservationSpec, ...] = option((), help="what it sees beyond the contract")
 
 

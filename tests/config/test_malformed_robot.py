@@ -249,8 +249,8 @@ CASES = {
     ),
     "norm_mode": (
         "net: {type: net}",
-        "net: {type: net, norm_mode: degree}",
-        "robot.yaml:22: models.net.norm_mode: 'degree' is not one of: radians, degrees, range_m100_100",
+        "net: {type: net, norm_mode: range_m100_100}",
+        "robot.yaml:22: models.net.norm_mode: 'range_m100_100' is not one of: radians",
     ),
     "recording_topics": (
         "recording: {type: log}",
