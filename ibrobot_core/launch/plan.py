@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import attrs
 
-from ibrobot_core.errors import ComponentFailed
+from ibrobot_core.errors import ComponentFailed, NotSupported
 from ibrobot_core.launch.builders.control import NAME as CONTROL
 from ibrobot_core.launch.builders.control import Control
 from ibrobot_core.launch.builders.execution import InferenceFeeder, Model
@@ -69,8 +69,14 @@ def mode_parts(session: Session, name: str, sensors: tuple[str, ...]) -> ModePar
 
 
 def build_plan(session: Session) -> LaunchPlan:
-    """All components of a run, in the order in which they can start."""
+    """All components of a run, in the order in which they can start.
+
+    Raises:
+        NotSupported: for a transport that would not be used.
+    """
     config = session.config
+    if config.transport is not None and config.transport.type != "local":
+        raise NotSupported(f"transport: {config.transport.type}: a run shares its topics within one process; use local")
     names = tuple(f"sensor:{name}" for name in config.peripherals)
     parts = mode_parts(session, session.mode, names)
     components: list[Component] = [*parts.models]

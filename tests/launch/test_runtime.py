@@ -6,10 +6,14 @@ from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING
 
+import attrs
 import pytest
 
-from ibrobot_core.errors import ComponentFailed, PlanningError
+from ibrobot_core.config.schema import Component
+from ibrobot_core.errors import ComponentFailed, NotSupported, PlanningError
 from ibrobot_core.launch.runtime import ESTOP, RESET, Runtime
+from ibrobot_core.launch.session import Session
+from ibrobot_core.options import NoOptions
 
 if TYPE_CHECKING:
     from conftest import Runs
@@ -221,3 +225,11 @@ def test_a_goal_that_cannot_be_meant_is_refused_before_anything_starts(runs: Run
         runs.make(mode=mode, goals=(goal,))
     assert str(failure.value) == told
     assert failure.value.exit_code == 2
+
+
+def test_a_transport_that_a_run_does_not_use_is_refused(runs: Runs):
+    session = runs.make().session
+    shared = Component(type="shared", options=NoOptions())
+    with pytest.raises(NotSupported, match="transport: shared: a run shares its topics within one process; use local"):
+        Runtime(Session(attrs.evolve(session.config, transport=shared), session.registry, session.request))
+    runs.make("transport={type: local}")
