@@ -14,14 +14,25 @@ nox.options.default_venv_backend = "uv"
 nox.options.reuse_venv = "yes"
 
 PROJECT = nox.project.load_toml("pyproject.toml")
-PLUGINS = sorted(path.name.removeprefix("ibrobot-plugin-") for path in Path("plugins").glob("ibrobot-plugin-*"))
+FOLDERS = {
+    path.name.removeprefix("ibrobot-").removeprefix("plugin-"): path
+    for path in sorted(Path("plugins").glob("ibrobot-*"))
+}
+"""Name -> folder, of every plugin and of the library that plugins may share."""
+PLUGINS = sorted(FOLDERS)
+SHARED = "ros2"
 # A fixed seed: the same checks give the same result; `nox -s core -- --hypothesis-seed=random` explores.
 PYTEST = ("pytest", "--config-file=pyproject.toml", "--rootdir=.", "--hypothesis-seed=0")
 
 
 def packages(*plugins: str) -> list[str]:
-    """Install arguments for core and some plugins, as they are in this folder."""
-    return ["-e", ".", *(argument for name in plugins for argument in ("-e", f"plugins/ibrobot-plugin-{name}"))]
+    """Install arguments for core and some plugins, as they are in this folder, with the library that they share."""
+    wanted = list(plugins)
+    for name in plugins:
+        needs = nox.project.load_toml(FOLDERS[name] / "pyproject.toml")["project"]["dependencies"]
+        if SHARED not in wanted and any(need.startswith(f"ibrobot-{SHARED}") for need in needs):
+            wanted.append(SHARED)
+    return ["-e", ".", *(argument for name in wanted for argument in ("-e", str(FOLDERS[name])))]
 
 
 def install(
@@ -59,7 +70,7 @@ def types(session: nox.Session) -> None:
     install(session, *PLUGINS, groups=("lint", "test"))
     session.run("mypy", "--strict", "ibrobot_core")
     for name in PLUGINS:
-        session.run("mypy", "--strict", f"plugins/ibrobot-plugin-{name}/ibrobot_{name}")
+        session.run("mypy", "--strict", str(FOLDERS[name] / f"ibrobot_{name}"))
 
 
 @nox.session
@@ -73,7 +84,7 @@ def layers(session: nox.Session) -> None:
 def core(session: nox.Session) -> None:
     """Core's tests with no plugin installed."""
     install(session)
-    session.run(*PYTEST, "-m", "not integration", "tests", *session.posargs)
+    session.run(*PYTEST, "-m", "not integration and not lerobot", "tests", *session.posargs)
 
 
 @nox.session
@@ -83,7 +94,7 @@ def plugin(session: nox.Session, name: str) -> None:
     install(session, name)
     if name == "mujoco":
         render_off_screen(session)
-    session.run(*PYTEST, f"plugins/ibrobot-plugin-{name}/tests", *session.posargs)
+    session.run(*PYTEST, str(FOLDERS[name] / "tests"), *session.posargs)
 
 
 @nox.session
@@ -92,6 +103,13 @@ def integration(session: nox.Session) -> None:
     install(session, *PLUGINS)
     render_off_screen(session)
     session.run(*PYTEST, "-m", "integration", "tests", *session.posargs)
+
+
+@nox.session
+def lerobot(session: nox.Session) -> None:
+    """LeRobot itself, unmodified, against what the plugins offer; the one session with torch."""
+    install(session, *PLUGINS, options=("lerobot[dataset,feetech]>=0.6.1,<0.7",))
+    session.run(*PYTEST, "-m", "lerobot", "tests", *session.posargs)
 
 
 @nox.session
@@ -107,4 +125,4 @@ def minimums(session: nox.Session) -> None:
     """Core's and the plugins' tests with the oldest versions that they allow."""
     install(session, *PLUGINS, options=("--resolution=lowest-direct",))
     render_off_screen(session)
-    session.run(*PYTEST, "-m", "not integration", "tests", "plugins", *session.posargs)
+    session.run(*PYTEST, "-m", "not integration and not lerobot", "tests", "plugins", *session.posargs)

@@ -43,6 +43,11 @@ KNOWN_PACKAGES: Mapping[tuple[str, str], str] = {
     ("recorder", "joint_log"): "ibrobot-plugin-jointlog",
     ("dataset", "npz"): "ibrobot-plugin-jointlog",
     ("planner", "joint"): "ibrobot-plugin-planning",
+    ("hardware", "feetech_so101"): "ibrobot-plugin-feetech",
+    ("teleop", "so101_leader"): "ibrobot-plugin-feetech",
+    ("sensor", "opencv"): "ibrobot-plugin-camera",
+    ("sensor", "realsense"): "ibrobot-plugin-camera",
+    ("recorder", "mcap"): "ibrobot-plugin-mcap",
 }
 """Types of this project's own plugins, so that a missing one can be named."""
 

@@ -1,0 +1,1 @@
+"""Feetech STS servos: packets of the bus and the control table of the STS3215."""

@@ -1,0 +1,65 @@
+"""What can go wrong on a Feetech bus; every error names the port, the servo, the register and what to check."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import attrs
+
+from ibrobot_core.errors import HardwareError
+
+
+@attrs.frozen
+class Place:
+    """Where on a bus something went wrong."""
+
+    port: str
+    servo: int | None = None
+    joint: str | None = None
+    register: str | None = None
+
+    def __str__(self) -> str:
+        parts = [self.port]
+        if self.servo is not None:
+            parts.append(f"servo {self.servo}" + (f" ({self.joint})" if self.joint else ""))
+        if self.register is not None:
+            parts.append(self.register)
+        return ", ".join(parts)
+
+
+class FeetechError(HardwareError):
+    """Base of the errors of a servo bus.
+
+    Args:
+        place: where.
+        what: what happened, with the values.
+    """
+
+    check: ClassVar[str]
+    """What to look at."""
+
+    def __init__(self, place: Place, what: str) -> None:
+        self.place = place
+        super().__init__(f"{place}: {what}; {self.check}")
+
+
+class PacketError(FeetechError):
+    """Bytes that are no valid packet, e.g. one with a wrong checksum."""
+
+    check = "check the cable, its ground, and that no two servos share an id"
+
+
+class UnexpectedReply(FeetechError):
+    """A valid packet that does not answer the request, e.g. one of another servo or length."""
+
+    check = "check that no other program uses the port and that no two servos share an id"
+
+
+class ServoFault(FeetechError):
+    """A servo that reports an error of its own, e.g. overheating; `faults` names them."""
+
+    check = "check its supply, its load and its temperature, then take its torque off and on"
+
+    def __init__(self, place: Place, faults: tuple[str, ...]) -> None:
+        self.faults = faults
+        super().__init__(place, f"the servo reports {', '.join(faults)}")

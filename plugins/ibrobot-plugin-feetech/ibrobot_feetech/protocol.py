@@ -1,0 +1,205 @@
+"""Packets of the Feetech STS bus: packing, parsing, and finding them in a stream of bytes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from enum import IntEnum
+
+import attrs
+
+from ibrobot_feetech.errors import PacketError, Place, ServoFault, UnexpectedReply
+
+HEADER = b"\xff\xff"
+BROADCAST = 0xFE
+MAX_ID = 0xFD
+OVERHEAD = 6
+"""Bytes of a packet beside its parameters: header, id, length, code, checksum."""
+MAX_PARAMETERS = 0xFF - 2 - 1
+"""One less than the length byte could say: length 0xFF could be taken for a header."""
+
+
+class Instruction(IntEnum):
+    """What a packet of the host asks for."""
+
+    PING = 0x01
+    READ = 0x02
+    WRITE = 0x03
+    REG_WRITE = 0x04
+    ACTION = 0x05
+    SYNC_READ = 0x82
+    SYNC_WRITE = 0x83
+
+
+FAULTS: Mapping[int, str] = {0: "voltage", 1: "angle sensor", 2: "overheating", 3: "over-current", 5: "overload"}
+"""Bit of a status packet's error byte -> what it means."""
+
+
+@attrs.frozen
+class Packet:
+    """A packet: of the host, where `code` is the instruction, or of a servo, where it is the error byte."""
+
+    servo: int
+    code: int
+    parameters: bytes = b""
+
+
+def checksum(body: bytes | bytearray) -> int:
+    """The checksum of what lies between header and checksum."""
+    return ~sum(body) & 0xFF
+
+
+def pack(packet: Packet) -> bytes:
+    """The bytes of a packet.
+
+    Raises:
+        ValueError: for an id, code or number of parameters that no packet can have.
+    """
+    if not 0 <= packet.servo <= BROADCAST:
+        raise ValueError(f"servo id must be 0 to {MAX_ID}, or {BROADCAST} for all, not {packet.servo}")
+    if not 0 <= packet.code <= 0xFF:
+        raise ValueError(f"code must be a byte, not {packet.code}")
+    if len(packet.parameters) > MAX_PARAMETERS:
+        raise ValueError(f"a packet has at most {MAX_PARAMETERS} parameters, not {len(packet.parameters)}")
+    body = bytes((packet.servo, len(packet.parameters) + 2, packet.code)) + packet.parameters
+    return HEADER + body + bytes((checksum(body),))
+
+
+def ping(servo: int) -> bytes:
+    """Ask whether a servo is there."""
+    return pack(Packet(servo, Instruction.PING))
+
+
+def read(servo: int, address: int, size: int) -> bytes:
+    """Ask for `size` bytes from `address`."""
+    return pack(Packet(servo, Instruction.READ, bytes((address, size))))
+
+
+def write(servo: int, address: int, content: bytes) -> bytes:
+    """Set bytes from `address`."""
+    return pack(Packet(servo, Instruction.WRITE, bytes((address,)) + content))
+
+
+def reg_write(servo: int, address: int, content: bytes) -> bytes:
+    """Set bytes from `address` when `action` comes."""
+    return pack(Packet(servo, Instruction.REG_WRITE, bytes((address,)) + content))
+
+
+def action(servo: int = BROADCAST) -> bytes:
+    """Carry out what `reg_write` prepared."""
+    return pack(Packet(servo, Instruction.ACTION))
+
+
+def sync_read(servos: Iterable[int], address: int, size: int) -> bytes:
+    """Ask several servos for the same registers; each answers in turn."""
+    return pack(Packet(BROADCAST, Instruction.SYNC_READ, bytes((address, size, *_distinct(servos)))))
+
+
+def sync_write(address: int, contents: Mapping[int, bytes]) -> bytes:
+    """Set the same registers of several servos; none answers.
+
+    Args:
+        address: the first register.
+        contents: servo id -> bytes, of one length for all.
+    """
+    sizes = {len(content) for content in contents.values()}
+    if len(sizes) != 1:
+        raise ValueError(f"sync write needs bytes of one length for all servos, not of {sorted(sizes)}")
+    each = b"".join(bytes((servo,)) + contents[servo] for servo in _distinct(contents))
+    return pack(Packet(BROADCAST, Instruction.SYNC_WRITE, bytes((address, *sizes)) + each))
+
+
+def _distinct(servos: Iterable[int]) -> Sequence[int]:
+    ids = tuple(servos)
+    if not ids or len(set(ids)) != len(ids) or not all(0 <= servo <= MAX_ID for servo in ids):
+        raise ValueError(f"servo ids must be distinct, each 0 to {MAX_ID}, and at least one, not {list(ids)}")
+    return ids
+
+
+def parse(packet: bytes, place: Place) -> Packet:
+    """The packet that these bytes are, all of them.
+
+    Raises:
+        PacketError: when they are none.
+    """
+    if packet[:2] != HEADER:
+        raise PacketError(place, f"a packet must begin with ff ff, not {packet[:2].hex(' ') or 'nothing'}")
+    if len(packet) < OVERHEAD:
+        raise PacketError(place, f"a packet has at least {OVERHEAD} bytes, not {len(packet)}")
+    if packet[3] != len(packet) - 4:
+        raise PacketError(place, f"the length byte says {packet[3]}, {len(packet) - 4} bytes follow")
+    if packet[-1] != checksum(packet[2:-1]):
+        raise PacketError(place, f"checksum {packet[-1]:#04x}, expected {checksum(packet[2:-1]):#04x}")
+    return Packet(packet[2], packet[4], packet[5:-1])
+
+
+def check_status(packet: Packet, servo: int, size: int, place: Place) -> bytes:
+    """The parameters of the status packet with which `servo` answers a request for `size` bytes.
+
+    Raises:
+        UnexpectedReply: when it comes from another servo or has another length.
+        ServoFault: when an error bit is set.
+    """
+    if packet.servo != servo:
+        raise UnexpectedReply(place, f"servo {packet.servo} answered, {servo} was asked")
+    # A servo in trouble may answer without parameters, and its trouble is what to say.
+    if packet.code:
+        raise ServoFault(place, faults(packet.code))
+    if len(packet.parameters) != size:
+        raise UnexpectedReply(place, f"{len(packet.parameters)} bytes came, {size} were asked for")
+    return packet.parameters
+
+
+def faults(code: int) -> tuple[str, ...]:
+    """The names of the bits set in an error byte."""
+    return tuple(FAULTS.get(bit, f"unknown error bit {bit}") for bit in range(8) if code >> bit & 1)
+
+
+class Scanner:
+    """Finds packets in a stream that may hold garbage; what begins like a packet and is none costs one byte."""
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+        self.discarded = 0
+        """Bytes dropped so far since they belonged to no packet."""
+
+    def feed(self, received: bytes) -> list[Packet]:
+        """The packets complete now; an unfinished one is kept for the next call."""
+        self._buffer += received
+        packets = []
+        while (packet := self._next()) is not None:
+            packets.append(packet)
+        return packets
+
+    def clear(self) -> None:
+        """Forget an unfinished packet, as before a new request."""
+        self._drop(len(self._buffer))
+
+    def _next(self) -> Packet | None:
+        buffer = self._buffer
+        while True:
+            start = buffer.find(HEADER)
+            if start < 0:
+                self._drop(len(buffer) - buffer.endswith(b"\xff"))
+                return None
+            self._drop(start)
+            if len(buffer) < 4:
+                # Of three ff the first can be no header: no id is ff.
+                if buffer[2:3] == b"\xff":
+                    self._drop(1)
+                    continue
+                return None
+            end = buffer[3] + 4
+            if buffer[2] == 0xFF or not 2 <= buffer[3] <= MAX_PARAMETERS + 2:
+                self._drop(1)
+            elif len(buffer) < end:
+                return None
+            elif buffer[end - 1] != checksum(buffer[2 : end - 1]):
+                self._drop(1)
+            else:
+                packet = Packet(buffer[2], buffer[4], bytes(buffer[5 : end - 1]))
+                del buffer[:end]
+                return packet
+
+    def _drop(self, count: int) -> None:
+        self.discarded += count
+        del self._buffer[:count]

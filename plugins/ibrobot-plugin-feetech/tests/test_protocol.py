@@ -1,0 +1,114 @@
+"""Packets: known bytes, round trips, and streams with garbage in them."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from ibrobot_feetech import protocol
+from ibrobot_feetech.errors import PacketError, Place, ServoFault, UnexpectedReply
+from ibrobot_feetech.protocol import Packet, Scanner, pack, parse
+
+PLACE = Place("/dev/ttyACM0", 3, "elbow_flex", "present_position")
+packets = st.builds(Packet, st.integers(0, 0xFE), st.integers(0, 0xFF), st.binary(max_size=protocol.MAX_PARAMETERS))
+
+
+@pytest.mark.parametrize(
+    ("made", "expected"),
+    [
+        (protocol.ping(1), "ff ff 01 02 01 fb"),
+        (protocol.read(1, 56, 2), "ff ff 01 04 02 38 02 be"),
+        (protocol.write(1, 5, b"\x01"), "ff ff 01 04 03 05 01 f1"),
+        (protocol.reg_write(1, 42, b"\x00\x08"), "ff ff 01 05 04 2a 00 08 c3"),
+        (protocol.action(), "ff ff fe 02 05 fa"),
+        (protocol.sync_read((1, 2), 56, 8), "ff ff fe 06 82 38 08 01 02 36"),
+        (protocol.sync_write(42, {1: b"\x00\x08", 2: b"\x01\x08"}), "ff ff fe 0a 83 2a 02 01 00 08 02 01 08 34"),
+    ],
+)
+def test_known_bytes(made: bytes, expected: str) -> None:
+    assert made.hex(" ") == expected
+
+
+@given(packets)
+def test_parse_undoes_pack(packet: Packet) -> None:
+    assert parse(pack(packet), PLACE) == packet
+
+
+@given(packets, st.data())
+def test_one_changed_byte_is_refused(packet: Packet, data: st.DataObject) -> None:
+    raw = bytearray(pack(packet))
+    raw[data.draw(st.integers(0, len(raw) - 1))] ^= data.draw(st.integers(1, 0xFF))
+    with pytest.raises(PacketError):
+        parse(bytes(raw), PLACE)
+
+
+@given(st.binary(max_size=40))
+def test_any_bytes_parse_or_raise_a_packet_error(raw: bytes) -> None:
+    try:
+        packet = parse(raw, PLACE)
+    except PacketError:
+        return
+    assert pack(packet) == raw
+
+
+def test_errors_say_where_and_what_to_check() -> None:
+    where = r"/dev/ttyACM0, servo 3 \(elbow_flex\), present_position: checksum 0x00, expected 0xfb; check the cable"
+    with pytest.raises(PacketError, match=where):
+        parse(protocol.ping(1)[:-1] + b"\x00", PLACE)
+
+
+@given(st.lists(packets, max_size=4), st.integers(1, 9))
+def test_scanner_finds_packets_in_any_slices(sent: list[Packet], step: int) -> None:
+    sent = [packet for packet in sent if len(packet.parameters) < 30]
+    stream = b"".join(map(pack, sent))
+    scanner = Scanner()
+    found = [packet for i in range(0, len(stream), step) for packet in scanner.feed(stream[i : i + step])]
+    assert found == sent
+    assert scanner.discarded == 0
+
+
+@given(st.lists(st.binary(max_size=30), max_size=8), packets)
+def test_scanner_finds_its_way_after_garbage(garbage: list[bytes], packet: Packet) -> None:
+    scanner = Scanner()
+    for part in garbage:
+        scanner.feed(part)
+    scanner.clear()
+    assert scanner.feed(pack(packet)) == [packet]
+
+
+def test_scanner_skips_a_corrupt_packet_and_an_extra_ff() -> None:
+    good, bad = Packet(2, 0, b"\x10\x08"), bytearray(pack(Packet(1, 0, b"\x10\x08")))
+    bad[5] ^= 1
+    scanner = Scanner()
+    assert scanner.feed(bytes(bad) + b"\xff" + pack(good)) == [good]
+    assert scanner.discarded == len(bad) + 1
+
+
+def test_status_of_another_servo_or_length_is_refused() -> None:
+    assert protocol.check_status(Packet(3, 0, b"\x10\x08"), 3, 2, PLACE) == b"\x10\x08"
+    with pytest.raises(UnexpectedReply, match="servo 2 answered, 3 was asked"):
+        protocol.check_status(Packet(2, 0, b"\x10\x08"), 3, 2, PLACE)
+    with pytest.raises(UnexpectedReply, match="1 bytes came, 2 were asked for"):
+        protocol.check_status(Packet(3, 0, b"\x10"), 3, 2, PLACE)
+
+
+def test_error_bits_are_named() -> None:
+    with pytest.raises(ServoFault, match=r"servo 3 \(elbow_flex\).*overheating, overload") as caught:
+        protocol.check_status(Packet(3, 0b100100), 3, 2, PLACE)
+    assert caught.value.faults == ("overheating", "overload")
+    assert protocol.faults(0x80) == ("unknown error bit 7",)
+
+
+@pytest.mark.parametrize("servo", [-1, 255])
+def test_ids_that_no_servo_has(servo: int) -> None:
+    with pytest.raises(ValueError, match=f"not {servo}"):
+        protocol.ping(servo)
+
+
+def test_sync_needs_distinct_servos_and_one_length() -> None:
+    with pytest.raises(ValueError, match="distinct"):
+        protocol.sync_read((1, 1), 56, 2)
+    with pytest.raises(ValueError, match="distinct"):
+        protocol.sync_read((), 56, 2)
+    with pytest.raises(ValueError, match="one length"):
+        protocol.sync_write(42, {1: b"\x00", 2: b"\x00\x00"})

@@ -1,0 +1,1 @@
+"""Records ibrobot's episodes as rosbag2 directories with MCAP files."""
