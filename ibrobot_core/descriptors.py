@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from ibrobot_core.interfaces import (
         Context,
         DatasetWriter,
+        EpisodeReader,
         Executor,
         Hardware,
         Planner,
@@ -101,6 +102,22 @@ class DatasetDescriptor(Descriptor["DatasetWriter"]):
 @attrs.frozen
 class ViewerDescriptor(Descriptor["Viewer"]):
     """A viewer."""
+
+
+@attrs.frozen
+class ReaderDescriptor:
+    """A format of recorded episodes that can be read; the first installed one that knows a path reads it."""
+
+    type: str
+    summary: str
+    reads: Callable[[Path], bool]
+    """Whether what lies at a path is of this format; looks at names and first bytes only."""
+    make: Callable[[Path], EpisodeReader]
+    """Opens an episode.
+
+    Raises:
+        RecorderError: when it cannot be read.
+    """
 
 
 @attrs.frozen

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
         HardwareDescriptor,
         PlannerDescriptor,
         PolicyDescriptor,
+        ReaderDescriptor,
         RecorderDescriptor,
         SensorDescriptor,
         TeleopDescriptor,
@@ -82,6 +83,11 @@ def ibrobot_transports() -> Iterable[TransportDescriptor]:  # type: ignore[empty
 @hookspec
 def ibrobot_recorders() -> Iterable[RecorderDescriptor]:  # type: ignore[empty-body]
     """Episode recorders."""
+
+
+@hookspec
+def ibrobot_readers() -> Iterable[ReaderDescriptor]:  # type: ignore[empty-body]
+    """Formats of recorded episodes that this plugin reads."""
 
 
 @hookspec

@@ -7,15 +7,19 @@ from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import attrs
 import pluggy
 
 from ibrobot_core import hookspecs
-from ibrobot_core.descriptors import Check, Command, ConfigFile, Descriptor
-from ibrobot_core.errors import PluginError
+from ibrobot_core.descriptors import Check, Command, ConfigFile, Descriptor, ReaderDescriptor
+from ibrobot_core.errors import PluginError, RecorderError
+
+if TYPE_CHECKING:
+    from ibrobot_core.interfaces import EpisodeReader
 
 ENTRY_POINT_GROUP = "ibrobot"
 
@@ -87,6 +91,7 @@ class Registry:
     entries: dict[tuple[str, str], Entry] = attrs.field(factory=dict)
     failures: list[Failure] = attrs.field(factory=list)
     configs: list[ConfigFile] = attrs.field(factory=list)
+    readers: list[ReaderDescriptor] = attrs.field(factory=list)
     commands: dict[str, Command] = attrs.field(factory=dict)
     managers: dict[str, pluggy.PluginManager] = attrs.field(factory=dict)
 
@@ -104,6 +109,21 @@ class Registry:
         if entry is None:
             raise PluginError(self._why_missing(kind, type_))
         return entry.descriptor
+
+    def open_episode(self, path: Path) -> EpisodeReader:
+        """A reader of the episode at `path`.
+
+        Raises:
+            RecorderError: when nothing is there, no installed plugin reads it, or it cannot be read.
+        """
+        if not path.exists():
+            raise RecorderError(f"{path}: there is no such episode")
+        for reader in self.readers:
+            if reader.reads(path):
+                return reader.make(path)
+        formats = ", ".join(f"{reader.type} ({reader.summary})" for reader in self.readers)
+        hint = "" if formats else "; pip install ibrobot-plugin-mcap reads rosbag2"
+        raise RecorderError(f"{path}: not an episode of a known format; installed: {formats or 'none'}{hint}")
 
     def _why_missing(self, kind: str, type_: str) -> str:
         package = KNOWN_PACKAGES.get((kind, type_))
@@ -169,6 +189,8 @@ def _collect(registry: Registry, plugin: str, package: str, version: str, manage
                 if not isinstance(descriptor, Descriptor):
                     raise TypeError(f"expected a Descriptor, got {descriptor!r}")
                 found.append((kind, descriptor))
+        stage = "ibrobot_readers"
+        readers = [r for result in manager.hook.ibrobot_readers() for r in result]
         stage = "ibrobot_configs"
         configs = [c for result in manager.hook.ibrobot_configs() for c in result]
         stage = "ibrobot_commands"
@@ -183,6 +205,7 @@ def _collect(registry: Registry, plugin: str, package: str, version: str, manage
             registry.failures.append(Failure(plugin, package, KINDS[kind], reason))
             continue
         registry.entries[kind, descriptor.type] = Entry(kind, descriptor, plugin, package, version)
+    registry.readers += readers
     registry.configs += configs
     registry.commands.update({command.name: command for command in commands})
     registry.managers[plugin] = manager

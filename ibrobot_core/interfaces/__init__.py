@@ -6,6 +6,7 @@ from ibrobot_core.interfaces.executor import Executor, GoalState, GoalStatus, Pl
 from ibrobot_core.interfaces.hardware import Episode, Hardware, JointReading, Signal, SimulatedHardware, nan_vector
 from ibrobot_core.interfaces.planner import JointGoal, Planner, PlanRequest, PoseGoal
 from ibrobot_core.interfaces.policy import Frame, Policy, PolicySpec, Tensors
+from ibrobot_core.interfaces.reader import EpisodeReader, EpisodeSummary, Recorded, TopicSummary
 from ibrobot_core.interfaces.recorder import EpisodeEnd, EpisodeStart, Recorder
 from ibrobot_core.interfaces.sensor import Sensor
 from ibrobot_core.interfaces.teleop import Teleop, TeleopCommand
@@ -17,7 +18,9 @@ __all__ = [
     "DatasetWriter",
     "Episode",
     "EpisodeEnd",
+    "EpisodeReader",
     "EpisodeStart",
+    "EpisodeSummary",
     "Executor",
     "Feature",
     "Frame",
@@ -32,6 +35,7 @@ __all__ = [
     "Policy",
     "PolicySpec",
     "PoseGoal",
+    "Recorded",
     "Recorder",
     "Sensor",
     "Signal",
@@ -39,6 +43,7 @@ __all__ = [
     "Teleop",
     "TeleopCommand",
     "Tensors",
+    "TopicSummary",
     "Transport",
     "Viewer",
     "nan_vector",

@@ -1,0 +1,78 @@
+"""Episode readers: what gives the messages of an episode back, also of one that was never finished."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Collection, Iterator, Mapping
+from pathlib import Path
+
+import attrs
+
+from ibrobot_core.messages import Message
+
+
+@attrs.frozen(eq=False)
+class Recorded:
+    """A message as it was recorded."""
+
+    topic: str
+    message: Message
+    received_ns: int
+    """When the recorder's side had it [ns]: what alignment counts as the time of receipt."""
+    published_ns: int
+    """When it was sent [ns]; equal to `received_ns` where the episode does not tell them apart."""
+
+
+@attrs.frozen
+class TopicSummary:
+    """One topic of an episode."""
+
+    type: str
+    """ROS 2 message type."""
+    count: int
+    """Messages that can be read."""
+    dropped: int = 0
+    """Messages that the recorder says it lost."""
+
+
+@attrs.frozen
+class EpisodeSummary:
+    """What is known of an episode without decoding its messages."""
+
+    path: Path
+    finished: bool
+    """False where its writer was killed; what can be read is counted all the same."""
+    start_ns: int
+    end_ns: int
+    """Receipt of the first and the last message [ns]; both 0 for an episode without messages."""
+    topics: Mapping[str, TopicSummary]
+    metadata: Mapping[str, str]
+    """What the recorder was told: prompt, contract, fingerprint, calibration, versions; empty in foreign bags."""
+    outcome: str = "unknown"
+
+
+class EpisodeReader(ABC):
+    """Reads one episode. Messages come one by one: an episode need not fit into memory."""
+
+    @abstractmethod
+    def summary(self) -> EpisodeSummary:
+        """What is in the episode.
+
+        Raises:
+            RecorderError: when it cannot be read.
+        """
+
+    @abstractmethod
+    def messages(self, topics: Collection[str] | None = None) -> Iterator[Recorded]:
+        """The messages of these topics (of all when None), in the order of receipt. May be called again.
+
+        A message of a type that core does not know comes as a `messages.Message` made from its definition where the
+        episode brings one.
+
+        Raises:
+            RecorderError: for damage in the midst of the file; what came before has been given.
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """Release the files. Safe to call twice."""
