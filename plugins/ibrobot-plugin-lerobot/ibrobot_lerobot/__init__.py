@@ -1,0 +1,1 @@
+"""LeRobot datasets for ibrobot: episodes to LeRobot v3 and back, without torch."""
