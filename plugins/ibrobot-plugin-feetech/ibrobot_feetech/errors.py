@@ -43,6 +43,18 @@ class FeetechError(HardwareError):
         super().__init__(f"{place}: {what}; {self.check}")
 
 
+class PortError(FeetechError):
+    """A serial port that cannot be opened or is gone, e.g. an unplugged cable."""
+
+    check = "check the USB cable; `ibrobot feetech find-port` lists the ports that are there"
+
+
+class NoReply(FeetechError):
+    """A servo that did not answer in time, after all retries."""
+
+    check = "check its power, the cable to it, its id and the baud rate; `ibrobot feetech scan` shows who answers"
+
+
 class PacketError(FeetechError):
     """Bytes that are no valid packet, e.g. one with a wrong checksum."""
 

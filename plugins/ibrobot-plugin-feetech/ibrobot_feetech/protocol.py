@@ -161,6 +161,8 @@ class Scanner:
         self._buffer = bytearray()
         self.discarded = 0
         """Bytes dropped so far since they belonged to no packet."""
+        self.damaged = 0
+        """What began like a packet and had a wrong checksum."""
 
     def feed(self, received: bytes) -> list[Packet]:
         """The packets complete now; an unfinished one is kept for the next call."""
@@ -194,6 +196,7 @@ class Scanner:
             elif len(buffer) < end:
                 return None
             elif buffer[end - 1] != checksum(buffer[2 : end - 1]):
+                self.damaged += 1
                 self._drop(1)
             else:
                 packet = Packet(buffer[2], buffer[4], bytes(buffer[5 : end - 1]))

@@ -18,7 +18,7 @@ class Register:
     name: str
     address: int
     size: int
-    area: Literal["eprom", "ram"]
+    area: Literal["eprom", "ram", "factory"]
     """EPROM survives power-off and is written only while `lock` is 0."""
     unit: str = ""
     writable: bool = True
@@ -111,7 +111,20 @@ _TABLE = (
     Register("status", 65, 1, "ram", "error bits", writable=False),
     Register("moving", 66, 1, "ram", writable=False),
     Register("present_current", 69, 2, "ram", "6.5 mA", writable=False, sign_bit=15),
+    Register("goal_position_2", 71, 2, "ram", _TICK, writable=False),
+    Register("moving_velocity_threshold", 80, 1, "factory"),
+    Register("dts", 81, 1, "factory", "ms"),
+    Register("velocity_unit_factor", 82, 1, "factory"),
+    Register("hts", 83, 1, "factory"),
+    Register("maximum_velocity_limit", 84, 1, "factory"),
+    Register("maximum_acceleration", 85, 1, "factory", "100 * 360/4096 deg/s^2"),
+    Register("acceleration_multiplier", 86, 1, "factory"),
 )
+
+BAUD_RATES: Mapping[int, int] = {
+    1_000_000: 0, 500_000: 1, 250_000: 2, 128_000: 3, 115_200: 4, 57_600: 5, 38_400: 6, 19_200: 7,
+}  # fmt: skip
+"""Baud rate -> the code of register `baud_rate`."""
 
 STS3215: Mapping[str, Register] = {register.name: register for register in _TABLE}
 """Name -> register, in order of address."""
