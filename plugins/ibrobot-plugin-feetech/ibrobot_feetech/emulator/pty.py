@@ -1,0 +1,179 @@
+"""Serves emulated servos on a real pseudo-terminal, from a thread."""
+
+from __future__ import annotations
+
+import heapq
+import os
+import select
+import termios
+import threading
+import time
+import tty
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from ibrobot_core.clock import Clock
+from ibrobot_core.units import seconds
+from ibrobot_feetech.emulator.faults import Faults
+from ibrobot_feetech.emulator.servo import EmulatedServo
+from ibrobot_feetech.emulator.wire import Wire
+
+_SPEED = 5
+"""Index of the output speed in a terminal's attributes."""
+_RATES = {
+    getattr(termios, f"B{rate}"): rate
+    for rate in (4800, 9600, 19200, 38400, 57600, 115200, 500000, 1000000)
+    if hasattr(termios, f"B{rate}")
+}
+
+
+class Emulator:
+    """A bus of emulated servos behind a pseudo-terminal; a context manager.
+
+    Servos move in the clock's time, as far as it has come whenever a byte arrives: with a stepped clock all is
+    deterministic. `lock` is held while a request is carried out; hold it to change several things at once.
+
+    Args:
+        servos: how many, with the ids 1 to `servos`; or id -> servo.
+        baud_rate: at which the servos listen at first [baud].
+        throttle: whether bytes take the time that they take on a wire.
+        seed: of the chances in `faults`.
+        clock: in whose time the joints move; the machine's when None.
+        link: where to put a symbolic link to the pseudo-terminal, which stays the same over unplugging.
+    """
+
+    def __init__(
+        self, servos: int | Mapping[int, EmulatedServo] = 6, *, baud_rate: int = 1_000_000, throttle: bool = False,
+        seed: int = 0, clock: Clock | None = None, link: Path | str | None = None,
+    ) -> None:  # fmt: skip
+        made = {i: EmulatedServo(i) for i in range(1, servos + 1)} if isinstance(servos, int) else dict(servos)
+        self.servos: dict[int, EmulatedServo] = made
+        self.faults = Faults()
+        self.lock = threading.RLock()
+        self.on_request: Callable[[], None] = lambda: None
+        """Called, with the lock held, after every request was carried out."""
+        self._default_rate = baud_rate
+        self._wire = Wire(self.servos, self.faults, throttle=throttle, seed=seed)
+        self._clock = clock
+        self._link = Path(link) if link is not None else None
+        self._master = self._slave = -1
+        self._thread: threading.Thread | None = None
+        self._error: BaseException | None = None
+        self.port = ""
+        """The path of the pseudo-terminal."""
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    def start(self) -> None:
+        """Begin to serve."""
+        self._stop_reader, self._stop_writer = os.pipe()
+        self._plug()
+
+    def stop(self) -> None:
+        """End, and raise what went wrong in the serving thread."""
+        self.unplug()
+        os.close(self._stop_reader)
+        os.close(self._stop_writer)
+        if self._error is not None:
+            raise self._error
+
+    def unplug(self) -> None:
+        """Pull the cable: the port is gone for whoever has it open."""
+        if self._thread is None:
+            return
+        os.write(self._stop_writer, b".")
+        self._thread.join()
+        os.read(self._stop_reader, 1)
+        self._thread = None
+        if self._link is not None:
+            self._link.unlink(missing_ok=True)
+        for descriptor in (self._slave, self._master):
+            os.close(descriptor)
+
+    def replug(self) -> None:
+        """Put the cable back: a port under the same link, or under a new path in `port`."""
+        if self._thread is None:
+            self._plug()
+
+    def settle(self) -> None:
+        """Let the joints move to where they are now, in the clock's time, with no request."""
+        with self.lock:
+            self._wire.advance(self._now_s())
+
+    def _plug(self) -> None:
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self.port = os.ttyname(self._slave)
+        self._base = termios.tcgetattr(self._slave)
+        if self._link is not None:
+            self._link.unlink(missing_ok=True)
+            self._link.symlink_to(self.port)
+        self._thread = threading.Thread(target=self._serve, name=f"emulator {self.port}", daemon=True)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        try:
+            self._loop()
+        except BaseException as error:  # noqa: BLE001 - kept for whoever stops the emulator
+            self._error = error
+
+    def _loop(self) -> None:
+        poll = select.poll()
+        poll.register(self._master, select.POLLIN)
+        poll.register(self._stop_reader, select.POLLIN)
+        pending: list[tuple[float, int, bytes]] = []
+        count = 0
+        while True:
+            for descriptor, _ in poll.poll(self._wait_ms(pending)):
+                if descriptor == self._stop_reader:
+                    return
+                with suppress(BlockingIOError):
+                    arrived = time.monotonic()
+                    for after_s, reply in self._carry_out(os.read(self._master, 4096)):
+                        heapq.heappush(pending, (arrived + after_s, count, reply))
+                        count += 1
+            out = b""
+            while pending and pending[0][0] <= time.monotonic():
+                out += heapq.heappop(pending)[2]
+            if out:
+                with suppress(BlockingIOError):  # nobody reads: a wire keeps nothing either
+                    os.write(self._master, out)
+
+    def _wait_ms(self, pending: list[tuple[float, int, bytes]]) -> float | None:
+        """How long to sleep: not at all in the last millisecond before a reply is due, which `poll` cannot measure."""
+        if not pending:
+            return None
+        wait_s = pending[0][0] - time.monotonic()
+        if wait_s > 0.001:
+            return (wait_s - 0.001) * 1e3
+        if wait_s > 0:
+            time.sleep(wait_s)
+        return 0
+
+    def _carry_out(self, received: bytes) -> list[tuple[float, bytes]]:
+        with self.lock:
+            self._wire.advance(self._now_s())
+            replies = self._wire.receive(received, self._host_rate())
+            self.on_request()
+        return replies
+
+    def _now_s(self) -> float:
+        return time.monotonic() if self._clock is None else seconds(self._clock.now_ns())
+
+    def _host_rate(self) -> int:
+        """The rate that the host has set on its side; the pseudo-terminal's own until then."""
+        attributes = termios.tcgetattr(self._slave)
+        if attributes[_SPEED] == self._base[_SPEED]:
+            return self._default_rate
+        return _RATES.get(attributes[_SPEED], 0)

@@ -1,0 +1,239 @@
+"""An emulated STS3215: its control table, its EPROM lock, and a joint that follows its goal."""
+
+from __future__ import annotations
+
+import math
+
+from ibrobot_feetech.registers import MODEL_STS3215, STS3215, Register, register
+
+TURN = 4096
+"""Ticks of one turn."""
+_LOCK = register("lock").address
+_EPROM_END = register("torque_enable").address
+_TORQUE = register("torque_enable").address
+_MIDDLE = 128
+"""Written to `torque_enable`, it makes the present position the middle of the turn."""
+_MAX_VELOCITY = 3073
+"""What the motor can do at 12 V without load [ticks/s]: 0.222 s for 60 degrees."""
+_FORWARD, _BACKWARD = 1, -1
+
+_DEFAULTS = {
+    "firmware_major": 3,
+    "firmware_minor": 10,
+    "model_number": MODEL_STS3215,
+    "return_delay": 250,
+    "status_return_level": 1,
+    "max_position_limit": 4095,
+    "max_temperature_limit": 70,
+    "max_voltage_limit": 140,
+    "min_voltage_limit": 40,
+    "max_torque": 1000,
+    "phase": 12,
+    "unloading_condition": 44,
+    "led_alarm_condition": 47,
+    "p_coefficient": 32,
+    "d_coefficient": 32,
+    "min_startup_force": 16,
+    "cw_dead_zone": 1,
+    "ccw_dead_zone": 1,
+    "protection_current": 500,
+    "angular_resolution": 1,
+    "protective_torque": 20,
+    "protection_time": 200,
+    "overload_torque": 80,
+    "velocity_p_coefficient": 10,
+    "over_current_protection_time": 200,
+    "velocity_i_coefficient": 10,
+    "torque_limit": 1000,
+    "lock": 1,
+    "present_voltage": 121,
+    "present_temperature": 28,
+    "maximum_acceleration": 254,
+}
+
+
+class EmulatedServo:
+    """One servo. Time is told to it: `advance` moves the joint; nothing here sleeps.
+
+    The table is kept as the servo keeps it, raw; positions in it are the encoder's less the homing offset.
+
+    Args:
+        servo: its id.
+        encoder: where the joint is at first [ticks], 0 to 4095.
+    """
+
+    def __init__(self, servo: int, encoder: float = 2048.0) -> None:
+        self.table = bytearray(256)
+        for name, value in _DEFAULTS.items():
+            self.set(name, value)
+        self.set("id", servo)
+        self._eprom = bytes(self.table[:_EPROM_END])
+        self.encoder = encoder
+        """Where the joint is [ticks], before the homing offset."""
+        self.velocity = 0.0
+        """[ticks/s]"""
+        self.external: float | None = None
+        """Where physics outside of the servo hold the joint [ticks]; None where the servo moves it."""
+        self.errors = 0
+        """Error bits forced upon it."""
+        self._prepared: tuple[int, bytes] | None = None
+        self._publish()
+        self.set("goal_position", self.get("present_position"))
+
+    @property
+    def id(self) -> int:
+        """Its id, as others address it."""
+        return self.table[STS3215["id"].address]
+
+    @property
+    def error(self) -> int:
+        """The error byte of its replies."""
+        return self.errors | self.get("status")
+
+    @property
+    def torque(self) -> bool:
+        """Whether the motor is on."""
+        return self.table[_TORQUE] == 1
+
+    def get(self, name: str) -> int:
+        """A register's value, decoded."""
+        found = register(name)
+        return found.decode(bytes(self.table[found.address : found.address + found.size]))
+
+    def set(self, name: str, value: int) -> None:
+        """Set a register, read-only or locked as it may be."""
+        found = register(name)
+        self.table[found.address : found.address + found.size] = found.encode(value)
+
+    def turn(self, encoder: float) -> None:
+        """Somebody moves the joint by hand to an encoder position [ticks]; only with torque off.
+
+        Raises:
+            ValueError: with torque on.
+        """
+        if self.torque:
+            raise ValueError(f"servo {self.id} has torque on: it cannot be turned by hand")
+        self.encoder, self.velocity = encoder, 0.0
+        self._publish()
+
+    def read(self, address: int, size: int) -> bytes:
+        """Bytes of the table."""
+        return bytes(self.table[address : address + size])
+
+    def write(self, address: int, content: bytes) -> None:
+        """Write as the host does: read-only registers keep their values, and EPROM does while it is locked."""
+        for offset, value in enumerate(content):
+            self._write_byte(address + offset, value)
+        touched = range(address, address + len(content))
+        if _TORQUE in touched and self.table[_TORQUE] == _MIDDLE:
+            self._make_middle()
+        if self.table[_LOCK] == 0:
+            self._eprom = bytes(self.table[:_EPROM_END])
+        self._publish()
+
+    def prepare(self, address: int, content: bytes) -> None:
+        """Keep a write until `act`."""
+        self._prepared = address, content
+
+    def act(self) -> None:
+        """Carry out what was prepared."""
+        if self._prepared is not None:
+            prepared, self._prepared = self._prepared, None
+            self.write(*prepared)
+
+    def brown_out(self) -> None:
+        """Lose power for a moment: RAM and torque are gone, EPROM stays."""
+        servo = EmulatedServo(self.id, self.encoder)
+        self.table[:] = servo.table
+        self.table[:_EPROM_END] = self._eprom
+        self.velocity, self._prepared = 0.0, None
+        self._publish()
+        self.set("goal_position", self.get("present_position"))
+
+    def advance(self, elapsed_s: float) -> None:
+        """Let time pass [s]: the joint moves towards its goal."""
+        if self.external is not None:
+            self.velocity = (self.external - self.encoder) / elapsed_s if elapsed_s > 0 else self.velocity
+            self.encoder = self.external
+        elif self.torque and self.get("operating_mode") == 0:
+            self._follow(elapsed_s)
+        else:
+            self.velocity = 0.0
+        self._publish()
+
+    @property
+    def goal(self) -> float:
+        """Where the motor wants the joint [ticks of the encoder], within the limits of its table."""
+        low, high = self.get("min_position_limit"), self.get("max_position_limit")
+        goal = self.get("goal_position")
+        if low < high:
+            goal = min(max(goal, low), high)
+        return goal + self.get("homing_offset")
+
+    def _follow(self, elapsed_s: float) -> None:
+        """Along a trapezoid of velocity towards the goal; exact in the way, not in the last few ticks' timing."""
+        way = self._way()
+        if abs(way) < 0.5 and abs(self.velocity) < 50:
+            self.encoder, self.velocity = self.encoder + way, 0.0
+            return
+        top = float(min(abs(self.get("goal_velocity")) or _MAX_VELOCITY, _MAX_VELOCITY))
+        acceleration = 100.0 * (self.table[register("acceleration").address] or 254)
+        remaining = elapsed_s
+        step_s = 0.001
+        while remaining > 1e-9:
+            step = min(step_s, remaining)
+            remaining -= step
+            way = self._way()
+            wanted = math.copysign(min(top, math.sqrt(2 * acceleration * abs(way)), abs(way) / step), way)
+            change = min(max(wanted - self.velocity, -acceleration * step), acceleration * step)
+            self.velocity += change
+            moved = self.velocity * step
+            if abs(moved) >= abs(way) and moved * way > 0 and abs(self.velocity) <= acceleration * step * 2:
+                self.encoder, self.velocity = self.encoder + way, 0.0
+                return
+            self.encoder += moved
+
+    def _way(self) -> float:
+        return self.goal - self.encoder
+
+    def _make_middle(self) -> None:
+        self.table[_TORQUE] = 0
+        offset = round(self.encoder) - TURN // 2
+        self.set("homing_offset", max(-2047, min(2047, offset)))
+
+    def _write_byte(self, address: int, value: int) -> None:
+        if address > 0xFF or _READ_ONLY[address]:
+            return
+        if address < _EPROM_END and self.table[_LOCK] != 0:
+            return
+        self.table[address] = value
+
+    def _publish(self) -> None:
+        """Bring the read-only registers up to date."""
+        reported = round(self.encoder) - self.get("homing_offset")
+        # With bit 4 of `phase` clear the reported position stays within one turn.
+        if not self.get("phase") & 0x10:
+            reported %= TURN
+        self.set("present_position", reported)
+        self.set("present_velocity", max(-32767, min(32767, round(self.velocity))))
+        way = self._way() if self.torque else 0.0
+        self.set("present_load", max(-1000, min(1000, round(way * self.get("p_coefficient") / 32))))
+        self.set("moving", int(abs(self.velocity) > 0))
+        status = 0
+        if not self.get("min_voltage_limit") <= self.get("present_voltage") <= self.get("max_voltage_limit"):
+            status |= 0x01
+        if self.get("present_temperature") > self.get("max_temperature_limit"):
+            status |= 0x04
+        self.set("status", status)
+
+
+def _read_only() -> list[bool]:
+    table = [False] * 256
+    found: Register
+    for found in STS3215.values():
+        for address in range(found.address, found.address + found.size):
+            table[address] = not found.writable
+    return table
+
+
+_READ_ONLY = _read_only()
