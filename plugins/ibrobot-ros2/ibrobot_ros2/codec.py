@@ -1,0 +1,96 @@
+"""Messages to and from CDR, the serialisation of ROS 2."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping
+from typing import Any
+
+from rosbags.serde import SerdeError
+from rosbags.typesys.store import Typestore
+
+from ibrobot_core.messages import Message
+from ibrobot_ros2.convert import Convert, core_class, decoder, encoder, make_class
+from ibrobot_ros2.definitions import CodecError, make_typestore, standard_types, type_hash
+
+_ENCAPSULATIONS = {b"\x00\x00": False, b"\x00\x01": True}
+"""First bytes of plain CDR -> whether it is little-endian."""
+
+
+class Codec:
+    """Encodes and decodes messages of the standard types, of `ibrobot_msgs`, and of those that are defined here.
+
+    Args:
+        definitions: type -> its `ros2msg` text, e.g. as a bag brings them; they come before the standard ones.
+    """
+
+    def __init__(self, definitions: Mapping[str, str] | None = None) -> None:
+        self._types: Typestore = make_typestore(definitions) if definitions else standard_types()
+        self._classes: dict[str, type[Any]] = {}
+        self._encoders: dict[str, Convert] = {}
+        self._decoders: dict[str, Convert] = {}
+
+    def encode(self, message: Message) -> memoryview:
+        """CDR of a message, little-endian, with its encapsulation header; arrays are copied once.
+
+        Raises:
+            CodecError: e.g. for a number that its field cannot hold.
+        """
+        type_name = message.ros_type
+        convert = self._encoders.get(type_name)
+        if convert is None:
+            self._check(type_name)
+            convert = self._encoders[type_name] = encoder(type_name, self._types)
+        try:
+            return self._types.serialize_cdr(convert(message), type_name, little_endian=True)
+        except (SerdeError, struct.error, ValueError, OverflowError, TypeError, AttributeError) as error:
+            raise CodecError(f"{type_name}: cannot be encoded: {error}") from error
+
+    def decode(self, type_name: str, data: bytes | memoryview) -> Message:
+        """The message in `data`. Arrays are views of it; bytes behind the message are passed over.
+
+        A type that core does not have becomes a class made from its definition, with stamps as `…_ns` [ns].
+
+        Raises:
+            CodecError: for a type that nobody defined, or data that is no such message.
+        """
+        convert = self._decoders.get(type_name)
+        if convert is None:
+            self._check(type_name)
+            convert = decoder(type_name, self._class_of(type_name), self._types, self._class_of)
+            self._decoders[type_name] = convert
+        little_endian = _ENCAPSULATIONS.get(bytes(data[:2]))
+        if little_endian is None or len(data) < 4:
+            raise CodecError(f"{type_name}: not plain CDR: begins with {bytes(data[:4]).hex(' ') or 'nothing'}")
+        entry = self._types.get_msgdef(type_name)
+        deserialize = entry.deserialize_cdr_le if little_endian else entry.deserialize_cdr_be
+        try:
+            ros, _ = deserialize(memoryview(data)[4:], 0, entry.cls, self._types)
+        except (SerdeError, struct.error, ValueError) as error:
+            raise CodecError(f"{type_name}: {len(data)} bytes cannot be decoded: {error}") from error
+        message: Message = convert(ros)
+        return message
+
+    def _class_of(self, type_name: str) -> type[Any]:
+        """Core's class where the type is as core knows it; else one made from the definition."""
+        if type_name not in self._classes:
+            known = core_class(type_name)
+            same = known is not None and type_hash(type_name, self._types) == type_hash(type_name)
+            self._classes[type_name] = known if known and same else make_class(type_name, self._types)
+        return self._classes[type_name]
+
+    def _check(self, type_name: str) -> None:
+        type_hash(type_name, self._types)  # walks the whole type
+
+
+_standard = Codec()
+
+
+def encode(message: Message) -> memoryview:
+    """CDR of a message of a standard type; see `Codec.encode`."""
+    return _standard.encode(message)
+
+
+def decode(type_name: str, data: bytes | memoryview) -> Message:
+    """A message of a standard type; see `Codec.decode`."""
+    return _standard.decode(type_name, data)

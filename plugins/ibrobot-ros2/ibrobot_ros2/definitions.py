@@ -1,0 +1,89 @@
+"""Definitions of message types: ROS 2's own, `ibrobot_msgs`, and those that a bag brings along."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+from importlib.resources import files
+from typing import Any
+
+from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from ibrobot_core.errors import IbrobotError
+
+_PACKAGE = "ibrobot_msgs"
+
+
+class CodecError(IbrobotError):
+    """A message that cannot be encoded or decoded, e.g. of a type that nobody defined."""
+
+
+def parse_definition(type_name: str, text: str) -> dict[str, Any]:
+    """The types in a `.msg` text, or in a `ros2msg` text with its dependencies.
+
+    Raises:
+        CodecError: for a text that is no definition.
+    """
+    try:
+        return dict(get_types_from_msg(text, type_name))
+    except TypesysError as error:
+        raise CodecError(f"{type_name}: its definition cannot be read: {error}") from error
+
+
+def make_typestore(definitions: Mapping[str, str] | None = None) -> Typestore:
+    """The types of ROS 2 Jazzy and `ibrobot_msgs`; `definitions` (type -> text) come before them.
+
+    Raises:
+        CodecError: for a definition that cannot be used.
+    """
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for file in (files(__package__) / "msg").iterdir():
+        name = f"{_PACKAGE}/msg/{file.name.removesuffix('.msg')}"
+        store.register(parse_definition(name, file.read_text(encoding="utf-8")))
+    for name, text in (definitions or {}).items():
+        types = parse_definition(name, text)
+        for known in types.keys() & store.fielddefs.keys():
+            if types[known][1] == store.fielddefs[known][1]:
+                del types[known]
+            else:
+                del store.fielddefs[known], store.types[known]
+        try:
+            store.register(types)
+        except (TypesysError, SyntaxError) as error:
+            raise CodecError(f"{name}: its definition cannot be used: {error}") from error
+    return store
+
+
+@cache
+def standard_types() -> Typestore:
+    """The types of ROS 2 Jazzy and `ibrobot_msgs`."""
+    return make_typestore()
+
+
+def definition(type_name: str) -> str:
+    """The `ros2msg` text of a type: its fields, then those of each type that it needs.
+
+    Raises:
+        CodecError: for a type that is not known.
+    """
+    return _known(type_name, standard_types()).generate_msgdef(type_name, ros_version=2)[0]
+
+
+def type_hash(type_name: str, types: Typestore | None = None) -> str:
+    """The type's hash as ROS 2 makes it, `RIHS01_…`; of a standard type where `types` is None.
+
+    Raises:
+        CodecError: for a type that is not known.
+    """
+    types = standard_types() if types is None else types
+    try:
+        return _known(type_name, types).hash_rihs01(type_name)
+    except KeyError as error:
+        raise CodecError(f"{type_name}: needs {error}, which nobody defined") from None
+
+
+def _known(type_name: str, types: Typestore) -> Typestore:
+    if type_name not in types.fielddefs:
+        raise CodecError(f"{type_name}: nobody defined this message type")
+    return types
