@@ -58,6 +58,12 @@ class HardwareError(IbrobotError):
     """Hardware that cannot be opened, read or written, e.g. a servo that stopped answering."""
 
 
+class CalibrationError(IbrobotError):
+    """A calibration that is missing or cannot be true, e.g. a range that crosses the encoder's end."""
+
+    exit_code = 2
+
+
 class SensorError(IbrobotError):
     """A sensor that cannot be opened or read, e.g. a camera that another program holds."""
 

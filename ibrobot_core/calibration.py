@@ -1,0 +1,273 @@
+"""Calibrations: where each joint's zero and range lie in servo ticks; files as LeRobot and IB-Robot have them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import attrs
+
+from ibrobot_core.errors import CalibrationError
+from ibrobot_core.units import TICKS_PER_TURN
+
+VERSION = 1
+"""Of the file that stands beside the numbers."""
+MAX_OFFSET = 2047
+"""Greatest homing offset that a servo can keep: sign and 11 bits."""
+MIDDLE = TICKS_PER_TURN // 2
+_LAST = TICKS_PER_TURN - 1
+
+
+@attrs.frozen
+class JointCalibration:
+    """One joint, by LeRobot's names (`MotorCalibration`)."""
+
+    id: int
+    """Of the servo."""
+    drive_mode: int
+    """1 where radians fall while ticks grow."""
+    homing_offset: int
+    """What the servo takes from its encoder's position before it reports it [ticks], -2047 to 2047."""
+    range_min: int
+    """Least reported position [ticks], 0 to 4094."""
+    range_max: int
+    """Greatest reported position [ticks], above `range_min`, at most 4095."""
+
+    def __attrs_post_init__(self) -> None:
+        for field in attrs.fields(JointCalibration):
+            value = getattr(self, field.name)
+            if type(value) is not int:
+                raise ValueError(f"{field.name}: must be a whole number, not {value!r}")
+        if not 0 <= self.id <= 253:
+            raise ValueError(f"id: must be 0 to 253, not {self.id}")
+        if self.drive_mode not in (0, 1):
+            raise ValueError(f"drive_mode: must be 0 or 1, not {self.drive_mode}")
+        if abs(self.homing_offset) > MAX_OFFSET:
+            raise ValueError(
+                f"homing_offset: must be -{MAX_OFFSET} to {MAX_OFFSET}, not {self.homing_offset}; the servo's horn "
+                "sits so that the joint's middle is at the encoder's end: mount it half a turn on, and calibrate again"
+            )
+        for name in ("range_min", "range_max"):
+            if not 0 <= getattr(self, name) <= _LAST:
+                raise ValueError(
+                    f"{name}: must be 0 to {_LAST}, not {getattr(self, name)}; a range beyond that crosses the "
+                    "encoder's end: calibrate again with the joint in the middle of its range at the first question"
+                )
+        if self.range_min >= self.range_max:
+            raise ValueError(f"range_min: must be below range_max ({self.range_max}), not {self.range_min}")
+
+    @property
+    def inverted(self) -> bool:
+        """Whether radians fall while ticks grow."""
+        return self.drive_mode == 1
+
+    def zero(self, closed: float | None = None) -> float:
+        """The tick at which the joint is at 0 rad: the encoder's middle, where calibration puts the joint's.
+
+        Args:
+            closed: for a joint that is anchored at its lower end instead, as a gripper is: its angle there [rad].
+        """
+        if closed is None:
+            return float(MIDDLE)
+        ticks = closed * TICKS_PER_TURN / (2 * math.pi)
+        return self.range_max + ticks if self.inverted else self.range_min - ticks
+
+
+@attrs.frozen
+class Calibration:
+    """A whole arm."""
+
+    joints: Mapping[str, JointCalibration]
+    """By name, in the order of the servos."""
+    robot: str = ""
+    """Which arm it is."""
+    date: str = ""
+    """When it was made: ISO 8601, UTC."""
+    path: Path | None = None
+    """Where it was loaded from."""
+
+    def __attrs_post_init__(self) -> None:
+        owners: dict[int, str] = {}
+        for name, joint in self.joints.items():
+            if joint.id in owners:
+                raise ValueError(f"{name}: id: servo {joint.id} belongs to {owners[joint.id]} already")
+            owners[joint.id] = name
+
+    def numbers(self) -> dict[str, dict[str, int]]:
+        """The numbers alone, as LeRobot's file has them."""
+        return {name: attrs.asdict(joint) for name, joint in self.joints.items()}
+
+    def fingerprint(self) -> str:
+        """SHA-256 of the numbers, 64 hexadecimal digits."""
+        return hashlib.sha256(json.dumps(self.numbers(), sort_keys=True).encode()).hexdigest()
+
+
+def calibration_path(name: str | Path) -> Path:
+    """Where a calibration lies.
+
+    Args:
+        name: a path, which has a slash or ends in `.json`; or a name, which stands for `NAME.json` in
+            `$XDG_CONFIG_HOME/ibrobot/calibration` (`~/.config/ibrobot/calibration`).
+    """
+    if isinstance(name, Path) or "/" in name or name.endswith(".json"):
+        return Path(name).expanduser()
+    home = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
+    return home / "ibrobot" / "calibration" / f"{name}.json"
+
+
+def load_calibration(name: str | Path, joints: Sequence[str] | None = None) -> Calibration:
+    """Load a calibration: LeRobot's JSON (motor -> numbers) or IB-Robot's (servo id -> numbers).
+
+    Args:
+        name: a name or a path, see `calibration_path`.
+        joints: names of the joints that it must have; for IB-Robot's file, in the order of their ids from 1.
+
+    Raises:
+        CalibrationError: when it is missing or cannot be true; names file, joint, key, value and what would be right.
+    """
+    path = calibration_path(name)
+    document = _document(path)
+    if not isinstance(document, dict) or not document:
+        raise CalibrationError(f"{path}: must be an object of joints, each with {_KEYS}")
+    if all(key.isdigit() for key in document):
+        document = _by_name(document, path, joints)
+    found = {}
+    for joint, numbers in document.items():
+        try:
+            found[joint] = _joint(numbers)
+        except ValueError as error:
+            raise CalibrationError(f"{path}: {joint}: {error}") from None
+    if joints is not None and (missing := [joint for joint in joints if joint not in found]):
+        raise CalibrationError(f"{path}: has no joint {missing[0]!r}; it has: {', '.join(found)}")
+    try:
+        calibration = Calibration(found, path=path)
+    except ValueError as error:
+        raise CalibrationError(f"{path}: {error}") from None
+    return _with_meta(calibration, path)
+
+
+def save_calibration(
+    calibration: Calibration, name: str | Path, *, overwrite: bool = False, by_id: bool = False
+) -> Path:
+    """Save a calibration as LeRobot's JSON, and beside it `NAME.meta.json` with version, arm, date and a hash.
+
+    Two files, since LeRobot's loader refuses keys that it does not know.
+
+    Args:
+        calibration: what to save.
+        name: a name or a path, see `calibration_path`.
+        overwrite: whether it may replace a file.
+        by_id: write IB-Robot's layout, servo id -> numbers.
+
+    Raises:
+        CalibrationError: when there is one already, or it cannot be written.
+    """
+    path = calibration_path(name)
+    if path.exists() and not overwrite:
+        raise CalibrationError(f"{path}: is there already; give another name, or say that it may be overwritten")
+    meta = {
+        "version": VERSION,
+        "robot": calibration.robot,
+        "date": calibration.date,
+        "sha256": calibration.fingerprint(),
+    }
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # The numbers come first: without its companion the file is LeRobot's own, and is taken as such.
+        _meta_path(path).unlink(missing_ok=True)
+        numbers = calibration.numbers()
+        _write(path, {str(joint["id"]): joint for joint in numbers.values()} if by_id else numbers)
+        _write(_meta_path(path), meta)
+    except OSError as error:
+        raise CalibrationError(f"{path}: cannot be written: {error.strerror}") from None
+    return path
+
+
+_NAMES = tuple(field.name for field in attrs.fields(JointCalibration))
+_KEYS = ", ".join(_NAMES)
+
+
+def _document(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text(), object_pairs_hook=_once)
+    except FileNotFoundError:
+        raise CalibrationError(f"{path}: there is no such calibration; `ibrobot feetech calibrate` makes one") from None
+    except json.JSONDecodeError as error:
+        raise CalibrationError(f"{path}:{error.lineno}: not JSON: {error.msg}") from None
+    except (OSError, UnicodeDecodeError, ValueError) as error:
+        raise CalibrationError(f"{path}: cannot be read: {error}") from None
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"{twice!r} is there twice")
+    return found
+
+
+def _joint(numbers: Any) -> JointCalibration:
+    if not isinstance(numbers, dict):
+        raise ValueError(f"must be an object with {_KEYS}, not {numbers!r}")
+    if unknown := [key for key in numbers if key not in _NAMES]:
+        raise ValueError(f"{unknown[0]}: unknown key; known: {_KEYS}")
+    if missing := [key for key in _NAMES if key not in numbers]:
+        raise ValueError(f"{missing[0]}: is missing")
+    return JointCalibration(**numbers)
+
+
+def _by_name(document: dict[str, Any], path: Path, joints: Sequence[str] | None) -> dict[str, Any]:
+    """IB-Robot's file as LeRobot's: servo ids become names, and are repeated as `id`."""
+    if joints is None:
+        raise CalibrationError(f"{path}: its joints are numbered; say which joint each number is")
+    named = {}
+    for key, numbers in document.items():
+        servo = int(key)
+        if not 1 <= servo <= len(joints):
+            raise CalibrationError(f"{path}: {key}: no such servo; ids are 1 to {len(joints)}")
+        if not isinstance(numbers, dict) or numbers.get("id", servo) != servo:
+            raise CalibrationError(f"{path}: {key}: must be an object with {_KEYS}; its id must be {servo}")
+        named[joints[servo - 1]] = {"id": servo, "drive_mode": 0, **numbers}
+    return named
+
+
+def _with_meta(calibration: Calibration, path: Path) -> Calibration:
+    companion = _meta_path(path)
+    if not companion.exists():
+        return calibration
+    meta = _document(companion)
+    if not isinstance(meta, dict) or meta.get("version") != VERSION:
+        found = meta.get("version") if isinstance(meta, dict) else meta
+        raise CalibrationError(f"{companion}: version: must be {VERSION}, not {found!r}")
+    if meta.get("sha256") != calibration.fingerprint():
+        raise CalibrationError(
+            f"{path}: the numbers are not those of {meta.get('date')}, which {companion.name} tells of; if they were "
+            f"changed on purpose, delete {companion.name}"
+        )
+    return attrs.evolve(calibration, robot=str(meta.get("robot", "")), date=str(meta.get("date", "")))
+
+
+def _meta_path(path: Path) -> Path:
+    return path.with_suffix(".meta.json")
+
+
+def _write(path: Path, document: Mapping[str, Any]) -> None:
+    """All of the file or none of it."""
+    with tempfile.NamedTemporaryFile("w", dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
+        try:
+            json.dump(document, file, indent=4)
+            file.write("\n")
+            file.flush()
+            os.fsync(file.fileno())
+        except BaseException:
+            Path(file.name).unlink()
+            raise
+    Path(file.name).chmod(0o644)
+    Path(file.name).replace(path)

@@ -1,0 +1,133 @@
+"""Calibration files: LeRobot's and IB-Robot's layouts, the companion, and every way in which one cannot be true."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ibrobot_core.calibration import (
+    Calibration,
+    JointCalibration,
+    calibration_path,
+    load_calibration,
+    save_calibration,
+)
+from ibrobot_core.errors import CalibrationError
+from ibrobot_core.units import ticks_to_radians
+
+GOOD: dict[str, Any] = {"id": 1, "drive_mode": 0, "homing_offset": -12, "range_min": 700, "range_max": 3400}
+
+
+@st.composite
+def calibrations(draw: st.DrawFn) -> Calibration:
+    names = draw(st.lists(st.sampled_from(["pan", "lift", "elbow", "wrist", "gripper"]), min_size=1, unique=True))
+    joints = {}
+    for number, name in enumerate(names, 1):
+        low = draw(st.integers(0, 4094))
+        high = draw(st.integers(low + 1, 4095))
+        joints[name] = JointCalibration(number, draw(st.integers(0, 1)), draw(st.integers(-2047, 2047)), low, high)
+    return Calibration(joints, robot="left", date="2026-01-02T03:04:05+00:00")
+
+
+@given(calibrations(), st.booleans())
+def test_what_is_saved_is_loaded(tmp_path_factory: pytest.TempPathFactory, made: Calibration, by_id: bool) -> None:
+    path = tmp_path_factory.mktemp("c") / "arm.json"
+    save_calibration(made, path, by_id=by_id)
+    loaded = load_calibration(path, list(made.joints))
+    assert loaded.joints == made.joints
+    assert (loaded.robot, loaded.date, loaded.path) == (made.robot, made.date, path)
+
+
+def test_the_file_holds_lerobots_keys_and_nothing_else(tmp_path: Path) -> None:
+    made = Calibration({"pan": JointCalibration(**GOOD)}, robot="left", date="2026-01-02")
+    save_calibration(made, tmp_path / "arm.json")
+    assert json.loads((tmp_path / "arm.json").read_text()) == {"pan": GOOD}
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["arm.json", "arm.meta.json"]
+
+
+def test_a_name_lies_in_the_configuration_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    assert calibration_path("left") == tmp_path / "ibrobot" / "calibration" / "left.json"
+    assert calibration_path("here/left") == Path("here/left")
+    assert calibration_path("left.json") == Path("left.json")
+
+
+def test_it_overwrites_only_when_told(tmp_path: Path) -> None:
+    made = Calibration({"pan": JointCalibration(**GOOD)})
+    path = save_calibration(made, tmp_path / "arm.json")
+    with pytest.raises(CalibrationError, match="is there already"):
+        save_calibration(made, path)
+    save_calibration(made, path, overwrite=True)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"homing_offset": 2048}, "homing_offset: must be -2047 to 2047, not 2048; the servo's horn"),
+        ({"range_max": 4200}, "range_max: must be 0 to 4095, not 4200; a range beyond that crosses the encoder's end"),
+        ({"range_min": 3400}, r"range_min: must be below range_max \(3400\), not 3400"),
+        ({"range_min": 3.9}, "range_min: must be a whole number, not 3.9"),
+        ({"range_min": "5"}, "range_min: must be a whole number, not '5'"),
+        ({"drive_mode": True}, "drive_mode: must be a whole number, not True"),
+        ({"drive_mode": 2}, "drive_mode: must be 0 or 1, not 2"),
+        ({"id": 254}, "id: must be 0 to 253, not 254"),
+        ({"speed": 1}, "speed: unknown key; known: id, drive_mode, homing_offset, range_min, range_max"),
+    ],
+)
+def test_what_cannot_be_true_is_refused_by_name(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+    path = tmp_path / "arm.json"
+    path.write_text(json.dumps({"pan": {**GOOD, **change}}))
+    with pytest.raises(CalibrationError, match=rf"arm\.json: pan: {message}"):
+        load_calibration(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{\n  broken", r"arm\.json:2: not JSON"),
+        ("[]", "must be an object of joints"),
+        ('{"pan": 5}', "pan: must be an object with id, drive_mode"),
+        ('{"pan": {"id": 1}}', "pan: drive_mode: is missing"),
+        (json.dumps({"a": GOOD, "b": GOOD}), "b: id: servo 1 belongs to a already"),
+        ('{"pan": {}, "pan": {}}', "'pan' is there twice"),
+        (json.dumps({"1": GOOD}), "its joints are numbered; say which joint each number is"),
+    ],
+)
+def test_files_that_are_none_are_refused(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "arm.json").write_text(text)
+    with pytest.raises(CalibrationError, match=message):
+        load_calibration(tmp_path / "arm.json")
+
+
+def test_a_missing_file_says_how_to_make_one(tmp_path: Path) -> None:
+    with pytest.raises(CalibrationError, match=r"no such calibration; `ibrobot feetech calibrate` makes one"):
+        load_calibration(tmp_path / "arm.json")
+
+
+def test_a_missing_joint_is_named(tmp_path: Path) -> None:
+    path = save_calibration(Calibration({"pan": JointCalibration(**GOOD)}), tmp_path / "arm.json")
+    with pytest.raises(CalibrationError, match="has no joint 'lift'; it has: pan"):
+        load_calibration(path, ["pan", "lift"])
+
+
+def test_numbers_changed_behind_the_companions_back_are_refused(tmp_path: Path) -> None:
+    made = Calibration({"pan": JointCalibration(**GOOD)}, date="2026-01-02")
+    path = save_calibration(made, tmp_path / "arm.json")
+    path.write_text(json.dumps({"pan": {**GOOD, "range_min": 701}}))
+    with pytest.raises(CalibrationError, match=r"not those of 2026-01-02, .* delete arm\.meta\.json"):
+        load_calibration(path)
+
+
+@pytest.mark.parametrize("drive_mode", [0, 1])
+def test_a_gripper_is_anchored_at_its_closed_end(drive_mode: int) -> None:
+    joint = JointCalibration(**{**GOOD, "drive_mode": drive_mode})
+    closed = joint.range_max if drive_mode else joint.range_min
+    zero = joint.zero(math.radians(-10))
+    assert ticks_to_radians(float(closed), zero=zero, inverted=joint.inverted) == pytest.approx(math.radians(-10))
+    assert joint.zero() == 2048
