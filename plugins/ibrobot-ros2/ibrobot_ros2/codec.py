@@ -11,7 +11,7 @@ from rosbags.typesys.store import Typestore
 
 from ibrobot_core.messages import Message
 from ibrobot_ros2.convert import Convert, core_class, decoder, encoder, make_class
-from ibrobot_ros2.definitions import CodecError, make_typestore, standard_types, type_hash
+from ibrobot_ros2.definitions import CodecError, define, make_typestore, standard_types, type_hash
 
 _ENCAPSULATIONS = {b"\x00\x00": False, b"\x00\x01": True}
 """First bytes of plain CDR -> whether it is little-endian."""
@@ -21,11 +21,13 @@ class Codec:
     """Encodes and decodes messages of the standard types, of `ibrobot_msgs`, and of those that are defined here.
 
     Args:
-        definitions: type -> its `ros2msg` text, e.g. as a bag brings them; they come before the standard ones.
+        definitions: type -> its `ros2msg` or `ros2idl` text, e.g. as a bag brings them; they come before the standard
+            ones. A text is read when its type is first needed.
     """
 
     def __init__(self, definitions: Mapping[str, str] | None = None) -> None:
-        self._types: Typestore = make_typestore(definitions) if definitions else standard_types()
+        self._types: Typestore = make_typestore() if definitions else standard_types()
+        self._definitions = dict(definitions or {})
         self._classes: dict[str, type[Any]] = {}
         self._encoders: dict[str, Convert] = {}
         self._decoders: dict[str, Convert] = {}
@@ -39,7 +41,7 @@ class Codec:
         type_name = message.ros_type
         convert = self._encoders.get(type_name)
         if convert is None:
-            self._check(type_name)
+            self._define(type_name)
             convert = self._encoders[type_name] = encoder(type_name, self._types)
         try:
             return self._types.serialize_cdr(convert(message), type_name, little_endian=True)
@@ -56,7 +58,7 @@ class Codec:
         """
         convert = self._decoders.get(type_name)
         if convert is None:
-            self._check(type_name)
+            self._define(type_name)
             convert = decoder(type_name, self._class_of(type_name), self._types, self._class_of)
             self._decoders[type_name] = convert
         little_endian = _ENCAPSULATIONS.get(bytes(data[:2]))
@@ -79,8 +81,10 @@ class Codec:
             self._classes[type_name] = known if known and same else make_class(type_name, self._types)
         return self._classes[type_name]
 
-    def _check(self, type_name: str) -> None:
-        type_hash(type_name, self._types)  # walks the whole type
+    def _define(self, type_name: str) -> None:
+        if type_name in self._definitions:
+            define(self._types, type_name, self._definitions.pop(type_name))
+        type_hash(type_name, self._types)  # finds types that nobody defined, also deep inside
 
 
 _standard = Codec()

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import cache
 from importlib.resources import files
 from typing import Any
 
-from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
+from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from ibrobot_core.errors import IbrobotError
 
 _PACKAGE = "ibrobot_msgs"
+_SEPARATOR = "=" * 80 + "\n"
 
 
 class CodecError(IbrobotError):
@@ -20,39 +20,48 @@ class CodecError(IbrobotError):
 
 
 def parse_definition(type_name: str, text: str) -> dict[str, Any]:
-    """The types in a `.msg` text, or in a `ros2msg` text with its dependencies.
+    """The types in a `.msg` text, or in a `ros2msg` or `ros2idl` text with its dependencies.
 
     Raises:
         CodecError: for a text that is no definition.
     """
     try:
-        return dict(get_types_from_msg(text, type_name))
+        if not text.startswith(f"{_SEPARATOR}IDL: "):
+            return dict(get_types_from_msg(text, type_name))
+        found: dict[str, Any] = {}
+        for part in text.split(_SEPARATOR)[1:]:
+            found.update(get_types_from_idl(part.partition("\n")[2]))
+        return found
     except TypesysError as error:
         raise CodecError(f"{type_name}: its definition cannot be read: {error}") from error
 
 
-def make_typestore(definitions: Mapping[str, str] | None = None) -> Typestore:
-    """The types of ROS 2 Jazzy and `ibrobot_msgs`; `definitions` (type -> text) come before them.
+def make_typestore() -> Typestore:
+    """A new store of the types of ROS 2 Jazzy and `ibrobot_msgs`."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for file in (files(__package__) / "msg").iterdir():
+        name = f"{_PACKAGE}/msg/{file.name.removesuffix('.msg')}"
+        define(store, name, file.read_text(encoding="utf-8"))
+    return store
+
+
+def define(store: Typestore, type_name: str, text: str) -> None:
+    """Add a type, with those that its text brings along, to a store; they replace others of their names.
 
     Raises:
         CodecError: for a definition that cannot be used.
     """
-    store = get_typestore(Stores.ROS2_JAZZY)
-    for file in (files(__package__) / "msg").iterdir():
-        name = f"{_PACKAGE}/msg/{file.name.removesuffix('.msg')}"
-        store.register(parse_definition(name, file.read_text(encoding="utf-8")))
-    for name, text in (definitions or {}).items():
-        types = parse_definition(name, text)
-        for known in types.keys() & store.fielddefs.keys():
-            if types[known][1] == store.fielddefs[known][1]:
-                del types[known]
-            else:
-                del store.fielddefs[known], store.types[known]
-        try:
-            store.register(types)
-        except (TypesysError, SyntaxError) as error:
-            raise CodecError(f"{name}: its definition cannot be used: {error}") from error
-    return store
+    types = parse_definition(type_name, text)
+    for name in types.keys() & store.fielddefs.keys():
+        if types[name][1] == store.fielddefs[name][1]:
+            del types[name]
+        else:
+            del store.fielddefs[name], store.types[name]
+            store.cache.pop(name, None)
+    try:
+        store.register(types)
+    except (TypesysError, SyntaxError) as error:
+        raise CodecError(f"{type_name}: its definition cannot be used: {error}") from error
 
 
 @cache

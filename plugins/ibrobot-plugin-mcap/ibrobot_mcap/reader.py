@@ -1,0 +1,137 @@
+"""Reader `rosbag2`: episodes of recorder `mcap`, finished or not, and bags from elsewhere."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Iterator, Mapping
+from pathlib import Path
+from typing import Any, override
+
+import yaml
+from ibrobot_ros2 import Codec, CodecError
+
+from ibrobot_core.errors import RecorderError
+from ibrobot_core.interfaces import EpisodeReader, EpisodeSummary, Recorded, TopicSummary
+from ibrobot_mcap.sources import McapSource, RosbagsSource, Source
+
+METADATA = "metadata.yaml"
+INFORMATION = "rosbag2_bagfile_information"
+RECORD = ("rosbag2", "serialized_metadata")
+"""Name and key of the metadata record that has `metadata.yaml` within an MCAP file."""
+OUTCOME = "outcome"
+DROPPED = "dropped"
+"""Keys that the recorder adds to `custom_data`: a word, and JSON topic -> number of messages."""
+
+
+def is_rosbag2(path: Path) -> bool:
+    """Whether a bag lies at `path`: its folder, or one of its files."""
+    if path.is_dir():
+        return (path / METADATA).is_file() or any(_storage_files(path))
+    return path.suffix in (".mcap", ".db3")
+
+
+class Rosbag2Reader(EpisodeReader):
+    """Reads a rosbag2 directory or a single file of one.
+
+    Raises:
+        RecorderError: when it cannot be read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        facts = _read_metadata(path / METADATA) if path.is_dir() else {}
+        self._finished = bool(facts) or not path.is_dir()
+        self._source = _open(path, facts)
+        self._custom = dict(facts.get("custom_data") or self._source.custom or self._recorded_custom())
+        self._codec: Codec | None = None
+
+    @override
+    def summary(self) -> EpisodeSummary:
+        source = self._source
+        custom = dict(self._custom)
+        dropped = _read_dropped(custom.pop(DROPPED, "{}"))
+        outcome = custom.pop(OUTCOME, "unknown")
+        topics = {
+            topic: TopicSummary(type_, source.counts[topic], dropped.get(topic, 0))
+            for topic, type_ in sorted(source.types.items())
+        }
+        return EpisodeSummary(
+            self._path, self._finished and source.finished, source.start_ns, source.end_ns, topics, custom, outcome
+        )
+
+    @override
+    def messages(self, topics: Collection[str] | None = None) -> Iterator[Recorded]:
+        source = self._source
+        if self._codec is None:
+            self._codec = Codec(source.definitions)
+        wanted = frozenset(source.types if topics is None else topics)
+        for raw in source.messages(wanted):
+            try:
+                message = self._codec.decode(raw.type, raw.data)
+            except CodecError as error:
+                raise RecorderError(f"{self._path}: {raw.topic} at {raw.received_ns} ns: {error}") from error
+            yield Recorded(raw.topic, message, raw.received_ns, raw.published_ns)
+
+    @override
+    def close(self) -> None:
+        self._source.close()
+
+    def _recorded_custom(self) -> Mapping[str, str]:
+        """What the newest metadata record says, for an episode without `metadata.yaml`."""
+        found: Mapping[str, str] = {}
+        for record in self._source.metadata if isinstance(self._source, McapSource) else ():
+            if record.name == RECORD[0] and RECORD[1] in record.metadata:
+                found = _parse(record.metadata[RECORD[1]], self._path).get("custom_data") or {}
+        return found
+
+
+def _open(path: Path, facts: Mapping[str, Any]) -> Source:
+    if not path.is_dir():
+        return McapSource([path]) if path.suffix == ".mcap" else RosbagsSource(path)
+    listed = [path / Path(name).name for name in facts.get("relative_file_paths", ())]
+    for file in listed:
+        if not file.is_file():
+            raise RecorderError(f"{path}: {file.name} is missing, which {METADATA} lists")
+    files = [*listed, *sorted(file for file in _storage_files(path) if file not in listed)]
+    if not files:
+        raise RecorderError(f"{path}: has no .mcap or .db3 file")
+    if all(file.suffix == ".mcap" for file in files) and not facts.get("compression_format"):
+        return McapSource(files)
+    if not facts:
+        raise RecorderError(f"{path}: has no {METADATA}, without which only MCAP files can be read; open one file")
+    return RosbagsSource(path)
+
+
+def _storage_files(path: Path) -> Iterator[Path]:
+    return (file for file in path.iterdir() if file.suffix in (".mcap", ".db3") and file.is_file())
+
+
+def _read_metadata(path: Path) -> dict[str, Any]:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        return {}
+    except (OSError, UnicodeDecodeError) as error:
+        raise RecorderError(f"{path}: cannot be read: {error}") from error
+    return _parse(text, path)
+
+
+def _parse(text: str, path: Path) -> dict[str, Any]:
+    try:
+        document = yaml.load(text, getattr(yaml, "CBaseLoader", yaml.BaseLoader))
+        facts: dict[str, Any] = dict(document.get(INFORMATION, document))
+    except (yaml.YAMLError, AttributeError, TypeError, ValueError) as error:
+        raise RecorderError(f"{path}: its metadata is not that of a rosbag2: {error}") from error
+    return facts
+
+
+def _read_dropped(text: str) -> Mapping[str, int]:
+    try:
+        dropped = json.loads(text)
+    except ValueError:
+        return {}  # somebody else's key of the same name
+    return (
+        {topic: count for topic, count in dropped.items() if isinstance(count, int)}
+        if isinstance(dropped, dict)
+        else {}
+    )

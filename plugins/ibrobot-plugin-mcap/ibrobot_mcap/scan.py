@@ -1,0 +1,226 @@
+"""What is in an MCAP file, found by walking over its records: works on unfinished files as on whole ones."""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from collections.abc import Iterator
+from io import BytesIO
+from pathlib import Path
+from typing import BinaryIO
+
+import attrs
+import lz4.frame  # type: ignore[import-untyped]
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Channel, Header, Metadata, Schema
+from mcap.writer import MCAP0_MAGIC as MAGIC
+
+from ibrobot_core.errors import RecorderError
+
+REPEATED = "ibrobot.repeated"
+"""Name of the metadata record ahead of a chunk with copies of latched messages from the file before."""
+
+_RECORD = struct.Struct("<BQ")
+_CHUNK = struct.Struct("<QQQII")
+_MESSAGE = struct.Struct("<HIQQ")
+_LOOSE_SIZE = 4 << 20
+"""Messages outside of chunks are taken in blocks of this size [bytes]."""
+_LARGEST = 4 << 30
+"""No chunk is larger than this [bytes], by the format's own libraries."""
+
+
+@attrs.frozen
+class Entry:
+    """A message as it lies in the file."""
+
+    channel: int
+    received_ns: int
+    published_ns: int
+    data: memoryview
+
+
+@attrs.define
+class Block:
+    """A chunk, or a run of messages outside of chunks."""
+
+    offset: int
+    """Where its records begin in the file; compressed where it is a chunk that says so."""
+    length: int
+    start_ns: int = 2**63
+    end_ns: int = 0
+    chunk: bool = True
+    repeated: bool = False
+    counts: dict[int, int] = attrs.field(factory=dict)
+    """Channel -> number of messages."""
+
+
+def records(content: memoryview) -> Iterator[tuple[int, memoryview]]:
+    """Opcode and content of each whole record."""
+    position = 0
+    while position + _RECORD.size <= len(content):
+        opcode, length = _RECORD.unpack_from(content, position)
+        position += _RECORD.size
+        if position + length > len(content):
+            return
+        yield opcode, content[position : position + length]
+        position += length
+
+
+class McapFile:
+    """One file: its channels and schemas, where its messages are, and whether its writer finished it.
+
+    Raises:
+        RecorderError: when it cannot be read or is no MCAP file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.channels: dict[int, Channel] = {}
+        self.schemas: dict[int, Schema] = {}
+        self.blocks: list[Block] = []
+        self.metadata: list[Metadata] = []
+        self.library = ""
+        self.finished = False
+        self.size = 0
+        """Bytes up to the end of the last whole record."""
+        try:
+            self._file: BinaryIO = path.open("rb")
+        except OSError as error:
+            raise RecorderError(f"{path}: cannot be read: {error.strerror}") from error
+        try:
+            self._scan(os.fstat(self._file.fileno()).st_size)
+            self._look_inside()
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Release the file. Safe to call twice."""
+        self._file.close()
+
+    def read(self, block: Block) -> memoryview:
+        """The block's records, uncompressed and checked.
+
+        Raises:
+            RecorderError: when they are damaged.
+        """
+        content = memoryview(os.pread(self._file.fileno(), block.length, block.offset))
+        if not block.chunk:
+            return content
+        try:
+            _, _, size, crc, name = _CHUNK.unpack_from(content)
+            start = _CHUNK.size + name
+            compression = bytes(content[_CHUNK.size : start]).decode()
+            content = _expand(compression, content[start + 8 :], size)
+        except (struct.error, ValueError, RuntimeError, zstandard.ZstdError) as error:
+            raise RecorderError(f"{self.path}: chunk at byte {block.offset} is damaged: {error}") from error
+        if crc and zlib.crc32(content) != crc:
+            raise RecorderError(f"{self.path}: chunk at byte {block.offset} is damaged: its checksum is wrong")
+        return content
+
+    def entries(self, block: Block) -> Iterator[Entry]:
+        """The messages of a block, in the order written.
+
+        Raises:
+            RecorderError: when it is damaged.
+        """
+        for opcode, content in records(self.read(block)):
+            if opcode == Opcode.MESSAGE:
+                channel, _, received_ns, published_ns = _MESSAGE.unpack_from(content)
+                yield Entry(channel, received_ns, published_ns, content[_MESSAGE.size :])
+
+    def _scan(self, end: int) -> None:
+        """Walk over the records, looking into small ones only."""
+        file = self._file
+        start = file.read(len(MAGIC))
+        if start != MAGIC[: len(start)]:
+            raise RecorderError(f"{self.path}: not an MCAP file: begins with {start.hex(' ')}")
+        self.size = position = len(MAGIC)
+        repeated = False
+        while position + _RECORD.size <= end:
+            file.seek(position)
+            opcode, length = _RECORD.unpack(file.read(_RECORD.size))
+            content, position = position + _RECORD.size, position + _RECORD.size + length
+            if opcode == 0 or position > end:
+                return  # what comes was never written whole
+            if opcode == Opcode.CHUNK:
+                start_ns, end_ns = struct.unpack("<QQ", file.read(16))
+                self.blocks.append(Block(content, length, start_ns, end_ns, repeated=repeated))
+                repeated = False
+            elif opcode == Opcode.MESSAGE:
+                self._add_loose(content, length)
+            elif opcode == Opcode.MESSAGE_INDEX and self.blocks:
+                channel, size = struct.unpack("<HI", file.read(6))
+                self.blocks[-1].counts[channel] = size // 16
+            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.HEADER):
+                repeated = self._note(opcode, memoryview(file.read(length))) or repeated
+            self.size = position
+            if opcode == Opcode.FOOTER:
+                file.seek(position)
+                self.finished = file.read(len(MAGIC)) == MAGIC
+                return
+
+    def _add_loose(self, content: int, length: int) -> None:
+        """A message outside of chunks: joins the run just before it, where there is one."""
+        channel, _, received_ns, _ = _MESSAGE.unpack(self._file.read(_MESSAGE.size))
+        begin = content - _RECORD.size
+        last = self.blocks[-1] if self.blocks else None
+        if last is None or last.chunk or last.offset + last.length != begin or last.length > _LOOSE_SIZE:
+            last = Block(begin, 0, chunk=False)
+            self.blocks.append(last)
+        last.length = content + length - last.offset
+        last.start_ns, last.end_ns = min(last.start_ns, received_ns), max(last.end_ns, received_ns)
+        last.counts[channel] = last.counts.get(channel, 0) + 1
+
+    def _note(self, opcode: int, content: memoryview) -> bool:
+        """Keep what a record says; returns whether it announces repeated messages."""
+        stream = ReadDataStream(BytesIO(content))
+        if opcode == Opcode.SCHEMA:
+            schema = Schema.read(stream)
+            self.schemas[schema.id] = schema
+        elif opcode == Opcode.CHANNEL:
+            channel = Channel.read(stream)
+            self.channels[channel.id] = channel
+        elif opcode == Opcode.HEADER:
+            self.library = Header.read(stream).library
+        else:
+            metadata = Metadata.read(stream)
+            self.metadata.append(metadata)
+            return bool(metadata.name == REPEATED)
+        return False
+
+    def _look_inside(self) -> None:
+        """Read the chunks whose channels or counts are not known from outside; unfinished files have some."""
+        for block in list(self.blocks):
+            last_of_unfinished = not self.finished and block is self.blocks[-1]
+            if block.counts and block.counts.keys() <= self.channels.keys() and not last_of_unfinished:
+                continue
+            counts: dict[int, int] = {}
+            try:
+                for opcode, content in records(self.read(block)):
+                    if opcode == Opcode.MESSAGE:
+                        channel = _MESSAGE.unpack_from(content)[0]
+                        counts[channel] = counts.get(channel, 0) + 1
+                    elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                        self._note(opcode, content)
+            except RecorderError:
+                if not last_of_unfinished:
+                    raise
+                self.blocks.remove(block)  # it was being written when its writer ended
+                return
+            block.counts = counts
+
+
+def _expand(compression: str, data: memoryview, size: int) -> memoryview:
+    if compression == "":
+        return data
+    if size > _LARGEST:
+        raise ValueError(f"{size} bytes are said to be in it, at most {_LARGEST} can be")
+    if compression == "zstd":
+        return memoryview(zstandard.ZstdDecompressor().decompress(data, max_output_size=size))
+    if compression == "lz4":
+        return memoryview(lz4.frame.decompress(data))
+    raise ValueError(f"compression {compression!r} is not known; zstd and lz4 are")

@@ -1,0 +1,152 @@
+"""Where an episode's messages come from: MCAP files walked over, or any other bag by the rosbags library."""
+
+from __future__ import annotations
+
+import heapq
+from abc import ABC, abstractmethod
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import override
+
+import attrs
+from rosbags.interfaces import Connection
+from rosbags.rosbag2 import Reader, ReaderError
+
+from ibrobot_core.errors import RecorderError
+from ibrobot_mcap.scan import Entry, McapFile
+
+
+@attrs.frozen
+class Raw:
+    """A message, not yet decoded."""
+
+    topic: str
+    type: str
+    data: bytes
+    received_ns: int
+    published_ns: int
+
+
+class Source(ABC):
+    """Raw messages, and what is known of them."""
+
+    finished: bool
+    custom: Mapping[str, str]
+    """`custom_data` of the bag."""
+    types: Mapping[str, str]
+    """Topic -> type."""
+    counts: Mapping[str, int]
+    """Topic -> number of messages."""
+    definitions: Mapping[str, str]
+    """Type -> its definition, where the bag has it."""
+    start_ns: int
+    end_ns: int
+
+    @abstractmethod
+    def messages(self, topics: Collection[str]) -> Iterator[Raw]:
+        """The messages of these topics, in the order of receipt."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Release the files. Safe to call twice."""
+
+
+class McapSource(Source):
+    """MCAP files, whole or not. Messages that a file repeats from the one before are passed over."""
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        self._files: list[McapFile] = []
+        try:
+            for path in paths:
+                self._files.append(McapFile(path))
+        except BaseException:
+            self.close()
+            raise
+        blocks = [(block.start_ns, file, block) for file in self._files for block in file.blocks if not block.repeated]
+        self._blocks = sorted(blocks, key=lambda item: item[0])
+        self.finished = all(file.finished for file in self._files)
+        self.start_ns = min((block.start_ns for _, _, block in blocks), default=0)
+        self.end_ns = max((block.end_ns for _, _, block in blocks), default=0)
+        self.metadata = [record for file in self._files for record in file.metadata]
+        types: dict[str, str] = {}
+        counts: dict[str, int] = {}
+        self.definitions = {}
+        for file in self._files:
+            for schema in file.schemas.values():
+                if schema.encoding in ("ros2msg", "ros2idl"):
+                    self.definitions[schema.name] = schema.data.decode("utf-8", "replace")
+            for channel in file.channels.values():
+                schema_of = file.schemas.get(channel.schema_id)
+                types[channel.topic] = schema_of.name if schema_of else "?"
+                counts.setdefault(channel.topic, 0)
+        for _, file, block in blocks:
+            for number, count in block.counts.items():
+                counts[file.channels[number].topic] += count
+        self.types, self.counts, self.custom = types, counts, {}
+
+    @override
+    def messages(self, topics: Collection[str]) -> Iterator[Raw]:
+        waiting: list[tuple[int, int, McapFile, Entry]] = []
+        serial = 0
+        for index, (_, file, block) in enumerate(self._blocks):
+            wanted = {number for number, channel in file.channels.items() if channel.topic in topics}
+            if not wanted.isdisjoint(block.counts):
+                for entry in file.entries(block):
+                    if entry.channel in wanted:
+                        heapq.heappush(waiting, (entry.received_ns, serial, file, entry))
+                        serial += 1
+            # Nothing that comes later begins before this.
+            bound = self._blocks[index + 1][0] if index + 1 < len(self._blocks) else 2**64
+            while waiting and waiting[0][0] < bound:
+                yield self._raw(*heapq.heappop(waiting)[2:])
+
+    def _raw(self, file: McapFile, entry: Entry) -> Raw:
+        channel = file.channels[entry.channel]
+        # A copy: a view would keep its whole chunk in memory.
+        return Raw(
+            channel.topic, self.types[channel.topic], bytes(entry.data), entry.received_ns, entry.published_ns
+        )  # fmt: skip
+
+    @override
+    def close(self) -> None:
+        for file in self._files:
+            file.close()
+
+
+class RosbagsSource(Source):
+    """What the rosbags library reads: sqlite3, compressed files and messages."""
+
+    def __init__(self, path: Path) -> None:
+        try:
+            self._reader = Reader(path)
+            self._reader.open()
+        except (ReaderError, OSError) as error:
+            raise RecorderError(f"{path}: {error}") from error
+        self._path = path
+        reader = self._reader
+        self.finished = True
+        self.custom = dict(self._reader.storage.metadata.custom or {})
+        self.types = {connection.topic: connection.msgtype for connection in reader.connections}
+        counts: dict[str, int] = {}
+        for connection in reader.connections:
+            counts[connection.topic] = counts.get(connection.topic, 0) + connection.msgcount
+        self.counts = counts
+        self.definitions = {c.msgtype: c.msgdef.data for c in reader.connections if c.msgdef.data}
+        some = reader.message_count > 0
+        self.start_ns, self.end_ns = (reader.start_time, reader.end_time - 1) if some else (0, 0)
+
+    @override
+    def messages(self, topics: Collection[str]) -> Iterator[Raw]:
+        wanted: list[Connection] = [c for c in self._reader.connections if c.topic in topics]
+        if not wanted:
+            return
+        try:
+            for connection, stamp_ns, data in self._reader.messages(wanted):
+                yield Raw(connection.topic, connection.msgtype, bytes(data), stamp_ns, stamp_ns)
+        except (ReaderError, OSError) as error:
+            raise RecorderError(f"{self._path}: {error}") from error
+
+    @override
+    def close(self) -> None:
+        if self._reader.is_open:
+            self._reader.close()
