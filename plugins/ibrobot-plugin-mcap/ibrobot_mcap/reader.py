@@ -42,7 +42,8 @@ class Rosbag2Reader(EpisodeReader):
         facts = _read_metadata(path / METADATA) if path.is_dir() else {}
         self._finished = bool(facts) or not path.is_dir()
         self._source = _open(path, facts)
-        self._custom = dict(facts.get("custom_data") or self._source.custom or self._recorded_custom())
+        custom = facts.get("custom_data") or self._source.custom or self._recorded_custom()
+        self._custom = {str(key): str(value) for key, value in custom.items()}
         self._codec: Codec | None = None
 
     @override
@@ -118,7 +119,7 @@ def _read_metadata(path: Path) -> dict[str, Any]:
 
 def _parse(text: str, path: Path) -> dict[str, Any]:
     try:
-        document = yaml.load(text, getattr(yaml, "CBaseLoader", yaml.BaseLoader))
+        document = yaml.load(text, getattr(yaml, "CSafeLoader", yaml.SafeLoader))
         facts: dict[str, Any] = dict(document.get(INFORMATION, document))
     except (yaml.YAMLError, AttributeError, TypeError, ValueError) as error:
         raise RecorderError(f"{path}: its metadata is not that of a rosbag2: {error}") from error
