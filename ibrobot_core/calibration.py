@@ -6,8 +6,10 @@ import hashlib
 import json
 import math
 import os
+import re
 import tempfile
 from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -51,13 +53,14 @@ class JointCalibration:
         if abs(self.homing_offset) > MAX_OFFSET:
             raise ValueError(
                 f"homing_offset: must be -{MAX_OFFSET} to {MAX_OFFSET}, not {self.homing_offset}; the servo's horn "
-                "sits so that the joint's middle is at the encoder's end: mount it half a turn on, and calibrate again"
+                "sits so that the joint's middle is at the encoder's end (0/4095): mount it half a turn on, "
+                "and re-run the calibration"
             )
         for name in ("range_min", "range_max"):
             if not 0 <= getattr(self, name) <= _LAST:
                 raise ValueError(
                     f"{name}: must be 0 to {_LAST}, not {getattr(self, name)}; a range beyond that crosses the "
-                    "encoder's end: calibrate again with the joint in the middle of its range at the first question"
+                    "encoder's end (0/4095): re-run the calibration with the joint's middle in the middle"
                 )
         if self.range_min >= self.range_max:
             raise ValueError(f"range_min: must be below range_max ({self.range_max}), not {self.range_min}")
@@ -67,15 +70,16 @@ class JointCalibration:
         """Whether radians fall while ticks grow."""
         return self.drive_mode == 1
 
-    def zero(self, closed: float | None = None) -> float:
+    def zero(self, lower: float | None = None) -> float:
         """The tick at which the joint is at 0 rad: the encoder's middle, where calibration puts the joint's.
 
         Args:
-            closed: for a joint that is anchored at its lower end instead, as a gripper is: its angle there [rad].
+            lower: for a joint that is anchored at its closed end instead, as a gripper is: its lower limit [rad]. The
+                closed end is at `range_min`, or at `range_max` where inverted.
         """
-        if closed is None:
+        if lower is None:
             return float(MIDDLE)
-        ticks = closed * TICKS_PER_TURN / (2 * math.pi)
+        ticks = lower * TICKS_PER_TURN / (2 * math.pi)
         return self.range_max + ticks if self.inverted else self.range_min - ticks
 
 
@@ -89,6 +93,8 @@ class Calibration:
     """Which arm it is."""
     date: str = ""
     """When it was made: ISO 8601, UTC."""
+    version: int = VERSION
+    """Of the layout of the file beside the numbers."""
     path: Path | None = None
     """Where it was loaded from."""
 
@@ -132,7 +138,7 @@ def load_calibration(name: str | Path, joints: Sequence[str] | None = None) -> C
         CalibrationError: when it is missing or cannot be true; names file, joint, key, value and what would be right.
     """
     path = calibration_path(name)
-    document = _document(path)
+    text, document = _document(path)
     if not isinstance(document, dict) or not document:
         raise CalibrationError(f"{path}: must be an object of joints, each with {_KEYS}")
     if all(key.isdigit() for key in document):
@@ -142,7 +148,8 @@ def load_calibration(name: str | Path, joints: Sequence[str] | None = None) -> C
         try:
             found[joint] = _joint(numbers)
         except ValueError as error:
-            raise CalibrationError(f"{path}: {joint}: {error}") from None
+            line = _line(text, joint if f'"{joint}"' in text else str(numbers.get("id")), str(error).partition(":")[0])
+            raise CalibrationError(f"{path}:{line}: {joint}: {error}") from None
     if joints is not None and (missing := [joint for joint in joints if joint not in found]):
         raise CalibrationError(f"{path}: has no joint {missing[0]!r}; it has: {', '.join(found)}")
     try:
@@ -172,7 +179,7 @@ def save_calibration(
     if path.exists() and not overwrite:
         raise CalibrationError(f"{path}: is there already; give another name, or say that it may be overwritten")
     meta = {
-        "version": VERSION,
+        "version": calibration.version,
         "robot": calibration.robot,
         "date": calibration.date,
         "sha256": calibration.fingerprint(),
@@ -193,9 +200,10 @@ _NAMES = tuple(field.name for field in attrs.fields(JointCalibration))
 _KEYS = ", ".join(_NAMES)
 
 
-def _document(path: Path) -> Any:
+def _document(path: Path) -> tuple[str, Any]:
     try:
-        return json.loads(path.read_text(), object_pairs_hook=_once)
+        text = path.read_text()
+        return text, json.loads(text, object_pairs_hook=_once)
     except FileNotFoundError:
         raise CalibrationError(f"{path}: there is no such calibration; `ibrobot feetech calibrate` makes one") from None
     except json.JSONDecodeError as error:
@@ -211,6 +219,15 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         twice = next(name for name in names if names.count(name) > 1)
         raise ValueError(f"{twice!r} is there twice")
     return found
+
+
+def _line(text: str, *keys: str) -> int:
+    """The line of the last of nested keys that is there."""
+    position = 0
+    for key in keys:
+        found = re.compile(re.escape(json.dumps(key)) + r"\s*:").search(text, position)
+        position = found.start() if found else position
+    return text.count("\n", 0, position) + 1
 
 
 def _joint(numbers: Any) -> JointCalibration:
@@ -242,14 +259,15 @@ def _with_meta(calibration: Calibration, path: Path) -> Calibration:
     companion = _meta_path(path)
     if not companion.exists():
         return calibration
-    meta = _document(companion)
+    _, meta = _document(companion)
     if not isinstance(meta, dict) or meta.get("version") != VERSION:
         found = meta.get("version") if isinstance(meta, dict) else meta
         raise CalibrationError(f"{companion}: version: must be {VERSION}, not {found!r}")
     if meta.get("sha256") != calibration.fingerprint():
+        changed = datetime.fromtimestamp(path.stat().st_mtime, UTC).isoformat(timespec="seconds")
         raise CalibrationError(
-            f"{path}: the numbers are not those of {meta.get('date')}, which {companion.name} tells of; if they were "
-            f"changed on purpose, delete {companion.name}"
+            f"{path}: the numbers, changed {changed}, are not those calibrated {meta.get('date')} that "
+            f"{companion.name} tells of: calibrate again, or if they are right, delete {companion.name}"
         )
     return attrs.evolve(calibration, robot=str(meta.get("robot", "")), date=str(meta.get("date", "")))
 
@@ -260,14 +278,15 @@ def _meta_path(path: Path) -> Path:
 
 def _write(path: Path, document: Mapping[str, Any]) -> None:
     """All of the file or none of it."""
-    with tempfile.NamedTemporaryFile("w", dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
-        try:
+    descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(descriptor, "w") as file:
             json.dump(document, file, indent=4)
             file.write("\n")
             file.flush()
             os.fsync(file.fileno())
-        except BaseException:
-            Path(file.name).unlink()
-            raise
-    Path(file.name).chmod(0o644)
-    Path(file.name).replace(path)
+        Path(name).chmod(0o644)
+        Path(name).replace(path)
+    except BaseException:
+        Path(name).unlink()
+        raise

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+from typing import Any, overload
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 NS_PER_S = 1_000_000_000
 
@@ -37,28 +38,35 @@ LEROBOT_MODES = ("range_m100_100", "range_0_100", "degrees")
 """Units of joint positions in LeRobot, by the names of its `MotorNormMode`."""
 
 
-def ticks_to_radians[T: (float, NDArray[np.float64])](
-    ticks: T, *, zero: float | NDArray[np.float64] = 2048.0, inverted: bool | NDArray[np.bool_] = False
-) -> T:
+def ticks_to_radians[T: (float, NDArray[Any])](ticks: T, *, zero: ArrayLike = 2048.0, inverted: ArrayLike = False) -> T:
     """Servo ticks -> radians: `(ticks - zero) 2 pi / 4096`, negated for an inverted joint.
 
     Args:
         ticks: positions as the servo reports them; a number, or an array of any shape.
-        zero: the tick at which the joint is at 0 rad.
-        inverted: whether radians fall while ticks grow (LeRobot's `drive_mode` 1).
+        zero: the tick at which the joint is at 0 rad; a number, or one per joint.
+        inverted: whether radians fall while ticks grow (LeRobot's `drive_mode` 1); likewise.
     """
-    angle = (ticks - zero) * (2 * math.pi / TICKS_PER_TURN)
-    return angle * _sign(inverted)  # type: ignore[return-value]
+    converted: T = (ticks - np.asarray(zero)) * _sign(inverted) * (2 * math.pi / TICKS_PER_TURN)
+    return converted
 
 
-def radians_to_ticks[T: (float, NDArray[np.float64])](
-    radians: T, *, zero: float | NDArray[np.float64] = 2048.0, inverted: bool | NDArray[np.bool_] = False
+@overload
+def radians_to_ticks(radians: float, *, zero: float = 2048.0, inverted: bool = False) -> int: ...
+@overload
+def radians_to_ticks(
+    radians: NDArray[Any], *, zero: ArrayLike = 2048.0, inverted: ArrayLike = False
+) -> NDArray[np.intp]: ...
+def radians_to_ticks(
+    radians: float | NDArray[Any], *, zero: ArrayLike = 2048.0, inverted: ArrayLike = False
+) -> int | NDArray[np.intp]:
+    """Radians -> servo ticks, rounded to the nearest; the inverse of `ticks_to_radians`."""
+    ticks = np.rint(_ticks(radians, zero, inverted)).astype(np.intp)
+    return ticks if isinstance(radians, np.ndarray) else int(ticks)
+
+
+def ticks_to_lerobot[T: (float, NDArray[Any])](
+    ticks: T, mode: str, *, range_min: ArrayLike, range_max: ArrayLike, inverted: ArrayLike = False
 ) -> T:
-    """Radians -> servo ticks, not rounded; the inverse of `ticks_to_radians`."""
-    return radians * _sign(inverted) * (TICKS_PER_TURN / (2 * math.pi)) + zero  # type: ignore[return-value]
-
-
-def ticks_to_lerobot(ticks: float, mode: str, *, range_min: int, range_max: int, inverted: bool = False) -> float:
     """Servo ticks -> LeRobot's units, as its `MotorsBus` (0.6) normalises them.
 
     - `range_m100_100`: `range_min`..`range_max` -> -100..100, clipped; negated where inverted.
@@ -66,47 +74,98 @@ def ticks_to_lerobot(ticks: float, mode: str, *, range_min: int, range_max: int,
     - `degrees`: from the middle of the range, `360 / 4095` degrees a tick, neither clipped nor inverted.
 
     Args:
-        ticks: a position as the servo reports it.
+        ticks: positions as the servo reports them; a number, or an array of any shape.
         mode: one of `LEROBOT_MODES`.
-        range_min: the least position of the calibrated range [ticks].
-        range_max: the greatest.
-        inverted: LeRobot's `drive_mode` 1.
+        range_min: the least position of the calibrated range [ticks]; a number, or one per joint.
+        range_max: the greatest; likewise.
+        inverted: LeRobot's `drive_mode` 1; likewise.
 
     Raises:
         ValueError: for an unknown mode or an empty range.
     """
-    _check(mode, range_min, range_max)
+    low, high = _range(mode, range_min, range_max)
+    converted: T
     if mode == "degrees":
-        return (ticks - (range_min + range_max) / 2) * 360 / (TICKS_PER_TURN - 1)
-    fraction = (min(range_max, max(range_min, ticks)) - range_min) / (range_max - range_min)
+        converted = (ticks - (low + high) / 2) * 360 / (TICKS_PER_TURN - 1)
+        return converted
+    fraction = (np.clip(ticks, low, high) - low) / (high - low)
     if mode == "range_m100_100":
-        value = fraction * 200 - 100
-        return -value if inverted else value
-    return 100 - fraction * 100 if inverted else fraction * 100
+        converted = (fraction * 200 - 100) * _sign(inverted)
+    else:
+        scaled: Any = np.where(inverted, 100 - fraction * 100, fraction * 100)
+        converted = scaled[()]
+    return converted
 
 
-def lerobot_to_ticks(value: float, mode: str, *, range_min: int, range_max: int, inverted: bool = False) -> float:
+def lerobot_to_ticks[T: (float, NDArray[Any])](
+    values: T, mode: str, *, range_min: ArrayLike, range_max: ArrayLike, inverted: ArrayLike = False
+) -> T:
     """LeRobot's units -> servo ticks, not rounded (LeRobot cuts the fraction off); see `ticks_to_lerobot`.
 
     Raises:
         ValueError: for an unknown mode or an empty range.
     """
-    _check(mode, range_min, range_max)
+    low, high = _range(mode, range_min, range_max)
+    ticks: T
     if mode == "degrees":
-        return value * (TICKS_PER_TURN - 1) / 360 + (range_min + range_max) / 2
+        ticks = values * (TICKS_PER_TURN - 1) / 360 + (low + high) / 2
+        return ticks
     if mode == "range_m100_100":
-        fraction = (min(100.0, max(-100.0, -value if inverted else value)) + 100) / 200
+        fraction = (np.clip(values * _sign(inverted), -100.0, 100.0) + 100) / 200
     else:
-        fraction = min(100.0, max(0.0, 100 - value if inverted else value)) / 100
-    return fraction * (range_max - range_min) + range_min
+        fraction = np.clip(np.where(inverted, 100 - values, values), 0.0, 100.0) / 100
+    ticks = (fraction * (high - low) + low)[()]
+    return ticks
 
 
-def _sign(inverted: bool | NDArray[np.bool_]) -> float | NDArray[np.float64]:
-    return np.where(inverted, -1.0, 1.0) if isinstance(inverted, np.ndarray) else 1.0 - 2.0 * inverted
+def radians_to_lerobot[T: (float, NDArray[Any])](
+    radians: T,
+    mode: str,
+    *,
+    range_min: ArrayLike,
+    range_max: ArrayLike,
+    zero: ArrayLike = 2048.0,
+    inverted: ArrayLike = False,
+) -> T:
+    """Radians -> LeRobot's units, by way of ticks that are not rounded; see `ticks_to_radians`, `ticks_to_lerobot`.
+
+    Raises:
+        ValueError: for an unknown mode or an empty range.
+    """
+    ticks: T = _ticks(radians, zero, inverted)
+    return ticks_to_lerobot(ticks, mode, range_min=range_min, range_max=range_max, inverted=inverted)
 
 
-def _check(mode: str, range_min: int, range_max: int) -> None:
+def lerobot_to_radians[T: (float, NDArray[Any])](
+    values: T,
+    mode: str,
+    *,
+    range_min: ArrayLike,
+    range_max: ArrayLike,
+    zero: ArrayLike = 2048.0,
+    inverted: ArrayLike = False,
+) -> T:
+    """LeRobot's units -> radians, by way of ticks that are not rounded; the inverse of `radians_to_lerobot`.
+
+    Raises:
+        ValueError: for an unknown mode or an empty range.
+    """
+    ticks = lerobot_to_ticks(values, mode, range_min=range_min, range_max=range_max, inverted=inverted)
+    return ticks_to_radians(ticks, zero=zero, inverted=inverted)
+
+
+def _ticks(radians: float | NDArray[Any], zero: ArrayLike, inverted: ArrayLike) -> Any:
+    return radians * _sign(inverted) * (TICKS_PER_TURN / (2 * math.pi)) + np.asarray(zero)
+
+
+def _sign(inverted: ArrayLike) -> Any:
+    return np.where(inverted, -1.0, 1.0)[()]
+
+
+def _range(mode: str, range_min: ArrayLike, range_max: ArrayLike) -> tuple[Any, Any]:
     if mode not in LEROBOT_MODES:
         raise ValueError(f"unknown unit {mode!r}; LeRobot has: {', '.join(LEROBOT_MODES)}")
-    if not range_min < range_max:
-        raise ValueError(f"range_min ({range_min}) must be below range_max ({range_max})")
+    low, high = np.asarray(range_min), np.asarray(range_max)
+    if not np.all(low < high):
+        raise ValueError(f"range_min ({low}) must be below range_max ({high})")
+    return low, high

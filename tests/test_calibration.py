@@ -7,6 +7,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import attrs
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -70,7 +71,7 @@ def test_it_overwrites_only_when_told(tmp_path: Path) -> None:
     ("change", "message"),
     [
         ({"homing_offset": 2048}, "homing_offset: must be -2047 to 2047, not 2048; the servo's horn"),
-        ({"range_max": 4200}, "range_max: must be 0 to 4095, not 4200; a range beyond that crosses the encoder's end"),
+        ({"range_max": 4200}, r"range_max: must be 0 to 4095, not 4200; .* re-run .* the joint's middle in the middle"),
         ({"range_min": 3400}, r"range_min: must be below range_max \(3400\), not 3400"),
         ({"range_min": 3.9}, "range_min: must be a whole number, not 3.9"),
         ({"range_min": "5"}, "range_min: must be a whole number, not '5'"),
@@ -82,8 +83,9 @@ def test_it_overwrites_only_when_told(tmp_path: Path) -> None:
 )
 def test_what_cannot_be_true_is_refused_by_name(tmp_path: Path, change: dict[str, Any], message: str) -> None:
     path = tmp_path / "arm.json"
-    path.write_text(json.dumps({"pan": {**GOOD, **change}}))
-    with pytest.raises(CalibrationError, match=rf"arm\.json: pan: {message}"):
+    path.write_text(json.dumps({"pan": {**GOOD, **change}}, indent=1))
+    line = list({**GOOD, **change}).index(next(iter(change))) + 3
+    with pytest.raises(CalibrationError, match=rf"arm\.json:{line}: pan: {message}"):
         load_calibration(path)
 
 
@@ -105,6 +107,28 @@ def test_files_that_are_none_are_refused(tmp_path: Path, text: str, message: str
         load_calibration(tmp_path / "arm.json")
 
 
+def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(CalibrationError, match=r"file/arm\.json: cannot be written: "):
+        save_calibration(Calibration({"pan": JointCalibration(**GOOD)}), tmp_path / "file" / "arm.json")
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = Calibration({"pan": JointCalibration(**GOOD)})
+    path = save_calibration(made, tmp_path / "arm.json")
+
+    def full(descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(CalibrationError, match="No space left on device"):
+        save_calibration(
+            attrs.evolve(made, joints={"pan": JointCalibration(**{**GOOD, "range_min": 1})}), path, overwrite=True
+        )
+    assert load_calibration(path).joints == made.joints
+    assert not list(tmp_path.glob(".*"))
+
+
 def test_a_missing_file_says_how_to_make_one(tmp_path: Path) -> None:
     with pytest.raises(CalibrationError, match=r"no such calibration; `ibrobot feetech calibrate` makes one"):
         load_calibration(tmp_path / "arm.json")
@@ -120,7 +144,9 @@ def test_numbers_changed_behind_the_companions_back_are_refused(tmp_path: Path) 
     made = Calibration({"pan": JointCalibration(**GOOD)}, date="2026-01-02")
     path = save_calibration(made, tmp_path / "arm.json")
     path.write_text(json.dumps({"pan": {**GOOD, "range_min": 701}}))
-    with pytest.raises(CalibrationError, match=r"not those of 2026-01-02, .* delete arm\.meta\.json"):
+    with pytest.raises(
+        CalibrationError, match=r"changed 20.*, are not those calibrated 2026-01-02 .* delete arm\.meta\.json"
+    ):
         load_calibration(path)
 
 

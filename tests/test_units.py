@@ -11,7 +11,9 @@ from hypothesis import strategies as st
 
 from ibrobot_core.units import (
     LEROBOT_MODES,
+    lerobot_to_radians,
     lerobot_to_ticks,
+    radians_to_lerobot,
     radians_to_ticks,
     ticks_to_lerobot,
     ticks_to_radians,
@@ -30,13 +32,40 @@ def test_the_middle_tick_is_zero_and_a_quarter_turn_is_half_pi() -> None:
 @given(st.floats(-10, 10), st.floats(0, 4095), st.booleans())
 def test_radians_come_back(radians: float, zero: float, inverted: bool) -> None:
     ticks = radians_to_ticks(radians, zero=zero, inverted=inverted)
-    assert ticks_to_radians(ticks, zero=zero, inverted=inverted) == pytest.approx(radians, abs=1e-9)
+    assert type(ticks) is int
+    half_a_tick = math.pi / 4096 + 1e-9
+    assert ticks_to_radians(ticks, zero=zero, inverted=inverted) == pytest.approx(radians, abs=half_a_tick)
+    assert radians_to_ticks(ticks_to_radians(ticks, zero=zero), zero=zero) == ticks
+
+
+@given(st.sampled_from(LEROBOT_MODES), ranges, st.floats(0, 1), st.floats(0, 4095), st.booleans())
+def test_radians_within_the_range_come_back_from_lerobots_units(
+    mode: str, limits: tuple[int, int], part: float, zero: float, inverted: bool
+) -> None:
+    low, high = limits
+    radians = ticks_to_radians(low + part * (high - low), zero=zero, inverted=inverted)
+    value = radians_to_lerobot(radians, mode, range_min=low, range_max=high, zero=zero, inverted=inverted)
+    back = lerobot_to_radians(value, mode, range_min=low, range_max=high, zero=zero, inverted=inverted)
+    assert back == pytest.approx(radians, abs=1e-9)
 
 
 def test_arrays_are_converted_element_by_element() -> None:
     ticks = np.array([2048.0, 3072.0, 3072.0])
     found = ticks_to_radians(ticks, zero=np.array([2048.0, 2048.0, 3072.0]), inverted=np.array([False, True, False]))
     np.testing.assert_allclose(found, [0.0, -math.pi / 2, 0.0])
+    back = radians_to_ticks(found, zero=np.array([2048.0, 2048.0, 3072.0]), inverted=np.array([False, True, False]))
+    assert back.dtype == np.intp
+    np.testing.assert_array_equal(back, ticks)
+    values = ticks_to_lerobot(
+        np.array([1500, 1500, 9999]),
+        "range_0_100",
+        range_min=np.array([1000, 1000, 0]),
+        range_max=3000,
+        inverted=np.array([False, True, False]),
+    )
+    np.testing.assert_allclose(values, [25.0, 75.0, 100.0])
+    ticks = lerobot_to_ticks(values, "range_0_100", range_min=np.array([1000, 1000, 0]), range_max=3000)
+    np.testing.assert_allclose(ticks, [1500.0, 2500.0, 3000.0])
 
 
 @pytest.mark.parametrize(
