@@ -1,4 +1,4 @@
-"""What must hold between sections: joints, groups, poses, hardware, executors, modes, stop behaviour."""
+"""What must hold between sections: joints, groups, poses, hardware, executors, modes, start and stop behaviours."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Checks:
             self._robot(robot)
             self._hardware(robot)
             self._executors(robot)
-            self._stop(robot)
+            self._behaviours(robot)
         for name, mode in (self.parts.plain.get("control_modes") or {}).items():
             self._mode(name, mode, robot)
         self._default_mode()
@@ -108,15 +108,21 @@ class Checks:
         for part in self.parts.executors.values():
             self._refer((*part.key, "group"), part.keys.group, list(robot.groups), "group")
 
-    def _stop(self, robot: Robot) -> None:
+    def _behaviours(self, robot: Robot) -> None:
         control: Control | None = self.parts.plain.get("control", Control())
-        if control is None or control.stop in ("hold", "relax"):
+        if control is None:
             return
-        word, _, pose = control.stop.partition(" ")
-        if word != "pose" or not pose:
-            self.document.add(("control", "stop"), f"{control.stop!r} is not one of: hold, relax, pose NAME")
-        else:
-            self._refer(("control", "stop"), pose, list(robot.description.poses), "pose")
+        for key, value, words in (
+            ("startup", control.startup, ("hold",)),
+            ("stop", control.stop, ("hold", "relax")),
+        ):
+            word, _, pose = value.partition(" ")
+            if value in words:
+                continue
+            if word == "pose" and pose:
+                self._refer(("control", key), pose, list(robot.description.poses), "pose")
+            else:
+                self.document.add(("control", key), f"{value!r} is not one of: {', '.join(words)}, pose NAME")
 
     def _mode(self, name: str, mode: ModeKeys, robot: Robot | None) -> None:
         key: Key = ("control_modes", name)

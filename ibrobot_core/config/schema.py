@@ -169,6 +169,7 @@ class Control:
     """The `control:` section."""
 
     rate_hz: float = option(100.0, unit="Hz", gt=0, le=1000, help="rate of the control loop")
+    startup: str = option("hold", help="what starting does before the mode begins: hold, or pose NAME")
     stop: str = option("hold", help="what stopping does: hold, relax, or pose NAME")
     priority: int = option(60, ge=1, le=99, help="SCHED_FIFO priority, where the machine permits it")
     state_timeout: float = option(0.1, unit="s", gt=0, help="time without a state from the hardware before a fault")

@@ -24,7 +24,7 @@ from ibrobot_core.units import ns
 EMERGENCY_STOP = "emergency stop"
 """The fault that a person raises."""
 _POSE_SPEED = 0.25
-"""Fraction of the velocity limits at which the stop behaviour `pose` moves."""
+"""Fraction of the velocity limits at which start and stop move to a pose."""
 _POSE_TIMEOUT_S = 10.0
 
 
@@ -69,7 +69,7 @@ class ControlCore:
         self._counts = {"read_errors": 0, "write_errors": 0, "signal_errors": 0, "stale_states": 0, "old_plans": 0}
         self._relaxed = False
         self._stopping = False
-        self._stop_target: Vector | None = None
+        self._target: Vector | None = None
         self._tick = 0
         self._commands: dict[str, Callable[..., Mapping[str, Any] | None]] = {
             "switch_mode": self._switch_mode,
@@ -90,7 +90,7 @@ class ControlCore:
         self._log = logging.getLogger("ibrobot.control")
 
     def start(self, mode: str) -> None:
-        """Connect, take the joints over where they are, and enter `mode`.
+        """Connect, take the joints over where they are, and enter `mode` once `arrived`.
 
         Raises:
             HardwareError: when the hardware does not connect or its first reading is no position.
@@ -101,7 +101,32 @@ class ControlCore:
         self._hardware.connect()
         self._measured = self._first_reading()
         self._safety.activate(self._measured.position)
-        self._switch_mode(mode)
+        self.mode = mode
+        behaviour, _, pose = self._config.control.startup.partition(" ")
+        if behaviour == "pose":
+            self._move_to(pose)
+        else:
+            self._switch_mode(mode)
+
+    def arrived(self) -> bool:
+        """Whether the robot is in its mode; until then it moves to its startup pose: tick on.
+
+        Raises:
+            HardwareError: when a fault came on the way, or it took too long.
+        """
+        if self._target is None:
+            return True
+        if self.fault:
+            raise HardwareError(f"control.startup: {self._config.control.startup}: {self.fault}")
+        if self._at_target:
+            self._target = None
+            self._switch_mode(self.mode)
+            return True
+        if self._late_to_pose:
+            raise HardwareError(
+                f"control.startup: {self._config.control.startup}: not reached within {_POSE_TIMEOUT_S:g} s"
+            )
+        return False
 
     def tick(self, late_ns: int = 0, periods: int = 1) -> ControlState:
         """One cycle.
@@ -151,6 +176,7 @@ class ControlCore:
             "safety": dict(self._safety.counters()),
             "joints": dict(self._safety.interventions),
             "executors": {name: dict(owned.executor.counters()) for name, owned in self._owned.items()},
+            "hardware": self._hardware.counters(),
             "loop": dict(self._counts),
         }
 
@@ -158,12 +184,12 @@ class ControlCore:
         """Start the configured stop behaviour; tick until `stopped`."""
         self._stopping = True
         self._leave()
+        self._target = None
         behaviour, _, pose = self._config.control.stop.partition(" ")
-        self._stop_deadline = self._clock.now_ns() + ns(_POSE_TIMEOUT_S)
         if behaviour == "relax":
             self._relax("stop")
         elif behaviour == "pose" and not self.fault and not self._safety.estopped:
-            self._stop_target = self._robot.pose(pose.strip())
+            self._move_to(pose)
 
     @property
     def signals(self) -> tuple[Signal, ...]:
@@ -180,10 +206,9 @@ class ControlCore:
         """Whether the stop behaviour is done."""
         if self._relaxed:
             return True
-        if not self._safety.at_rest:
-            return False
-        target = self._stop_target
-        return target is None or self._late_to_pose or bool(np.allclose(self._safety.current, target, atol=1e-4))
+        if self._target is None or self._late_to_pose:
+            return self._safety.at_rest
+        return self._at_target
 
     def abandon(self) -> None:
         """After a bug in the loop, when it cannot tick any more: torque off if that is the stop behaviour."""
@@ -201,21 +226,31 @@ class ControlCore:
         self._answered_ns = measured.stamp_ns
         return measured
 
+    def _move_to(self, pose: str) -> None:
+        self._target = self._robot.pose(pose.strip())
+        self._pose_deadline = self._clock.now_ns() + ns(_POSE_TIMEOUT_S)
+
+    @property
+    def _at_target(self) -> bool:
+        target = self._target
+        return target is not None and self._safety.at_rest and np.allclose(self._safety.current, target, atol=1e-4)
+
     @property
     def _late_to_pose(self) -> bool:
-        return self._clock.now_ns() >= self._stop_deadline
+        return self._clock.now_ns() >= self._pose_deadline
 
     def _read(self) -> None:
         try:
             measured = self._hardware.read()
         except HardwareError as error:
+            # The driver has ridden out what can be.
             self._counts["read_errors"] += 1
             measured = attrs.evolve(self._measured, stale=True)
-            self._lost(str(error))
+            self._raise_fault(str(error))
         else:
             if measured.stale:
                 self._counts["stale_states"] += 1
-                self._lost("the joints do not answer")
+                self._stale()
             else:
                 self._answered_ns = measured.stamp_ns
         self._measured = measured
@@ -228,11 +263,11 @@ class ControlCore:
             self._counts["signal_errors"] += 1
             return np.full(self.signal_size, np.nan)
 
-    def _lost(self, why: str) -> None:
+    def _stale(self) -> None:
         """A tick without a new state: a fault once that has lasted for `state_timeout`."""
         age_ns = self._clock.now_ns() - self._answered_ns
         if age_ns >= self._state_timeout_ns:
-            self._raise_fault(f"{why}: no state for {age_ns / 1e6:.0f} ms")
+            self._raise_fault(f"the joints do not answer: no state for {age_ns / 1e6:.0f} ms")
 
     def _write(self, command: Vector) -> None:
         if self._relaxed:
@@ -245,8 +280,8 @@ class ControlCore:
 
     def _desired(self) -> Vector | None:
         """What is asked for in this tick; None to brake and hold."""
-        if self._stop_target is not None:
-            return None if self._late_to_pose else self._safety.towards(self._stop_target, _POSE_SPEED)
+        if self._target is not None:
+            return None if self._late_to_pose else self._safety.towards(self._target, _POSE_SPEED)
         if not self._active:
             return None
         # A plan goes on by time where a single reply was lost.
@@ -302,7 +337,7 @@ class ControlCore:
         self.fault = fault
         self.events.append({"event": "fault", "fault": fault, "stamp_ns": self._clock.now_ns()})
         self._leave()
-        self._stop_target = None
+        self._target = None
         if self._config.control.stop == "relax" and not self._relaxed:
             self._relax("fault")
 

@@ -105,6 +105,9 @@ class InlineControl(ControlHost):
     def start(self) -> None:
         try:
             self._core.start(self._mode)
+            while not self._core.arrived():
+                self._clock.advance(self._core.period_ns)
+                self._core.tick()
         except BaseException:
             self._core.close()
             raise

@@ -98,6 +98,10 @@ class HardwareParts:
         """Clear the faults that parts have latched."""
         self._each(lambda part: part.reset_faults())
 
+    def counters(self) -> dict[str, dict[str, int]]:
+        """What the parts count, per part; those that count nothing left out."""
+        return {name: counts for name, part in self._parts.items() if (counts := dict(part.counters()))}
+
     def read_signals(self) -> Vector:
         """The signals of all parts one after the other, shape (S,); the array is reused by the next call."""
         begin = 0

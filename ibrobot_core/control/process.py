@@ -13,6 +13,7 @@ import signal
 import socket
 import sys
 import traceback
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, override
 
@@ -47,17 +48,19 @@ class _ToHost(logging.Handler):
 
 
 class ControlProcess:
-    """The loop on its absolute deadlines, and the link to the host."""
+    """The loop on its absolute deadlines, and the link to the host: told `ready` once the robot has arrived."""
 
     def __init__(
-        self, core: ControlCore, clock: RealClock, channel: Channel, memory: SharedMemory, wake: int, host: int
-    ) -> None:
+        self, core: ControlCore, clock: RealClock, channel: Channel, memory: SharedMemory, wake: int, host: int,
+        ready: Mapping[str, Any],
+    ) -> None:  # fmt: skip
         self._core = core
         self._clock = clock
         self._channel = channel
         self._memory = memory
         self._wake = wake
         self._host = host
+        self._ready: Mapping[str, Any] | None = ready
         self._punctuality = Punctuality()
         self._stopping = False
         self._terminated = False
@@ -73,6 +76,10 @@ class ControlProcess:
             self._clock.sleep_until(deadline)
             late = self._clock.now_ns() - deadline
             self._cycle(deadline, late, periods)
+            if self._obey():
+                # It was waited for, e.g. hardware that is set up anew after a fault: no tick was missed.
+                deadline, periods = self._clock.now_ns() + period, 1
+                continue
             deadline += period
             behind = (self._clock.now_ns() - deadline) // period
             periods = 1 + max(0, behind)
@@ -85,17 +92,25 @@ class ControlProcess:
             self._core.set_plan(plan)
         self._memory.write_state(self._core.tick(late, periods))
         self._punctuality.tick(deadline, late, periods - 1)
+        if self._ready is not None and not self._stopping and self._core.arrived():
+            self._channel.send({**self._ready, "epoch": self._core.epoch})
+            self._ready = None
         self._tell_host()
-        for command in self._channel.receive():
-            if command["do"] == "stop":
-                self._begin_stop(_TOLD)
-            else:
-                self._channel.send(self._core.handle(command))
         # A process that the host forked keeps the socket open beyond the host's death.
         if self._channel.closed or os.getppid() != self._host:
             self._begin_stop("the host is gone")
         elif self._terminated:
             self._begin_stop("terminated")
+
+    def _obey(self) -> bool:
+        """Carry out the host's commands; whether that took longer than a period."""
+        begun_ns = self._clock.now_ns()
+        for command in self._channel.receive():
+            if command["do"] == "stop":
+                self._begin_stop(_TOLD)
+            else:
+                self._channel.send(self._core.handle(command))
+        return self._clock.now_ns() - begun_ns > self._core.period_ns
 
     def _tell_host(self) -> None:
         # A full pipe wakes the host as well as one more byte would; a closed one shows on the socket.
@@ -140,8 +155,8 @@ def main(descriptors: list[int]) -> int:
         os.set_blocking(descriptors[2], False)
         refused = go_real_time(config.control.priority)
         signals = [[signal.topic, signal.size] for signal in core.signals]
-        channel.send({"event": "ready", "signals": signals, "refused": refused, "epoch": core.epoch})
-        ControlProcess(core, clock, channel, memory, descriptors[2], order["host"]).run()
+        ready = {"event": "ready", "signals": signals, "refused": refused}
+        ControlProcess(core, clock, channel, memory, descriptors[2], order["host"], ready).run()
     except IbrobotError as error:
         if core is not None:
             core.abandon()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import ClassVar
+from collections.abc import Mapping
 
 import attrs
 import numpy as np
@@ -44,7 +44,7 @@ class Hardware(ABC):
 
     joints: tuple[str, ...]
     """The joints that this hardware owns; the order of all its vectors. Set by the constructor."""
-    signals: ClassVar[tuple[Signal, ...]] = ()
+    signals: tuple[Signal, ...] = ()
 
     @abstractmethod
     def connect(self) -> None:
@@ -58,8 +58,10 @@ class Hardware(ABC):
     def read(self) -> JointReading:
         """Measure all joints, now.
 
+        A lost reply that may be ridden out gives a reading that is `stale`; an error is a fault at once.
+
         Raises:
-            HardwareError: when the hardware does not answer, or is not connected.
+            HardwareError: when the hardware does not answer any more, or is not connected.
         """
 
     @abstractmethod
@@ -84,6 +86,10 @@ class Hardware(ABC):
 
     def reset_faults(self) -> None:
         """Clear latched faults so that `read` and `write` may work again. Called on `reset`."""
+
+    def counters(self) -> Mapping[str, int]:
+        """What went by so far that a user should know of, e.g. retries; shown on `/diagnostics`."""
+        return {}
 
     def read_signal(self, index: int, out: Vector) -> None:
         """Write the present value of `signals[index]` into `out`, shape (size,)."""

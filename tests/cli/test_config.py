@@ -76,7 +76,13 @@ def test_show_fills_in_the_defaults_and_loads_again(ibrobot: Ibrobot, robot: Pat
 
     document = parse(shown.out, "shown").root
     assert document["hardware"]["max_speed"] == 3.0
-    assert document["control"] == {"rate_hz": 50.0, "stop": "hold", "priority": 60, "state_timeout": 0.1}
+    assert document["control"] == {
+        "rate_hz": 50.0,
+        "startup": "hold",
+        "stop": "hold",
+        "priority": 60,
+        "state_timeout": 0.1,
+    }
     robot.write_text(shown.out)
     assert ibrobot("config", "show", "mini.yaml").out == shown.out
 

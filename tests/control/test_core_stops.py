@@ -7,25 +7,35 @@ import pytest
 
 
 class TestFailures:
-    @pytest.mark.parametrize(("how", "counter"), [("silent", "read_errors"), ("stale", "stale_states")])
-    def test_a_lost_reply_is_ridden_out_without_a_jerk(self, make_rig, how, counter):
+    def test_a_lost_reply_is_ridden_out_without_a_jerk(self, make_rig):
         rig, undisturbed = make_rig({}).start(), make_rig({}).start()
         for each in (rig, undisturbed):
             each.plan([0.4, 0.4, 0.9])
         for tick in range(40):
-            setattr(rig.hardware, how, tick % 10 == 5)
+            rig.hardware.stale = tick % 10 == 5
             assert rig.tick().stale == (tick % 10 == 5)
             np.testing.assert_array_equal(rig.core.state.command, undisturbed.tick().command)
 
         assert rig.core.fault == ""
-        assert rig.core.counters()["loop"][counter] == 4
+        assert rig.core.counters()["loop"]["stale_states"] == 4
 
-    @pytest.mark.parametrize("how", ["silent", "stale"])
-    def test_silence_for_the_state_timeout_is_a_fault_and_brakes(self, make_rig, how):
+    def test_an_error_of_the_hardware_is_a_fault_at_once(self, make_rig):
         rig = make_rig({}).start()
         rig.plan([0.9, 1.0, 0.9], 0.5)
         rig.tick(20)
-        setattr(rig.hardware, how, True)
+        rig.hardware.silent = True
+        assert rig.tick().stale
+        assert rig.core.fault
+        rig.tick(20)
+        rig.assert_within_limits()
+        assert rig.core.counters()["loop"]["read_errors"] == 21
+        assert len(rig.events("fault")) == 1
+
+    def test_stale_states_for_the_state_timeout_are_a_fault_and_brake(self, make_rig):
+        rig = make_rig({}).start()
+        rig.plan([0.9, 1.0, 0.9], 0.5)
+        rig.tick(20)
+        rig.hardware.stale = True
 
         assert rig.tick(4).stale
         assert rig.core.fault == ""

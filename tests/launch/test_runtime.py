@@ -194,7 +194,7 @@ def test_hardware_that_falls_silent_is_a_fault_and_a_reset_goes_on(runs: Runs):
     runs.parts.MADE["simulation"].broken = True
     seconds(runtime, 0.4)
     (fault,) = runtime.summary()["faults"]
-    assert fault.startswith("the bus is silent: no state for ")
+    assert fault == "the bus is silent"
     assert ("fault", fault) in runs.parts.EVENTS
     stuck = position(runtime)
     runtime.reset()

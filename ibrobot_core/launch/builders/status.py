@@ -61,6 +61,7 @@ class Status(Worker):
         counters: Mapping[str, Any] = report["counters"]
         groups = {"loop": {**report["loop"], **counters.get("loop", {})}, "safety": counters.get("safety", {})}
         groups |= {f"executor {name}": counts for name, counts in counters.get("executors", {}).items()}
+        groups |= {f"hardware {name}": counts for name, counts in counters.get("hardware", {}).items()}
         if session.stats is not None:
             groups["dispatch"] = attrs.asdict(session.stats)
         groups["bus drops"] = session.bus.dropped()
