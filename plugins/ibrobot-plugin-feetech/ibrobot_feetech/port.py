@@ -56,7 +56,7 @@ class SerialPort:
         # Drivers without such a flag are fast already, or cannot be made so.
         with suppress(OSError, ValueError, NotImplementedError, AttributeError):
             self._serial.set_low_latency_mode(True)
-        self._fd = self._serial.fd
+        self._fd = self._serial.fileno()
         self._poll = select.poll()
         self._poll.register(self._fd, select.POLLIN)
         self._wake_at = 0

@@ -1,0 +1,276 @@
+"""The follower: an SO-101 whose STS3215 servos sit on one bus, as hardware of the control loop."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import override
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ibrobot_core.calibration import load_calibration
+from ibrobot_core.errors import HardwareError
+from ibrobot_core.interfaces import Context, Hardware, JointReading, Signal, nan_vector
+from ibrobot_core.robot import Vector
+from ibrobot_core.units import ns, seconds
+from ibrobot_feetech import arm as servos
+from ibrobot_feetech.arm import Arm, Tuning
+from ibrobot_feetech.bus import FeetechBus
+from ibrobot_feetech.errors import FeetechError, NoReply, Place, PortError, ServoFault
+from ibrobot_feetech.options import FollowerOptions
+from ibrobot_feetech.protocol import faults
+from ibrobot_feetech.sync import Replies, SyncReader, SyncWriter
+
+_RADIANS_PER_TICK = 2 * np.pi / 4096
+_SLACK_TICKS = 16
+"""How far a position may be from where the last one and the speed say [ticks]."""
+_MAX_ACCELERATION, _MAX_SPEED = 40_000, 4_000
+"""What a joint can do beside that [ticks/s^2, ticks/s]."""
+_HEALTH = (("temperature", "present_temperature", 1.0), ("voltage", "present_voltage", 0.1))
+_CURRENT_A = 0.0065
+
+
+class FeetechFollower(Hardware):
+    """Each tick one sync read of position, velocity and load, and one sync write of goals.
+
+    A reply that is lost, damaged or implausible leaves the joint where it was, for `lost_replies` ticks, in readings
+    that are stale; then, and at once for an error that a servo reports, it is a fault, which `reset_faults` ends by
+    setting the servos up anew. Until then `read` fails without waiting for anything.
+
+    Args:
+        options: the YAML's.
+        ctx: its `joints` are the servos', in the order of the vectors.
+
+    Raises:
+        CalibrationError: for a calibration that is missing or does not have every joint.
+    """
+
+    def __init__(self, options: FollowerOptions, ctx: Context) -> None:
+        self.joints = ctx.joints
+        self._options = options
+        self._ctx = ctx
+        order = ctx.robot.indices(ctx.joints)
+        lower = dict(zip(ctx.joints, ctx.robot.lower[order], strict=True))
+        unknown = [joint for joint in (*options.anchored, *options.gentle) if joint not in ctx.joints]
+        if unknown and ctx.joints == ctx.robot.joint_names:
+            raise HardwareError(f"{ctx.name}: no joint {unknown[0]!r}; the joints are: {', '.join(ctx.joints)}")
+        calibration = load_calibration(options.calibration, ctx.joints)
+        closed = {joint: float(lower[joint]) for joint in options.anchored if joint in lower}
+        self._arm = Arm(ctx.joints, calibration, closed)
+        self._bus = FeetechBus(
+            options.port, baud_rate=options.baud_rate, joints=self._arm.names, retries=options.retries
+        )
+        size = len(ctx.joints)
+        self.signals = tuple(
+            Signal(f"/{ctx.name}/{name}", size, f"of each servo [{unit}]")
+            for name, unit in (("temperature", "deg C"), ("voltage", "V"), ("current", "A"), ("load", "of full torque"))
+        )
+        self._health = [nan_vector(size) for _ in self.signals]
+        self._lost = np.zeros(size, dtype=np.intp)
+        self._health_due_ns = self._stamp_ns = 0
+        self._speed: Vector = np.zeros(size)
+        self._velocity: Vector = np.zeros(size)
+        self._counts = {"lost_replies": 0, "implausible_positions": 0}
+        self._fault: HardwareError | None = None
+        self._relaxed = False
+        self._limits = ctx.robot.lower[order], ctx.robot.upper[order]
+
+    @override
+    def connect(self) -> None:
+        bus, arm = self._bus, self._arm
+        self._fault = HardwareError(f"{self._ctx.name}: not connected")
+        bus.open()
+        try:
+            servos.find_servos(bus, arm)
+            self._check_calibration()
+            for servo in arm.servos:
+                servos.set_up(bus, arm, self._tuning(), servo)
+            self._start()
+        except BaseException:
+            bus.close()
+            raise
+        self._warn_of_reach()
+
+    @override
+    def read(self) -> JointReading:
+        if self._fault is not None:
+            raise self._fault
+        begun_ns = self._ctx.clock.now_ns()
+        healthy = begun_ns >= self._health_due_ns
+        try:
+            replies = (self._health_reader if healthy else self._reader).read()
+            stamp_ns = (begun_ns + self._ctx.clock.now_ns()) // 2
+            good = replies.answered & self._plausible(replies, stamp_ns)
+            self._check(replies, good)
+        except FeetechError as error:
+            self._fault = error
+            raise
+        self._take(replies, good)
+        if healthy and good.all():
+            self._health_due_ns = begun_ns + ns(self._options.health_period)
+            self._take_health(replies)
+        stale = bool(self._lost.any())
+        self._stamp_ns = stamp_ns
+        position = self._arm.radians(self._ticks.astype(np.float64))
+        return JointReading(stamp_ns, position, self._velocity.copy(), self._effort(), stale)
+
+    @override
+    def write(self, position: Vector) -> None:
+        if np.shape(position) != (len(self.joints),) or not np.isfinite(position).all():
+            raise HardwareError(f"{self._ctx.name}: expected {len(self.joints)} finite positions, got {position}")
+        if not self._bus.is_open:
+            raise HardwareError(f"{self._ctx.name}: not connected")
+        if self._relaxed:
+            for servo in self._arm.servos:
+                servos.hold(self._bus, servo)
+            self._relaxed = False
+        self._writer.write(self._arm.ticks(position))
+
+    @override
+    def relax(self) -> None:
+        servos.relax(self._bus, self._arm.servos)
+        self._relaxed = True
+
+    @override
+    def reset_faults(self) -> None:
+        fault = self._fault
+        if fault is None:
+            return
+        bus, arm = self._bus, self._arm
+        if isinstance(fault, PortError) or not bus.is_open:
+            bus.close()
+            bus.open()
+        bus.resynchronise()
+        servos.find_servos(bus, arm)
+        for servo in arm.servos:
+            # A servo that kept its settings and its torque goes on holding its joint.
+            troubled = bus.read_faulty(servo, "status") or bus.read_faulty(servo, "torque_enable") != 1
+            if not self._relaxed and (troubled or servo == _servo(fault)):
+                servos.set_up(bus, arm, self._tuning(), servo)
+        self._start()
+
+    @override
+    def disconnect(self) -> None:
+        self._fault = HardwareError(f"{self._ctx.name}: not connected")
+        self._bus.close()
+
+    @override
+    def counters(self) -> Mapping[str, int]:
+        return {**self._bus.counters, **self._counts}
+
+    @override
+    def read_signal(self, index: int, out: Vector) -> None:
+        out[:] = self._health[index]
+
+    def _start(self) -> None:
+        """Begin to read anew: from where the joints stand, which every servo must say."""
+        bus, ids = self._bus, self._arm.servos
+        self._reader = SyncReader(bus, ids, "present_position", "present_load")
+        self._health_reader = SyncReader(bus, ids, "present_position", "present_current")
+        self._writer = SyncWriter(bus, ids)
+        self._ticks = np.array(list(bus.sync_read("present_position", ids).values()), dtype=np.intp)
+        self._doubtful = self._ticks
+        self._speed = np.zeros(len(ids))
+        self._velocity = np.zeros(len(ids))
+        self._lost[:] = 0
+        self._stamp_ns = self._ctx.clock.now_ns()
+        self._health_due_ns = self._stamp_ns
+        self._fault = None
+
+    def _plausible(self, replies: Replies, stamp_ns: int) -> NDArray[np.bool_]:
+        """Whether a joint can be where its reply says. The checksum has 8 bits: some damage passes it.
+
+        What a joint's speed does not explain is believed when the next reply says it again.
+        """
+        ticks = replies.values[:, 0]
+        elapsed_s = seconds(stamp_ns - self._stamp_ns)
+        expected = self._ticks + self._speed * elapsed_s
+        band = _SLACK_TICKS + min(_MAX_ACCELERATION * elapsed_s, _MAX_SPEED) * elapsed_s
+        near = np.abs(ticks - expected) <= band
+        again = np.abs(ticks - self._doubtful) <= band
+        inside = (ticks >= 0) & (ticks < 4096)
+        good: NDArray[np.bool_] = inside & (near | again)
+        self._counts["implausible_positions"] += int((replies.answered & ~good).sum())
+        self._doubtful = np.where(replies.answered & inside, ticks, self._doubtful)
+        return good
+
+    def _check(self, replies: Replies, good: NDArray[np.bool_]) -> None:
+        """Raise what ends the reading: errors that servos report, and replies that are missing for too long."""
+        if replies.errors.any():
+            index = int(np.flatnonzero(replies.errors)[0])
+            raise ServoFault(self._place(index), faults(int(replies.errors[index])))
+        self._lost = np.where(good, 0, self._lost + 1)
+        self._counts["lost_replies"] += int((~replies.answered).sum())
+        if (self._lost > self._options.lost_replies).any():
+            gone = [self._arm.servos[i] for i in np.flatnonzero(self._lost > self._options.lost_replies)]
+            ticks = self._options.lost_replies + 1
+            others = f", nor from {', '.join(self._arm.names[servo] for servo in gone[1:])}" if len(gone) > 1 else ""
+            raise NoReply(self._bus.place(gone[0]), f"no good reply for {ticks} ticks{others}")
+
+    def _take(self, replies: Replies, good: NDArray[np.bool_]) -> None:
+        position, velocity, load = replies.values[:, 0], replies.values[:, 1], replies.values[:, 2]
+        self._ticks = np.where(good, position, self._ticks)
+        self._speed = np.where(good, velocity, self._speed)
+        self._velocity = self._speed * self._arm.sign * _RADIANS_PER_TICK
+        self._health[3] = np.where(good, load * self._arm.sign * 1e-3, self._health[3])
+
+    def _take_health(self, replies: Replies) -> None:
+        columns = self._health_reader.registers
+        for index, (_, name, unit) in enumerate(_HEALTH):
+            self._health[index] = replies.values[:, columns.index(name)].astype(np.float64) * unit
+        self._health[2] = replies.values[:, columns.index("present_current")].astype(np.float64) * _CURRENT_A
+        hot = np.flatnonzero(self._health[0] > self._options.max_temperature)
+        if hot.size:
+            found = f"{self._health[0][hot[0]]:.0f} deg C, above max_temperature ({self._options.max_temperature:g})"
+            self._fault = ServoFault(self._place(int(hot[0])), (f"overheating: {found}",))
+            raise self._fault
+
+    def _effort(self) -> Vector:
+        if self._options.stall_torque is None:
+            return nan_vector(len(self.joints))
+        return self._health[3] * self._options.stall_torque
+
+    def _place(self, index: int) -> Place:
+        return self._bus.place(self._arm.servos[index])
+
+    def _check_calibration(self) -> None:
+        differences = servos.calibration_differences(self._bus, self._arm)
+        if not differences:
+            return
+        if self._options.write_calibration:
+            servos.write_calibration(self._bus, self._arm, sorted({servo for servo, *_ in differences}))
+            return
+        servo, name, found, wanted = differences[0]
+        more = f", and {len(differences) - 1} more differ" if len(differences) > 1 else ""
+        raise HardwareError(
+            f"{self._bus.place(servo, name)}: the servo has {found}, {self._arm.calibration.path} says {wanted}{more}; "
+            "`ibrobot feetech check` shows all, `write_calibration: true` writes the file's to the servos"
+        )
+
+    def _tuning(self) -> Tuning:
+        options = self._options
+        every = {
+            "return_delay": 0,
+            "operating_mode": 0,
+            "p_coefficient": options.p_coefficient,
+            "i_coefficient": options.i_coefficient,
+            "d_coefficient": options.d_coefficient,
+            "maximum_acceleration": 254,
+            "acceleration": options.acceleration,
+        }
+        # As LeRobot protects the gripper's motor from burning out.
+        gentle = {"max_torque": 500, "protection_current": 250, "overload_torque": 25}
+        return Tuning(every, dict.fromkeys(options.gentle, gentle))
+
+    def _warn_of_reach(self) -> None:
+        """Say where the calibrated range ends before the YAML's limit: the servo will not go there."""
+        for joint, low, high, lower, upper in zip(self.joints, *self._arm.reach(), *self._limits, strict=True):
+            if lower < low - 0.1 or upper > high + 0.1:
+                self._ctx.log.warning(
+                    "%s: its calibrated range is %.2f to %.2f rad, its limits are %.2f to %.2f: it stops at the range",
+                    joint, low, high, lower, upper,
+                )  # fmt: skip
+
+
+def _servo(fault: HardwareError) -> int | None:
+    return fault.place.servo if isinstance(fault, ServoFault) else None

@@ -1,0 +1,34 @@
+"""What the YAML may say of a Feetech arm."""
+
+from __future__ import annotations
+
+import attrs
+
+from ibrobot_core.options import option
+
+
+@attrs.frozen
+class FollowerOptions:
+    """Options of `type: feetech_so101`: an arm whose joints are STS3215 servos on one bus."""
+
+    port: str = option(help="serial port, e.g. /dev/ttyACM0; a path under /dev/serial/by-id stays the same")
+    calibration: str = option(help="name of a calibration, or a path to one; ibrobot feetech calibrate makes it")
+    baud_rate: int = option(1_000_000, unit="baud", gt=0, help="of the bus")
+    anchored: tuple[str, ...] = option(
+        ("gripper",), help="joints whose calibrated closed end is their lower limit; others have 0 rad in the middle"
+    )
+    lost_replies: int = option(3, unit="ticks", ge=0, help="replies of one servo in a row that may be missing")
+    retries: int = option(2, ge=0, help="how often a request outside of the loop is sent again")
+    p_coefficient: int = option(16, ge=0, le=254, help="of the servos' position control; lower shakes less")
+    i_coefficient: int = option(0, ge=0, le=254, help="of the servos' position control")
+    d_coefficient: int = option(32, ge=0, le=254, help="of the servos' position control")
+    acceleration: int = option(254, unit="100 ticks/s^2", ge=0, le=254, help="limit of the servos' own")
+    gentle: tuple[str, ...] = option(
+        ("gripper",), help="joints that hold things: half the torque and current, a quarter of the torque in overload"
+    )
+    health_period: float = option(1.0, unit="s", gt=0, help="how often voltage, temperature and current are read")
+    max_temperature: float = option(65.0, unit="deg C", gt=0, le=80, help="of a servo; above it is a fault")
+    stall_torque: float | None = option(
+        None, unit="Nm", gt=0, help="turns the servos' load into an estimate of effort; without it there is none"
+    )
+    write_calibration: bool = option(False, help="write the calibration to servos that have another, at the start")

@@ -1,0 +1,298 @@
+"""The follower against the emulated bus: the suite of hardware, set-up, faults and coming back from them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, override
+
+import attrs
+import numpy as np
+import pytest
+from ibrobot_feetech.emulator import Emulator
+from ibrobot_feetech.errors import FeetechError, NoReply, PortError, ServoFault
+from ibrobot_feetech.follower import FeetechFollower
+from ibrobot_feetech.options import FollowerOptions
+
+from ibrobot_core.calibration import Calibration, save_calibration
+from ibrobot_core.clock import SteppedClock
+from ibrobot_core.errors import CalibrationError, HardwareError
+from ibrobot_core.interfaces import Context, Hardware
+from ibrobot_core.testing.contexts import START_NS, control_context
+from ibrobot_core.testing.hardware import HardwareSuite
+
+from .conftest import JOINTS, arm_calibration, prepare
+
+TICK = 2 * math.pi / 4096
+
+
+class TestFollower(HardwareSuite):
+    @pytest.fixture(autouse=True)
+    def _arm(self, calibration_file: Path) -> Iterator[None]:
+        self.clock = SteppedClock(START_NS)
+        self.file = calibration_file
+        with Emulator(6, clock=self.clock) as self.emulator:
+            prepare(self.emulator, arm_calibration())
+            yield
+
+    @override
+    def context(self) -> Context:
+        return control_context(clock=self.clock)
+
+    @override
+    def make(self, ctx: Context) -> Hardware:
+        return FeetechFollower(FollowerOptions(port=self.emulator.port, calibration=str(self.file)), ctx)
+
+    @override
+    def elapse(self, hardware: Hardware, ctx: Context, duration_s: float) -> None:
+        hardware.read()  # once it is answered, the goals sent before it have arrived
+        super().elapse(hardware, ctx, duration_s)
+
+
+class Rig:
+    """A connected follower with what it is connected to."""
+
+    def __init__(self, emulator: Emulator, clock: SteppedClock, follower: FeetechFollower) -> None:
+        self.emulator, self.clock, self.follower = emulator, clock, follower
+
+    def tick(self, goal: Any = None) -> Any:
+        self.clock.advance(10_000_000)
+        reading = self.follower.read()
+        self.follower.write(reading.position if goal is None else np.asarray(goal))
+        return reading
+
+    def run(self, ticks: int, goal: Any = None) -> list[Any]:
+        return [self.tick(goal) for _ in range(ticks)]
+
+    def register(self, name: str) -> list[int]:
+        if self.follower._bus.is_open:
+            self.follower._bus.read_faulty(1, "id")  # once it is answered, all that was sent before it has arrived
+        with self.emulator.lock:
+            return [servo.get(name) for servo in self.emulator.servos.values()]
+
+
+@pytest.fixture
+def rig(calibration_file: Path) -> Iterator[Rig]:
+    with rig_of(calibration_file) as rig:
+        rig.follower.connect()
+        yield rig
+
+
+@contextmanager
+def rig_of(file: Path, link: Path | None = None, **options: Any) -> Iterator[Rig]:
+    clock = SteppedClock(START_NS)
+    with Emulator(6, clock=clock, link=link) as emulator:
+        prepare(emulator, arm_calibration())
+        ctx = control_context("arm", clock=clock)
+        port = str(link) if link is not None else emulator.port
+        follower = FeetechFollower(FollowerOptions(port=port, calibration=str(file), **options), ctx)
+        try:
+            yield Rig(emulator, clock, follower)
+        finally:
+            follower.disconnect()
+
+
+class TestSetUp:
+    def test_the_servos_hold_where_they_stand_with_their_settings_locked(self, rig: Rig) -> None:
+        assert rig.register("torque_enable") == [1] * 6
+        assert rig.register("goal_position") == rig.register("present_position")
+        assert rig.register("lock") == [1] * 6
+        assert rig.register("return_delay") == [0] * 6
+        assert rig.register("p_coefficient") == [16] * 6
+        assert rig.register("max_torque") == [1000] * 5 + [500]
+        assert rig.register("protection_current") == [500] * 5 + [250]
+
+    def test_positions_are_radians_from_the_middle_and_from_the_grippers_closed_end(self, rig: Rig) -> None:
+        # Every joint stands at the middle of its range, 2 ticks above the middle of the turn.
+        expected = [2 * TICK, 2 * TICK, -2 * TICK, 2 * TICK, 2 * TICK, -0.2 + 750 * TICK]
+        np.testing.assert_allclose(rig.tick().position, expected, atol=1e-9)
+
+    def test_a_goal_goes_to_the_servos_in_their_ticks(self, rig: Rig) -> None:
+        rig.tick([0.1, 0.2, 0.3, -0.1, 0.0, 0.5])
+        expected = [2048 + 0.1 / TICK, 2048 + 0.2 / TICK, 2048 - 0.3 / TICK, 2048 - 0.1 / TICK, 2048]
+        assert rig.register("goal_position") == [round(tick) for tick in (*expected, 1500 + 0.7 / TICK)]
+
+    def test_missing_servos_are_named_all_at_once(self, calibration_file: Path) -> None:
+        with rig_of(calibration_file, retries=0) as rig:
+            rig.emulator.faults.silent |= {2, 5}
+            with pytest.raises(NoReply, match=r"no reply from servos 2 \(shoulder_lift\), 5 \(wrist_roll\); check its"):
+                rig.follower.connect()
+            assert rig.register("torque_enable") == [0] * 6
+
+    def test_another_model_is_refused(self, calibration_file: Path) -> None:
+        with rig_of(calibration_file) as rig:
+            rig.emulator.servos[4].set("model_number", 2825)
+            with pytest.raises(HardwareError, match=r"servo 4 \(wrist_flex\), model_number: it is model 2825"):
+                rig.follower.connect()
+
+    def test_firmwares_that_differ_are_refused(self, calibration_file: Path) -> None:
+        with rig_of(calibration_file) as rig:
+            rig.emulator.servos[4].set("firmware_minor", 9)
+            with pytest.raises(HardwareError, match=r"different firmware: shoulder_pan 3\.10, .*wrist_flex 3\.9"):
+                rig.follower.connect()
+
+    def test_a_calibration_that_the_servo_does_not_have_is_refused_or_written(self, calibration_file: Path) -> None:
+        with rig_of(calibration_file) as rig:
+            rig.emulator.servos[1].set("homing_offset", 7)
+            with pytest.raises(
+                HardwareError, match=r"servo 1 \(shoulder_pan\), homing_offset: the servo has 7, .*-120"
+            ):
+                rig.follower.connect()
+        with rig_of(calibration_file, write_calibration=True) as rig:
+            rig.emulator.servos[1].set("homing_offset", 7)
+            rig.follower.connect()
+            assert rig.register("homing_offset")[0] == -120
+
+    def test_a_calibration_without_a_joint_is_refused(self, tmp_path: Path) -> None:
+        joints = {name: joint for name, joint in arm_calibration().joints.items() if name != "gripper"}
+        file = save_calibration(Calibration(joints), tmp_path / "short.json")
+        with pytest.raises(CalibrationError, match="has no joint 'gripper'"), rig_of(file):
+            pass
+
+    def test_no_port_says_what_to_do(self, calibration_file: Path) -> None:
+        options = FollowerOptions(port="/dev/ttyNONE", calibration=str(calibration_file))
+        with pytest.raises(PortError, match=r"/dev/ttyNONE: there is no such port; check the USB cable"):
+            FeetechFollower(options, control_context()).connect()
+
+
+class TestFaults:
+    def test_lost_replies_are_stale_and_then_a_fault_that_names_the_servo(self, rig: Rig) -> None:
+        before = rig.tick().position
+        rig.emulator.faults.silent.add(3)
+        for reading in rig.run(3, before + 0.2):
+            assert reading.stale
+            assert reading.position[2] == before[2]
+        assert reading.position[0] > before[0], "the others go on"
+        with pytest.raises(NoReply, match=r"servo 3 \(elbow_flex\): no good reply for 4 ticks; check its power"):
+            rig.tick()
+        assert rig.follower.counters()["lost_replies"] == 4
+
+    def test_a_reply_that_comes_again_ends_the_staleness(self, rig: Rig) -> None:
+        rig.emulator.faults.silent.add(3)
+        rig.run(2)
+        rig.emulator.faults.silent.clear()
+        assert not rig.tick().stale
+
+    @pytest.mark.parametrize(
+        ("bits", "names"), [(0x04, "overheating"), (0x20, "overload"), (0x09, "voltage, over-cur")]
+    )
+    def test_what_a_servo_reports_is_a_fault_at_once(self, rig: Rig, bits: int, names: str) -> None:
+        rig.emulator.faults.errors[5] = bits
+        with pytest.raises(ServoFault, match=rf"servo 5 \(wrist_roll\): the servo reports {names}"):
+            rig.tick()
+        rig.emulator.faults.errors.clear()
+        with pytest.raises(ServoFault):
+            rig.tick()
+        rig.follower.reset_faults()
+        assert not rig.tick().stale
+
+    def test_a_hot_servo_is_a_fault_before_it_reports_it(self, rig: Rig) -> None:
+        rig.tick()
+        rig.emulator.servos[2].set("present_temperature", 66)
+        with pytest.raises(ServoFault, match=r"shoulder_lift.*overheating: 66 deg C, above max_temperature \(65\)"):
+            rig.run(101)
+
+    def test_writes_go_on_after_a_fault(self, rig: Rig) -> None:
+        goal = rig.tick().position + 0.1
+        rig.emulator.faults.silent.add(3)
+        with pytest.raises(NoReply):
+            rig.run(4, goal)
+        before = rig.register("goal_position")
+        rig.follower.write(goal + 0.1)
+        after = rig.register("goal_position")
+        assert [a != b for a, b in zip(after, before, strict=True)] == [True, True, False, True, True, True]
+
+    def test_a_servo_that_browned_out_is_set_up_again_by_reset(self, rig: Rig) -> None:
+        rig.tick()
+        with rig.emulator.lock:
+            rig.emulator.servos[3].brown_out()
+            rig.emulator.servos[3].turn(2300)
+        rig.emulator.faults.silent.add(3)
+        with pytest.raises(NoReply):
+            rig.run(4)
+        rig.emulator.faults.silent.clear()
+        rig.follower.reset_faults()
+        assert rig.register("torque_enable") == [1] * 6
+        assert rig.register("p_coefficient") == [16] * 6
+        assert rig.register("goal_position")[2] == 2300
+        assert not rig.tick().stale
+
+    def test_unplugged_is_a_fault_at_once_and_replugged_it_comes_back(
+        self, tmp_path: Path, calibration_file: Path
+    ) -> None:
+        with rig_of(calibration_file, link=tmp_path / "port") as rig:
+            rig.follower.connect()
+            rig.tick()
+            rig.emulator.unplug()
+            with pytest.raises(PortError, match="the port is gone; check the USB cable"):
+                rig.tick()
+            with pytest.raises(PortError, match="there is no such port"):
+                rig.follower.reset_faults()
+            with pytest.raises(PortError):
+                rig.tick()
+            rig.emulator.replug()
+            rig.follower.reset_faults()
+            assert not rig.tick().stale
+
+    def test_a_position_that_no_speed_explains_is_not_believed_until_it_is_said_again(self, rig: Rig) -> None:
+        before = rig.run(2)[-1].position[1]
+        servo = rig.emulator.servos[2]
+        with rig.emulator.lock:
+            servo.external = servo.encoder + 300
+            servo.velocity = 0.0
+            servo.advance(0.0)
+        first, second = rig.run(2)
+        assert first.stale
+        assert first.position[1] == before
+        assert not second.stale
+        assert second.position[1] == pytest.approx(before + 300 * TICK, abs=1e-6)
+        assert rig.follower.counters()["implausible_positions"] == 1
+
+
+class TestTorque:
+    def test_relaxed_means_torque_off_and_a_write_takes_over_where_the_joints_are(self, rig: Rig) -> None:
+        rig.tick()
+        rig.follower.relax()
+        assert rig.register("torque_enable") == [0] * 6
+        with rig.emulator.lock:
+            rig.emulator.servos[1].turn(1900)
+        rig.run(2, rig.run(2)[-1].position)
+        assert rig.register("torque_enable") == [1] * 6
+
+    def test_torque_that_stays_on_is_an_error_and_not_a_hope(self, rig: Rig) -> None:
+        rig.emulator.faults.silent.add(4)
+        with pytest.raises(FeetechError, match=r"servo 4 \(wrist_flex\), torque_enable: no reply"):
+            rig.follower.relax()
+        assert [value for i, value in enumerate(rig.register("torque_enable")) if i != 3] == [0] * 5
+
+
+class TestSignals:
+    def test_health_is_read_in_si(self, rig: Rig) -> None:
+        rig.emulator.servos[1].set("present_current", -10)
+        rig.tick()
+        values = {}
+        for index, signal in enumerate(rig.follower.signals):
+            values[signal.topic] = np.empty(6)
+            rig.follower.read_signal(index, values[signal.topic])
+        assert values["/arm/temperature"].tolist() == [28.0] * 6
+        assert values["/arm/voltage"] == pytest.approx([12.1] * 6)
+        assert values["/arm/current"][0] == pytest.approx(-0.065)
+        assert set(values) == {"/arm/temperature", "/arm/voltage", "/arm/current", "/arm/load"}
+
+    def test_effort_is_missing_unless_the_motors_torque_is_given(self, rig: Rig, calibration_file: Path) -> None:
+        assert np.isnan(rig.tick().effort).all()
+        with rig_of(calibration_file, stall_torque=2.0) as strong:
+            strong.follower.connect()
+            assert np.isfinite(strong.tick().effort).all()
+
+
+def test_options_have_ranges() -> None:
+    for change in ({"lost_replies": -1}, {"p_coefficient": 255}, {"max_temperature": 90.0}):
+        with pytest.raises(ValueError):
+            attrs.evolve(FollowerOptions(port="a", calibration="b"), **change)
+
+
+def test_the_joints_of_the_fixture_are_those_of_the_robot() -> None:
+    assert control_context().joints == JOINTS
