@@ -115,7 +115,10 @@ class Emulator:
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
         self.port = os.ttyname(self._slave)
-        self._base = termios.tcgetattr(self._slave)
+        # A rate that no host asks for, to tell whether one has asked.
+        attributes = termios.tcgetattr(self._slave)
+        attributes[_SPEED - 1] = attributes[_SPEED] = termios.B50
+        termios.tcsetattr(self._slave, termios.TCSANOW, attributes)
         if self._link is not None:
             self._link.unlink(missing_ok=True)
             self._link.symlink_to(self.port)
@@ -172,8 +175,6 @@ class Emulator:
         return time.monotonic() if self._clock is None else seconds(self._clock.now_ns())
 
     def _host_rate(self) -> int:
-        """The rate that the host has set on its side; the pseudo-terminal's own until then."""
-        attributes = termios.tcgetattr(self._slave)
-        if attributes[_SPEED] == self._base[_SPEED]:
-            return self._default_rate
-        return _RATES.get(attributes[_SPEED], 0)
+        """The rate that the host has set on its side; the servos' own until then."""
+        speed = termios.tcgetattr(self._slave)[_SPEED]
+        return self._default_rate if speed == termios.B50 else _RATES.get(speed, 0)

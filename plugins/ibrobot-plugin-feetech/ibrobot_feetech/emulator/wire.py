@@ -51,8 +51,10 @@ class Wire:
         replies: list[tuple[float, bytes]] = []
         for packet in self._scanner.feed(received):
             sent_s = self._wire_s(protocol.OVERHEAD + len(packet.parameters), baud_rate)
-            for servo, content in self._carry_out(packet, self._hearing(baud_rate)):
-                reply = protocol.pack(Packet(servo.id, servo.error | self._faults.errors.get(servo.id, 0), content))
+            hearing = self._hearing(baud_rate)
+            for asked, content in self._carry_out(packet, hearing):
+                servo = hearing[asked]
+                reply = protocol.pack(Packet(asked, servo.error | self._faults.errors.get(asked, 0), content))
                 if self._throttle:
                     sent_s += servo.get("return_delay") * 2e-6
                 sent_s += self._wire_s(len(reply), baud_rate)
@@ -68,11 +70,14 @@ class Wire:
             if servo.id not in silent and _RATES.get(servo.get("baud_rate")) == baud_rate
         }
 
-    def _carry_out(self, packet: Packet, servos: dict[int, EmulatedServo]) -> list[tuple[EmulatedServo, bytes]]:
-        """Do what a packet asks for; returns who answers, in order, with what."""
+    def _carry_out(self, packet: Packet, servos: dict[int, EmulatedServo]) -> list[tuple[int, bytes]]:
+        """Do what a packet asks for; returns which ids answer, in order, with what.
+
+        A servo whose id is changed answers by the former one.
+        """
         if packet.code == Instruction.SYNC_READ and len(packet.parameters) > 2:
             address, size, *ids = packet.parameters
-            return [(servos[servo], servos[servo].read(address, size)) for servo in ids if servo in servos]
+            return [(servo, servos[servo].read(address, size)) for servo in ids if servo in servos]
         if packet.code == Instruction.SYNC_WRITE and len(packet.parameters) > 2:
             address, size = packet.parameters[:2]
             each = packet.parameters[2:]
@@ -81,10 +86,9 @@ class Wire:
                     servos[each[begin]].write(address, each[begin + 1 : begin + 1 + size])
             return []
         everyone = packet.servo == BROADCAST
-        asked = list(servos.values()) if everyone else [servos[packet.servo]] if packet.servo in servos else []
         answers = []
-        for servo in sorted(asked, key=lambda each: each.id):
-            content = _one(servo, packet)
+        for servo in sorted(servos) if everyone else [packet.servo] if packet.servo in servos else []:
+            content = _one(servos[servo], packet)
             if content is not None and (not everyone or packet.code == Instruction.PING):
                 answers.append((servo, content))
         return answers
