@@ -30,6 +30,8 @@ class Subscription:
         self.topic = topic
         self.depth = depth
         self.dropped = 0
+        self.lost: dict[str, int] = {}
+        """Topic -> messages dropped."""
         self._bus = bus
         self._queue: deque[Received] = deque()
         self._arrived = threading.Condition(bus._lock)
@@ -37,8 +39,9 @@ class Subscription:
     def _put(self, item: Received) -> None:
         """Called with the bus lock held."""
         if len(self._queue) >= self.depth:
-            self._queue.popleft()
+            oldest = self._queue.popleft()
             self.dropped += 1
+            self.lost[oldest.topic] = self.lost.get(oldest.topic, 0) + 1
         self._queue.append(item)
         self._arrived.notify_all()
 
@@ -132,6 +135,11 @@ class Bus:
         """Every topic seen: message type and number of messages published."""
         with self._lock:
             return {topic: (self._types[topic], count) for topic, count in sorted(self._counts.items())}
+
+    def latched(self) -> dict[str, Received]:
+        """Topic -> its newest message, of every topic that keeps it for later subscribers."""
+        with self._lock:
+            return dict(self._latched)
 
     def dropped(self) -> dict[str, int]:
         """Messages dropped from full queues, per topic, over the present subscribers; topics without loss left out."""

@@ -22,6 +22,8 @@ class EpisodeStart:
     """Topic -> ROS 2 message type, for all that may be written."""
     metadata: Mapping[str, str]
     """Prompt, contract, fingerprint, calibration, versions: string to string."""
+    any_topic: bool = False
+    """Whether messages of topics that are not in `topics` are to be written too: of those that appear later."""
 
 
 @attrs.frozen
@@ -48,7 +50,7 @@ class Recorder(ABC):
 
     @abstractmethod
     def write(self, topic: str, message: Message, received_ns: int) -> None:
-        """Append one message. Topics that this recorder does not keep are passed over.
+        """Append one message. Topics that were not announced, or that this recorder does not keep, are passed over.
 
         Raises:
             RecorderError: e.g. no open episode, or a full disk; what was written before stays readable.

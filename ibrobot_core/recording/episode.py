@@ -24,7 +24,8 @@ def episode_start(
         config: the robot.
         recording: its `recording` section.
         topics: every topic on the bus: topic -> message type; those that the section asks for are kept. Where it
-            asks for the contract's, they are all there from the start, also the ones that nobody published yet.
+            asks for the contract's, they are all there from the start, also the ones that nobody published yet; where
+            it asks for all, or names some, others may come later (`any_topic`).
         mode: the control mode.
         seed: of the scene.
         stamp_ns: when it begins [ns].
@@ -45,10 +46,16 @@ def episode_start(
     if recording.topics == "contract":
         kept = contract.topics
     else:
-        kept = {
-            topic: type_ for topic, type_ in topics.items() if recording.topics == "all" or topic in recording.topics
-        }
-    return EpisodeStart(root / f"{_PREFIX}{_next_number(root):06d}", stamp_ns, kept, metadata)
+        kept = {topic: type_ for topic, type_ in topics.items() if is_kept(topic, recording, contract)}
+    directory = root / f"{_PREFIX}{_next_number(root):06d}"
+    return EpisodeStart(directory, stamp_ns, kept, metadata, any_topic=recording.topics != "contract")
+
+
+def is_kept(topic: str, recording: Recording, contract: Contract) -> bool:
+    """Whether the `recording` section asks for `topic`."""
+    if recording.topics == "contract":
+        return topic in contract.topics
+    return recording.topics == "all" or topic in recording.topics
 
 
 def _next_number(root: Path) -> int:

@@ -6,19 +6,39 @@ import threading
 from collections import deque
 from typing import override
 
-from ibrobot_core.bus import Subscription
+import attrs
+
+from ibrobot_core.bus import Received, Subscription
 from ibrobot_core.config.schema import Recording as RecordingConfig
+from ibrobot_core.contract.specs import Contract
+from ibrobot_core.errors import RecorderError
 from ibrobot_core.interfaces import EpisodeEnd, EpisodeStart, Recorder
-from ibrobot_core.launch.component import Worker
+from ibrobot_core.launch.component import Worker, cause
 from ibrobot_core.launch.session import Session
-from ibrobot_core.recording.episode import episode_start
+from ibrobot_core.recording.episode import episode_start, is_kept
 
 _DEPTH = 4096
 """Messages that may wait for the recorder."""
 
 
+@attrs.frozen
+class _Begin:
+    """An episode begins, with what was latched then."""
+
+    start: EpisodeStart
+    latched: tuple[Received, ...]
+
+    @property
+    def stamp_ns(self) -> int:
+        return self.start.stamp_ns
+
+
 class Recording(Worker):
-    """Writes what is on the bus while an episode is on."""
+    """Writes what is on the bus while an episode is on.
+
+    A recorder that fails, e.g. on a full disk, ends its episode's recording and is told as a fault; the robot goes on,
+    and the next episode is recorded again.
+    """
 
     def __init__(self, session: Session, config: RecordingConfig) -> None:
         super().__init__(
@@ -28,13 +48,16 @@ class Recording(Worker):
         self._session = session
         self._config = config
         self._recorder: Recorder | None = None
-        self._orders: deque[EpisodeStart | EpisodeEnd] = deque()
+        self._contract = Contract.from_config(session.config)
+        self._orders: deque[_Begin | EpisodeEnd] = deque()
         self._order = threading.Lock()
         """Held while an order is stamped and queued, and while orders and messages are taken: neither overtakes."""
         self._incoming: Subscription | None = None
-        self._kept: frozenset[str] | None = None
-        """Topics of the open episode; None outside of one."""
-        self._dropped = 0
+        self._open = False
+        self._lost: dict[str, int] = {}
+        """Topic -> messages lost on the way here, before the present episode."""
+        self.failure: RecorderError | None = None
+        """Why the recording of the present or last episode ended before it; None where it did not."""
 
     @override
     def setup(self) -> None:
@@ -52,15 +75,16 @@ class Recording(Worker):
             start = episode_start(
                 session.config, self._config, topics, mode=session.mode, seed=seed, stamp_ns=session.bus.snapshot_ns()
             )
-            self._orders.append(start)
+            latched = tuple(i for i in session.bus.latched().values() if i.received_ns <= start.stamp_ns)
+            self._orders.append(_Begin(start, latched))
+            self._lost = self._lost_now()
 
     def end(self, outcome: str) -> None:
         """Messages up to here belong to the episode."""
-        assert self._incoming is not None
         with self._order:
-            dropped, self._dropped = self._incoming.dropped - self._dropped, self._incoming.dropped
-            lost = {"*": dropped} if dropped else {}
-            self._orders.append(EpisodeEnd(self._session.bus.snapshot_ns(), outcome, lost))
+            lost = {topic: n - self._lost.get(topic, 0) for topic, n in self._lost_now().items() if self._keeps(topic)}
+            dropped = {topic: n for topic, n in lost.items() if n}
+            self._orders.append(EpisodeEnd(self._session.bus.snapshot_ns(), outcome, dropped))
 
     @override
     def work(self, timeout_s: float) -> None:
@@ -73,18 +97,51 @@ class Recording(Worker):
         for item in items:
             while orders and orders[0].stamp_ns < item.received_ns:
                 self._obey(self._recorder, orders.popleft())
-            if self._kept is not None and item.topic in self._kept:
-                self._recorder.write(item.topic, item.message, item.received_ns)
+            self._write(self._recorder, item, item.received_ns)
         for order in orders:
             self._obey(self._recorder, order)
 
-    def _obey(self, recorder: Recorder, order: EpisodeStart | EpisodeEnd) -> None:
-        if isinstance(order, EpisodeStart):
-            recorder.begin(order)
-            self._kept = frozenset(order.topics)
-        elif self._kept is not None:
-            self._kept = None
-            recorder.end(order)
+    def _obey(self, recorder: Recorder, order: _Begin | EpisodeEnd) -> None:
+        if isinstance(order, _Begin):
+            self.failure = None
+            recorder.begin(order.start)
+            self._open = True
+            for item in order.latched:
+                self._write(recorder, item, order.stamp_ns)
+        elif self._open:
+            self._open = False
+            try:
+                recorder.end(order)
+            except RecorderError as error:
+                self._fail(error)
+
+    def _write(self, recorder: Recorder, item: Received, received_ns: int) -> None:
+        if not self._open or not self._keeps(item.topic):
+            return
+        try:
+            recorder.write(item.topic, item.message, received_ns)
+        except RecorderError as error:
+            self._fail(error)
+            self._obey(recorder, EpisodeEnd(received_ns, "unknown"))
+
+    def _fail(self, error: RecorderError) -> None:
+        session = self._session
+        if self.failure is not None:
+            return  # what follows from the first is no news
+        self.failure = error
+        fault = f"recording ended: {cause(error)}"
+        session.outcome.faults.append(fault)
+        session.log.error("%s; the robot goes on", fault)
+        session.registry.emit(
+            "ibrobot_fault_raised", robot=session.config.robot.name, fault=fault, stamp_ns=session.clock.now_ns()
+        )
+
+    def _keeps(self, topic: str) -> bool:
+        return is_kept(topic, self._config, self._contract)
+
+    def _lost_now(self) -> dict[str, int]:
+        assert self._incoming is not None
+        return self._incoming.lost.copy()
 
     @override
     def teardown(self) -> None:

@@ -1,16 +1,23 @@
-"""The plugin's hooks: reader `rosbag2`."""
+"""The plugin's hooks: recorder `mcap`, reader `rosbag2`."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.descriptors import ReaderDescriptor
+from ibrobot_core.descriptors import ReaderDescriptor, RecorderDescriptor
 from ibrobot_core.hookspecs import hookimpl
+from ibrobot_mcap.options import McapOptions
 
 if TYPE_CHECKING:
-    from ibrobot_core.interfaces import EpisodeReader
+    from ibrobot_core.interfaces import Context, EpisodeReader, Recorder
+
+
+def _record(options: Any, ctx: Context) -> Recorder:
+    from ibrobot_mcap.recorder import McapRecorder
+
+    return McapRecorder(options, ctx)
 
 
 def _reads(path: Path) -> bool:
@@ -26,6 +33,14 @@ def _read(path: Path) -> EpisodeReader:
 
 
 @hookimpl
+def ibrobot_recorders() -> Iterable[RecorderDescriptor]:
+    """What writes bags."""
+    yield RecorderDescriptor(
+        type="mcap", options=McapOptions, make=_record, summary="ROS 2 bags: MCAP in a rosbag2 directory"
+    )
+
+
+@hookimpl
 def ibrobot_readers() -> Iterable[ReaderDescriptor]:
-    """Bags of ROS 2."""
+    """What reads bags, also those of others."""
     yield ReaderDescriptor("rosbag2", "ROS 2 bags: MCAP, also unfinished, and sqlite3", _reads, _read)

@@ -12,15 +12,10 @@ from ibrobot_ros2 import Codec, CodecError
 
 from ibrobot_core.errors import RecorderError
 from ibrobot_core.interfaces import EpisodeReader, EpisodeSummary, Recorded, TopicSummary
+from ibrobot_core.messages import CompressedImage, Image
+from ibrobot_mcap.jpeg import from_jpeg, is_jpeg
+from ibrobot_mcap.metadata import DROPPED, INFORMATION, METADATA, OUTCOME, RECORD, RECORD_KEY
 from ibrobot_mcap.sources import McapSource, RosbagsSource, Source
-
-METADATA = "metadata.yaml"
-INFORMATION = "rosbag2_bagfile_information"
-RECORD = ("rosbag2", "serialized_metadata")
-"""Name and key of the metadata record that has `metadata.yaml` within an MCAP file."""
-OUTCOME = "outcome"
-DROPPED = "dropped"
-"""Keys that the recorder adds to `custom_data`: a word, and JSON topic -> number of messages."""
 
 
 def is_rosbag2(path: Path) -> bool:
@@ -31,7 +26,7 @@ def is_rosbag2(path: Path) -> bool:
 
 
 class Rosbag2Reader(EpisodeReader):
-    """Reads a rosbag2 directory or a single file of one.
+    """Reads a rosbag2 directory or a single file of one. JPEG pictures come as `Image`, as a contract asks for them.
 
     Raises:
         RecorderError: when it cannot be read.
@@ -44,7 +39,8 @@ class Rosbag2Reader(EpisodeReader):
         self._source = _open(path, facts)
         custom = facts.get("custom_data") or self._source.custom or self._recorded_custom()
         self._custom = {str(key): str(value) for key, value in custom.items()}
-        self._codec: Codec | None = None
+        self._codec = Codec(self._source.definitions)
+        self._types = {topic: self._delivered(topic, type_) for topic, type_ in self._source.types.items()}
 
     @override
     def summary(self) -> EpisodeSummary:
@@ -54,7 +50,7 @@ class Rosbag2Reader(EpisodeReader):
         outcome = custom.pop(OUTCOME, "unknown")
         topics = {
             topic: TopicSummary(type_, source.counts[topic], dropped.get(topic, 0))
-            for topic, type_ in sorted(source.types.items())
+            for topic, type_ in sorted(self._types.items())
         }
         return EpisodeSummary(
             self._path, self._finished and source.finished, source.start_ns, source.end_ns, topics, custom, outcome
@@ -63,13 +59,12 @@ class Rosbag2Reader(EpisodeReader):
     @override
     def messages(self, topics: Collection[str] | None = None) -> Iterator[Recorded]:
         source = self._source
-        if self._codec is None:
-            self._codec = Codec(source.definitions)
-        wanted = frozenset(source.types if topics is None else topics)
-        for raw in source.messages(wanted):
+        for raw in source.messages(frozenset(source.types if topics is None else topics)):
             try:
                 message = self._codec.decode(raw.type, raw.data)
-            except CodecError as error:
+                if isinstance(message, CompressedImage) and is_jpeg(message):
+                    message = from_jpeg(message)
+            except (CodecError, RecorderError) as error:
                 raise RecorderError(f"{self._path}: {raw.topic} at {raw.received_ns} ns: {error}") from error
             yield Recorded(raw.topic, message, raw.received_ns, raw.published_ns)
 
@@ -77,12 +72,22 @@ class Rosbag2Reader(EpisodeReader):
     def close(self) -> None:
         self._source.close()
 
+    def _delivered(self, topic: str, type_: str) -> str:
+        """The type of the messages that `messages` gives of a topic: its first one tells JPEG from other pictures."""
+        if type_ != CompressedImage.ros_type:
+            return type_
+        first = next(self._source.messages({topic}), None)
+        if first is None:
+            return type_
+        message = self._codec.decode(type_, first.data)
+        return Image.ros_type if isinstance(message, CompressedImage) and is_jpeg(message) else type_
+
     def _recorded_custom(self) -> Mapping[str, str]:
         """What the newest metadata record says, for an episode without `metadata.yaml`."""
         found: Mapping[str, str] = {}
         for record in self._source.metadata if isinstance(self._source, McapSource) else ():
-            if record.name == RECORD[0] and RECORD[1] in record.metadata:
-                found = _parse(record.metadata[RECORD[1]], self._path).get("custom_data") or {}
+            if record.name == RECORD and RECORD_KEY in record.metadata:
+                found = _parse(record.metadata[RECORD_KEY], self._path).get("custom_data") or {}
         return found
 
 

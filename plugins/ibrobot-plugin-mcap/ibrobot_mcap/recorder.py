@@ -1,0 +1,109 @@
+"""Recorder `mcap`: an episode as a rosbag2 directory."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import override
+
+from ibrobot_ros2 import CodecError, encode
+
+from ibrobot_core.clock import SteppedClock
+from ibrobot_core.errors import RecorderError
+from ibrobot_core.interfaces import Context, EpisodeEnd, EpisodeStart, Recorder
+from ibrobot_core.messages import CompressedImage, Image, Message
+from ibrobot_mcap.bagfile import Item
+from ibrobot_mcap.jpeg import fits_jpeg, to_jpeg
+from ibrobot_mcap.metadata import Topic
+from ibrobot_mcap.options import McapOptions
+from ibrobot_mcap.storage import Storage
+from ibrobot_mcap.thread import WriterThread
+
+
+class McapRecorder(Recorder):
+    """Writes MCAP files and `metadata.yaml`.
+
+    In real time messages go through a bounded queue to a thread that writes, so that a slow disk costs messages, which
+    are counted, and never time. In lockstep they are written at once: equal runs give equal files.
+    """
+
+    def __init__(self, options: McapOptions, ctx: Context) -> None:
+        self._options = options
+        self._ctx = ctx
+        self._episode: EpisodeStart | None = None
+        self._storage: Storage | None = None
+        self._thread: WriterThread | None = None
+        self._topics: dict[str, Topic] = {}
+        self._last_ns = 0
+
+    @override
+    def begin(self, episode: EpisodeStart) -> None:
+        if self._episode is not None:
+            raise RecorderError(f"the episode in {self._episode.directory} has not ended")
+        self._storage = Storage(episode, self._options)
+        if not isinstance(self._ctx.clock, SteppedClock):
+            self._thread = WriterThread(self._storage, self._options.queue_size)
+        self._episode, self._topics, self._last_ns = episode, {}, episode.stamp_ns
+
+    @override
+    def write(self, topic: str, message: Message, received_ns: int) -> None:
+        episode, storage = self._open()
+        if topic not in episode.topics and not episode.any_topic:
+            return
+        try:
+            item = self._item(topic, message, received_ns)
+        except (CodecError, RecorderError) as error:
+            raise RecorderError(f"{topic}: {error}") from error
+        self._last_ns = max(self._last_ns, received_ns)
+        if self._thread is not None:
+            self._thread.put(item)
+        else:
+            storage.write(item)
+
+    @override
+    def end(self, episode: EpisodeEnd) -> Path | None:
+        start, storage = self._open()
+        discard = episode.outcome == "discarded"
+        dropped = Counter(episode.dropped)
+        failure: RecorderError | None = None
+        if self._thread is not None:
+            failure = self._thread.stop(discard=discard)
+            dropped.update(self._thread.dropped)
+        self._episode = self._storage = self._thread = None
+        if discard:
+            storage.discard()
+            return None
+        for topic, type_ in start.topics.items():
+            if topic not in self._topics:
+                storage.announce(self._topic(topic, type_))
+        storage.finish(episode.outcome, dropped)
+        if failure is not None:
+            self._ctx.log.warning("%s ends early: %s", start.directory, failure)
+        return start.directory
+
+    @override
+    def close(self) -> None:
+        if self._episode is not None:
+            self.end(EpisodeEnd(self._last_ns, "unknown"))
+
+    def _open(self) -> tuple[EpisodeStart, Storage]:
+        if self._episode is None or self._storage is None:
+            raise RecorderError("no episode has begun")
+        return self._episode, self._storage
+
+    def _item(self, topic: str, message: Message, received_ns: int) -> Item:
+        kept = self._topics.get(topic)
+        if isinstance(message, Image) and self._options.images == "jpeg":
+            as_jpeg = fits_jpeg(message) if kept is None else kept.type == CompressedImage.ros_type
+            if as_jpeg:
+                message = to_jpeg(message, self._options.jpeg_quality)
+        if kept is None:
+            kept = self._topics[topic] = self._topic(topic, message.ros_type)
+        if message.ros_type != kept.type:
+            raise RecorderError(f"carries {message.ros_type}, was {kept.type} before")
+        # Encoded here and now, so that arrays may change afterwards.
+        return Item(kept, encode(message), received_ns, received_ns)
+
+    def _topic(self, topic: str, type_: str) -> Topic:
+        bus = self._ctx.bus
+        return Topic(topic, type_, latched=bus is not None and topic in bus.latched())

@@ -1,0 +1,194 @@
+"""An episode's folder as it is written: files that follow one another, and `metadata.yaml` at the end."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import time
+from collections.abc import Mapping
+from typing import NoReturn
+
+from ibrobot_core.errors import RecorderError
+from ibrobot_core.interfaces import EpisodeStart
+from ibrobot_core.units import NS_PER_S, ns
+from ibrobot_mcap.bagfile import BagFile, Item
+from ibrobot_mcap.metadata import DROPPED, OUTCOME, Counted, Topic, information, write_metadata
+from ibrobot_mcap.options import MIB, McapOptions
+
+_LOOK_SIZE = 16 * MIB
+"""Free space is looked at whenever this much was written [bytes]."""
+
+
+class Storage:
+    """Writes an episode. Used by one thread at a time.
+
+    A chunk goes to the operating system when it is full or `chunk_period_s` old, which is what a killed process
+    leaves behind; to the disk every `sync_period_s`, which is what a power failure leaves behind.
+
+    Raises:
+        RecorderError: when the folder exists or cannot be written, or the disk has too little space.
+    """
+
+    def __init__(self, episode: EpisodeStart, options: McapOptions) -> None:
+        self._episode = episode
+        self._options = options
+        self._directory = episode.directory
+        self._period_ns = ns(options.chunk_period_s)
+        self._files: dict[str, Counted] = {}
+        self._topics: dict[Topic, int] = {}
+        self._latched: dict[str, Item] = {}
+        self._looked_at = 0
+        """Size of the present file when free space was last looked at [bytes]."""
+        self._synced_s = time.monotonic()
+        self._waits_since_s: float | None = None
+        """When the oldest message that is not in the file yet came, by wall time [s]."""
+        self._broken: RecorderError | None = None
+        self._check_space(self._directory.parent)
+        try:
+            self._directory.mkdir()
+        except OSError as error:
+            raise RecorderError(f"cannot record into {self._directory}: {error.strerror}") from error
+        try:
+            self._file = self._open_file()
+        except OSError as error:
+            shutil.rmtree(self._directory)
+            raise RecorderError(f"cannot record into {self._directory}: {error.strerror}") from error
+
+    def announce(self, topic: Topic) -> None:
+        """Let the episode have `topic`, with or without messages."""
+        self._topics.setdefault(topic, 0)
+
+    def write(self, item: Item) -> None:
+        """Add a message.
+
+        Raises:
+            RecorderError: when the disk refuses it, or has less than `min_free` left.
+        """
+        try:
+            if self._is_full(item):
+                self._close_file()
+                self._file = self._open_file()
+                self._repeat(item.received_ns)
+            if self._file.chunk_age_ns(item.received_ns) >= self._period_ns:
+                self._flush()
+            if self._file.size - self._looked_at >= _LOOK_SIZE:
+                self._check_space(self._directory)
+                self._looked_at = self._file.size
+            self._file.add(item)
+        except OSError as error:
+            self._fail(error)
+        if item.topic.latched:
+            self._latched[item.topic.name] = item
+        self._topics[item.topic] = self._topics.get(item.topic, 0) + 1
+        if not self._file.waiting:
+            self._waits_since_s = None
+        elif self._waits_since_s is None:
+            self._waits_since_s = time.monotonic()
+
+    def due_in_s(self) -> float | None:
+        """Time until `flush_due` has something to do, by wall time [s]; None where nothing waits."""
+        if self._waits_since_s is None:
+            return None
+        return max(0.0, self._waits_since_s + self._options.chunk_period_s - time.monotonic())
+
+    def flush_due(self) -> None:
+        """Put messages into the file that have waited for `chunk_period_s` by wall time, also when no more come.
+
+        Raises:
+            RecorderError: when the disk refuses them.
+        """
+        if self.due_in_s() != 0.0:
+            return
+        try:
+            self._flush()
+            self._check_space(self._directory)
+            period_s = self._options.sync_period_s
+            if period_s is not None and time.monotonic() - self._synced_s >= period_s:
+                self._file.sync()
+                self._synced_s = time.monotonic()
+        except OSError as error:
+            self._fail(error)
+
+    def finish(self, outcome: str, dropped: Mapping[str, int]) -> None:
+        """Make the episode whole: the files' indices, then `metadata.yaml`, which says that it is.
+
+        Raises:
+            RecorderError: when the disk refuses it; the episode stays unfinished, and readable.
+        """
+        if self._broken is not None:
+            self._file.abandon()
+            raise self._broken
+        lost = json.dumps(dict(sorted(dropped.items())))
+        custom = {**self._episode.metadata, OUTCOME: outcome, DROPPED: lost}
+        try:
+            self._close_file(custom)
+            write_metadata(self._directory, self._facts(custom))
+        except OSError as error:
+            self._file.abandon()
+            self._fail(error)
+
+    def discard(self) -> None:
+        """Remove the episode.
+
+        Raises:
+            RecorderError: when it cannot be removed.
+        """
+        self._file.abandon()
+        try:
+            shutil.rmtree(self._directory)
+        except OSError as error:
+            raise RecorderError(f"{self._directory}: cannot be removed: {error.strerror}") from error
+
+    def _open_file(self) -> BagFile:
+        path = self._directory / f"{self._directory.name}_{len(self._files)}.mcap"
+        file = BagFile(path, self._options, self._facts(self._episode.metadata))
+        self._files[path.name] = file.counted
+        self._looked_at = 0
+        return file
+
+    def _close_file(self, custom: Mapping[str, str] | None = None) -> None:
+        for topic in self._topics:
+            self._file.announce(topic)
+        self._file.finish(self._facts(self._episode.metadata if custom is None else custom))
+        self._waits_since_s = None
+
+    def _is_full(self, item: Item) -> bool:
+        size, duration = self._options.split_size, self._options.split_duration
+        if self._file.counted.count == 0:
+            return False
+        full = size is not None and self._file.size >= size
+        return full or (duration is not None and item.received_ns - self._file.counted.start_ns >= duration * NS_PER_S)
+
+    def _repeat(self, received_ns: int) -> None:
+        """Begin a file with what is latched, so that it can be played without the one before."""
+        items = [Item(i.topic, i.data, received_ns, i.published_ns) for i in self._latched.values()]
+        if items:
+            self._file.add_repeated(items)
+        for item in items:
+            self._topics[item.topic] += 1
+
+    def _facts(self, custom: Mapping[str, str]) -> dict[str, object]:
+        return information(self._files, self._topics, custom, self._episode.stamp_ns)
+
+    def _flush(self) -> None:
+        self._file.flush()
+        self._waits_since_s = None
+
+    def _check_space(self, path: os.PathLike[str]) -> None:
+        try:
+            disk = os.statvfs(path)
+        except OSError as error:
+            raise RecorderError(f"cannot record into {self._directory}: {error.strerror}") from error
+        free = disk.f_bavail * disk.f_frsize
+        if free < self._options.min_free:
+            raise RecorderError(
+                f"{self._directory}: its disk has {free // MIB} MiB left, recording needs "
+                f"{self._options.min_free // MIB} MiB (min_free); make room or record elsewhere (recording.root)"
+            )
+
+    def _fail(self, error: OSError) -> NoReturn:
+        self._broken = RecorderError(
+            f"{self._directory}: cannot be written: {error.strerror}; it stays unfinished, with what was written before"
+        )
+        raise self._broken from error
