@@ -202,14 +202,21 @@ class Structurer:
     def _simulation(self, parts: Parts) -> None:
         if "simulation" not in self.document.root:
             return
-        part = self._component("hardware", ("simulation",), ComponentKeys, needed=parts.simulated)
+        part = self._component("hardware", ("simulation",), ComponentKeys, needed=parts.simulated or self._elsewhere)
         if part is None:
             return
         if not getattr(part.descriptor, "simulated", False):
             message = f"{part.descriptor.type!r} is no simulation; it belongs in the hardware section"
             self.document.add(("simulation", "type"), message)
-        elif parts.simulated:
+        elif parts.simulated or self._elsewhere:
             parts.simulation = part
+
+    @property
+    def _elsewhere(self) -> bool:
+        """Whether a simulation runs in another process: there are peripherals of kind `simulation`, which bring it here."""
+        peripherals = self.document.root.get("peripherals")
+        items = peripherals if isinstance(peripherals, list) else ()
+        return any(isinstance(item, Mapping) and item.get("kind") == "simulation" for item in items)
 
     def _hardware(self, parts: Parts) -> None:
         value = self.document.root.get("hardware")
@@ -228,7 +235,7 @@ class Structurer:
             parts.hardware[name] = part
 
     def _peripherals(self, parts: Parts) -> None:
-        descriptor = parts.simulation.descriptor if parts.simulation else None
+        descriptor = parts.simulation.descriptor if parts.simulation and parts.simulated else None
         stand_ins = descriptor.sensors if isinstance(descriptor, HardwareDescriptor) else {}
         lines: dict[str, int] = {}
         value = self.document.root.get("peripherals")
@@ -259,7 +266,7 @@ class Structurer:
             if as_is.descriptor.kind != as_is.keys.kind:
                 found = as_is.descriptor.kind
                 self.document.add((*key, "kind"), f"sensor type {as_is.descriptor.type!r} is of kind {found!r}")
-            if not simulated and self._only_simulated(as_is.keys.kind, as_is.descriptor.type):
+            if not simulated and not self._elsewhere and self._only_simulated(as_is.keys.kind, as_is.descriptor.type):
                 message = f"{as_is.descriptor.type!r} exists only in simulation; run with --sim, or name a real sensor"
                 self.document.add((*key, "type"), message)
         if stand_in is None or len(self.document.problems) > before:

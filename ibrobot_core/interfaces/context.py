@@ -30,6 +30,6 @@ class Context:
     bus: Bus | None = None
     """The host's bus; None in the control process."""
     simulation: Any = None
-    """The options of the simulation in use (an attrs instance of its plugin), None on real hardware."""
+    """The options of the simulation in use (an attrs instance of its plugin), which may run elsewhere; else None."""
     keys: Callable[[], Any] | None = None
     """Returns a new queue of keys typed in the terminal (`queue.SimpleQueue[str]`); None where there is no terminal."""

@@ -62,7 +62,8 @@ class Arm:
     @cached_property
     def sign(self) -> Vector:
         """1, or -1 where radians fall while ticks grow; shape (J,)."""
-        return np.where(self._inverted, -1.0, 1.0)
+        signs: Vector = np.where(self._inverted, -1.0, 1.0)
+        return signs
 
     def radians(self, ticks: Vector) -> Vector:
         """Reported positions [ticks] -> joint positions [rad], shape (J,)."""
@@ -70,8 +71,12 @@ class Arm:
 
     def ticks(self, radians: Vector) -> NDArray[np.intp]:
         """Joint positions [rad] -> goals [ticks], shape (J,), within the calibrated ranges."""
-        ticks = radians_to_ticks(radians, zero=self._zero, inverted=self._inverted)
-        return np.rint(np.clip(ticks, *self._limits)).astype(np.intp)
+        return np.clip(self.positions(radians), *self._limits).astype(np.intp)
+
+    def positions(self, radians: Vector) -> NDArray[np.intp]:
+        """Joint positions [rad] -> reported positions [ticks], shape (J,), wherever they lie."""
+        ticks: NDArray[np.intp] = radians_to_ticks(radians, zero=self._zero, inverted=self._inverted)
+        return ticks
 
     def reach(self) -> tuple[Vector, Vector]:
         """Lower and upper ends of the calibrated ranges [rad], each shape (J,)."""

@@ -240,9 +240,7 @@ class TestFaults:
         before = rig.run(2)[-1].position[1]
         servo = rig.emulator.servos[2]
         with rig.emulator.lock:
-            servo.external = servo.encoder + 300
-            servo.velocity = 0.0
-            servo.advance(0.0)
+            servo.drive(servo.encoder + 300, 0.0)
         first, second = rig.run(2)
         assert first.stale
         assert first.position[1] == before

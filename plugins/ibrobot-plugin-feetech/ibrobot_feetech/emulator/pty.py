@@ -58,7 +58,7 @@ class Emulator:
         self._default_rate = baud_rate
         self._wire = Wire(self.servos, self.faults, throttle=throttle, seed=seed)
         self._clock = clock
-        self._link = Path(link) if link is not None else None
+        self.link = Path(link) if link is not None else None
         self._master = self._slave = -1
         self._thread: threading.Thread | None = None
         self._error: BaseException | None = None
@@ -95,8 +95,8 @@ class Emulator:
         self._thread.join()
         os.read(self._stop_reader, 1)
         self._thread = None
-        if self._link is not None:
-            self._link.unlink(missing_ok=True)
+        if self.link is not None:
+            self.link.unlink(missing_ok=True)
         for descriptor in (self._slave, self._master):
             os.close(descriptor)
 
@@ -119,9 +119,9 @@ class Emulator:
         attributes = termios.tcgetattr(self._slave)
         attributes[_SPEED - 1] = attributes[_SPEED] = termios.B50
         termios.tcsetattr(self._slave, termios.TCSANOW, attributes)
-        if self._link is not None:
-            self._link.unlink(missing_ok=True)
-            self._link.symlink_to(self.port)
+        if self.link is not None:
+            self.link.unlink(missing_ok=True)
+            self.link.symlink_to(self.port)
         self._thread = threading.Thread(target=self._serve, name=f"emulator {self.port}", daemon=True)
         self._thread.start()
 

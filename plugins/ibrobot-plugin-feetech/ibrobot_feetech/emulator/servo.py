@@ -72,8 +72,7 @@ class EmulatedServo:
         """Where the joint is [ticks], before the homing offset."""
         self.velocity = 0.0
         """[ticks/s]"""
-        self.external: float | None = None
-        """Where physics outside of the servo hold the joint [ticks]; None where the servo moves it."""
+        self._driven = False
         self.errors = 0
         """Error bits forced upon it."""
         self._prepared: tuple[int, bytes] | None = None
@@ -116,6 +115,12 @@ class EmulatedServo:
         self.encoder, self.velocity = encoder, 0.0
         self._publish()
 
+    def drive(self, encoder: float, velocity: float) -> None:
+        """Put the joint where physics outside of the servo have it [ticks, ticks/s]; from now on only they move it."""
+        self._driven = True
+        self.encoder, self.velocity = encoder, velocity
+        self._publish()
+
     def read(self, address: int, size: int) -> bytes:
         """Bytes of the table."""
         return bytes(self.table[address : address + size])
@@ -152,10 +157,9 @@ class EmulatedServo:
 
     def advance(self, elapsed_s: float) -> None:
         """Let time pass [s]: the joint moves towards its goal."""
-        if self.external is not None:
-            self.velocity = (self.external - self.encoder) / elapsed_s if elapsed_s > 0 else self.velocity
-            self.encoder = self.external
-        elif self.torque and self.get("operating_mode") == 0:
+        if self._driven:
+            return
+        if self.torque and self.get("operating_mode") == 0:
             self._follow(elapsed_s)
         else:
             self.velocity = 0.0

@@ -1,0 +1,145 @@
+"""`ibrobot feetech emulate`: a servo bus on a pseudo-terminal, for trying things out without an arm."""
+
+from __future__ import annotations
+
+import datetime
+import math
+import signal
+import threading
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from ibrobot_core.calibration import (
+    MIDDLE,
+    Calibration,
+    JointCalibration,
+    calibration_path,
+    load_calibration,
+    save_calibration,
+)
+from ibrobot_core.units import TICKS_PER_TURN
+
+if TYPE_CHECKING:
+    from ibrobot_core.config import RobotConfig
+    from ibrobot_core.robot import Robot
+    from ibrobot_feetech.emulator import Emulator
+    from ibrobot_feetech.emulator.physics import PhysicsArm
+
+_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
+
+
+@click.command()
+@click.option("--servos", type=click.IntRange(1, 253), default=6, show_default=True, help="How many, from id 1.")
+@click.option("--baud", type=int, default=1_000_000, show_default=True, help="At which the servos listen at first.")
+@click.option("--throttle", is_flag=True, help="Let bytes take the time that they take on a wire.")
+@click.option("--link", type=click.Path(path_type=Path), help="A path that always leads to the port.")
+@click.option("--calibration", metavar="NAME", help="Give the servos this calibration; made and saved where missing.")
+@click.option("--physics", metavar="CONFIG", help="Let the simulation of this robot YAML move the joints.")
+@click.option("--seed", type=int, default=0, show_default=True, help="Of all chances, and of the scene.")
+@click.option("--drop", type=click.FloatRange(0, 1), default=0.0, help="Probability that a reply is lost.")
+@click.option("--corrupt", type=click.FloatRange(0, 1), default=0.0, help="Probability that a byte of one is damaged.")
+@click.option("--duplicate", type=click.FloatRange(0, 1), default=0.0, help="Probability that a reply comes twice.")
+@click.option("--late", type=click.FloatRange(0, 1), default=0.0, help="Probability that one comes late.")
+@click.option("--late-s", type=click.FloatRange(min=0), default=0.05, show_default=True, help="How late [s].")
+def emulate(
+    servos: int, baud: int, throttle: bool, link: Path | None, calibration: str | None, physics: str | None, seed: int,
+    **chances: float,
+) -> None:  # fmt: skip
+    """Emulate a bus of STS3215 servos on a pseudo-terminal.
+
+    The first line says the port's path; use it wherever a serial port is asked for. With --physics the simulation of
+    a robot YAML moves the joints, and its scene is served to the run that uses the port. Ctrl-C ends it.
+    """
+    from ibrobot_feetech.emulator import Emulator
+
+    ended = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: ended.set())
+    config = _config(physics) if physics is not None else None
+    joints = config.robot.joint_names if config is not None else _JOINTS[:servos]
+    count = len(joints) if config is not None else servos
+    with ExitStack() as stack:
+        emulator = stack.enter_context(Emulator(count, baud_rate=baud, throttle=throttle, seed=seed, link=link))
+        for name, value in chances.items():
+            setattr(emulator.faults, name, value)
+        found = _calibrate(emulator, calibration, joints, config.robot if config is not None else None)
+        click.echo(str(link) if link is not None else emulator.port)
+        arm = None
+        if config is not None:
+            assert found is not None
+            arm = _physics(config, found, emulator, seed)
+            arm.start()
+            stack.callback(arm.stop)
+        click.echo(f"{count} servos at {baud} baud; Ctrl-C ends it", err=True)
+        _wait(ended, arm)
+
+
+def _wait(ended: threading.Event, arm: PhysicsArm | None) -> None:
+    told = False
+    while not ended.wait(0.05):
+        if arm is not None:
+            if arm.error is not None:
+                return
+            if arm.success and not told:
+                told = True
+                click.echo("success: the scene's task is done")
+
+
+def _config(name: str) -> RobotConfig:
+    from ibrobot_core.config import find_config, load
+    from ibrobot_core.plugins import installed
+
+    registry = installed()
+    return load(find_config(name, registry), sim=True, registry=registry)
+
+
+def _physics(config: RobotConfig, calibration: Calibration, emulator: Emulator, seed: int) -> PhysicsArm:
+    from ibrobot_core.plugins import installed
+    from ibrobot_feetech.arm import Arm
+    from ibrobot_feetech.emulator.physics import PhysicsArm
+
+    robot = config.robot
+    closed = {joint.name: joint.lower for joint in robot.joints if joint.name == _JOINTS[-1]}
+    socket = Path(f"{emulator.link or emulator.port.replace('/dev/pts/', '/tmp/ibrobot-emulator-')}.signals")
+    arm = PhysicsArm(config, installed(), Arm(robot.joint_names, calibration, closed), emulator, socket, seed)
+    click.echo(f"signals on {socket}")
+    return arm
+
+
+def _calibrate(emulator: Emulator, name: str | None, joints: Sequence[str], robot: Robot | None) -> Calibration | None:
+    """Give the servos a calibration; None where none was asked for."""
+    if name is None and robot is None:
+        return None
+    if name is not None and calibration_path(name).exists():
+        calibration = load_calibration(name, joints)
+    else:
+        date = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+        calibration = Calibration(_ranges(joints, robot), robot=name or "emulated", date=date)
+        if name is not None:
+            click.echo(f"calibration saved in {save_calibration(calibration, name)}", err=True)
+    with emulator.lock:
+        for joint in calibration.joints.values():
+            servo = emulator.servos[joint.id]
+            servo.set("homing_offset", joint.homing_offset)
+            servo.set("min_position_limit", joint.range_min)
+            servo.set("max_position_limit", joint.range_max)
+    return calibration
+
+
+def _ranges(joints: Sequence[str], robot: Robot | None) -> dict[str, JointCalibration]:
+    """Ranges as the joints' limits, about the middle of the turn; of an SO-101's size where no robot is given."""
+    limits = {joint.name: (joint.lower, joint.upper) for joint in robot.joints} if robot is not None else {}
+    found = {}
+    for number, joint in enumerate(joints, 1):
+        lower, upper = limits.get(joint, (-1.7, 1.7))
+        per_radian = TICKS_PER_TURN / (2 * math.pi)
+        if joint == _JOINTS[-1]:  # anchored at its closed end: about the middle all the same
+            half = (upper - lower) / 2
+            lower, upper = -half, half
+        low, high = math.floor(MIDDLE + lower * per_radian), math.ceil(MIDDLE + upper * per_radian)
+        found[joint] = JointCalibration(number, 0, 0, max(0, low), min(TICKS_PER_TURN - 1, high))
+    return found

@@ -1,0 +1,115 @@
+"""An emulated arm whose joints a simulation moves: the servos' goals go to the physics, its joints to the encoders."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from pathlib import Path
+
+import numpy as np
+
+from ibrobot_core.clock import RealClock
+from ibrobot_core.config import RobotConfig
+from ibrobot_core.errors import IbrobotError
+from ibrobot_core.interfaces import Context, Episode, SimulatedHardware
+from ibrobot_core.plugins import Registry
+from ibrobot_core.units import ns, radians_to_ticks
+from ibrobot_feetech.arm import Arm
+from ibrobot_feetech.emulator.pty import Emulator
+from ibrobot_feetech.emulator.signals import SignalServer
+
+
+class PhysicsArm:
+    """Advances a simulation in real time and couples it to the servos of an emulator; `start` and `stop` it.
+
+    Args:
+        config: a robot whose `simulation` section names the physics.
+        registry: where its plugin is.
+        arm: which servo is which joint.
+        emulator: whose servos it moves.
+        socket: where the simulation's signals are served.
+        seed: of the scene.
+
+    Raises:
+        IbrobotError: when the simulation cannot be made.
+    """
+
+    def __init__(
+        self, config: RobotConfig, registry: Registry, arm: Arm, emulator: Emulator, socket: Path, seed: int
+    ) -> None:
+        assert config.simulation is not None
+        self._clock = RealClock()
+        self._period_ns = ns(1.0 / config.control.rate_hz)
+        ctx = Context(
+            "emulator", self._clock, logging.getLogger("ibrobot.emulator"), config.robot, joints=arm.joints,
+            period_ns=self._period_ns, seed=seed, simulation=config.simulation.options,
+        )  # fmt: skip
+        hardware = registry.find("hardware", config.simulation.type).make(config.simulation.options, ctx)
+        assert isinstance(hardware, SimulatedHardware)
+        self._hardware = hardware
+        self._arm = arm
+        self._emulator = emulator
+        self._seed = seed
+        self._server = SignalServer(socket, hardware.signals)
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="emulated physics", daemon=True)
+        self.error: IbrobotError | None = None
+        """What ended the simulation, if something did."""
+        self.success: bool | None = None
+        """Whether the scene's task is done; None for a scene without one."""
+
+    def start(self) -> None:
+        """Set the scene up, and the servos where its joints are."""
+        self._hardware.connect()
+        self._hardware.reset(Episode(self._seed))
+        self._place()
+        for servo in self._emulator.servos.values():
+            servo.set("goal_position", servo.get("present_position"))
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End; raises what went wrong in the simulation."""
+        self._ended.set()
+        self._thread.join()
+        self._server.close()
+        self._hardware.disconnect()
+        if self.error is not None:
+            raise self.error
+
+    def _run(self) -> None:
+        deadline = self._clock.now_ns()
+        try:
+            while not self._ended.is_set():
+                deadline = max(deadline + self._period_ns, self._clock.now_ns() - self._period_ns)
+                self._clock.sleep_until(deadline)
+                self._step()
+        except IbrobotError as error:
+            self.error = error
+
+    def _step(self) -> None:
+        hardware, emulator = self._hardware, self._emulator
+        with emulator.lock:
+            servos = [emulator.servos[servo] for servo in self._arm.servos]
+            torque = np.array([servo.torque for servo in servos])
+            goals = np.array([servo.goal - servo.get("homing_offset") for servo in servos])
+        if torque.any():
+            # A joint without torque among others that have it is led by where it is.
+            here = hardware.read().position
+            hardware.write(np.where(torque, self._arm.radians(goals), here))
+        else:
+            hardware.relax()
+        hardware.advance(self._period_ns)
+        self._place()
+        self._server.publish(hardware)
+        self.success = hardware.success()
+
+    def _place(self) -> None:
+        """Put the encoders where the simulation's joints are."""
+        reading = self._hardware.read()
+        arm = self._arm
+        ticks = arm.positions(reading.position)
+        speeds = radians_to_ticks(reading.velocity * arm.sign, zero=0.0)
+        with self._emulator.lock:
+            for servo, tick, speed in zip(arm.servos, ticks, speeds, strict=True):
+                emulated = self._emulator.servos[servo]
+                emulated.drive(float(tick) + emulated.get("homing_offset"), float(speed))
