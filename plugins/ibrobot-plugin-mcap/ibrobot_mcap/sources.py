@@ -62,7 +62,13 @@ class McapSource(Source):
         except BaseException:
             self.close()
             raise
-        blocks = [(block.start_ns, file, block) for file in self._files for block in file.blocks if not block.repeated]
+        # What the first file repeats lies in none that is read here.
+        blocks = [
+            (block.start_ns, file, block)
+            for index, file in enumerate(self._files)
+            for block in file.blocks
+            if not (index and block.repeated)
+        ]
         self._blocks = sorted(blocks, key=lambda item: item[0])
         self.finished = all(file.finished for file in self._files)
         self.start_ns = min((block.start_ns for _, _, block in blocks), default=0)

@@ -1,0 +1,213 @@
+"""Messages of every type survive CDR, which is that of the rosbags library; what does not fit is refused."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import types
+import typing
+
+import attrs
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from ibrobot_ros2 import Codec, CodecError, decode, definition, encode, type_hash
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from ibrobot_core import messages
+from ibrobot_core.messages import MESSAGE_TYPES, CameraInfo, Header, Image, Imu, Int32, JointState, Message, String
+
+STAMP = st.integers(-(2**31) * 10**9, (2**31 - 1) * 10**9 + 999_999_999)
+FIXED = {"k": 9, "r": 9, "p": 12, "orientation_covariance": 9, "angular_velocity_covariance": 9,
+         "linear_acceleration_covariance": 9}  # fmt: skip
+RANGES = {
+    "std_msgs/msg/Int32": (-(2**31), 2**31 - 1),
+    "level": (0, 127),
+    "is_bigendian": (0, 255),
+    "datatype": (0, 255),
+    "episode": (-(2**63), 2**63 - 1),
+}
+UNSIGNED = (0, 2**32 - 1)
+
+
+def of_class(cls: type) -> st.SearchStrategy:
+    hints = typing.get_type_hints(cls)
+    return st.builds(cls, **{f.name: of_field(cls, f.name, hints[f.name]) for f in attrs.fields(cls)})
+
+
+def of_field(cls: type, name: str, hint: object) -> st.SearchStrategy:
+    if typing.get_origin(hint) is tuple:
+        return st.lists(of_field(cls, name, typing.get_args(hint)[0]), max_size=3).map(tuple)
+    if attrs.has(hint):
+        return of_class(hint)
+    if isinstance(hint, types.GenericAlias | typing._GenericAlias):
+        dtype = typing.get_args(hint)[-1]
+        length = FIXED.get(name) if cls in (CameraInfo, Imu) else None
+        return hnp.arrays(dtype, length if length is not None else st.integers(0, 5))
+    if hint is int:
+        low, high = RANGES.get(getattr(cls, "ros_type", ""), RANGES.get(name, UNSIGNED))
+        return STAMP if name.endswith("_ns") else st.integers(low, high)
+    plain = {bool: st.booleans(), float: st.floats(allow_nan=False), str: st.text(st.characters(codec="utf-8"))}
+    return plain[hint]
+
+
+def same(one, other) -> bool:
+    """Equal, and NaN equals NaN."""
+    if attrs.has(type(one)):
+        return type(one) is type(other) and all(
+            same(getattr(one, f.name), getattr(other, f.name)) for f in attrs.fields(type(one))
+        )
+    if isinstance(one, tuple):
+        return len(one) == len(other) and all(map(same, one, other))
+    if isinstance(one, np.ndarray):
+        return one.dtype == other.dtype and np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
+    return one == other
+
+
+@pytest.mark.parametrize("name", MESSAGE_TYPES)
+def test_every_type_survives(name):
+    @settings(max_examples=25, deadline=None)
+    @given(of_class(MESSAGE_TYPES[name]), st.binary(max_size=20))
+    def check(message, trailing):
+        data = bytes(encode(message))
+        assert same(decode(name, data), message)
+        assert same(decode(name, data + trailing), message)
+
+    check()
+
+
+def test_the_bytes_are_those_of_rosbags():
+    store = get_typestore(Stores.ROS2_JAZZY)
+    kind = store.types
+    header = kind["std_msgs/msg/Header"](kind["builtin_interfaces/msg/Time"](-2, 500_000_000), "base")
+    theirs = kind["sensor_msgs/msg/JointState"](header, ["a", "é"], np.array([1.0, 2.0]), np.array([]), np.array([3.0]))
+    ours = JointState(Header(-1_500_000_000, "base"), ("a", "é"), [1.0, 2.0], [], [3.0])
+    assert bytes(encode(ours)) == bytes(store.serialize_cdr(theirs, "sensor_msgs/msg/JointState"))
+
+
+@pytest.mark.parametrize("name", MESSAGE_TYPES)
+def test_definitions_define_the_type(name):
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(definition(name), name))
+    assert store.hash_rihs01(name) == type_hash(name)
+
+
+def test_big_endian_is_read():
+    store = get_typestore(Stores.ROS2_JAZZY)
+    data = store.serialize_cdr(store.types["std_msgs/msg/Int32"](7), "std_msgs/msg/Int32", little_endian=False)
+    assert decode("std_msgs/msg/Int32", data) == Int32(7)
+
+
+def test_arrays_of_any_layout_are_taken():
+    pixels = np.arange(24, dtype=np.uint8).reshape(2, 4, 3)
+    for data in (pixels, pixels[:, ::-1, :], np.asfortranarray(pixels)):
+        image = decode(Image.ros_type, encode(Image(Header(), 2, 4, "rgb8", 12, data)))
+        assert np.array_equal(image.data, data.ravel())
+
+
+def test_unknown_covariance_is_zeros_as_in_ros():
+    assert np.array_equal(decode(Imu.ros_type, encode(Imu(Header()))).orientation_covariance, np.zeros(9))
+
+
+WRONG = {
+    "too large": (Int32(2**31), "std_msgs/msg/Int32: cannot be encoded: .*format requires"),
+    "covariance": (Imu(Header(), orientation_covariance=[1.0]), "sensor_msgs/msg/Imu: cannot be encoded: .*length"),
+    "not text": (String(5), "std_msgs/msg/String: cannot be encoded"),
+    "no type": (attrs.make_class("Other", [], bases=(Message,))(), "nobody defined this message type"),
+}
+
+
+@pytest.mark.parametrize(("message", "reason"), WRONG.values(), ids=WRONG)
+def test_what_does_not_fit_is_refused(message, reason):
+    with pytest.raises(CodecError, match=reason):
+        encode(message)
+
+
+def test_damage_is_refused():
+    data = bytes(encode(String("hello")))
+    for wrong in (b"", b"\x00", data[:6], data[:-3], b"\x00\x03" + data[2:], data[:4] + b"\xff\xff\xff\xff" + data[8:]):
+        with pytest.raises(CodecError, match=r"std_msgs/msg/String: "):
+            decode("std_msgs/msg/String", wrong)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.sampled_from(sorted(MESSAGE_TYPES)), st.binary(max_size=120))
+def test_garbage_raises_nothing_else(name, garbage):
+    with contextlib.suppress(CodecError):
+        decode(name, b"\x00\x01\x00\x00" + garbage)
+
+
+SEPARATOR = "=" * 80
+LAMP = f"""builtin_interfaces/Time since
+builtin_interfaces/Duration[] blinks
+std_msgs/Header header
+float32[2] colour
+lamp_msgs/Bulb[] bulbs
+string class
+{SEPARATOR}
+MSG: lamp_msgs/Bulb
+string[] marks
+bool lit
+"""
+
+
+def lamp_bytes():
+    store = get_typestore(Stores.ROS2_JAZZY)
+    store.register(get_types_from_msg(LAMP, "lamp_msgs/msg/Lamp"))
+    kind = store.types
+    time, duration = kind["builtin_interfaces/msg/Time"], kind["builtin_interfaces/msg/Duration"]
+    lamp = kind["lamp_msgs/msg/Lamp"](
+        time(1, 2), [duration(0, 5), duration(-1, 0)], kind["std_msgs/msg/Header"](time(3, 4), "roof"),
+        np.array([0.5, 1.0], np.float32), [kind["lamp_msgs/msg/Bulb"](["a", "b"], True)], "E27",
+    )  # fmt: skip
+    return bytes(store.serialize_cdr(lamp, "lamp_msgs/msg/Lamp"))
+
+
+def test_a_foreign_type_is_read_by_its_definition():
+    codec = Codec({"lamp_msgs/msg/Lamp": LAMP})
+    lamp = codec.decode("lamp_msgs/msg/Lamp", lamp_bytes())
+    assert isinstance(lamp, Message)
+    assert lamp.ros_type == "lamp_msgs/msg/Lamp"
+    assert lamp.since_ns == 1_000_000_002
+    assert lamp.blinks_ns == (5, -1_000_000_000)
+    assert lamp.header == Header(3_000_000_004, "roof")
+    assert lamp.colour.tolist() == [0.5, 1.0]
+    assert (lamp.bulbs[0].marks, lamp.bulbs[0].lit) == (("a", "b"), True)
+    assert lamp.class_ == "E27"
+    assert lamp == codec.decode("lamp_msgs/msg/Lamp", lamp_bytes())
+    assert bytes(codec.encode(lamp)) == lamp_bytes()
+
+
+def test_a_foreign_type_leaves_the_standard_ones_alone():
+    odd = {"std_msgs/msg/String": "string text\nint32 more\n"}
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(odd["std_msgs/msg/String"], "std_msgs/msg/String"))
+    data = store.serialize_cdr(store.types["std_msgs/msg/String"]("x", 4), "std_msgs/msg/String")
+    found = Codec(odd).decode("std_msgs/msg/String", data)
+    assert (type(found) is not String, found.text, found.more) == (True, "x", 4)
+    assert decode("std_msgs/msg/String", encode(String("y"))) == String("y")
+
+
+def test_idl_is_read_too():
+    struct = "module lamp_msgs { module msg { struct Dim { double level; }; }; };"
+    idl = f"{SEPARATOR}\nIDL: lamp_msgs/msg/Dim\n{struct}"
+    codec = Codec({"lamp_msgs/msg/Dim": idl})
+    assert codec.decode("lamp_msgs/msg/Dim", b"\x00\x01\x00\x00" + np.float64(0.5).tobytes()).level == 0.5
+
+
+@pytest.mark.parametrize("text", ["float64", "x_msgs/Nowhere it\n", "wstring w\n"])
+def test_a_definition_that_cannot_be_used_is_told_when_it_is_needed(text):
+    codec = Codec({"odd_msgs/msg/Odd": text})
+    assert codec.decode("std_msgs/msg/Int32", encode(Int32(1))) == Int32(1)
+    with pytest.raises(CodecError, match=re.escape("odd_msgs/msg/Odd: ")):
+        codec.decode("odd_msgs/msg/Odd", b"\x00\x01\x00\x00")
+
+
+def test_all_parts_of_messages_are_core_classes():
+    """A part that core has and the codec does not know of would come as another class."""
+    parts = {cls for cls in vars(messages).values() if attrs.has(cls)} - set(MESSAGE_TYPES.values()) - {Message}
+    from ibrobot_ros2.convert import _PARTS
+
+    assert parts == set(_PARTS.values())
