@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import override
 
 import attrs
+from mcap.records import Channel
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader, ReaderError
 
@@ -64,10 +65,10 @@ class McapSource(Source):
             raise
         # What the first file repeats lies in none that is read here.
         blocks = [
-            (block.start_ns, file, block)
-            for index, file in enumerate(self._files)
+            (block.start_ns, number, block)
+            for number, file in enumerate(self._files)
             for block in file.blocks
-            if not (index and block.repeated)
+            if not (number and block.repeated)
         ]
         self._blocks = sorted(blocks, key=lambda item: item[0])
         self.finished = all(file.finished for file in self._files)
@@ -85,29 +86,29 @@ class McapSource(Source):
                 schema_of = file.schemas.get(channel.schema_id)
                 types[channel.topic] = schema_of.name if schema_of else "?"
                 counts.setdefault(channel.topic, 0)
-        for _, file, block in blocks:
-            for number, count in block.counts.items():
-                counts[file.channels[number].topic] += count
+        for _, number, block in blocks:
+            for key, count in block.counts.items():
+                counts[self._files[number].channels[key].topic] += count
         self.types, self.counts, self.custom = types, counts, {}
 
     @override
     def messages(self, topics: Collection[str]) -> Iterator[Raw]:
-        waiting: list[tuple[int, int, McapFile, Entry]] = []
-        serial = 0
-        for index, (_, file, block) in enumerate(self._blocks):
-            wanted = {number for number, channel in file.channels.items() if channel.topic in topics}
+        # Equal stamps stay in the order written: file, chunk, place in it.
+        waiting: list[tuple[int, int, int, int, Entry]] = []
+        for index, (_, number, block) in enumerate(self._blocks):
+            file = self._files[number]
+            wanted = {key for key, channel in file.channels.items() if channel.topic in topics}
             if not wanted.isdisjoint(block.counts):
-                for entry in file.entries(block):
+                for place, entry in enumerate(file.entries(block)):
                     if entry.channel in wanted:
-                        heapq.heappush(waiting, (entry.received_ns, serial, file, entry))
-                        serial += 1
+                        heapq.heappush(waiting, (entry.received_ns, number, block.offset, place, entry))
             # Nothing that comes later begins before this.
             bound = self._blocks[index + 1][0] if index + 1 < len(self._blocks) else 2**64
             while waiting and waiting[0][0] < bound:
-                yield self._raw(*heapq.heappop(waiting)[2:])
+                _, origin, _, _, entry = heapq.heappop(waiting)
+                yield self._raw(self._files[origin].channels[entry.channel], entry)
 
-    def _raw(self, file: McapFile, entry: Entry) -> Raw:
-        channel = file.channels[entry.channel]
+    def _raw(self, channel: Channel, entry: Entry) -> Raw:
         # A copy: a view would keep its whole chunk in memory.
         return Raw(
             channel.topic, self.types[channel.topic], bytes(entry.data), entry.received_ns, entry.published_ns

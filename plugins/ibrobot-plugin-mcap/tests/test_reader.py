@@ -1,0 +1,248 @@
+"""Reading: any beginning of a file, damage, order, and bags from elsewhere."""
+
+from __future__ import annotations
+
+import shutil
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from ibrobot_mcap import ibrobot_readers
+from ibrobot_mcap.reader import Rosbag2Reader, is_rosbag2
+from ibrobot_mcap.scan import McapFile
+from ibrobot_ros2 import definition, encode
+from mcap.writer import CompressionType, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import Writer as RosbagsWriter
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from ibrobot_core.errors import RecorderError
+from ibrobot_core.messages import CompressedImage, Header, JointState
+from ibrobot_core.plugins import installed
+
+from .conftest import CAMERA, JOINTS, Bench, joints, picture, read, reading, stamp, summary
+
+LAMP = "builtin_interfaces/Time since\nstring[] marks\n"
+
+
+@pytest.fixture(scope="module", params=["none", "lz4", "zstd"])
+def unfinished(request, tmp_path_factory):
+    """The file of an episode that was never ended, with 400 messages in many chunks."""
+    made = Bench(tmp_path_factory.mktemp("kept"), compression=request.param, chunk_size=2048)
+    made.begin(prompt="pick")
+    made.write(400)
+    made.recorder._storage.flush_due()
+    copy = tmp_path_factory.mktemp("copy") / "file.mcap"
+    shutil.copyfile(made.path / "episode_000001_0.mcap", copy)
+    made.end()
+    return copy
+
+
+def test_any_beginning_of_a_file_can_be_read(unfinished, tmp_path_factory):
+    """What a killed process leaves ends anywhere. What is read is a beginning of what was written."""
+    whole = unfinished.read_bytes()
+    path = tmp_path_factory.mktemp("cut") / "file.mcap"
+    counts = {}
+
+    @settings(max_examples=60, deadline=None)
+    @given(st.integers(0, len(whole)) | st.integers(len(whole) - 100, len(whole)))
+    def check(length):
+        path.write_bytes(whole[:length])
+        found = [r.message for r in read(path)]
+        assert found == [joints(i) for i in range(len(found))]
+        kept = summary(path)
+        assert not kept.finished
+        assert sum(topic.count for topic in kept.topics.values()) == len(found)
+        assert (kept.start_ns, kept.end_ns) == ((stamp(0), stamp(len(found) - 1)) if found else (0, 0))
+        counts[length] = len(found)
+
+    check()
+    lengths = sorted(counts)
+    assert [counts[length] for length in lengths] == sorted(counts.values())
+    assert max(counts.values()) > 300
+
+
+def test_zeros_behind_what_was_written_are_passed_over(unfinished, tmp_path):
+    """A power failure may leave a file longer than what reached the disk."""
+    path = tmp_path / "file.mcap"
+    path.write_bytes(unfinished.read_bytes() + bytes(5000))
+    assert len(read(path)) == len(read(unfinished))
+
+
+def test_an_unfinished_episode_tells_what_it_is(unfinished, tmp_path):
+    folder = tmp_path / "episode_000007"
+    folder.mkdir()
+    shutil.copyfile(unfinished, folder / "episode_000007_0.mcap")
+    kept = summary(folder)
+    assert (kept.finished, dict(kept.metadata), kept.outcome) == (False, {"prompt": "pick"}, "unknown")
+
+
+def test_damage_in_the_midst_is_told_after_what_came_before(bench):
+    made = bench(chunk_size=2048)
+    made.begin()
+    made.write(200)
+    path = made.end()
+    file = path / "episode_000001_0.mcap"
+    chunks = McapFile(file)
+    chunks.close()
+    block = chunks.blocks[len(chunks.blocks) // 2]
+    content = bytearray(file.read_bytes())
+    content[block.offset + block.length - 5] ^= 0xFF
+    file.write_bytes(content)
+    found = []
+    with (
+        reading(path) as reader,
+        pytest.raises(RecorderError, match=rf"chunk at byte {block.offset} is damaged: its checksum"),
+    ):
+        found.extend(item.message for item in reader.messages())
+    assert 10 < len(found) < 190
+    assert found == [joints(i) for i in range(len(found))]
+
+
+def test_metadata_that_lists_missing_files_is_refused(bench):
+    made = bench()
+    made.begin()
+    path = made.end()
+    (path / "episode_000001_0.mcap").rename(path / "other.mcap")
+    with pytest.raises(RecorderError, match=r"episode_000001_0.mcap is missing, which metadata.yaml lists"):
+        Rosbag2Reader(path)
+
+
+NOT_BAGS = {
+    "file.mcap": (b"RIFF....WAVE", "not an MCAP file: begins with 52 49 46 46"),
+    "file.db3": (b"no database", "file.db3: "),
+}
+
+
+@pytest.mark.parametrize(("name", "content", "reason"), [(n, *rest) for n, rest in NOT_BAGS.items()])
+def test_what_is_no_bag_is_refused(tmp_path, name, content, reason):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(RecorderError, match=reason):
+        Rosbag2Reader(tmp_path / name)
+
+
+@pytest.mark.parametrize("text", ["- 1\n", "{", "rosbag2_bagfile_information: 5\n"])
+def test_metadata_that_is_none_is_refused(tmp_path, text):
+    (tmp_path / "metadata.yaml").write_text(text)
+    with pytest.raises(RecorderError, match=r"metadata.yaml: its metadata is not that of a rosbag2"):
+        Rosbag2Reader(tmp_path)
+
+
+def test_bags_are_known_by_their_looks(tmp_path, bench):
+    assert not is_rosbag2(tmp_path)
+    made = bench()
+    made.begin()
+    assert is_rosbag2(made.path)
+    (reader,) = ibrobot_readers()
+    assert reader.reads(made.path)
+    opened = installed().open_episode(made.end())
+    assert opened.summary().finished
+    opened.close()
+    opened.close()
+
+
+def test_messages_may_be_read_again_and_by_topic(bench):
+    made = bench(chunk_size=2048)
+    made.begin(topics=(JOINTS, CAMERA))
+    made.write(50)
+    made.write(2, CAMERA, picture, start=50)
+    with reading(made.end()) as reader:
+        assert [r.message for r in reader.messages({CAMERA})] == [picture(50), picture(51)]
+        assert [r.message for r in reader.messages({JOINTS, "/nowhere"})] == [joints(i) for i in range(50)]
+        assert len(list(reader.messages())) == 52 == len(list(reader.messages()))
+        item = next(reader.messages())
+        assert (item.topic, item.received_ns, item.published_ns) == (JOINTS, stamp(0), stamp(0))
+
+
+def test_messages_keep_no_chunk_in_memory(bench):
+    made = bench()
+    made.begin()
+    made.write(1000)
+    first = read(made.end())[0].message.position
+    while first.base is not None and not isinstance(first.base, bytes | memoryview):
+        first = first.base
+    owner = first.base.obj if isinstance(first.base, memoryview) else first.base
+    assert len(owner) < 500
+
+
+@pytest.mark.parametrize("chunking", [True, False])
+@settings(max_examples=20, deadline=None)
+@given(st.lists(st.integers(0, 50), min_size=1, max_size=60))
+def test_messages_come_in_the_order_of_receipt(tmp_path_factory, chunking, stamps):
+    """Also from a file whose chunks overlap; equal stamps stay in the order written."""
+    path = tmp_path_factory.mktemp("mixed") / "file.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream, chunk_size=300, compression=CompressionType.NONE, use_chunking=chunking)
+        writer.start("ros2", "another writer")
+        schema = writer.register_schema(JointState.ros_type, "ros2msg", definition(JointState.ros_type).encode())
+        channel = writer.register_channel(JOINTS, "cdr", schema)
+        for index, at_ns in enumerate(stamps):
+            writer.add_message(channel, at_ns, bytes(encode(JointState(Header(index), ()))), at_ns + 7)
+        writer.finish()
+    found = read(path)
+    expected = sorted(range(len(stamps)), key=lambda index: stamps[index])
+    assert [r.message.header.stamp_ns for r in found] == expected
+    assert [(r.received_ns, r.published_ns) for r in found] == [(stamps[i], stamps[i] + 7) for i in expected]
+    kept = summary(path)
+    assert (kept.finished, kept.start_ns, kept.end_ns) == (True, min(stamps), max(stamps))
+    assert kept.topics[JOINTS].count == len(stamps)
+
+
+@pytest.mark.parametrize("storage", list(StoragePlugin))
+@pytest.mark.parametrize("compression", [None, CompressionMode.MESSAGE, CompressionMode.FILE])
+def test_foreign_bags_are_read(tmp_path, storage, compression):
+    store = get_typestore(Stores.ROS2_JAZZY)
+    store.register(get_types_from_msg(LAMP, "lamp_msgs/msg/Lamp"))
+    kind = store.types
+    writer = RosbagsWriter(tmp_path / "bag", version=9, storage_plugin=storage)
+    if compression is not None:
+        writer.set_compression(compression, CompressionFormat.ZSTD)
+    with writer:
+        known = writer.add_connection(JOINTS, JointState.ros_type, typestore=store)
+        foreign = writer.add_connection("/lamp", "lamp_msgs/msg/Lamp", typestore=store)
+        writer.set_custom_data("place", "lab")
+        lamp = kind["lamp_msgs/msg/Lamp"](kind["builtin_interfaces/msg/Time"](1, 2), ["a"])
+        for index in range(20):
+            writer.write(known, stamp(index), bytes(encode(joints(index))))
+            writer.write(foreign, stamp(index), store.serialize_cdr(lamp, "lamp_msgs/msg/Lamp"))
+    kept = summary(tmp_path / "bag")
+    assert {topic: (t.type, t.count) for topic, t in kept.topics.items()} == {
+        JOINTS: (JointState.ros_type, 20), "/lamp": ("lamp_msgs/msg/Lamp", 20),
+    }  # fmt: skip
+    assert (kept.finished, kept.start_ns, kept.end_ns) == (True, stamp(0), stamp(19))
+    assert (dict(kept.metadata), kept.outcome) == ({"place": "lab"}, "unknown")
+    assert [r.message for r in read(tmp_path / "bag", {JOINTS})] == [joints(i) for i in range(20)]
+    lamps = read(tmp_path / "bag", {"/lamp"})
+    assert {(r.message.since_ns, r.message.marks) for r in lamps} == {(1_000_000_002, ("a",))}
+    assert [r.received_ns for r in lamps] == [r.published_ns for r in lamps] == [stamp(i) for i in range(20)]
+
+
+def foreign_file(path, type_name, text, payloads, encoding="ros2msg"):
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("ros2", "another writer")
+        schema = writer.register_schema(type_name, encoding, text.encode())
+        channel = writer.register_channel("/it", "cdr", schema)
+        for index, payload in enumerate(payloads):
+            writer.add_message(channel, stamp(index), payload, stamp(index))
+        writer.finish()
+
+
+def test_a_type_that_cannot_be_read_is_told_by_topic(tmp_path):
+    foreign_file(tmp_path / "file.mcap", "odd_msgs/msg/Odd", "wstring text\n", [b"\x00\x01\x00\x00"])
+    assert summary(tmp_path / "file.mcap").topics["/it"].count == 1
+    with pytest.raises(RecorderError, match=rf"/it at {stamp(0)} ns: odd_msgs/msg/Odd: "):
+        read(tmp_path / "file.mcap")
+
+
+def test_foreign_pictures_come_as_they_are_unless_jpeg(tmp_path):
+    png = CompressedImage(Header(1), "png", np.frombuffer(b"\x89PNG....", np.uint8))
+    text = definition(CompressedImage.ros_type)
+    foreign_file(tmp_path / "file.mcap", CompressedImage.ros_type, text, [bytes(encode(png))])
+    assert summary(tmp_path / "file.mcap").topics["/it"].type == CompressedImage.ros_type
+    assert [r.message for r in read(tmp_path / "file.mcap")] == [png]
+    broken = CompressedImage(Header(1), "jpeg", np.frombuffer(b"\xff\xd8\xff....", np.uint8))
+    foreign_file(tmp_path / "file.mcap", CompressedImage.ros_type, text, [bytes(encode(broken))])
+    with pytest.raises(RecorderError, match=rf"/it at {stamp(0)} ns: JPEG picture of 7 bytes: "):
+        read(tmp_path / "file.mcap")
