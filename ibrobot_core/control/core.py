@@ -75,6 +75,7 @@ class ControlCore:
             "switch_mode": self._switch_mode,
             "reset_episode": self._reset_episode,
             "estop": self._estop,
+            "fault": self._raise_fault,
             "reset": self._reset,
             "goal": self._goal,
             "cancel": self._cancel,

@@ -40,7 +40,8 @@ class Teleop(ABC):
             measured: the robot's joints in robot order, for devices that move relative to them.
 
         Raises:
-            TeleopError: when the device is gone or not connected.
+            TeleopError: when the device is gone or not connected; a fault, until a reset after which `disconnect` and
+                `connect` have brought it back.
         """
 
     @abstractmethod

@@ -128,10 +128,11 @@ class Runtime:
         """Clear faults and the emergency stop; the mode begins anew from where the joints are.
 
         Raises:
-            HardwareError: when the hardware does not answer yet.
+            IbrobotError: when the hardware, or what the mode needs, does not answer yet.
         """
         session = self.session
         if session.feeder is not None:
+            session.feeder.recover()
             session.feeder.end()
         session.command("reset")
         if session.feeder is not None:

@@ -63,6 +63,13 @@ class Feed(ABC):
     def stop(self) -> None:
         """Release what it took."""
 
+    def recover(self) -> None:
+        """A reset is to come: make ready again what failed.
+
+        Raises:
+            IbrobotError: when that cannot be; the fault stays.
+        """
+
     def take_goal(self, event: Mapping[str, Any]) -> None:
         """A goal of an executor changed its state."""
 
@@ -119,7 +126,7 @@ class Session:
     def context(self, name: str, *, seed: int | None = None) -> Context:
         """The context for a plugin's `make` in the host."""
         config = self.config
-        simulation = config.simulation.options if config.simulated and config.simulation is not None else None
+        simulation = config.simulation.options if config.simulation is not None else None
         return Context(
             name=name, clock=self.clock, log=logging.getLogger(f"ibrobot.{name}"), robot=config.robot,
             joints=config.robot.joint_names, period_ns=ns(1.0 / config.control.rate_hz),

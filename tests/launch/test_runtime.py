@@ -10,7 +10,7 @@ import attrs
 import pytest
 
 from ibrobot_core.config.schema import Component
-from ibrobot_core.errors import ComponentFailed, NotSupported, PlanningError
+from ibrobot_core.errors import ComponentFailed, NotSupported, PlanningError, TeleopError
 from ibrobot_core.launch.runtime import ESTOP, RESET, Runtime
 from ibrobot_core.launch.session import Session
 from ibrobot_core.options import NoOptions
@@ -201,6 +201,35 @@ def test_hardware_that_falls_silent_is_a_fault_and_a_reset_goes_on(runs: Runs):
     seconds(runtime, 0.5)
     assert position(runtime) > stuck + 0.03
     assert runtime.summary()["faults"] == [fault], "what happened is not forgotten"
+
+
+def test_a_teleop_device_that_is_lost_is_a_fault_and_a_reset_connects_it_anew(
+    runs: Runs, monkeypatch: pytest.MonkeyPatch
+):
+    runtime = runs.start(mode="teleop")
+    stick = runs.parts.MADE["stick"]
+    seconds(runtime, 0.4)
+    stick.disconnect()
+    seconds(runtime, 0.4)
+    assert not runtime.session.finished.is_set()
+    (fault,) = runtime.summary()["faults"]
+    assert "not connected" in fault
+    stopped = position(runtime)
+    seconds(runtime, 0.5)
+    assert position(runtime) == pytest.approx(stopped, abs=1e-3)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(stick, "connect", lambda: (_ for _ in ()).throw(TeleopError("still gone")))
+        with pytest.raises(TeleopError, match="still gone"):
+            runtime.reset()
+    seconds(runtime, 0.5)
+    assert position(runtime) == pytest.approx(stopped, abs=1e-3)
+
+    runtime.reset()
+    seconds(runtime, 0.5)
+    assert 0.03 < position(runtime) - stopped < 0.15, "it goes on from where it stood, with no jump"
+    assert runtime.summary()["faults"] == [fault]
+    assert runs.parts.CALLS.count("connect stick") == 2
 
 
 def test_services_end_with_the_run(runs: Runs):

@@ -8,13 +8,17 @@ import numpy as np
 
 from ibrobot_core.bus import Subscription
 from ibrobot_core.config.schema import ControlMode
+from ibrobot_core.errors import TeleopError
 from ibrobot_core.interfaces import Teleop
 from ibrobot_core.launch.feeder import Feeder
 from ibrobot_core.launch.session import Session
 
 
 class TeleopFeeder(Feeder):
-    """A teleoperation device. It joins at the plan: there is one way to the motors."""
+    """A teleoperation device. It joins at the plan: there is one way to the motors.
+
+    A device that fails while the robot follows is a fault; a reset connects it anew.
+    """
 
     def __init__(self, session: Session, mode: ControlMode, device: str, needs: tuple[str, ...]) -> None:
         component = session.config.teleoperation[device]
@@ -23,6 +27,7 @@ class TeleopFeeder(Feeder):
         self._component = component
         self._device: Teleop | None = None
         self._states: Subscription | None = None
+        self._lost = False
 
     @override
     def setup(self) -> None:
@@ -31,6 +36,14 @@ class TeleopFeeder(Feeder):
         device = self._device = descriptor.make(self._component.options, session.context(self._device_name))
         device.connect()
         self._states = session.bus.subscribe("/joint_states", 1)
+
+    @override
+    def recover(self) -> None:
+        with self.lock:
+            if self._lost and self._device is not None:
+                self._device.disconnect()
+                self._device.connect()
+                self._lost = False
 
     @override
     def begin_feeding(self, seed: int) -> None:
@@ -49,7 +62,13 @@ class TeleopFeeder(Feeder):
 
     def _follow(self, device: Teleop) -> None:
         session = self.session
-        command = device.read(session.measured())
+        try:
+            command = device.read(session.measured())
+        except TeleopError as error:
+            self._lost = True
+            self.end()
+            session.control.call("fault", fault=str(error))
+            return
         if command.estop:
             session.control.call("estop")
         elif command.positions:

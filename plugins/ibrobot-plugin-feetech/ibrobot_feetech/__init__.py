@@ -1,16 +1,18 @@
-"""The plugin's hooks: hardware `feetech_so101`, the commands `ibrobot feetech …`, a check of the serial ports."""
+"""The plugin's hooks: hardware `feetech_so101`, teleop `so101_leader`, `ibrobot feetech …`, a check of the ports."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.descriptors import HardwareDescriptor
+from ibrobot_core.descriptors import Command, HardwareDescriptor, SensorDescriptor, TeleopDescriptor
 from ibrobot_core.hookspecs import hookimpl
-from ibrobot_feetech.options import FollowerOptions
+from ibrobot_feetech.options import EmulatedSignalOptions, FollowerOptions, LeaderOptions
 
 if TYPE_CHECKING:
-    from ibrobot_core.interfaces import Context, Hardware
+    import click
+
+    from ibrobot_core.interfaces import Context, Hardware, Sensor, Teleop
 
 
 def _follower(options: Any, ctx: Context) -> Hardware:
@@ -19,9 +21,50 @@ def _follower(options: Any, ctx: Context) -> Hardware:
     return FeetechFollower(options, ctx)
 
 
+def _signal(options: Any, ctx: Context) -> Sensor:
+    from ibrobot_feetech.emulator.signals import EmulatedSignal
+
+    return EmulatedSignal(options, ctx)
+
+
+def _leader(options: Any, ctx: Context) -> Teleop:
+    from ibrobot_feetech.leader import LeaderTeleop
+
+    return LeaderTeleop(options, ctx)
+
+
 @hookimpl
 def ibrobot_hardware() -> Iterable[HardwareDescriptor]:
     """The SO-101 on its servo bus."""
     yield HardwareDescriptor(
         type="feetech_so101", options=FollowerOptions, make=_follower, summary="SO-101 arm: STS3215 servos on one bus"
     )
+
+
+@hookimpl
+def ibrobot_sensors() -> Iterable[SensorDescriptor]:
+    """What the simulation behind an emulated arm says of its scene."""
+    yield SensorDescriptor(
+        type="feetech_emulator", kind="simulation", options=EmulatedSignalOptions, make=_signal,
+        summary="a signal of the simulation that moves an emulated arm",
+    )  # fmt: skip
+
+
+@hookimpl
+def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
+    """The SO-101's leader arm."""
+    yield TeleopDescriptor(
+        type="so101_leader", options=LeaderOptions, make=_leader, summary="SO-101 leader arm, moved by hand"
+    )
+
+
+def _commands() -> click.Command:
+    from ibrobot_feetech.commands import feetech
+
+    return feetech
+
+
+@hookimpl
+def ibrobot_commands() -> Iterable[Command]:
+    """`ibrobot feetech …`."""
+    yield Command("feetech", "Set up, calibrate, watch and emulate the servos of an SO-101.", _commands)

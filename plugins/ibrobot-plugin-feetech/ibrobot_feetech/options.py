@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import attrs
 
 from ibrobot_core.options import option
@@ -32,3 +34,43 @@ class FollowerOptions:
         None, unit="Nm", gt=0, help="turns the servos' load into an estimate of effort; without it there is none"
     )
     write_calibration: bool = option(False, help="write the calibration to servos that have another, at the start")
+
+
+@attrs.frozen
+class LeaderOptions:
+    """Options of `type: so101_leader`: an arm of STS3215 servos that a person moves."""
+
+    port: str = option(help="serial port, e.g. /dev/ttyACM1; a path under /dev/serial/by-id stays the same")
+    calibration: str = option(help="name of a calibration, or a path to one; ibrobot feetech calibrate makes it")
+    baud_rate: int = option(1_000_000, unit="baud", gt=0, help="of the bus")
+    joints: Mapping[str, str] = option(
+        factory=dict, help="joint of the leader -> joint of the robot; all of the same names where nothing is said"
+    )
+    inverted: tuple[str, ...] = option((), help="joints of the leader that turn the robot's the other way")
+    scaled: tuple[str, ...] = option(
+        ("gripper",), help="joints of the leader whose calibrated range becomes the robot's limits; others map by angle"
+    )
+    ramp_velocity: float = option(
+        1.0, unit="rad/s", gt=0, help="at which the robot approaches the leader's pose at first and after each pause"
+    )
+    follow_tolerance: float = option(
+        0.02, unit="rad", gt=0, help="distance from the leader's pose at which the approach ends"
+    )
+    deadman: str = option(
+        "none",
+        choices=("none", "toggle", "hold"),
+        help="none: always follows; toggle: space follows and pauses; hold: follows while space is held",
+    )
+    release: float = option(
+        0.2, unit="s", gt=0, le=1, help="deadman hold: without a repeat of the key for so long, it counts as released"
+    )
+    estop_key: str = option("esc", help="key of the emergency stop")
+    lost_replies: int = option(3, unit="reads", ge=0, help="replies of one servo in a row that may be missing")
+
+
+@attrs.frozen
+class EmulatedSignalOptions:
+    """Options of `type: feetech_emulator`: a signal of the simulation that moves an emulated arm."""
+
+    socket: str = option(help="the socket that `ibrobot feetech emulate --physics` prints")
+    signal: str = option(help="topic of the signal, e.g. /simulation/scene")

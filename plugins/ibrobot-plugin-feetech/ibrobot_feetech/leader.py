@@ -1,0 +1,247 @@
+"""Teleop `so101_leader`: an arm without torque that a person moves, and that the robot follows."""
+
+from __future__ import annotations
+
+import queue
+from collections.abc import Sequence
+from typing import override
+
+import numpy as np
+
+from ibrobot_core.calibration import load_calibration
+from ibrobot_core.errors import HardwareError, TeleopError
+from ibrobot_core.interfaces import Context, JointReading, Teleop, TeleopCommand
+from ibrobot_core.robot import Vector
+from ibrobot_core.units import TICKS_PER_TURN, ns, seconds, ticks_to_lerobot
+from ibrobot_feetech.arm import Arm, calibration_differences, find_servos, relax
+from ibrobot_feetech.bus import FeetechBus
+from ibrobot_feetech.errors import FeetechError
+from ibrobot_feetech.options import LeaderOptions
+from ibrobot_feetech.sync import SyncReader
+
+_LONGEST_STEP_S = 0.1
+"""What a ramp makes up for at most, after a host that stood still [s]."""
+_FASTEST_HAND = 13_000
+"""Faster than a person turns a joint [ticks/s]: three turns a second."""
+_SLACK = 64
+"""What a position may differ from the last one at any rate [ticks]."""
+
+
+class LeaderTeleop(Teleop):
+    """Maps the leader's positions to the robot's joints; approaches them slowly at first, then follows directly.
+
+    Joints are mapped by angle; those in `scaled` by their share of the calibrated range, which becomes the same share
+    of the robot's limits. Arrays here have one element for each mapped joint, shape (S,).
+    """
+
+    def __init__(self, options: LeaderOptions, ctx: Context) -> None:
+        self._options = options
+        self._ctx = ctx
+        robot = ctx.robot
+        pairs = dict(options.joints) or {joint: joint for joint in robot.joint_names}
+        self._leader_joints = tuple(pairs)
+        self._joints = tuple(pairs.values())
+        self._check_names("joints", self._joints, robot.joint_names)
+        calibration = load_calibration(options.calibration, self._leader_joints)
+        for option, names in (("inverted", options.inverted), ("scaled", options.scaled)):
+            self._check_names(option, names, tuple(calibration.joints))
+        self._arm = Arm(self._leader_joints, calibration)
+        joints = [calibration.joints[name] for name in self._leader_joints]
+        self._range = np.array([joint.range_min for joint in joints]), np.array([joint.range_max for joint in joints])
+        self._turned = np.array([joint.inverted for joint in joints])
+        self._mirrored = np.array([name in options.inverted for name in self._leader_joints])
+        self._scaled = np.array([name in options.scaled for name in self._leader_joints])
+        columns = robot.indices(self._joints)
+        self._columns = columns
+        self._lower, self._upper = robot.lower[columns], robot.upper[columns]
+        self._ramp = np.minimum(options.ramp_velocity, robot.max_velocity[columns])
+
+        self._bus: FeetechBus | None = None
+        self._reader: SyncReader | None = None
+        self._keys: queue.SimpleQueue[str] | None = None
+        self._ticks = np.zeros(len(pairs), dtype=np.int32)
+        """The last good positions."""
+        self._ticks_ns = np.zeros(len(pairs), dtype=np.int64)
+        """When they came [ns]."""
+        self._lost = np.zeros(len(pairs), dtype=np.int32)
+        """Reads since then."""
+        self._setpoint: Vector | None = None
+        """The last one [rad]; None while paused."""
+        self._set_ns = 0
+        """When it was made [ns]."""
+        self._following = False
+        """Whether the approach is over."""
+        self._toggled = False
+        self._pressed_ns: int | None = None
+        self._held_until_ns = 0
+
+    @override
+    def connect(self) -> None:
+        if self._options.deadman != "none" and self._ctx.keys is None:
+            raise TeleopError(
+                f"{self._ctx.name}: deadman: {self._options.deadman} needs a terminal: start ibrobot in one, its input "
+                "not redirected, or set deadman: none"
+            )
+        bus = FeetechBus(self._options.port, baud_rate=self._options.baud_rate, joints=self._arm.names)
+        try:
+            bus.open()
+            self._prepare(bus)
+        except HardwareError as error:
+            bus.close()
+            raise TeleopError(f"{self._ctx.name}: {error}") from None
+        self._bus, self._reader = bus, SyncReader(bus, self._arm.servos, "present_position")
+        self._keys = self._ctx.keys() if self._ctx.keys is not None else None
+
+    @override
+    def activate(self, measured: JointReading) -> None:
+        self._release()
+        self._typed()  # what was typed for something else
+
+    @override
+    def read(self, measured: JointReading) -> TeleopCommand:
+        if self._reader is None:
+            raise TeleopError(f"{self._ctx.name}: the leader is not connected: connect comes before read")
+        now_ns = measured.stamp_ns
+        if self._options.estop_key in (typed := self._typed()):
+            self._release()
+            return TeleopCommand(None, estop=True)
+        self._obey(typed.count("space"), now_ns)
+        self._receive(self._reader, now_ns)
+        if not self._engaged(now_ns):
+            self._setpoint = None
+            return TeleopCommand(None)
+        self._setpoint = self._next(measured)
+        return TeleopCommand(dict(zip(self._joints, self._setpoint.tolist(), strict=True)))
+
+    @override
+    def disconnect(self) -> None:
+        bus, self._bus, self._reader, self._keys = self._bus, None, None, None
+        if bus is not None:
+            bus.close()
+
+    @override
+    def help(self) -> str:
+        words = {
+            "none": "the robot follows the leader arm",
+            "toggle": "space  follow the leader arm, and pause",
+            "hold": "space held  follow the leader arm",
+        }
+        return f"{words[self._options.deadman]}   {self._options.estop_key}  emergency stop"
+
+    def _check_names(self, option: str, names: Sequence[str], known: Sequence[str]) -> None:
+        for name in names:
+            if name not in known:
+                raise TeleopError(f"{self._ctx.name}: {option}: no joint {name!r}; the joints are: {', '.join(known)}")
+
+    def _prepare(self, bus: FeetechBus) -> None:
+        """Torque off and seen to be, answers without delay, the calibration's numbers in the servos.
+
+        Raises:
+            HardwareError: e.g. naming a servo that does not answer.
+        """
+        ids = self._arm.servos
+        find_servos(bus, self._arm)
+        relax(bus, ids)
+        for servo, delay in bus.sync_read("return_delay", ids).items():
+            if delay:
+                bus.write(servo, "lock", 0)
+                bus.write(servo, "return_delay", 0)
+                bus.write(servo, "lock", 1)
+        for servo, name, found, wanted in calibration_differences(bus, self._arm):
+            raise HardwareError(
+                f"{bus.place(servo, name)}: the servo has {found}, {self._arm.calibration.path} says {wanted}; "
+                "`ibrobot feetech check` shows all differences, `ibrobot feetech calibrate` makes a new calibration"
+            )
+        ticks = bus.sync_read("present_position", ids)
+        self._ticks[:] = [ticks[servo] for servo in ids]
+        self._ticks_ns[:] = self._ctx.clock.now_ns()
+        self._lost[:] = 0
+
+    def _receive(self, reader: SyncReader, now_ns: int) -> None:
+        """Take the positions that came; those that did not, or that no hand can have reached, stay as they were."""
+        try:
+            replies = reader.read()
+        except FeetechError as error:
+            raise TeleopError(f"{self._ctx.name}: {error}") from None
+        # Error bits are passed over: without torque nothing can overheat, and the encoder is right all the same.
+        ticks = replies.values[:, 0]
+        reach = _SLACK + _FASTEST_HAND * (now_ns - self._ticks_ns) * 1e-9
+        good = replies.answered & (ticks >= 0) & (ticks < TICKS_PER_TURN) & (np.abs(ticks - self._ticks) <= reach)
+        self._ticks[good] = ticks[good]
+        self._ticks_ns[good] = now_ns
+        self._lost = np.where(good, 0, self._lost + 1)
+        worst = int(np.argmax(self._lost))
+        if self._lost[worst] > self._options.lost_replies:
+            self._give_up(worst, int(ticks[worst]) if replies.answered[worst] else None)
+
+    def _give_up(self, joint: int, ticks: int | None) -> None:
+        assert self._bus is not None
+        what = (
+            "no reply"
+            if ticks is None
+            else f"position {ticks} right after {self._ticks[joint]}, which no hand can do: "
+            "it passed the encoder's end (0/4095), so calibrate again, or its answers are damaged"
+        )
+        place, times = self._bus.place(self._arm.servos[joint]), self._lost[joint]
+        raise TeleopError(
+            f"{self._ctx.name}: {place}: {what}, {times} times in a row; check its power and the cable to it"
+        )
+
+    def _pose(self) -> Vector:
+        """What the leader's positions mean for the robot [rad], within its limits."""
+        ticks = self._ticks.astype(np.float64)
+        low, high = self._range
+        angles = np.where(self._mirrored, -1.0, 1.0) * self._arm.radians(ticks)
+        opened = ticks_to_lerobot(
+            ticks, "range_0_100", range_min=low, range_max=high, inverted=self._turned != self._mirrored
+        )
+        positions = np.where(self._scaled, self._lower + opened / 100 * (self._upper - self._lower), angles)
+        return np.clip(positions, self._lower, self._upper)
+
+    def _next(self, measured: JointReading) -> Vector:
+        """The setpoint [rad]: the measured positions at first, then nearer to the leader's, then the leader's."""
+        now_ns, pose = measured.stamp_ns, self._pose()
+        before = self._setpoint
+        elapsed_s, self._set_ns = min(seconds(now_ns - self._set_ns), _LONGEST_STEP_S), now_ns
+        if before is None:
+            self._following = False
+            return measured.position[list(self._columns)]
+        way = pose - before
+        if self._following or np.abs(way).max() <= self._options.follow_tolerance:
+            self._following = True
+            return pose
+        # All joints arrive together: the one with the longest way sets the pace.
+        share = float(np.min(self._ramp * elapsed_s / np.maximum(np.abs(way), 1e-9)))
+        return before + way * min(1.0, share)
+
+    def _release(self) -> None:
+        """As if nobody had touched a key: paused where there is a deadman, and a ramp to begin with."""
+        self._setpoint = self._pressed_ns = None
+        self._toggled = False
+        self._held_until_ns = 0
+
+    def _typed(self) -> list[str]:
+        typed: list[str] = []
+        while self._keys is not None and not self._keys.empty():
+            typed.append(self._keys.get_nowait())
+        return typed
+
+    def _obey(self, presses: int, now_ns: int) -> None:
+        """Take in presses of the deadman.
+
+        A terminal tells of no release, but repeats a held key: it is held while presses come close together.
+        """
+        release_ns = ns(self._options.release)
+        for _ in range(presses):
+            self._toggled = not self._toggled
+            if self._pressed_ns is not None and now_ns - self._pressed_ns <= release_ns:
+                self._held_until_ns = now_ns + release_ns
+            self._pressed_ns = now_ns
+
+    def _engaged(self, now_ns: int) -> bool:
+        match self._options.deadman:
+            case "toggle":
+                return self._toggled
+            case "hold":
+                return now_ns < self._held_until_ns
+        return True

@@ -1,0 +1,318 @@
+"""The leader against the emulated bus: mapping, approach, deadman, lost replies, and coming back."""
+
+from __future__ import annotations
+
+import math
+import queue
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, override
+
+import numpy as np
+import pytest
+from ibrobot_feetech.emulator import Emulator
+from ibrobot_feetech.leader import LeaderTeleop
+from ibrobot_feetech.options import LeaderOptions
+
+from ibrobot_core.clock import SteppedClock
+from ibrobot_core.errors import TeleopError
+from ibrobot_core.interfaces import Context, JointReading, Teleop, TeleopCommand
+from ibrobot_core.robot import Vector
+from ibrobot_core.testing import TeleopSuite
+from ibrobot_core.testing.contexts import START_NS, host_context
+
+from .conftest import JOINTS, OFFSETS, arm_calibration, prepare
+
+TICK_NS = 10_000_000
+RADIAN = 4096 / (2 * math.pi)
+"""Ticks."""
+
+
+class LeaderSuite(TeleopSuite):
+    @pytest.fixture(autouse=True)
+    def _arm(self, calibration_file: Path) -> Iterator[None]:
+        self.file, self.typed = calibration_file, queue.SimpleQueue[str]()
+        with Emulator(6) as self.emulator:
+            prepare(self.emulator, arm_calibration())
+            yield
+
+    @override
+    def context(self) -> Context:
+        return host_context(keys=lambda: self.typed)
+
+    def leader(self, ctx: Context, deadman: str) -> Teleop:
+        return LeaderTeleop(LeaderOptions(self.emulator.port, str(self.file), deadman=deadman), ctx)
+
+    @override
+    def operate(self, teleop: Teleop) -> None:
+        with self.emulator.lock:
+            for servo in self.emulator.servos.values():
+                servo.turn(servo.encoder + 100)
+
+
+class TestAlwaysFollowing(LeaderSuite):
+    has_deadman = False
+
+    @override
+    def make(self, ctx: Context) -> Teleop:
+        return self.leader(ctx, "none")
+
+
+class TestToggle(LeaderSuite):
+    @override
+    def make(self, ctx: Context) -> Teleop:
+        return self.leader(ctx, "toggle")
+
+    @override
+    def engage(self, teleop: Teleop) -> None:
+        self.typed.put("space")
+
+    release = engage
+
+
+class TestHold(LeaderSuite):
+    @override
+    def make(self, ctx: Context) -> Teleop:
+        return self.leader(ctx, "hold")
+
+    @override
+    def engage(self, teleop: Teleop) -> None:
+        self.typed.put("space")
+        self.typed.put("space")
+
+    @override
+    def release(self, teleop: Teleop) -> None:
+        self.clock.advance(300_000_000)
+
+    @override
+    def context(self) -> Context:
+        self.clock = SteppedClock(START_NS)
+        return host_context(clock=self.clock, keys=lambda: self.typed)
+
+
+class Desk:
+    """A leader and a robot that is where it was told to be."""
+
+    def __init__(self, emulator: Emulator, file: Path, link: Path | None = None, **options: Any) -> None:
+        self.emulator, self.clock = emulator, SteppedClock(START_NS)
+        self.typed = queue.SimpleQueue[str]()
+        ctx = host_context("leader", clock=self.clock, keys=lambda: self.typed)
+        self.leader = LeaderTeleop(LeaderOptions(str(link or emulator.port), str(file), **options), ctx)
+        self.position: Vector = np.zeros(6)
+
+    def read(self, *keys: str) -> TeleopCommand:
+        for key in keys:
+            self.typed.put(key)
+        command = self.leader.read(self.measured())
+        if command.positions is not None:
+            for joint, position in command.positions.items():
+                self.position[JOINTS.index(joint)] = position
+        return command
+
+    def measured(self) -> JointReading:
+        self.clock.advance(TICK_NS)
+        return JointReading(self.clock.now_ns(), self.position.copy(), np.zeros(6), np.zeros(6))
+
+    def follow(self, reads: int = 300) -> Vector:
+        for _ in range(reads):
+            self.read()
+        return self.position
+
+    def turn(self, joint: str, ticks: float, in_ns: int = 500_000_000) -> None:
+        """Move a joint of the leader to a reported position [ticks]."""
+        self.clock.advance(in_ns)
+        index = JOINTS.index(joint)
+        with self.emulator.lock:
+            self.emulator.servos[index + 1].turn(ticks + OFFSETS[index])
+
+    def register(self, name: str) -> list[int]:
+        with self.emulator.lock:
+            return [servo.get(name) for servo in self.emulator.servos.values()]
+
+
+@pytest.fixture
+def desk(emulator: Emulator, calibration_file: Path, request: pytest.FixtureRequest) -> Iterator[Desk]:
+    desk = Desk(emulator, calibration_file, **getattr(request, "param", {}))
+    desk.leader.connect()
+    desk.leader.activate(desk.measured())
+    yield desk
+    desk.leader.disconnect()
+
+
+def options(**given: Any) -> Any:
+    return pytest.mark.parametrize("desk", [given], indirect=True)
+
+
+class TestMapping:
+    def test_angles_are_the_robots(self, desk: Desk):
+        desk.turn("shoulder_pan", 2048 + 0.5 * RADIAN)
+        desk.turn("elbow_flex", 2048 + 0.4 * RADIAN)  # drive_mode 1
+        position = desk.follow()
+        assert position[JOINTS.index("shoulder_pan")] == pytest.approx(0.5, abs=1e-3)
+        assert position[JOINTS.index("elbow_flex")] == pytest.approx(-0.4, abs=1e-3)
+
+    @pytest.mark.parametrize("desk", [{}, {"inverted": ("gripper",)}], indirect=True, ids=["", "inverted"])
+    @pytest.mark.parametrize("share", [-0.1, 0.0, 0.25, 0.8, 1.0, 1.1])
+    def test_the_triggers_range_is_the_grippers(self, desk: Desk, share: float, request: pytest.FixtureRequest):
+        desk.turn("gripper", 1500 + share * 1500)
+        opened = 1 - share if "inverted" in request.node.callspec.id else share
+        assert desk.follow()[5] == pytest.approx(-0.2 + np.clip(opened, 0, 1) * 1.9, abs=1e-9)
+
+    @options(inverted=("shoulder_pan",))
+    def test_an_inverted_joint_turns_the_other_way(self, desk: Desk):
+        desk.turn("shoulder_pan", 2048 + 0.5 * RADIAN)
+        assert desk.follow()[0] == pytest.approx(-0.5, abs=1e-3)
+
+    @options(joints={"wrist_roll": "shoulder_pan"})
+    def test_only_mapped_joints_are_commanded(self, desk: Desk):
+        desk.turn("wrist_roll", 2048 + 0.5 * RADIAN)
+        desk.follow()
+        assert desk.read().positions == {"shoulder_pan": pytest.approx(0.5, abs=1e-3)}
+
+    def test_the_robots_limits_hold(self, desk: Desk):
+        desk.turn("wrist_flex", 600)
+        assert desk.follow()[3] == -1.5
+
+    @pytest.mark.parametrize(
+        ("given", "told"),
+        [
+            ({"joints": {"shoulder_pan": "sholder"}}, "joints: no joint 'sholder'; the joints are: shoulder_pan"),
+            ({"inverted": ("roll",)}, "inverted: no joint 'roll'; the joints are: shoulder_pan, shoulder_lift"),
+            ({"scaled": ("grip",)}, "scaled: no joint 'grip'; the joints are: shoulder_pan, shoulder_lift"),
+        ],
+    )
+    def test_unknown_joints_are_told(self, emulator: Emulator, calibration_file: Path, given: Any, told: str):
+        with pytest.raises(TeleopError, match=told):
+            Desk(emulator, calibration_file, **given)
+
+
+class TestApproach:
+    @options(ramp_velocity=1.0)
+    def test_is_bounded_in_proportion_and_ends_in_following(self, desk: Desk):
+        desk.turn("shoulder_pan", 2048 + 0.8 * RADIAN)
+        desk.turn("wrist_roll", 2048 - 0.4 * RADIAN)
+        path = [desk.position.copy()]
+        for _ in range(200):
+            desk.read()
+            path.append(desk.position.copy())
+        steps = np.diff(path, axis=0)
+        assert np.abs(steps).max() <= 0.021, "10 ms at 1 rad/s, or the tolerance at the end"
+        # On the way the two joints have gone the same share of theirs.
+        middle = path[40]
+        assert middle[0] / 0.8 == pytest.approx(middle[4] / -0.4, abs=1e-3)
+        assert 0.3 < middle[0] < 0.5
+        assert path[-1][0] == pytest.approx(0.8, abs=1e-3)
+        desk.turn("shoulder_pan", 2048 + 0.9 * RADIAN)
+        desk.read()
+        assert desk.position[0] == pytest.approx(0.9, abs=1e-3), "it follows directly"
+
+    def test_after_a_host_that_stood_still_leaps_no_further_than_a_tenth_of_a_second(self, desk: Desk):
+        desk.turn("shoulder_pan", 2048 + 1.5 * RADIAN)
+        desk.follow(3)
+        before = desk.position[0]
+        desk.clock.advance(5_000_000_000)
+        desk.read()
+        assert desk.position[0] - before == pytest.approx(0.1, abs=1e-3)
+
+
+class TestDeadman:
+    @options(deadman="toggle", ramp_velocity=1.0)
+    def test_a_pause_ends_in_the_same_approach(self, desk: Desk):
+        assert desk.read().positions is None
+        desk.read("space")
+        desk.follow(200)
+        desk.read("space")
+        desk.turn("shoulder_pan", 2048 + 1.0 * RADIAN)
+        before = desk.position.copy()
+        assert [desk.read().positions for _ in range(50)] == [None] * 50
+        desk.read("space")
+        np.testing.assert_array_equal(desk.position, before)
+        desk.read()
+        assert desk.position[0] - before[0] == pytest.approx(0.01, abs=1e-6)
+
+    @options(deadman="hold")
+    def test_held_follows_while_the_key_repeats_and_a_single_press_does_nothing(self, desk: Desk):
+        assert desk.read("space").positions is None
+        assert [desk.read().positions for _ in range(50)] == [None] * 50
+        desk.read("space")
+        assert all(desk.read(*["space"] * (i % 3 == 0)).positions is not None for i in range(30))
+        paused = [desk.read().positions is None for _ in range(25)]
+        assert paused == sorted(paused)
+        assert paused[-1]
+
+    def test_the_emergency_stop_key(self, desk: Desk):
+        assert desk.read("esc") == TeleopCommand(None, estop=True)
+
+    @options(deadman="toggle")
+    def test_what_was_typed_before_the_mode_began_does_not_count(self, desk: Desk):
+        desk.typed.put("space")
+        desk.leader.activate(desk.measured())
+        assert desk.read().positions is None
+
+    def test_without_a_terminal_it_is_refused(self, emulator: Emulator, calibration_file: Path):
+        given = LeaderOptions(emulator.port, str(calibration_file), deadman="hold")
+        with pytest.raises(TeleopError, match="deadman: hold needs a terminal"):
+            LeaderTeleop(given, host_context("leader")).connect()
+
+
+class TestBus:
+    def test_torque_is_off_and_answers_come_without_delay(self, emulator: Emulator, calibration_file: Path):
+        for servo in emulator.servos.values():
+            servo.set("torque_enable", 1)
+        desk = Desk(emulator, calibration_file)
+        desk.leader.connect()
+        desk.leader.disconnect()
+        assert desk.register("torque_enable") == [0] * 6
+        assert desk.register("return_delay") == [0] * 6
+        assert desk.register("lock") == [1] * 6
+
+    def test_another_calibration_is_refused(self, emulator: Emulator, calibration_file: Path):
+        emulator.servos[4].set("homing_offset", 12)
+        with pytest.raises(TeleopError, match=r"servo 4 \(wrist_flex\), homing_offset: the servo has 12, .* says 900"):
+            Desk(emulator, calibration_file).leader.connect()
+
+    def test_missing_servos_are_named_together(self, emulator: Emulator, calibration_file: Path):
+        emulator.faults.silent |= {2, 5}
+        with pytest.raises(TeleopError, match=r"leader: .*2 \(shoulder_lift\), 5 \(wrist_roll\)"):
+            Desk(emulator, calibration_file).leader.connect()
+
+    def test_single_lost_replies_hold_the_position_and_many_are_an_error_with_a_name(self, desk: Desk):
+        desk.follow()
+        desk.emulator.faults.silent.add(3)
+        for _ in range(3):
+            assert desk.read().positions is not None
+        desk.emulator.faults.silent.clear()
+        desk.read()
+        desk.emulator.faults.silent.add(3)
+        before = desk.position.copy()
+        desk.follow(3)
+        np.testing.assert_array_equal(desk.position, before)
+        with pytest.raises(TeleopError, match=r"servo 3 \(elbow_flex\): no reply, 4 times in a row"):
+            desk.read()
+
+    def test_a_position_that_no_hand_can_reach_is_not_followed(self, desk: Desk):
+        desk.turn("shoulder_pan", 3000)
+        before = desk.follow().copy()
+        desk.turn("shoulder_pan", 100, in_ns=0)
+        desk.follow(3)
+        np.testing.assert_array_equal(desk.position, before)
+        with pytest.raises(TeleopError, match=r"servo 1 \(shoulder_pan\): position 100 right after 3000"):
+            desk.read()
+
+    def test_unplugged_it_says_so_and_replugged_it_connects(self, tmp_path: Path, calibration_file: Path):
+        link = tmp_path / "port"
+        with Emulator(6, link=link) as emulator:
+            prepare(emulator, arm_calibration())
+            desk = Desk(emulator, calibration_file, link)
+            desk.leader.connect()
+            desk.read()
+            emulator.unplug()
+            with pytest.raises(TeleopError, match=r"leader: .*port: the port is"):
+                desk.read()
+            desk.leader.disconnect()
+            with pytest.raises(TeleopError, match=r"leader: .*port: there is no such port"):
+                desk.leader.connect()
+            emulator.replug()
+            desk.leader.connect()
+            assert desk.read().positions is not None
+            desk.leader.disconnect()
