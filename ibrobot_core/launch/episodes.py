@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from ibrobot_core.errors import RecorderError
 from ibrobot_core.launch.session import Session
 
 if TYPE_CHECKING:
@@ -19,6 +20,11 @@ class Episodes:
         self.number = 0
         """Of the present episode, from 1; 0 before the first."""
         self.running = False
+
+    @property
+    def recording_failure(self) -> RecorderError | None:
+        """Why the recording of the present or last episode ended before it did; None where it did not."""
+        return None if self._recording is None else self._recording.failure
 
     def begin(self) -> None:
         """The next episode begins."""

@@ -1,0 +1,130 @@
+"""Recording: a recorder that fails costs its episode only; topics that appear late, latched ones, and lost messages."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ibrobot_core.errors import RecorderError
+from ibrobot_core.interfaces import EpisodeEnd, EpisodeStart
+from ibrobot_core.launch.builders import recording
+from ibrobot_core.messages import String
+
+if TYPE_CHECKING:
+    from conftest import Runs
+
+    from ibrobot_core.launch.runtime import Runtime
+
+
+class Notes:
+    """What a recorder was told; `full` makes every write fail."""
+
+    def __init__(self, recorder: object, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.begun: list[EpisodeStart] = []
+        self.ended: list[EpisodeEnd] = []
+        self.written: list[tuple[str, object, int]] = []
+        self.full = False
+        self.stuck = False
+        for name in ("begin", "write", "end"):
+            monkeypatch.setattr(recorder, name, getattr(self, name))
+
+    def begin(self, episode: EpisodeStart) -> None:
+        self.begun.append(episode)
+
+    def write(self, topic: str, message: object, received_ns: int) -> None:
+        if self.full:
+            raise RecorderError("its disk has 1 MiB left")
+        self.written.append((topic, message, received_ns))
+
+    def end(self, episode: EpisodeEnd) -> None:
+        self.ended.append(episode)
+        if self.stuck:
+            raise RecorderError("cannot be written")
+
+
+def ticks(runtime: Runtime, count: int) -> None:
+    for _ in range(count):
+        assert not runtime.step()
+
+
+def note(runs: Runs, monkeypatch: pytest.MonkeyPatch, topics: str = "contract") -> tuple[Runtime, Notes]:
+    """A run whose next episode is noted."""
+    runtime = runs.start(f"recording={{type: lines, topics: {topics}}}", mode="teleop")
+    ticks(runtime, 2)
+    runtime.plan.episodes.end("unknown")
+    ticks(runtime, 1)
+    return runtime, Notes(runs.parts.MADE["recording"], monkeypatch)
+
+
+@pytest.mark.parametrize("stuck", [False, True])
+def test_a_recorder_that_fails_costs_its_episode_and_the_robot_goes_on(
+    runs: Runs, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, stuck: bool
+):
+    runtime, notes = note(runs, monkeypatch)
+    runtime.plan.episodes.begin()
+    ticks(runtime, 3)
+    notes.full, notes.stuck = True, stuck
+    kept = len(notes.written)
+    ticks(runtime, 10)
+    fault = "recording ended: its disk has 1 MiB left"
+    assert [end.outcome for end in notes.ended] == ["unknown"]
+    assert len(notes.written) == kept > 0
+    assert runtime.session.outcome.faults == [fault]
+    assert ("fault", fault) in runs.parts.EVENTS
+    assert caplog.text.count(f"{fault}; the robot goes on") == 1
+    assert str(runtime.plan.episodes.recording_failure) == "its disk has 1 MiB left"
+    notes.full = notes.stuck = False
+    runtime.plan.episodes.end("success")
+    runtime.plan.episodes.begin()
+    ticks(runtime, 3)
+    assert len(notes.begun) == 2
+    assert len(notes.written) > kept
+    assert runtime.plan.episodes.recording_failure is None
+
+
+@pytest.mark.parametrize(("topics", "kept"), [("all", True), ("[/late]", True), ("contract", False)])
+def test_a_topic_that_appears_during_the_episode_is_recorded(
+    runs: Runs, monkeypatch: pytest.MonkeyPatch, topics: str, kept: bool
+):
+    runtime, notes = note(runs, monkeypatch, topics)
+    runtime.plan.episodes.begin()
+    ticks(runtime, 3)
+    runtime.session.bus.publish("/late", String("here"))
+    ticks(runtime, 1)
+    assert ("/late" in {topic for topic, _, _ in notes.written}) == kept
+    (start,) = notes.begun
+    assert start.any_topic == kept
+    assert "/late" not in start.topics
+
+
+def test_an_episode_begins_with_what_is_latched(runs: Runs, monkeypatch: pytest.MonkeyPatch):
+    runtime, notes = note(runs, monkeypatch, "all")
+    runtime.session.bus.publish("/description", String("old"), latched=True)
+    runtime.session.bus.publish("/description", String("arm"), latched=True)
+    ticks(runtime, 3)
+    runtime.plan.episodes.begin()
+    ticks(runtime, 3)
+    stamp_ns = notes.begun[0].stamp_ns
+    assert [item for item in notes.written if item[0] == "/description"] == [("/description", String("arm"), stamp_ns)]
+    assert notes.written[0][0] == "/description"
+
+
+def test_messages_that_were_lost_on_the_way_are_told_by_topic(runs: Runs, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(recording, "_DEPTH", 50)
+    runtime, notes = note(runs, monkeypatch, "[/many, /few]")
+    ticks(runtime, 1)
+    bus = runtime.session.bus
+    for _ in range(80):
+        bus.publish("/many", String("before"))
+    ticks(runtime, 1)
+    runtime.plan.episodes.begin()
+    ticks(runtime, 1)
+    for _ in range(10):
+        bus.publish("/few", String("y"))
+    for _ in range(45):
+        bus.publish("/many", String("x"))
+    runtime.plan.episodes.end("success")
+    ticks(runtime, 1)
+    assert dict(notes.ended[-1].dropped) == {"/few": 5}
+    assert [topic for topic, _, _ in notes.written] == ["/few"] * 5 + ["/many"] * 45
