@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
+from collections.abc import Mapping
 from typing import override
 
 import attrs
@@ -23,10 +24,11 @@ _DEPTH = 4096
 
 @attrs.frozen
 class _Begin:
-    """An episode begins, with what was latched then."""
+    """An episode begins, with what was latched then, and what had been lost on the way here by then."""
 
     start: EpisodeStart
     latched: tuple[Received, ...]
+    lost: Mapping[str, int]
 
     @property
     def stamp_ns(self) -> int:
@@ -54,7 +56,7 @@ class Recording(Worker):
         """Held while an order is stamped and queued, and while orders and messages are taken: neither overtakes."""
         self._incoming: Subscription | None = None
         self._open = False
-        self._lost: dict[str, int] = {}
+        self._lost: Mapping[str, int] = {}
         """Topic -> messages lost on the way here, before the present episode."""
         self.failure: RecorderError | None = None
         """Why the recording of the present or last episode ended before it; None where it did not."""
@@ -76,15 +78,12 @@ class Recording(Worker):
                 session.config, self._config, topics, mode=session.mode, seed=seed, stamp_ns=session.bus.snapshot_ns()
             )
             latched = tuple(i for i in session.bus.latched().values() if i.received_ns <= start.stamp_ns)
-            self._orders.append(_Begin(start, latched))
-            self._lost = self._lost_now()
+            self._orders.append(_Begin(start, latched, self._lost_now()))
 
     def end(self, outcome: str) -> None:
         """Messages up to here belong to the episode."""
         with self._order:
-            lost = {topic: n - self._lost.get(topic, 0) for topic, n in self._lost_now().items() if self._keeps(topic)}
-            dropped = {topic: n for topic, n in lost.items() if n}
-            self._orders.append(EpisodeEnd(self._session.bus.snapshot_ns(), outcome, dropped))
+            self._orders.append(EpisodeEnd(self._session.bus.snapshot_ns(), outcome))
 
     @override
     def work(self, timeout_s: float) -> None:
@@ -104,14 +103,17 @@ class Recording(Worker):
     def _obey(self, recorder: Recorder, order: _Begin | EpisodeEnd) -> None:
         if isinstance(order, _Begin):
             self.failure = None
+            self._lost = order.lost
             recorder.begin(order.start)
             self._open = True
             for item in order.latched:
                 self._write(recorder, item, order.stamp_ns)
         elif self._open:
             self._open = False
+            # Counted now: what waited when the episode ended may have been lost since.
+            lost = {topic: n - self._lost.get(topic, 0) for topic, n in self._lost_now().items() if self._keeps(topic)}
             try:
-                recorder.end(order)
+                recorder.end(attrs.evolve(order, dropped={topic: n for topic, n in lost.items() if n}))
             except RecorderError as error:
                 self._fail(error)
 
