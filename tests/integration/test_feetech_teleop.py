@@ -1,0 +1,211 @@
+"""Teleoperation over two emulated servo buses: a leader that is moved by hand, and a follower in the control process."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import attrs
+import numpy as np
+import pytest
+from ibrobot_feetech.emulator import Emulator
+
+from ibrobot_core.calibration import Calibration, JointCalibration, save_calibration
+from ibrobot_core.config import load
+from ibrobot_core.errors import IbrobotError
+from ibrobot_core.launch.runtime import ESTOP, RESET, Runtime
+from ibrobot_core.launch.session import Request, Session
+from ibrobot_core.plugins import installed
+
+pytestmark = pytest.mark.integration
+
+CONFIG = Path(__file__).parents[2] / "configs" / "so101_blind.yaml"
+JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
+RADIAN = 4096 / (2 * math.pi)
+"""Ticks."""
+MAX_STEP = 3.0 * 0.01 * RADIAN
+"""The velocity limit, for one tick of control [ticks]."""
+PATIENCE_S = 20.0
+
+
+def arm(folder: Path, name: str) -> tuple[Emulator, Path]:
+    """An emulated arm at zero, and its calibration."""
+    joints = {joint: JointCalibration(i + 1, 0, 0, 700, 3400) for i, joint in enumerate(JOINTS[:-1])}
+    joints["gripper"] = JointCalibration(6, 0, 0, 1500, 2752)
+    emulator = Emulator(6, link=folder / name)
+    for joint in joints.values():
+        servo = emulator.servos[joint.id]
+        servo.set("min_position_limit", joint.range_min)
+        servo.set("max_position_limit", joint.range_max)
+    return emulator, save_calibration(Calibration(joints), folder / f"{name}.json")
+
+
+@attrs.define
+class Station:
+    """Both arms and the run between them."""
+
+    leader: Emulator
+    follower: Emulator
+    runtime: Runtime
+    goals: list[list[int]] = attrs.field(factory=list)
+    """The follower's goals [ticks], as often as they changed."""
+
+    def watch(self) -> None:
+        """Note the follower's goals after each request, once its torque is on."""
+        goals = [servo.get("goal_position") for servo in self.follower.servos.values()]
+        torque = all(servo.torque for servo in self.follower.servos.values())
+        if torque and (not self.goals or self.goals[-1] != goals):
+            self.goals.append(goals)
+
+    def turn(self, joint: str, angle: float, over_s: float = 0.3) -> None:
+        """A person moves a joint of the leader to an angle [rad]."""
+        servo = self.leader.servos[JOINTS.index(joint) + 1]
+        begin, begun = servo.encoder, time.monotonic()
+        while (share := min(1.0, (time.monotonic() - begun) / over_s)) < 1.0:
+            with self.leader.lock:
+                servo.turn(begin + share * (2048 + angle * RADIAN - begin))
+            self.runtime.wait(0.005)
+        with self.leader.lock:
+            servo.turn(2048 + angle * RADIAN)
+
+    def angle(self, joint: str) -> float:
+        """Where a joint of the follower is [rad]."""
+        with self.follower.lock:
+            return (self.follower.servos[JOINTS.index(joint) + 1].encoder - 2048) / RADIAN
+
+    def until(self, condition: Callable[[], bool], what: str) -> None:
+        deadline = time.monotonic() + PATIENCE_S
+        while not condition():
+            self.runtime.raise_failure()
+            assert time.monotonic() < deadline, f"{what}: not within {PATIENCE_S:.0f} s"
+            self.runtime.wait(0.01)
+
+    def until_at(self, joint: str, angle: float) -> None:
+        self.until(lambda: abs(self.angle(joint) - angle) < 0.01, f"{joint} comes to {angle} rad")
+
+    @property
+    def faults(self) -> list[str]:
+        return self.runtime.session.outcome.faults
+
+    def until_fault(self, count: int = 1) -> str:
+        self.until(lambda: len(self.faults) >= count, "a fault")
+        return self.faults[-1]
+
+    def until_at_rest(self) -> float:
+        """Where the follower's pan comes to rest [rad]."""
+        since, last = time.monotonic(), self.angle("shoulder_pan")
+        while time.monotonic() - since < 0.3:
+            self.runtime.wait(0.02)
+            if abs(self.angle("shoulder_pan") - last) > 1e-4:
+                since, last = time.monotonic(), self.angle("shoulder_pan")
+        return last
+
+    def assert_no_jump(self) -> None:
+        """No goal was further from the one before it than the limits allow, a missed tick or two granted."""
+        steps = np.abs(np.diff(self.goals, axis=0))
+        assert steps.max() <= 3 * MAX_STEP + 1
+
+
+@pytest.fixture
+def station(tmp_path: Path) -> Iterator[Callable[..., Station]]:
+    made: list[Any] = []
+
+    def start(*overrides: str) -> Station:
+        leader, leader_file = arm(tmp_path, "leader")
+        follower, follower_file = arm(tmp_path, "follower")
+        sections = (
+            f"hardware={{type: feetech_so101, port: {tmp_path}/follower, calibration: {follower_file}}}",
+            f"teleoperation.leader={{type: so101_leader, port: {tmp_path}/leader, calibration: {leader_file}}}",
+            "control_modes.teleop.teleop=leader",
+        )
+        config = load(CONFIG, overrides=(*sections, *overrides), mode="teleop")
+        station = Station(leader, follower, Runtime(Session(config, installed(), Request())))
+        made.append(station)
+        follower.on_request = station.watch
+        leader.start()
+        follower.start()
+        leader.servos[1].turn(2048 + 0.6 * RADIAN)
+        station.runtime.start()
+        return station
+
+    yield start
+    for station in made:
+        station.runtime.stop()
+        station.leader.stop()
+        station.follower.stop()
+
+
+def test_the_follower_comes_to_the_leader_without_a_jump_and_follows(station: Callable[..., Station]):
+    arms = station()
+    arms.until_at("shoulder_pan", 0.6)
+    steps = np.abs(np.diff(arms.goals, axis=0))
+    assert steps.max() <= 3 * 1.0 * 0.01 * RADIAN + 1, "the approach is slower than the limits"
+    for angle in (-0.5, 0.4):
+        arms.turn("shoulder_pan", angle)
+        arms.turn("elbow_flex", -angle)
+        arms.until_at("shoulder_pan", angle)
+        arms.until_at("elbow_flex", -angle)
+    arms.assert_no_jump()
+    assert arms.faults == []
+    assert not any(servo.torque for servo in arms.leader.servos.values())
+
+
+def test_an_unplugged_leader_is_a_fault_and_replugged_a_reset_goes_on(station: Callable[..., Station]):
+    arms = station()
+    arms.until_at("shoulder_pan", 0.6)
+    arms.leader.unplug()
+    fault = arms.until_fault()
+    assert "leader: " in fault
+    assert "the port is" in fault
+    stopped = arms.until_at_rest()
+    assert stopped == pytest.approx(0.6, abs=0.05)
+    with pytest.raises(IbrobotError, match="there is no such port"):
+        arms.runtime.session.bus.call(RESET, None)
+
+    arms.leader.servos[1].turn(2048 - 0.3 * RADIAN)
+    arms.leader.replug()
+    assert arms.until_at_rest() == stopped, "nothing moves before the reset"
+    arms.runtime.session.bus.call(RESET, None)
+    arms.until_at("shoulder_pan", -0.3)
+    arms.assert_no_jump()
+    assert arms.faults == [fault]
+
+
+def test_an_unplugged_follower_is_a_fault_and_replugged_a_reset_goes_on(station: Callable[..., Station]):
+    arms = station()
+    arms.until_at("shoulder_pan", 0.6)
+    arms.follower.unplug()
+    fault = arms.until_fault()
+    assert "follower: the port is" in fault
+    with pytest.raises(IbrobotError, match="there is no such port"):
+        arms.runtime.session.bus.call(RESET, None)
+
+    arms.turn("shoulder_pan", -0.3)
+    arms.follower.replug()
+    assert arms.until_at_rest() == pytest.approx(0.6, abs=0.05)
+    arms.runtime.session.bus.call(RESET, None)
+    arms.until_at("shoulder_pan", -0.3)
+    arms.assert_no_jump()
+    assert not arms.runtime.session.finished.is_set()
+
+
+def test_a_servo_of_the_leader_that_dies_is_named(station: Callable[..., Station]):
+    arms = station("control.stop=relax")
+    arms.until_at("shoulder_pan", 0.6)
+    arms.leader.faults.silent.add(3)
+    assert "servo 3 (elbow_flex)" in arms.until_fault()
+    arms.until(lambda: not any(servo.torque for servo in arms.follower.servos.values()), "torque goes off")
+
+
+def test_the_emergency_stop_holds_until_the_reset(station: Callable[..., Station]):
+    arms = station()
+    arms.until_at("shoulder_pan", 0.6)
+    arms.runtime.session.bus.call(ESTOP, None)
+    arms.turn("shoulder_pan", -0.3)
+    assert arms.until_at_rest() == pytest.approx(0.6, abs=0.05)
+    arms.runtime.session.bus.call(RESET, None)
+    arms.until_at("shoulder_pan", -0.3)
+    arms.assert_no_jump()
