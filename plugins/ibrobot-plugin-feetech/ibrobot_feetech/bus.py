@@ -53,7 +53,8 @@ class FeetechBus:
             dict.fromkeys(("requests", "retries", "timeouts", "late_replies", "bad_packets", "discarded_bytes"), 0)
         )
         """Every request and everything that went wrong, since the bus was made."""
-        self._outstanding: dict[tuple[int, int], float] = {}
+        self.outstanding: dict[tuple[int, int], float] = {}
+        """Servo and length of replies that may yet come late -> until when (`time.monotonic`) [s]."""
 
     @property
     def is_open(self) -> bool:
@@ -66,7 +67,7 @@ class FeetechBus:
         Raises:
             PortError: when it is not there, not permitted, or held by another program.
         """
-        self._outstanding.clear()
+        self.outstanding.clear()
         self.port.open()
 
     def close(self) -> None:
@@ -213,22 +214,17 @@ class FeetechBus:
         end = time.monotonic() + LATE_S
         while time.monotonic() < end:
             self.counters["discarded_bytes"] += len(self.port.read(255, end))
-        self._outstanding.clear()
+        self.outstanding.clear()
 
     def may_be_late(self, servo: int, length: int) -> bool:
         """Whether a reply of that length may still come from an earlier request that timed out."""
-        expiry = self._outstanding.get((servo, length))
+        expiry = self.outstanding.get((servo, length))
         if expiry is None:
             return False
         if time.monotonic() < expiry:
             return True
-        del self._outstanding[servo, length]
+        del self.outstanding[servo, length]
         return False
-
-    @property
-    def any_late(self) -> bool:
-        """Whether any reply may still come from an earlier request that timed out."""
-        return bool(self._outstanding)
 
     def _read_once(self, servo: int, target: Register, *, faulty: bool = False) -> int:
         start, length = self._span((servo,), target.address, target.size)
@@ -317,7 +313,7 @@ class FeetechBus:
         self._expect_late(servo, length)
 
     def _expect_late(self, servo: int, length: int) -> None:
-        self._outstanding[servo, length] = time.monotonic() + LATE_S
+        self.outstanding[servo, length] = time.monotonic() + LATE_S
 
     def timeout(self, sent: int, expected: int, servos: int = 1) -> float:
         """How long to wait for replies [s]: the time on the wire of both, and the delays on both sides."""

@@ -100,15 +100,16 @@ class FeetechFollower(Hardware):
         try:
             replies = (self._health_reader if healthy else self._reader).read()
             stamp_ns = (begun_ns + self._ctx.clock.now_ns()) // 2
-            good = replies.answered & self._plausible(replies, stamp_ns)
+            values = replies.values
+            good = replies.answered & self._plausible(values[:, 0], replies.answered, stamp_ns)
             self._check(replies, good)
         except FeetechError as error:
             self._fault = error
             raise
-        self._take(replies, good)
+        self._take(values, good)
         if healthy and good.all():
             self._health_due_ns = begun_ns + ns(self._options.health_period)
-            self._take_health(replies)
+            self._take_health(values)
         stale = bool(self._lost.any())
         self._stamp_ns = stamp_ns
         position = self._arm.radians(self._ticks.astype(np.float64))
@@ -177,12 +178,11 @@ class FeetechFollower(Hardware):
         self._health_due_ns = self._stamp_ns
         self._fault = None
 
-    def _plausible(self, replies: Replies, stamp_ns: int) -> NDArray[np.bool_]:
+    def _plausible(self, ticks: NDArray[np.intp], answered: NDArray[np.bool_], stamp_ns: int) -> NDArray[np.bool_]:
         """Whether a joint can be where its reply says. The checksum has 8 bits: some damage passes it.
 
         What a joint's speed does not explain is believed when the next reply says it again.
         """
-        ticks = replies.values[:, 0]
         elapsed_s = seconds(stamp_ns - self._stamp_ns)
         expected = self._ticks + self._speed * elapsed_s
         band = _SLACK_TICKS + min(_MAX_ACCELERATION * elapsed_s, _MAX_SPEED) * elapsed_s
@@ -190,8 +190,8 @@ class FeetechFollower(Hardware):
         again = np.abs(ticks - self._doubtful) <= band
         inside = (ticks >= 0) & (ticks < 4096)
         good: NDArray[np.bool_] = inside & (near | again)
-        self._counts["implausible_positions"] += int((replies.answered & ~good).sum())
-        self._doubtful = np.where(replies.answered & inside, ticks, self._doubtful)
+        self._counts["implausible_positions"] += int((answered & ~good).sum())
+        self._doubtful = np.where(answered & inside, ticks, self._doubtful)
         return good
 
     def _check(self, replies: Replies, good: NDArray[np.bool_]) -> None:
@@ -207,18 +207,18 @@ class FeetechFollower(Hardware):
             others = f", nor from {', '.join(self._arm.names[servo] for servo in gone[1:])}" if len(gone) > 1 else ""
             raise NoReply(self._bus.place(gone[0]), f"no good reply for {ticks} ticks{others}")
 
-    def _take(self, replies: Replies, good: NDArray[np.bool_]) -> None:
-        position, velocity, load = replies.values[:, 0], replies.values[:, 1], replies.values[:, 2]
+    def _take(self, values: NDArray[np.intp], good: NDArray[np.bool_]) -> None:
+        position, velocity, load = values[:, 0], values[:, 1], values[:, 2]
         self._ticks = np.where(good, position, self._ticks)
         self._speed = np.where(good, velocity, self._speed)
         self._velocity = self._speed * self._arm.sign * _RADIANS_PER_TICK
         self._health[3] = np.where(good, load * self._arm.sign * 1e-3, self._health[3])
 
-    def _take_health(self, replies: Replies) -> None:
+    def _take_health(self, values: NDArray[np.intp]) -> None:
         columns = self._health_reader.registers
         for index, (_, name, unit) in enumerate(_HEALTH):
-            self._health[index] = replies.values[:, columns.index(name)].astype(np.float64) * unit
-        self._health[2] = replies.values[:, columns.index("present_current")].astype(np.float64) * _CURRENT_A
+            self._health[index] = values[:, columns.index(name)].astype(np.float64) * unit
+        self._health[2] = values[:, columns.index("present_current")].astype(np.float64) * _CURRENT_A
         hot = np.flatnonzero(self._health[0] > self._options.max_temperature)
         if hot.size:
             found = f"{self._health[0][hot[0]]:.0f} deg C, above max_temperature ({self._options.max_temperature:g})"

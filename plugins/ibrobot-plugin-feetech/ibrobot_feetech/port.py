@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 import select
 import termios
@@ -15,7 +16,10 @@ from ibrobot_feetech.errors import Place, PortError
 
 _GONE = (errno.EIO, errno.ENODEV, errno.ENXIO, errno.EBADF)
 _VMIN = 6
-"""Index in the control characters: the least number of bytes that wakes a reader."""
+"""Index of the control characters among a terminal's attributes."""
+_NOTHING = bytes(4)
+_MOST_AWAITED = 255
+"""Greatest number of bytes that a reader can be woken by."""
 
 
 class SerialPort:
@@ -35,6 +39,7 @@ class SerialPort:
         self._serial: serial.Serial | None = None
         self._fd = -1
         self._wake_at = 0
+        self._waiting = bytearray(4)
 
     @property
     def is_open(self) -> bool:
@@ -105,7 +110,7 @@ class SerialPort:
         """
         received = b""
         while len(received) < size:
-            self._wake_when(min(size - len(received), 255))
+            self._wake_when(min(size - len(received), _MOST_AWAITED))
             timeout_ms = max(0.0, deadline - time.monotonic()) * 1e3
             try:
                 ready = self._poll.poll(timeout_ms)
@@ -118,6 +123,28 @@ class SerialPort:
                 raise PortError(Place(self.path), "the port is closed at its other end")
         return received
 
+    def exchange(self, request: bytes, size: int, timeout_ms: int) -> bytes:
+        """Send `request` and give back what came when `size` bytes are there, or in time: the fast way of a tick.
+
+        Raises:
+            PortError: when the port is gone or closed.
+        """
+        if size > _MOST_AWAITED:
+            self.write(request)
+            return self.read(size, time.monotonic() + timeout_ms / 1e3)
+        if size != self._wake_at:
+            self._wake_when(size)
+        try:
+            if os.write(self._fd, request) < len(request):
+                raise OSError(errno.EIO, "the port does not take a request of a few bytes")
+            if self._poll.poll(timeout_ms):
+                if received := os.read(self._fd, size):
+                    return received
+                raise PortError(Place(self.path), "the port is closed at its other end")
+            return self._pending()
+        except OSError as error:
+            raise self._gone(error) from None
+
     def discard(self) -> int:
         """Throw away what has come unasked; returns how many bytes it was.
 
@@ -125,8 +152,9 @@ class SerialPort:
             PortError: when the port is gone or closed.
         """
         try:
-            return len(self._pending())
-        except OSError as error:
+            fcntl.ioctl(self._fd, termios.FIONREAD, self._waiting)
+            return len(self._pending()) if self._waiting != _NOTHING else 0
+        except (OSError, ValueError) as error:
             raise self._gone(error) from None
 
     def _pending(self) -> bytes:
@@ -145,12 +173,12 @@ class SerialPort:
                 raise self._gone(OSError(*error.args)) from None
             self._wake_at = size
 
-    def _gone(self, error: OSError) -> PortError:
+    def _gone(self, error: Exception) -> PortError:
         if self._serial is None:
             return PortError(Place(self.path), "the port is not open")
-        if error.errno in _GONE:
+        if getattr(error, "errno", None) in _GONE:
             return PortError(Place(self.path), "the port is gone")
-        return PortError(Place(self.path), error.strerror or str(error))
+        return PortError(Place(self.path), getattr(error, "strerror", None) or str(error))
 
 
 def _why_closed(error: Exception) -> str:

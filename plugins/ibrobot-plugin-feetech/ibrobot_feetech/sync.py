@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import time
+import math
+import struct
 from collections.abc import Sequence
+from typing import NamedTuple
 
-import attrs
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,16 +19,22 @@ _HEADER = 5
 """Bytes of a reply before its parameters."""
 
 
-@attrs.frozen(eq=False)
-class Replies:
+class Replies(NamedTuple):
     """What the servos answered to one sync read, in the order in which they were asked."""
 
+    decoded: list[int]
+    """Registers, servo by servo, S x R of them; 0 where there was no answer."""
     answered: NDArray[np.bool_]
     """Shape (S,)."""
-    values: NDArray[np.int32]
-    """Decoded registers, shape (S, R); meaningless where `answered` is False."""
     errors: NDArray[np.uint8]
     """The error byte of each reply, shape (S,)."""
+    complete: bool
+    """Whether all answered, and none reports an error."""
+
+    @property
+    def values(self) -> NDArray[np.intp]:
+        """`decoded` as an array, shape (S, R)."""
+        return np.array(self.decoded).reshape(len(self.answered), -1)
 
 
 class SyncReader:
@@ -52,15 +59,16 @@ class SyncReader:
         self._address = begin.address
         self._size = end.address + end.size - begin.address
         self._request = protocol.sync_read(self._servos, self._address, self._size)
-        self._dtype = _reply_type(inside, self._address, self._size)
-        signs = [1 << r.sign_bit if r.sign_bit is not None else 0 for r in inside]
-        self._signs = np.array(signs, dtype=np.int32)
-        self._magnitudes = np.array([s - 1 if s else (1 << 8 * r.size) - 1 for s, r in zip(signs, inside, strict=True)])
         count = len(self._servos)
-        self._expected = count * (OVERHEAD + self._size)
+        self._unpack = struct.Struct("<" + _layout(inside, self._address, self._size) * count).unpack
+        self._signs = [1 << (r.sign_bit if r.sign_bit is not None else 8 * r.size) for r in inside] * count
+        length = OVERHEAD + self._size
+        self._expected = count * length
+        self._bodies = [(start + 2, start + length) for start in range(0, self._expected, length)]
         self._mask, self._pattern = self._frame()
         self._everyone = np.ones(count, dtype=np.bool_)
-        self._timeout_s = bus.timeout(len(self._request), self._expected, count)
+        self._no_errors = np.zeros(count, dtype=np.uint8)
+        self._timeout_ms = math.ceil(bus.timeout(len(self._request), self._expected, count) * 1e3)
 
     def read(self) -> Replies:
         """Ask all servos and take what comes in time.
@@ -69,33 +77,32 @@ class SyncReader:
             PortError: when the port is gone.
         """
         bus = self._bus
-        if bus.any_late:
+        if bus.outstanding:
             return self._slowly(bus.sync_read_span(self._address, self._size, self._servos))
         bus.begin_request()
-        bus.port.write(self._request)
-        received = bus.port.read(self._expected, time.monotonic() + self._timeout_s)
-        # Headers, ids and lengths all at once, as one great number; then all checksums.
+        received = bus.port.exchange(self._request, self._expected, self._timeout_ms)
+        # Headers, ids, lengths and error bytes of all, as one great number; then the checksums.
         if len(received) == self._expected and int.from_bytes(received) & self._mask == self._pattern:
-            raw = np.frombuffer(received, dtype=np.uint8).reshape(len(self._servos), -1)
-            if (raw[:, 2:].sum(axis=1, dtype=np.uint8) == 0xFF).all():
-                return self._decode(received, self._everyone, raw[:, 4])
+            for start, end in self._bodies:
+                if sum(received[start:end]) & 0xFF != 0xFF:
+                    break
+            else:
+                return Replies(self._decode(received), self._everyone, self._no_errors, True)
         return self._slowly(bus.sync_replies(received, self._request, self._servos, self._size, 0, self._size))
 
     def _frame(self) -> tuple[int, int]:
         """Mask and pattern of the bytes that are known beforehand in a good answer."""
-        one = b"\xff\xff\xff\xff\x00" + b"\x00" * (self._size + 1)
+        one = b"\xff" * _HEADER + b"\x00" * (self._size + 1)
         pattern = b"".join(
             protocol.HEADER + bytes((servo, self._size + 2, 0)) + b"\x00" * (self._size + 1) for servo in self._servos
         )
         return int.from_bytes(one * len(self._servos)), int.from_bytes(pattern)
 
-    def _decode(self, received: bytes, answered: NDArray[np.bool_], errors: NDArray[np.uint8]) -> Replies:
-        fields = np.frombuffer(received, dtype=self._dtype)
-        values = np.empty((len(self._servos), len(self.registers)), dtype=np.int32)
-        for column, name in enumerate(self.registers):
-            values[:, column] = fields[name]
-        magnitude = values & self._magnitudes
-        return Replies(answered, np.where(values & self._signs, -magnitude, magnitude).astype(np.int32), errors)
+    def _decode(self, received: bytes) -> list[int]:
+        return [
+            -(raw & (sign - 1)) if raw & sign else raw & (sign - 1)
+            for raw, sign in zip(self._unpack(received), self._signs, strict=False)
+        ]
 
     def _slowly(self, found: dict[int, tuple[bytes, int]]) -> Replies:
         answered = np.array([servo in found for servo in self._servos])
@@ -103,7 +110,7 @@ class SyncReader:
         blank = b"\x00" * self._size
         contents = [found[servo][0] if servo in found else blank for servo in self._servos]
         received = b"".join(b"\x00" * _HEADER + content + b"\x00" for content in contents)
-        return self._decode(received, answered, errors)
+        return Replies(self._decode(received), answered, errors, bool(answered.all() and not errors.any()))
 
 
 class SyncWriter:
@@ -118,7 +125,14 @@ class SyncWriter:
     def __init__(self, bus: FeetechBus, servos: Sequence[int], name: str = "goal_position") -> None:
         self._bus = bus
         self._servos = tuple(servos)
-        self._register = register(name)
+        self._register = target = register(name)
+        self._interleaved = [0] * (2 * len(self._servos))
+        self._interleaved[::2] = self._servos
+        self._pack = struct.Struct("<" + ("BH" if target.size == 2 else "BB") * len(self._servos)).pack
+        example = protocol.sync_write(target.address, {servo: bytes(target.size) for servo in self._servos})
+        self._head = example[: -1 - len(self._servos) * (1 + target.size)]
+        self._head_sum = sum(self._head[2:])
+        self._greatest = target.limits[1]
 
     def write(self, values: Sequence[int] | NDArray[np.integer]) -> None:
         """Send the values, one for each servo.
@@ -127,18 +141,20 @@ class SyncWriter:
             PortError: when the port is gone.
             ValueError: for a value that the register cannot hold.
         """
+        numbers = values.tolist() if isinstance(values, np.ndarray) else values
+        if min(numbers) < 0 or max(numbers) > self._greatest:
+            encode = self._register.encode
+            numbers = [int.from_bytes(encode(value), "little") for value in numbers]
+        self._interleaved[1::2] = numbers
+        body = self._pack(*self._interleaved)
         self._bus.counters["requests"] += 1
-        encode = self._register.encode
-        contents = {servo: encode(int(value)) for servo, value in zip(self._servos, values, strict=True)}
-        self._bus.port.write(protocol.sync_write(self._register.address, contents))
+        self._bus.port.write(self._head + body + bytes((~(self._head_sum + sum(body)) & 0xFF,)))
 
 
-def _reply_type(registers: Sequence[Register], address: int, size: int) -> np.dtype[np.void]:
-    return np.dtype(
-        {
-            "names": [r.name for r in registers],
-            "formats": ["<u2" if r.size == 2 else "u1" for r in registers],
-            "offsets": [_HEADER + r.address - address for r in registers],
-            "itemsize": OVERHEAD + size,
-        }
-    )
+def _layout(registers: Sequence[Register], address: int, size: int) -> str:
+    """A reply as the module `struct` describes it: only its registers."""
+    layout, at = f"{_HEADER}x", address
+    for found in registers:
+        layout += f"{found.address - at}x" + ("H" if found.size == 2 else "B")
+        at = found.address + found.size
+    return layout + f"{address + size - at + 1}x"
