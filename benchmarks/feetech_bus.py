@@ -25,7 +25,6 @@ from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
-
 from ibrobot_feetech import protocol
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.protocol import Packet

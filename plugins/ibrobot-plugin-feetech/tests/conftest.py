@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from ibrobot_feetech.emulator import Emulator
 
 from ibrobot_core.calibration import Calibration, JointCalibration, save_calibration
 from ibrobot_core.testing.contexts import ARM, GRIPPER
-from ibrobot_feetech.emulator import Emulator
 
 JOINTS = (*ARM, *GRIPPER)
 OFFSETS = (-120, 35, 0, 900, -2000, 40)
