@@ -1,4 +1,4 @@
-"""Teleoperation over two emulated servo buses: a leader that is moved by hand, and a follower in the control process."""
+"""Teleoperation over two emulated servo buses: a leader moved by hand, a follower in the control process."""
 
 from __future__ import annotations
 
