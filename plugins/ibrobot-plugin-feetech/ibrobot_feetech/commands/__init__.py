@@ -1,0 +1,26 @@
+"""`ibrobot feetech …`: setting up, calibrating and looking after the servos of an arm; one file a command."""
+
+from __future__ import annotations
+
+import click
+
+from ibrobot_feetech.commands.calibrate import calibrate
+from ibrobot_feetech.commands.check import check
+from ibrobot_feetech.commands.emulate import emulate
+from ibrobot_feetech.commands.find_port import find_port
+from ibrobot_feetech.commands.monitor import monitor
+from ibrobot_feetech.commands.scan import scan
+from ibrobot_feetech.commands.setup_motors import setup_motors
+from ibrobot_feetech.commands.torque import torque
+
+
+@click.group()
+def feetech() -> None:
+    """Set up, calibrate and look after the servos of an SO-101.
+
+    PORT may be left out where exactly one adapter of an SO-101 is plugged in.
+    """
+
+
+for command in (find_port, scan, setup_motors, calibrate, check, monitor, torque, emulate):
+    feetech.add_command(command)

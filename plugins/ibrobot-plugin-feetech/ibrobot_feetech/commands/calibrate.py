@@ -1,0 +1,115 @@
+"""`ibrobot feetech calibrate`: measures where each joint's middle and range lie, and keeps it in a file and the servos."""
+
+from __future__ import annotations
+
+import shutil
+from datetime import UTC, datetime
+from pathlib import Path
+
+import click
+
+from ibrobot_core.calibration import Calibration, JointCalibration, calibration_path, save_calibration
+from ibrobot_core.errors import HardwareError, IbrobotError
+from ibrobot_feetech.arm import relax
+from ibrobot_feetech.bus import FeetechBus
+from ibrobot_feetech.commands.dialogue import agree
+from ibrobot_feetech.commands.eprom import write_eprom
+from ibrobot_feetech.commands.joints import by_servo, joints_of
+from ibrobot_feetech.commands.measure import Answers, Measurement
+from ibrobot_feetech.commands.ports import adapter_serial_number, opened, port_argument
+
+
+@click.command()
+@port_argument
+@click.option("--name", help="Of the calibration, or a path.  [default: so101_follower, or so101_leader]")
+@click.option("--leader", is_flag=True, help="A leader arm: the range of its gripper is its own.")
+@click.option("--robot", metavar="CONFIG", help="Robot YAML with the joints; an SO-101's by default.")
+@click.option(
+    "--arm", help="Which arm it is, kept beside the numbers.  [default: the adapter's serial number, or name]"
+)
+@click.option(
+    "--full-turn", multiple=True, default=("wrist_roll",), show_default=True, help="Joint that turns all round."
+)
+@click.option("--check-signs", is_flag=True, help="Ask to turn each joint in its positive direction.")
+@click.option("--middle-now", is_flag=True, help="The arm stands in its middle pose: do not ask.")
+@click.option("--range-seconds", type=click.FloatRange(0.1), help="Watch the ranges for so long, not until Enter.")
+@click.option("--accept-ranges", is_flag=True, help="Take ranges that do not look like the joints' limits.")
+@click.option("--yes", is_flag=True, help="Torque off, and overwrite, without asking; the former file is kept.")
+def calibrate(
+    port: str | None, name: str | None, leader: bool, robot: str | None, arm: str | None, full_turn: tuple[str, ...],
+    check_signs: bool, middle_now: bool, range_seconds: float | None, accept_ranges: bool, yes: bool,
+) -> None:  # fmt: skip
+    """Calibrate an arm: its middle pose, then the range of each joint, moved by hand.
+
+    Nothing is written, to the servos or to disk, before all is measured.
+    """
+    name = name or ("so101_leader" if leader else "so101_follower")
+    joints = joints_of(robot, name)
+    path = calibration_path(name)
+    if path.exists() and not yes and not agree(f"{path} is there already. Calibrate anew?", flag="--yes"):
+        raise click.Abort
+    compared = [joint.name for joint in joints if not (leader and joint.name == "gripper")]
+    answers = Answers(middle_now, range_seconds, accept_ranges, check_signs)
+    with opened(port, joints=by_servo(joints)) as bus:
+        _prepare(bus, yes)
+        try:
+            measurement = Measurement(bus, joints, full_turn=full_turn, compared=compared, answers=answers)
+            found = measurement.run()
+        except BaseException:
+            click.echo("Nothing was written; the torque is off, and the servos are calibrated as before.", err=True)
+            raise
+        which = arm or adapter_serial_number(bus.port.path) or Path(name).stem
+        date = datetime.now(UTC).isoformat(timespec="seconds")
+        backup(path)
+        save_calibration(Calibration(found, robot=which, date=date), path, overwrite=True)
+        click.echo(f"saved: {path}")
+        _write(bus, found, name)
+    click.echo(f"written to servos {', '.join(str(joint.servo) for joint in joints)}")
+
+
+def backup(path: Path) -> None:
+    """Keep a calibration that is there, under its date."""
+    if path.exists():
+        date = datetime.fromtimestamp(path.stat().st_mtime, UTC).strftime("%Y%m%dT%H%M%SZ")
+        for suffix in (".json", ".meta.json"):
+            former = path.with_suffix(suffix)
+            if former.exists():
+                shutil.copy2(former, path.with_name(f"{path.stem}.{date}{suffix}"))
+        click.echo(f"the former one is kept: {path.with_name(f'{path.stem}.{date}.json')}")
+
+
+def _prepare(bus: FeetechBus, yes: bool) -> None:
+    """See that every servo is there, measures plain positions, and is without torque."""
+    servos = list(bus.joints)
+    for servo in servos:
+        if (mode := bus.read(servo, "operating_mode")) != 0:
+            raise HardwareError(
+                f"{bus.place(servo, 'operating_mode')}: it is {mode}, and must be 0 (position); "
+                f"`ibrobot feetech setup-motors --joint {bus.joints[servo]}` sets it"
+            )
+    if any(bus.sync_read("torque_enable", servos).values()) and not yes:
+        click.echo("The torque goes off, and the arm falls: hold it.")
+        if not agree("Go on?", flag="--yes", default=True):
+            raise click.Abort
+    relax(bus, servos)
+
+
+def _write(bus: FeetechBus, found: dict[str, JointCalibration], name: str) -> None:
+    done: list[str] = []
+    try:
+        for joint, numbers in found.items():
+            values = {
+                "homing_offset": numbers.homing_offset,
+                "min_position_limit": numbers.range_min,
+                "max_position_limit": numbers.range_max,
+            }
+            write_eprom(bus, numbers.id, values)
+            done.append(joint)
+    except (IbrobotError, KeyboardInterrupt):
+        left = ", ".join(joint for joint in found if joint not in done)
+        click.echo(
+            f"The file is saved, but not all servos have it (not: {left}). "
+            f"`ibrobot feetech check {bus.port.path} --name {name} --write` writes the rest.",
+            err=True,
+        )
+        raise

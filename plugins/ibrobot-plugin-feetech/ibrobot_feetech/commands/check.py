@@ -1,0 +1,111 @@
+"""`ibrobot feetech check`: whether the servos are as their calibration's file says."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+
+import attrs
+import click
+
+from ibrobot_core.calibration import Calibration, load_calibration
+from ibrobot_feetech.bus import FeetechBus
+from ibrobot_feetech.commands.dialogue import agree, show, table
+from ibrobot_feetech.commands.eprom import write_eprom
+from ibrobot_feetech.commands.joints import joints_of
+from ibrobot_feetech.commands.ports import opened, port_argument
+from ibrobot_feetech.errors import NoReply
+from ibrobot_feetech.options import FollowerOptions
+from ibrobot_feetech.registers import MODEL_STS3215
+
+_TUNING = ("p_coefficient", "i_coefficient", "d_coefficient")
+
+
+@attrs.frozen
+class Difference:
+    """A register that is not as it should be."""
+
+    joint: str
+    servo: int
+    register: str
+    found: str
+    wanted: str
+    remedy: str
+    """What to do; empty where `--write` does it."""
+    matters: bool = True
+
+
+@click.command()
+@port_argument
+@click.option("--name", default="so101_follower", show_default=True, help="Of the calibration, or a path.")
+@click.option("--robot", metavar="CONFIG", help="Robot YAML with the joints; an SO-101's by default.")
+@click.option("--write", is_flag=True, help="Write the file's values to servos that have others; torque goes off.")
+@click.option("--yes", is_flag=True, help="Write without asking.")
+def check(port: str | None, name: str, robot: str | None, write: bool, yes: bool) -> None:
+    """Compare the servos with a calibration; exit 1 with a table of what differs."""
+    calibration = load_calibration(name, [joint.name for joint in joints_of(robot, name)])
+    click.echo(
+        f"{calibration.path}: arm {calibration.robot or 'unnamed'}, made {calibration.date or 'at an unknown time'}"
+    )
+    with opened(port, joints={joint.id: each for each, joint in calibration.joints.items()}) as bus:
+        found = list(differences(bus, calibration))
+        if write and (wrong := [each for each in found if not each.remedy]):
+            _print(found)
+            servos = sorted({each.servo for each in wrong})
+            click.echo("The torque of these servos goes off, and the arm may fall: hold it.")
+            if not (yes or agree(f"Write to servos {', '.join(map(str, servos))}?", flag="--yes")):
+                raise click.Abort
+            for servo in servos:
+                write_eprom(bus, servo, {each.register: int(each.wanted) for each in wrong if each.servo == servo})
+            found = list(differences(bus, calibration))
+    if found:
+        _print(found)
+    if any(each.matters for each in found):
+        sys.exit(1)
+    click.echo(f"{len(calibration.joints)} servos are as the calibration says")
+
+
+def differences(bus: FeetechBus, calibration: Calibration) -> Iterator[Difference]:
+    """Everything that is not as it should be, servo by servo.
+
+    Raises:
+        FeetechError: when a servo answers wrongly, or the port is gone.
+    """
+    options = attrs.fields_dict(FollowerOptions)
+    versions: dict[str, str] = {}
+    for joint, numbers in calibration.joints.items():
+        servo = numbers.id
+        try:
+            model = bus.read_faulty(servo, "model_number")
+        except NoReply:
+            yield Difference(joint, servo, "", "no reply", "", "check power, cable, id")
+            continue
+        if model != MODEL_STS3215:
+            yield Difference(joint, servo, "model_number", str(model), str(MODEL_STS3215), "is it the right arm?")
+        versions[joint] = ".".join(str(bus.read_faulty(servo, f"firmware_{part}")) for part in ("major", "minor"))
+        wanted = {
+            "homing_offset": numbers.homing_offset,
+            "min_position_limit": numbers.range_min,
+            "max_position_limit": numbers.range_max,
+            "operating_mode": 0,
+        }
+        for register, value in wanted.items():
+            if (found := bus.read_faulty(servo, register)) != value:
+                yield Difference(joint, servo, register, str(found), str(value), "")
+        for register in _TUNING:
+            if (found := bus.read_faulty(servo, register)) != options[register].default:
+                default = str(options[register].default)
+                yield Difference(joint, servo, register, str(found), default, "set at each start", matters=False)
+    common = max(versions.values(), key=list(versions.values()).count, default="")
+    for joint, version in versions.items():
+        if version != common:
+            servo = calibration.joints[joint].id
+            yield Difference(joint, servo, "firmware", version, common, "update the older servos")
+
+
+def _print(found: list[Difference]) -> None:
+    made = table(">id", "joint", "register", ">servo", ">file", "remedy")
+    for each in found:
+        remedy = each.remedy or "--write"
+        made.add_row(str(each.servo), each.joint, each.register, each.found, each.wanted, remedy)
+    show(made)

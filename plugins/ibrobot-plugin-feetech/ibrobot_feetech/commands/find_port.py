@@ -1,0 +1,46 @@
+"""`ibrobot feetech find-port`: which port the arm is on."""
+
+from __future__ import annotations
+
+import click
+
+from ibrobot_core.errors import HardwareError
+from ibrobot_feetech.commands.dialogue import wait_for_enter
+from ibrobot_feetech.commands.ports import UsbPort, usb_ports
+
+
+@click.command()
+@click.option("--list", "only_list", is_flag=True, help="List the ports and ask nothing.")
+def find_port(only_list: bool) -> None:
+    """Find the port of an arm: pull its USB cable, and put it back."""
+    before = usb_ports()
+    for port in before:
+        _show(port)
+    if not before:
+        click.echo("No USB serial port is there.")
+    if only_list:
+        return
+    wait_for_enter("Pull the arm's USB cable, if it is plugged in.", flag="--list")
+    without = {port.path for port in usb_ports()}
+    gone = [port for port in before if port.path not in without]
+    if len(gone) > 1:
+        raise HardwareError(f"several ports are gone: {', '.join(p.path for p in gone)}; pull one cable at a time")
+    wait_for_enter("Plug it in (again).", flag="--list")
+    # The number in a path may be another now.
+    new = [port for port in usb_ports() if port.path not in without]
+    if not new:
+        raise HardwareError("no port came with the cable; check the cable (some only charge) and the arm's board")
+    if len(new) > 1:
+        raise HardwareError(f"several ports came: {', '.join(port.path for port in new)}; plug in one arm at a time")
+    click.echo("\nThe arm is at:")
+    _show(new[0])
+
+
+def _show(port: UsbPort) -> None:
+    arm = " (an SO-101's adapter)" if port.is_arm else ""
+    number = f", serial number {port.serial_number}" if port.serial_number else ""
+    click.echo(f"{port.path}  {port.description}, USB {port.usb_id}{number}{arm}")
+    if port.stable:
+        click.echo(f"    better in a YAML, since it stays the same: {port.stable}")
+    if not port.permitted:
+        click.echo("    no permission: sudo usermod -aG dialout $USER, then log in again")

@@ -1,0 +1,73 @@
+"""The joints that a command is about: names, servo ids, limits."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import attrs
+import click
+
+SO101 = {
+    "shoulder_pan": (-1.91986, 1.91986),
+    "shoulder_lift": (-1.74533, 1.74533),
+    "elbow_flex": (-1.69, 1.69),
+    "wrist_flex": (-1.65806, 1.65806),
+    "wrist_roll": (-2.74385, 2.74385),
+    "gripper": (-0.17453, 1.74533),
+}
+"""Joint -> its limits [rad], in the order of the servos' ids from 1."""
+
+
+@attrs.frozen
+class Joint:
+    """A joint and its servo."""
+
+    name: str
+    servo: int
+    lower: float
+    """[rad]"""
+    upper: float
+    """[rad]"""
+
+
+def joints_of(robot: str | None = None, calibration: str | None = None) -> list[Joint]:
+    """The joints of a robot's YAML, or the SO-101's; servos have the ids from 1 in that order.
+
+    Args:
+        robot: a path, or the name of a shipped config.
+        calibration: where the robot has several arms, the one whose options name this calibration.
+
+    Raises:
+        ConfigError: when the config cannot be used.
+    """
+    limits: Mapping[str, tuple[float, float]] = SO101
+    if robot is not None:
+        from ibrobot_core.config import find_config, load
+        from ibrobot_core.plugins import installed
+
+        config = load(find_config(robot, installed()))
+        arms = config.hardware.values()
+        names = next(
+            (arm.joints for arm in arms if getattr(arm.options, "calibration", None) == calibration),
+            config.robot.joint_names,
+        )
+        limits = {joint.name: (joint.lower, joint.upper) for joint in config.robot.joints if joint.name in names}
+    return [Joint(name, servo, *ends) for servo, (name, ends) in enumerate(limits.items(), 1)]
+
+
+def chosen(joints: Sequence[Joint], names: Sequence[str]) -> list[Joint]:
+    """Those of these names; all where none is given.
+
+    Raises:
+        BadParameter: for a name that there is not.
+    """
+    known = {joint.name: joint for joint in joints}
+    for name in names:
+        if name not in known:
+            raise click.BadParameter(f"no joint {name!r}; there are: {', '.join(known)}", param_hint="--joint")
+    return [known[name] for name in names] or list(joints)
+
+
+def by_servo(joints: Sequence[Joint]) -> dict[int, str]:
+    """Servo id -> joint."""
+    return {joint.servo: joint.name for joint in joints}

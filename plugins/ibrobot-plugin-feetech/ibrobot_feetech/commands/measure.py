@@ -1,0 +1,181 @@
+"""The dialogue that measures an arm: the middle pose, the ranges by hand, the signs. It writes nothing."""
+
+from __future__ import annotations
+
+import queue
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+
+import attrs
+import click
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+from ibrobot_core.calibration import JointCalibration
+from ibrobot_core.errors import CalibrationError
+from ibrobot_core.terminal import Keys
+from ibrobot_core.units import TICKS_PER_TURN
+from ibrobot_feetech.bus import FeetechBus
+from ibrobot_feetech.commands.dialogue import Unanswered, agree, interactive, table, wait_for_enter
+from ibrobot_feetech.commands.joints import Joint
+from ibrobot_feetech.commands.ranges import Range, doubtful, homing_offset, impossible
+
+_PERIOD_S = 0.03
+_TURNED = 40
+"""A joint that moved by as much was turned on purpose [ticks]."""
+
+
+@attrs.frozen
+class Answers:
+    """What the flags answer beforehand."""
+
+    middle_now: bool
+    range_seconds: float | None
+    accept_ranges: bool
+    check_signs: bool
+
+
+class Measurement:
+    """One arm, its torque off.
+
+    Args:
+        bus: an open bus.
+        joints: the arm's.
+        full_turn: joints that turn all round: their range is all of it.
+        compared: joints whose range is compared with their limits.
+        answers: what the flags answer.
+    """
+
+    def __init__(
+        self, bus: FeetechBus, joints: Sequence[Joint], *, full_turn: Sequence[str], compared: Sequence[str],
+        answers: Answers,
+    ) -> None:  # fmt: skip
+        self._bus = bus
+        self._joints = joints
+        self._ids = [joint.servo for joint in joints]
+        self._measured = [joint for joint in joints if joint.name not in full_turn]
+        self._compared = compared
+        self._answers = answers
+        self._kept = {servo: bus.read(servo, "homing_offset") for servo in self._ids}
+
+    def run(self) -> dict[str, JointCalibration]:
+        """Go through the dialogue.
+
+        Raises:
+            CalibrationError: when what was measured cannot be true.
+            FeetechError: when a servo stops answering.
+        """
+        offsets = self._middle()
+        ranges = self._ranges(offsets)
+        whole = Range(0, 0, TICKS_PER_TURN - 1)
+        inverted = {joint.name: self._is_inverted(joint) for joint in self._joints} if self._answers.check_signs else {}
+        found = {}
+        for joint in self._joints:
+            measured = ranges.get(joint.name, whole)
+            found[joint.name] = JointCalibration(
+                joint.servo,
+                int(inverted.get(joint.name, False)),
+                offsets[joint.servo],
+                measured.least,
+                measured.greatest,
+            )
+        return found
+
+    def _encoders(self) -> dict[int, int]:
+        """Servo id -> its encoder's position [ticks], 0 to 4095."""
+        positions = self._bus.sync_read("present_position", self._ids)
+        return {servo: (position + self._kept[servo]) % TICKS_PER_TURN for servo, position in positions.items()}
+
+    def _middle(self) -> dict[int, int]:
+        """Servo id -> homing offset."""
+        request = "Move every joint to the middle of its range."
+        while True:
+            if not self._answers.middle_now:
+                wait_for_enter(request, flag="--middle-now")
+            encoders = self._encoders()
+            try:
+                return {joint.servo: homing_offset(joint.name, encoders[joint.servo]) for joint in self._joints}
+            except CalibrationError as error:
+                if self._answers.middle_now:
+                    raise
+                click.echo(f"error: {error}", err=True)
+
+    def _ranges(self, offsets: Mapping[int, int]) -> dict[str, Range]:
+        reported = self._reported(offsets)
+        ranges = {joint.name: Range.at(reported[joint.servo]) for joint in self._measured}
+        while True:
+            self._follow(offsets, ranges)
+            wrong = [text for joint in self._measured if (text := impossible(joint.name, ranges[joint.name]))]
+            for text in wrong:
+                click.echo(f"error: {text}", err=True)
+            crossed = any(measured.crosses for measured in ranges.values())
+            if not wrong and self._accepted(ranges):
+                return ranges
+            if crossed or self._answers.range_seconds is not None or not agree("Measure on?", flag="", default=True):
+                what = wrong[0] if wrong else "the ranges were not accepted; --accept-ranges takes them all the same"
+                raise CalibrationError(what)
+
+    def _accepted(self, ranges: Mapping[str, Range]) -> bool:
+        doubts = [
+            text
+            for joint in self._measured
+            if joint.name in self._compared
+            and (text := doubtful(joint, ranges[joint.name], centred=joint.lower < 0 < joint.upper + joint.lower * 2 or
+                                  abs(joint.lower + joint.upper) < 0.2))
+        ]  # fmt: skip
+        for text in doubts:
+            click.echo(f"warning: {text}", err=True)
+        if not doubts or self._answers.accept_ranges:
+            return True
+        return self._answers.range_seconds is None and agree("Take these ranges all the same?", flag="--accept-ranges")
+
+    def _reported(self, offsets: Mapping[int, int]) -> dict[int, int]:
+        """Servo id -> what it will report with its new offset [ticks], 0 to 4095."""
+        return {servo: (encoder - offsets[servo]) % TICKS_PER_TURN for servo, encoder in self._encoders().items()}
+
+    def _follow(self, offsets: Mapping[int, int], ranges: Mapping[str, Range]) -> None:
+        """Watch the joints being moved, until Enter or the end of the time."""
+        seconds = self._answers.range_seconds
+        if seconds is None and not interactive():
+            raise Unanswered("Nobody is at a terminal to press Enter; run it in one, or give --range-seconds")
+        end = "Enter ends it" if seconds is None else f"for {seconds:g} s"
+        click.echo(f"Move {', '.join(joint.name for joint in self._measured)} to both ends ({end}).")
+        until = time.monotonic() + (seconds if seconds is not None else float("inf"))
+        with ExitStack() as stack:
+            typed = stack.enter_context(Keys()).subscribe() if interactive() else queue.SimpleQueue[str]()
+            live = stack.enter_context(Live(_rows(self._measured, ranges), console=Console(), auto_refresh=False))
+            while time.monotonic() < until:
+                reported = self._reported(offsets)
+                for joint in self._measured:
+                    ranges[joint.name].follow(reported[joint.servo])
+                live.update(_rows(self._measured, ranges), refresh=live.console.is_terminal)
+                try:
+                    if typed.get(timeout=_PERIOD_S) == "enter":
+                        break
+                except queue.Empty:
+                    continue
+
+    def _is_inverted(self, joint: Joint) -> bool:
+        """Whether radians fall while ticks grow."""
+        while True:
+            before = self._encoders()[joint.servo]
+            wait_for_enter(f"Turn {joint.name} a little, so that its angle grows.", flag="no --check-signs")
+            half = TICKS_PER_TURN // 2
+            moved = (self._encoders()[joint.servo] - before + half) % TICKS_PER_TURN - half
+            if abs(moved) >= _TURNED:
+                break
+            click.echo(f"error: {joint.name} moved by {moved} ticks only; again", err=True)
+        if moved < 0:
+            click.echo(f"warning: {joint.name}: ticks fall while its angle grows: it is stored as inverted", err=True)
+        return moved < 0
+
+
+def _rows(joints: Sequence[Joint], ranges: Mapping[str, Range]) -> Table:
+    made = table(">id", "joint", ">min", ">now", ">max", ">span", "")
+    for joint in joints:
+        found = ranges[joint.name]
+        numbers = (found.least, found.now, found.greatest, found.span)
+        made.add_row(str(joint.servo), joint.name, *map(str, numbers), "crosses 0/4095" if found.crosses else "")
+    return made

@@ -1,0 +1,63 @@
+"""`ibrobot feetech scan`: who is on the bus."""
+
+from __future__ import annotations
+
+import click
+
+from ibrobot_core.errors import HardwareError
+from ibrobot_feetech.bus import FeetechBus
+from ibrobot_feetech.commands.dialogue import show, table
+from ibrobot_feetech.commands.joints import by_servo, joints_of
+from ibrobot_feetech.commands.ports import opened, port_argument
+from ibrobot_feetech.errors import PortError
+from ibrobot_feetech.registers import BAUD_RATES, MODEL_STS3215
+
+
+class BaudRates(click.ParamType[tuple[int, ...]]):
+    """One baud rate, or `all`."""
+
+    name = "all|N"
+
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, ...]:
+        """The rates to try [baud]."""
+        if isinstance(value, tuple):
+            return value
+        if value == "all":
+            return tuple(BAUD_RATES)
+        if str(value).isdigit() and int(str(value)) in BAUD_RATES:
+            return (int(str(value)),)
+        self.fail(f"{value!r} is none of: all, {', '.join(map(str, BAUD_RATES))}", param, ctx)
+
+
+@click.command()
+@port_argument
+@click.option("--baud", type=BaudRates(), default="1000000", show_default=True, help="Rate at which to ask.")
+def scan(port: str | None, baud: tuple[int, ...]) -> None:
+    """List the servos that answer: id, model, firmware, baud rate. Exit 1 if there are none."""
+    names = by_servo(joints_of())
+    found = table(">id", "joint of an SO-101", "model", "firmware", ">baud")
+    with opened(port, baud[0]) as bus:
+        for rate in baud:
+            for servo, model in search(bus, rate).items():
+                firmware = ".".join(str(bus.read_faulty(servo, f"firmware_{part}")) for part in ("major", "minor"))
+                kind = "STS3215" if model == MODEL_STS3215 else str(model)
+                found.add_row(str(servo), names.get(servo, ""), kind, firmware, str(rate))
+        if not found.row_count:
+            at = f"{baud[0]} baud" if len(baud) == 1 else "any baud rate"
+            more = " and other rates (--baud all)" if len(baud) == 1 else ""
+            raise HardwareError(
+                f"{bus.port.path}: no servo answers at {at}; check the arm's power supply, the cable to its first "
+                f"servo, the jumpers of the board (USB){more}"
+            )
+    show(found)
+
+
+def search(bus: FeetechBus, rate: int) -> dict[int, int]:
+    """Servo id -> model, of those that answer at a baud rate; none where the port cannot have it."""
+    try:
+        bus.port.set_baud_rate(rate)
+    except PortError:
+        if len(bus.port.path) and rate != 1_000_000:
+            return {}
+        raise
+    return bus.scan()

@@ -1,0 +1,95 @@
+"""`ibrobot feetech setup-motors`: gives each servo its id and the baud rate, one at a time."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+
+import click
+
+from ibrobot_core.errors import HardwareError
+from ibrobot_feetech.bus import FeetechBus
+from ibrobot_feetech.commands.dialogue import agree, interactive, wait_for_enter
+from ibrobot_feetech.commands.joints import Joint, by_servo, chosen, joints_of
+from ibrobot_feetech.commands.ports import opened, port_argument
+from ibrobot_feetech.commands.scan import BaudRates, search
+from ibrobot_feetech.errors import NoReply
+from ibrobot_feetech.registers import BAUD_RATES, MODEL_STS3215
+
+_RATE = 1_000_000
+
+
+@click.command()
+@port_argument
+@click.option("--joint", "names", multiple=True, metavar="NAME", help="Only this joint; may be repeated.")
+@click.option("--robot", metavar="CONFIG", help="Robot YAML with the joints; an SO-101's by default.")
+@click.option(
+    "--baud", type=BaudRates(), default="all", show_default=True, help="Rates at which to look for the servo."
+)
+@click.option("--yes", is_flag=True, help="The servo is connected: ask nothing; goes with one --joint.")
+def setup_motors(port: str | None, names: tuple[str, ...], robot: str | None, baud: tuple[int, ...], yes: bool) -> None:
+    """Give each servo its id and 1 Mbaud, with only that one connected; the last joint comes first."""
+    if yes and len(names) != 1:
+        raise click.UsageError("--yes goes with exactly one --joint: only one servo may be connected")
+    every = joints_of(robot)
+    with opened(port, joints=by_servo(every)) as bus:
+        for joint in reversed(chosen(every, names)):
+            _set_up(bus, joint, baud, yes)
+    click.echo("Now connect the servos in a chain; `ibrobot feetech scan` must show all of them.")
+
+
+def _set_up(bus: FeetechBus, joint: Joint, rates: tuple[int, ...], yes: bool) -> None:
+    while True:
+        if not yes:
+            wait_for_enter(f"Connect only the servo of {joint.name} (id {joint.servo}), and power.", flag="--yes")
+        try:
+            servo, rate = _the_only_one(bus, joint, rates)
+            _assign(bus, servo, rate, joint)
+        except HardwareError as error:
+            if yes or not interactive():
+                raise
+            click.echo(f"error: {error}", err=True)
+            if not agree("Try again?", flag="--yes", default=True):
+                raise click.Abort from None
+        else:
+            click.echo(f"{joint.name}: was id {servo} at {rate} baud, is id {joint.servo} at {_RATE} baud")
+            return
+
+
+def _the_only_one(bus: FeetechBus, joint: Joint, rates: tuple[int, ...]) -> tuple[int, int]:
+    """Id and baud rate of the servo that is connected.
+
+    Raises:
+        HardwareError: when none answers, more than one does, or it is another model.
+    """
+    damaged = bus.counters["bad_packets"]
+    found = {(servo, rate): model for rate in rates for servo, model in search(bus, rate).items()}
+    where = f"{bus.port.path}, {joint.name}"
+    if not found:
+        if bus.counters["bad_packets"] > damaged:
+            raise HardwareError(f"{where}: the answers are damaged: several servos share an id; connect only one")
+        raise HardwareError(f"{where}: no servo answers at {len(rates)} baud rates; check its power and its cable")
+    if len(found) > 1:
+        who = ", ".join(f"id {servo} at {rate} baud" for servo, rate in found)
+        raise HardwareError(f"{where}: {len(found)} servos answer ({who}); connect only that of {joint.name}")
+    (servo, rate), model = next(iter(found.items()))
+    if model != MODEL_STS3215:
+        raise HardwareError(f"{where}: servo {servo} is model {model}, an STS3215 is {MODEL_STS3215}")
+    return servo, rate
+
+
+def _assign(bus: FeetechBus, servo: int, rate: int, joint: Joint) -> None:
+    """Give the servo its id and baud rate, position mode besides, and lock them."""
+    bus.port.set_baud_rate(rate)
+    bus.write(servo, "torque_enable", 0)
+    bus.write(servo, "lock", 0)
+    bus.write(servo, "operating_mode", 0)
+    # Whether the acknowledgement comes from the old id or rate or from the new differs between firmwares.
+    with suppress(NoReply):
+        bus.write(servo, "id", joint.servo)
+    with suppress(NoReply):
+        bus.write(joint.servo, "baud_rate", BAUD_RATES[_RATE])
+    bus.port.set_baud_rate(_RATE)
+    bus.write(joint.servo, "lock", 1)
+    found = bus.read(joint.servo, "id"), bus.read(joint.servo, "baud_rate")
+    if found != (joint.servo, BAUD_RATES[_RATE]):
+        raise HardwareError(f"{bus.place(joint.servo)}: it has id and rate code {found} after being set; try again")

@@ -1,0 +1,31 @@
+"""`ibrobot feetech torque`: the motors on, without a jump, or off."""
+
+from __future__ import annotations
+
+import click
+
+from ibrobot_feetech.arm import hold, relax
+from ibrobot_feetech.commands.dialogue import agree
+from ibrobot_feetech.commands.joints import by_servo, chosen, joints_of
+from ibrobot_feetech.commands.ports import opened, port_argument
+
+
+@click.command()
+@click.argument("state", type=click.Choice(["on", "off"]))
+@port_argument
+@click.option("--joint", "names", multiple=True, metavar="NAME", help="Only this joint; may be repeated.")
+@click.option("--robot", metavar="CONFIG", help="Robot YAML with the joints; an SO-101's by default.")
+@click.option("--yes", is_flag=True, help="Off without asking.")
+def torque(state: str, port: str | None, names: tuple[str, ...], robot: str | None, yes: bool) -> None:
+    """Switch the motors on where the joints stand, or off."""
+    joints = chosen(joints_of(robot), names)
+    with opened(port, joints=by_servo(joints)) as bus:
+        if state == "on":
+            for joint in joints:
+                hold(bus, joint.servo)
+        else:
+            click.echo("Without torque the arm falls: hold it, or see that it lies.")
+            if not (yes or agree("Torque off?", flag="--yes")):
+                raise click.Abort
+            relax(bus, [joint.servo for joint in joints])
+    click.echo(f"torque {state}: {', '.join(joint.name for joint in joints)}")
