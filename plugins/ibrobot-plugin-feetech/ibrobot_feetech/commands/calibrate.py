@@ -1,4 +1,4 @@
-"""`ibrobot feetech calibrate`: measures where each joint's middle and range lie, and keeps it in a file and the servos."""
+"""`ibrobot feetech calibrate`: each joint's middle and range, kept in a file and in the servos."""
 
 from __future__ import annotations
 
@@ -24,9 +24,7 @@ from ibrobot_feetech.commands.ports import adapter_serial_number, opened, port_a
 @click.option("--name", help="Of the calibration, or a path.  [default: so101_follower, or so101_leader]")
 @click.option("--leader", is_flag=True, help="A leader arm: the range of its gripper is its own.")
 @click.option("--robot", metavar="CONFIG", help="Robot YAML with the joints; an SO-101's by default.")
-@click.option(
-    "--arm", help="Which arm it is, kept beside the numbers.  [default: the adapter's serial number, or name]"
-)
+@click.option("--arm", help="Which arm it is, for the records.  [default: the adapter's serial number]")
 @click.option(
     "--full-turn", multiple=True, default=("wrist_roll",), show_default=True, help="Joint that turns all round."
 )

@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 import attrs
 import click
 
+from ibrobot_feetech.options import FollowerOptions
+
 SO101 = {
     "shoulder_pan": (-1.91986, 1.91986),
     "shoulder_lift": (-1.74533, 1.74533),
@@ -28,6 +30,8 @@ class Joint:
     """[rad]"""
     upper: float
     """[rad]"""
+    anchored: bool = False
+    """Whether its calibrated closed end, rather than its middle pose, says where its angle begins."""
 
 
 def joints_of(robot: str | None = None, calibration: str | None = None) -> list[Joint]:
@@ -41,18 +45,18 @@ def joints_of(robot: str | None = None, calibration: str | None = None) -> list[
         ConfigError: when the config cannot be used.
     """
     limits: Mapping[str, tuple[float, float]] = SO101
+    anchored: tuple[str, ...] = ("gripper",)
     if robot is not None:
         from ibrobot_core.config import find_config, load
         from ibrobot_core.plugins import installed
 
         config = load(find_config(robot, installed()))
-        arms = config.hardware.values()
-        names = next(
-            (arm.joints for arm in arms if getattr(arm.options, "calibration", None) == calibration),
-            config.robot.joint_names,
-        )
+        arms = [arm for arm in config.hardware.values() if isinstance(arm.options, FollowerOptions)]
+        arm = next((arm for arm in arms if arm.options.calibration == calibration), None)
+        names = arm.joints if arm is not None else config.robot.joint_names
+        anchored = arm.options.anchored if arm is not None else anchored
         limits = {joint.name: (joint.lower, joint.upper) for joint in config.robot.joints if joint.name in names}
-    return [Joint(name, servo, *ends) for servo, (name, ends) in enumerate(limits.items(), 1)]
+    return [Joint(name, servo, *ends, name in anchored) for servo, (name, ends) in enumerate(limits.items(), 1)]
 
 
 def chosen(joints: Sequence[Joint], names: Sequence[str]) -> list[Joint]:

@@ -75,12 +75,9 @@ class Measurement:
         for joint in self._joints:
             measured = ranges.get(joint.name, whole)
             found[joint.name] = JointCalibration(
-                joint.servo,
-                int(inverted.get(joint.name, False)),
-                offsets[joint.servo],
-                measured.least,
-                measured.greatest,
-            )
+                id=joint.servo, drive_mode=int(inverted.get(joint.name, False)), homing_offset=offsets[joint.servo],
+                range_min=measured.least, range_max=measured.greatest,
+            )  # fmt: skip
         return found
 
     def _encoders(self) -> dict[int, int]:
@@ -108,23 +105,19 @@ class Measurement:
         while True:
             self._follow(offsets, ranges)
             wrong = [text for joint in self._measured if (text := impossible(joint.name, ranges[joint.name]))]
-            for text in wrong:
-                click.echo(f"error: {text}", err=True)
             crossed = any(measured.crosses for measured in ranges.values())
             if not wrong and self._accepted(ranges):
                 return ranges
-            if crossed or self._answers.range_seconds is not None or not agree("Measure on?", flag="", default=True):
-                what = wrong[0] if wrong else "the ranges were not accepted; --accept-ranges takes them all the same"
-                raise CalibrationError(what)
+            refused = "\n".join(wrong) or "the ranges were not accepted; --accept-ranges takes them all the same"
+            if crossed or self._answers.range_seconds is not None:
+                raise CalibrationError(refused)
+            click.echo(refused, err=True)
+            if not agree("Measure on?", flag="--range-seconds", default=True):
+                raise click.Abort
 
     def _accepted(self, ranges: Mapping[str, Range]) -> bool:
-        doubts = [
-            text
-            for joint in self._measured
-            if joint.name in self._compared
-            and (text := doubtful(joint, ranges[joint.name], centred=joint.lower < 0 < joint.upper + joint.lower * 2 or
-                                  abs(joint.lower + joint.upper) < 0.2))
-        ]  # fmt: skip
+        compared = [joint for joint in self._measured if joint.name in self._compared]
+        doubts = [text for joint in compared if (text := doubtful(joint, ranges[joint.name]))]
         for text in doubts:
             click.echo(f"warning: {text}", err=True)
         if not doubts or self._answers.accept_ranges:
@@ -145,17 +138,22 @@ class Measurement:
         until = time.monotonic() + (seconds if seconds is not None else float("inf"))
         with ExitStack() as stack:
             typed = stack.enter_context(Keys()).subscribe() if interactive() else queue.SimpleQueue[str]()
-            live = stack.enter_context(Live(_rows(self._measured, ranges), console=Console(), auto_refresh=False))
+            console = Console()
+            live = Live(console=console, auto_refresh=False)
+            if console.is_terminal:
+                stack.enter_context(live)
             while time.monotonic() < until:
                 reported = self._reported(offsets)
                 for joint in self._measured:
                     ranges[joint.name].follow(reported[joint.servo])
-                live.update(_rows(self._measured, ranges), refresh=live.console.is_terminal)
+                live.update(_rows(self._measured, ranges), refresh=console.is_terminal)
                 try:
                     if typed.get(timeout=_PERIOD_S) == "enter":
                         break
                 except queue.Empty:
                     continue
+        if not console.is_terminal:
+            console.print(_rows(self._measured, ranges))
 
     def _is_inverted(self, joint: Joint) -> bool:
         """Whether radians fall while ticks grow."""

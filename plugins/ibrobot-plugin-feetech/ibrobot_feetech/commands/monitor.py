@@ -48,8 +48,15 @@ def monitor(port: str | None, robot: str | None, period: float, once: bool, as_j
                     if once:
                         return
                     time.sleep(period)
-            with Live(_panel(bus, reader, joints), console=Console(), auto_refresh=False) as live:
+            console = Console()
+            if once or not console.is_terminal:
+                console.print(_panel(bus, reader, joints))
                 while not once:
+                    time.sleep(period)
+                    console.print(_panel(bus, reader, joints))
+                return
+            with Live(_panel(bus, reader, joints), console=console, auto_refresh=False) as live:
+                while True:
                     time.sleep(period)
                     live.update(_panel(bus, reader, joints), refresh=True)
         except KeyboardInterrupt:
@@ -73,8 +80,9 @@ def reading(reader: SyncReader, joints: Sequence[Joint]) -> list[dict[str, Any]]
 
 
 def _panel(bus: FeetechBus, reader: SyncReader, joints: Sequence[Joint]) -> Group:
+    rows = _rows(reading(reader, joints))
     counts = ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in bus.counters.items())
-    return Group(_rows(reading(reader, joints)), Text(counts, style="dim"))
+    return Group(rows, Text(counts, style="dim"))
 
 
 def _rows(servos: Sequence[Mapping[str, Any]]) -> Table:
@@ -84,9 +92,10 @@ def _rows(servos: Sequence[Mapping[str, Any]]) -> Table:
         if not servo["answers"]:
             made.add_row(*name, *[""] * 7, Text("no reply", style="red"))
             continue
+        errors = Text(", ".join(servo["errors"]) or "none", style="red" if servo["errors"] else "")
         made.add_row(
             *name, str(servo["position_ticks"]), f"{servo['position_deg']:.1f}", f"{servo['velocity_deg_s']:.0f}",
             f"{servo['load_percent']:.0f}", f"{servo['temperature_c']:.0f}", f"{servo['voltage_v']:.1f}",
-            f"{servo['current_a']:.2f}", Text(", ".join(servo["errors"]) or "none", style="red" if servo["errors"] else ""),
+            f"{servo['current_a']:.2f}", errors,
         )  # fmt: skip
     return made

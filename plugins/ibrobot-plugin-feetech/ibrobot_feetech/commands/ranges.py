@@ -62,7 +62,7 @@ class Range:
 
     @property
     def span(self) -> int:
-        """[ticks]"""
+        """How far it moved [ticks]."""
         return self.greatest - self.least
 
     @property
@@ -83,14 +83,8 @@ def impossible(joint: str, measured: Range) -> str | None:
     return None
 
 
-def doubtful(joint: Joint, measured: Range, *, centred: bool) -> str | None:
-    """Why a range does not look like the joint's limits; None where it does.
-
-    Args:
-        joint: with its limits.
-        measured: the range.
-        centred: whether the joint's 0 rad is at the middle pose.
-    """
+def doubtful(joint: Joint, measured: Range) -> str | None:
+    """Why a range does not look like the joint's limits; None where it does."""
     ticks = TICKS_PER_TURN / (2 * math.pi)
     expected = (joint.upper - joint.lower) * ticks
     if abs(measured.span - expected) > _TOLERANCE * expected:
@@ -101,7 +95,7 @@ def doubtful(joint: Joint, measured: Range, *, centred: bool) -> str | None:
     off = (measured.least + measured.greatest) / 2 - TICKS_PER_TURN / 2
     # The sign of the ticks is not known here: limits about 0 have their middle near 0 either way.
     off = abs(off) - abs((joint.lower + joint.upper) / 2) * ticks
-    if centred and off > _OFF_CENTRE:
+    if not joint.anchored and off > _OFF_CENTRE:
         return f"{joint.name}: the middle of its range is {_deg(off):.0f} deg off the middle pose, which is its 0 deg"
     return None
 

@@ -26,7 +26,7 @@ class BaudRates(click.ParamType[tuple[int, ...]]):
             return tuple(BAUD_RATES)
         if str(value).isdigit() and int(str(value)) in BAUD_RATES:
             return (int(str(value)),)
-        self.fail(f"{value!r} is none of: all, {', '.join(map(str, BAUD_RATES))}", param, ctx)
+        return self.fail(f"{value!r} is none of: all, {', '.join(map(str, BAUD_RATES))}", param, ctx)
 
 
 @click.command()
@@ -57,7 +57,5 @@ def search(bus: FeetechBus, rate: int) -> dict[int, int]:
     try:
         bus.port.set_baud_rate(rate)
     except PortError:
-        if len(bus.port.path) and rate != 1_000_000:
-            return {}
-        raise
+        return {}
     return bus.scan()
