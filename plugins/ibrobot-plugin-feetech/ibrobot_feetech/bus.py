@@ -3,7 +3,8 @@
 The protocol has no sequence numbers: a reply says which servo sent it and how long it is, nothing more. A reply that
 comes after its request timed out could therefore be taken for the answer to the next one, and every later answer would
 then be one request old. So an exchange that timed out leaves its servo and the length of its reply on a list, for
-longer than any reply can be late; meanwhile
+longer than any reply can be late (but not where exactly the bytes came that were due: a reply that came damaged comes
+no more); meanwhile
 
 - a read asks for a span of another length, by beginning some registers earlier;
 - a reply of a listed length is dropped and counted;
@@ -14,7 +15,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Generator, Iterable, Mapping, Sequence
 
 from ibrobot_feetech import protocol
 from ibrobot_feetech.errors import FeetechError, NoReply, PacketError, Place, ServoFault, UnexpectedReply
@@ -24,8 +25,10 @@ from ibrobot_feetech.registers import STS3215, Register, register
 
 LATE_S = 0.5
 """Longer than a reply can be late [s]: adapters were seen to hold one back for 0.08 s."""
-_ADAPTER_S = 0.005
+_ADAPTER_S = 0.004
 """Time for the USB adapter and the kernel beside the time on the wire [s]."""
+_TRAIL_S = 0.001
+"""How long to go on listening when as many bytes came as were asked for, but not all of them good [s]."""
 _RETURN_DELAY_S = 0.000_5
 """A servo's own delay before it answers, as it is shipped [s]: 250 units of 2 us."""
 _EPROM_S = 0.02
@@ -93,7 +96,9 @@ class FeetechBus:
         self.port.write(protocol.ping(BROADCAST))
         # Each servo waits for its turn, which is due by its id.
         timeout_s = self.timeout(OVERHEAD, OVERHEAD * len(wanted)) + 0.001 * len(wanted)
-        found = {p.servo for p in self._collect(OVERHEAD * (protocol.MAX_ID + 1), timeout_s) if not p.parameters}
+        found = {
+            p.servo for p in self._collect(OVERHEAD * (protocol.MAX_ID + 1), timeout_s, bytearray()) if not p.parameters
+        }
         for servo in wanted:
             self._expect_late(servo, 0)
         if not found & wanted:
@@ -194,15 +199,18 @@ class FeetechBus:
         wanted = set(servos)
         found: dict[int, tuple[bytes, int]] = {}
         expected = (OVERHEAD + length) * len(servos)
-        for packet in self._collect(expected, self.timeout(len(request), expected, len(servos)), received):
+        heard, foreign = bytearray(), self.counters["late_replies"]
+        for packet in self._collect(expected, self.timeout(len(request), expected, len(servos)), heard, received):
             if packet.servo not in wanted or not self._is_answer(packet, length) or packet.servo in found:
                 self.counters["late_replies"] += 1
                 continue
             found[packet.servo] = packet.parameters[skip : skip + size], packet.code
             if len(found) == len(wanted):
                 break
-        for servo in wanted - found.keys():
-            self._lost(servo, length)
+        own = self.counters["late_replies"] == foreign
+        if not (own and _all_in_place(heard, servos, found, OVERHEAD + length)):
+            for servo in wanted - found.keys():
+                self._lost(servo, length)
         return found
 
     def resynchronise(self) -> None:
@@ -260,33 +268,40 @@ class FeetechBus:
         self.begin_request()
         self.port.write(request)
         timeout_s = self.timeout(len(request), OVERHEAD + length) + extra_s
-        bad = self.counters["bad_packets"]
-        for packet in self._collect(OVERHEAD + length, timeout_s):
+        heard, foreign = bytearray(), self.counters["late_replies"]
+        for packet in self._collect(OVERHEAD + length, timeout_s, heard):
             if packet.servo == servo and self._is_answer(packet, length):
                 return packet
             self.counters["late_replies"] += 1
-        self._lost(servo, length)
-        if self.counters["bad_packets"] > bad:
+        own = self.counters["late_replies"] == foreign
+        if own and _all_in_place(heard, (servo,), {}, OVERHEAD + length):
             raise PacketError(self.place(servo, name), "the reply came damaged")
+        self._lost(servo, length)
         raise NoReply(self.place(servo, name), f"no reply within {timeout_s * 1e3:.1f} ms")
 
     def _is_answer(self, packet: Packet, length: int) -> bool:
         # A servo in trouble may answer without parameters; that is told, not read.
         return len(packet.parameters) == length and not self.may_be_late(packet.servo, length)
 
-    def _collect(self, expected: int, timeout_s: float, received: bytes = b"") -> Generator[Packet]:
-        """Packets as they come, until the time is over; the caller stops when it has what it waits for."""
-        deadline = time.monotonic() + timeout_s
-        scanner = protocol.Scanner()
+    def _collect(self, expected: int, timeout_s: float, heard: bytearray, received: bytes = b"") -> Generator[Packet]:
+        """Packets as they come, until the time is over; the caller stops when it has what it waits for.
+
+        All bytes are added to `heard`.
+        """
         missing = expected - len(received)
+        deadline = time.monotonic() + (timeout_s if missing > 0 else min(timeout_s, _TRAIL_S))
+        scanner = protocol.Scanner()
         try:
             while True:
+                heard += received
                 yield from scanner.feed(received)
                 # What came may have been garbage: go on while there is time, a packet at a time.
                 received = self.port.read(max(missing, OVERHEAD), deadline)
                 if not received:
                     return
                 missing -= len(received)
+                if missing <= 0:
+                    deadline = min(deadline, time.monotonic() + _TRAIL_S)
         finally:
             scanner.clear()
             self.counters["bad_packets"] += scanner.damaged
@@ -336,3 +351,11 @@ class FeetechBus:
             f"{servo} ({self.joints[servo]})" if servo in self.joints else str(servo) for servo in missing
         )
         return f"no reply; nor from the others of servos {names}"
+
+
+def _all_in_place(heard: bytearray, servos: Sequence[int], found: Container[int], size: int) -> bool:
+    """Whether exactly the replies came that were due, each of `size` bytes and in its place, good or damaged."""
+    if len(heard) != size * len(servos):
+        return False
+    places = enumerate(servos)
+    return all(heard[i * size + 2] == servo for i, servo in places if servo in found)

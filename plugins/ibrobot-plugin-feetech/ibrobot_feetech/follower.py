@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 from typing import override
 
@@ -26,6 +27,8 @@ _SLACK_TICKS = 16
 """How far a position may be from where the last one and the speed say [ticks]."""
 _MAX_ACCELERATION, _MAX_SPEED = 40_000, 4_000
 """What a joint can do beside that [ticks/s^2, ticks/s]."""
+_AGAIN = 0.4
+"""Part of a tick within which servos that did not answer well are asked once more."""
 _HEALTH = (("temperature", "present_temperature", 1.0), ("voltage", "present_voltage", 0.1))
 _CURRENT_A = 0.0065
 
@@ -70,7 +73,9 @@ class FeetechFollower(Hardware):
         self._health_due_ns = self._stamp_ns = 0
         self._speed: Vector = np.zeros(size)
         self._velocity: Vector = np.zeros(size)
+        self._complaints = np.zeros(size, dtype=np.uint8)
         self._counts = {"lost_replies": 0, "implausible_positions": 0}
+        self._again_s = _AGAIN * seconds(ctx.period_ns)
         self._fault: HardwareError | None = None
         self._relaxed = False
         self._limits = ctx.robot.lower[order], ctx.robot.upper[order]
@@ -98,7 +103,8 @@ class FeetechFollower(Hardware):
         begun_ns = self._ctx.clock.now_ns()
         healthy = begun_ns >= self._health_due_ns
         try:
-            replies = (self._health_reader if healthy else self._reader).read()
+            reader = self._health_reader if healthy else self._reader
+            replies = reader.read(time.monotonic() + self._again_s)
             stamp_ns = (begun_ns + self._ctx.clock.now_ns()) // 2
             values = replies.values
             good = replies.answered & self._plausible(values[:, 0], replies.answered, stamp_ns)
@@ -196,9 +202,11 @@ class FeetechFollower(Hardware):
 
     def _check(self, replies: Replies, good: NDArray[np.bool_]) -> None:
         """Raise what ends the reading: errors that servos report, and replies that are missing for too long."""
-        if replies.errors.any():
-            index = int(np.flatnonzero(replies.errors)[0])
-            raise ServoFault(self._place(index), faults(int(replies.errors[index])))
+        # Damage that passes the checksum must not stop the robot: an error counts when it is reported twice.
+        lasting, self._complaints = replies.errors & self._complaints, replies.errors
+        if lasting.any():
+            index = int(np.flatnonzero(lasting)[0])
+            raise ServoFault(self._place(index), faults(int(lasting[index])))
         self._lost = np.where(good, 0, self._lost + 1)
         self._counts["lost_replies"] += int((~replies.answered).sum())
         if (self._lost > self._options.lost_replies).any():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
+import time
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -38,7 +39,7 @@ class Replies(NamedTuple):
 
 
 class SyncReader:
-    """Reads the registers `first` to `last` of all servos, in one request and without retries.
+    """Reads the registers `first` to `last` of all servos, in one request.
 
     A good answer is checked and decoded as one array; anything else goes through the bus, packet by packet.
 
@@ -70,15 +71,18 @@ class SyncReader:
         self._no_errors = np.zeros(count, dtype=np.uint8)
         self._timeout_ms = math.ceil(bus.timeout(len(self._request), self._expected, count) * 1e3)
 
-    def read(self) -> Replies:
+    def read(self, again_until: float = 0.0) -> Replies:
         """Ask all servos and take what comes in time.
+
+        Args:
+            again_until: until when (`time.monotonic`) [s] those that did not answer well are asked once more.
 
         Raises:
             PortError: when the port is gone.
         """
         bus = self._bus
         if bus.outstanding:
-            return self._slowly(bus.sync_read_span(self._address, self._size, self._servos))
+            return self._slowly(bus.sync_read_span(self._address, self._size, self._servos), again_until)
         bus.begin_request()
         received = bus.port.exchange(self._request, self._expected, self._timeout_ms)
         # Headers, ids, lengths and error bytes of all, as one great number; then the checksums.
@@ -88,7 +92,8 @@ class SyncReader:
                     break
             else:
                 return Replies(self._decode(received), self._everyone, self._no_errors, True)
-        return self._slowly(bus.sync_replies(received, self._request, self._servos, self._size, 0, self._size))
+        found = bus.sync_replies(received, self._request, self._servos, self._size, 0, self._size)
+        return self._slowly(found, again_until)
 
     def _frame(self) -> tuple[int, int]:
         """Mask and pattern of the bytes that are known beforehand in a good answer."""
@@ -104,7 +109,11 @@ class SyncReader:
             for raw, sign in zip(self._unpack(received), self._signs, strict=False)
         ]
 
-    def _slowly(self, found: dict[int, tuple[bytes, int]]) -> Replies:
+    def _slowly(self, found: dict[int, tuple[bytes, int]], again_until: float) -> Replies:
+        missing = [servo for servo in self._servos if servo not in found]
+        if missing and time.monotonic() < again_until:
+            self._bus.counters["retries"] += 1
+            found |= self._bus.sync_read_span(self._address, self._size, missing)
         answered = np.array([servo in found for servo in self._servos])
         errors = np.array([found[servo][1] if servo in found else 0 for servo in self._servos], dtype=np.uint8)
         blank = b"\x00" * self._size

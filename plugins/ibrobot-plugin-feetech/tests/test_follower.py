@@ -178,8 +178,9 @@ class TestFaults:
     @pytest.mark.parametrize(
         ("bits", "names"), [(0x04, "overheating"), (0x20, "overload"), (0x09, "voltage, over-cur")]
     )
-    def test_what_a_servo_reports_is_a_fault_at_once(self, rig: Rig, bits: int, names: str) -> None:
+    def test_what_a_servo_reports_twice_is_a_fault(self, rig: Rig, bits: int, names: str) -> None:
         rig.emulator.faults.errors[5] = bits
+        rig.tick()
         with pytest.raises(ServoFault, match=rf"servo 5 \(wrist_roll\): the servo reports {names}"):
             rig.tick()
         rig.emulator.faults.errors.clear()
