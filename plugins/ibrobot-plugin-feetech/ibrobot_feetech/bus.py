@@ -33,6 +33,8 @@ _RETURN_DELAY_S = 0.000_5
 """A servo's own delay before it answers, as it is shipped [s]: 250 units of 2 us."""
 _EPROM_S = 0.02
 """Further time for an acknowledgement, where the servo first writes its EPROM [s]."""
+_MOST_EXTRA = 16
+"""Most bytes that are read for nothing so that a reply has a length of its own."""
 _BITS_PER_BYTE = 10
 
 
@@ -160,6 +162,8 @@ class FeetechBus:
         missing, values = list(servos), dict[int, int]()
         for attempt in range(self.retries + 1):
             self.counters["retries"] += attempt > 0
+            if not self._span(missing, target.address, target.size)[1]:
+                self.resynchronise()
             for servo, (content, code) in self.sync_read_span(target.address, target.size, missing).items():
                 if code:
                     raise ServoFault(self.place(servo, name), protocol.faults(code))
@@ -183,10 +187,14 @@ class FeetechBus:
     def sync_read_span(self, address: int, size: int, servos: Sequence[int]) -> dict[int, tuple[bytes, int]]:
         """Servo id -> registers from `address`, shape (size,), and error byte; of those that answered in one request.
 
+        None is asked while too many replies may be late: on a line as bad as that nothing can be believed.
+
         Raises:
             PortError: when the port is gone.
         """
         start, length = self._span(servos, address, size)
+        if not length:
+            return {}
         self.begin_request()
         request = protocol.sync_read(servos, start, length)
         self.port.write(request)
@@ -236,6 +244,9 @@ class FeetechBus:
 
     def _read_once(self, servo: int, target: Register, *, faulty: bool = False) -> int:
         start, length = self._span((servo,), target.address, target.size)
+        if not length:
+            self.resynchronise()
+            start, length = target.address, target.size
         packet = self._exchange(servo, length, protocol.read(servo, start, length), target.name)
         if packet.code and not faulty:
             raise ServoFault(self.place(servo, target.name), protocol.faults(packet.code))
@@ -289,7 +300,8 @@ class FeetechBus:
         All bytes are added to `heard`.
         """
         missing = expected - len(received)
-        deadline = time.monotonic() + (timeout_s if missing > 0 else min(timeout_s, _TRAIL_S))
+        last = time.monotonic() + timeout_s
+        deadline = last if missing > 0 else min(last, time.monotonic() + _TRAIL_S)
         scanner = protocol.Scanner()
         try:
             while True:
@@ -301,18 +313,21 @@ class FeetechBus:
                     return
                 missing -= len(received)
                 if missing <= 0:
-                    deadline = min(deadline, time.monotonic() + _TRAIL_S)
+                    deadline = min(last, time.monotonic() + _TRAIL_S)
         finally:
             scanner.clear()
             self.counters["bad_packets"] += scanner.damaged
             self.counters["discarded_bytes"] += scanner.discarded
 
     def _span(self, servos: Sequence[int], address: int, size: int) -> tuple[int, int]:
-        """Where to begin reading, and how many bytes, so that no reply that may be late has that length."""
-        for extra in range(address + 1):
+        """Where to begin reading, and how many bytes, so that no reply that may be late has that length.
+
+        Nothing (0, 0) where too many may be late.
+        """
+        for extra in range(min(address, _MOST_EXTRA) + 1):
             if not any(self.may_be_late(servo, size + extra) for servo in servos):
                 return address - extra, size + extra
-        return address, size
+        return 0, 0
 
     def begin_request(self) -> None:
         """Count a request, and throw away what came unasked before it.
