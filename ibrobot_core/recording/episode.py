@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -41,7 +42,8 @@ def episode_start(
         raise RecorderError(f"recording.root: {root} cannot be made: {error.strerror}") from None
     metadata = {
         "robot": config.robot.name, "robot_type": config.robot.robot_type, "mode": mode,
-        "fingerprint": contract.fingerprint(), "ibrobot_version": ibrobot_core.__version__, "seed": str(seed),
+        "contract": json.dumps(contract.canonical(), sort_keys=True), "fingerprint": contract.fingerprint(),
+        "ibrobot_version": ibrobot_core.__version__, "seed": str(seed),
     }  # fmt: skip
     if recording.topics == "contract":
         kept = contract.topics

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from typing import TYPE_CHECKING
 
 import pytest
 
+from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import RecorderError
 from ibrobot_core.interfaces import EpisodeEnd, EpisodeStart
 from ibrobot_core.launch.builders import recording
@@ -109,6 +111,16 @@ def test_an_episode_begins_with_what_is_latched(runs: Runs, monkeypatch: pytest.
     stamp_ns = notes.begun[0].stamp_ns
     assert [item for item in notes.written if item[0] == "/description"] == [("/description", String("arm"), stamp_ns)]
     assert notes.written[0][0] == "/description"
+
+
+def test_an_episode_knows_its_contract(runs: Runs, monkeypatch: pytest.MonkeyPatch):
+    runtime, notes = note(runs, monkeypatch)
+    runtime.plan.episodes.begin()
+    ticks(runtime, 2)
+    contract = Contract.from_config(runtime.session.config)
+    kept = notes.begun[0].metadata
+    assert kept["fingerprint"] == contract.fingerprint()
+    assert contract.difference(json.loads(kept["contract"])) == ""
 
 
 def test_messages_that_were_lost_on_the_way_are_told_by_topic(runs: Runs, monkeypatch: pytest.MonkeyPatch):
