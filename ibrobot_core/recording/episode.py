@@ -42,7 +42,7 @@ def episode_start(
         raise RecorderError(f"recording.root: {root} cannot be made: {error.strerror}") from None
     metadata = {
         "robot": config.robot.name, "robot_type": config.robot.robot_type, "mode": mode,
-        "contract": json.dumps(contract.canonical(), sort_keys=True), "fingerprint": contract.fingerprint(),
+        "contract": json.dumps(contract.canonical()), "fingerprint": contract.fingerprint(),
         "ibrobot_version": ibrobot_core.__version__, "seed": str(seed),
     }  # fmt: skip
     if recording.topics == "contract":
