@@ -77,6 +77,7 @@ class Emulator:
     def start(self) -> None:
         """Begin to serve."""
         self._stop_reader, self._stop_writer = os.pipe()
+        self.settle()
         self._plug()
 
     def stop(self) -> None:

@@ -33,14 +33,14 @@ class Wire:
         self._throttle = throttle
         self._chance = np.random.default_rng(seed)
         self._scanner = protocol.Scanner()
-        self._now_s = 0.0
+        self._now_s: float | None = None
 
     def advance(self, now_s: float) -> None:
         """Let the joints move until `now_s` [s]."""
-        elapsed_s, self._now_s = now_s - self._now_s, now_s
-        if elapsed_s > 0:
-            for servo in self._servos:
-                servo.advance(elapsed_s)
+        elapsed_s = now_s - self._now_s if self._now_s is not None else 0.0
+        self._now_s = now_s
+        for servo in self._servos:
+            servo.advance(max(0.0, elapsed_s))
 
     def receive(self, received: bytes, baud_rate: int) -> list[tuple[float, bytes]]:
         """Take bytes of the host in, sent at `baud_rate`.
@@ -73,7 +73,7 @@ class Wire:
     def _carry_out(self, packet: Packet, servos: dict[int, EmulatedServo]) -> list[tuple[int, bytes]]:
         """Do what a packet asks for; returns which ids answer, in order, with what.
 
-        A servo whose id is changed answers by the former one.
+        A servo whose id or status return level is changed answers as it would have before.
         """
         if packet.code == Instruction.SYNC_READ and len(packet.parameters) > 2:
             address, size, *ids = packet.parameters
@@ -88,13 +88,19 @@ class Wire:
         everyone = packet.servo == BROADCAST
         answers = []
         for servo in sorted(servos) if everyone else [packet.servo] if packet.servo in servos else []:
+            asked = packet.code == Instruction.PING if everyone else _answered(servos[servo], packet)
             content = _one(servos[servo], packet)
-            if content is not None and (not everyone or packet.code == Instruction.PING):
+            if content is not None and asked:
                 answers.append((servo, content))
         return answers
 
     def _wire_s(self, size: int, baud_rate: int) -> float:
         return size * _BITS / baud_rate if self._throttle else 0.0
+
+
+def _answered(servo: EmulatedServo, packet: Packet) -> bool:
+    """Whether the servo's status return level has it answer; at level 0 it acknowledges no writes."""
+    return servo.get("status_return_level") != 0 or packet.code in (Instruction.PING, Instruction.READ)
 
 
 def _one(servo: EmulatedServo, packet: Packet) -> bytes | None:
