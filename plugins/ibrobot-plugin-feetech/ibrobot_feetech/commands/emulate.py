@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import math
 import signal
+import sys
 import threading
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -31,6 +32,11 @@ if TYPE_CHECKING:
 
 _JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
 
+_PRIORITY = 70
+"""Above a control process's, which waits for the servos."""
+_SWITCH_S = 2e-4
+"""For how long the physics may keep the servos from answering [s]."""
+
 
 @click.command()
 @click.option("--servos", type=click.IntRange(1, 253), default=6, show_default=True, help="How many, from id 1.")
@@ -56,6 +62,8 @@ def emulate(
     """
     from ibrobot_feetech.emulator import Emulator
 
+    if link is not None and link.exists() and not link.is_symlink():
+        raise click.BadParameter(f"{link} is there already and is no link: name another path", param_hint="--link")
     ended = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ended.set())
@@ -74,8 +82,18 @@ def emulate(
             arm = _physics(config, found, emulator, seed)
             arm.start()
             stack.callback(arm.stop)
+        _hurry()
         click.echo(f"{count} servos at {baud} baud; Ctrl-C ends it", err=True)
         _wait(ended, arm)
+
+
+def _hurry() -> None:
+    """Have the servos answer in time on a busy machine, as those with processors of their own do."""
+    from ibrobot_core.control.realtime import go_real_time
+
+    sys.setswitchinterval(_SWITCH_S)
+    for refused in go_real_time(_PRIORITY):
+        click.echo(refused, err=True)
 
 
 def _wait(ended: threading.Event, arm: PhysicsArm | None) -> None:
@@ -105,7 +123,10 @@ def _physics(config: RobotConfig, calibration: Calibration, emulator: Emulator, 
     robot = config.robot
     closed = {joint.name: joint.lower for joint in robot.joints if joint.name == _JOINTS[-1]}
     socket = Path(f"{emulator.link or emulator.port.replace('/dev/pts/', '/tmp/ibrobot-emulator-')}.signals")
-    arm = PhysicsArm(config, installed(), Arm(robot.joint_names, calibration, closed), emulator, socket, seed)
+    try:
+        arm = PhysicsArm(config, installed(), Arm(robot.joint_names, calibration, closed), emulator, socket, seed)
+    except OSError as error:
+        raise click.BadParameter(f"no socket can be made at {socket}: {error}", param_hint="--link") from None
     click.echo(f"signals on {socket}")
     return arm
 

@@ -121,7 +121,8 @@ class Emulator:
         attributes[_SPEED - 1] = attributes[_SPEED] = termios.B50
         termios.tcsetattr(self._slave, termios.TCSANOW, attributes)
         if self.link is not None:
-            self.link.unlink(missing_ok=True)
+            if self.link.is_symlink():  # of an emulator that was killed; anything else is not ours to remove
+                self.link.unlink()
             self.link.symlink_to(self.port)
         self._thread = threading.Thread(target=self._serve, name=f"emulator {self.port}", daemon=True)
         self._thread.start()

@@ -1,0 +1,53 @@
+"""`ibrobot feetech emulate` as a user runs it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from ibrobot_feetech.bus import FeetechBus
+
+from ibrobot_core.calibration import load_calibration
+
+IBROBOT = (sys.executable, "-c", "from ibrobot_core.cli.main import main; main()")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_it_says_its_port_serves_and_ends_cleanly(number: signal.Signals, tmp_path: Path) -> None:
+    link = tmp_path / "arm"
+    command = (*IBROBOT, "feetech", "emulate", "--servos", "2", "--link", str(link), "--calibration", "two")
+    environment = {**os.environ, "XDG_CONFIG_HOME": str(tmp_path)}
+    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as ran:
+        try:
+            assert ran.stdout is not None
+            assert ran.stderr is not None
+            assert ran.stdout.readline() == f"{link}\n"
+            bus = FeetechBus(str(link))
+            bus.open()
+            assert bus.scan() == {1: 777, 2: 777}
+            low = bus.read(2, "min_position_limit")
+            bus.close()
+            ran.send_signal(number)
+            assert "Traceback" not in ran.stderr.read()
+        finally:
+            ran.terminate()
+    assert ran.returncode == 0
+    assert not link.is_symlink()
+    calibration = load_calibration(tmp_path / "ibrobot" / "calibration" / "two.json")
+    assert list(calibration.joints) == ["shoulder_pan", "shoulder_lift"]
+    assert calibration.joints["shoulder_lift"].range_min == low
+
+
+def test_a_file_in_the_links_place_is_left_alone(tmp_path: Path) -> None:
+    file = tmp_path / "notes"
+    file.write_text("mine")
+    ran = subprocess.run(
+        (*IBROBOT, "feetech", "emulate", "--link", str(file)), capture_output=True, text=True, timeout=60, check=False
+    )
+    assert ran.returncode == 2
+    assert f"{file} is there already and is no link" in ran.stderr
+    assert file.read_text() == "mine"
