@@ -174,6 +174,9 @@ class Checks:
         name = self.parts.plain.get("default_control_mode")
         if name is not None:
             self._refer(("default_control_mode",), name, self._known("control_modes"), "control mode")
+        if self.parts.simulation is not None and (name := self.parts.simulation.keys.default_control_mode) is not None:
+            key = ("simulation", "default_control_mode")
+            self._refer(key, name, self._known("control_modes"), "control mode")
 
     def _recording(self) -> None:
         topics: Any = self.parts.recording.keys.topics if self.parts.recording else ()

@@ -19,6 +19,7 @@ from ibrobot_core.config.keys import (
     PeripheralKeys,
     RecordingKeys,
     Sections,
+    SimulationKeys,
 )
 from ibrobot_core.config.show import plain
 from ibrobot_core.descriptors import HardwareDescriptor
@@ -138,7 +139,7 @@ def json_schema(registry: Registry) -> Schema:
     several = {"type": "object", "additionalProperties": hardware}
     sections: dict[str, Schema] = {
         "hardware": {"if": {"required": ["type"]}, "then": hardware, "else": several},
-        "simulation": _component(registry, "hardware", ComponentKeys, sorted(simulated)),
+        "simulation": _component(registry, "hardware", SimulationKeys, sorted(simulated)),
         "peripherals": {"type": "array", "items": _component(registry, "sensor", PeripheralKeys)},
         "executors": _named(_component(registry, "executor", ExecutorKeys)),
         "models": _named(_component(registry, "policy", ModelKeys)),

@@ -30,6 +30,14 @@ class HardwareKeys:
 
 
 @attrs.frozen
+class SimulationKeys:
+    """Keys of the simulation."""
+
+    type: str = option(help="which plugin; `ibrobot plugins` lists them")
+    default_control_mode: str | None = option(None, help="with --sim, in place of the file's default_control_mode")
+
+
+@attrs.frozen
 class PeripheralKeys:
     """Keys of a sensor."""
 

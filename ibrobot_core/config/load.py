@@ -45,7 +45,7 @@ def load(
     Args:
         path: the file.
         overrides: `path.to.key=value`, each checked like the file.
-        mode: in place of its `default_control_mode`.
+        mode: in place of its `default_control_mode`, and of the simulation's.
         sim: use the `simulation` section even where there is `hardware`.
         registry: the plugins; the installed ones when None.
 
@@ -65,6 +65,8 @@ def load(
     if mode is not None:
         place = Place(len(overrides) + 1, 0, 0, f"--mode {mode}")
         put(document, "default_control_mode", Document(mode, {}, [], place.file), place)
+        if isinstance(simulation := document.root.get("simulation"), dict):
+            simulation.pop("default_control_mode", None)
     return _build(document, Path(path), sim, registry or installed())
 
 
@@ -95,7 +97,7 @@ def _build(document: Document, source: Path, sim: bool, registry: Registry) -> R
             for group in (part.keys.group,)
         },
         control_modes=_modes(parts),
-        default_control_mode=plain["default_control_mode"],
+        default_control_mode=_default_mode(parts),
         hardware={} if parts.simulated else {
             name: HardwareComponent(part.descriptor.type, part.options, name, part.keys.joints or robot.joint_names)
             for name, part in parts.hardware.items()
@@ -126,6 +128,12 @@ def _build(document: Document, source: Path, sim: bool, registry: Registry) -> R
 
 def _component(part: Part | None) -> Any:
     return part.component if part is not None else None
+
+
+def _default_mode(parts: Parts) -> str:
+    simulated = parts.simulation.keys.default_control_mode if parts.simulated and parts.simulation else None
+    mode: str = simulated or parts.plain["default_control_mode"]
+    return mode
 
 
 def _modes(parts: Parts) -> dict[str, ControlMode]:

@@ -20,6 +20,7 @@ from ibrobot_core.config.keys import (
     PeripheralKeys,
     RecordingKeys,
     Sections,
+    SimulationKeys,
 )
 from ibrobot_core.config.schema import Component
 from ibrobot_core.config.yaml_nodes import Document, Key
@@ -202,7 +203,7 @@ class Structurer:
     def _simulation(self, parts: Parts) -> None:
         if "simulation" not in self.document.root:
             return
-        part = self._component("hardware", ("simulation",), ComponentKeys, needed=parts.simulated or self._elsewhere)
+        part = self._component("hardware", ("simulation",), SimulationKeys, needed=parts.simulated or self._elsewhere)
         if part is None:
             return
         if not getattr(part.descriptor, "simulated", False):

@@ -58,6 +58,22 @@ def test_simulation_stands_for_hardware_and_its_sensors_for_real_ones(load_text:
     assert config.peripherals["chest"].type == "gyro"
 
 
+@pytest.mark.parametrize(
+    ("sim", "mode", "begins"),
+    [(False, None, "teleop"), (True, None, "policy"), (True, "plan", "plan"), (False, "plan", "plan")],
+)
+def test_a_simulation_may_begin_in_a_mode_of_its_own(
+    load_text: Load, base: str, sim: bool, mode: str | None, begins: str
+) -> None:
+    text = base.replace("{type: world}", "{type: world, default_control_mode: policy}")
+    assert load_text(text, sim=sim, mode=mode).default_control_mode == begins
+
+
+def test_an_unknown_mode_of_the_simulation_is_told(faults_of_edit: Faults) -> None:
+    told = faults_of_edit("{type: world}", "{type: world, default_control_mode: polcy}", sim=True)
+    assert "simulation.default_control_mode: unknown control mode 'polcy', did you mean 'policy'?" in told
+
+
 def test_simulation_needs_no_plugin_of_the_real_robot(load_text: Load, base: str, registry: Registry) -> None:
     del registry.entries["hardware", "bus"]
     del registry.entries["sensor", "webcam"]
