@@ -16,9 +16,10 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Container, Generator, Iterable, Mapping, Sequence
+from contextlib import suppress
 
 from ibrobot_feetech import protocol
-from ibrobot_feetech.errors import FeetechError, NoReply, PacketError, Place, ServoFault, UnexpectedReply
+from ibrobot_feetech.errors import NoReply, PacketError, Place, ServoFault, UnexpectedReply
 from ibrobot_feetech.port import SerialPort
 from ibrobot_feetech.protocol import BROADCAST, OVERHEAD, Packet
 from ibrobot_feetech.registers import STS3215, Register, register
@@ -91,8 +92,16 @@ class FeetechBus:
         """
         return self.read(servo, "model_number")
 
-    def scan(self, servos: Iterable[int] = range(protocol.MAX_ID + 1)) -> dict[int, int]:
-        """Servo id -> model number, of those that answer a broadcast ping or, where none does, one of their own."""
+    def scan(self, servos: Iterable[int] = range(protocol.MAX_ID + 1), *, one_by_one: bool = True) -> dict[int, int]:
+        """Servo id -> model number, of those that answer a broadcast ping or, where none does, one of their own.
+
+        Args:
+            servos: ids to look for.
+            one_by_one: whether to ask each id, which takes seconds, where none answers the broadcast.
+
+        Raises:
+            PortError: when the port is gone.
+        """
         wanted = set(servos)
         self.begin_request()
         self.port.write(protocol.ping(BROADCAST))
@@ -103,15 +112,13 @@ class FeetechBus:
         }
         for servo in wanted:
             self._expect_late(servo, 0)
-        if not found & wanted:
-            found = wanted
+        model = STS3215["model_number"]
+        if found & wanted:
+            return {servo: self.read_faulty(servo, model.name) for servo in sorted(found & wanted)}
         models = {}
-        for servo in sorted(found & wanted):
-            try:
-                models[servo] = self._read_once(servo, STS3215["model_number"])
-            except FeetechError as error:
-                if isinstance(error, ServoFault):
-                    models[servo] = self.read_faulty(servo, "model_number")
+        for servo in sorted(wanted) if one_by_one else ():
+            with suppress(NoReply, PacketError):
+                models[servo] = self._read_once(servo, model, faulty=True)
         return models
 
     def read(self, servo: int, name: str) -> int:

@@ -17,6 +17,8 @@ from ibrobot_feetech.bus import FeetechBus
 
 ADAPTER_VENDOR = 0x1A86
 """USB vendor of the CH340 and CH343 on the SO-101's boards."""
+_RETRIES = 5
+"""Nothing here is in a hurry."""
 _BY_ID = Path("/dev/serial/by-id")
 
 
@@ -97,7 +99,7 @@ def opened(
     Raises:
         HardwareError: when it cannot be opened.
     """
-    bus = FeetechBus(the_port(port), baud_rate=baud_rate, joints=joints)
+    bus = FeetechBus(the_port(port), baud_rate=baud_rate, joints=joints, retries=_RETRIES)
     bus.open()
     try:
         yield bus

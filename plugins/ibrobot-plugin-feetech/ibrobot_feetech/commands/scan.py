@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import click
 
 from ibrobot_core.errors import HardwareError
@@ -37,11 +39,11 @@ def scan(port: str | None, baud: tuple[int, ...]) -> None:
     names = by_servo(joints_of())
     found = table(">id", "joint of an SO-101", "model", "firmware", ">baud")
     with opened(port, baud[0]) as bus:
-        for rate in baud:
-            for servo, model in search(bus, rate).items():
-                firmware = ".".join(str(bus.read_faulty(servo, f"firmware_{part}")) for part in ("major", "minor"))
-                kind = "STS3215" if model == MODEL_STS3215 else str(model)
-                found.add_row(str(servo), names.get(servo, ""), kind, firmware, str(rate))
+        for (servo, rate), model in search(bus, baud).items():
+            bus.port.set_baud_rate(rate)
+            firmware = ".".join(str(bus.read_faulty(servo, f"firmware_{part}")) for part in ("major", "minor"))
+            kind = "STS3215" if model == MODEL_STS3215 else str(model)
+            found.add_row(str(servo), names.get(servo, ""), kind, firmware, str(rate))
         if not found.row_count:
             at = f"{baud[0]} baud" if len(baud) == 1 else "any baud rate"
             more = " and other rates (--baud all)" if len(baud) == 1 else ""
@@ -52,10 +54,24 @@ def scan(port: str | None, baud: tuple[int, ...]) -> None:
     show(found)
 
 
-def search(bus: FeetechBus, rate: int) -> dict[int, int]:
-    """Servo id -> model, of those that answer at a baud rate; none where the port cannot have it."""
-    try:
-        bus.port.set_baud_rate(rate)
-    except PortError:
-        return {}
-    return bus.scan()
+def search(bus: FeetechBus, rates: Sequence[int]) -> dict[tuple[int, int], int]:
+    """Servo id and baud rate -> model, of those that answer.
+
+    All are asked together at each rate; one by one, which takes a while, only where that finds none at any rate.
+
+    Raises:
+        PortError: when the port is gone.
+    """
+    for one_by_one in (False, True):
+        found: dict[tuple[int, int], int] = {}
+        for rate in rates:
+            try:
+                bus.port.set_baud_rate(rate)
+            except PortError:  # not every port can have every rate
+                if len(rates) == 1:
+                    raise
+                continue
+            found |= {(servo, rate): model for servo, model in bus.scan(one_by_one=one_by_one).items()}
+        if found:
+            break
+    return found

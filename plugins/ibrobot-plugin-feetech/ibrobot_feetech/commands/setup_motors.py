@@ -62,7 +62,7 @@ def _the_only_one(bus: FeetechBus, joint: Joint, rates: tuple[int, ...]) -> tupl
         HardwareError: when none answers, more than one does, or it is another model.
     """
     damaged = bus.counters["bad_packets"]
-    found = {(servo, rate): model for rate in rates for servo, model in search(bus, rate).items()}
+    found = search(bus, rates)
     where = f"{bus.port.path}, {joint.name}"
     if not found:
         if bus.counters["bad_packets"] > damaged:

@@ -1,0 +1,117 @@
+"""A command line run in a pseudo-terminal, for tests of dialogues: what is on the screen, and somebody who types."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Mapping
+from types import TracebackType
+from typing import Self
+
+_START = """
+import fcntl, sys, termios
+fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+{before}
+from ibrobot_core.cli.main import main
+main()
+"""
+_TIMEOUT_S = 30.0
+
+
+class Terminal:
+    """`ibrobot ARGUMENTS` in a pseudo-terminal of its own, which is its controlling one; a context manager.
+
+    Args:
+        arguments: of the command.
+        before: Python source that the process runs first.
+        environment: variables on top of this process's.
+        columns: width of the terminal.
+    """
+
+    def __init__(
+        self, *arguments: str, before: str = "", environment: Mapping[str, str] | None = None, columns: int = 80
+    ) -> None:
+        self._master, slave = os.openpty()
+        try:
+            self._process = subprocess.Popen(
+                [sys.executable, "-c", _START.format(before=before), *arguments],
+                stdin=slave, stdout=slave, stderr=slave, start_new_session=True,
+                env={**os.environ, "TERM": "xterm", "COLUMNS": str(columns), "LINES": "40", **(environment or {})},
+            )  # fmt: skip
+        finally:
+            os.close(slave)
+        self.screen = ""
+        """Everything that it printed so far."""
+        self._seen = 0
+        self._ended = False
+        self._changed = threading.Condition()
+        # Read at all times: a terminal that nobody reads stops whoever prints.
+        self._thread = threading.Thread(target=self._read, name="terminal", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if self._process.poll() is None:
+            self._process.kill()
+        self._process.wait()
+        self._thread.join()
+        os.close(self._master)
+
+    def wait_for(self, text: str) -> None:
+        """Wait until the text is printed, after what was waited for before.
+
+        Raises:
+            AssertionError: when it does not come.
+        """
+        with self._changed:
+            come = self._changed.wait_for(lambda: self._ended or text in self.screen[self._seen :], _TIMEOUT_S)
+            if not come or text not in self.screen[self._seen :]:
+                raise AssertionError(f"{text!r} did not come; the screen was:\n{self.screen}")
+            self._seen = self.screen.index(text, self._seen) + len(text)
+
+    def type(self, text: str) -> None:
+        """Press keys; Enter is a carriage return, Ctrl-C the character 3."""
+        os.write(self._master, text.encode())
+
+    def interrupt(self) -> None:
+        """Press Ctrl-C, and again where nothing comes of it, until the command ends.
+
+        A signal between Python's last look at it and the system call that reads a line is not seen before the next.
+        """
+        with self._changed:
+            for _ in range(10):
+                self.type("\x03")
+                if self._changed.wait_for(lambda: self._ended, 3):
+                    return
+
+    def end(self) -> int:
+        """Wait for the end and take the exit code.
+
+        Raises:
+            AssertionError: when it does not end.
+        """
+        try:
+            code = self._process.wait(_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            raise AssertionError(f"it does not end; the screen was:\n{self.screen}") from None
+        self._thread.join()
+        return code
+
+    def _read(self) -> None:
+        while True:
+            try:
+                received = os.read(self._master, 65536)
+            except OSError:  # nobody has the other end open any more
+                received = b""
+            with self._changed:
+                self.screen += received.decode(errors="replace")
+                self._ended = not received
+                self._changed.notify_all()
+            if self._ended:
+                return

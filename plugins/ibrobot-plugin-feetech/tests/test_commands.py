@@ -1,0 +1,371 @@
+"""The commands, typed in a pseudo-terminal by a person who also moves the emulated arm."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from ibrobot_feetech.emulator import EmulatedServo, Emulator
+
+from ibrobot_core.calibration import load_calibration
+from ibrobot_core.testing.terminal import Terminal
+
+JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
+MIDDLES = {1: 2500, 2: 300, 3: 2048, 4: 3900, 5: 1000, 6: 100}
+"""Servo -> where its encoder is in the middle pose."""
+ENDS = {1: (797, 3297), 2: (900, 3190), 3: (950, 3150), 4: (970, 3120), 6: (1400, 2700)}
+"""Servo -> what it reports at its joint's ends, once the middle is at 2047."""
+STEP = 100
+
+
+class Person:
+    """Moves joints by hand, a step each time that the servos are asked something."""
+
+    def __init__(self, emulator: Emulator) -> None:
+        self.emulator = emulator
+        self.done = threading.Event()
+        self._path: Iterator[dict[int, int]] = iter(())
+        self._left = -1
+        for servo, middle in MIDDLES.items():
+            emulator.servos[servo].set("homing_offset", 77 * servo - 300)
+            emulator.servos[servo].turn(middle)
+        emulator.on_request = self._move
+
+    def sweep(self, ends: dict[int, tuple[int, int]]) -> None:
+        """Move joints to both ends, and a few readings longer; returns when it is done."""
+        self._path = iter(
+            [
+                {servo: start + (stop - start) * step // 40 for servo, (start, stop) in legs.items()}
+                for legs in (
+                    {servo: (2047, low) for servo, (low, _) in ends.items()},
+                    dict(ends),
+                )
+                for step in range(41)
+            ]
+        )
+        self._left = 5
+        assert self.done.wait(30)
+
+    def turn(self, servo: int, ticks: int) -> None:
+        with self.emulator.lock:
+            joint = self.emulator.servos[servo]
+            joint.turn((joint.encoder + ticks) % 4096)
+
+    def _move(self) -> None:
+        pose = next(self._path, None)
+        if pose is not None:
+            for servo, reported in pose.items():
+                self.emulator.servos[servo].turn((reported + MIDDLES[servo] - 2047) % 4096)
+        elif self._left > 0:
+            self._left -= 1
+            if self._left == 0:
+                self.done.set()
+
+
+@pytest.fixture
+def emulator() -> Iterator[Emulator]:
+    with Emulator(6) as made:
+        yield made
+
+
+@pytest.fixture
+def person(emulator: Emulator) -> Person:
+    return Person(emulator)
+
+
+@pytest.fixture
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where calibrations are kept."""
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    return tmp_path / "ibrobot" / "calibration"
+
+
+def eprom(emulator: Emulator) -> list[bytes]:
+    with emulator.lock:
+        return [bytes(servo.table[:40]) for servo in emulator.servos.values()]
+
+
+def ran(*arguments: str, before: str = "") -> tuple[int, str]:
+    with Terminal("feetech", *arguments, before=before) as terminal:
+        return terminal.end(), terminal.screen
+
+
+def test_an_arm_is_calibrated_in_the_dialogue_and_the_former_file_is_kept(emulator, person, home):
+    home.mkdir(parents=True)
+    former = home / "so101_follower.json"
+    former.write_text('{"pan": {"id": 1, "drive_mode": 0, "homing_offset": 5, "range_min": 1, "range_max": 9}}')
+    before = former.read_text()
+    with Terminal("feetech", "calibrate", emulator.port, "--arm", "left") as terminal:
+        terminal.wait_for("Calibrate anew? [y/N]")
+        terminal.type("y\r")
+        terminal.wait_for("middle of its range. Then press Enter")
+        terminal.type("\r")
+        terminal.wait_for("to both ends (Enter ends it)")
+        person.sweep(ENDS)
+        terminal.type("\r")
+        terminal.wait_for("written to servos 1, 2, 3, 4, 5, 6")
+        assert terminal.end() == 0
+    found = load_calibration("so101_follower", JOINTS)
+    assert found.robot == "left"
+    assert found.date
+    for joint in found.joints.values():
+        assert joint.homing_offset == MIDDLES[joint.id] - 2047
+        assert (joint.range_min, joint.range_max) == ENDS.get(joint.id, (0, 4095))
+        servo = emulator.servos[joint.id]
+        written = [servo.get(name) for name in ("homing_offset", "min_position_limit", "max_position_limit")]
+        assert written == [joint.homing_offset, joint.range_min, joint.range_max]
+        assert servo.get("lock") == 1
+    (kept,) = (path for path in home.glob("so101_follower.2*.json") if "meta" not in path.name)
+    assert kept.read_text() == before
+    assert "are as the calibration says" in ran("check", emulator.port)[1]
+
+
+QUESTIONS = ("Calibrate anew?", "Go on?", "Then press Enter", "(Enter ends it)")
+
+
+@pytest.mark.parametrize("question", QUESTIONS)
+def test_ctrl_c_at_a_question_leaves_servos_and_files_as_they_were(emulator, person, home, question):
+    home.mkdir(parents=True)
+    former = home / "so101_follower.json"
+    former.write_text("{}")
+    for servo in emulator.servos.values():
+        servo.set("torque_enable", 1)
+    before = eprom(emulator)
+    with Terminal("feetech", "calibrate", emulator.port) as terminal:
+        for asked in QUESTIONS:
+            terminal.wait_for(asked)
+            if asked == question:
+                break
+            terminal.type("y\r" if asked.endswith("?") else "\r")
+        terminal.interrupt()
+        terminal.wait_for("Aborted!")
+        assert terminal.end() == 1
+    assert ("Nothing was written" in terminal.screen) == (question in QUESTIONS[2:])
+    assert eprom(emulator) == before
+    assert former.read_text() == "{}"
+    assert len(list(home.iterdir())) == 1
+
+
+def test_an_existing_file_is_not_overwritten_against_the_answer(emulator, home):
+    home.mkdir(parents=True)
+    (home / "so101_leader.json").write_text("{}")
+    with Terminal("feetech", "calibrate", emulator.port, "--leader") as terminal:
+        terminal.wait_for("Calibrate anew? [y/N]")
+        terminal.type("n\r")
+        assert terminal.end() == 1
+    assert (home / "so101_leader.json").read_text() == "{}"
+
+
+@pytest.mark.parametrize(
+    ("ends", "told"),
+    [
+        (ENDS | {3: (2047, 4400)}, "elbow_flex: its range 2047 to 4400 crosses the encoder's end (0/4095)"),
+        ({servo: both for servo, both in ENDS.items() if servo != 4}, "wrist_flex: it moved by 0 ticks"),
+        (ENDS | {2: (1747, 2347)}, "shoulder_lift: it moved by 53 deg, its limits are 200 deg apart"),
+        (ENDS | {1: (1247, 3747)}, "shoulder_pan: the middle of its range is 39 deg off the middle pose"),
+    ],
+)
+def test_ranges_that_cannot_be_true_are_explained_and_not_kept(emulator, person, home, ends, told):
+    before = eprom(emulator)
+    with Terminal("feetech", "calibrate", emulator.port, "--middle-now") as terminal:
+        terminal.wait_for("(Enter ends it)")
+        person.sweep(ends)
+        terminal.type("\r")
+        terminal.wait_for(told)
+        terminal.interrupt()
+        assert terminal.end() != 0
+    assert eprom(emulator) == before
+    assert not home.exists()
+
+
+def test_a_middle_that_no_offset_reaches_is_explained_and_asked_again(emulator, person, home):
+    emulator.servos[2].turn(4095)
+    with Terminal("feetech", "calibrate", emulator.port) as terminal:
+        terminal.wait_for("Then press Enter")
+        terminal.type("\r")
+        terminal.wait_for("which needs an offset of 2048")
+        person.turn(2, -1)
+        terminal.wait_for("Then press Enter")
+        terminal.type("\r")
+        terminal.wait_for("(Enter ends it)")
+
+
+def test_signs_are_learnt_from_turning_each_joint(emulator, person, home):
+    with Terminal(
+        "feetech", "calibrate", emulator.port, "--middle-now", "--range-seconds", "6", "--check-signs"
+    ) as terminal:
+        terminal.wait_for("to both ends")
+        person.sweep(ENDS)
+        for servo, joint in enumerate(JOINTS, 1):
+            terminal.wait_for(f"Turn {joint} a little")
+            person.turn(servo, -100 if joint == "elbow_flex" else 100)
+            terminal.type("\r")
+        terminal.wait_for("written to servos")
+        assert terminal.end() == 0
+    found = load_calibration("so101_follower", JOINTS).joints
+    assert [name for name, joint in found.items() if joint.inverted] == ["elbow_flex"]
+
+
+def test_a_servo_that_dies_while_measuring_is_named_and_nothing_is_written(emulator, person, home):
+    before = eprom(emulator)
+    with Terminal("feetech", "calibrate", emulator.port, "--middle-now") as terminal:
+        terminal.wait_for("(Enter ends it)")
+        emulator.faults.silent.add(4)
+        terminal.wait_for("Nothing was written")
+        terminal.wait_for("servo 4 (wrist_flex)")
+        assert terminal.end() == 1
+    assert eprom(emulator) == before
+    assert not home.exists()
+
+
+def test_drift_is_reported_and_written_back(emulator, calibration_file):
+    arguments = ("check", emulator.port, "--name", str(calibration_file))
+    assert ran(*arguments, "--write", "--yes")[0] == 0
+    emulator.servos[3].set("homing_offset", 99)
+    code, screen = ran(*arguments)
+    assert code == 1
+    assert "elbow_flex" in screen
+    assert "homing_offset" in screen
+    assert "99" in screen
+    with Terminal("feetech", *arguments, "--write") as terminal:
+        terminal.wait_for("Write to servos 3? [y/N]")
+        terminal.interrupt()
+        assert terminal.end() == 1
+    assert emulator.servos[3].get("homing_offset") == 99
+    assert ran(*arguments, "--write", "--yes")[0] == 0
+    assert (
+        emulator.servos[3].get("homing_offset") == load_calibration(calibration_file).joints["elbow_flex"].homing_offset
+    )
+
+
+@pytest.mark.parametrize("rate_code", [0, 4])
+def test_a_new_servo_is_found_at_any_rate_and_gets_its_id(rate_code):
+    servo = EmulatedServo(1)
+    servo.set("baud_rate", rate_code)
+    with Emulator({1: servo}) as emulator, Terminal(
+        "feetech", "setup-motors", emulator.port, "--joint", "gripper"
+    ) as terminal:  # fmt: skip
+        terminal.wait_for("Connect only the servo of gripper (id 6), and power. Then press Enter")
+        terminal.type("\r")
+        terminal.wait_for("is id 6 at 1000000 baud")
+        assert terminal.end() == 0
+    assert (servo.id, servo.get("baud_rate"), servo.get("lock")) == (6, 0, 1)
+
+
+def test_several_servos_are_refused_and_nothing_is_set(emulator):
+    before = eprom(emulator)
+    code, screen = ran("setup-motors", emulator.port, "--joint", "gripper", "--yes", "--baud", "1000000")
+    assert code == 1
+    assert "6 servos answer" in screen
+    with Terminal("feetech", "setup-motors", emulator.port) as terminal:
+        terminal.wait_for("Then press Enter")
+        terminal.interrupt()
+        assert terminal.end() == 1
+    assert eprom(emulator) == before
+
+
+def test_scan_lists_who_answers_and_hints_where_nobody_does(emulator):
+    emulator.faults.silent.add(2)
+    code, screen = ran("scan", emulator.port)
+    assert code == 0
+    assert "shoulder_lift" not in screen
+    assert screen.count("STS3215") == 5
+    emulator.faults.silent |= set(range(1, 7))
+    code, screen = ran("scan", emulator.port)
+    assert code == 1
+    assert "check the arm's power supply" in screen
+
+
+def test_monitor_only_reads(emulator):
+    emulator.servos[1].set("torque_enable", 1)
+    emulator.servos[3].set("present_temperature", 61)
+    emulator.faults.silent.add(6)
+    before = eprom(emulator)
+    code, screen = ran("monitor", emulator.port, "--once", "--json")
+    servos = {servo["id"]: servo for servo in json.loads(screen)["servos"]}
+    assert code == 0
+    assert servos[3]["temperature_c"] == 61
+    assert not servos[6]["answers"]
+    with Terminal("feetech", "monitor", emulator.port) as terminal:
+        terminal.wait_for("no reply")
+        terminal.wait_for("elbow_flex")
+        terminal.interrupt()
+        assert terminal.end() == 0
+    assert eprom(emulator) == before
+    assert emulator.servos[1].torque
+
+
+def test_torque_comes_without_a_jump_and_goes_after_asking(emulator):
+    emulator.servos[2].turn(900)
+    assert ran("torque", "on", emulator.port)[0] == 0
+    assert emulator.servos[2].get("goal_position") == 900
+    assert emulator.servos[2].torque
+    with Terminal("feetech", "torque", "off", emulator.port, "--joint", "gripper") as terminal:
+        terminal.wait_for("Torque off? [y/N]")
+        terminal.interrupt()
+        assert terminal.end() == 1
+    assert emulator.servos[6].torque
+    with Terminal("feetech", "torque", "off", emulator.port, "--joint", "gripper") as terminal:
+        terminal.wait_for("Torque off? [y/N]")
+        terminal.type("y\r")
+        assert terminal.end() == 0
+    assert not emulator.servos[6].torque
+    assert emulator.servos[5].torque
+
+
+def test_a_port_that_is_missing_forbidden_or_not_said_is_told(tmp_path):
+    code, screen = ran("scan", str(tmp_path / "ttyACM9"))
+    assert code == 1
+    assert "there is no such port" in screen
+    code, screen = ran("scan", "/dev/ttyACM9", before=FORBIDDEN)
+    assert code == 1
+    assert "no permission: add yourself to the group" in screen.replace("\r\n", "")
+
+
+# Root may open anything: the refusal is made up.
+FORBIDDEN = """
+import errno, serial
+def refuse(*arguments, **options):
+    raise serial.SerialException(errno.EACCES, 'Permission denied')
+serial.Serial = refuse
+"""
+PORTS = """
+from serial.tools import list_ports
+from serial.tools.list_ports_common import ListPortInfo
+from pathlib import Path
+def comports():
+    found = []
+    for path in sorted(Path({folder!r}).iterdir()):
+        port = ListPortInfo(str(path))
+        port.vid, port.pid, port.description, port.serial_number = 0x1A86, 0x55D3, "USB Single Serial", "5A" + path.name
+        found.append(port)
+    return found
+list_ports.comports = comports
+"""
+
+
+def test_the_port_is_found_by_pulling_its_cable_and_putting_it_back(tmp_path):
+    (tmp_path / "ttyACM0").touch()
+    (tmp_path / "ttyACM1").touch()
+    before = PORTS.format(folder=str(tmp_path))
+    with Terminal("feetech", "find-port", before=before, columns=200) as terminal:
+        terminal.wait_for("ttyACM1")
+        terminal.wait_for("Then press Enter")
+        (tmp_path / "ttyACM1").unlink()
+        terminal.type("\r")
+        terminal.wait_for("Then press Enter")
+        (tmp_path / "ttyACM2").touch()
+        terminal.type("\r")
+        terminal.wait_for("The arm is at:")
+        terminal.wait_for("ttyACM2")
+        assert terminal.end() == 0
+    code, screen = ran("scan", before=before)
+    assert code == 1
+    assert "several arms" in screen
+    with Terminal("feetech", "find-port", before=before) as terminal:
+        terminal.wait_for("Then press Enter")
+        terminal.interrupt()
+        assert terminal.end() == 1
