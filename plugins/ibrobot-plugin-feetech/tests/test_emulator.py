@@ -187,7 +187,16 @@ class TestTable:
         host.write(1, "homing_offset", offset)
         raw = offset if offset >= 0 else 0x800 | -offset
         assert emulator.servos[1].read(31, 2) == raw.to_bytes(2, "little")
-        assert host.read(1, "present_position") == (2048 - offset) % 4096
+        for encoder in (100, 2048, 4000):
+            emulator.servos[1].turn(encoder)
+            assert host.read(1, "present_position") == (encoder - offset) % 4096
+
+    def test_bit_4_of_phase_reports_beyond_one_turn(self, host: Host, emulator: Emulator) -> None:
+        host.write(1, "lock", 0)
+        host.write(1, "homing_offset", 1000)
+        host.write(1, "phase", 12 | 0x10)
+        emulator.servos[1].turn(100)
+        assert host.read(1, "present_position") == -900
 
     def test_torque_128_makes_here_the_middle(self, host: Host, emulator: Emulator) -> None:
         emulator.servos[1].turn(3000)
