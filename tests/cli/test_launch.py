@@ -45,6 +45,11 @@ class Stick(FakeTeleop):
             raise TeleopError("the stick is gone")
         return super().read(measured)
 
+class Bug(FakeTeleop):
+    """Fails in a way that nobody foresaw."""
+    def read(self, measured):
+        raise ZeroDivisionError("one over nothing")
+
 class Person(FakeTeleop):
     """Presses Ctrl-C after a second."""
     reads = 0
@@ -66,6 +71,7 @@ def ibrobot_policies():
 @hookimpl
 def ibrobot_teleop():
     yield TeleopDescriptor("stick", lambda options, ctx: Stick(ctx), "a stick")
+    yield TeleopDescriptor("bug", lambda options, ctx: Bug(ctx), "a bug")
     yield TeleopDescriptor("person", lambda options, ctx: Person(ctx), "a person")
 
 @hookimpl
@@ -90,11 +96,13 @@ models:
 control_modes:
   policy: {executors: [position], inference: {model: net}}
   stick: {executors: [position], teleop: stick}
+  bug: {executors: [position], teleop: bug}
   person: {executors: [position], teleop: person}
   plan: {executors: [trajectory], planner: {type: cubic}}
 default_control_mode: policy
 teleoperation:
   stick: {type: stick}
+  bug: {type: bug}
   person: {type: person}
 contract:
   rate_hz: 25
@@ -155,7 +163,8 @@ def test_the_summary_as_json_is_the_last_line(launch: Callable[..., Ran]):
         (("--duration", "0.2"), 0),
         (("--episodes", "2", "--seed", "12"), 3),
         (("--episodes", "1", "--seed", "66", "--set", "contract.max_duration_s=4"), 1),
-        (("--mode", "stick"), 1),
+        (("--mode", "stick", "--duration", "2"), 1),
+        (("--mode", "bug"), 1),
         (("--mode", "person"), 0),
         (("--mode", "plan", "--goal", "up"), 0),
         (("--mode", "plan", "--goal", "pan=3"), 3),
@@ -172,10 +181,17 @@ def test_exit_codes(launch: Callable[..., Ran], arguments: tuple[str, ...], code
     assert "Traceback" not in ran.err
 
 
+def test_a_device_that_is_lost_is_a_fault_and_the_run_goes_on(launch: Callable[..., Ran]):
+    ran = launch(*LOCKSTEP, "--mode", "stick", "--duration", "2", "--json")
+    assert "E fault: the stick is gone; the robot holds" in ran.err
+    summary = json.loads(ran.out.splitlines()[-1])
+    assert summary.items() >= {"faults": ["the stick is gone"], "duration_s": 2.0}.items()
+
+
 def test_what_died_is_told_after_the_summary(launch: Callable[..., Ran]):
-    ran = launch(*LOCKSTEP, "--mode", "stick", "--json")
-    assert ran.err.splitlines()[-1] == "error: mode:stick: the stick is gone"
-    assert json.loads(ran.out)["mode"] == "stick"
+    ran = launch(*LOCKSTEP, "--mode", "bug", "--json")
+    assert ran.err.splitlines()[-1] == "error: mode:bug: ZeroDivisionError: one over nothing"
+    assert json.loads(ran.out)["mode"] == "bug"
 
 
 def test_the_first_ctrl_c_ends_the_run_in_order(launch: Callable[..., Ran]):
