@@ -18,7 +18,6 @@ MIDDLES = {1: 2500, 2: 300, 3: 2048, 4: 3900, 5: 1000, 6: 100}
 """Servo -> where its encoder is in the middle pose."""
 ENDS = {1: (797, 3297), 2: (900, 3190), 3: (950, 3150), 4: (970, 3120), 6: (1400, 2700)}
 """Servo -> what it reports at its joint's ends, once the middle is at 2047."""
-STEP = 100
 
 
 class Person:
@@ -38,12 +37,12 @@ class Person:
         """Move joints to both ends, and a few readings longer; returns when it is done."""
         self._path = iter(
             [
-                {servo: start + (stop - start) * step // 40 for servo, (start, stop) in legs.items()}
+                {servo: start + (stop - start) * step // 8 for servo, (start, stop) in legs.items()}
                 for legs in (
                     {servo: (2047, low) for servo, (low, _) in ends.items()},
                     dict(ends),
                 )
-                for step in range(41)
+                for step in range(9)
             ]
         )
         self._left = 5
@@ -195,7 +194,7 @@ def test_a_middle_that_no_offset_reaches_is_explained_and_asked_again(emulator, 
 
 def test_signs_are_learnt_from_turning_each_joint(emulator, person, home):
     with Terminal(
-        "feetech", "calibrate", emulator.port, "--middle-now", "--range-seconds", "6", "--check-signs"
+        "feetech", "calibrate", emulator.port, "--middle-now", "--range-seconds", "3", "--check-signs"
     ) as terminal:
         terminal.wait_for("to both ends")
         person.sweep(ENDS)
@@ -219,6 +218,28 @@ def test_a_servo_that_dies_while_measuring_is_named_and_nothing_is_written(emula
         assert terminal.end() == 1
     assert eprom(emulator) == before
     assert not home.exists()
+
+
+def test_a_servo_that_dies_while_being_written_leaves_a_state_that_check_repairs(emulator, person, home):
+    with Terminal("feetech", "calibrate", emulator.port, "--middle-now", "--yes") as terminal:
+        terminal.wait_for("(Enter ends it)")
+        person.sweep(ENDS)
+
+        def die() -> None:
+            if emulator.servos[3].get("lock") == 0:
+                emulator.faults.silent.add(3)
+
+        emulator.on_request = die
+        terminal.type("\r")
+        terminal.wait_for("not all servos have it (not: elbow_flex, wrist_flex, wrist_roll, gripper)")
+        assert terminal.end() == 1
+    emulator.on_request = lambda: None
+    emulator.faults.silent.clear()
+    assert ran("check", emulator.port)[0] == 1
+    assert ran("check", emulator.port, "--write", "--yes")[0] == 0
+    for joint in load_calibration("so101_follower", JOINTS).joints.values():
+        assert emulator.servos[joint.id].get("homing_offset") == joint.homing_offset
+        assert emulator.servos[joint.id].get("lock") == 1
 
 
 def test_drift_is_reported_and_written_back(emulator, calibration_file):

@@ -134,7 +134,7 @@ class Measurement:
         if seconds is None and not interactive():
             raise Unanswered("Nobody is at a terminal to press Enter; run it in one, or give --range-seconds")
         end = "Enter ends it" if seconds is None else f"for {seconds:g} s"
-        click.echo(f"Move {', '.join(joint.name for joint in self._measured)} to both ends ({end}).")
+        click.echo(f"Move each joint of the table to both ends ({end}).")
         until = time.monotonic() + (seconds if seconds is not None else float("inf"))
         with ExitStack() as stack:
             typed = stack.enter_context(Keys()).subscribe() if interactive() else queue.SimpleQueue[str]()
