@@ -137,6 +137,7 @@ class Runtime:
         session.command("reset")
         if session.feeder is not None:
             session.feeder.begin(session.request.seed)
+        session.log.info("reset: mode %s begins anew", session.mode)
 
     def stop(self) -> None:
         """Stop every component, the last started first. Errors are logged, so that all are stopped."""
