@@ -170,7 +170,8 @@ class TestLateReplies:
                     found = [bus.read(2, "present_position")]
                 except FeetechError:
                     found = []
-            assert all(value == before for value in found)
+            # What is older is of an earlier request; on a busy machine the servos may have been told of more since.
+            assert all(before <= value <= counting.truth() for value in found)  # type: ignore[attr-defined]
 
     def test_a_servo_that_was_late_is_heard_again(self, bus: FeetechBus, counting: Emulator) -> None:
         reader = SyncReader(bus, SERVOS, "present_position", "present_load")
@@ -212,7 +213,7 @@ class TestLateReplies:
         bus.resynchronise()
         assert bus.counters["discarded_bytes"] > 0
         before = counting.truth()  # type: ignore[attr-defined]
-        assert bus.read(2, "present_position") == before
+        assert bus.read(2, "present_position") >= before
 
 
 class TestDamage:
