@@ -191,7 +191,8 @@ def _observation(spec: ObservationSpec, config: RobotConfig) -> ObservationPart:
 
 
 def _image_feature(image: ImageSpec, camera: Any) -> Feature:
-    height, width = image.resize or (getattr(camera, "height", -1), getattr(camera, "width", -1))
+    size = getattr(camera, "height", None) or -1, getattr(camera, "width", None) or -1
+    height, width = image.resize or size
     channels = 3 if image.encoding in ("rgb8", "bgr8") else 1
     dtype = _IMAGE_DTYPES.get(image.encoding, "image")
     return Feature(dtype, (height, width, channels), ("height", "width", "channels"))

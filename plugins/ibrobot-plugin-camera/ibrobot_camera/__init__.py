@@ -1,1 +1,51 @@
-"""Cameras for ibrobot: V4L2 devices, RTSP streams and video files through OpenCV, RealSense as an extra."""
+"""The plugin's hooks: sensors `opencv` and `realsense`, the commands `ibrobot camera …`, a check of the cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+from ibrobot_camera.options import OpenCvOptions
+from ibrobot_core.descriptors import Check, Command, SensorDescriptor
+from ibrobot_core.hookspecs import hookimpl
+
+if TYPE_CHECKING:
+    import click
+
+    from ibrobot_core.interfaces import Context, Sensor
+
+
+def _opencv(options: Any, ctx: Context) -> Sensor:
+    from ibrobot_camera.camera import OpenCvCamera
+
+    return OpenCvCamera(options, ctx)
+
+
+@hookimpl
+def ibrobot_sensors() -> Iterable[SensorDescriptor]:
+    """Cameras."""
+    yield SensorDescriptor(
+        type="opencv", options=OpenCvOptions, make=_opencv, summary="V4L2 device, RTSP or HTTP stream, or video file"
+    )
+
+
+def _commands() -> click.Command:
+    from ibrobot_camera.commands import camera
+
+    return camera
+
+
+@hookimpl
+def ibrobot_commands() -> Iterable[Command]:
+    """`ibrobot camera …`."""
+    yield Command("camera", "List, look through and photograph with cameras.", _commands)
+
+
+@hookimpl
+def ibrobot_doctor() -> Iterable[Check]:
+    """Which cameras this user may open."""
+    from ibrobot_camera.v4l2 import cameras
+
+    for camera in cameras():
+        found = camera.problem or camera.name
+        yield Check(f"camera {camera.path}", not camera.problem, found, "sudo usermod -aG video $USER, log in anew")

@@ -1,0 +1,49 @@
+"""Camera calibrations as ROS's camera_calibration writes them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from ibrobot_core.errors import SensorError
+from ibrobot_core.messages import CameraInfo, Header
+
+_MATRICES = {"distortion_coefficients": None, "camera_matrix": 9, "rectification_matrix": 9, "projection_matrix": 12}
+"""Key -> how many numbers it has."""
+
+
+def load_info(path: Path, name: str) -> Callable[[Header], CameraInfo]:
+    """What makes the CameraInfo of a calibration file.
+
+    Raises:
+        SensorError: naming file and key, when it cannot be read or lacks something.
+    """
+    try:
+        document = yaml.safe_load(path.read_text())
+    except (OSError, yaml.YAMLError) as error:
+        raise SensorError(f"camera {name}: {path}: cannot be read: {error}") from None
+    if not isinstance(document, dict):
+        raise SensorError(f"camera {name}: {path}: must be a mapping, as camera_calibration writes it")
+    height, width = document.get("image_height"), document.get("image_width")
+    if type(height) is not int or type(width) is not int:
+        found = f"{width!r} and {height!r}"
+        raise SensorError(f"camera {name}: {path}: image_width and image_height must be whole numbers, not {found}")
+    d, k, r, p = (_numbers(document, key, count, f"camera {name}: {path}") for key, count in _MATRICES.items())
+    model = str(document.get("distortion_model", "plumb_bob"))
+    return lambda header: CameraInfo(header, height, width, model, d, k, r, p)
+
+
+def _numbers(document: dict[str, Any], key: str, count: int | None, where: str) -> NDArray[np.float64]:
+    entry = document.get(key)
+    try:
+        found = np.array(entry["data"], dtype=np.float64)  # type: ignore[index]
+    except (TypeError, KeyError, ValueError):
+        raise SensorError(f"{where}: {key}: must have `data`, a list of numbers, not {entry!r}") from None
+    if found.ndim != 1 or (count is not None and found.size != count):
+        raise SensorError(f"{where}: {key}: must have {count} numbers, not {found.size}")
+    return found

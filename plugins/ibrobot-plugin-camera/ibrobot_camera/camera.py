@@ -1,0 +1,214 @@
+"""The sensor `opencv`: the newest picture of a live source, or a video file at its own rate."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from typing import override
+
+from ibrobot_camera.calibration import load_info
+from ibrobot_camera.capture import Capture, Picture, Pixels
+from ibrobot_camera.device import find_device
+from ibrobot_camera.options import OpenCvOptions
+from ibrobot_core.errors import SensorError
+from ibrobot_core.interfaces import Context, Sensor
+from ibrobot_core.messages import CameraInfo, Header, Image, Message
+from ibrobot_core.units import NS_PER_S, ns
+
+_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 2.0
+"""Between attempts to open a lost source again."""
+_CLOSE_S = 5.0
+
+
+class OpenCvCamera(Sensor):
+    """Pictures of a V4L2 device or a network stream, read by a thread that keeps only the newest; or of a video file.
+
+    Args:
+        options: the YAML's.
+        ctx: name, clock and logger.
+
+    Raises:
+        SensorError: for a device that is not there, or a calibration that cannot be read.
+    """
+
+    message_type = Image
+
+    def __init__(self, options: OpenCvOptions, ctx: Context) -> None:
+        self.topic = f"/camera/{ctx.name}/image_raw"
+        self._options = options
+        self._ctx = ctx
+        self._frame_id = options.frame_id or f"{ctx.name}_optical_frame"
+        self._source: _Live | _File | None = None
+        self._last_ns = 0
+
+    @override
+    def open(self) -> None:
+        device = find_device(self._options.device, self._ctx.name)
+        make = _File if device.kind == "file" else _Live
+        self._info = load_info(self._options.info, self._ctx.name) if self._options.info is not None else None
+        self._source = make(lambda: Capture(device, self._options, self._ctx.name), self._options, self._ctx)
+        self._source.open()
+
+    @override
+    def read(self, timeout_s: float) -> Image | None:
+        if self._source is None:
+            raise SensorError(f"camera {self._ctx.name}: not open")
+        found = self._source.read(timeout_s)
+        if found is None:
+            return None
+        pixels, stamp_ns = found
+        # A driver whose stamps stand still must not give two pictures of one time.
+        self._last_ns = stamp_ns = max(stamp_ns, self._last_ns + 1)
+        return to_image(pixels, Header(stamp_ns, self._frame_id))
+
+    @override
+    def close(self) -> None:
+        source, self._source = self._source, None
+        if source is not None:
+            source.close()
+
+    @override
+    def latched(self) -> tuple[tuple[str, Message], ...]:
+        if self._info is None or self._source is None:
+            return ()
+        info: CameraInfo = self._info(Header(self._ctx.clock.now_ns(), self._frame_id))
+        return ((f"/camera/{self._ctx.name}/camera_info", info),)
+
+
+def to_image(pixels: Pixels, header: Header) -> Image:
+    """A picture as a message: bgr8, mono8, or 16UC1 for depth."""
+    height, width = pixels.shape[:2]
+    encoding = "16UC1" if pixels.dtype == "uint16" else "bgr8" if pixels.ndim == 3 else "mono8"
+    flat = pixels.reshape(-1).view("uint8")
+    return Image(header, height, width, encoding, flat.size // height, flat)
+
+
+class _Live:
+    """A source that gives pictures by itself: a thread takes each, and keeps the newest."""
+
+    def __init__(self, make: Callable[[], Capture], options: OpenCvOptions, ctx: Context) -> None:
+        self._make = make
+        self._patience_s = options.reconnect_timeout
+        self._ctx = ctx
+        self._changed = threading.Condition()
+        self._newest: Picture | None = None
+        self._error: SensorError | None = None
+        self._ended = threading.Event()
+
+    def open(self) -> None:
+        capture = self._make()
+        for difference in capture.differences:
+            self._ctx.log.warning("camera %s %s", self._ctx.name, difference)
+        self._thread = threading.Thread(target=self._run, args=(capture,), name=f"camera {self._ctx.name}", daemon=True)
+        self._thread.start()
+
+    def read(self, timeout_s: float) -> tuple[Pixels, int] | None:
+        with self._changed:
+            if self._newest is None and self._error is None and timeout_s > 0:
+                self._changed.wait(timeout_s)
+            picture, self._newest = self._newest, None
+            if picture is not None:
+                age_ns = time.monotonic_ns() - picture.taken_ns
+                return picture.pixels, self._ctx.clock.now_ns() - age_ns
+            if self._error is not None:
+                raise self._error
+            return None
+
+    def close(self) -> None:
+        self._ended.set()
+        self._thread.join(_CLOSE_S)
+
+    def _run(self, capture: Capture) -> None:
+        try:
+            while not self._ended.is_set():
+                picture = capture.read()
+                if picture is None:
+                    capture.close()
+                    found = self._reconnect()
+                    if found is None:
+                        return
+                    capture = found
+                    continue
+                with self._changed:
+                    self._newest = picture
+                    self._changed.notify()
+        finally:
+            capture.close()
+
+    def _reconnect(self) -> Capture | None:
+        """The source again, or None when the camera is closed or was gone for too long."""
+        self._ctx.log.warning("camera %s is lost; trying for %g s", self._ctx.name, self._patience_s)
+        lost, pause_s = time.monotonic(), _FIRST_PAUSE_S
+        while True:
+            try:
+                capture = self._make()
+            except SensorError as error:
+                last = error
+            else:
+                self._ctx.log.warning("camera %s is back after %.1f s", self._ctx.name, time.monotonic() - lost)
+                return capture
+            if time.monotonic() - lost >= self._patience_s:
+                with self._changed:
+                    self._error = SensorError(f"{last}; it was lost and did not come back in {self._patience_s:g} s")
+                    self._changed.notify()
+                return None
+            if self._ended.wait(pause_s):
+                return None
+            pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
+
+
+class _File:
+    """A video file: picture `i` is due `i / rate` after it was opened, in the clock's time."""
+
+    def __init__(self, make: Callable[[], Capture], options: OpenCvOptions, ctx: Context) -> None:
+        self._make = make
+        self._options = options
+        self._ctx = ctx
+
+    def open(self) -> None:
+        self._capture: Capture | None = self._make()
+        rate = self._options.fps or self._capture.fps
+        if not rate:
+            self._capture.close()
+            raise SensorError(f"camera {self._ctx.name}: the file does not say its rate; give fps")
+        self._period_ns = ns(1.0 / rate)
+        self._begun_ns = self._ctx.clock.now_ns()
+        self._next = 0
+
+    def read(self, timeout_s: float) -> tuple[Pixels, int] | None:
+        clock = self._ctx.clock
+        due_ns = self._begun_ns + self._next * self._period_ns
+        now_ns = clock.now_ns()
+        if due_ns > now_ns:
+            if due_ns - now_ns > timeout_s * NS_PER_S:
+                if timeout_s > 0:
+                    clock.sleep_until(now_ns + ns(timeout_s))
+                return None
+            clock.sleep_until(due_ns)
+            now_ns = clock.now_ns()
+        # Of several that are due only the newest is given, with the time at which it was.
+        picture = None
+        while due_ns <= now_ns:
+            newer = self._picture()
+            if newer is None:
+                break
+            picture, stamp_ns = newer, due_ns
+            self._next += 1
+            due_ns += self._period_ns
+        return (picture.pixels, stamp_ns) if picture is not None else None
+
+    def close(self) -> None:
+        if self._capture is not None:
+            self._capture.close()
+            self._capture = None
+
+    def _picture(self) -> Picture | None:
+        if self._capture is None:
+            return None
+        picture = self._capture.read()
+        if picture is None and self._options.loop:
+            self._capture.close()
+            self._capture = self._make()
+            picture = self._capture.read()
+        return picture

@@ -1,0 +1,174 @@
+"""One open source of pictures, through OpenCV: set up as asked, compared with what was asked, stamped."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Mapping
+
+import attrs
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ibrobot_camera.device import Device
+from ibrobot_camera.options import OpenCvOptions
+from ibrobot_camera.v4l2 import Mode, modes
+from ibrobot_core.errors import SensorError
+from ibrobot_core.units import NS_PER_S
+
+type Pixels = NDArray[np.uint8] | NDArray[np.uint16]
+
+_TIMEOUT_MS = 3000
+"""After it a network stream that says nothing is lost."""
+_STREAM_OPTIONS = "rtsp_transport;tcp|fflags;nobuffer|flags;low_delay"
+_MANUAL_EXPOSURE, _AUTO_EXPOSURE = 1, 3
+"""V4L2_EXPOSURE_MANUAL, V4L2_EXPOSURE_APERTURE_PRIORITY."""
+_ROTATIONS: Mapping[int, int] = {
+    90: cv2.ROTATE_90_CLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_90_COUNTERCLOCKWISE,
+}  # fmt: skip
+# What goes wrong is told in this package's own errors.
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+
+
+@attrs.frozen(eq=False)
+class Picture:
+    """A picture and when it was taken."""
+
+    pixels: Pixels
+    """(H, W, 3) uint8, blue first; (H, W) uint8 or, for depth, uint16."""
+    taken_ns: int
+    """`time.monotonic_ns()`: the driver's own stamp where there is one, else when it came."""
+
+
+class Capture:
+    """An open source.
+
+    Args:
+        device: which.
+        options: the YAML's.
+        name: the camera's, for messages.
+
+    Raises:
+        SensorError: when it cannot be opened, or gives other pictures than were asked for and `strict` is set.
+    """
+
+    def __init__(self, device: Device, options: OpenCvOptions, name: str) -> None:
+        self._device = device
+        self._options = options
+        self._name = name
+        self._capture = self._open()
+        try:
+            if device.kind == "v4l2":
+                self._set_up()
+            self.differences = self._differences()
+            """What the source gives differently from what was asked."""
+            if self.differences and options.strict:
+                raise self._error(f"{'; '.join(self.differences)}{self._offered()}; `strict: false` takes it as it is")
+        except BaseException:
+            self._capture.release()
+            raise
+        self.fps = float(self._capture.get(cv2.CAP_PROP_FPS))
+        """Pictures a second, as the source says [Hz]; 0 where it does not."""
+        self.driver_stamps = False
+        """Whether the last picture has the driver's own stamp."""
+
+    def read(self) -> Picture | None:
+        """The next picture; None at the end of a file, or when the source is lost."""
+        good, pixels = self._capture.read()
+        if not good:
+            return None
+        taken_ns = self._taken_ns(time.monotonic_ns())
+        if self._options.rotation:
+            pixels = cv2.rotate(pixels, _ROTATIONS[self._options.rotation])
+        return Picture(np.ascontiguousarray(pixels), taken_ns)  # type: ignore[arg-type]
+
+    def close(self) -> None:
+        """Release the source."""
+        self._capture.release()
+
+    def _open(self) -> cv2.VideoCapture:
+        device = self._device
+        if device.kind == "v4l2":
+            if not os.path.exists(device.target):
+                raise self._error("there is no such device; `ibrobot camera list` shows those that are there")
+            if not os.access(device.target, os.R_OK | os.W_OK):
+                raise self._error("no permission: add yourself to the group `video`, log in anew")
+            capture = cv2.VideoCapture(device.target, cv2.CAP_V4L2)
+            why = "cannot be opened; another program may hold it"
+        elif device.kind == "stream":
+            os.environ.setdefault("OPENCV_FFMPEG_CAPTURE_OPTIONS", _STREAM_OPTIONS)
+            timeouts = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, _TIMEOUT_MS, cv2.CAP_PROP_READ_TIMEOUT_MSEC, _TIMEOUT_MS]
+            capture = cv2.VideoCapture(device.target, cv2.CAP_FFMPEG, timeouts)
+            why = f"cannot be opened within {_TIMEOUT_MS / 1e3:.0f} s; check the address and that the server runs"
+        else:
+            capture = cv2.VideoCapture(device.target, cv2.CAP_FFMPEG)
+            why = "is no video that can be decoded"
+        if not capture.isOpened():
+            capture.release()
+            raise self._error(why)
+        return capture
+
+    def _set_up(self) -> None:
+        options, capture = self._options, self._capture
+        capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
+        # The format first: it says which sizes there are, and those say which rates.
+        if options.fourcc is not None:
+            capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*options.fourcc))
+            if options.fourcc in ("Y16 ", "Z16 "):
+                capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)
+        if options.width is not None and options.height is not None:
+            capture.set(cv2.CAP_PROP_FRAME_WIDTH, options.width)
+            capture.set(cv2.CAP_PROP_FRAME_HEIGHT, options.height)
+        if options.fps is not None:
+            capture.set(cv2.CAP_PROP_FPS, options.fps)
+        automatic = options.exposure is None
+        capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, _AUTO_EXPOSURE if automatic else _MANUAL_EXPOSURE)
+        self._control("exposure", cv2.CAP_PROP_EXPOSURE, options.exposure)
+        capture.set(cv2.CAP_PROP_AUTO_WB, float(options.white_balance is None))
+        self._control("white_balance", cv2.CAP_PROP_WB_TEMPERATURE, options.white_balance)
+        self._control("brightness", cv2.CAP_PROP_BRIGHTNESS, options.brightness)
+
+    def _control(self, name: str, prop: int, value: float | None) -> None:
+        if value is not None and not self._capture.set(prop, value):
+            raise self._error(f"does not take {name}: {value:g}")
+
+    def _differences(self) -> list[str]:
+        options, get = self._options, self._capture.get
+        found = []
+        size = round(get(cv2.CAP_PROP_FRAME_WIDTH)), round(get(cv2.CAP_PROP_FRAME_HEIGHT))
+        if options.width is not None and size != (options.width, options.height):
+            found.append(f"gives {size[0]}x{size[1]}, {options.width}x{options.height} was asked for")
+        rate = get(cv2.CAP_PROP_FPS)
+        if options.fps is not None and rate and abs(rate - options.fps) > 0.01 * options.fps:
+            found.append(f"gives {rate:g} Hz, {options.fps:g} was asked for")
+        code = int(get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little").decode(errors="replace")
+        if self._device.kind == "v4l2" and options.fourcc is not None and code != options.fourcc:
+            found.append(f"gives format {code}, {options.fourcc} was asked for")
+        return found
+
+    def _offered(self) -> str:
+        if self._device.kind != "v4l2":
+            return ""
+        return _told(modes(self._device.target))
+
+    def _taken_ns(self, now_ns: int) -> int:
+        # OpenCV's V4L2 backend gives the buffer's stamp, which drivers take from the monotonic clock.
+        if self._device.kind == "v4l2":
+            stamp_ns = round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
+            if now_ns - NS_PER_S < stamp_ns <= now_ns:
+                self.driver_stamps = True
+                return stamp_ns
+        self.driver_stamps = False
+        return now_ns
+
+    def _error(self, what: str) -> SensorError:
+        return SensorError(f"camera {self._name}: {self._device}: {what}")
+
+
+def _told(offered: tuple[Mode, ...]) -> str:
+    if not offered:
+        return ""
+    lines = (f"{m.fourcc} {m.width}x{m.height} at {', '.join(f'{r:g}' for r in m.rates_hz)}" for m in offered[:12])
+    return f"; it offers: {'; '.join(lines)}"

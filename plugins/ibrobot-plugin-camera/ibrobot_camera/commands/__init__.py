@@ -1,0 +1,22 @@
+"""`ibrobot camera …`: what cameras there are, and what they see; one file a command."""
+
+from __future__ import annotations
+
+import click
+
+from ibrobot_camera.commands.list_cameras import list_cameras
+from ibrobot_camera.commands.preview import preview
+from ibrobot_camera.commands.snapshot import snapshot
+
+
+@click.group()
+def camera() -> None:
+    """List, look through and photograph with cameras.
+
+    SOURCE is a device as in a robot YAML (a number, a path, a stable id, a URL, a video file), or a robot YAML: then
+    all its `opencv` cameras.
+    """
+
+
+for command in (list_cameras, preview, snapshot):
+    camera.add_command(command)

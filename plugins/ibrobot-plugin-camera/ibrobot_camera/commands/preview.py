@@ -1,0 +1,152 @@
+"""`ibrobot camera preview`: the cameras in a browser, on this machine or through an SSH tunnel."""
+
+from __future__ import annotations
+
+import html
+import secrets
+import signal
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import TYPE_CHECKING, Any
+from urllib.parse import parse_qs, urlsplit
+
+import click
+import cv2
+
+if TYPE_CHECKING:
+    from ibrobot_camera.camera import OpenCvCamera
+
+_BOUNDARY = "picture"
+_QUALITY = 80
+
+
+class Newest:
+    """The newest picture of one camera as a JPEG, for any number of viewers."""
+
+    def __init__(self, name: str, camera: OpenCvCamera, ended: threading.Event) -> None:
+        self.name = name
+        self._camera = camera
+        self._ended = ended
+        self._changed = threading.Condition()
+        self._jpeg = b""
+        self._number = 0
+        self.problem = ""
+        self.thread = threading.Thread(target=self._run, name=f"preview {name}", daemon=True)
+
+    def after(self, number: int, timeout_s: float) -> tuple[int, bytes]:
+        """The first picture newer than `number`, with its own; empty when none came in time."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._number > number, timeout_s)
+            return (self._number, self._jpeg) if self._number > number else (number, b"")
+
+    def _run(self) -> None:
+        from ibrobot_camera.commands.sources import pixels
+        from ibrobot_core.errors import SensorError
+
+        while not self._ended.is_set():
+            try:
+                image = self._camera.read(0.2)
+            except SensorError as error:
+                self.problem = str(error)
+                self._ended.set()
+                return
+            if image is None:
+                continue
+            found = pixels(image)
+            if image.encoding == "16UC1":
+                found = cv2.applyColorMap(cv2.convertScaleAbs(found, alpha=255 / 4000), cv2.COLORMAP_TURBO)  # type: ignore[assignment]
+            _, jpeg = cv2.imencode(".jpg", found, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+            with self._changed:
+                self._jpeg, self._number = jpeg.tobytes(), self._number + 1
+                self._changed.notify_all()
+
+
+@click.command()
+@click.argument("source")
+@click.option("--host", default="127.0.0.1", show_default=True, help="Where to listen.")
+@click.option("--port", type=click.IntRange(0, 65535), default=0, help="0: any free one.")
+@click.option("--seconds", type=click.FloatRange(min=0), help="End after so many seconds.")
+def preview(source: str, host: str, port: int, seconds: float | None) -> None:
+    """Show the cameras of SOURCE in a browser.
+
+    Prints the page's address, which has a secret in it; nothing but this machine can open it unless --host says so.
+    From another machine: `ssh -L 8000:127.0.0.1:PORT robot`, with --port. Ctrl-C ends it.
+    """
+    from ibrobot_camera.commands.sources import opened
+
+    ended = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: ended.set())
+    token = secrets.token_urlsafe(16)
+    with opened(source) as cameras:
+        views = {name: Newest(name, camera, ended) for name, camera in cameras.items()}
+        server = ThreadingHTTPServer((host, port), _handler(views, token, ended))
+        server.daemon_threads = True
+        for thread in (*(view.thread for view in views.values()), threading.Thread(target=server.serve_forever)):
+            thread.start()
+        click.echo(f"http://{host}:{server.server_address[1]}/?token={token}")
+        ended.wait(seconds)
+        ended.set()
+        server.shutdown()
+        server.server_close()
+        for view in views.values():
+            view.thread.join()
+    for view in views.values():
+        if view.problem:
+            raise click.ClickException(view.problem)
+
+
+def _handler(views: dict[str, Newest], token: str, ended: threading.Event) -> type[BaseHTTPRequestHandler]:
+    class Handler(BaseHTTPRequestHandler):
+        """The page, and a stream of pictures for each camera."""
+
+        def do_GET(self) -> None:
+            """Answer a browser that knows the token."""
+            address = urlsplit(self.path)
+            given = parse_qs(address.query).get("token", [""])[0]
+            if not secrets.compare_digest(given, token):
+                self.send_error(403)
+            elif address.path == "/":
+                self._page()
+            elif (name := address.path.removeprefix("/stream/")) in views:
+                self._stream(views[name])
+            else:
+                self.send_error(404)
+
+        def log_message(self, format: str, *arguments: Any) -> None:
+            """Say nothing: the terminal shows the address."""
+
+        def _page(self) -> None:
+            figures = "".join(
+                f'<figure><img src="/stream/{name}?token={token}" alt="{html.escape(name)}">'
+                f"<figcaption>{html.escape(name)}</figcaption></figure>"
+                for name in views
+            )
+            body = (
+                '<!doctype html><html lang="en"><meta charset="utf-8"><title>ibrobot cameras</title><style>'
+                "body{margin:1em;background:#111;color:#eee;font-family:sans-serif;display:flex;flex-wrap:wrap;gap:1em}"
+                "figure{margin:0}img{max-width:100%;min-width:20em;background:#333}</style>" + figures
+            ).encode()
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html; charset=utf-8")
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            self.wfile.write(body)
+
+        def _stream(self, view: Newest) -> None:
+            self.send_response(200)
+            self.send_header("Content-Type", f"multipart/x-mixed-replace; boundary={_BOUNDARY}")
+            self.send_header("Cache-Control", "no-store")
+            self.end_headers()
+            number = 0
+            try:
+                while not ended.is_set():
+                    number, jpeg = view.after(number, 0.5)
+                    if not jpeg:
+                        continue
+                    head = f"--{_BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n"
+                    self.wfile.write(f"{head}\r\n".encode() + jpeg + b"\r\n")
+            except OSError:
+                return  # the browser has gone
+
+    return Handler

@@ -1,0 +1,64 @@
+"""The cameras that a command line names: one device, or all of a robot YAML."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ibrobot_camera.camera import OpenCvCamera
+from ibrobot_camera.options import OpenCvOptions
+from ibrobot_core.clock import RealClock
+from ibrobot_core.config import find_config, load
+from ibrobot_core.errors import SensorError
+from ibrobot_core.interfaces import Context
+from ibrobot_core.messages import Image
+from ibrobot_core.plugins import installed
+from ibrobot_core.robot import Robot
+
+_TO_BGR = {"bgr8": None, "mono8": cv2.COLOR_GRAY2BGR}
+
+
+@contextmanager
+def opened(source: str) -> Iterator[dict[str, OpenCvCamera]]:
+    """Name -> camera, open, of a device or of a robot YAML.
+
+    Raises:
+        ConfigError: for a robot YAML with mistakes.
+        SensorError: when a camera does not open, or the YAML has none.
+    """
+    clock = RealClock()
+    with ExitStack() as stack:
+        cameras = {}
+        for name, options in _options(source).items():
+            ctx = Context(name, clock, logging.getLogger(f"ibrobot.{name}"), Robot("camera", ()))
+            camera = OpenCvCamera(options, ctx)
+            camera.open()
+            stack.callback(camera.close)
+            cameras[name] = camera
+        yield cameras
+
+
+def _options(source: str) -> dict[str, OpenCvOptions]:
+    registry = installed()
+    if not source.endswith((".yaml", ".yml")):
+        return {"camera": OpenCvOptions(device=source, strict=False)}
+    config = load(find_config(source, registry), registry=registry)
+    found = {name: p.options for name, p in config.peripherals.items() if isinstance(p.options, OpenCvOptions)}
+    if not found:
+        raise SensorError(f"{source}: has no camera of type opencv")
+    return found
+
+
+def pixels(image: Image) -> NDArray[np.uint8] | NDArray[np.uint16]:
+    """An image as OpenCV writes it: (H, W, 3) blue first, or (H, W) of depth."""
+    if image.encoding == "16UC1":
+        return image.data.view(np.uint16).reshape(image.height, image.width)
+    conversion = _TO_BGR[image.encoding]
+    shape = (image.height, image.width) if conversion is not None else (image.height, image.width, 3)
+    found = image.data.reshape(shape)
+    return found if conversion is None else np.asarray(cv2.cvtColor(found, conversion), dtype=np.uint8)

@@ -1,0 +1,54 @@
+"""What a YAML means by `device`: a V4L2 device, a network stream, or a video file."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import attrs
+
+from ibrobot_core.errors import SensorError
+
+BY_ID = Path("/dev/v4l/by-id")
+_URL = re.compile(r"[a-z][a-z0-9+.-]*://", re.IGNORECASE)
+
+
+@attrs.frozen
+class Device:
+    """A source of pictures."""
+
+    kind: str
+    """`v4l2`, `stream` or `file`."""
+    target: str
+    """A device's path, a URL, or a file's path."""
+
+    def __str__(self) -> str:
+        """For messages: without user and password."""
+        if self.kind != "stream":
+            return self.target
+        parts = urlsplit(self.target)
+        host = parts.netloc.rpartition("@")[2]
+        return parts._replace(netloc=host).geturl()
+
+
+def find_device(device: int | str, name: str) -> Device:
+    """What `device` means.
+
+    Raises:
+        SensorError: when it is nothing that is there.
+    """
+    text = str(device)
+    if _URL.match(text):
+        return Device("stream", text)
+    if text.isdigit():
+        return Device("v4l2", f"/dev/video{text}")
+    if "/" not in text and (BY_ID / text).exists():
+        return Device("v4l2", str(BY_ID / text))
+    path = Path(text).expanduser()
+    if text.startswith("/dev/"):
+        return Device("v4l2", text)
+    if path.is_file():
+        return Device("file", str(path))
+    there = ", ".join(sorted(entry.name for entry in BY_ID.iterdir())) if BY_ID.is_dir() else "none"
+    raise SensorError(f"camera {name}: no file, URL or device {text!r}; devices under {BY_ID}: {there}")
