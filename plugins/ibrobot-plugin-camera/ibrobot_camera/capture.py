@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 
 import attrs
 import cv2
@@ -22,6 +24,7 @@ type Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 _TIMEOUT_MS = 3000
 """After it a network stream that says nothing is lost."""
 _STREAM_OPTIONS = "rtsp_transport;tcp|fflags;nobuffer|flags;low_delay"
+_environment = threading.Lock()
 _MANUAL_EXPOSURE, _AUTO_EXPOSURE = 1, 3
 """V4L2_EXPOSURE_MANUAL, V4L2_EXPOSURE_APERTURE_PRIORITY."""
 _ROTATIONS: Mapping[int, int] = {
@@ -98,9 +101,9 @@ class Capture:
             capture = cv2.VideoCapture(device.target, cv2.CAP_V4L2)
             why = "cannot be opened; another program may hold it"
         elif device.kind == "stream":
-            os.environ.setdefault("OPENCV_FFMPEG_CAPTURE_OPTIONS", _STREAM_OPTIONS)
             timeouts = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, _TIMEOUT_MS, cv2.CAP_PROP_READ_TIMEOUT_MSEC, _TIMEOUT_MS]
-            capture = cv2.VideoCapture(device.target, cv2.CAP_FFMPEG, timeouts)
+            with _stream_options():
+                capture = cv2.VideoCapture(device.target, cv2.CAP_FFMPEG, timeouts)
             why = f"cannot be opened within {_TIMEOUT_MS / 1e3:.0f} s; check the address and that the server runs"
         else:
             capture = cv2.VideoCapture(device.target, cv2.CAP_FFMPEG)
@@ -165,6 +168,23 @@ class Capture:
 
     def _error(self, what: str) -> SensorError:
         return SensorError(f"camera {self._name}: {self._device}: {what}")
+
+
+@contextmanager
+def _stream_options() -> Iterator[None]:
+    """FFmpeg's options for a source that is to be seen at once; OpenCV takes them from the environment only.
+
+    They must not stay there: with them a video file loses its first picture.
+    """
+    name = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
+    with _environment:
+        before = os.environ.get(name)
+        os.environ[name] = before or _STREAM_OPTIONS
+        try:
+            yield
+        finally:
+            if before is None:
+                del os.environ[name]
 
 
 def _told(offered: tuple[Mode, ...]) -> str:

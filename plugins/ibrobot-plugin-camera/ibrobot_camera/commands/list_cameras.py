@@ -9,14 +9,14 @@ import click
 from rich.console import Console
 from rich.table import Table
 
-from ibrobot_camera.v4l2 import Camera, cameras
+from ibrobot_camera import v4l2
 
 
 @click.command("list")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def list_cameras(as_json: bool) -> None:
     """List the cameras of this machine: path, stable id, name, and formats, sizes and rates."""
-    found = cameras()
+    found = v4l2.cameras()
     if as_json:
         click.echo(json.dumps([attrs.asdict(camera) for camera in found], indent=2))
         return
@@ -34,7 +34,7 @@ def list_cameras(as_json: bool) -> None:
             console.print(_table(camera))
 
 
-def _table(camera: Camera) -> Table:
+def _table(camera: v4l2.Camera) -> Table:
     table = Table(box=None, padding=(0, 2))
     for heading in ("format", "size", "rates [Hz]"):
         table.add_column(heading)

@@ -1,0 +1,303 @@
+"""The sensor `opencv` with real decoders: files in the clock's time, a local stream, what is lost and comes back."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, override
+
+import cv2
+import numpy as np
+import pytest
+from ibrobot_camera import capture as capture_module
+from ibrobot_camera.camera import OpenCvCamera, to_image
+from ibrobot_camera.capture import Capture
+from ibrobot_camera.device import Device, find_device
+from ibrobot_camera.options import OpenCvOptions
+
+from ibrobot_core.clock import RealClock, SteppedClock
+from ibrobot_core.errors import SensorError
+from ibrobot_core.interfaces import Context, Sensor
+from ibrobot_core.messages import CameraInfo, Header
+from ibrobot_core.testing import SensorSuite, host_context
+from ibrobot_core.testing.contexts import START_NS
+
+from .stream_server import HEIGHT, WIDTH, StreamServer, number_of, numbered
+
+FRAMES, FPS = 12, 25.0
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Twelve numbered pictures at 25 Hz."""
+    path = tmp_path_factory.mktemp("video") / "numbers.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), FPS, (WIDTH, HEIGHT))
+    for number in range(1, FRAMES + 1):
+        writer.write(numbered(number))
+    writer.release()
+    return path
+
+
+def camera(ctx: Context, device: Any, **options: Any) -> OpenCvCamera:
+    return OpenCvCamera(OpenCvOptions(device=device, **options), ctx)
+
+
+def number(image: Any) -> int:
+    return number_of(image.data.reshape(image.height, image.width, 3))
+
+
+class TestFileConformance(SensorSuite):
+    @pytest.fixture(autouse=True)
+    def _video(self, video: Path) -> None:
+        self.video = video
+
+    @override
+    def context(self) -> Context:
+        return host_context("top", clock=SteppedClock(START_NS))
+
+    @override
+    def make(self, ctx: Context) -> Sensor:
+        return camera(ctx, str(self.video))
+
+    @override
+    def trigger(self, sensor: Sensor, ctx: Context) -> None:
+        ctx.clock.sleep_until(ctx.clock.now_ns() + 40_000_000)
+
+    def test_silence_gives_none(self) -> None:
+        """Between two pictures there is none."""
+        with self.opened() as (sensor, _):
+            assert sensor.read(0.0) is not None
+            assert sensor.read(0.0) is None
+
+
+class TestStreamConformance(SensorSuite):
+    @pytest.fixture(autouse=True)
+    def _server(self) -> Iterator[None]:
+        with StreamServer() as self.server:
+            yield
+
+    @override
+    def context(self) -> Context:
+        return host_context("top", clock=RealClock())
+
+    @override
+    def make(self, ctx: Context) -> Sensor:
+        return camera(ctx, self.server.url)
+
+    @override
+    def silence(self, sensor: Sensor) -> None:
+        self.server.running.clear()
+        while sensor.read(0.1) is not None:
+            pass
+
+
+class TestFile:
+    def test_pictures_come_at_their_own_rate_in_the_clocks_time(self, video: Path) -> None:
+        ctx = host_context("top", clock=SteppedClock(START_NS))
+        top = camera(ctx, str(video))
+        top.open()
+        seen = []
+        for _ in range(30):
+            image = top.read(0.0)
+            if image is not None:
+                seen.append((number(image), image.header.stamp_ns - START_NS))
+            ctx.clock.sleep_until(ctx.clock.now_ns() + 10_000_000)
+        top.close()
+        assert seen == [(n + 1, n * 40_000_000) for n in range(8)]
+
+    def test_it_is_the_same_every_time(self, video: Path) -> None:
+        runs = []
+        for _ in range(2):
+            ctx = host_context("top", clock=SteppedClock(START_NS))
+            top = camera(ctx, str(video))
+            top.open()
+            images = [top.read(0.05) for _ in range(10)]
+            runs.append([(i.header.stamp_ns, i.data.tobytes()) for i in images if i is not None])
+            top.close()
+        assert len(runs[0]) >= 9
+        assert runs[0] == runs[1]
+
+    def test_late_readers_get_the_newest_with_its_own_stamp(self, video: Path) -> None:
+        ctx = host_context("top", clock=SteppedClock(START_NS))
+        top = camera(ctx, str(video))
+        top.open()
+        ctx.clock.sleep_until(START_NS + 205_000_000)
+        image = top.read(0.0)
+        top.close()
+        assert image is not None
+        assert (number(image), image.header.stamp_ns) == (6, START_NS + 200_000_000)
+
+    @pytest.mark.parametrize(("loop", "expected"), [(True, [12, 1, 2]), (False, [12])])
+    def test_at_its_end_it_begins_anew_or_falls_silent(self, video: Path, loop: bool, expected: list[int]) -> None:
+        ctx = host_context("top", clock=SteppedClock(START_NS))
+        top = camera(ctx, str(video), loop=loop)
+        top.open()
+        images = [top.read(0.05) for _ in range(14)]
+        top.close()
+        assert [number(image) for image in images[11:] if image is not None] == expected
+
+    def test_rotation_turns_clockwise(self, video: Path) -> None:
+        ctx = host_context("top", clock=SteppedClock(START_NS))
+        top = camera(ctx, str(video), rotation=90)
+        top.open()
+        image = top.read(0.0)
+        top.close()
+        assert image is not None
+        assert (image.height, image.width) == (WIDTH, HEIGHT)
+        turned = np.rot90(image.data.reshape(WIDTH, HEIGHT, 3))
+        assert number_of(turned) == 1
+
+
+class TestStream:
+    def test_each_picture_is_new_and_as_old_as_it_says(self) -> None:
+        with StreamServer() as server:
+            ctx = host_context("top", clock=RealClock())
+            top = camera(ctx, server.url)
+            top.open()
+            seen = [number(image) for _ in range(20) if (image := top.read(5.0)) is not None]
+            newest = server.number
+            top.close()
+        assert seen == sorted(set(seen))
+        assert newest - seen[-1] <= 2, "no queue of old pictures grows"
+
+    def test_a_reader_that_pauses_gets_the_newest(self) -> None:
+        with StreamServer() as server:
+            ctx = host_context("top", clock=RealClock())
+            top = camera(ctx, server.url)
+            top.open()
+            top.read(5.0)
+            before = server.number
+            while server.number < before + 20:
+                time.sleep(0.01)
+            image = top.read(5.0)
+            top.close()
+            assert image is not None
+            assert number(image) >= before + 18
+
+    def test_a_lost_stream_comes_back(self, caplog: pytest.LogCaptureFixture) -> None:
+        ctx = host_context("top", clock=RealClock())
+        with StreamServer() as server:
+            top = camera(ctx, server.url, reconnect_timeout=20.0)
+            top.open()
+            while (last := top.read(5.0)) is not None and number(last) < 20:
+                pass
+        assert last is not None
+        while top.read(0.1) is not None:
+            pass
+        with StreamServer(server.port):
+            image = None
+            while image is None:
+                image = top.read(5.0)
+            top.close()
+        assert image.header.stamp_ns > last.header.stamp_ns
+        assert number(image) < number(last), "a picture of the new stream"
+        assert "camera top is lost; trying for 20 s" in caplog.text
+
+    def test_a_stream_that_stays_away_is_an_error(self) -> None:
+        ctx = host_context("top", clock=RealClock())
+        with StreamServer() as server:
+            top = camera(ctx, server.url, reconnect_timeout=0.0)
+            top.open()
+            assert top.read(5.0) is not None
+        with pytest.raises(SensorError, match=r"was lost and did not come back in 0 s"):  # noqa: PT012
+            while True:
+                top.read(5.0)
+        top.close()
+
+    def test_no_server_is_told_without_the_password(self) -> None:
+        ctx = host_context("top", clock=RealClock())
+        with pytest.raises(SensorError, match=r"camera top: rtsp://127\.0\.0\.1:9/live: cannot be opened") as caught:
+            camera(ctx, "rtsp://arm:secret@127.0.0.1:9/live").open()
+        assert "secret" not in str(caught.value)
+
+
+class TestWhatWasAsked:
+    def test_another_size_is_an_error_or_a_warning(self, video: Path) -> None:
+        ctx = host_context("top", clock=SteppedClock(START_NS))
+        with pytest.raises(SensorError, match=r"gives 64x48, 640x480 was asked for; `strict: false` takes it as it is"):
+            camera(ctx, str(video), width=640, height=480).open()
+        with StreamServer() as server:
+            real = host_context("top", clock=RealClock())
+            top = camera(real, server.url, width=640, height=480, strict=False)
+            top.open()
+            top.close()
+
+    def test_a_driver_that_does_not_take_a_control_is_told(self, video: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(capture_module.Capture, "_open", lambda self: cv2.VideoCapture(str(video)))
+        with pytest.raises(SensorError, match=r"camera top: /dev/video7: does not take exposure: 40"):
+            Capture(Device("v4l2", "/dev/video7"), OpenCvOptions(device=7, exposure=40.0, strict=False), "top")
+
+    @pytest.mark.parametrize(
+        ("options", "message"),
+        [
+            ({"width": 640}, "width and height belong together"),
+            ({"fourcc": "MJPEG"}, "four characters, e.g. MJPG, not 'MJPEG'"),
+            ({"rotation": 45}, "45 is not one of: 0, 90, 180, 270"),
+        ],
+    )
+    def test_options_that_cannot_be_are_refused(self, options: dict[str, Any], message: str) -> None:
+        with pytest.raises(ValueError, match=message):
+            OpenCvOptions(device=0, **options)
+
+
+class TestDevices:
+    @pytest.mark.parametrize(
+        ("device", "kind", "target"),
+        [
+            (0, "v4l2", "/dev/video0"),
+            ("2", "v4l2", "/dev/video2"),
+            ("/dev/video4", "v4l2", "/dev/video4"),
+            ("rtsp://host/live", "stream", "rtsp://host/live"),
+        ],
+    )
+    def test_what_a_device_means(self, device: int | str, kind: str, target: str) -> None:
+        assert find_device(device, "top") == Device(kind, target)
+
+    def test_nothing_that_is_there_is_told(self, tmp_path: Path) -> None:
+        with pytest.raises(SensorError, match=r"camera top: no file, URL or device 'usb-cam'"):
+            find_device("usb-cam", "top")
+        with pytest.raises(SensorError, match=r"/dev/video77: there is no such device; `ibrobot camera list`"):
+            camera(host_context("top"), 77).open()
+        (tmp_path / "no.mp4").write_text("no video")
+        with pytest.raises(SensorError, match="is no video that can be decoded"):
+            camera(host_context("top"), str(tmp_path / "no.mp4")).open()
+
+
+def test_depth_is_16uc1_with_its_bytes() -> None:
+    depth = np.arange(12, dtype=np.uint16).reshape(3, 4)
+    image = to_image(depth, Header(1))
+    assert (image.encoding, image.step, image.height, image.width) == ("16UC1", 8, 3, 4)
+    np.testing.assert_array_equal(image.data.view(np.uint16).reshape(3, 4), depth)
+
+
+class TestCalibration:
+    def test_info_of_camera_calibration_is_published(self, video: Path, tmp_path: Path) -> None:
+        (tmp_path / "top.yaml").write_text(
+            "image_width: 64\nimage_height: 48\ndistortion_model: plumb_bob\n"
+            "camera_matrix: {rows: 3, cols: 3, data: [50, 0, 32, 0, 50, 24, 0, 0, 1]}\n"
+            "distortion_coefficients: {rows: 1, cols: 5, data: [0.1, 0, 0, 0, 0]}\n"
+            "rectification_matrix: {rows: 3, cols: 3, data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}\n"
+            "projection_matrix: {rows: 3, cols: 4, data: [50, 0, 32, 0, 0, 50, 24, 0, 0, 0, 1, 0]}\n"
+        )
+        top = camera(host_context("top"), str(video), info=tmp_path / "top.yaml")
+        top.open()
+        ((topic, info),) = top.latched()
+        top.close()
+        assert topic == "/camera/top/camera_info"
+        assert isinstance(info, CameraInfo)
+        assert (info.width, info.k[2], info.d[0]) == (64, 32.0, 0.1)
+
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            ("[]", "must be a mapping"),
+            ("image_width: a\nimage_height: 2", "must be whole numbers, not 'a' and 2"),
+            ("image_width: 1\nimage_height: 2", "distortion_coefficients: must have `data`"),
+            ("a: [", "cannot be read"),
+        ],
+    )
+    def test_a_file_that_is_none_is_told(self, video: Path, tmp_path: Path, text: str, message: str) -> None:
+        (tmp_path / "top.yaml").write_text(text)
+        with pytest.raises(SensorError, match=message):
+            camera(host_context("top"), str(video), info=tmp_path / "top.yaml").open()

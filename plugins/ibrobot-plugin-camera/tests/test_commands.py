@@ -1,0 +1,85 @@
+"""`ibrobot camera …` with real sources: what is printed, the files that are written, the page in the browser."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+import cv2
+import pytest
+from click.testing import CliRunner
+from ibrobot_camera import v4l2
+from ibrobot_camera.commands import camera
+
+from ibrobot_core.errors import SensorError
+
+from .stream_server import StreamServer
+
+ROBOT = """
+robot: {{name: r, joints: [{{name: j, lower: -1, upper: 1, max_velocity: 1, max_acceleration: 1}}], groups: {{a: [j]}}}}
+hardware: {{type: nothing}}
+peripherals:
+  - {{name: top, kind: camera, type: opencv, device: "{url}"}}
+  - {{name: wrist, kind: camera, type: opencv, device: "{url}"}}
+"""
+
+
+def test_list_without_cameras_says_what_to_look_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(v4l2, "cameras", list)
+    result = CliRunner().invoke(camera, ["list"])
+    assert result.exit_code == 0
+    assert "no camera: there is no /dev/video*" in result.output
+    assert CliRunner().invoke(camera, ["list", "--json"]).output == "[]\n"
+
+
+def test_list_shows_stable_ids_and_modes(monkeypatch: pytest.MonkeyPatch) -> None:
+    modes = (v4l2.Mode("MJPG", 640, 480, (30.0, 15.0)),)
+    found = [
+        v4l2.Camera("/dev/video0", "HD Cam", "usb-HD_Cam-video-index0", modes),
+        v4l2.Camera("/dev/video2", "", "", (), "Permission denied"),
+    ]
+    monkeypatch.setattr(v4l2, "cameras", lambda: found)
+    output = CliRunner().invoke(camera, ["list"]).output
+    for text in ("/dev/video0  HD Cam", "usb-HD_Cam-video-index0", "MJPG", "640x480", "30, 15", "Permission denied"):
+        assert text in output
+
+
+def test_snapshot_saves_the_picture_and_says_its_rate(tmp_path: Path) -> None:
+    with StreamServer() as server:
+        arguments = ["snapshot", server.url, "-o", str(tmp_path / "a.png"), "--seconds", "0.5"]
+        result = CliRunner().invoke(camera, arguments, catch_exceptions=False)
+    assert result.output.startswith(f"{tmp_path / 'a.png'}: camera, 64x48 bgr8, ")
+    assert cv2.imread(str(tmp_path / "a.png")).shape == (48, 64, 3)
+
+
+def test_snapshot_refuses_what_it_cannot_write() -> None:
+    result = CliRunner().invoke(camera, ["snapshot", "0", "-o", "a.gif"])
+    assert result.exit_code == 2
+    assert "must end in .png or .jpg" in result.output
+    with pytest.raises(SensorError, match="no file, URL or device"):
+        CliRunner().invoke(camera, ["snapshot", "nothing"], catch_exceptions=False)
+
+
+def test_preview_shows_the_stream_to_who_has_the_token() -> None:
+    with StreamServer() as server:
+        command = [sys.executable, "-c", "from ibrobot_core.cli.main import main; main()", "camera", "preview"]
+        with subprocess.Popen([*command, server.url], stdout=subprocess.PIPE, text=True) as preview:
+            assert preview.stdout is not None
+            try:
+                url = preview.stdout.readline().strip()
+                page = urllib.request.urlopen(url, timeout=20).read().decode()
+                assert '<img src="/stream/camera?token=' in page
+                with pytest.raises(urllib.error.HTTPError, match="403"):
+                    urllib.request.urlopen(url.partition("?")[0], timeout=20)
+                stream = urllib.request.urlopen(url.replace("/?", "/stream/camera?"), timeout=20)
+                assert stream.headers["Content-Type"].startswith("multipart/x-mixed-replace")
+                received = stream.read(6000)
+                assert received.count(b"--picture") >= 2
+                assert b"\xff\xd8" in received
+                stream.close()
+            finally:
+                preview.terminate()
+        assert preview.returncode == 0
