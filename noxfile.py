@@ -21,6 +21,8 @@ FOLDERS = {
 """Name -> folder, of every plugin and of the library that plugins may share."""
 PLUGINS = sorted(FOLDERS)
 SHARED = "ros2"
+EXTRAS = {"camera": "[realsense]"}
+"""Name -> extras that its tests use."""
 # A fixed seed: the same checks give the same result; `nox -s core -- --hypothesis-seed=random` explores.
 PYTEST = ("pytest", "--config-file=pyproject.toml", "--rootdir=.", "--hypothesis-seed=0")
 
@@ -32,7 +34,7 @@ def packages(*plugins: str) -> list[str]:
         needs = nox.project.load_toml(FOLDERS[name] / "pyproject.toml")["project"]["dependencies"]
         if SHARED not in wanted and any(need.startswith(f"ibrobot-{SHARED}") for need in needs):
             wanted.append(SHARED)
-    return ["-e", ".", *(argument for name in wanted for argument in ("-e", str(FOLDERS[name])))]
+    return ["-e", ".", *(argument for name in wanted for argument in ("-e", f"{FOLDERS[name]}{EXTRAS.get(name, '')}"))]
 
 
 def install(

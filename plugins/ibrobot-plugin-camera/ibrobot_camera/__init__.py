@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
-from ibrobot_camera.options import OpenCvOptions
+from ibrobot_camera.options import OpenCvOptions, RealSenseOptions
 from ibrobot_core.descriptors import Check, Command, SensorDescriptor
 from ibrobot_core.hookspecs import hookimpl
 
@@ -21,11 +21,20 @@ def _opencv(options: Any, ctx: Context) -> Sensor:
     return OpenCvCamera(options, ctx)
 
 
+def _realsense(options: Any, ctx: Context) -> Sensor:
+    from ibrobot_camera.realsense import RealSenseCamera
+
+    return RealSenseCamera(options, ctx)
+
+
 @hookimpl
 def ibrobot_sensors() -> Iterable[SensorDescriptor]:
     """Cameras."""
     yield SensorDescriptor(
         type="opencv", options=OpenCvOptions, make=_opencv, summary="V4L2 device, RTSP or HTTP stream, or video file"
+    )
+    yield SensorDescriptor(
+        type="realsense", options=RealSenseOptions, make=_realsense, summary="Intel RealSense: colour, or aligned depth"
     )
 
 

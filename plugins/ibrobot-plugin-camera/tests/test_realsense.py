@@ -1,0 +1,144 @@
+"""The sensor `realsense` on the library's own software device: real frames through the real library."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Iterator
+from typing import Any, override
+
+import numpy as np
+import pytest
+from ibrobot_camera import realsense
+from ibrobot_camera.options import RealSenseOptions
+from ibrobot_camera.realsense import RealSenseCamera
+
+from ibrobot_core.clock import RealClock
+from ibrobot_core.errors import SensorError
+from ibrobot_core.interfaces import Context, Sensor
+from ibrobot_core.messages import CameraInfo
+from ibrobot_core.testing import SensorSuite, host_context
+
+WIDTH, HEIGHT = 64, 48
+SMALL = RealSenseOptions(width=WIDTH, height=HEIGHT)
+
+
+def test_without_the_library_it_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pyrealsense2", None)
+    with pytest.raises(SensorError, match=r"pip install 'ibrobot-plugin-camera\[realsense\]'"):
+        RealSenseCamera(SMALL, host_context("top"))
+
+
+class SoftwareCamera:
+    """A RealSense in software: pictures whose colour and depth say their number."""
+
+    def __init__(self, rs: Any) -> None:
+        self._rs = rs
+        self.device = rs.software_device()
+        self.device.register_info(rs.camera_info.serial_number, "1")
+        self._streams = {}
+        intrinsics = rs.intrinsics()
+        intrinsics.width, intrinsics.height, intrinsics.fx, intrinsics.fy = WIDTH, HEIGHT, 50.0, 50.0
+        intrinsics.ppx, intrinsics.ppy, intrinsics.model, intrinsics.coeffs = 32.0, 24.0, rs.distortion.none, [0.0] * 5
+        kinds = (("depth", rs.stream.depth, rs.format.z16, 2), ("color", rs.stream.color, rs.format.bgr8, 3))
+        for uid, (name, stream, pixel_format, size) in enumerate(kinds):
+            sensor = self.device.add_sensor(name)
+            video = rs.video_stream()
+            video.type, video.uid, video.index, video.fmt, video.bpp = stream, uid, 0, pixel_format, size
+            video.width, video.height, video.fps, video.intrinsics = WIDTH, HEIGHT, 30, intrinsics
+            if name == "depth":
+                sensor.add_read_only_option(rs.option.depth_units, 0.001)
+            self._streams[name] = sensor, sensor.add_video_stream(video), size
+        same_place = rs.extrinsics()
+        same_place.rotation, same_place.translation = [1, 0, 0, 0, 1, 0, 0, 0, 1], [0, 0, 0]
+        self._streams["depth"][1].register_extrinsics_to(self._streams["color"][1], same_place)
+        self.device.create_matcher(rs.matchers.default)
+        self.number = 0
+        self.running = threading.Event()
+        self.ended = threading.Event()
+        self.thread = threading.Thread(target=self._run)
+
+    def _run(self) -> None:
+        while not self.ended.wait(0.02):
+            if self.running.is_set():
+                self.number += 1
+                self._push("depth", np.full((HEIGHT, WIDTH), 1000 + self.number, dtype=np.uint16))
+                self._push("color", np.full((HEIGHT, WIDTH, 3), self.number % 200, dtype=np.uint8))
+
+    def _push(self, name: str, pixels: np.ndarray) -> None:
+        sensor, profile, size = self._streams[name]
+        frame = self._rs.software_video_frame()
+        frame.pixels, frame.stride, frame.bpp = pixels, WIDTH * size, size
+        frame.timestamp, frame.domain = self.number * 20.0, self._rs.timestamp_domain.hardware_clock
+        frame.frame_number, frame.profile = self.number, profile.as_video_stream_profile()
+        if name == "depth":
+            frame.depth_units = 0.001
+        sensor.on_video_frame(frame)
+
+
+@pytest.fixture
+def soft(monkeypatch: pytest.MonkeyPatch) -> Iterator[SoftwareCamera]:
+    rs = pytest.importorskip("pyrealsense2", reason="needs the extra `realsense`")
+    camera = SoftwareCamera(rs)
+    monkeypatch.setattr(realsense, "find_device", lambda serial: camera.device)
+    camera.running.set()
+    camera.thread.start()
+    yield camera
+    camera.ended.set()
+    camera.thread.join()
+
+
+class TestConformance(SensorSuite):
+    @pytest.fixture(autouse=True)
+    def _soft(self, soft: SoftwareCamera) -> None:
+        self.soft = soft
+
+    @override
+    def context(self) -> Context:
+        return host_context("top", clock=RealClock())
+
+    @override
+    def make(self, ctx: Context) -> Sensor:
+        return RealSenseCamera(SMALL, ctx)
+
+    @override
+    def silence(self, sensor: Sensor) -> None:
+        self.soft.running.clear()
+        while sensor.read(0.1) is not None:
+            pass
+
+
+def test_colour_and_aligned_depth_share_a_camera(soft: SoftwareCamera) -> None:
+    colour = RealSenseCamera(SMALL, host_context("top", clock=RealClock()))
+    depth = RealSenseCamera(RealSenseOptions(width=WIDTH, height=HEIGHT, stream="depth"), host_context("top_depth"))
+    colour.open()
+    depth.open()
+    pictures = [sensor.read(5.0) for sensor in (colour, depth)]
+    ((_, info),) = colour.latched()
+    colour.close()
+    assert depth.read(5.0) is not None, "the other goes on"
+    depth.close()
+    assert all(picture is not None for picture in pictures)
+    assert [picture.encoding for picture in pictures if picture] == ["bgr8", "16UC1"]
+    distance = pictures[1].data.view(np.uint16).reshape(HEIGHT, WIDTH)[HEIGHT // 2, WIDTH // 2]  # type: ignore[union-attr]
+    assert 1000 < distance <= 1000 + soft.number
+    assert isinstance(info, CameraInfo)
+    assert (info.k[0], info.p[3], info.p[11]) == (50.0, 0.0, 0.0)
+
+
+def test_sizes_that_it_does_not_give_or_that_differ_are_refused(soft: SoftwareCamera) -> None:
+    with pytest.raises(SensorError, match=r"gives no color and depth of 640x480 at 30 Hz"):
+        RealSenseCamera(RealSenseOptions(), host_context("top")).open()
+    first = RealSenseCamera(SMALL, host_context("top"))
+    first.open()
+    with pytest.raises(SensorError, match=r"another peripheral has this RealSense open with 64x48 at 30 Hz"):
+        RealSenseCamera(RealSenseOptions(), host_context("wrist")).open()
+    first.close()
+
+
+def test_no_device_says_which_there_are() -> None:
+    pytest.importorskip("pyrealsense2", reason="needs the extra `realsense`")
+    with pytest.raises(SensorError, match=r"no RealSense with serial number 42; there are: none"):
+        realsense.find_device("42")
+    with pytest.raises(SensorError, match=r"serial must say which RealSense is meant; there are: none"):
+        realsense.find_device("")
