@@ -39,13 +39,18 @@ def _loop_text(session: Session) -> str:
     )
 
 
+def _sensor_text(session: Session, name: str) -> str:
+    age = f", {session.ages[name] * 1e3:.0f} ms old" if name in session.ages else ""
+    return f"{name} {session.rates[name]:.1f} Hz{age}"
+
+
 def plain_line(session: Session) -> str:
     """One line of status."""
     outcome, stats = session.outcome, session.stats
     pieces = [f"mode {session.mode}", f"loop {_loop_text(session)}"]
     if stats is not None:
         pieces.append(f"plan {stats.plan_length}, latency {stats.latency_ms:.0f} ms")
-    pieces += [f"{name} {rate:.1f} Hz" for name, rate in session.rates.items()]
+    pieces += [_sensor_text(session, name) for name in session.rates]
     pieces.append(f"episodes {outcome.episodes}, successes {outcome.successes}")
     if outcome.faults:
         pieces.append(f"FAULTS {len(outcome.faults)}")
@@ -71,7 +76,7 @@ def panel(session: Session, log: RecentLog, help_text: str) -> RenderableType:
             f"holds {stats.holds}, failures {stats.failures + stats.timeouts}",
         )  # fmt: skip
     if session.rates:
-        facts.add_row("sensors", "  ".join(f"{name} {rate:.1f} Hz" for name, rate in session.rates.items()))
+        facts.add_row("sensors", "  ".join(_sensor_text(session, name) for name in session.rates))
     facts.add_row("episodes", f"{outcome.episodes} done, {outcome.successes} successful")
     state = session.state
     estop = state is not None and state.estop

@@ -214,7 +214,7 @@ class Structurer:
 
     @property
     def _elsewhere(self) -> bool:
-        """Whether a simulation runs in another process: there are peripherals of kind `simulation`, which bring it here."""
+        """Whether a simulation runs in another process: peripherals of kind `simulation` bring its state here."""
         peripherals = self.document.root.get("peripherals")
         items = peripherals if isinstance(peripherals, list) else ()
         return any(isinstance(item, Mapping) and item.get("kind") == "simulation" for item in items)

@@ -96,6 +96,8 @@ class Session:
         self.stats: DispatchStats | None = None
         self.rates: dict[str, float] = {}
         """Measured rate of each sensor [Hz]."""
+        self.ages: dict[str, float] = {}
+        """Age of each sensor's newest message when it was published [s], by its stamp."""
         self.failure: tuple[str, Exception] | None = None
         self.finished = threading.Event()
         """Set when the run should stop."""

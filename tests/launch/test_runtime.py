@@ -262,3 +262,18 @@ def test_a_transport_that_a_run_does_not_use_is_refused(runs: Runs):
     with pytest.raises(NotSupported, match="transport: shared: a run shares its topics within one process; use local"):
         Runtime(Session(attrs.evolve(session.config, transport=shared), session.registry, session.request))
     runs.make("transport={type: local}")
+
+
+def test_diagnostics_have_each_sensors_rate_and_age_and_what_the_hardware_counts(
+    runs: Runs, monkeypatch: pytest.MonkeyPatch
+):
+    runtime = runs.start(mode="teleop")
+    monkeypatch.setattr(runs.parts.MADE["simulation"], "counters", lambda: {"retries": 3}, raising=False)
+    diagnostics = runtime.session.bus.subscribe("/diagnostics", 1)
+    seconds(runtime, 3.0)
+    received = diagnostics.get()
+    assert received is not None
+    found = {status.name: {pair.key: pair.value for pair in status.values} for status in received.message.status}
+    assert float(found["sensor top"]["rate_hz"]) > 1
+    assert 0 <= float(found["sensor top"]["age_ms"]) < 1000
+    assert found["hardware simulation"] == {"retries": "3"}

@@ -45,7 +45,10 @@ class SensorWorker(Worker):
         if message is None:
             return
         self._session.bus.publish(self._sensor.topic, message)
-        self._stamps.append(self._session.clock.now_ns())
+        now_ns = self._session.clock.now_ns()
+        self._stamps.append(now_ns)
+        if (header := getattr(message, "header", None)) is not None:
+            self._session.ages[self._peripheral.name] = seconds(now_ns - header.stamp_ns)
         elapsed_s = seconds(self._stamps[-1] - self._stamps[0])
         if elapsed_s > 0:
             self._session.rates[self._peripheral.name] = (len(self._stamps) - 1) / elapsed_s
