@@ -21,6 +21,18 @@ LIBRARY = f"ibrobot-plugin-mcap {version('ibrobot-plugin-mcap')}"
 _COMPRESSION = {"none": CompressionType.NONE, "lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD}
 # Not everywhere is there a sync that leaves the file's times alone.
 _sync = getattr(os, "fdatasync", os.fsync)
+_PIECE = 256 * 1024
+"""What is given to the operating system at a time [bytes]."""
+
+
+def _to_disk(descriptor: int, offset: int) -> None:
+    """Have the piece at `offset` written out now.
+
+    What the kernel gathers it writes in large requests, during which even processes of real-time priority wait: the
+    control loop was 2 ms late then, and a tenth of that with this.
+    """
+    if hasattr(os, "posix_fadvise"):
+        os.posix_fadvise(descriptor, offset, _PIECE, os.POSIX_FADV_DONTNEED)
 
 
 @attrs.frozen
@@ -45,8 +57,11 @@ class _Output:
     def write(self, data: bytes) -> int:
         rest = memoryview(data)
         while rest:
-            rest = rest[os.write(self._descriptor, rest) :]
-        self.size += len(data)
+            written = os.write(self._descriptor, rest[: _PIECE - self.size % _PIECE])
+            rest = rest[written:]
+            self.size += written
+            if self.size % _PIECE == 0:
+                _to_disk(self._descriptor, self.size - _PIECE)
         return len(data)
 
     def tell(self) -> int:

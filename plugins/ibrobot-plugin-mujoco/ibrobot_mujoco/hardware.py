@@ -57,7 +57,7 @@ class MujocoHardware(SimulatedHardware):
         self._stride = options.velocity_limit * options.timestep
         physics = Signal(PHYSICS_TOPIC, physics_size(model), "stamp and state, for cameras and viewers")
         scene = Signal(SCENE_TOPIC, SCENE_SIZE, "cube position, cube quaternion wxyz, bin centre [m, base frame]")
-        self.signals = (physics, scene) if self._task is not None else (physics,)  # type: ignore[misc]
+        self.signals = (physics, scene) if self._task is not None else (physics,)
 
     @override
     def connect(self) -> None:
