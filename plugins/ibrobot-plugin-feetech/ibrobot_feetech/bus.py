@@ -30,7 +30,7 @@ _ADAPTER_S = 0.004
 """Time for the USB adapter and the kernel beside the time on the wire [s]."""
 _TRAIL_S = 0.001
 """How long to go on listening when as many bytes came as were asked for, but not all of them good [s]."""
-_RETURN_DELAY_S = 0.000_5
+RETURN_DELAY_S = 0.000_5
 """A servo's own delay before it answers, as it is shipped [s]: 250 units of 2 us."""
 _EPROM_S = 0.02
 """Further time for an acknowledgement, where the servo first writes its EPROM [s]."""
@@ -55,6 +55,8 @@ class FeetechBus:
         self.port = SerialPort(port, baud_rate)
         self.joints = dict(joints or {})
         self.retries = retries
+        self.return_delay_s = RETURN_DELAY_S
+        """What every servo waits before it answers [s]; less once they are set up."""
         self.counters: Counter[str] = Counter(
             dict.fromkeys(("requests", "retries", "timeouts", "late_replies", "bad_packets", "discarded_bytes"), 0)
         )
@@ -355,7 +357,7 @@ class FeetechBus:
     def timeout(self, sent: int, expected: int, servos: int = 1) -> float:
         """How long to wait for replies [s]: the time on the wire of both, and the delays on both sides."""
         wire_s = (sent + expected) * _BITS_PER_BYTE / self.port.baud_rate
-        return wire_s + servos * _RETURN_DELAY_S + _ADAPTER_S
+        return wire_s + servos * self.return_delay_s + _ADAPTER_S
 
     def _retried[T](self, act: Callable[[], T]) -> T:
         for attempt in range(self.retries + 1):

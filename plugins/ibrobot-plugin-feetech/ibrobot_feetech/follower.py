@@ -16,7 +16,7 @@ from ibrobot_core.robot import Vector
 from ibrobot_core.units import ns, seconds
 from ibrobot_feetech import arm as servos
 from ibrobot_feetech.arm import Arm, Tuning
-from ibrobot_feetech.bus import FeetechBus
+from ibrobot_feetech.bus import RETURN_DELAY_S, FeetechBus
 from ibrobot_feetech.errors import FeetechError, NoReply, Place, PortError, ServoFault
 from ibrobot_feetech.options import FollowerOptions
 from ibrobot_feetech.protocol import faults
@@ -85,6 +85,7 @@ class FeetechFollower(Hardware):
         bus, arm = self._bus, self._arm
         self._fault = HardwareError(f"{self._ctx.name}: not connected")
         bus.open()
+        bus.return_delay_s = RETURN_DELAY_S
         try:
             servos.find_servos(bus, arm)
             self._check_calibration()
@@ -147,6 +148,7 @@ class FeetechFollower(Hardware):
         if isinstance(fault, PortError) or not bus.is_open:
             bus.close()
             bus.open()
+        bus.return_delay_s = RETURN_DELAY_S
         bus.resynchronise()
         servos.find_servos(bus, arm)
         for servo in arm.servos:
@@ -172,6 +174,7 @@ class FeetechFollower(Hardware):
     def _start(self) -> None:
         """Begin to read anew: from where the joints stand, which every servo must say."""
         bus, ids = self._bus, self._arm.servos
+        bus.return_delay_s = 0.0
         self._reader = SyncReader(bus, ids, "present_position", "present_load")
         self._health_reader = SyncReader(bus, ids, "present_position", "present_current")
         self._writer = SyncWriter(bus, ids)
