@@ -119,7 +119,7 @@ def test_a_servo_that_dies_is_named_and_the_others_hold(bench: Bench) -> None:
     bench.emulator.faults.silent.add(3)
     out, err = run.communicate(timeout=PATIENCE_S)
     assert run.returncode == 1
-    assert "servo 3 (elbow_flex): no good reply for 4 ticks" in err
+    assert "servo 3 (elbow_flex), present_position: no good reply for 4 ticks" in err
     assert "the robot holds" in err
     (fault,) = json.loads(out.splitlines()[-1])["faults"]
     assert fault.startswith(f"{bench.emulator.port}, servo 3 (elbow_flex)")
@@ -132,7 +132,7 @@ def test_a_servo_that_overloads_relaxes_the_arm_where_that_is_configured(bench: 
     bench.emulator.faults.errors[5] = 0x20
     _, err = run.communicate(timeout=PATIENCE_S)
     assert run.returncode == 1
-    assert "servo 5 (wrist_roll): the servo reports overload" in err
+    assert "servo 5 (wrist_roll), status: the servo reports overload" in err
     assert bench.torque() == [False] * 6
 
 

@@ -216,7 +216,7 @@ class FeetechFollower(Hardware):
             gone = [self._arm.servos[i] for i in np.flatnonzero(self._lost > self._options.lost_replies)]
             ticks = self._options.lost_replies + 1
             others = f", nor from {', '.join(self._arm.names[servo] for servo in gone[1:])}" if len(gone) > 1 else ""
-            raise NoReply(self._bus.place(gone[0]), f"no good reply for {ticks} ticks{others}")
+            raise NoReply(self._bus.place(gone[0], "present_position"), f"no good reply for {ticks} ticks{others}")
 
     def _take(self, values: NDArray[np.intp], good: NDArray[np.bool_]) -> None:
         position, velocity, load = values[:, 0], values[:, 1], values[:, 2]
@@ -242,7 +242,7 @@ class FeetechFollower(Hardware):
         return self._health[3] * self._options.stall_torque
 
     def _place(self, index: int) -> Place:
-        return self._bus.place(self._arm.servos[index])
+        return self._bus.place(self._arm.servos[index], "status")
 
     def _check_calibration(self) -> None:
         differences = servos.calibration_differences(self._bus, self._arm)

@@ -165,7 +165,7 @@ class TestFaults:
             assert reading.stale
             assert reading.position[2] == before[2]
         assert reading.position[0] > before[0], "the others go on"
-        with pytest.raises(NoReply, match=r"servo 3 \(elbow_flex\): no good reply for 4 ticks; check its power"):
+        with pytest.raises(NoReply, match=r"servo 3 \(elbow_flex\), present_position: no good reply for 4 ticks; check its power"):
             rig.tick()
         assert rig.follower.counters()["lost_replies"] == 4
 
@@ -181,7 +181,7 @@ class TestFaults:
     def test_what_a_servo_reports_twice_is_a_fault(self, rig: Rig, bits: int, names: str) -> None:
         rig.emulator.faults.errors[5] = bits
         rig.tick()
-        with pytest.raises(ServoFault, match=rf"servo 5 \(wrist_roll\): the servo reports {names}"):
+        with pytest.raises(ServoFault, match=rf"servo 5 \(wrist_roll\), status: the servo reports {names}"):
             rig.tick()
         rig.emulator.faults.errors.clear()
         with pytest.raises(ServoFault):

@@ -51,9 +51,12 @@ _SWITCH_S = 2e-4
 @click.option("--duplicate", type=click.FloatRange(0, 1), default=0.0, help="Probability that a reply comes twice.")
 @click.option("--late", type=click.FloatRange(0, 1), default=0.0, help="Probability that one comes late.")
 @click.option("--late-s", type=click.FloatRange(min=0), default=0.05, show_default=True, help="How late [s].")
+@click.option("--delay-s", type=click.FloatRange(min=0), default=0.0, help="Further delay of every reply [s].")
+@click.option("--silent", type=int, multiple=True, metavar="ID", help="A servo that neither hears nor answers.")
+@click.option("--error", "errors", type=(int, int), multiple=True, metavar="ID BITS", help="Error bits of a servo.")
 def emulate(
     servos: int, baud: int, throttle: bool, link: Path | None, calibration: str | None, physics: str | None, seed: int,
-    **chances: float,
+    silent: tuple[int, ...], errors: tuple[tuple[int, int], ...], **chances: float,
 ) -> None:  # fmt: skip
     """Emulate a bus of STS3215 servos on a pseudo-terminal.
 
@@ -74,6 +77,8 @@ def emulate(
         emulator = stack.enter_context(Emulator(count, baud_rate=baud, throttle=throttle, seed=seed, link=link))
         for name, value in chances.items():
             setattr(emulator.faults, name, value)
+        emulator.faults.silent |= set(silent)
+        emulator.faults.errors |= dict(errors)
         found = _calibrate(emulator, calibration, joints, config.robot if config is not None else None)
         click.echo(str(link) if link is not None else emulator.port)
         arm = None
