@@ -1,4 +1,4 @@
-"""The plugin's hooks: recorder `mcap`, reader `rosbag2`."""
+"""The plugin's hooks: recorder `mcap`, reader `rosbag2`, the commands `ibrobot episodes …`."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.descriptors import ReaderDescriptor, RecorderDescriptor
+from ibrobot_core.descriptors import Command, ReaderDescriptor, RecorderDescriptor
 from ibrobot_core.hookspecs import hookimpl
 from ibrobot_mcap.options import McapOptions
 
 if TYPE_CHECKING:
+    import click
+
     from ibrobot_core.interfaces import Context, EpisodeReader, Recorder
 
 
@@ -44,3 +46,15 @@ def ibrobot_recorders() -> Iterable[RecorderDescriptor]:
 def ibrobot_readers() -> Iterable[ReaderDescriptor]:
     """What reads bags, also those of others."""
     yield ReaderDescriptor("rosbag2", "ROS 2 bags: MCAP, also unfinished, and sqlite3", _reads, _read)
+
+
+def _commands() -> click.Command:
+    from ibrobot_mcap.commands import episodes
+
+    return episodes
+
+
+@hookimpl
+def ibrobot_commands() -> Iterable[Command]:
+    """`ibrobot episodes …`."""
+    yield Command("episodes", "List, check, mend, cut, plot and export recorded episodes.", _commands)

@@ -15,7 +15,7 @@ from ibrobot_core.interfaces import EpisodeReader, EpisodeSummary, Recorded, Top
 from ibrobot_core.messages import CompressedImage, Image
 from ibrobot_mcap.jpeg import from_jpeg, is_jpeg
 from ibrobot_mcap.metadata import DROPPED, INFORMATION, METADATA, OUTCOME, RECORD, RECORD_KEY
-from ibrobot_mcap.sources import McapSource, RosbagsSource, Source
+from ibrobot_mcap.sources import McapSource, Raw, RosbagsSource, Source
 
 
 def is_rosbag2(path: Path) -> bool:
@@ -68,6 +68,18 @@ class Rosbag2Reader(EpisodeReader):
                 raise RecorderError(f"{self._path}: {raw.topic} at {raw.received_ns} ns: {error}") from error
             yield Recorded(raw.topic, message, raw.received_ns, raw.published_ns)
 
+    def raw(self) -> Iterator[Raw]:
+        """The messages as they are stored, in the order of receipt."""
+        return self._source.messages(frozenset(self._source.types))
+
+    def stored_types(self) -> Mapping[str, str]:
+        """Topic -> type, as they are stored: JPEG pictures are `CompressedImage`."""
+        return self._source.types
+
+    def latched(self) -> frozenset[str]:
+        """Topics whose offered QoS is transient local."""
+        return self._source.latched
+
     @override
     def close(self) -> None:
         self._source.close()
@@ -89,6 +101,16 @@ class Rosbag2Reader(EpisodeReader):
             if record.name == RECORD and RECORD_KEY in record.metadata:
                 found = _parse(record.metadata[RECORD_KEY], self._path).get("custom_data") or {}
         return found
+
+
+def stated_counts(path: Path) -> Mapping[str, int]:
+    """Topic -> number of messages, as a `metadata.yaml` states them; nothing where there is none.
+
+    Raises:
+        RecorderError: when it cannot be read.
+    """
+    topics = _read_metadata(path).get("topics_with_message_count") or []
+    return {entry["topic_metadata"]["name"]: entry["message_count"] for entry in topics}
 
 
 def _open(path: Path, facts: Mapping[str, Any]) -> Source:

@@ -40,6 +40,8 @@ class Source(ABC):
     """Topic -> number of messages."""
     definitions: Mapping[str, str]
     """Type -> its definition, where the bag has it."""
+    latched: frozenset[str] = frozenset()
+    """Topics that were offered as transient local."""
     start_ns: int
     end_ns: int
 
@@ -75,6 +77,12 @@ class McapSource(Source):
         self.start_ns = min((block.start_ns for _, _, block in blocks), default=0)
         self.end_ns = max((block.end_ns for _, _, block in blocks), default=0)
         self.metadata = [record for file in self._files for record in file.metadata]
+        self.latched = frozenset(
+            channel.topic
+            for file in self._files
+            for channel in file.channels.values()
+            if "transient_local" in channel.metadata.get("offered_qos_profiles", "")
+        )
         types: dict[str, str] = {}
         counts: dict[str, int] = {}
         self.definitions = {}

@@ -1,0 +1,69 @@
+"""What can be wrong with a recorded episode, found by reading all of it."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+
+from ibrobot_core.errors import RecorderError
+from ibrobot_core.units import NS_PER_S
+from ibrobot_mcap.metadata import METADATA
+from ibrobot_mcap.reader import Rosbag2Reader, stated_counts
+
+_FEW = 8
+"""Messages that a topic must have before its period means something."""
+
+
+def problems_of(path: Path, longest_gap: float) -> list[str]:
+    """Everything that is wrong with an episode; nothing for a good one.
+
+    Args:
+        path: the episode.
+        longest_gap: longest pause within a topic, in its median periods.
+    """
+    try:
+        reader = Rosbag2Reader(path)
+    except RecorderError as error:
+        return [str(error)]
+    problems = []
+    stamps: dict[str, list[int]] = defaultdict(list)
+    last_header: dict[str, int] = {}
+    back: dict[str, int] = defaultdict(int)
+    try:
+        summary = reader.summary()
+        if not summary.finished:
+            problems.append("unfinished; `ibrobot episodes repair` makes it whole")
+        for item in reader.messages():
+            stamps[item.topic].append(item.received_ns)
+            header = getattr(item.message, "header", None)
+            if header is not None:
+                back[item.topic] += header.stamp_ns < last_header.get(item.topic, header.stamp_ns)
+                last_header[item.topic] = header.stamp_ns
+    except RecorderError as error:
+        problems.append(str(error))
+    finally:
+        reader.close()
+    for topic, stated in stated_counts(path / METADATA).items():
+        if stated != len(stamps[topic]):
+            problems.append(f"{topic}: {len(stamps[topic])} messages, {METADATA} says {stated}")
+    for topic, known in summary.topics.items():
+        if known.dropped:
+            problems.append(f"{topic}: {known.dropped} messages were lost while recording")
+        if back[topic]:
+            problems.append(f"{topic}: header stamps went back {back[topic]} times")
+        problems += _pause(topic, stamps[topic], longest_gap, summary.start_ns)
+    return problems
+
+
+def _pause(topic: str, stamps: list[int], longest_gap: float, start_ns: int) -> list[str]:
+    """The longest pause of a topic, where it is too long."""
+    if len(stamps) < _FEW:
+        return []
+    pauses = np.diff(stamps) / 1e6
+    period, longest = float(np.median(pauses)), float(pauses.max())
+    if period <= 0 or longest <= longest_gap * period:
+        return []
+    at_s = (stamps[int(pauses.argmax())] - start_ns) / NS_PER_S
+    return [f"{topic}: a pause of {longest:.0f} ms at {at_s:.2f} s, its period is {period:.1f} ms"]

@@ -1,0 +1,27 @@
+"""`ibrobot episodes …`: what was recorded; one file a command."""
+
+from __future__ import annotations
+
+import click
+
+from ibrobot_mcap.commands.delete import delete
+from ibrobot_mcap.commands.export import export
+from ibrobot_mcap.commands.info import info
+from ibrobot_mcap.commands.list_episodes import list_episodes
+from ibrobot_mcap.commands.plot import plot
+from ibrobot_mcap.commands.repair import repair
+from ibrobot_mcap.commands.trim import trim
+from ibrobot_mcap.commands.verify import verify
+
+
+@click.group()
+def episodes() -> None:
+    """List, check, mend, cut and export recorded episodes.
+
+    An episode is a folder such as episodes/pick_cube/episodes/episode_000001; where several are meant, a dataset or the
+    folder of all of them does too.
+    """
+
+
+for command in (list_episodes, info, verify, repair, plot, trim, export, delete):
+    episodes.add_command(command)

@@ -1,0 +1,31 @@
+"""`ibrobot episodes delete`."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import click
+
+from ibrobot_core.errors import RecorderError
+
+
+@click.command()
+@click.argument("episodes", type=click.Path(path_type=Path), nargs=-1, required=True)
+@click.option("--yes", is_flag=True, help="Do not ask.")
+def delete(episodes: tuple[Path, ...], yes: bool) -> None:
+    """Delete EPISODES, after asking. Only folders of episodes are deleted."""
+    from ibrobot_mcap.commands.found import size_of, told_size
+    from ibrobot_mcap.reader import is_rosbag2
+
+    for episode in episodes:
+        if not (episode.is_dir() and is_rosbag2(episode)):
+            raise RecorderError(f"{episode}: is no episode; nothing was deleted")
+    for episode in episodes:
+        if not yes:
+            click.confirm(f"delete {episode} ({told_size(size_of(episode))})?", abort=True)
+        try:
+            shutil.rmtree(episode)
+        except OSError as error:
+            raise RecorderError(f"{episode}: cannot be deleted: {error.strerror}") from error
+        click.echo(f"{episode}: deleted")

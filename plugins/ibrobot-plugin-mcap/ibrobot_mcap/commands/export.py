@@ -1,0 +1,118 @@
+"""`ibrobot episodes export`."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import attrs
+import click
+import numpy as np
+
+from ibrobot_core.errors import RecorderError
+from ibrobot_core.messages import Image, Message
+
+_TO_RGB = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2, 3), "bgra8": (2, 1, 0, 3)}
+"""Encoding -> its channels in the order of a PNG."""
+
+
+@click.command()
+@click.argument("episode", type=click.Path(path_type=Path))
+@click.argument("topic")
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), required=True, help="A .csv, or a folder for pictures."
+)
+def export(episode: Path, topic: str, output: Path) -> None:
+    """Export one TOPIC of an EPISODE: numbers and texts to a CSV file, pictures to PNG files with their stamps."""
+    from ibrobot_mcap.commands.found import opened
+
+    with opened(episode) as reader:
+        topics = reader.summary().topics
+        if topic not in topics:
+            raise RecorderError(f"{episode}: has no topic {topic!r}; it has: {', '.join(topics)}")
+        if output.exists():
+            raise RecorderError(f"{output}: is there already")
+        items = ((item.received_ns, item.message) for item in reader.messages({topic}))
+        try:
+            count = (_pictures if topics[topic].type == Image.ros_type else _rows)(items, output)
+        except OSError as error:
+            raise RecorderError(f"{output}: cannot be written: {error.strerror}") from error
+    click.echo(f"{output}: {count} messages of {topic}")
+
+
+def _rows(items: Iterator[tuple[int, Message]], output: Path) -> int:
+    count = 0
+    with output.open("x", newline="", encoding="utf-8") as file:
+        writer = None
+        for received_ns, message in items:
+            row = {"received_ns": received_ns, **dict(_flat(message))}
+            if writer is None:
+                writer = csv.DictWriter(file, list(row))
+                writer.writeheader()
+            if row.keys() - set(writer.fieldnames):
+                raise RecorderError(f"message {count} has other fields than the first: it cannot be a row of one table")
+            writer.writerow(row)
+            count += 1
+    return count
+
+
+def _flat(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """The numbers and texts of a message, by dotted paths; an array's by index, a joint's by its name."""
+    if attrs.has(type(value)):
+        names = getattr(value, "name", None) if isinstance(getattr(value, "name", None), tuple) else None
+        for field in attrs.fields(type(value)):
+            part = getattr(value, field.name)
+            if names and isinstance(part, np.ndarray) and len(part) == len(names):
+                yield from ((f"{field.name}.{name}", number) for name, number in zip(names, part.tolist(), strict=True))
+            elif not (names and field.name == "name"):
+                yield from _flat(part, f"{path}{field.name}.")
+    elif isinstance(value, np.ndarray | tuple | list):
+        for index, part in enumerate(value.tolist() if isinstance(value, np.ndarray) else value):
+            yield from _flat(part, f"{path}{index}.")
+    else:
+        yield path.rstrip("."), value
+
+
+def _pictures(items: Iterator[tuple[int, Message]], output: Path) -> int:
+    output.mkdir(parents=True)
+    count = 0
+    with (output / "stamps.csv").open("x", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(("file", "stamp_ns", "received_ns"))
+        for received_ns, message in items:
+            assert isinstance(message, Image)
+            name = f"{count:06d}.png"
+            save_png(message, output / name)
+            writer.writerow((name, message.header.stamp_ns, received_ns))
+            count += 1
+    return count
+
+
+def save_png(image: Image, path: Path) -> None:
+    """Save a picture, lossless; depth as 16-bit grey.
+
+    Raises:
+        RecorderError: for an encoding that PNG has not.
+    """
+    from PIL import Image as Png
+
+    Png.fromarray(pixels_of(image)).save(path)
+
+
+def pixels_of(image: Image) -> np.ndarray[Any, Any]:
+    """A picture as (H, W) grey or depth, or (H, W, C) with red first.
+
+    Raises:
+        RecorderError: for an encoding that PNG has not.
+    """
+    rows = image.data.reshape(image.height, image.step)
+    if image.encoding in ("16UC1", "mono16"):
+        return np.ascontiguousarray(rows[:, : 2 * image.width]).view(np.uint16)
+    if image.encoding == "mono8":
+        return rows[:, : image.width]
+    if image.encoding not in _TO_RGB:
+        raise RecorderError(f"{image.encoding} pictures cannot become PNG")
+    order = _TO_RGB[image.encoding]
+    return rows[:, : len(order) * image.width].reshape(image.height, image.width, len(order))[:, :, order]

@@ -1,0 +1,85 @@
+"""The episodes that a command line means."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+
+from ibrobot_core.errors import RecorderError
+from ibrobot_core.interfaces import EpisodeSummary
+from ibrobot_core.units import NS_PER_S
+from ibrobot_mcap.reader import Rosbag2Reader, is_rosbag2
+
+
+def episodes_in(path: Path) -> list[Path]:
+    """The episode at `path`, or all of the dataset, or of the folder of datasets, there; sorted.
+
+    Raises:
+        RecorderError: when there is none.
+    """
+    if not path.exists():
+        raise RecorderError(f"{path}: there is no such file or folder")
+    if is_rosbag2(path):
+        return [path]
+    patterns = ("*", "episodes/*", "*/episodes/*")
+    found = {p for pattern in patterns for p in path.glob(pattern) if p.is_dir() and not p.name.startswith(".")}
+    episodes = sorted(folder for folder in found if is_rosbag2(folder))
+    if not episodes:
+        raise RecorderError(f"{path}: has no episode in it")
+    return episodes
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[Rosbag2Reader]:
+    """A reader of an episode.
+
+    Raises:
+        RecorderError: when it cannot be read.
+    """
+    if not path.exists():
+        raise RecorderError(f"{path}: there is no such episode")
+    reader = Rosbag2Reader(path)
+    try:
+        yield reader
+    finally:
+        reader.close()
+
+
+def summary_of(path: Path) -> EpisodeSummary:
+    """What is in an episode.
+
+    Raises:
+        RecorderError: when it cannot be read.
+    """
+    with opened(path) as reader:
+        return reader.summary()
+
+
+def size_of(path: Path) -> int:
+    """Bytes of all files of an episode."""
+    files = path.rglob("*") if path.is_dir() else (path,)
+    return sum(file.stat().st_size for file in files if file.is_file())
+
+
+def duration_s(summary: EpisodeSummary) -> float:
+    """From the first to the last message [s]."""
+    return (summary.end_ns - summary.start_ns) / NS_PER_S
+
+
+def date_of(summary: EpisodeSummary) -> str:
+    """When the episode began, in UTC; empty for one without messages."""
+    if not summary.start_ns:
+        return ""
+    return datetime.fromtimestamp(summary.start_ns / NS_PER_S, UTC).strftime("%Y-%m-%d %H:%M")
+
+
+def told_size(size: int) -> str:
+    """Bytes for people."""
+    number = float(size)
+    for unit in ("B", "kB", "MB"):
+        if number < 1000:
+            return f"{number:.0f} {unit}" if unit == "B" else f"{number:.1f} {unit}"
+        number /= 1000
+    return f"{number:.1f} GB"

@@ -1,0 +1,42 @@
+"""`ibrobot episodes info`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import attrs
+import click
+from rich.console import Console
+from rich.table import Table
+
+_LONG = 200
+"""Metadata longer than this is only told the length of [characters]."""
+
+
+@click.command()
+@click.argument("episode", type=click.Path(path_type=Path))
+@click.option("--json", "as_json", is_flag=True, help="Print JSON, with all metadata.")
+def info(episode: Path, as_json: bool) -> None:
+    """Show what is in an EPISODE: topics, counts, losses and metadata. An unfinished one needs no repair for it."""
+    from ibrobot_mcap.commands.found import date_of, duration_s, size_of, summary_of, told_size
+
+    summary = summary_of(episode)
+    if as_json:
+        click.echo(json.dumps(attrs.asdict(summary), indent=2, default=str))
+        return
+    console = Console()
+    state = summary.outcome if summary.finished else "unfinished; `ibrobot episodes repair` makes it whole"
+    console.print(f"{episode}: {state}", soft_wrap=True)
+    console.print(f"{date_of(summary)} UTC, {duration_s(summary):.2f} s, {told_size(size_of(episode))}")
+    table = Table(box=None, padding=(0, 1))
+    for heading in ("topic", "type", "messages", "Hz", "lost"):
+        table.add_column(heading, justify="left" if heading in ("topic", "type") else "right")
+    span_s = duration_s(summary)
+    for name, topic in summary.topics.items():
+        rate = f"{(topic.count - 1) / span_s:.1f}" if span_s and topic.count > 1 else ""
+        table.add_row(name, topic.type, str(topic.count), rate, str(topic.dropped or ""))
+    console.print(table)
+    for key, value in summary.metadata.items():
+        shown = value if len(value) <= _LONG else f"({len(value)} characters; --json shows them)"
+        console.print(f"{key}: {shown}", soft_wrap=True, highlight=False)

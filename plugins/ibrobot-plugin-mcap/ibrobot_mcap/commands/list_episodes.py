@@ -1,0 +1,63 @@
+"""`ibrobot episodes list`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+from rich.console import Console
+from rich.table import Table
+
+from ibrobot_core.errors import RecorderError
+
+
+@click.command("list")
+@click.argument("path", type=click.Path(path_type=Path), default=Path("episodes"))
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def list_episodes(path: Path, as_json: bool) -> None:
+    """List the episodes in PATH: a folder of datasets (`episodes` when left out), a dataset, or an episode."""
+    from ibrobot_mcap.commands.found import date_of, duration_s, episodes_in, size_of, summary_of, told_size
+
+    rows = []
+    problems = []
+    for episode in episodes_in(path):
+        try:
+            summary = summary_of(episode)
+        except RecorderError as error:
+            problems.append(str(error))
+            continue
+        rows.append({
+            "path": str(episode), "date": date_of(summary), "mode": summary.metadata.get("mode", ""),
+            "prompt": summary.metadata.get("prompt", ""), "duration_s": round(duration_s(summary), 2),
+            "messages": sum(topic.count for topic in summary.topics.values()),
+            "dropped": sum(topic.dropped for topic in summary.topics.values()),
+            "outcome": summary.outcome, "finished": summary.finished, "bytes": size_of(episode),
+        })  # fmt: skip
+    if as_json:
+        click.echo(json.dumps(rows, indent=2))
+    else:
+        table = Table(box=None, padding=(0, 1))
+        for heading in ("episode", "date (UTC)", "s", "messages", "lost", "outcome", "size", "prompt"):
+            right = heading in ("s", "messages", "lost", "size")
+            table.add_column(heading, justify="right" if right else "left", no_wrap=heading != "prompt")
+        for row in rows:
+            table.add_row(
+                _shown(Path(str(row["path"])), path), str(row["date"]), f"{row['duration_s']:.1f}",
+                str(row["messages"]), str(row["dropped"]),
+                str(row["outcome"]) if row["finished"] else "[red]unfinished[/red]", told_size(int(str(row["bytes"]))),
+                str(row["prompt"]),
+            )  # fmt: skip
+        Console().print(table)
+    for problem in problems:
+        click.echo(f"unreadable: {problem}", err=True)
+    if problems:
+        raise SystemExit(1)
+
+
+def _shown(episode: Path, folder: Path) -> str:
+    """An episode's path within the folder that was asked for, without what all have."""
+    if episode == folder:
+        return episode.name
+    parts = [part for part in episode.relative_to(folder).parts if part != "episodes"]
+    return "/".join(parts)

@@ -1,0 +1,34 @@
+"""`ibrobot episodes verify`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+
+@click.command()
+@click.argument("path", type=click.Path(path_type=Path))
+@click.option("--gap", type=click.FloatRange(min=1), default=5.0, show_default=True, help="Longest pause, in periods.")
+def verify(path: Path, gap: float) -> None:
+    """Read every message of the episodes in PATH, and say what is wrong; exits with 1 if something is.
+
+    Wrong are: an unfinished episode, a message that cannot be decoded, counts that differ from metadata.yaml, losses,
+    header stamps that go back, a pause in a topic longer than --gap of its median period, and episodes of one dataset
+    with different contracts.
+    """
+    from ibrobot_mcap.checks import problems_of
+    from ibrobot_mcap.commands.found import episodes_in, summary_of
+
+    bad = 0
+    contracts: dict[Path, tuple[str, Path]] = {}
+    for episode in episodes_in(path):
+        problems = problems_of(episode, gap)
+        fingerprint = summary_of(episode).metadata.get("fingerprint", "")
+        first, where = contracts.setdefault(episode.parent, (fingerprint, episode))
+        if fingerprint != first:
+            problems.append(f"its contract is {fingerprint[:12]}, that of {where.name} is {first[:12]}")
+        bad += bool(problems)
+        click.echo(f"{episode}: {'; '.join(problems) or 'good'}")
+    if bad:
+        raise SystemExit(1)

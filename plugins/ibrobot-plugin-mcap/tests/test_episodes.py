@@ -1,0 +1,204 @@
+"""`ibrobot episodes …` on episodes that the recorder wrote: what is told, what is mended, cut, exported, deleted."""
+
+from __future__ import annotations
+
+import csv
+import json
+import sys
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from ibrobot_mcap import rewrite
+from ibrobot_mcap.commands import episodes
+from ibrobot_mcap.reader import Rosbag2Reader
+from PIL import Image as Png
+
+from ibrobot_core.errors import RecorderError
+
+from .conftest import CAMERA, JOINTS, Bench, joints, picture, stamp
+
+
+def run(*arguments, code=0):
+    result = CliRunner().invoke(episodes, [str(argument) for argument in arguments])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    assert result.exit_code == code, result.output
+    return result.output
+
+
+def made(folder, number=1, *, outcome="success", frames=0, count=100, **metadata):
+    """An episode in a dataset `pick`."""
+    root = folder / "pick" / "episodes"
+    root.mkdir(parents=True, exist_ok=True)
+    bench = Bench(root)
+    bench.path = root / f"episode_{number:06d}"
+    bench.begin((JOINTS, CAMERA) if frames else (JOINTS,), **metadata)
+    for index in range(count):
+        bench.recorder.write(JOINTS, joints(index), stamp(index))
+        if index < frames:
+            bench.recorder.write(CAMERA, picture(index), stamp(index))
+    bench.end(outcome)
+    return bench.path
+
+
+def unfinish(path, cut=0):
+    """As a killed recorder leaves it."""
+    (path / "metadata.yaml").unlink()
+    (file,) = path.glob("*.mcap")
+    file.write_bytes(file.read_bytes()[: -cut or None])
+    return path
+
+
+def contents(path):
+    reader = Rosbag2Reader(path)
+    try:
+        return reader.summary(), [(r.topic, r.message, r.received_ns, r.published_ns) for r in reader.messages()]
+    finally:
+        reader.close()
+
+
+def test_list_tells_every_episode_of_a_folder_of_datasets(tmp_path):
+    made(tmp_path, 1, prompt="pick the cube")
+    unfinish(made(tmp_path, 2), cut=400)
+    output = run("list", tmp_path)
+    assert "pick/episode_000001" in output
+    assert "unfinished" in output
+    rows = json.loads(run("list", tmp_path / "pick", "--json"))
+    assert [row["finished"] for row in rows] == [True, False]
+    assert rows[0]["messages"] == 100
+    assert rows[0]["prompt"] == "pick the cube"
+
+
+def test_one_that_cannot_be_read_does_not_hide_the_others(tmp_path):
+    made(tmp_path, 1)
+    bad = made(tmp_path, 2)
+    (bad / "metadata.yaml").write_text("][")
+    result = CliRunner().invoke(episodes, ["list", str(tmp_path)])
+    assert result.exit_code == 1
+    assert "pick/episode_000001" in result.output
+    assert "unreadable" in result.output
+
+
+def test_info_needs_no_repair(tmp_path):
+    path = unfinish(made(tmp_path, prompt="pick"), cut=300)
+    output = run("info", path)
+    assert "unfinished; `ibrobot episodes repair` makes it whole" in output
+    assert "/joint_states" in output
+    assert "prompt: pick" in output
+    assert json.loads(run("info", path, "--json"))["metadata"]["prompt"] == "pick"
+
+
+@pytest.mark.parametrize("cut", [0, 1, 300, 2000])
+def test_repair_makes_an_episode_whole_with_all_that_was_there(tmp_path, cut):
+    path = unfinish(made(tmp_path, frames=20, prompt="pick"), cut)
+    before, messages = contents(path)
+    assert not before.finished
+    assert f"repaired, {len(messages)} messages" in run("repair", tmp_path)
+    after, again = contents(path)
+    assert after.finished
+    assert again == messages
+    assert after.metadata == {**before.metadata, rewrite.REPAIRED: "true"}
+    assert [p.name for p in path.parent.iterdir()] == [path.name], "nothing else is left"
+    assert "is whole" in run("repair", path)
+    assert "good" in run("verify", path)
+
+
+def test_a_repair_that_fails_leaves_the_original(tmp_path, monkeypatch):
+    path = unfinish(made(tmp_path), 300)
+    kept = {p.name: p.read_bytes() for p in path.iterdir()}
+    monkeypatch.setattr(rewrite.Storage, "finish", lambda *_: (_ for _ in ()).throw(RecorderError("the disk is full")))
+    assert "the disk is full" in run("repair", path, code=1)
+    assert {p.name: p.read_bytes() for p in path.iterdir()} == kept
+    assert [p.name for p in path.parent.iterdir()] == [path.name]
+
+
+def test_verify_says_what_is_wrong(tmp_path):
+    good = made(tmp_path, 1, fingerprint="a" * 64)
+    assert run("verify", good) == f"{good}: good\n"
+    bench = Bench(good.parent)
+    bench.path = good.parent / "episode_000002"
+    bench.begin(fingerprint="b" * 64)
+    bench.write(50)
+    bench.recorder.write(JOINTS, joints(3), stamp(80))
+    bench.end("success", **{JOINTS: 4})
+    output = run("verify", tmp_path, code=1)
+    assert "4 messages were lost while recording" in output
+    assert "header stamps went back 1 times" in output
+    assert "a pause of 310 ms at 0.49 s, its period is 10.0 ms" in output
+    assert "its contract is bbbbbbbbbbbb, that of episode_000001 is aaaaaaaaaaaa" in output
+    text = (good / "metadata.yaml").read_text()
+    (good / "metadata.yaml").write_text(text.replace("message_count: 100", "message_count: 101"))
+    assert "100 messages, metadata.yaml says 101" in run("verify", good, code=1)
+    unfinish(good)
+    assert "unfinished" in run("verify", good, code=1)
+
+
+def test_trim_copies_a_part(tmp_path):
+    path = made(tmp_path, prompt="pick")
+    assert "messages, 0.20 s" in run("trim", path, "--from", "0.3", "--to", "0.5", "-o", tmp_path / "cut")
+    summary, messages = contents(tmp_path / "cut")
+    assert [received for _, _, received, _ in messages] == [stamp(index) for index in range(30, 51)]
+    assert messages[0][1] == joints(30)
+    assert summary.finished
+    assert summary.metadata["trimmed"] == "0.3 s to 0.5 s of episode_000001"
+    with pytest.raises(RecorderError, match=r"is 0\.99 s long; --from 0\.5 --to 0\.2 is no part of it"):
+        run("trim", path, "--from", "0.5", "--to", "0.2", "-o", tmp_path / "none")
+
+
+def test_export_writes_numbers_by_joint(tmp_path):
+    path = made(tmp_path, count=3)
+    run("export", path, JOINTS, "-o", tmp_path / "joints.csv")
+    with (tmp_path / "joints.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [float(row["position.tilt"]) for row in rows] == [0.0, -1.0, -2.0]
+    assert int(rows[1]["header.stamp_ns"]) == stamp(1)
+    with pytest.raises(RecorderError, match="is there already"):
+        run("export", path, JOINTS, "-o", tmp_path / "joints.csv")
+    with pytest.raises(RecorderError, match=r"has no topic '/imu'; it has: /joint_states"):
+        run("export", path, "/imu", "-o", tmp_path / "imu.csv")
+
+
+def test_export_writes_pictures_without_loss(tmp_path):
+    path = made(tmp_path, frames=3)
+    run("export", path, CAMERA, "-o", tmp_path / "top")
+    expected = picture(2)
+    with Png.open(tmp_path / "top" / "000002.png") as png:
+        pixels = np.asarray(png)
+    np.testing.assert_array_equal(pixels, expected.data.reshape(48, 64, 3))
+    lines = (tmp_path / "top" / "stamps.csv").read_text().splitlines()
+    assert lines[3] == f"000002.png,{stamp(2)},{stamp(2)}"
+
+
+def test_plot_draws_a_png(tmp_path):
+    path = made(tmp_path, frames=40)
+    run("plot", path, "-o", tmp_path / "a.png")
+    with Png.open(tmp_path / "a.png") as png:
+        width, height = png.size
+    assert width > 1000
+    assert height > 800
+
+
+def test_plot_without_matplotlib_says_how_to_install_it(tmp_path, monkeypatch):
+    path = made(tmp_path)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(RecorderError, match=r"pip install 'ibrobot-plugin-mcap\[plot\]'"):
+        run("plot", path)
+
+
+def test_delete_asks_and_takes_nothing_but_episodes(tmp_path):
+    path = made(tmp_path)
+    CliRunner().invoke(episodes, ["delete", str(path)], input="n\n")
+    assert path.is_dir()
+    with pytest.raises(RecorderError, match="is no episode; nothing was deleted"):
+        run("delete", "--yes", path, tmp_path)
+    assert path.is_dir()
+    run("delete", "--yes", path)
+    assert not path.exists()
+
+
+def test_what_is_not_there_is_told(tmp_path):
+    with pytest.raises(RecorderError, match="there is no such file or folder"):
+        run("list", tmp_path / "none")
+    with pytest.raises(RecorderError, match="has no episode in it"):
+        run("list", tmp_path)
