@@ -11,6 +11,7 @@ from ibrobot_camera.calibration import load_info
 from ibrobot_camera.capture import Capture, Picture, Pixels
 from ibrobot_camera.device import find_device
 from ibrobot_camera.options import OpenCvOptions
+from ibrobot_core.clock import SteppedClock
 from ibrobot_core.errors import SensorError
 from ibrobot_core.interfaces import Context, Sensor
 from ibrobot_core.messages import CameraInfo, Header, Image, Message
@@ -45,10 +46,13 @@ class OpenCvCamera(Sensor):
     @override
     def open(self) -> None:
         device = find_device(self._options.device, self._ctx.name)
+        if device.kind != "file" and isinstance(self._ctx.clock, SteppedClock):
+            raise SensorError(f"camera {self._ctx.name}: {device}: a live source cannot be in lockstep; a file can")
         make = _File if device.kind == "file" else _Live
         self._info = load_info(self._options.info, self._ctx.name) if self._options.info is not None else None
-        self._source = make(lambda: Capture(device, self._options, self._ctx.name), self._options, self._ctx)
-        self._source.open()
+        source = make(lambda: Capture(device, self._options, self._ctx.name), self._options, self._ctx)
+        source.open()
+        self._source = source
 
     @override
     def read(self, timeout_s: float) -> Image | None:
@@ -58,6 +62,7 @@ class OpenCvCamera(Sensor):
         if found is None:
             return None
         pixels, stamp_ns = found
+        self._check_calibration(pixels)
         # A driver whose stamps stand still must not give two pictures of one time.
         self._last_ns = stamp_ns = max(stamp_ns, self._last_ns + 1)
         return to_image(pixels, Header(stamp_ns, self._frame_id))
@@ -67,6 +72,16 @@ class OpenCvCamera(Sensor):
         source, self._source = self._source, None
         if source is not None:
             source.close()
+
+    def _check_calibration(self, pixels: Pixels) -> None:
+        if self._info is None:
+            return
+        calibrated, (height, width) = self._info(Header()), pixels.shape[:2]
+        if (calibrated.width, calibrated.height) != (width, height):
+            raise SensorError(
+                f"camera {self._ctx.name}: {self._options.info}: is for pictures of "
+                f"{calibrated.width}x{calibrated.height}, these are {width}x{height}"
+            )
 
     @override
     def latched(self) -> tuple[tuple[str, Message], ...]:
@@ -196,7 +211,10 @@ class _File:
             picture, stamp_ns = newer, due_ns
             self._next += 1
             due_ns += self._period_ns
-        return (picture.pixels, stamp_ns) if picture is not None else None
+        if picture is None:  # the file has ended
+            clock.sleep_until(now_ns + ns(timeout_s))
+            return None
+        return picture.pixels, stamp_ns
 
     def close(self) -> None:
         if self._capture is not None:

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from typing import Any
 
 import attrs
 import cv2
@@ -23,6 +24,8 @@ type Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 
 _TIMEOUT_MS = 3000
 """After it a network stream that says nothing is lost."""
+_DAMAGED = 30
+"""After so many pictures in a row that cannot be decoded the source is lost; single ones, as USB has, are left out."""
 _STREAM_OPTIONS = "rtsp_transport;tcp|fflags;nobuffer|flags;low_delay"
 _environment = threading.Lock()
 _MANUAL_EXPOSURE, _AUTO_EXPOSURE = 1, 3
@@ -32,7 +35,11 @@ _ROTATIONS: Mapping[int, int] = {
 }  # fmt: skip
 # What goes wrong is told in this package's own errors.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+_SILENT = 0
+_set_log_level = getattr(cv2, "setLogLevel", None) or cv2.utils.logging.setLogLevel  # OpenCV 4, OpenCV 5
+_set_log_level(_SILENT)
+# A device that gives nothing more would hold the reader, and so the end of a run, for 10 s.
+os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", str(_TIMEOUT_MS // 1000))
 
 
 @attrs.frozen(eq=False)
@@ -79,13 +86,26 @@ class Capture:
 
     def read(self) -> Picture | None:
         """The next picture; None at the end of a file, or when the source is lost."""
-        good, pixels = self._capture.read()
-        if not good:
-            return None
-        taken_ns = self._taken_ns(time.monotonic_ns())
-        if self._options.rotation:
-            pixels = cv2.rotate(pixels, _ROTATIONS[self._options.rotation])
-        return Picture(np.ascontiguousarray(pixels), taken_ns)  # type: ignore[arg-type]
+        for _ in range(_DAMAGED):
+            if not self._capture.grab():
+                return None
+            taken_ns = self._taken_ns(time.monotonic_ns())  # before decoding, which takes time
+            good, pixels = self._capture.retrieve()
+            if good and self._options.fourcc == "Z16 ":
+                good, pixels = self._depth(pixels)
+            if good:
+                if self._options.rotation:
+                    pixels = cv2.rotate(pixels, _ROTATIONS[self._options.rotation])
+                return Picture(np.ascontiguousarray(pixels), taken_ns)  # type: ignore[arg-type]
+        return None
+
+    def _depth(self, pixels: NDArray[Any]) -> tuple[bool, NDArray[Any]]:
+        """Whether a picture is whole, and its depths: OpenCV does not know Z16, and gives the bytes in one row."""
+        get = self._capture.get
+        height, width = round(get(cv2.CAP_PROP_FRAME_HEIGHT)), round(get(cv2.CAP_PROP_FRAME_WIDTH))
+        if pixels.nbytes != 2 * height * width:
+            return False, pixels
+        return True, pixels.reshape(-1).view(np.uint16).reshape(height, width)
 
     def close(self) -> None:
         """Release the source."""
@@ -115,7 +135,6 @@ class Capture:
 
     def _set_up(self) -> None:
         options, capture = self._options, self._capture
-        capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
         # The format first: it says which sizes there are, and those say which rates.
         if options.fourcc is not None:
             capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*options.fourcc))
@@ -143,7 +162,8 @@ class Capture:
         size = round(get(cv2.CAP_PROP_FRAME_WIDTH)), round(get(cv2.CAP_PROP_FRAME_HEIGHT))
         if options.width is not None and size != (options.width, options.height):
             found.append(f"gives {size[0]}x{size[1]}, {options.width}x{options.height} was asked for")
-        rate = get(cv2.CAP_PROP_FPS)
+        # A stream's rate is its sender's; what FFmpeg says of it is often a guess.
+        rate = get(cv2.CAP_PROP_FPS) if self._device.kind != "stream" else 0.0
         if options.fps is not None and rate and abs(rate - options.fps) > 0.01 * options.fps:
             found.append(f"gives {rate:g} Hz, {options.fps:g} was asked for")
         code = int(get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little").decode(errors="replace")

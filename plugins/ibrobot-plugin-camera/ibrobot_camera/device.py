@@ -24,12 +24,12 @@ class Device:
     """A device's path, a URL, or a file's path."""
 
     def __str__(self) -> str:
-        """For messages: without user and password."""
+        """For messages: without user, password and query, where cameras take passwords too."""
         if self.kind != "stream":
             return self.target
         parts = urlsplit(self.target)
         host = parts.netloc.rpartition("@")[2]
-        return parts._replace(netloc=host).geturl()
+        return parts._replace(netloc=host, query="…" if parts.query else "").geturl()
 
 
 def find_device(device: int | str, name: str) -> Device:

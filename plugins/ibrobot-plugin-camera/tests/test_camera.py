@@ -148,6 +148,17 @@ class TestFile:
         turned = np.rot90(image.data.reshape(WIDTH, HEIGHT, 3))
         assert number_of(turned) == 1
 
+    def test_after_its_end_a_reader_waits(self, video: Path) -> None:
+        ctx = host_context("top", clock=SteppedClock(START_NS))
+        top = camera(ctx, str(video), loop=False)
+        top.open()
+        while ctx.clock.now_ns() < START_NS + 480_000_000:
+            top.read(0.05)
+        before = ctx.clock.now_ns()
+        assert top.read(0.1) is None
+        top.close()
+        assert ctx.clock.now_ns() == before + 100_000_000
+
 
 class TestStream:
     def test_each_picture_is_new_and_as_old_as_it_says(self) -> None:
@@ -211,8 +222,30 @@ class TestStream:
             camera(ctx, "rtsp://arm:secret@127.0.0.1:9/live").open()
         assert "secret" not in str(caught.value)
 
+    def test_nor_does_an_error_show_a_password_in_the_query(self) -> None:
+        device = Device("stream", "http://host/video.mjpg?user=arm&password=secret")
+        assert str(device) == "http://host/video.mjpg?…"
+
+    def test_it_can_be_closed_after_it_did_not_open(self) -> None:
+        top = camera(host_context("top", clock=RealClock()), "http://127.0.0.1:9/live")
+        with pytest.raises(SensorError, match="cannot be opened"):
+            top.open()
+        top.close()
+        with pytest.raises(SensorError, match="not open"):
+            top.read(0.0)
+
+    def test_it_cannot_be_in_lockstep(self) -> None:
+        with pytest.raises(SensorError, match="a live source cannot be in lockstep; a file can"):
+            camera(host_context("top", clock=SteppedClock(START_NS)), "http://127.0.0.1:9/live").open()
+
 
 class TestWhatWasAsked:
+    def test_the_rate_of_a_stream_is_its_senders(self) -> None:
+        with StreamServer() as server:
+            top = camera(host_context("top", clock=RealClock()), server.url, fps=30.0)
+            top.open()
+            top.close()
+
     def test_another_size_is_an_error_or_a_warning(self, video: Path) -> None:
         ctx = host_context("top", clock=SteppedClock(START_NS))
         with pytest.raises(SensorError, match=r"gives 64x48, 640x480 was asked for; `strict: false` takes it as it is"):
@@ -258,7 +291,7 @@ class TestDevices:
         with pytest.raises(SensorError, match=r"camera top: no file, URL or device 'usb-cam'"):
             find_device("usb-cam", "top")
         with pytest.raises(SensorError, match=r"/dev/video77: there is no such device; `ibrobot camera list`"):
-            camera(host_context("top"), 77).open()
+            camera(host_context("top", clock=RealClock()), 77).open()
         (tmp_path / "no.mp4").write_text("no video")
         with pytest.raises(SensorError, match="is no video that can be decoded"):
             camera(host_context("top"), str(tmp_path / "no.mp4")).open()
@@ -287,6 +320,19 @@ class TestCalibration:
         assert topic == "/camera/top/camera_info"
         assert isinstance(info, CameraInfo)
         assert (info.width, info.k[2], info.d[0]) == (64, 32.0, 0.1)
+
+    def test_one_for_other_pictures_is_told(self, video: Path, tmp_path: Path) -> None:
+        three = "{data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}"
+        (tmp_path / "top.yaml").write_text(
+            f"image_width: 640\nimage_height: 480\ncamera_matrix: {three}\nrectification_matrix: {three}\n"
+            "distortion_coefficients: {data: [0, 0, 0, 0, 0]}\n"
+            "projection_matrix: {data: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0]}\n"
+        )
+        top = camera(host_context("top"), str(video), info=tmp_path / "top.yaml")
+        top.open()
+        with pytest.raises(SensorError, match=r"top\.yaml: is for pictures of 640x480, these are 64x48"):
+            top.read(0.0)
+        top.close()
 
     @pytest.mark.parametrize(
         ("text", "message"),

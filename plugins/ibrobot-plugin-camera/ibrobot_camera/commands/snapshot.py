@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import click
@@ -27,8 +28,9 @@ def snapshot(source: str, output: Path | None, seconds: float) -> None:
     output = output or Path("camera.png")
     if output.suffix.lower() not in (".png", ".jpg", ".jpeg"):
         raise click.BadParameter(f"{output}: must end in .png or .jpg", param_hint="--output")
-    with opened(source) as cameras:
-        pictures = {name: _watch(name, camera.read, seconds) for name, camera in cameras.items()}
+    with opened(source) as cameras, ThreadPoolExecutor(len(cameras)) as pool:
+        watched = {name: pool.submit(_watch, name, camera.read, seconds) for name, camera in cameras.items()}
+        pictures = {name: found.result() for name, found in watched.items()}
     for name, (image, rate_hz) in pictures.items():
         path = output if len(pictures) == 1 else output.with_stem(f"{output.stem}_{name}")
         if not cv2.imwrite(str(path), pixels(image)):
