@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import threading
+import time
 from typing import Any, ClassVar, override
 
 import attrs
 import numpy as np
+from numpy.typing import NDArray
 
 from ibrobot_camera.camera import to_image
 from ibrobot_camera.capture import Pixels
@@ -17,6 +19,9 @@ from ibrobot_core.messages import CameraInfo, Header, Image, Message
 
 _WAIT_MS = 200
 _CLOSE_S = 5.0
+_LOST_S = 5.0
+"""After so long without pictures the camera is lost [s]."""
+_SAME = 1e-6
 _NS_PER_MS = 1e6
 
 
@@ -135,7 +140,7 @@ class _Device:
         return profile if (video.width(), video.height(), float(profile.fps())) == self.size else None
 
     def _run(self) -> None:
-        rs = self._rs
+        rs, heard = self._rs, time.monotonic()
         while not self._ended.is_set():
             try:
                 good, frames = self._queue.try_wait_for_frames(_WAIT_MS)
@@ -168,8 +173,17 @@ class _Device:
         self._open.clear()
 
 
+def _millimetres(depth: Any) -> NDArray[np.uint16]:
+    """Depths [mm], shape (H, W), whatever the unit of the device (a D405's is 0.1 mm)."""
+    found = np.array(depth.get_data())
+    unit_mm = depth.get_units() * 1e3
+    if abs(unit_mm - 1.0) < _SAME:
+        return found
+    return np.rint(np.minimum(found * unit_mm, np.iinfo(np.uint16).max)).astype(np.uint16)
+
+
 class RealSenseCamera(Sensor):
-    """Colour as bgr8, or depth as 16UC1 in the device's depth unit (1 mm), aligned to the colour pictures.
+    """Colour as bgr8, or depth as 16UC1 [mm], aligned to the colour pictures.
 
     Args:
         options: the YAML's.

@@ -32,8 +32,9 @@ def test_without_the_library_it_says_how_to_install_it(monkeypatch: pytest.Monke
 class SoftwareCamera:
     """A RealSense in software: pictures whose colour and depth say their number."""
 
-    def __init__(self, rs: Any) -> None:
+    def __init__(self, rs: Any, unit: float = 0.001) -> None:
         self._rs = rs
+        self._unit = unit
         self.device = rs.software_device()
         self.device.register_info(rs.camera_info.serial_number, "1")
         self._streams = {}
@@ -47,7 +48,7 @@ class SoftwareCamera:
             video.type, video.uid, video.index, video.fmt, video.bpp = stream, uid, 0, pixel_format, size
             video.width, video.height, video.fps, video.intrinsics = WIDTH, HEIGHT, 30, intrinsics
             if name == "depth":
-                sensor.add_read_only_option(rs.option.depth_units, 0.001)
+                sensor.add_read_only_option(rs.option.depth_units, unit)
             self._streams[name] = sensor, sensor.add_video_stream(video), size
         same_place = rs.extrinsics()
         same_place.rotation, same_place.translation = [1, 0, 0, 0, 1, 0, 0, 0, 1], [0, 0, 0]
@@ -72,14 +73,14 @@ class SoftwareCamera:
         frame.timestamp, frame.domain = self.number * 20.0, self._rs.timestamp_domain.hardware_clock
         frame.frame_number, frame.profile = self.number, profile.as_video_stream_profile()
         if name == "depth":
-            frame.depth_units = 0.001
+            frame.depth_units = self._unit
         sensor.on_video_frame(frame)
 
 
-@pytest.fixture
-def soft(monkeypatch: pytest.MonkeyPatch) -> Iterator[SoftwareCamera]:
+@pytest.fixture(params=[0.001])
+def soft(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[SoftwareCamera]:
     rs = pytest.importorskip("pyrealsense2", reason="needs the extra `realsense`")
-    camera = SoftwareCamera(rs)
+    camera = SoftwareCamera(rs, request.param)
     monkeypatch.setattr(realsense, "find_device", lambda serial: camera.device)
     camera.running.set()
     camera.thread.start()
@@ -124,6 +125,29 @@ def test_colour_and_aligned_depth_share_a_camera(soft: SoftwareCamera) -> None:
     assert 1000 < distance <= 1000 + soft.number
     assert isinstance(info, CameraInfo)
     assert (info.k[0], info.p[3], info.p[11]) == (50.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("soft", [0.0001], indirect=True)
+def test_depth_is_in_millimetres_whatever_the_devices_unit(soft: SoftwareCamera) -> None:
+    depth = RealSenseCamera(RealSenseOptions(width=WIDTH, height=HEIGHT, stream="depth"), host_context("depth"))
+    depth.open()
+    picture = depth.read(5.0)
+    depth.close()
+    assert picture is not None
+    distance = picture.data.view(np.uint16).reshape(HEIGHT, WIDTH)[HEIGHT // 2, WIDTH // 2]
+    assert 100 <= distance <= (1000 + soft.number) / 10 + 1
+
+
+def test_a_camera_that_falls_silent_for_long_is_lost(soft: SoftwareCamera, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(realsense, "_LOST_S", 0.3)
+    top = RealSenseCamera(SMALL, host_context("top", clock=RealClock()))
+    top.open()
+    assert top.read(5.0) is not None
+    soft.running.clear()
+    with pytest.raises(SensorError, match=r"camera top: the RealSense has given nothing for 0\.3 s"):  # noqa: PT012
+        while True:
+            top.read(1.0)
+    top.close()
 
 
 def test_sizes_that_it_does_not_give_or_that_differ_are_refused(soft: SoftwareCamera) -> None:
