@@ -145,10 +145,13 @@ class _Device:
             try:
                 good, frames = self._queue.try_wait_for_frames(_WAIT_MS)
                 if not good or frames.size() < 2:
+                    if time.monotonic() - heard > _LOST_S:
+                        raise RuntimeError(f"the RealSense has given nothing for {_LOST_S:g} s; is it plugged in?")
                     continue
+                heard = time.monotonic()
                 aligned = self._align.process(frames)
                 colour, depth = aligned.get_color_frame(), aligned.get_depth_frame()
-                pictures = {"color": np.array(colour.get_data()), "depth": np.array(depth.get_data())}
+                pictures = {"color": np.array(colour.get_data()), "depth": _millimetres(depth)}
             except RuntimeError as error:
                 with self.changed:
                     self.error = str(error)
@@ -175,7 +178,7 @@ class _Device:
 
 def _millimetres(depth: Any) -> NDArray[np.uint16]:
     """Depths [mm], shape (H, W), whatever the unit of the device (a D405's is 0.1 mm)."""
-    found = np.array(depth.get_data())
+    found: NDArray[np.uint16] = np.array(depth.get_data())
     unit_mm = depth.get_units() * 1e3
     if abs(unit_mm - 1.0) < _SAME:
         return found
