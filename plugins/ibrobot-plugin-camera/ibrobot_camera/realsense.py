@@ -182,7 +182,8 @@ def _millimetres(depth: Any) -> NDArray[np.uint16]:
     unit_mm = depth.get_units() * 1e3
     if abs(unit_mm - 1.0) < _SAME:
         return found
-    return np.rint(np.minimum(found * unit_mm, np.iinfo(np.uint16).max)).astype(np.uint16)
+    scaled: NDArray[np.uint16] = np.rint(np.minimum(found * unit_mm, np.iinfo(np.uint16).max)).astype(np.uint16)
+    return scaled
 
 
 class RealSenseCamera(Sensor):
