@@ -6,7 +6,8 @@ import csv
 import json
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import attrs
 import numpy as np
 import pytest
 
+collect_ignore_glob = [] if find_spec("ibrobot_feetech") else ["test_feetech_*.py"]
 IBROBOT = (sys.executable, "-c", "from ibrobot_core.cli.main import main; main()")
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
 
@@ -53,6 +55,15 @@ class Log:
     def joint(self, name: str) -> np.ndarray:
         """Positions of one joint [rad], shape (N,)."""
         return self.positions[:, JOINTS.index(name)]
+
+
+@pytest.fixture
+def prompt_threads() -> Iterator[None]:
+    """Threads of the tests' process give way soon: an emulated servo bus in one of them must answer in time."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(5e-4)
+    yield
+    sys.setswitchinterval(before)
 
 
 @pytest.fixture

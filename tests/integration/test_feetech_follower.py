@@ -17,7 +17,7 @@ from ibrobot_feetech.emulator import Emulator
 
 from ibrobot_core.calibration import Calibration, JointCalibration, save_calibration
 
-pytestmark = pytest.mark.integration
+pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("prompt_threads")]
 
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
 PATIENCE_S = 30.0
@@ -42,9 +42,10 @@ class Bench:
             f"robot:\n  name: arm\n  joints:\n{joints}  groups: {{all: [{', '.join(JOINTS)}]}}\n"
             "  description: {poses: {up: [0.4, 0, 0, 0, 0, 0]}}\n"
             f"hardware: {{type: feetech_so101, port: {self.emulator.port}, calibration: {self.folder}/arm.json, "
-            "anchored: []}\n"
+            "anchored: [], lost_replies: 25}\n"
             "executors: {position: {type: position, group: all}}\n"
             "control_modes: {idle: {executors: [position]}}\ndefault_control_mode: idle\n"
+            "control: {state_timeout: 1.0}\n"
         )
         command = [*self.ibrobot, "launch", str(self.folder / "arm.yaml"), "--headless", "--json", *arguments]
         self.run = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -119,7 +120,7 @@ def test_a_servo_that_dies_is_named_and_the_others_hold(bench: Bench) -> None:
     bench.emulator.faults.silent.add(3)
     out, err = run.communicate(timeout=PATIENCE_S)
     assert run.returncode == 1
-    assert "servo 3 (elbow_flex), present_position: no good reply for 4 ticks" in err
+    assert "servo 3 (elbow_flex), present_position: no good reply for 26 ticks" in err
     assert "the robot holds" in err
     (fault,) = json.loads(out.splitlines()[-1])["faults"]
     assert fault.startswith(f"{bench.emulator.port}, servo 3 (elbow_flex)")

@@ -20,7 +20,7 @@ from ibrobot_core.launch.runtime import ESTOP, RESET, Runtime
 from ibrobot_core.launch.session import Request, Session
 from ibrobot_core.plugins import installed
 
-pytestmark = pytest.mark.integration
+pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("prompt_threads")]
 
 CONFIG = Path(__file__).parents[2] / "configs" / "so101_blind.yaml"
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
@@ -120,6 +120,10 @@ def station(tmp_path: Path) -> Iterator[Callable[..., Station]]:
             f"hardware={{type: feetech_so101, port: {tmp_path}/follower, calibration: {follower_file}}}",
             f"teleoperation.leader={{type: so101_leader, port: {tmp_path}/leader, calibration: {leader_file}}}",
             "control_modes.teleop.teleop=leader",
+            # A busy machine may keep the emulator, a thread of this process, from answering for a while.
+            "hardware.lost_replies=25",
+            "teleoperation.leader.lost_replies=25",
+            "control.state_timeout=1.0",
         )
         config = load(CONFIG, overrides=(*sections, *overrides), mode="teleop")
         station = Station(leader, follower, Runtime(Session(config, installed(), Request())))
