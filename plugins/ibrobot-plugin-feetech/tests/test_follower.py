@@ -11,6 +11,7 @@ from typing import Any, override
 import attrs
 import numpy as np
 import pytest
+from ibrobot_feetech import bus
 from ibrobot_feetech.emulator import Emulator
 from ibrobot_feetech.errors import FeetechError, NoReply, PortError, ServoFault
 from ibrobot_feetech.follower import FeetechFollower
@@ -26,6 +27,12 @@ from ibrobot_core.testing.hardware import HardwareSuite
 from .conftest import JOINTS, arm_calibration, prepare
 
 TICK = 2 * math.pi / 4096
+
+
+@pytest.fixture(autouse=True)
+def _patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A busy machine may keep the emulator, a thread of this process, from answering for a while."""
+    monkeypatch.setattr(bus, "_ADAPTER_S", 0.05)
 
 
 class TestFollower(HardwareSuite):
@@ -165,7 +172,9 @@ class TestFaults:
             assert reading.stale
             assert reading.position[2] == before[2]
         assert reading.position[0] > before[0], "the others go on"
-        with pytest.raises(NoReply, match=r"servo 3 \(elbow_flex\), present_position: no good reply for 4 ticks; check its power"):
+        with pytest.raises(
+            NoReply, match=r"servo 3 \(elbow_flex\), present_position: no good reply for 4 ticks; check its power"
+        ):
             rig.tick()
         assert rig.follower.counters()["lost_replies"] == 4
 
