@@ -34,29 +34,95 @@ _PANEL_HZ = 8
 _PLAIN_PERIOD_S = 2.0
 
 
+class Watcher:
+    """What looks after a run beside the mode: told of keys, asked what to show. This one does nothing."""
+
+    def attach(self, runtime: Runtime) -> None:
+        """The run is made, and not started yet."""
+
+    def step(self) -> None:
+        """Do what is due; called a few times a second, and in lockstep at every tick."""
+
+    def key(self, key: str) -> bool:
+        """Obey a key; False for one that means nothing here."""
+        return False
+
+    def rows(self) -> list[tuple[str, str]]:
+        """Heading and text, for the panel."""
+        return []
+
+    def line(self) -> str:
+        """For a plain line of status."""
+        return ""
+
+    def help(self) -> str:
+        """The keys, for the panel."""
+        return ""
+
+    def told(self) -> str:
+        """For the summary of the run."""
+        return ""
+
+
+def launch_options[C: Callable[..., Any]](command: C) -> C:
+    """The argument and the options that every command has which runs a robot."""
+    for add in reversed((
+        click.argument("config", required=False),
+        click.option("--sim", is_flag=True, help="Use the simulation section in place of hardware."),
+        click.option(
+            "--lockstep", is_flag=True, help="Simulated time, as fast as the machine goes; equal seeds, equal runs."
+        ),
+        click.option(
+            "--seed", type=int, default=0, show_default=True, help="Of the first episode; later ones count up."
+        ),
+        click.option("--mode", help="In place of default_control_mode."),
+        click.option(
+            "--set", "overrides", multiple=True, metavar="PATH=VALUE", help="Override a key, e.g. control.rate_hz=50."
+        ),
+        click.option("--duration", type=click.FloatRange(min=0), metavar="S", help="Stop after so many seconds."),
+        click.option("--episodes", type=click.IntRange(min=1), metavar="N", help="Stop after so many episodes."),
+        click.option(
+            "--goal", "goals", multiple=True, metavar="GOAL", help="For planning modes: a pose, or joint=rad,…"
+        ),
+        click.option("--window", is_flag=True, help="Show the simulation in a desktop window."),
+        click.option("--headless", is_flag=True, help="No window, no viewer, no panel: plain lines."),
+        click.option("--dry-run", is_flag=True, help="Print the plan and start nothing."),
+        click.option("--json", "as_json", is_flag=True, help="Print a summary as JSON, in the last line."),
+    )):  # fmt: skip
+        command = add(command)
+    return command
+
+
 @click.command()
-@click.argument("config", required=False)
-@click.option("--sim", is_flag=True, help="Use the simulation section in place of hardware.")
-@click.option("--lockstep", is_flag=True, help="Simulated time, as fast as the machine goes; equal seeds, equal runs.")
-@click.option("--seed", type=int, default=0, show_default=True, help="Of the first episode; later ones count up.")
-@click.option("--mode", help="In place of default_control_mode.")
-@click.option(
-    "--set", "overrides", multiple=True, metavar="PATH=VALUE", help="Override a key, e.g. control.rate_hz=50."
-)
-@click.option("--duration", type=click.FloatRange(min=0), metavar="S", help="Stop after so many seconds.")
-@click.option("--episodes", type=click.IntRange(min=1), metavar="N", help="Stop after so many simulated episodes.")
-@click.option("--goal", "goals", multiple=True, metavar="GOAL", help="For planning modes: a pose, or joint=rad,…")
-@click.option("--window", is_flag=True, help="Show the simulation in a desktop window.")
-@click.option("--headless", is_flag=True, help="No window, no viewer, no panel: plain lines.")
-@click.option("--dry-run", is_flag=True, help="Print the plan and start nothing.")
-@click.option("--json", "as_json", is_flag=True, help="Print a summary as JSON, in the last line.")
+@launch_options
 def launch(config: str | None, **options: Any) -> None:
     """Run a robot.
 
     CONFIG is a robot YAML: a path, or the name of one that comes with ibrobot or a plugin; so101 when left out.
+    --episodes counts those of a policy in simulation.
 
     Exits with 0 when the run ended well, 1 when a component failed or a fault was raised, 2 for a wrong command line
     or YAML, 3 when not every episode or goal succeeded, 130 on a second Ctrl-C.
+    """
+    run_robot(config, options)
+
+
+def run_robot(
+    config: str | None, options: dict[str, Any], *, watcher: Watcher | None = None, recording: tuple[str, ...] = (),
+    prompt: str = "",
+) -> None:  # fmt: skip
+    """Run a robot as a command line says, to the end of the process.
+
+    Args:
+        config: the robot YAML, as `launch` takes it.
+        options: those of `launch_options`.
+        watcher: what looks after the run.
+        recording: overrides, of which the first makes the `recording` section where the YAML has none; where it is
+            empty, the run does what the mode does.
+        prompt: what recorded episodes are recorded under.
+
+    Raises:
+        IbrobotError: e.g. for a YAML with mistakes, or when a component fails.
     """
     if options["window"] and options["headless"]:
         raise click.UsageError("--window and --headless exclude each other")
@@ -64,24 +130,30 @@ def launch(config: str | None, **options: Any) -> None:
         options["overrides"] = (*options["overrides"], "viewer={type: mujoco}")
     registry = installed()
     path = find_config(config, registry)
-    robot = load(path, overrides=options["overrides"], mode=options["mode"], sim=options["sim"], registry=registry)
+    changes, chosen = options["overrides"], {"mode": options["mode"], "sim": options["sim"], "registry": registry}
+    robot = load(path, overrides=changes, **chosen)
+    if recording:
+        default, *more = recording
+        robot = load(path, overrides=(*([default] if robot.recording is None else []), *changes, *more), **chosen)
     if options["lockstep"] and not robot.simulated:
         raise click.UsageError("--lockstep is for simulation: add --sim")
     if options["headless"] and robot.viewer is not None:
         robot = attrs.evolve(robot, viewer=None)
+    watcher = watcher or Watcher()
     with ExitStack() as stack:
         keys = None if options["headless"] or options["dry_run"] else _terminal_keys(stack)
         request = Request(
             options["lockstep"], options["seed"], options["duration"], options["episodes"], options["goals"],
-            keys.subscribe if keys is not None else None,
+            keys.subscribe if keys is not None else None, prompt, bool(recording),
         )  # fmt: skip
         runtime = Runtime(Session(robot, registry, request))
         if options["dry_run"]:
             click.echo("\n".join(runtime.plan.lines()))
             return
+        watcher.attach(runtime)
         _stop_on_signals(runtime.session, keys)
-        status = _run(runtime, path, live=not options["headless"] and sys.stdout.isatty())
-    _tell(runtime, options["as_json"])
+        status = _run(runtime, path, watcher, live=not options["headless"] and sys.stdout.isatty())
+    _tell(runtime, watcher, options["as_json"])
     runtime.raise_failure()
     sys.exit(status)
 
@@ -93,20 +165,22 @@ def _terminal_keys(stack: ExitStack) -> Keys | None:
     return stack.enter_context(Keys())
 
 
-def _run(runtime: Runtime, path: Path, *, live: bool) -> int:
+def _run(runtime: Runtime, path: Path, watcher: Watcher, *, live: bool) -> int:
     """Start, run and stop; returns the exit status of a run in which nothing failed."""
     session = runtime.session
     where = "simulation" if session.config.simulated else "hardware"
     with ExitStack() as stack:
-        display = _Panel(runtime, stack) if live else _Lines(session)
+        display = _Panel(runtime, watcher, stack) if live else _Lines(session, watcher)
         session.log.info("%s from %s: %s, mode %s", session.config.robot.name, path, where, session.mode)
         runtime.start(display.starting)
         stack.callback(runtime.stop)
         if session.request.lockstep:
             while not runtime.step():
+                watcher.step()
                 display.show()
         else:
             while not runtime.wait(1.0 / _PANEL_HZ):
+                watcher.step()
                 display.show()
     outcome = session.outcome
     if any(fault != EMERGENCY_STOP for fault in outcome.faults):
@@ -132,8 +206,9 @@ def _stop_on_signals(session: Session, keys: Keys | None) -> None:
 class _Lines:
     """Plain lines of status, where standard output is no terminal."""
 
-    def __init__(self, session: Session) -> None:
+    def __init__(self, session: Session, watcher: Watcher) -> None:
         self._session = session
+        self._watcher = watcher
         self._next_s = time.monotonic() + _PLAIN_PERIOD_S
         handler = logging.StreamHandler(sys.stderr)
         handler.setFormatter(logging.Formatter("%(levelname).1s %(message)s"))
@@ -146,16 +221,18 @@ class _Lines:
         """Print a line, now and then."""
         if time.monotonic() >= self._next_s:
             self._next_s += _PLAIN_PERIOD_S
-            click.echo(plain_line(self._session))
+            line = plain_line(self._session)
+            click.echo(f"{line} | {more}" if (more := self._watcher.line()) else line)
 
 
 class _Panel:
     """The live panel, and the runtime's own keys: F1..F9 modes, Esc emergency stop, F10 reset."""
 
-    def __init__(self, runtime: Runtime, stack: ExitStack) -> None:
+    def __init__(self, runtime: Runtime, watcher: Watcher, stack: ExitStack) -> None:
         from rich.live import Live
 
         self._runtime = runtime
+        self._watcher = watcher
         self._log = RecentLog()
         _log_to(self._log)
         self._display = stack.enter_context(Live(auto_refresh=False, screen=False))
@@ -178,7 +255,8 @@ class _Panel:
             self._obey(self._pressed.get())
         session = self._runtime.session
         help_text = session.feeder.help() if session.feeder is not None else ""
-        self._display.update(panel(session, self._log, help_text), refresh=True)
+        help_text = "\n".join(text for text in (help_text, self._watcher.help()) if text)
+        self._display.update(panel(session, self._log, help_text, self._watcher.rows()), refresh=True)
 
     def _listen(self, keys: queue.SimpleQueue[str]) -> None:
         """In a thread of its own, so that the emergency stop waits for nothing, e.g. not for a mode that loads."""
@@ -190,6 +268,8 @@ class _Panel:
                 self._pressed.put(key)
 
     def _obey(self, key: str) -> None:
+        if self._watcher.key(key):
+            return
         modes = list(self._runtime.session.config.control_modes)
         if key == "f10":
             self._try(self._runtime.reset)
@@ -209,7 +289,7 @@ def _log_to(handler: logging.Handler) -> None:
     logging.getLogger("ibrobot").setLevel(logging.INFO)
 
 
-def _tell(runtime: Runtime, as_json: bool) -> None:
+def _tell(runtime: Runtime, watcher: Watcher, as_json: bool) -> None:
     """The summary of a run."""
     summary = runtime.summary()
     if as_json:
@@ -226,4 +306,6 @@ def _tell(runtime: Runtime, as_json: bool) -> None:
             f"loop       {loop['rate_hz']:.2f} Hz, lateness p50 {loop['lateness_p50_us']:.0f} us, "
             f"p99 {loop['lateness_p99_us']:.0f} us, missed {loop['missed']}"
         )
+    if told := watcher.told():
+        click.echo(f"recorded   {told}")
     click.echo(f"faults     {'; '.join(summary['faults']) or 'none'}")

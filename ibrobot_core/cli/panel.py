@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
+from collections.abc import Sequence
 from typing import override
 
 import numpy as np
@@ -57,8 +58,8 @@ def plain_line(session: Session) -> str:
     return " | ".join(pieces)
 
 
-def panel(session: Session, log: RecentLog, help_text: str) -> RenderableType:
-    """The whole panel."""
+def panel(session: Session, log: RecentLog, help_text: str, more: Sequence[tuple[str, str]] = ()) -> RenderableType:
+    """The whole panel, with `more` rows of heading and text."""
     outcome, stats = session.outcome, session.stats
     facts = Table.grid(padding=(0, 2))
     facts.add_column(style="bold")
@@ -78,6 +79,8 @@ def panel(session: Session, log: RecentLog, help_text: str) -> RenderableType:
     if session.rates:
         facts.add_row("sensors", "  ".join(_sensor_text(session, name) for name in session.rates))
     facts.add_row("episodes", f"{outcome.episodes} done, {outcome.successes} successful")
+    for heading, text in more:
+        facts.add_row(heading, Text(text))
     state = session.state
     estop = state is not None and state.estop
     faults = Text("; ".join(outcome.faults[-3:]), "bold red") if outcome.faults else Text("none", "green")

@@ -20,6 +20,10 @@ class Episodes:
         self.number = 0
         """Of the present episode, from 1; 0 before the first."""
         self.running = False
+        self.prompt = session.request.prompt
+        """Of the next episode."""
+        self.begun_ns = 0
+        """When the present episode began [ns]."""
 
     @property
     def recording_failure(self) -> RecorderError | None:
@@ -29,24 +33,27 @@ class Episodes:
     def begin(self) -> None:
         """The next episode begins."""
         session = self._session
+        if self._recording is not None:
+            self._recording.begin(self.number + 1, self.prompt)
         self.number += 1
         self.running = True
-        if self._recording is not None:
-            self._recording.begin(self.number)
+        self.begun_ns = session.clock.now_ns()
         session.registry.emit(
             "ibrobot_episode_started", robot=session.config.robot.name, episode=self.number, mode=session.mode,
             stamp_ns=session.clock.now_ns(),
         )  # fmt: skip
 
     def end(self, outcome: str) -> None:
-        """The present episode, if any, ends as `success`, `failure` or `unknown`."""
+        """The present episode, if any, ends as `success`, `failure`, `discarded` or `unknown`."""
         if not self.running:
             return
         session = self._session
         self.running = False
         if self._recording is not None:
             self._recording.end(outcome)
-        if outcome != "unknown":
+        if outcome == "discarded":
+            session.log.info("episode %d: discarded", self.number)
+        elif outcome != "unknown":
             session.outcome.episodes += 1
             session.outcome.successes += outcome == "success"
             session.log.info("episode %d: %s", self.number, outcome)

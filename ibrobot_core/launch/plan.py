@@ -42,6 +42,7 @@ class LaunchPlan:
     mode: ModeParts
     """What the first mode brings; among `components` too."""
     episodes: Episodes
+    recording: Recording | None
     episodes_worker: SimulatedEpisodes | None
 
     def lines(self) -> list[str]:
@@ -97,7 +98,7 @@ def build_plan(session: Session) -> LaunchPlan:
     if config.simulated and isinstance(parts.feeder, InferenceFeeder):
         worker = SimulatedEpisodes(session, episodes, (parts.feeder.name,))
         components.append(worker)
-    return LaunchPlan(tuple(_ordered(components)), parts, episodes, worker)
+    return LaunchPlan(tuple(_ordered(components)), parts, episodes, recording, worker)
 
 
 def _ordered(components: list[Component]) -> list[Component]:

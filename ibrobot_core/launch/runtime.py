@@ -10,6 +10,7 @@ from ibrobot_core.errors import ComponentFailed, HardwareError, NotSupported
 from ibrobot_core.launch.builders.control import Control
 from ibrobot_core.launch.builders.planning import check_goals
 from ibrobot_core.launch.component import Component, Worker, cause, exit_code, told
+from ibrobot_core.launch.desk import EpisodeDesk
 from ibrobot_core.launch.plan import LaunchPlan, build_plan, mode_parts
 from ibrobot_core.launch.session import Session
 from ibrobot_core.units import ns
@@ -29,11 +30,17 @@ class Runtime:
         check_goals(session)
         self.session = session
         self.plan: LaunchPlan = build_plan(session)
-        if session.request.episodes is not None and self.plan.episodes_worker is None:
+        counted = self.plan.episodes_worker is not None or session.request.by_operator
+        if session.request.episodes is not None and not counted:
             raise NotSupported(
                 "--episodes counts a policy's episodes in simulation: it needs --sim and a mode with inference; "
                 f"mode {session.mode} ends with --duration, --goal or Ctrl-C"
             )
+        self.desk: EpisodeDesk | None = None
+        """Where an operator begins and ends episodes; None in a run that records nothing."""
+        if self.plan.recording is not None:
+            by_mode = self.plan.episodes_worker is not None or not session.request.by_operator
+            self.desk = EpisodeDesk(session, self.plan.episodes, self.plan.recording, by_mode=by_mode)
         self._mode_parts = self.plan.mode
         session.feeder = self.plan.mode.feeder
         self._started: list[Component] = []
@@ -69,6 +76,8 @@ class Runtime:
         session.bus.serve(SET_MODE, self.switch_mode)
         session.bus.serve(RESET, lambda _: self.reset())
         session.bus.serve(ESTOP, lambda _: session.control.call("estop"))
+        if self.desk is not None:
+            self.desk.serve()
 
     def wait(self, timeout_s: float) -> bool:
         """Wait up to `timeout_s` [s] for the end of the run; True when it has come."""
@@ -122,7 +131,8 @@ class Runtime:
             "ibrobot_mode_changed", robot=session.config.robot.name, mode=name, previous=previous,
             stamp_ns=session.clock.now_ns(),
         )  # fmt: skip
-        self.plan.episodes.begin()
+        if not session.request.by_operator:
+            self.plan.episodes.begin()
 
     def reset(self) -> None:
         """Clear faults and the emergency stop; the mode begins anew from where the joints are.
@@ -146,6 +156,8 @@ class Runtime:
         session.bus.unserve(SET_MODE)
         session.bus.unserve(RESET)
         session.bus.unserve(ESTOP)
+        if self.desk is not None:
+            self.desk.unserve()
         started, self._started = self._started, []
         if (worker := self.plan.episodes_worker) in started:
             started.remove(worker)
@@ -251,4 +263,5 @@ class Runtime:
         session.epoch = session.state.epoch
         if session.feeder is not None:
             session.feeder.begin(session.request.seed)
-        self.plan.episodes.begin()
+        if not session.request.by_operator:
+            self.plan.episodes.begin()

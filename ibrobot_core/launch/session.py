@@ -36,6 +36,10 @@ class Request:
     episodes: int | None = None
     goals: tuple[str, ...] = ()
     keys: Callable[[], Any] | None = None
+    prompt: str = ""
+    """What episodes are recorded under."""
+    by_operator: bool = False
+    """Whether an operator begins and ends episodes, rather than the mode."""
 
 
 @attrs.define

@@ -5,20 +5,24 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import ibrobot_core
+from ibrobot_core.calibration import load_calibration
 from ibrobot_core.config import RobotConfig
 from ibrobot_core.config.schema import Recording
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import RecorderError
 from ibrobot_core.interfaces import EpisodeStart
+from ibrobot_core.recording.dataset import Dataset
 
 _PREFIX = "episode_"
 
 
 def episode_start(
-    config: RobotConfig, recording: Recording, topics: Mapping[str, str], *, mode: str, seed: int, stamp_ns: int
-) -> EpisodeStart:
+    config: RobotConfig, recording: Recording, topics: Mapping[str, str], *, mode: str, seed: int, stamp_ns: int,
+    prompt: str = "",
+) -> EpisodeStart:  # fmt: skip
     """The start of the next episode of the dataset.
 
     Args:
@@ -30,9 +34,10 @@ def episode_start(
         mode: the control mode.
         seed: of the scene.
         stamp_ns: when it begins [ns].
+        prompt: what the operator calls the task.
 
     Raises:
-        RecorderError: when the folder cannot be made.
+        RecorderError: when the folder cannot be made, or the dataset has episodes of another contract.
     """
     contract = Contract.from_config(config)
     root = recording.root / recording.dataset / "episodes"
@@ -40,9 +45,11 @@ def episode_start(
         root.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RecorderError(f"recording.root: {root} cannot be made: {error.strerror}") from None
+    Dataset(root.parent).join(config, contract)
     metadata = {
-        "robot": config.robot.name, "robot_type": config.robot.robot_type, "mode": mode,
+        "robot": config.robot.name, "robot_type": config.robot.robot_type, "mode": mode, "prompt": prompt,
         "contract": json.dumps(contract.canonical()), "fingerprint": contract.fingerprint(),
+        "config": json.dumps(config.document, default=str), "calibration": json.dumps(_calibrations(config)),
         "ibrobot_version": ibrobot_core.__version__, "seed": str(seed),
     }  # fmt: skip
     if recording.topics == "contract":
@@ -58,6 +65,13 @@ def is_kept(topic: str, recording: Recording, contract: Contract) -> bool:
     if recording.topics == "contract":
         return topic in contract.topics
     return recording.topics == "all" or topic in recording.topics
+
+
+def _calibrations(config: RobotConfig) -> dict[str, Any]:
+    """The calibrations of the hardware in use, by its name; nothing for a simulation."""
+    options = {name: component.options for name, component in config.hardware.items()}
+    names = {name: getattr(each, "calibration", None) for name, each in options.items()}
+    return {name: load_calibration(found).numbers() for name, found in names.items() if found is not None}
 
 
 def _next_number(root: Path) -> int:

@@ -17,9 +17,14 @@ from ibrobot_core.interfaces import EpisodeEnd, EpisodeStart, Recorder
 from ibrobot_core.launch.component import Worker, cause
 from ibrobot_core.launch.session import Session
 from ibrobot_core.recording.episode import episode_start, is_kept
+from ibrobot_core.units import NS_PER_S, seconds
 
 _DEPTH = 4096
 """Messages that may wait for the recorder."""
+_RATE_WINDOW = 31
+"""Messages that a measured rate looks back on."""
+_SILENT_NS = NS_PER_S
+"""A topic without a message for so long is silent [ns]."""
 
 
 @attrs.frozen
@@ -56,6 +61,8 @@ class Recording(Worker):
         """Held while an order is stamped and queued, and while orders and messages are taken: neither overtakes."""
         self._incoming: Subscription | None = None
         self._open = False
+        self._seen: dict[str, deque[int]] = {}
+        """Topic -> times of the last messages [ns]."""
         self._lost: Mapping[str, int] = {}
         """Topic -> messages lost on the way here, before the present episode."""
         self.failure: RecorderError | None = None
@@ -68,15 +75,20 @@ class Recording(Worker):
         self._recorder = descriptor.make(self._config.options, session.context("recording"))
         self._incoming = session.bus.subscribe(None, _DEPTH)
 
-    def begin(self, number: int) -> None:
-        """From here on messages belong to a new episode."""
+    def begin(self, number: int, prompt: str) -> None:
+        """From here on messages belong to a new episode.
+
+        Raises:
+            RecorderError: when it cannot be recorded where it should.
+        """
         session = self._session
         topics = {topic: type_ for topic, (type_, _) in session.bus.topics().items()}
         seed = session.request.seed + number - 1
         with self._order:
             start = episode_start(
-                session.config, self._config, topics, mode=session.mode, seed=seed, stamp_ns=session.bus.snapshot_ns()
-            )
+                session.config, self._config, topics, mode=session.mode, seed=seed, stamp_ns=session.bus.snapshot_ns(),
+                prompt=prompt,
+            )  # fmt: skip
             latched = tuple(i for i in session.bus.latched().values() if i.received_ns <= start.stamp_ns)
             self._orders.append(_Begin(start, latched, self._lost_now()))
 
@@ -94,11 +106,41 @@ class Recording(Worker):
             orders, self._orders = self._orders, deque()
             items = [*([first] if first is not None else []), *self._incoming.drain()]
         for item in items:
+            self._note(item)
             while orders and orders[0].stamp_ns < item.received_ns:
                 self._obey(self._recorder, orders.popleft())
             self._write(self._recorder, item, item.received_ns)
         for order in orders:
             self._obey(self._recorder, order)
+
+    def rates(self) -> dict[str, float]:
+        """Measured rate of each topic that is recorded [Hz]; 0 for one that came once."""
+        rates = {}
+        for topic, stamps in self._seen.copy().items():
+            span_ns = stamps[-1] - stamps[0]
+            rates[topic] = (len(stamps) - 1) * NS_PER_S / span_ns if span_ns else 0.0
+        return rates
+
+    def silent(self) -> dict[str, float | None]:
+        """The contract's topics without a message for a second: topic -> for how long [s], None: none ever came."""
+        now_ns = self._session.clock.now_ns()
+        found: dict[str, float | None] = {}
+        for topic in self._contract.topics:
+            stamps = self._seen.get(topic)
+            if stamps is None:
+                found[topic] = None
+            elif now_ns - stamps[-1] > _SILENT_NS:
+                found[topic] = seconds(now_ns - stamps[-1])
+        return found
+
+    def lost(self) -> dict[str, int]:
+        """Messages that were lost on the way here during the present episode, per topic."""
+        counts = self._lost_now() if self._incoming is not None else {}
+        return {topic: n - self._lost.get(topic, 0) for topic, n in counts.items() if n > self._lost.get(topic, 0)}
+
+    def _note(self, item: Received) -> None:
+        if self._keeps(item.topic):
+            self._seen.setdefault(item.topic, deque(maxlen=_RATE_WINDOW)).append(item.received_ns)
 
     def _obey(self, recorder: Recorder, order: _Begin | EpisodeEnd) -> None:
         if isinstance(order, _Begin):

@@ -1,0 +1,160 @@
+"""The operator's desk: begins and ends recorded episodes, for the command line and, as services, for others."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ibrobot_core.errors import NotSupported, RecorderError
+from ibrobot_core.launch.builders.recording import Recording
+from ibrobot_core.launch.episodes import Episodes
+from ibrobot_core.launch.session import Session
+from ibrobot_core.recording.dataset import Dataset
+from ibrobot_core.units import seconds
+
+START = "/record_episode/start"
+"""Request: a prompt, or None for the last. Begins an episode."""
+STOP = "/record_episode/stop"
+"""Request: `success`, `failure` or `unknown`. Ends it."""
+DISCARD = "/record_episode/discard"
+"""Request: None. Ends it, and nothing is left of it."""
+STATUS = "/record_episode/status"
+"""Request: None. Returns what `EpisodeDesk.status` says."""
+OUTCOMES = ("success", "failure", "unknown")
+
+
+class EpisodeDesk:
+    """Episodes that an operator begins and ends. Safe to use from any thread.
+
+    Args:
+        session: the run.
+        episodes: the run's episodes, whose only user this is.
+        recording: what records them.
+        by_mode: whether the mode begins and ends them itself, so that here they can only be watched.
+    """
+
+    def __init__(self, session: Session, episodes: Episodes, recording: Recording, *, by_mode: bool) -> None:
+        self._session = session
+        self._episodes = episodes
+        self._recording = recording
+        self._by_mode = by_mode
+        self._lock = threading.Lock()
+        config = session.config.recording
+        assert config is not None
+        self.folder: Path = config.root / config.dataset
+        self._dataset = Dataset(self.folder)
+        self.saved = 0
+        """Episodes that were recorded and kept."""
+
+    @property
+    def recording(self) -> bool:
+        """Whether an episode is on."""
+        return self._episodes.running
+
+    @property
+    def last_prompt(self) -> str:
+        """The prompt of the last episode, also of an earlier run.
+
+        Raises:
+            RecorderError: when the dataset's file cannot be read.
+        """
+        return self._episodes.prompt or self._dataset.prompt
+
+    def start(self, prompt: str | None = None) -> None:
+        """Begin an episode.
+
+        Args:
+            prompt: what the task is called; the last one's when None.
+
+        Raises:
+            RecorderError: when one is on, a topic of the contract is silent, or the disk is full; says which.
+            NotSupported: where the mode begins episodes itself.
+        """
+        with self._lock:
+            self._check_mine()
+            if self._episodes.running:
+                raise RecorderError("an episode is being recorded; end it first")
+            if silent := self._recording.silent():
+                told = ", ".join(
+                    f"{topic} ({'nothing yet' if age is None else f'nothing for {age:.1f} s'})"
+                    for topic, age in silent.items()
+                )
+                raise RecorderError(f"not recording: the contract's topics are silent: {told}")
+            self._episodes.prompt = self.last_prompt if prompt is None else prompt
+            self._episodes.begin()
+            if self._episodes.prompt:
+                self._dataset.prompt = self._episodes.prompt
+
+    def stop(self, outcome: str = "unknown") -> None:
+        """End the episode.
+
+        Raises:
+            RecorderError: when none is on, or for an outcome that there is not.
+            NotSupported: where the mode ends episodes itself.
+        """
+        if outcome not in OUTCOMES:
+            raise RecorderError(f"outcome must be one of {', '.join(OUTCOMES)}, not {outcome!r}")
+        self._end(outcome)
+        self.saved += 1
+
+    def discard(self) -> None:
+        """End the episode, and leave nothing of it.
+
+        Raises:
+            RecorderError: when none is on.
+            NotSupported: where the mode ends episodes itself.
+        """
+        self._end("discarded")
+
+    def elapsed_s(self) -> float:
+        """Since the episode began [s]; 0 where none is on."""
+        if not self._episodes.running:
+            return 0.0
+        return seconds(self._session.clock.now_ns() - self._episodes.begun_ns)
+
+    def free_bytes(self) -> int:
+        """Space left on the disk of the dataset."""
+        folder = self.folder
+        while not folder.exists():
+            folder = folder.parent
+        disk = os.statvfs(folder)
+        return disk.f_bavail * disk.f_frsize
+
+    def status(self) -> Mapping[str, Any]:
+        """What a front end shows."""
+        failure = self._recording.failure
+        return {
+            "recording": self._episodes.running, "episode": self._episodes.number, "saved": self.saved,
+            "prompt": self._episodes.prompt, "elapsed_s": round(self.elapsed_s(), 2),
+            "max_duration_s": self._session.config.contract.max_duration_s,
+            "rates_hz": {topic: round(rate, 1) for topic, rate in self._recording.rates().items()},
+            "silent": list(self._recording.silent()), "lost": self._recording.lost(),
+            "free_bytes": self.free_bytes(), "failure": str(failure) if failure is not None else "",
+        }  # fmt: skip
+
+    def serve(self) -> None:
+        """Offer the services."""
+        bus = self._session.bus
+        bus.serve(START, self.start)
+        bus.serve(STOP, self.stop)
+        bus.serve(DISCARD, lambda _: self.discard())
+        bus.serve(STATUS, lambda _: self.status())
+
+    def unserve(self) -> None:
+        """Offer them no more."""
+        for service in (START, STOP, DISCARD, STATUS):
+            self._session.bus.unserve(service)
+
+    def _end(self, outcome: str) -> None:
+        with self._lock:
+            self._check_mine()
+            if not self._episodes.running:
+                raise RecorderError("no episode is being recorded")
+            self._episodes.end(outcome)
+
+    def _check_mine(self) -> None:
+        if self._by_mode:
+            raise NotSupported(f"mode {self._session.mode} begins and ends its episodes itself")

@@ -1,0 +1,74 @@
+"""A dataset's own file, `dataset.yaml` beside its episodes: which robot, which contract, the last prompt."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from ibrobot_core.config import RobotConfig
+from ibrobot_core.contract.specs import Contract
+from ibrobot_core.errors import RecorderError
+
+
+class Dataset:
+    """The dataset in a folder.
+
+    Args:
+        folder: `ROOT/DATASET`; need not exist.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._file = folder / "dataset.yaml"
+
+    @property
+    def prompt(self) -> str:
+        """The last prompt; empty where there was none.
+
+        Raises:
+            RecorderError: when `dataset.yaml` cannot be read.
+        """
+        return str(self._read().get("prompt", ""))
+
+    @prompt.setter
+    def prompt(self, prompt: str) -> None:
+        self._write({**self._read(), "prompt": prompt})
+
+    def join(self, config: RobotConfig, contract: Contract) -> None:
+        """See that an episode of this contract may join the others.
+
+        Raises:
+            RecorderError: when they have another contract; shows both.
+        """
+        known = self._read()
+        if "fingerprint" not in known:
+            facts = {"name": self._folder.name, "robot": config.robot.name, "robot_type": config.robot.robot_type}
+            self._write({**facts, "fingerprint": contract.fingerprint(), "contract": contract.canonical(), **known})
+        elif known["fingerprint"] != contract.fingerprint():
+            difference = contract.difference(known.get("contract") or {}, names=("this run", "the dataset"))
+            raise RecorderError(
+                f"{self._file}: its episodes have another contract; record into another dataset "
+                f"(recording.dataset), or change the contract back:\n{difference}"
+            )
+
+    def _read(self) -> dict[str, Any]:
+        try:
+            document = yaml.safe_load(self._file.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            return {}
+        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+            raise RecorderError(f"{self._file}: cannot be read: {error}") from None
+        if not isinstance(document, dict):
+            raise RecorderError(f"{self._file}: must be a mapping, with name, robot, fingerprint and contract")
+        return document
+
+    def _write(self, facts: dict[str, Any]) -> None:
+        staged = self._file.with_suffix(".yaml.new")
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            staged.write_text(yaml.safe_dump(facts, sort_keys=False, allow_unicode=True), encoding="utf-8")
+            staged.replace(self._file)
+        except OSError as error:
+            raise RecorderError(f"{self._file}: cannot be written: {error.strerror}") from None
