@@ -129,7 +129,7 @@ class Operator(Watcher):
     def _state(self) -> str:
         desk = self._desk
         if self._typed is not None:
-            return f"prompt (Enter takes “{desk.last_prompt}”, Esc goes back): {self._typed}_"
+            return f"prompt (Enter alone takes “{desk.last_prompt}”, Tab goes back): {self._typed}_"
         if desk.recording:
             left_s = max(0.0, self._longest_s - desk.elapsed_s())
             prompt = f" “{desk.last_prompt}”" if desk.last_prompt else ""
@@ -159,7 +159,7 @@ class Operator(Watcher):
             typed, self._typed = self._typed, None
             self._resume()
             self._begin(typed or None)
-        elif key == "esc":
+        elif key == _START:
             self._typed = None
             self._resume()
         elif key == "backspace":

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import NotSupported, RecorderError
 from ibrobot_core.launch.builders.recording import Recording
 from ibrobot_core.launch.episodes import Episodes
@@ -34,6 +35,9 @@ class EpisodeDesk:
         episodes: the run's episodes, whose only user this is.
         recording: what records them.
         by_mode: whether the mode begins and ends them itself, so that here they can only be watched.
+
+    Raises:
+        RecorderError: when the dataset has episodes of another contract.
     """
 
     def __init__(self, session: Session, episodes: Episodes, recording: Recording, *, by_mode: bool) -> None:
@@ -46,6 +50,7 @@ class EpisodeDesk:
         assert config is not None
         self.folder: Path = config.root / config.dataset
         self._dataset = Dataset(self.folder)
+        self._dataset.check(Contract.from_config(session.config))
         self.saved = 0
         """Episodes that were recorded and kept."""
 

@@ -37,16 +37,25 @@ class Dataset:
         self._write({**self._read(), "prompt": prompt})
 
     def join(self, config: RobotConfig, contract: Contract) -> None:
+        """See that an episode of this contract may join the others, and make the dataset for the first.
+
+        Raises:
+            RecorderError: when they have another contract, or the file cannot be written.
+        """
+        self.check(contract)
+        known = self._read()
+        if "fingerprint" not in known:
+            facts = {"name": self._folder.name, "robot": config.robot.name, "robot_type": config.robot.robot_type}
+            self._write({**facts, "fingerprint": contract.fingerprint(), "contract": contract.canonical(), **known})
+
+    def check(self, contract: Contract) -> None:
         """See that an episode of this contract may join the others.
 
         Raises:
             RecorderError: when they have another contract; shows both.
         """
         known = self._read()
-        if "fingerprint" not in known:
-            facts = {"name": self._folder.name, "robot": config.robot.name, "robot_type": config.robot.robot_type}
-            self._write({**facts, "fingerprint": contract.fingerprint(), "contract": contract.canonical(), **known})
-        elif known["fingerprint"] != contract.fingerprint():
+        if known.get("fingerprint", contract.fingerprint()) != contract.fingerprint():
             difference = contract.difference(known.get("contract") or {}, names=("this run", "the dataset"))
             raise RecorderError(
                 f"{self._file}: its episodes have another contract; record into another dataset "

@@ -38,12 +38,12 @@ def list_episodes(path: Path, as_json: bool) -> None:
         click.echo(json.dumps(rows, indent=2))
     else:
         table = Table(box=None, padding=(0, 1))
-        for heading in ("episode", "date (UTC)", "s", "messages", "lost", "outcome", "size", "prompt"):
+        for heading in ("episode", "began", "s", "messages", "lost", "outcome", "size", "prompt"):
             right = heading in ("s", "messages", "lost", "size")
             table.add_column(heading, justify="right" if right else "left", no_wrap=heading != "prompt")
         for row in rows:
             table.add_row(
-                _shown(Path(str(row["path"])), path), str(row["date"]), f"{row['duration_s']:.1f}",
+                _shown(Path(str(row["path"])), path), str(row["date"])[5:], f"{row['duration_s']:.1f}",
                 str(row["messages"]), str(row["dropped"]),
                 str(row["outcome"]) if row["finished"] else "[red]unfinished[/red]", told_size(int(str(row["bytes"]))),
                 str(row["prompt"]),

@@ -1,0 +1,71 @@
+"""`ibrobot record` as a user runs it: unattended in simulation, and by keys in a terminal."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from pathlib import Path
+
+import pytest
+import yaml
+
+from ibrobot_core.plugins import installed
+from ibrobot_core.testing.terminal import Terminal
+
+pytestmark = pytest.mark.integration
+
+
+def outcomes(folder: Path) -> list[tuple[str, str, int]]:
+    """Outcome, prompt and number of joint states of each episode."""
+    found = []
+    for path in sorted((folder / "episodes").glob("episode_*")):
+        reader = installed().open_episode(path)
+        summary = reader.summary()
+        reader.close()
+        assert summary.finished
+        found.append((summary.outcome, summary.metadata["prompt"], summary.topics["/joint_states"].count))
+    return found
+
+
+def test_simulated_episodes_are_recorded_unattended_with_the_scenes_judgement(tmp_path: Path, ibrobot: tuple[str, ...]):
+    command = [*ibrobot, "record", "so101_blind", "--sim", "--lockstep", "--headless", "--json", "--episodes", "3"]
+    options = ["--dataset", "pick", "--prompt", "pick the cube", "--set", "contract.max_duration_s=4.5"]
+    done = subprocess.run([*command, *options], cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
+    summary = json.loads(done.stdout.splitlines()[-1])
+    kept = outcomes(tmp_path / "episodes" / "pick")
+    assert [outcome for outcome, _, _ in kept].count("success") == summary["successes"]
+    assert {outcome for outcome, _, _ in kept} == {"success", "failure"}, "some are too slow for the time given"
+    assert done.returncode == 3, done.stderr
+    assert all(prompt == "pick the cube" and count > 400 for _, prompt, count in kept)
+    dataset = yaml.safe_load((tmp_path / "episodes" / "pick" / "dataset.yaml").read_text())
+    assert dataset["robot"] == "so101"
+
+
+def test_an_operator_records_by_keys(tmp_path: Path):
+    arguments = ("record", "so101_blind", "--sim", "--mode", "teleop", "--root", str(tmp_path), "--dataset", "desk")
+    with Terminal(*arguments, columns=120) as terminal:
+        terminal.wait_for("waiting: Tab starts")
+        terminal.type("\t")
+        terminal.wait_for("prompt (Enter alone takes")
+        terminal.type("wave\r")
+        terminal.wait_for("recording “wave”, 1 s")
+        terminal.type("\t")
+        terminal.wait_for("episode 1: success")
+        terminal.type("\t")
+        terminal.wait_for("takes “wave”")
+        terminal.type("\r")
+        terminal.wait_for("recording “wave”, 1 s")
+        terminal.type("\x1b[24~")  # F12
+        terminal.wait_for("episode 2: discarded")
+        terminal.interrupt()
+        terminal.wait_for("recorded   1 episodes")
+        assert terminal.end() == 0
+    (kept,) = outcomes(tmp_path / "desk")
+    assert kept[:2] == ("success", "wave")
+
+
+def test_without_a_terminal_it_says_what_to_add(tmp_path: Path, ibrobot: tuple[str, ...]):
+    command = [*ibrobot, "record", "so101_blind", "--sim", "--headless", "--mode", "teleop"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 2
+    assert "without a terminal nobody can begin an episode: add --auto" in done.stderr

@@ -1,0 +1,176 @@
+"""The operator's desk: episodes by services, what keeps one from beginning, and the dataset's own file."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+import pytest
+import yaml
+
+from ibrobot_core.cli.record import Operator
+from ibrobot_core.errors import NotSupported, RecorderError
+from ibrobot_core.launch.desk import DISCARD, START, STATUS, STOP
+
+if TYPE_CHECKING:
+    from conftest import Runs
+
+    from ibrobot_core.launch.runtime import Runtime
+
+RECORDING = "recording={type: lines, root: kept, dataset: pick}"
+
+
+def ticks(runtime: Runtime, count: int) -> None:
+    for _ in range(count):
+        assert not runtime.step()
+
+
+@pytest.fixture
+def run(runs: Runs, monkeypatch: pytest.MonkeyPatch) -> Runtime:
+    monkeypatch.chdir(runs.folder)
+    runtime = runs.start(RECORDING, mode="teleop", by_operator=True)
+    ticks(runtime, 5)
+    return runtime
+
+
+def folders(runs: Runs) -> list[str]:
+    return sorted(path.name for path in (runs.folder / "kept" / "pick" / "episodes").glob("*"))
+
+
+def test_services_begin_end_and_discard_episodes(run: Runtime, runs: Runs):
+    bus = run.session.bus
+    bus.call(START, "pick the cube")
+    ticks(run, 3)
+    status = bus.call(STATUS, None)
+    assert (status["recording"], status["prompt"], status["episode"]) == (True, "pick the cube", 1)
+    assert status["elapsed_s"] == pytest.approx(0.06)
+    assert status["rates_hz"]["/joint_states"] == pytest.approx(50)
+    bus.call(STOP, "failure")
+    bus.call(START, None)
+    ticks(run, 2)
+    assert bus.call(STATUS, None)["prompt"] == "pick the cube", "the last one"
+    bus.call(DISCARD, None)
+    ticks(run, 2)
+    run.stop()
+    assert ("ended", 1, "failure") in runs.parts.EVENTS
+    assert ("ended", 2, "discarded") in runs.parts.EVENTS
+    assert run.desk is not None
+    assert run.desk.saved == 1
+    assert folders(runs) == ["episode_000001"]
+
+
+def test_metadata_say_how_the_episode_was_made(run: Runtime, runs: Runs):
+    run.session.bus.call(START, "pick")
+    ticks(run, 2)
+    run.session.bus.call(STOP, "success")
+    run.stop()
+    (line,) = (runs.folder / "kept" / "pick" / "episodes").glob("*/metadata.json")
+    metadata = json.loads(line.read_text())
+    assert metadata["prompt"] == "pick"
+    assert json.loads(metadata["config"])["robot"]["name"] == "mini"
+    assert json.loads(metadata["calibration"]) == {}
+    dataset = yaml.safe_load((runs.folder / "kept" / "pick" / "dataset.yaml").read_text())
+    assert (dataset["name"], dataset["robot"], dataset["prompt"]) == ("pick", "mini", "pick")
+    assert dataset["fingerprint"] == metadata["fingerprint"]
+
+
+def test_what_cannot_be_is_refused(run: Runtime):
+    bus = run.session.bus
+    with pytest.raises(RecorderError, match="no episode is being recorded"):
+        bus.call(STOP, "success")
+    bus.call(START, "")
+    with pytest.raises(RecorderError, match="an episode is being recorded; end it first"):
+        bus.call(START, "")
+    with pytest.raises(RecorderError, match="outcome must be one of success, failure, unknown, not 'good'"):
+        bus.call(STOP, "good")
+
+
+def test_a_silent_topic_of_the_contract_is_named(runs: Runs, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(runs.folder)
+    runtime = runs.start(RECORDING, mode="plan", by_operator=True)
+    ticks(runtime, 5)
+    silent = r"silent: /arm/commands \(nothing yet\), /grip/commands \(nothing yet\)"
+    with pytest.raises(RecorderError, match=silent):
+        runtime.session.bus.call(START, "")
+    assert folders(runs) == []
+
+
+def test_a_mode_that_begins_its_own_episodes_keeps_them(runs: Runs, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(runs.folder)
+    runtime = runs.start(RECORDING, mode="policy", by_operator=True)
+    ticks(runtime, 5)
+    assert runtime.session.bus.call(STATUS, None)["recording"]
+    with pytest.raises(NotSupported, match="mode policy begins and ends its episodes itself"):
+        runtime.session.bus.call(STOP, "success")
+
+
+def test_a_dataset_of_another_contract_is_refused_before_anything_starts(run: Runtime, runs: Runs):
+    run.session.bus.call(START, "")
+    run.stop()
+    runs.parts.MADE.clear()
+    with pytest.raises(
+        RecorderError, match="its episodes have another contract; record into another dataset"
+    ) as caught:
+        runs.start(RECORDING, "contract.rate_hz=20", mode="teleop", by_operator=True)
+    assert "this run: 20" in str(caught.value)
+    assert runs.parts.MADE == {}
+
+
+class TestOperator:
+    def watch(self, run: Runtime, **asked: object) -> Operator:
+        operator = Operator(
+            **{"count": None, "reset_time_s": 0.0, "prompt": None, "auto": False, "keys": True, **asked}
+        )
+        operator.attach(run)
+        return operator
+
+    def step(self, run: Runtime, operator: Operator, count: int) -> None:
+        for _ in range(count):
+            operator.step()
+            if run.step():
+                return
+
+    def test_tab_asks_for_a_prompt_and_enter_begins(self, run: Runtime):
+        operator = self.watch(run)
+        for key in ("tab", "h", "o", "p", "backspace", "space", "!"):
+            assert operator.key(key)
+        assert "ho !_" in operator.rows()[0][1]
+        assert not run.desk.recording
+        operator.key("enter")
+        assert run.desk.recording
+        assert "recording “ho !”" in operator.line()
+        operator.key("tab")
+        assert (run.desk.recording, run.desk.saved) == (False, 1)
+        operator.key("tab")
+        operator.key("tab")
+        assert not run.desk.recording, "a second Tab goes back"
+        assert not operator.key("a"), "letters belong to the mode again"
+
+    def test_failure_and_discard(self, run: Runtime, runs: Runs):
+        operator = self.watch(run, prompt="pick")
+        for end in ("f11", "f12"):
+            operator.key("tab")
+            self.step(run, operator, 2)
+            operator.key(end)
+            self.step(run, operator, 2)
+        assert [event[2] for event in runs.parts.EVENTS if event[0] == "ended"] == ["failure", "discarded"]
+        assert run.desk.saved == 1
+
+    def test_unattended_episodes_pause_and_end_with_the_count(self, run: Runtime, runs: Runs):
+        operator = self.watch(run, auto=True, count=2, reset_time_s=0.5, prompt="pick")
+        self.step(run, operator, 50 + 2)
+        assert run.desk.saved == 1
+        assert "set the scene up anew" in operator.line()
+        self.step(run, operator, 200)
+        assert run.session.finished.is_set()
+        assert operator.told().startswith("2 of 2 episodes into")
+        ended = [event for event in runs.parts.EVENTS if event[0] == "ended"]
+        assert ended == [("ended", 1, "unknown"), ("ended", 2, "unknown")]
+
+    def test_why_it_does_not_begin_is_shown(self, runs: Runs, monkeypatch: pytest.MonkeyPatch):
+        monkeypatch.chdir(runs.folder)
+        runtime = runs.start(RECORDING, mode="plan", by_operator=True)
+        operator = self.watch(runtime, auto=True, prompt="")
+        ticks(runtime, 5)
+        self.step(runtime, operator, 3)
+        assert "topics are silent: /arm/commands" in operator.rows()[-1][1]
