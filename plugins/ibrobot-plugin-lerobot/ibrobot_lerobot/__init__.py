@@ -1,1 +1,0 @@
-"""LeRobot datasets for ibrobot: episodes to LeRobot v3 and back, without torch."""
