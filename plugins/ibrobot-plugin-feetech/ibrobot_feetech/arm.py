@@ -148,11 +148,25 @@ def write_calibration(bus: FeetechBus, arm: Arm, servos: Sequence[int] | None = 
         FeetechError: when a servo does not take it.
     """
     for servo in arm.servos if servos is None else servos:
-        bus.write(servo, "torque_enable", 0)
-        bus.write(servo, "lock", 0)
-        for name, value in _calibrated(arm, servo).items():
+        write_eprom(bus, servo, _calibrated(arm, servo))
+
+
+def write_eprom(bus: FeetechBus, servo: int, values: Mapping[str, int]) -> None:
+    """Set registers of a servo's EPROM, torque off, and see that it kept them.
+
+    Raises:
+        FeetechError: when it did not take one.
+    """
+    bus.write(servo, "torque_enable", 0)
+    bus.write(servo, "lock", 0)
+    try:
+        for name, value in values.items():
             bus.write(servo, name, value)
+    finally:
         bus.write(servo, "lock", 1)
+    for name, value in values.items():
+        if (found := bus.read(servo, name)) != value:
+            raise FeetechError(bus.place(servo, name), f"it was set to {value} and reads {found}")
 
 
 def set_up(bus: FeetechBus, arm: Arm, tuning: Tuning, servo: int) -> None:

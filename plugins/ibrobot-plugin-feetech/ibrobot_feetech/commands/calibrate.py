@@ -10,10 +10,9 @@ import click
 
 from ibrobot_core.calibration import Calibration, JointCalibration, calibration_path, save_calibration
 from ibrobot_core.errors import HardwareError, IbrobotError
-from ibrobot_feetech.arm import relax
+from ibrobot_feetech.arm import relax, write_eprom
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.commands.dialogue import agree
-from ibrobot_feetech.commands.eprom import write_eprom
 from ibrobot_feetech.commands.joints import by_servo, joints_of
 from ibrobot_feetech.commands.measure import Answers, Measurement
 from ibrobot_feetech.commands.ports import adapter_serial_number, opened, port_argument

@@ -9,9 +9,9 @@ import attrs
 import click
 
 from ibrobot_core.calibration import Calibration, load_calibration
+from ibrobot_feetech.arm import write_eprom
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.commands.dialogue import agree, show, table
-from ibrobot_feetech.commands.eprom import write_eprom
 from ibrobot_feetech.commands.joints import joints_of
 from ibrobot_feetech.commands.ports import opened, port_argument
 from ibrobot_feetech.errors import NoReply

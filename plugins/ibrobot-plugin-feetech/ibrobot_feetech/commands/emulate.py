@@ -23,6 +23,7 @@ from ibrobot_core.calibration import (
     save_calibration,
 )
 from ibrobot_core.units import TICKS_PER_TURN
+from ibrobot_feetech.commands.joints import SO101
 
 if TYPE_CHECKING:
     from ibrobot_core.config import RobotConfig
@@ -30,7 +31,8 @@ if TYPE_CHECKING:
     from ibrobot_feetech.emulator import Emulator
     from ibrobot_feetech.emulator.physics import PhysicsArm
 
-_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
+_JOINTS = tuple(SO101)
+_GRIPPER = _JOINTS[-1]
 
 _PRIORITY = 70
 """Above a control process's, which waits for the servos."""
@@ -126,7 +128,7 @@ def _physics(config: RobotConfig, calibration: Calibration, emulator: Emulator, 
     from ibrobot_feetech.emulator.physics import PhysicsArm
 
     robot = config.robot
-    closed = {joint.name: joint.lower for joint in robot.joints if joint.name == _JOINTS[-1]}
+    closed = {joint.name: joint.lower for joint in robot.joints if joint.name == _GRIPPER}
     socket = Path(f"{emulator.link or emulator.port.replace('/dev/pts/', '/tmp/ibrobot-emulator-')}.signals")
     try:
         arm = PhysicsArm(config, installed(), Arm(robot.joint_names, calibration, closed), emulator, socket, seed)
@@ -158,12 +160,12 @@ def _calibrate(emulator: Emulator, name: str | None, joints: Sequence[str], robo
 
 def _ranges(joints: Sequence[str], robot: Robot | None) -> dict[str, JointCalibration]:
     """Ranges as the joints' limits, about the middle of the turn; of an SO-101's size where no robot is given."""
-    limits = {joint.name: (joint.lower, joint.upper) for joint in robot.joints} if robot is not None else {}
+    limits = {joint.name: (joint.lower, joint.upper) for joint in robot.joints} if robot is not None else SO101
     found = {}
     for number, joint in enumerate(joints, 1):
-        lower, upper = limits.get(joint, (-1.7, 1.7))
+        lower, upper = limits[joint]
         per_radian = TICKS_PER_TURN / (2 * math.pi)
-        if joint == _JOINTS[-1]:  # anchored at its closed end: about the middle all the same
+        if joint == _GRIPPER:  # anchored at its closed end: about the middle all the same
             half = (upper - lower) / 2
             lower, upper = -half, half
         low, high = math.floor(MIDDLE + lower * per_radian), math.ceil(MIDDLE + upper * per_radian)
