@@ -19,10 +19,10 @@ from collections.abc import Callable, Container, Generator, Iterable, Mapping, S
 from contextlib import suppress
 
 from ibrobot_feetech import protocol
-from ibrobot_feetech.errors import NoReply, PacketError, Place, ServoFault, UnexpectedReply
+from ibrobot_feetech.errors import EpromLocked, NoReply, PacketError, Place, ServoFault, UnexpectedReply
 from ibrobot_feetech.port import SerialPort
 from ibrobot_feetech.protocol import BROADCAST, OVERHEAD, Packet
-from ibrobot_feetech.registers import STS3215, Register, register
+from ibrobot_feetech.registers import STS3215, Register, register, writable
 
 LATE_S = 0.5
 """Longer than a reply can be late [s]: adapters were seen to hold one back for 0.08 s."""
@@ -139,11 +139,14 @@ class FeetechBus:
         """Set a register and wait for the servo to say that it is set.
 
         Raises:
-            FeetechError: when it did not, after all retries.
-            ValueError: for a value that the register cannot hold.
+            FeetechError: when it did not, after all retries, or for a register of EPROM while that is locked.
+            ValueError: for a value that the register cannot hold, or a register that cannot be set.
         """
-        target = register(name)
+        target = writable(name)
         request = protocol.write(servo, target.address, target.encode(value))
+        # A servo acknowledges this all the same, and forgets the value without power.
+        if target.area == "eprom" and self.read_faulty(servo, "lock"):
+            raise EpromLocked(self.place(servo, name), f"EPROM is locked, {value} was not written")
         self._retried(lambda: self._write_once(servo, target, value, request))
 
     def reg_write(self, servo: int, name: str, value: int) -> None:
@@ -152,7 +155,7 @@ class FeetechBus:
         Raises:
             FeetechError: when the servo did not acknowledge it. It is sent once: there is no telling by reading back.
         """
-        target = register(name)
+        target = writable(name)
         request = protocol.reg_write(servo, target.address, target.encode(value))
         self._acknowledged(servo, target, request)
 
@@ -187,9 +190,9 @@ class FeetechBus:
 
         Raises:
             PortError: when the port is gone.
-            ValueError: for a value that the register cannot hold.
+            ValueError: for a value that the register cannot hold, or a register that cannot be set.
         """
-        target = register(name)
+        target = writable(name)
         self.counters["requests"] += 1
         self.port.write(protocol.sync_write(target.address, {s: target.encode(v) for s, v in values.items()}))
 
@@ -271,6 +274,8 @@ class FeetechBus:
             else:
                 return
         else:
+            # Its acknowledgement, which nobody waits for, may be late in its turn.
+            self._expect_late(servo, 0)
             self.counters["requests"] += 1
             self.port.write(request)
         found = self._read_once(servo, target, faulty=True)
@@ -300,7 +305,6 @@ class FeetechBus:
         raise NoReply(self.place(servo, name), f"no reply within {timeout_s * 1e3:.1f} ms")
 
     def _is_answer(self, packet: Packet, length: int) -> bool:
-        # A servo in trouble may answer without parameters; that is told, not read.
         return len(packet.parameters) == length and not self.may_be_late(packet.servo, length)
 
     def _collect(self, expected: int, timeout_s: float, heard: bytearray, received: bytes = b"") -> Generator[Packet]:
@@ -319,12 +323,12 @@ class FeetechBus:
                 # What came may have been garbage: go on while there is time, a packet at a time.
                 received = self.port.read(max(missing, OVERHEAD), deadline)
                 if not received:
+                    yield from scanner.finish()
                     return
                 missing -= len(received)
                 if missing <= 0:
                     deadline = min(last, time.monotonic() + _TRAIL_S)
         finally:
-            scanner.clear()
             self.counters["bad_packets"] += scanner.damaged
             self.counters["discarded_bytes"] += scanner.discarded
 

@@ -35,7 +35,7 @@ class FeetechError(HardwareError):
         what: what happened, with the values.
     """
 
-    check: ClassVar[str]
+    check: ClassVar[str] = "`ibrobot feetech monitor` shows what the servos report"
     """What to look at."""
 
     def __init__(self, place: Place, what: str) -> None:
@@ -65,6 +65,12 @@ class UnexpectedReply(FeetechError):
     """A valid packet that does not answer the request, e.g. one of another servo or length."""
 
     check = "check that no other program uses the port and that no two servos share an id"
+
+
+class EpromLocked(FeetechError):
+    """A write to EPROM that the servo would not keep."""
+
+    check = "set `lock` to 0 first, and to 1 afterwards"
 
 
 class ServoFault(FeetechError):

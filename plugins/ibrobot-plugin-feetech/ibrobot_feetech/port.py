@@ -65,7 +65,6 @@ class SerialPort:
         self._poll = select.poll()
         self._poll.register(self._fd, select.POLLIN)
         self._wake_at = 0
-        self.discard()
 
     def close(self) -> None:
         """Close the port. Safe to call twice."""

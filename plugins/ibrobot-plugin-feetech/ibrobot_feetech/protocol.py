@@ -7,8 +7,6 @@ from enum import IntEnum
 
 import attrs
 
-from ibrobot_feetech.errors import PacketError, Place, ServoFault, UnexpectedReply
-
 HEADER = b"\xff\xff"
 BROADCAST = 0xFE
 MAX_ID = 0xFD
@@ -115,40 +113,6 @@ def _distinct(servos: Iterable[int]) -> Sequence[int]:
     return ids
 
 
-def parse(packet: bytes, place: Place) -> Packet:
-    """The packet that these bytes are, all of them.
-
-    Raises:
-        PacketError: when they are none.
-    """
-    if packet[:2] != HEADER:
-        raise PacketError(place, f"a packet must begin with ff ff, not {packet[:2].hex(' ') or 'nothing'}")
-    if len(packet) < OVERHEAD:
-        raise PacketError(place, f"a packet has at least {OVERHEAD} bytes, not {len(packet)}")
-    if packet[3] != len(packet) - 4:
-        raise PacketError(place, f"the length byte says {packet[3]}, {len(packet) - 4} bytes follow")
-    if packet[-1] != checksum(packet[2:-1]):
-        raise PacketError(place, f"checksum {packet[-1]:#04x}, expected {checksum(packet[2:-1]):#04x}")
-    return Packet(packet[2], packet[4], packet[5:-1])
-
-
-def check_status(packet: Packet, servo: int, size: int, place: Place) -> bytes:
-    """The parameters of the status packet with which `servo` answers a request for `size` bytes.
-
-    Raises:
-        UnexpectedReply: when it comes from another servo or has another length.
-        ServoFault: when an error bit is set.
-    """
-    if packet.servo != servo:
-        raise UnexpectedReply(place, f"servo {packet.servo} answered, {servo} was asked")
-    # A servo in trouble may answer without parameters, and its trouble is what to say.
-    if packet.code:
-        raise ServoFault(place, faults(packet.code))
-    if len(packet.parameters) != size:
-        raise UnexpectedReply(place, f"{len(packet.parameters)} bytes came, {size} were asked for")
-    return packet.parameters
-
-
 def faults(code: int) -> tuple[str, ...]:
     """The names of the bits set in an error byte."""
     return tuple(FAULTS.get(bit, f"unknown error bit {bit}") for bit in range(8) if code >> bit & 1)
@@ -172,9 +136,13 @@ class Scanner:
             packets.append(packet)
         return packets
 
-    def clear(self) -> None:
-        """Forget an unfinished packet, as before a new request."""
-        self._drop(len(self._buffer))
+    def finish(self) -> list[Packet]:
+        """The packets in what looked like the beginning of a longer one, now that nothing more comes."""
+        packets = []
+        while self._buffer:
+            self._drop(1)
+            packets += self.feed(b"")
+        return packets
 
     def _next(self) -> Packet | None:
         buffer = self._buffer

@@ -141,3 +141,16 @@ def register(name: str) -> Register:
     close = get_close_matches(name, STS3215, 1)
     hint = f"did you mean {close[0]!r}?" if close else f"there are: {', '.join(STS3215)}"
     raise KeyError(f"the STS3215 has no register {name!r}, {hint}")
+
+
+def writable(name: str) -> Register:
+    """The register of that name, which can be set.
+
+    Raises:
+        KeyError: when there is none.
+        ValueError: when it can only be read.
+    """
+    found = register(name)
+    if not found.writable:
+        raise ValueError(f"{name} can only be read")
+    return found

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ibrobot_feetech import protocol
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.protocol import OVERHEAD
-from ibrobot_feetech.registers import STS3215, Register, register
+from ibrobot_feetech.registers import STS3215, Register, register, writable
 
 _HEADER = 5
 """Bytes of a reply before its parameters."""
@@ -134,7 +134,7 @@ class SyncWriter:
     def __init__(self, bus: FeetechBus, servos: Sequence[int], name: str = "goal_position") -> None:
         self._bus = bus
         self._servos = tuple(servos)
-        self._register = target = register(name)
+        self._register = target = writable(name)
         self._interleaved = [0] * (2 * len(self._servos))
         self._interleaved[::2] = self._servos
         self._pack = struct.Struct("<" + ("BH" if target.size == 2 else "BB") * len(self._servos)).pack

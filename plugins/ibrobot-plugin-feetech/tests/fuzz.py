@@ -19,7 +19,7 @@ from functools import partial
 
 from ibrobot_feetech import protocol
 from ibrobot_feetech.bus import FeetechBus
-from ibrobot_feetech.errors import FeetechError, PortError
+from ibrobot_feetech.errors import FeetechError, Place, PortError
 from ibrobot_feetech.port import SerialPort
 from ibrobot_feetech.protocol import BROADCAST, Instruction, Packet
 from ibrobot_feetech.sync import SyncReader, SyncWriter
@@ -47,7 +47,7 @@ class MemoryPort(SerialPort):
 
     def read(self, size: int, deadline: float) -> bytes:
         if self._chance.random() < 0.001:
-            raise PortError(protocol.Place(self.path), "the port is gone")
+            raise PortError(Place(self.path), "the port is gone")
         count = self._chance.choice((size, size, size + 3, 1, 7))
         received, self._coming = self._coming[:count], self._coming[count:]
         return received

@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.emulator import Emulator
-from ibrobot_feetech.errors import FeetechError, NoReply, PacketError, PortError, ServoFault, UnexpectedReply
+from ibrobot_feetech.errors import (
+    EpromLocked,
+    FeetechError,
+    NoReply,
+    PacketError,
+    PortError,
+    ServoFault,
+    UnexpectedReply,
+)
 from ibrobot_feetech.sync import SyncReader, SyncWriter
 
 SERVOS = (1, 2, 3, 4, 5, 6)
@@ -31,12 +39,24 @@ class TestRequests:
         bus.write(2, "homing_offset", -77)
         assert bus.read(2, "homing_offset") == emulator.servos[2].get("homing_offset") == -77
 
-    def test_eprom_that_is_locked_is_told(self, bus: FeetechBus, emulator: Emulator) -> None:
+    def test_eprom_is_written_while_unlocked_alone(self, bus: FeetechBus, emulator: Emulator) -> None:
+        with pytest.raises(EpromLocked, match="servo 2, p_coefficient: EPROM is locked, 20 was not written"):
+            bus.write(2, "p_coefficient", 20)
         bus.write(2, "lock", 0)
         bus.write(2, "p_coefficient", 20)
         bus.write(2, "lock", 1)
         emulator.servos[2].brown_out()
         assert bus.read(2, "p_coefficient") == 20
+
+    def test_what_can_only_be_read_is_not_written(self, bus: FeetechBus) -> None:
+        for write in (
+            lambda: bus.write(2, "present_load", 1),
+            lambda: bus.reg_write(2, "present_load", 1),
+            lambda: bus.sync_write("present_load", {2: 1}),
+            lambda: SyncWriter(bus, SERVOS, "present_load"),
+        ):
+            with pytest.raises(ValueError, match="present_load can only be read"):
+                write()
 
     def test_sync_read_and_write_reach_all(self, bus: FeetechBus) -> None:
         goals = {servo: 2000 + servo for servo in SERVOS}
@@ -200,10 +220,25 @@ class TestLateReplies:
         assert bus.counters["timeouts"] == 1
 
     def test_a_register_that_does_not_keep_its_value_is_told(self, bus: FeetechBus, emulator: Emulator) -> None:
+        def overwrite() -> None:
+            emulator.faults.drop = 0.0
+            emulator.servos[2].set("acceleration", 5)
+
         emulator.faults.drop = 1.0
-        emulator.on_request = lambda: setattr(emulator.faults, "drop", 0.0)
-        with pytest.raises(UnexpectedReply, match=r"p_coefficient: it was set to 20 and reads 32"):
-            bus.write(2, "p_coefficient", 20)  # EPROM, which is locked
+        emulator.on_request = overwrite
+        with pytest.raises(UnexpectedReply, match=r"acceleration: it was set to 20 and reads 5"):
+            bus.write(2, "acceleration", 20)
+
+    def test_an_acknowledgement_that_nobody_waited_for_may_be_late_too(
+        self, bus: FeetechBus, emulator: Emulator
+    ) -> None:
+        emulator.faults.drop = 1.0
+        with pytest.raises(NoReply):
+            bus.write(2, "acceleration", 20)
+        emulator.faults.drop = 0.0
+        until = bus.outstanding[2, 0]
+        bus.write(2, "acceleration", 30)
+        assert bus.outstanding[2, 0] > until
 
     def test_resynchronise_forgets_nothing_too_early(self, bus: FeetechBus, counting: Emulator) -> None:
         counting.faults.late, counting.faults.late_s = 1.0, 0.1
