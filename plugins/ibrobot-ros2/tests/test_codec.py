@@ -44,6 +44,7 @@ def of_field(cls: type, name: str, hint: object) -> st.SearchStrategy:
         return of_class(hint)
     if isinstance(hint, types.GenericAlias | typing._GenericAlias):
         dtype = typing.get_args(hint)[-1]
+        dtype = (typing.get_args(dtype) or (dtype,))[0]  # numpy.dtype[…] in older versions of NumPy
         length = FIXED.get(name) if cls in (CameraInfo, Imu) else None
         return hnp.arrays(dtype, length if length is not None else st.integers(0, 5))
     if hint is int:

@@ -15,7 +15,7 @@ from ibrobot_feetech.errors import PortError
 from ibrobot_feetech.registers import BAUD_RATES, MODEL_STS3215
 
 
-class BaudRates(click.ParamType[tuple[int, ...]]):
+class BaudRates(click.ParamType):  # type: ignore[type-arg]  # generic in newer versions only
     """One baud rate, or `all`."""
 
     name = "all|N"
