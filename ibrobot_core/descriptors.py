@@ -53,6 +53,8 @@ class HardwareDescriptor(Descriptor["Hardware"]):
     simulated: bool = False
     sensors: Mapping[str, str] = attrs.field(factory=dict)
     """For simulated hardware, sensor kind -> the sensor type that stands for it, e.g. camera -> mujoco."""
+    torque_off: str = ""
+    """For joints that hold on when no process commands them any more: the command that takes their torque off."""
 
 
 @attrs.frozen

@@ -26,6 +26,8 @@ EMERGENCY_STOP = "emergency stop"
 _POSE_SPEED = 0.25
 """Fraction of the velocity limits at which start and stop move to a pose."""
 _POSE_TIMEOUT_S = 10.0
+_POSE_TOLERANCE = 0.2
+"""How far a joint may hang from a startup pose that it was told [rad]."""
 
 
 @attrs.frozen(eq=False)
@@ -70,6 +72,7 @@ class ControlCore:
         self._relaxed = False
         self._stopping = False
         self._target: Vector | None = None
+        self._arriving = False
         self._tick = 0
         self._commands: dict[str, Callable[..., Mapping[str, Any] | None]] = {
             "switch_mode": self._switch_mode,
@@ -105,6 +108,7 @@ class ControlCore:
         self.mode = mode
         behaviour, _, pose = self._config.control.startup.partition(" ")
         if behaviour == "pose":
+            self._arriving = True
             self._move_to(pose)
         else:
             self._switch_mode(mode)
@@ -115,17 +119,20 @@ class ControlCore:
         Raises:
             HardwareError: when a fault came on the way, or it took too long.
         """
-        if self._target is None:
+        if not self._arriving:
             return True
-        if self.fault:
+        if self.fault or self._target is None:
             raise HardwareError(f"control.startup: {self._config.control.startup}: {self.fault}")
-        if self._at_target:
-            self._target = None
+        away = np.abs(self._measured.position - self._target)
+        if self._at_target and away.max() <= _POSE_TOLERANCE:
+            self._target, self._arriving = None, False
             self._switch_mode(self.mode)
             return True
         if self._late_to_pose:
+            joint = self._robot.joint_names[int(away.argmax())]
             raise HardwareError(
-                f"control.startup: {self._config.control.startup}: not reached within {_POSE_TIMEOUT_S:g} s"
+                f"control.startup: {self._config.control.startup}: not reached within {_POSE_TIMEOUT_S:g} s: "
+                f"{joint} is {away.max():.2f} rad away; check that nothing is in its way"
             )
         return False
 

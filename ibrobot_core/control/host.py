@@ -11,6 +11,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from typing import Any, override
@@ -32,6 +33,8 @@ from ibrobot_core.errors import ComponentFailed, HardwareError, IbrobotError
 from ibrobot_core.plugins import Registry
 
 _START_TIMEOUT_S = 60.0
+_GLANCE_S = 0.1
+"""How often a start looks whether it is given up."""
 _REPLY_TIMEOUT_S = 5.0
 _STOP_TIMEOUT_S = 15.0
 _GONE = "the control process is gone"
@@ -149,11 +152,22 @@ class InlineControl(ControlHost):
 
 
 class ControlClient(ControlHost):
-    """Control in a process of its own. A thread here receives its states and events and notices its death."""
+    """Control in a process of its own. A thread here receives its states and events and notices its death.
+
+    Args:
+        config: the robot YAML.
+        clock: the run's.
+        seed: for simulated hardware.
+        on_state: given each state, in that thread.
+        on_event: given each event, in that thread.
+        on_death: told when it dies.
+        given_up: set when a start is no longer wanted: the robot then stops, wherever it is on its way.
+        aftermath: what to say beside its death.
+    """
 
     def __init__(
         self, config: RobotConfig, clock: RealClock, seed: int, on_state: OnState, on_event: OnEvent,
-        on_death: Callable[[ComponentFailed], None],
+        on_death: Callable[[ComponentFailed], None], *, given_up: threading.Event | None = None, aftermath: str = "",
     ) -> None:  # fmt: skip
         super().__init__(on_state, on_event)
         self._config = config
@@ -162,6 +176,8 @@ class ControlClient(ControlHost):
             "mode": config.default_control_mode, "epoch_offset_ns": clock.epoch_offset_ns, "host": os.getpid(),
         }  # fmt: skip
         self._on_death = on_death
+        self._given_up = given_up or threading.Event()
+        self._aftermath = aftermath
         self._replies: dict[int, queue.SimpleQueue[Mapping[str, Any]]] = {}
         self._ids = itertools.count(1)
         self._stopping = False
@@ -200,12 +216,17 @@ class ControlClient(ControlHost):
         self._thread.start()
 
     def _await_ready(self) -> None:
+        deadline_s = time.monotonic() + _START_TIMEOUT_S
         while self._memory is None:
             try:
-                messages = self._channel.wait(_START_TIMEOUT_S)
+                messages = self._channel.wait(_GLANCE_S)
             except ComponentFailed:
-                raise ComponentFailed(f"the control process died while starting ({self._exit()})") from None
-            if not messages:
+                raise ComponentFailed(
+                    f"the control process died while starting ({self._exit()}){self._aftermath}"
+                ) from None
+            if self._given_up.is_set():
+                raise ComponentFailed("given up while control started")
+            if time.monotonic() > deadline_s:
                 raise ComponentFailed(f"the control process was not ready after {_START_TIMEOUT_S:.0f} s")
             for message in messages:
                 if message["event"] == "failed":
@@ -283,7 +304,7 @@ class ControlClient(ControlHost):
             return
         if not self._stopping:
             why = self._failure or self._exit()
-            self._on_death(ComponentFailed(f"the control process died ({why})"))
+            self._on_death(ComponentFailed(f"the control process died ({why}){self._aftermath}"))
         # Only then those that wait for an answer, so that the cause is told and not its consequence.
         for number in list(self._replies):
             self._take({"reply": number, "error": _GONE})

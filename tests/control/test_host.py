@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import queue
 import signal
+import threading
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -66,6 +67,7 @@ robot:
     - {name: pan, lower: -1.0, upper: 1.0, max_velocity: 3.0, max_acceleration: 40.0}
     - {name: grip, lower: 0.0, upper: 1.0, max_velocity: 3.0, max_acceleration: 40.0}
   groups: {arm: [pan, grip]}
+  description: {poses: {out: [1.0, 1.0]}}
 simulation: {type: arm}
 executors:
   position: {type: position, group: arm}
@@ -107,13 +109,18 @@ def make(site: Site, told: Told) -> Iterator[Callable[..., ControlHost]]:
     site.add("ibrobot-plugin-arm", PLUGIN)
     made: list[ControlHost] = []
 
-    def make_host(kind: str = "process", **options: Any) -> ControlHost:
+    def make_host(
+        kind: str = "process", startup: str = "hold", given_up: threading.Event | None = None, **options: Any
+    ) -> ControlHost:
         document = yaml.safe_load(DOCUMENT)
         document["simulation"] |= options
+        document["control"] = {"startup": startup}
         config = from_document(document, source=Path("mini.yaml"), sim=True)
         host: ControlHost
         if kind == "process":
-            host = ControlClient(config, RealClock(), 0, told.states.put, told.events.put, told.deaths.put)
+            host = ControlClient(
+                config, RealClock(), 0, told.states.put, told.events.put, told.deaths.put, given_up=given_up
+            )
         else:
             host = InlineControl(config, installed(), SteppedClock(), 0, told.states.put, told.events.put)
         made.append(host)
@@ -142,6 +149,14 @@ class TestBoth:
 
         assert (tmp_path / "closed").exists()
 
+    def test_the_mode_begins_at_the_startup_pose(self, make, kind, told):
+        host = make(kind, startup="pose out")
+        host.start()
+        epoch = host.call("counters")["epoch"]
+        if isinstance(host, InlineControl):
+            host.step()
+        np.testing.assert_allclose(told.state(lambda state: state.epoch == epoch).command, 1.0, atol=0.01)
+
     def test_commands_are_answered_with_the_epoch_and_refused_with_the_reason(self, make, kind):
         host = make(kind)
         host.start()
@@ -166,6 +181,15 @@ class TestProcess:
             ticks.append(state.tick)
         assert ticks == list(range(first.tick, first.tick + len(ticks)))
         assert host.lost_states == 0
+
+    def test_a_start_that_is_given_up_on_the_way_stops_the_robot(self, make, tmp_path):
+        given_up = threading.Event()
+        given_up.set()
+        host = make(startup="pose out", given_up=given_up, closed=str(tmp_path / "closed"))
+        with pytest.raises(ComponentFailed, match="given up"):
+            host.start()
+
+        assert (tmp_path / "closed").exists()
 
     def test_a_fault_is_told_and_reset(self, make, told):
         host = make()

@@ -10,6 +10,7 @@ import numpy as np
 from ibrobot_core.clock import RealClock, SteppedClock
 from ibrobot_core.control.host import ControlClient, ControlHost, InlineControl
 from ibrobot_core.control.link import ControlState
+from ibrobot_core.descriptors import HardwareDescriptor
 from ibrobot_core.errors import HardwareError
 from ibrobot_core.launch.component import Component
 from ibrobot_core.launch.session import Session
@@ -48,7 +49,7 @@ class Control(Component):
             assert isinstance(session.clock, RealClock)
             host = ControlClient(
                 session.config, session.clock, session.request.seed, self._publish, self._take,
-                lambda error: session.fail(NAME, error),
+                lambda error: session.fail(NAME, error), given_up=session.finished, aftermath=_aftermath(session),
             )  # fmt: skip
         session.control = host
         host.start()
@@ -96,6 +97,17 @@ class Control(Component):
             )
         else:
             raise HardwareError(f"control sent an unknown event {event['event']!r}")
+
+
+def _aftermath(session: Session) -> str:
+    """What is to do about hardware that no process commands any more."""
+    commands: dict[str, None] = {}
+    for part in () if session.config.simulated else session.config.hardware.values():
+        descriptor = session.registry.find("hardware", part.type)
+        assert isinstance(descriptor, HardwareDescriptor)
+        if descriptor.torque_off:
+            commands[f"`{descriptor.torque_off}`"] = None
+    return f"; if joints still hold, {' and '.join(commands)} takes their torque off" if commands else ""
 
 
 def _stopped_by(session: Session) -> str:

@@ -1,4 +1,4 @@
-"""The plugin's hooks: hardware `feetech_so101`, teleop `so101_leader`, `ibrobot feetech …`, a check of the ports."""
+"""The plugin's hooks: hardware `feetech_so101`, teleop `so101_leader`, `ibrobot feetech …`."""
 
 from __future__ import annotations
 
@@ -37,8 +37,9 @@ def _leader(options: Any, ctx: Context) -> Teleop:
 def ibrobot_hardware() -> Iterable[HardwareDescriptor]:
     """The SO-101 on its servo bus."""
     yield HardwareDescriptor(
-        type="feetech_so101", options=FollowerOptions, make=_follower, summary="SO-101 arm: STS3215 servos on one bus"
-    )
+        type="feetech_so101", options=FollowerOptions, make=_follower, torque_off="ibrobot feetech torque off",
+        summary="SO-101 arm: STS3215 servos on one bus",
+    )  # fmt: skip
 
 
 @hookimpl

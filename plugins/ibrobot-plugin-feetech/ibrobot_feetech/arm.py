@@ -169,8 +169,8 @@ def write_eprom(bus: FeetechBus, servo: int, values: Mapping[str, int]) -> None:
             raise FeetechError(bus.place(servo, name), f"it was set to {value} and reads {found}")
 
 
-def set_up(bus: FeetechBus, arm: Arm, tuning: Tuning, servo: int) -> None:
-    """Set one servo up: torque off, unlock, its registers, lock, and torque on where the joint stands.
+def set_up(bus: FeetechBus, arm: Arm, tuning: Tuning, servo: int, *, torque: bool = True) -> None:
+    """Set one servo up: torque off, unlock, its registers, lock, and with `torque` on again where the joint stands.
 
     Raises:
         FeetechError: when it does not take a register.
@@ -183,7 +183,8 @@ def set_up(bus: FeetechBus, arm: Arm, tuning: Tuning, servo: int) -> None:
     for name, value in {**tuning.registers, **tuning.special.get(arm.names[servo], {})}.items():
         bus.write(servo, name, value)
     bus.write(servo, "lock", 1)
-    hold(bus, servo)
+    if torque:
+        hold(bus, servo)
 
 
 def hold(bus: FeetechBus, servo: int) -> None:

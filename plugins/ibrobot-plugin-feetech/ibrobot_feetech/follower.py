@@ -154,8 +154,8 @@ class FeetechFollower(Hardware):
         for servo in arm.servos:
             # A servo that kept its settings and its torque goes on holding its joint.
             troubled = bus.read_faulty(servo, "status") or bus.read_faulty(servo, "torque_enable") != 1
-            if not self._relaxed and (troubled or servo == _servo(fault)):
-                servos.set_up(bus, arm, self._tuning(), servo)
+            if troubled or servo == _servo(fault):
+                servos.set_up(bus, arm, self._tuning(), servo, torque=not self._relaxed)
         self._start()
 
     @override

@@ -229,6 +229,23 @@ class TestFaults:
         assert rig.register("goal_position")[2] == 2300
         assert not rig.tick().stale
 
+    def test_one_that_browned_out_while_the_arm_is_relaxed_is_set_up_and_stays_relaxed(self, rig: Rig) -> None:
+        rig.tick()
+        rig.follower.relax()
+        with rig.emulator.lock:
+            rig.emulator.servos[3].brown_out()
+        rig.emulator.faults.silent.add(3)
+        for _ in range(3):
+            rig.follower.read()
+        with pytest.raises(NoReply):
+            rig.follower.read()
+        rig.emulator.faults.silent.clear()
+        rig.follower.reset_faults()
+        assert rig.register("torque_enable") == [0] * 6
+        assert rig.register("acceleration") == [254] * 6
+        rig.tick()
+        assert rig.register("torque_enable") == [1] * 6
+
     def test_unplugged_is_a_fault_at_once_and_replugged_it_comes_back(
         self, tmp_path: Path, calibration_file: Path
     ) -> None:

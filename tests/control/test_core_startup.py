@@ -1,0 +1,86 @@
+"""The control loop's work, tick by tick: how the robot goes to its startup pose before its mode begins."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ibrobot_core.errors import HardwareError
+
+REST = [-0.8, 1.0, 0.1]
+
+
+def start(make_rig, **control: str):
+    """Start, without a tick."""
+    rig = make_rig({"control": {"startup": "pose rest", **control}})
+    rig.core.start("stream")
+    rig.hardware.written.append(rig.hardware.read().position)
+    return rig
+
+
+@pytest.fixture
+def rig(make_rig):
+    return start(make_rig)
+
+
+def arrive(rig, longest: int = 1100) -> None:
+    """Tick until the robot is in its mode."""
+    for _ in range(longest):
+        if rig.core.arrived():
+            return
+        rig.tick()
+    raise AssertionError(f"it has not arrived after {longest} ticks")
+
+
+def test_it_arrives_slowly_and_then_the_mode_begins_from_there(rig):
+    rig.tick()
+    rig.plan([0.9, 0.0, 0.9], 0.1)
+    arrive(rig)
+
+    np.testing.assert_allclose(rig.core.state.command, REST, atol=1e-4)
+    assert np.abs(np.diff(rig.hardware.written, axis=0)).max() <= 0.25 * 3.0 * 0.01 * (1 + 1e-9)
+    rig.assert_within_limits()
+    assert rig.interventions == 0
+    rig.plan([-0.7, 0.9, 0.2])
+    np.testing.assert_allclose(rig.tick(60).command, [-0.7, 0.9, 0.2])
+
+
+def test_hold_is_in_its_mode_at_once(make_rig):
+    rig = make_rig({}).start()
+    assert rig.core.arrived()
+
+
+def test_a_joint_that_is_blocked_is_named(rig):
+    rig.tick()
+    blocked = rig.hardware.written[0][1]
+    follow = type(rig.hardware).read
+
+    def read():
+        reading = follow(rig.hardware)
+        reading.position[1] = blocked
+        return reading
+
+    rig.hardware.read = read
+    with pytest.raises(
+        HardwareError, match=r"control.startup: pose rest: not reached within 10 s: lift is \d\.\d\d rad away; check"
+    ):
+        arrive(rig)
+    assert "not active; active: none" in rig.call("goal", executor="arm_position", goal_id="1", goal={})["error"]
+
+
+def test_a_fault_on_the_way_is_told(rig):
+    rig.tick(20)
+    rig.hardware.silent = True
+    rig.tick()
+    with pytest.raises(HardwareError, match=r"control.startup: pose rest: .*the bus is silent"):
+        rig.core.arrived()
+
+
+@pytest.mark.parametrize("stop", ["hold", "relax"])
+def test_a_stop_on_the_way_ends_it(make_rig, stop):
+    rig = start(make_rig, stop=stop)
+    rig.tick(20)
+    assert rig.stop() <= 10
+    assert rig.hardware.relaxed == (stop == "relax")
+    assert np.abs(rig.core.state.command - REST).max() > 0.1
+    rig.assert_within_limits()
