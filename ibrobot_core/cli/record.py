@@ -65,7 +65,10 @@ class Operator(Watcher):
             return
         desk = self._desk
         if desk.recording:
-            if desk.elapsed_s() >= self._longest_s:
+            if desk.failure is not None:
+                self._end(lambda: desk.stop("unknown"))
+                self._refuse(f"recording ended: {desk.failure}")
+            elif desk.elapsed_s() >= self._longest_s:
                 log = self._runtime.session.log
                 log.info("the episode is %g s long (contract.max_duration_s): ended", self._longest_s)
                 self._end(lambda: desk.stop("unknown"))
@@ -140,7 +143,7 @@ class Operator(Watcher):
         return "waiting" if self._auto or self._by_mode else "waiting: Tab starts"
 
     def _saved(self) -> str:
-        saved = self._runtime.plan.episodes.number if self._by_mode else self._desk.saved
+        saved = self._desk.saved
         return f"{saved} of {self._count}" if self._count is not None else str(saved)
 
     def _ask(self) -> None:
@@ -182,10 +185,14 @@ class Operator(Watcher):
         except IbrobotError as error:
             if str(error) != self._complaint:
                 self._runtime.session.log.error("%s", error)
-            self._complaint = str(error)
-            self._not_before_s = self._clock_s() + 1.0 if self._auto else 0.0
+            self._refuse(str(error))
         else:
             self._complaint = ""
+
+    def _refuse(self, why: str) -> None:
+        self._complaint = why
+        if self._auto:  # what keeps an episode from being recorded rarely passes at once
+            self._not_before_s = max(self._not_before_s, self._clock_s() + 1.0)
 
     def _end(self, act: Callable[[], None]) -> None:
         act()

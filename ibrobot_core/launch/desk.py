@@ -51,8 +51,16 @@ class EpisodeDesk:
         self.folder: Path = config.root / config.dataset
         self._dataset = Dataset(self.folder)
         self._dataset.check(Contract.from_config(session.config))
-        self.saved = 0
-        """Episodes that were recorded and kept."""
+
+    @property
+    def saved(self) -> int:
+        """Episodes that were recorded whole and kept."""
+        return self._episodes.saved
+
+    @property
+    def failure(self) -> RecorderError | None:
+        """Why the recording of the present or last episode ended before it; None where it did not."""
+        return self._recording.failure
 
     @property
     def recording(self) -> bool:
@@ -103,7 +111,6 @@ class EpisodeDesk:
         if outcome not in OUTCOMES:
             raise RecorderError(f"outcome must be one of {', '.join(OUTCOMES)}, not {outcome!r}")
         self._end(outcome)
-        self.saved += 1
 
     def discard(self) -> None:
         """End the episode, and leave nothing of it.

@@ -19,6 +19,8 @@ class Episodes:
         self._recording = recording
         self.number = 0
         """Of the present episode, from 1; 0 before the first."""
+        self.saved = 0
+        """Episodes that ended, were kept, and whose recording did not end before them."""
         self.running = False
         self.prompt = session.request.prompt
         """Of the next episode."""
@@ -51,6 +53,7 @@ class Episodes:
         self.running = False
         if self._recording is not None:
             self._recording.end(outcome)
+            self.saved += outcome != "discarded" and self._recording.failure is None
         if outcome == "discarded":
             session.log.info("episode %d: discarded", self.number)
         elif outcome != "unknown":

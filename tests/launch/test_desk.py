@@ -174,3 +174,27 @@ class TestOperator:
         ticks(runtime, 5)
         self.step(runtime, operator, 3)
         assert "topics are silent: /arm/commands" in operator.rows()[-1][1]
+
+    @pytest.mark.parametrize("auto", [False, True])
+    def test_a_full_disk_ends_the_episode_and_it_does_not_count(
+        self, run: Runtime, runs: Runs, monkeypatch: pytest.MonkeyPatch, auto: bool
+    ):
+        def full(*_: object) -> None:
+            raise RecorderError("its disk has 1 MiB left")
+
+        operator = self.watch(run, prompt="pick", auto=auto, count=1)
+        if not auto:
+            operator.key("tab")
+        self.step(run, operator, 3)
+        assert run.desk.recording
+        with monkeypatch.context() as patch:
+            patch.setattr(runs.parts.MADE["recording"], "write", full)
+            self.step(run, operator, 3)
+        assert (run.desk.recording, run.desk.saved) == (False, 0)
+        assert ("", "recording ended: its disk has 1 MiB left") in operator.rows()
+        assert not run.session.finished.is_set(), "the robot goes on"
+        if not auto:
+            operator.key("tab")
+        self.step(run, operator, 60 if auto else 3)
+        assert run.desk.recording, "there is room again"
+        assert operator.rows()[-1][0] != ""

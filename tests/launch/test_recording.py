@@ -28,11 +28,14 @@ class Notes:
         self.ended: list[EpisodeEnd] = []
         self.written: list[tuple[str, object, int]] = []
         self.full = False
+        self.refuses = False
         self.stuck = False
         for name in ("begin", "write", "end"):
             monkeypatch.setattr(recorder, name, getattr(self, name))
 
     def begin(self, episode: EpisodeStart) -> None:
+        if self.refuses:
+            raise RecorderError("its disk has 1 MiB left")
         self.begun.append(episode)
 
     def write(self, topic: str, message: object, received_ns: int) -> None:
@@ -84,6 +87,27 @@ def test_a_recorder_that_fails_costs_its_episode_and_the_robot_goes_on(
     assert len(notes.begun) == 2
     assert len(notes.written) > kept
     assert runtime.plan.episodes.recording_failure is None
+
+
+def test_a_recorder_that_does_not_begin_costs_its_episode_and_the_robot_goes_on(
+    runs: Runs, monkeypatch: pytest.MonkeyPatch
+):
+    runtime, notes = note(runs, monkeypatch)
+    saved = runtime.plan.episodes.saved
+    notes.refuses = True
+    runtime.plan.episodes.begin()
+    ticks(runtime, 5)
+    runtime.plan.episodes.end("success")
+    ticks(runtime, 1)
+    assert (notes.written, notes.ended) == ([], [])
+    assert runtime.session.outcome.faults == ["recording ended: its disk has 1 MiB left"]
+    assert runtime.plan.episodes.saved == saved, "nothing of it was kept"
+    notes.refuses = False
+    runtime.plan.episodes.begin()
+    ticks(runtime, 3)
+    runtime.plan.episodes.end("success")
+    assert notes.written
+    assert runtime.plan.episodes.saved == saved + 1
 
 
 @pytest.mark.parametrize(("topics", "kept"), [("all", True), ("[/late]", True), ("contract", False)])

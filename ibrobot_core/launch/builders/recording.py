@@ -82,6 +82,7 @@ class Recording(Worker):
             RecorderError: when it cannot be recorded where it should.
         """
         session = self._session
+        self.failure = None
         topics = {topic: type_ for topic, (type_, _) in session.bus.topics().items()}
         seed = session.request.seed + number - 1
         with self._order:
@@ -146,7 +147,11 @@ class Recording(Worker):
         if isinstance(order, _Begin):
             self.failure = None
             self._lost = order.lost
-            recorder.begin(order.start)
+            try:
+                recorder.begin(order.start)
+            except RecorderError as error:
+                self._fail(error)
+                return
             self._open = True
             for item in order.latched:
                 self._write(recorder, item, order.stamp_ns)
