@@ -40,7 +40,7 @@ class Bench:
         )
         (self.folder / "arm.yaml").write_text(
             f"robot:\n  name: arm\n  joints:\n{joints}  groups: {{all: [{', '.join(JOINTS)}]}}\n"
-            "  description: {poses: {up: [0.4, 0, 0, 0, 0, 0]}}\n"
+            "  description: {poses: {up: [0.4, 0, 0, 0, 0, 0], far: [1.4, 0, 0, 0, 0, 0]}}\n"
             f"hardware: {{type: feetech_so101, port: {self.emulator.port}, calibration: {self.folder}/arm.json, "
             "anchored: [], lost_replies: 25}\n"
             "executors: {position: {type: position, group: all}}\n"
@@ -149,3 +149,24 @@ def test_startup_goes_slowly_to_a_pose_before_the_mode_begins(bench: Bench) -> N
     steps = [b - a for a, b in itertools.pairwise(goals)]
     slowly = 0.25 * 3.0 * 0.01 * 4096 / 6.283185307
     assert max(steps) <= 2 * slowly + 1
+
+
+def test_ctrl_c_on_the_way_to_the_startup_pose_stops_there(bench: Bench) -> None:
+    run = bench.launch("--set", "control.startup=pose far")
+    run.send_signal(signal.SIGINT)
+    _, err = run.communicate(timeout=PATIENCE_S)
+    assert run.returncode == 0, err
+    with bench.emulator.lock:
+        goal = bench.emulator.servos[1].get("goal_position")
+    assert goal < 2048 + 1.3 * 4096 / 6.283185307
+
+
+def test_a_killed_control_process_leaves_the_torque_on_and_the_host_says_what_takes_it_off(bench: Bench) -> None:
+    run = bench.launch()
+    time.sleep(0.5)
+    (control,) = Path(f"/proc/{run.pid}/task/{run.pid}/children").read_text().split()
+    os.kill(int(control), signal.SIGKILL)
+    _, err = run.communicate(timeout=PATIENCE_S)
+    assert run.returncode == 1
+    assert "(signal 9); if joints still hold, `ibrobot feetech torque off` takes their torque off" in err
+    assert bench.torque() == [True] * 6
