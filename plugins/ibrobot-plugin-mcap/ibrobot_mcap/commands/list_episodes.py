@@ -12,6 +12,10 @@ from rich.table import Table
 from ibrobot_core.errors import RecorderError
 
 
+_WIDE = 100
+"""Columns of a terminal in which prompts have room."""
+
+
 @click.command("list")
 @click.argument("path", type=click.Path(path_type=Path), default=Path("episodes"))
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
@@ -37,8 +41,10 @@ def list_episodes(path: Path, as_json: bool) -> None:
     if as_json:
         click.echo(json.dumps(rows, indent=2))
     else:
+        console = Console()
         table = Table(box=None, padding=(0, 1))
-        for heading in ("episode", "began", "s", "messages", "lost", "outcome", "size", "prompt"):
+        prompts = ("prompt",) if console.width >= _WIDE else ()
+        for heading in ("episode", "began", "s", "messages", "lost", "outcome", "size", *prompts):
             right = heading in ("s", "messages", "lost", "size")
             table.add_column(heading, justify="right" if right else "left", no_wrap=heading != "prompt")
         for row in rows:
@@ -46,9 +52,9 @@ def list_episodes(path: Path, as_json: bool) -> None:
                 _shown(Path(str(row["path"])), path), str(row["date"])[5:], f"{row['duration_s']:.1f}",
                 str(row["messages"]), str(row["dropped"]),
                 str(row["outcome"]) if row["finished"] else "[red]unfinished[/red]", told_size(int(str(row["bytes"]))),
-                str(row["prompt"]),
+                *([str(row["prompt"])] if prompts else []),
             )  # fmt: skip
-        Console().print(table)
+        console.print(table)
     for problem in problems:
         click.echo(f"unreadable: {problem}", err=True)
     if problems:
