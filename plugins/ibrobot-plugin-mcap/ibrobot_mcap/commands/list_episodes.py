@@ -11,7 +11,6 @@ from rich.table import Table
 
 from ibrobot_core.errors import RecorderError
 
-
 _WIDE = 100
 """Columns of a terminal in which prompts have room."""
 
