@@ -22,7 +22,7 @@ _COMPRESSION = {"none": CompressionType.NONE, "lz4": CompressionType.LZ4, "zstd"
 # Not everywhere is there a sync that leaves the file's times alone.
 _sync = getattr(os, "fdatasync", os.fsync)
 _PIECE = 256 * 1024
-"""What is given to the operating system at a time [bytes]."""
+"""What is given to the disk at a time [bytes]."""
 
 
 def _to_disk(descriptor: int, offset: int) -> None:
@@ -52,16 +52,19 @@ class _Output:
     def __init__(self, path: Path) -> None:
         self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
         self.size = 0
+        self._handed = 0
+        """Up to here the disk was given what is in the file [bytes]; whole pieces only."""
         self._closed = False
 
     def write(self, data: bytes) -> int:
         rest = memoryview(data)
         while rest:
-            written = os.write(self._descriptor, rest[: _PIECE - self.size % _PIECE])
+            written = os.write(self._descriptor, rest)
             rest = rest[written:]
             self.size += written
-            if self.size % _PIECE == 0:
-                _to_disk(self._descriptor, self.size - _PIECE)
+        while self._handed + _PIECE <= self.size:
+            _to_disk(self._descriptor, self._handed)
+            self._handed += _PIECE
         return len(data)
 
     def tell(self) -> int:
@@ -77,6 +80,7 @@ class _Output:
         os.ftruncate(self._descriptor, size)
         os.lseek(self._descriptor, size, os.SEEK_SET)
         self.size = size
+        self._handed = min(self._handed, size - size % _PIECE)
 
     def close(self) -> None:
         if not self._closed:
