@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from ibrobot_feetech import bus
 from ibrobot_feetech.emulator import Emulator
 
 from ibrobot_core.calibration import Calibration, JointCalibration, save_calibration
@@ -35,6 +36,12 @@ def prepare(emulator: Emulator, calibration: Calibration) -> None:
         ):
             servo.set(name, value)
         servo.turn((joint.range_min + joint.range_max) / 2 + joint.homing_offset)
+
+
+@pytest.fixture(autouse=True)
+def patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A busy machine may keep the emulator, a thread of this process, from answering for a while."""
+    monkeypatch.setattr(bus, "_ADAPTER_S", 0.05)
 
 
 @pytest.fixture

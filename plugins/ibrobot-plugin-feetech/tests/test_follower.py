@@ -11,7 +11,6 @@ from typing import Any, override
 import attrs
 import numpy as np
 import pytest
-from ibrobot_feetech import bus
 from ibrobot_feetech.emulator import Emulator
 from ibrobot_feetech.errors import FeetechError, NoReply, PortError, ServoFault
 from ibrobot_feetech.follower import FeetechFollower
@@ -27,12 +26,6 @@ from ibrobot_core.testing.hardware import HardwareSuite
 from .conftest import JOINTS, arm_calibration, prepare
 
 TICK = 2 * math.pi / 4096
-
-
-@pytest.fixture(autouse=True)
-def _patience(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A busy machine may keep the emulator, a thread of this process, from answering for a while."""
-    monkeypatch.setattr(bus, "_ADAPTER_S", 0.05)
 
 
 class TestFollower(HardwareSuite):
