@@ -41,7 +41,7 @@ def prepare(emulator: Emulator, calibration: Calibration) -> None:
 @pytest.fixture(autouse=True)
 def patience(monkeypatch: pytest.MonkeyPatch) -> None:
     """A busy machine may keep the emulator, a thread of this process, from answering for a while."""
-    monkeypatch.setattr(bus, "_ADAPTER_S", 0.05)
+    monkeypatch.setattr(bus, "_ADAPTER_S", 0.2)
 
 
 @pytest.fixture
