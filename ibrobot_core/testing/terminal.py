@@ -17,7 +17,7 @@ fcntl.ioctl(0, termios.TIOCSCTTY, 0)
 from ibrobot_core.cli.main import main
 main()
 """
-_TIMEOUT_S = 30.0
+_TIMEOUT_S = 120.0
 
 
 class Terminal:

@@ -46,7 +46,7 @@ class Person:
             ]
         )
         self._left = 5
-        assert self.done.wait(30)
+        assert self.done.wait(120)
 
     def turn(self, servo: int, ticks: int) -> None:
         with self.emulator.lock:
