@@ -5,8 +5,9 @@
 Interleaved, in one run: `ibrobot launch` of the simulated SO-101 with `scripted_pick`, physics and control at 100 Hz,
 three cameras at 30 Hz (synthetic pictures, so that rendering does not hide what recording costs), (a) without and
 (b) with the contract's topics recorded into MCAP, 83 MB/s. Each in a process of its own. Exits with 1 when a message
-was lost, when a bag does not have what its metadata counts, or when the median ratio of p99 lateness (b)/(a) is above
-1.5 while (b) is above 1 ms.
+was lost, when a bag does not have what its metadata counts, when the median ratio of p99 lateness (b)/(a) is above 1.5,
+or when (b) missed more ticks than (a). With --root on a memory disk it shows what recording itself costs, without the
+kernel's writing to a real one.
 """
 
 from __future__ import annotations
@@ -35,7 +36,6 @@ from ibrobot_core.plugins import Registry, discover
 
 CONFIG = Path(__file__).parents[1] / "configs" / "so101.yaml"
 ALLOWED_RATIO = 1.5
-UNNOTICED_US = 1000
 
 
 class Camera(Sensor):
@@ -152,18 +152,20 @@ def pairs(repetitions: int, seconds: float, root: Path | None) -> Iterator[tuple
 
 def compare(repetitions: int, seconds: float, root: Path | None) -> int:
     """Measure in turn, print what was found, and return the exit status."""
-    failed, ratios = False, []
+    failed, ratios, missed = False, [], [0, 0]
     for off, on in pairs(repetitions, seconds, root):
+        missed = [before + result["loop"]["missed"] for before, result in zip(missed, (off, on), strict=True)]
         late_off, late_on = (result["loop"]["lateness_p99_us"] for result in (off, on))
-        ratios.append(late_on / max(1, late_off) if late_on > UNNOTICED_US else min(1.0, late_on / max(1, late_off)))
+        ratios.append(late_on / max(1, late_off))
         failed |= any(e["dropped"] or not e["finished"] or e["messages"] != e["read"] for e in on["kept"])
         lost, faults = on["drops"].get("*", 0), on["faults"]
         if lost or faults:
             print(f"   lost on the way to the recorder: {lost}; faults: {'; '.join(faults) or 'none'}")
             failed = True
     ratio = statistics.median(ratios)
-    failed |= ratio > ALLOWED_RATIO
-    print(f"p99 lateness recorded / without: {ratio:.2f}")
+    # What the loop misses without recording is the machine's doing.
+    failed |= ratio > ALLOWED_RATIO or missed[1] > missed[0]
+    print(f"p99 lateness recorded / without: {ratio:.2f}; ticks missed: {missed[1]} recorded, {missed[0]} without")
     print("FAILED" if failed else "passed")
     return int(failed)
 
