@@ -62,8 +62,8 @@ def render_off_screen(session: nox.Session) -> None:
 def lint(session: nox.Session) -> None:
     """Style, formatting, docstrings."""
     session.install("-c", "constraints.txt", *nox.project.dependency_groups(PROJECT, "lint"))
-    session.run("ruff", "check", ".")
-    session.run("ruff", "format", "--check", ".")
+    session.run("ruff", "check", "--no-cache", ".")
+    session.run("ruff", "format", "--no-cache", "--check", ".")
 
 
 @nox.session

@@ -18,6 +18,7 @@ from ibrobot_core.plugins import discover
 
 if TYPE_CHECKING:
     from cli.conftest import Ran
+
     from conftest import Site
 
 Ibrobot = Callable[..., "Ran"]

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from cli.conftest import Ran
+
     from conftest import Site
 
 Ibrobot = Callable[..., "Ran"]

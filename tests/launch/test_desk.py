@@ -14,7 +14,6 @@ from ibrobot_core.launch.desk import DISCARD, START, STATUS, STOP
 
 if TYPE_CHECKING:
     from conftest import Runs
-
     from ibrobot_core.launch.runtime import Runtime
 
 RECORDING = "recording={type: lines, root: kept, dataset: pick}"

@@ -16,7 +16,6 @@ from ibrobot_core.messages import String
 
 if TYPE_CHECKING:
     from conftest import Runs
-
     from ibrobot_core.launch.runtime import Runtime
 
 
