@@ -52,6 +52,7 @@ KNOWN_PACKAGES: Mapping[tuple[str, str], str] = {
     ("sensor", "opencv"): "ibrobot-plugin-camera",
     ("sensor", "realsense"): "ibrobot-plugin-camera",
     ("recorder", "mcap"): "ibrobot-plugin-mcap",
+    ("dataset", "lerobot"): "ibrobot-plugin-lerobot",
 }
 """Types of this project's own plugins, so that a missing one can be named."""
 

@@ -1,7 +1,7 @@
 """One abstract class per plugin kind; the whole of what an implementation must know."""
 
 from ibrobot_core.interfaces.context import Context
-from ibrobot_core.interfaces.dataset import DatasetWriter, Feature
+from ibrobot_core.interfaces.dataset import DatasetSummary, DatasetWriter, Feature
 from ibrobot_core.interfaces.executor import Executor, GoalState, GoalStatus, Plan
 from ibrobot_core.interfaces.hardware import Episode, Hardware, JointReading, Signal, SimulatedHardware, nan_vector
 from ibrobot_core.interfaces.planner import JointGoal, Planner, PlanRequest, PoseGoal
@@ -15,6 +15,7 @@ from ibrobot_core.interfaces.viewer import Viewer
 
 __all__ = [
     "Context",
+    "DatasetSummary",
     "DatasetWriter",
     "Episode",
     "EpisodeEnd",

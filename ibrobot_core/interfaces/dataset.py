@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import attrs
 import numpy as np
 from numpy.typing import NDArray
+
+from ibrobot_core.errors import NotSupported
 
 
 @attrs.frozen
@@ -20,6 +22,18 @@ class Feature:
     """`float32`, `image`, …"""
     shape: tuple[int, ...]
     names: tuple[str, ...] = ()
+
+
+@attrs.frozen
+class DatasetSummary:
+    """What is known of a dataset on disk without reading its frames."""
+
+    fps: float
+    features: Mapping[str, Feature]
+    metadata: Mapping[str, Any]
+    """What `create` or `merge` was told; empty for a dataset that was not written by this writer."""
+    episodes: int
+    frames: int
 
 
 class DatasetWriter(ABC):
@@ -55,3 +69,29 @@ class DatasetWriter(ABC):
     @abstractmethod
     def finalize(self) -> None:
         """Finish the dataset; frames of an episode not saved are dropped. Safe to call twice."""
+
+    def summary(self, root: Path) -> DatasetSummary | None:
+        """What is in the finished dataset at `root`; None where there is none.
+
+        Raises:
+            DatasetError: when it cannot be read.
+            NotSupported: by default.
+        """
+        raise NotSupported(f"{type(self).__name__} does not read datasets back")
+
+    def merge(self, root: Path, parts: Sequence[Path], metadata: Mapping[str, Any]) -> None:
+        """Append finished datasets of this writer to the one at `root`, or make it of them where there is none.
+
+        Nothing is encoded anew, equal parts give equal bytes, and a crash leaves the old dataset or the new one: a
+        merge that was interrupted once it was certain is completed by the next call of `merge` or `summary`.
+
+        Args:
+            root: where the dataset is or shall be.
+            parts: datasets of the same rate and features, in the order in which their episodes come.
+            metadata: of the whole, in place of what was there.
+
+        Raises:
+            DatasetError: for a part that does not fit, or a full disk; what was there stays as it was.
+            NotSupported: by default.
+        """
+        raise NotSupported(f"{type(self).__name__} does not merge datasets")

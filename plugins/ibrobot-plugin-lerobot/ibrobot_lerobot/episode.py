@@ -1,0 +1,194 @@
+"""One episode, written as a LeRobot dataset of its own: what all others are merged from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import attrs
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from ibrobot_core.errors import DatasetError
+from ibrobot_lerobot import layout
+from ibrobot_lerobot.layout import Column
+from ibrobot_lerobot.pictures import PngEncoder, tiff
+from ibrobot_lerobot.stats import DepthStats, PixelStats, Stats, vector_stats
+from ibrobot_lerobot.video import Encoder, VideoTrack, describe_video
+
+_ROWS_BYTES = 16 << 20
+_ROWS = 1 << 13
+"""Rows are written whenever so many have come together: memory does not grow with the length of an episode."""
+
+
+@attrs.frozen
+class Format:
+    """What every episode of a dataset has in common."""
+
+    stored: Mapping[str, Column]
+    fps: int
+    encoder: Encoder | None
+    """None without videos."""
+    info: Mapping[str, Any]
+    """`info.json` before any episode."""
+
+
+class EpisodeWriter:
+    """Writes the frames of one episode as they come.
+
+    Args:
+        root: the dataset that it becomes; its folder must not exist.
+        form: what all episodes have in common.
+        metadata: for `meta/ibrobot.json`.
+    """
+
+    def __init__(self, root: Path, form: Format, metadata: Mapping[str, Any]) -> None:
+        self._root = root
+        self._form = form
+        self._metadata = metadata
+        self.frames = 0
+        self._tasks: dict[str, int] = {}
+        self._rows: list[dict[str, Any]] = []
+        self._rows_bytes = 0
+        self._vectors: dict[str, list[NDArray[Any]]] = {"task_index": []}
+        """Blocks of rows that have been written, for their statistics."""
+        self._pictures: dict[str, tuple[Any, PixelStats | DepthStats]] = {}
+        self._tracks: dict[str, VideoTrack] = {}
+        path = root / layout.chunk_file(layout.DATA, 0, "parquet")
+        path.parent.mkdir(parents=True)
+        self._schema = layout.table_schema(form.stored)
+        self._table = pq.ParquetWriter(path, self._schema, compression="snappy")
+        try:
+            for column in form.stored.values():
+                self._prepare(column)
+        except BaseException:
+            self.abort()
+            raise
+
+    def _prepare(self, column: Column) -> None:
+        shape = column.feature.shape
+        if column.storage == "video":
+            assert self._form.encoder is not None
+            path = self._video(column.key)
+            path.parent.mkdir(parents=True)
+            self._tracks[column.key] = VideoTrack(path, self._form.fps, shape, self._form.encoder)
+        elif column.storage == "image":
+            self._pictures[column.key] = (PngEncoder(*shape), PixelStats(shape[2]))
+        elif column.storage == "depth":
+            self._pictures[column.key] = (tiff, DepthStats())
+        else:
+            self._vectors[column.key] = []
+
+    def _video(self, key: str) -> Path:
+        return self._root / layout.chunk_file(f"{layout.VIDEOS}/{key}", 0, "mp4")
+
+    def add(self, values: Mapping[str, NDArray[Any]], task: str) -> None:
+        """Append a frame whose values have been checked.
+
+        Raises:
+            DatasetError: when it cannot be encoded or written.
+        """
+        number = self._tasks.setdefault(task, len(self._tasks))
+        row: dict[str, Any] = {
+            "timestamp": self.frames / self._form.fps, "frame_index": self.frames, "episode_index": 0,
+            "index": self.frames, "task_index": number,
+        }  # fmt: skip
+        for key, track in self._tracks.items():
+            track.add(values[key])
+        for key, (encode, stats) in self._pictures.items():
+            suffix = "png" if isinstance(encode, PngEncoder) else "tiff"
+            content = encode(values[key])
+            row[key] = {"bytes": content, "path": f"frame-{self.frames:06d}.{suffix}"}
+            self._rows_bytes += len(content)
+            stats.add(values[key])
+        row |= {key: values[key].copy() for key in self._vectors if key in values}
+        self._rows.append(row)
+        self.frames += 1
+        if self._rows_bytes >= _ROWS_BYTES or len(self._rows) >= _ROWS:
+            self._flush()
+
+    def _flush(self) -> None:
+        arrays = [self._array(field) for field in self._schema]
+        try:
+            self._table.write_table(pa.Table.from_arrays(arrays, schema=self._schema))
+        except OSError as error:
+            raise DatasetError(f"{self._root}: cannot be written: {error}") from error
+        self._rows, self._rows_bytes = [], 0
+
+    def _array(self, field: pa.Field) -> pa.Array:
+        values = [row[field.name] for row in self._rows]
+        if field.name not in self._vectors:
+            return pa.array(values, field.type)
+        block = np.array(values)
+        self._vectors[field.name].append(block)
+        flat = pa.array(block.ravel())
+        return flat if flat.type == field.type else pa.FixedSizeListArray.from_arrays(flat, field.type.list_size)
+
+    def close(self) -> None:
+        """Finish the episode: a dataset that LeRobot loads.
+
+        Raises:
+            DatasetError: when it cannot be written.
+        """
+        try:
+            if self._rows:
+                self._flush()
+            self._table.close()
+            stats = {key: track.close() for key, track in self._tracks.items()}
+            self._write_meta(stats)
+        except OSError as error:
+            raise DatasetError(f"{self._root}: cannot be written: {error}") from error
+        finally:
+            self.abort()
+
+    def abort(self) -> None:
+        """Let go of everything; what was written is worth nothing unless `close` went well."""
+        for track in self._tracks.values():
+            track.abort()
+        self._table.close()
+
+    def _write_meta(self, stats: dict[str, Stats]) -> None:
+        form, n = self._form, self.frames
+        vectors = {key: np.concatenate(blocks) for key, blocks in self._vectors.items()}
+        stats |= {key: vector_stats(values) for key, values in vectors.items() if key in form.stored}
+        stats |= {key: pixels.stats() for key, (_, pixels) in self._pictures.items()}
+        stats = {key: stats[key] for key in form.stored} | counter_stats(n, form.fps, 0, 0, vectors["task_index"])
+        info = {**form.info, "features": {key: dict(entry) for key, entry in form.info["features"].items()}}
+        for key in self._tracks:
+            assert form.encoder is not None
+            info["features"][key]["info"] = describe_video(self._video(key), form.fps, form.encoder)
+        info |= {"total_episodes": 1, "total_frames": n, "total_tasks": len(self._tasks), "splits": {"train": "0:1"}}
+        row: dict[str, Any] = {
+            "episode_index": 0, "tasks": list(self._tasks), "length": n, "data/chunk_index": 0, "data/file_index": 0,
+            "dataset_from_index": 0, "dataset_to_index": n,
+        }  # fmt: skip
+        for key in self._tracks:
+            place = {"chunk_index": 0, "file_index": 0, "from_timestamp": 0.0, "to_timestamp": n / form.fps}
+            row |= {f"videos/{key}/{name}": value for name, value in place.items()}
+        row |= {f"stats/{key}/{name}": value.tolist() for key, each in stats.items() for name, value in each.items()}
+        row |= {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
+        path = self._root / layout.chunk_file(layout.EPISODES, 0, "parquet")
+        path.parent.mkdir(parents=True)
+        pq.write_table(pa.Table.from_pylist([row]), path)
+        pq.write_table(layout.task_table(list(self._tasks)), self._root / layout.TASKS)
+        layout.write_json(self._root / layout.STATS, plain(stats))
+        layout.write_json(self._root / layout.OWN, self._metadata)
+        layout.write_json(self._root / layout.INFO, info)
+
+
+def counter_stats(frames: int, fps: int, begin: int, episode: int, task_numbers: NDArray[Any]) -> dict[str, Stats]:
+    """Statistics of the columns that the writer fills in itself."""
+    index = np.arange(frames)
+    found = {
+        "timestamp": index / fps, "frame_index": index, "episode_index": np.full(frames, episode),
+        "index": index + begin, "task_index": task_numbers,
+    }  # fmt: skip
+    return {key: vector_stats(values[:, None]) for key, values in found.items()}
+
+
+def plain(stats: Mapping[str, Stats]) -> dict[str, Any]:
+    """Statistics as JSON values."""
+    return {key: {name: value.tolist() for name, value in each.items()} for key, each in stats.items()}

@@ -1,0 +1,222 @@
+"""LeRobot v3.0 on disk: paths, `info.json`, table schemas, and what a dataset says of itself."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import attrs
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from ibrobot_core.errors import DatasetError
+from ibrobot_core.interfaces import Feature
+
+INFO = "meta/info.json"
+STATS = "meta/stats.json"
+TASKS = "meta/tasks.parquet"
+OWN = "meta/ibrobot.json"
+"""What `create` and `merge` were told; LeRobot passes it over."""
+DATA = "data"
+EPISODES = "meta/episodes"
+VIDEOS = "videos"
+FILES_PER_CHUNK = 1000
+COUNTERS = {
+    "timestamp": "float32",
+    "frame_index": "int64",
+    "episode_index": "int64",
+    "index": "int64",
+    "task_index": "int64",
+}
+"""Columns that the writer fills in itself."""
+_VERSION = "v3.0"
+_PICTURE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
+_DEPTH_UNITS = {"uint16": "mm", "float32": "m"}
+
+
+def chunk_file(folder: str, number: int, suffix: str) -> str:
+    """Path of file `number`, from 0, of a folder below the root."""
+    chunk, file = divmod(number, FILES_PER_CHUNK)
+    return f"{folder}/chunk-{chunk:03d}/file-{file:03d}.{suffix}"
+
+
+@attrs.frozen
+class Column:
+    """A feature and how it is stored."""
+
+    key: str
+    feature: Feature
+    storage: str
+    """`video`, `image`, `depth` or `vector`."""
+
+    @property
+    def info(self) -> dict[str, Any]:
+        """Its entry in `info.json`."""
+        dtype = {"vector": self.feature.dtype, "depth": "image"}.get(self.storage, self.storage)
+        entry = {"dtype": dtype, "shape": list(self.feature.shape), "names": list(self.feature.names) or None}
+        if self.storage == "depth":
+            entry["info"] = {"is_depth_map": True, "depth_unit": _DEPTH_UNITS[self.feature.dtype]}
+        return entry
+
+    @property
+    def arrow(self) -> pa.DataType:
+        """Its type in the tables."""
+        if self.storage != "vector":
+            return _PICTURE
+        element = pa.from_numpy_dtype(np.dtype(self.feature.dtype))
+        return element if self.feature.shape == (1,) else pa.list_(element, self.feature.shape[0])
+
+    @property
+    def hugging_face(self) -> dict[str, Any]:
+        """Its description in the tables' metadata."""
+        if self.storage != "vector":
+            return {"_type": "Image"}
+        value = {"dtype": self.feature.dtype, "_type": "Value"}
+        return (
+            value
+            if self.feature.shape == (1,)
+            else {"feature": value, "length": self.feature.shape[0], "_type": "List"}
+        )
+
+
+def columns(features: Mapping[str, Feature], *, videos: bool) -> dict[str, Column]:
+    """How the features are stored, by key.
+
+    Raises:
+        DatasetError: for one that LeRobot has no place for.
+    """
+    found = {}
+    for key, feature in features.items():
+        if key in COUNTERS or key == "task" or "/" in key:
+            raise DatasetError(f"feature {key!r}: LeRobot keeps that name for itself, or allows no slash in it")
+        found[key] = Column(key, feature, _storage(key, feature, videos))
+    return found
+
+
+def _storage(key: str, feature: Feature, videos: bool) -> str:
+    if min(feature.shape, default=0) < 1:
+        raise DatasetError(f"feature {key!r} has shape {feature.shape}, every dimension must be at least 1")
+    picture = len(feature.shape) == 3
+    if feature.dtype == "image" and picture and feature.shape[2] in (1, 3):
+        return "video" if videos and feature.shape[2] == 3 else "image"
+    if feature.dtype in _DEPTH_UNITS and picture and feature.shape[2] == 1:
+        return "depth"
+    if len(feature.shape) == 1 and feature.dtype in ("bool", "float32", "float64", "int32", "int64", "uint8", "uint16"):
+        return "vector"
+    raise DatasetError(f"feature {key!r}: {feature.dtype} of shape {feature.shape} is neither a vector nor a picture")
+
+
+def table_schema(stored: Mapping[str, Column]) -> pa.Schema:
+    """The schema of the data tables, in LeRobot's order of columns."""
+    kept = [column for column in stored.values() if column.storage != "video"]
+    fields = [pa.field(column.key, column.arrow) for column in kept]
+    fields += [pa.field(key, pa.from_numpy_dtype(np.dtype(dtype))) for key, dtype in COUNTERS.items()]
+    described = {column.key: column.hugging_face for column in kept}
+    described |= {key: {"dtype": dtype, "_type": "Value"} for key, dtype in COUNTERS.items()}
+    return pa.schema(fields, {"huggingface": json.dumps({"info": {"features": described}})})
+
+
+def new_info(stored: Mapping[str, Column], fps: int, robot_type: str, table_mb: int, video_mb: int) -> dict[str, Any]:
+    """`info.json` of a dataset without episodes."""
+    features = {key: column.info for key, column in stored.items()}
+    features |= {key: {"dtype": dtype, "shape": [1], "names": None} for key, dtype in COUNTERS.items()}
+    return {
+        "codebase_version": _VERSION, "fps": fps, "features": features,
+        "total_episodes": 0, "total_frames": 0, "total_tasks": 0,
+        "chunks_size": FILES_PER_CHUNK, "data_files_size_in_mb": table_mb, "video_files_size_in_mb": video_mb,
+        "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+        "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
+        "robot_type": robot_type, "splits": {},
+    }  # fmt: skip
+
+
+def task_table(tasks: list[str]) -> pa.Table:
+    """`tasks.parquet`: the number of each task; pandas reads the task as its index."""
+    text = {"pandas_type": "unicode", "numpy_type": "object"}
+    described = {
+        "index_columns": ["task"],
+        "column_indexes": [{"name": None, "field_name": None, **text, "metadata": {"encoding": "UTF-8"}}],
+        "columns": [
+            {"name": "task_index", "field_name": "task_index", "pandas_type": "int64", "numpy_type": "int64", "metadata": None},
+            {"name": "task", "field_name": "task", **text, "metadata": None},
+        ],
+        "attributes": {}, "creator": {"library": "pyarrow", "version": pa.__version__}, "pandas_version": "2.2.0",
+    }  # fmt: skip
+    table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), "task": pa.array(tasks, pa.string())})
+    return table.replace_schema_metadata({"pandas": json.dumps(described)})
+
+
+@attrs.frozen
+class OnDisk:
+    """A whole dataset, opened."""
+
+    root: Path
+    info: dict[str, Any]
+    stats: dict[str, Any]
+    """Feature -> name -> nested lists; empty without episodes."""
+    tasks: list[str]
+    """In the order of their numbers."""
+    metadata: dict[str, Any]
+
+    @property
+    def videos(self) -> list[str]:
+        """The keys of the cameras that are stored as videos."""
+        return [key for key, entry in self.info["features"].items() if entry["dtype"] == "video"]
+
+    @property
+    def features(self) -> dict[str, Feature]:
+        """The features, as `create` was told them."""
+        return {
+            key: Feature(_dtype(entry), tuple(entry["shape"]), tuple(entry["names"] or ()))
+            for key, entry in self.info["features"].items()
+            if key not in COUNTERS
+        }
+
+    def episodes(self) -> Iterator[dict[str, Any]]:
+        """The rows of `meta/episodes`, in order."""
+        for path in self.files(EPISODES, "parquet"):
+            with pq.ParquetFile(path) as file:
+                for batch in file.iter_batches(batch_size=64):
+                    yield from batch.to_pylist()
+
+    def files(self, folder: str, suffix: str) -> list[Path]:
+        """The files of a folder below the root, in order."""
+        return sorted((self.root / folder).glob(f"chunk-*/file-*.{suffix}"))
+
+
+def open_dataset(root: Path) -> OnDisk | None:
+    """The dataset at `root`; None where there is none.
+
+    Raises:
+        DatasetError: when it cannot be read, or is of another version.
+    """
+    if not (root / INFO).exists():
+        return None
+    try:
+        info = json.loads((root / INFO).read_bytes())
+        stats = json.loads((root / STATS).read_bytes()) if (root / STATS).exists() else {}
+        table = pq.read_table(root / TASKS).sort_by("task_index") if (root / TASKS).exists() else None
+        tasks = table.column("task").to_pylist() if table is not None else []
+        metadata = json.loads((root / OWN).read_bytes()) if (root / OWN).exists() else {}
+        version = info["codebase_version"]
+    except (OSError, ValueError, KeyError, TypeError, pa.ArrowException) as error:
+        raise DatasetError(f"{root}: no dataset of LeRobot's: {error!r}") from error
+    if version != _VERSION:
+        raise DatasetError(f"{root}: is of version {version!r}, must be {_VERSION!r}; LeRobot converts older ones")
+    return OnDisk(root, info, stats, tasks, metadata)
+
+
+def write_json(path: Path, document: Any) -> None:
+    """Write a JSON file, and the folder it lies in."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(document, indent=4, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def _dtype(entry: Mapping[str, Any]) -> str:
+    more = entry.get("info") or {}
+    if entry["dtype"] == "image" and more.get("is_depth_map"):
+        return next(dtype for dtype, unit in _DEPTH_UNITS.items() if unit == more.get("depth_unit"))
+    return "image" if entry["dtype"] == "video" else str(entry["dtype"])

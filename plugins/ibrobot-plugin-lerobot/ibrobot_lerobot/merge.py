@@ -1,0 +1,278 @@
+"""Merging datasets: tables renumbered, videos joined without encoding anew; all of it or nothing."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import attrs
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from ibrobot_core.errors import DatasetError
+from ibrobot_lerobot import layout
+from ibrobot_lerobot.episode import counter_stats, plain
+from ibrobot_lerobot.layout import OnDisk
+from ibrobot_lerobot.stats import Stats, aggregate
+from ibrobot_lerobot.video import VideoFile, join_videos
+
+_MERGING = ".merging"
+"""Where a merge is made; worth nothing."""
+_MERGED = ".merged"
+"""Where a merge is certain: its files need only be moved to their places."""
+_EPISODES_AT_ONCE = 64
+
+
+def complete(root: Path) -> None:
+    """Finish a merge that was interrupted once it was certain.
+
+    Raises:
+        DatasetError: when a file cannot be moved.
+    """
+    merged = root / _MERGED
+    if not merged.is_dir():
+        return
+    try:
+        # `info.json` says that there is a dataset, so it comes last.
+        files = sorted((p for p in merged.rglob("*") if p.is_file()), key=lambda p: (p == merged / layout.INFO, p))
+        for path in files:
+            target = root / path.relative_to(merged)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            path.replace(target)
+        shutil.rmtree(merged)
+    except OSError as error:
+        raise DatasetError(f"{root}: the merge cannot be completed: {error}") from error
+
+
+def adopt(root: Path, part: Path) -> None:
+    """Make `part`, which lies below `root`, the dataset at `root`, which has none yet.
+
+    Raises:
+        DatasetError: when a file cannot be moved.
+    """
+    try:
+        part.rename(root / _MERGED)
+    except OSError as error:
+        raise DatasetError(f"{part}: cannot be moved: {error}") from error
+    complete(root)
+
+
+def merge(root: Path, parts: Sequence[Path], metadata: Mapping[str, Any]) -> None:
+    """Append the episodes of `parts` to the dataset at `root`; see `DatasetWriter.merge`."""
+    complete(root)
+    old = layout.open_dataset(root)
+    if not parts:
+        raise DatasetError(f"{root}: nothing to merge")
+    merging = root / _MERGING
+    try:
+        shutil.rmtree(merging, ignore_errors=True)
+        merging.mkdir(parents=True)
+        _Merge(merging, old).run(parts, metadata)
+        merging.rename(root / _MERGED)
+    except (OSError, pa.ArrowException) as error:
+        raise DatasetError(f"{root}: cannot be merged: {error}") from error
+    finally:
+        shutil.rmtree(merging, ignore_errors=True)
+    complete(root)
+
+
+@attrs.define
+class _Place:
+    """A file that is growing: which one, how much of it there is, and where it began."""
+
+    number: int
+    bytes: int = 0
+    frames: int = 0
+
+
+class _Merge:
+    """One merge into the empty folder `target`, after what `old` has."""
+
+    def __init__(self, target: Path, old: OnDisk | None) -> None:
+        self._target = target
+        self._old = old
+        self._tasks = {task: i for i, task in enumerate(old.tasks)} if old else {}
+        self._stats: list[dict[str, Stats]] = [_arrays(old.stats)] if old and old.stats else []
+        self._episode = old.info["total_episodes"] if old else 0
+        self._frame = old.info["total_frames"] if old else 0
+        self._table: pq.ParquetWriter | None = None
+        self._data = _Place(_next(old, layout.DATA, "parquet"))
+        self._videos: dict[str, _Place] = {}
+        self._joining: dict[str, list[VideoFile]] = {}
+        self._rows: list[dict[str, Any]] = []
+        self._rows_table: pq.ParquetWriter | None = None
+        self._rows_number = _next(old, layout.EPISODES, "parquet")
+        self._info: dict[str, Any] = old.info if old else {}
+
+    def run(self, parts: Iterable[Path], metadata: Mapping[str, Any]) -> None:
+        try:
+            for path in parts:
+                part = layout.open_dataset(path)
+                if part is None:
+                    raise DatasetError(f"{path}: there is no dataset")
+                self._check(part)
+                self._append(part)
+                if len(self._rows) >= _EPISODES_AT_ONCE:
+                    self._flush_rows()
+            self._flush_rows()
+            for key in self._joining:
+                self._join(key)
+        finally:
+            for table in (self._table, self._rows_table):
+                if table is not None:
+                    table.close()
+        self._write_meta(metadata)
+
+    def _check(self, part: OnDisk) -> None:
+        """See that a part fits, and take the first one's description where there was none."""
+        if not self._info:
+            self._info = part.info
+        for name in ("fps", "features"):
+            if part.info[name] != self._info[name]:
+                raise DatasetError(
+                    f"{part.root} does not fit: its {name} are {_difference(part.info[name], self._info[name])}"
+                )
+
+    def _append(self, part: OnDisk) -> None:
+        tasks = np.array([self._tasks.setdefault(task, len(self._tasks)) for task in part.tasks], dtype=np.int64)
+        data = [self._append_table(path, tasks) for path in part.files(layout.DATA, "parquet")]
+        rows = list(part.episodes())
+        videos = {key: self._append_videos(part, key, rows) for key in part.videos}
+        for row in rows:
+            n = row["length"]
+            place = data[_number(row, "data")]
+            stats = _row_stats(row)
+            task_numbers = tasks[[part.tasks.index(task) for task in row["tasks"]]]
+            stats |= counter_stats(n, self._info["fps"], self._frame, self._episode, np.resize(task_numbers, n))
+            moved: dict[str, Any] = {
+                "episode_index": self._episode, "tasks": row["tasks"], "length": n, **_indices("data", place),
+                "dataset_from_index": self._frame, "dataset_to_index": self._frame + n,
+            }  # fmt: skip
+            for key, places in videos.items():
+                file, begin_s = places[_number(row, f"videos/{key}")]
+                moved |= _indices(f"videos/{key}", file)
+                for name in ("from_timestamp", "to_timestamp"):
+                    moved[f"videos/{key}/{name}"] = row[f"videos/{key}/{name}"] + begin_s
+            moved |= {f"stats/{key}/{name}": v.tolist() for key, each in stats.items() for name, v in each.items()}
+            self._rows.append(moved | _indices("meta/episodes", self._rows_number))
+            self._stats = (
+                [{key: aggregate([self._stats[0][key], stats[key]]) for key in stats}] if self._stats else [stats]
+            )
+            self._episode += 1
+            self._frame += n
+
+    def _append_table(self, path: Path, tasks: np.ndarray[Any, Any]) -> int:
+        """Append a table of a part, renumbered; returns the number of the file that it became a part of."""
+        size = path.stat().st_size
+        limit = self._info["data_files_size_in_mb"] << 20
+        if self._table is not None and self._data.bytes + size > limit:
+            self._table.close()
+            self._table, self._data = None, _Place(self._data.number + 1)
+        with pq.ParquetFile(path) as file:
+            if self._table is None:
+                target = self._target / layout.chunk_file(layout.DATA, self._data.number, "parquet")
+                target.parent.mkdir(parents=True, exist_ok=True)
+                self._table = pq.ParquetWriter(target, file.schema_arrow, compression="snappy")
+            for group in range(file.num_row_groups):
+                table = file.read_row_group(group)
+                for name, offset in (("index", self._frame), ("episode_index", self._episode)):
+                    table = _replaced(table, name, table.column(name).to_numpy() + offset)
+                table = _replaced(table, "task_index", tasks[table.column("task_index").to_numpy()])
+                self._table.write_table(table)
+        self._data.bytes += size
+        return self._data.number
+
+    def _append_videos(self, part: OnDisk, key: str, rows: list[dict[str, Any]]) -> list[tuple[int, float]]:
+        """Note a part's videos of a camera for joining; returns file and beginning [s] of each."""
+        limit = self._info["video_files_size_in_mb"] << 20
+        frames: dict[int, int] = {}
+        for row in rows:
+            number = _number(row, f"videos/{key}")
+            frames[number] = frames.get(number, 0) + row["length"]
+        placed = []
+        place = self._videos.setdefault(key, _Place(_next(self._old, f"{layout.VIDEOS}/{key}", "mp4")))
+        for number, path in enumerate(part.files(f"{layout.VIDEOS}/{key}", "mp4")):
+            size = path.stat().st_size
+            if place.frames and place.bytes + size > limit:
+                self._join(key)
+                place = self._videos[key] = _Place(place.number + 1)
+            placed.append((place.number, place.frames / self._info["fps"]))
+            self._joining.setdefault(key, []).append(VideoFile(path, frames[number]))
+            place.bytes, place.frames = place.bytes + size, place.frames + frames[number]
+        return placed
+
+    def _join(self, key: str) -> None:
+        """Write the video of a camera that is complete."""
+        path = self._target / layout.chunk_file(f"{layout.VIDEOS}/{key}", self._videos[key].number, "mp4")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        join_videos(self._joining[key], path, self._info["fps"])
+        self._joining[key] = []
+
+    def _flush_rows(self) -> None:
+        if not self._rows:
+            return
+        table = pa.Table.from_pylist(self._rows, None if self._rows_table is None else self._rows_table.schema)
+        if self._rows_table is None:
+            path = self._target / layout.chunk_file(layout.EPISODES, self._rows_number, "parquet")
+            path.parent.mkdir(parents=True)
+            self._rows_table = pq.ParquetWriter(path, table.schema)
+        self._rows_table.write_table(table)
+        self._rows = []
+
+    def _write_meta(self, metadata: Mapping[str, Any]) -> None:
+        info = self._info | {
+            "total_episodes": self._episode, "total_frames": self._frame, "total_tasks": len(self._tasks),
+            "splits": {"train": f"0:{self._episode}"},
+        }  # fmt: skip
+        pq.write_table(layout.task_table(list(self._tasks)), self._target / layout.TASKS)
+        layout.write_json(self._target / layout.STATS, plain(self._stats[0]))
+        layout.write_json(self._target / layout.OWN, metadata)
+        layout.write_json(self._target / layout.INFO, info)
+
+
+def _next(old: OnDisk | None, folder: str, suffix: str) -> int:
+    """The number of the first file after those that there are: old files are never touched."""
+    files = old.files(folder, suffix) if old else []
+    if not files:
+        return 0
+    chunk, file = files[-1].parent.name.removeprefix("chunk-"), files[-1].stem.removeprefix("file-")
+    return int(chunk) * layout.FILES_PER_CHUNK + int(file) + 1
+
+
+def _number(row: Mapping[str, Any], what: str) -> int:
+    """Which file of a folder an episode's row names."""
+    number: int = row[f"{what}/chunk_index"] * layout.FILES_PER_CHUNK + row[f"{what}/file_index"]
+    return number
+
+
+def _indices(what: str, number: int) -> dict[str, int]:
+    chunk, file = divmod(number, layout.FILES_PER_CHUNK)
+    return {f"{what}/chunk_index": chunk, f"{what}/file_index": file}
+
+
+def _replaced(table: pa.Table, name: str, values: np.ndarray[Any, Any]) -> pa.Table:
+    position = table.schema.get_field_index(name)
+    return table.set_column(position, table.schema.field(position), pa.array(values))
+
+
+def _row_stats(row: Mapping[str, Any]) -> dict[str, Stats]:
+    found: dict[str, Stats] = {}
+    for column, value in row.items():
+        if column.startswith("stats/"):
+            key, _, name = column.removeprefix("stats/").rpartition("/")
+            found.setdefault(key, {})[name] = np.array(value)
+    return found
+
+
+def _arrays(stats: Mapping[str, Any]) -> dict[str, Stats]:
+    return {key: {name: np.array(value) for name, value in each.items()} for key, each in stats.items()}
+
+
+def _difference(found: Any, wanted: Any) -> str:
+    if not isinstance(found, Mapping):
+        return f"{found}, the others' {wanted}"
+    keys = [key for key in {**wanted, **found} if found.get(key) != wanted.get(key)]
+    return "; ".join(f"{key} {found.get(key)}, the others' {wanted.get(key)}" for key in keys)
