@@ -56,7 +56,11 @@ class Column:
     def info(self) -> dict[str, Any]:
         """Its entry in `info.json`."""
         dtype = {"vector": self.feature.dtype, "depth": "image"}.get(self.storage, self.storage)
-        entry = {"dtype": dtype, "shape": list(self.feature.shape), "names": list(self.feature.names) or None}
+        entry: dict[str, Any] = {
+            "dtype": dtype,
+            "shape": list(self.feature.shape),
+            "names": list(self.feature.names) or None,
+        }
         if self.storage == "depth":
             entry["info"] = {"is_depth_map": True, "depth_unit": _DEPTH_UNITS[self.feature.dtype]}
         return entry
@@ -136,11 +140,12 @@ def new_info(stored: Mapping[str, Column], fps: int, robot_type: str, table_mb: 
 def task_table(tasks: list[str]) -> pa.Table:
     """`tasks.parquet`: the number of each task; pandas reads the task as its index."""
     text = {"pandas_type": "unicode", "numpy_type": "object"}
+    number = {"pandas_type": "int64", "numpy_type": "int64"}
     described = {
         "index_columns": ["task"],
         "column_indexes": [{"name": None, "field_name": None, **text, "metadata": {"encoding": "UTF-8"}}],
         "columns": [
-            {"name": "task_index", "field_name": "task_index", "pandas_type": "int64", "numpy_type": "int64", "metadata": None},
+            {"name": "task_index", "field_name": "task_index", **number, "metadata": None},
             {"name": "task", "field_name": "task", **text, "metadata": None},
         ],
         "attributes": {}, "creator": {"library": "pyarrow", "version": pa.__version__}, "pandas_version": "2.2.0",

@@ -95,7 +95,7 @@ class _Merge:
         self._target = target
         self._old = old
         self._tasks = {task: i for i, task in enumerate(old.tasks)} if old else {}
-        self._stats: list[dict[str, Stats]] = [_arrays(old.stats)] if old and old.stats else []
+        self._stats = _arrays(old.stats) if old else {}
         self._episode = old.info["total_episodes"] if old else 0
         self._frame = old.info["total_frames"] if old else 0
         self._table: pq.ParquetWriter | None = None
@@ -158,9 +158,9 @@ class _Merge:
                     moved[f"videos/{key}/{name}"] = row[f"videos/{key}/{name}"] + begin_s
             moved |= {f"stats/{key}/{name}": v.tolist() for key, each in stats.items() for name, v in each.items()}
             self._rows.append(moved | _indices("meta/episodes", self._rows_number))
-            self._stats = (
-                [{key: aggregate([self._stats[0][key], stats[key]]) for key in stats}] if self._stats else [stats]
-            )
+            self._stats = {
+                key: aggregate([self._stats[key], each]) if key in self._stats else each for key, each in stats.items()
+            }
             self._episode += 1
             self._frame += n
 
@@ -228,7 +228,7 @@ class _Merge:
             "splits": {"train": f"0:{self._episode}"},
         }  # fmt: skip
         pq.write_table(layout.task_table(list(self._tasks)), self._target / layout.TASKS)
-        layout.write_json(self._target / layout.STATS, plain(self._stats[0]))
+        layout.write_json(self._target / layout.STATS, plain(self._stats))
         layout.write_json(self._target / layout.OWN, metadata)
         layout.write_json(self._target / layout.INFO, info)
 

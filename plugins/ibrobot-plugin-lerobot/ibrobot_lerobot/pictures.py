@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from fractions import Fraction
 from typing import Any
 
 import av
@@ -25,10 +26,11 @@ class PngEncoder:
 
     def __init__(self, height: int, width: int, channels: int) -> None:
         self._format = _PNG_FORMATS[channels]
-        self._codec: Any = av.CodecContext.create("png", "w")
-        self._codec.width, self._codec.height, self._codec.pix_fmt = width, height, self._format
-        self._codec.time_base = "1/1"
-        self._codec.options = {"compression_level": "1", "pred": "up"}
+        codec: Any = av.CodecContext.create("png", "w")
+        codec.width, codec.height, codec.pix_fmt = width, height, self._format
+        codec.time_base = Fraction(1)
+        codec.options = {"compression_level": "1", "pred": "up"}
+        self._codec = codec
 
     def __call__(self, image: NDArray[np.uint8]) -> bytes:
         """A file of `image`, shape (H, W, C)."""

@@ -40,8 +40,8 @@ class PixelStats:
         """Count a picture, shape (H, W, C)."""
         step = thinning(*image.shape[:2])
         thinned = image[::step, ::step]
-        for channel, counts in enumerate(self._histogram):
-            counts += np.bincount(thinned[..., channel].ravel(), minlength=256)
+        for channel in range(len(self._histogram)):
+            self._histogram[channel] += np.bincount(thinned[..., channel].ravel(), minlength=256)
         self._pictures += 1
 
     def stats(self) -> Stats:

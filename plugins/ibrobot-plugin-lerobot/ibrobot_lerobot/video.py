@@ -70,8 +70,9 @@ def _encoder(codec: str, options: LeRobotOptions) -> Encoder:
         told |= {"rc": "constqp", "qp": str(options.crf)}
     else:
         told["q:v"] = str(max(1, 100 - 2 * options.crf))
-    described = {
-        "video.g": options.gop, "video.crf": options.crf, "video.preset": int(preset) if preset.isdigit() else preset or None,
+    described: dict[str, Any] = {
+        "video.g": options.gop, "video.crf": options.crf,
+        "video.preset": int(preset) if preset.isdigit() else preset or None,
         "video.fast_decode": 0, "video.video_backend": "pyav", "video.extra_options": {},
     }  # fmt: skip
     return Encoder(codec, told, described)
@@ -109,15 +110,16 @@ class VideoTrack:
         self._stats = PixelStats(shape[2])
         self._count = 0
         self._failure: Exception | None = None
-        self._queue: Queue[av.VideoFrame | None] = Queue(_QUEUED)
+        self._queue: Queue[Any] = Queue(_QUEUED)
         try:
             self._container: Any = av.open(str(path), "w", format="mp4")
-            self._stream: Any = self._container.add_stream(encoder.codec, fps, options=encoder.options)
+            stream: Any = self._container.add_stream(encoder.codec, fps, options=encoder.options)
         except (av.error.FFmpegError, ValueError) as error:
             raise DatasetError(f"{path}: {error}") from error
-        self._stream.height, self._stream.width = shape[:2]
-        self._stream.pix_fmt = PIXEL_FORMAT
-        self._stream.time_base = self._time_base = Fraction(1, fps)
+        stream.height, stream.width = shape[:2]
+        stream.pix_fmt = PIXEL_FORMAT
+        stream.time_base = self._time_base = Fraction(1, fps)
+        self._stream = stream
         self._thread = threading.Thread(target=self._run, name=f"encode {path.name}", daemon=True)
         self._thread.start()
 
@@ -154,7 +156,7 @@ class VideoTrack:
                 continue
             self._thread.join(0.05)
 
-    def _put(self, frame: av.VideoFrame | None) -> None:
+    def _put(self, frame: Any) -> None:
         while True:
             if self._failure is not None:
                 raise self._failed()
