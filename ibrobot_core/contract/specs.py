@@ -85,6 +85,31 @@ class Contract:
                 raise ContractError(f"{key} has several specs and one is an image; only vectors concatenate")
         return contract
 
+    @classmethod
+    def from_canonical(cls, canonical: Mapping[str, Any]) -> Contract:
+        """The contract that gave `canonical`, e.g. read back from an episode; of equal fingerprint.
+
+        What shapes no data is not in there: the executors, which go by their topics here, and what follows when
+        setpoints go stale.
+
+        Raises:
+            ContractError: when it is not what `canonical` gives.
+        """
+        try:
+            parts = [
+                _recorded_observation(key, part) for key, each in canonical["observations"].items() for part in each
+            ]
+            actions = [
+                ActionPart(part["topic"], part["topic"], part["type"], "hold", tuple(part["joints"]))
+                for part in canonical["action"]
+            ]
+            contract = cls(float(canonical["rate_hz"]), tuple(parts), tuple(actions))
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise ContractError(f"not a contract as it is recorded: {error!r}") from None
+        if canonical.get("version") != contract.canonical()["version"]:
+            raise ContractError(f"a contract of version {canonical.get('version')}, known is 1")
+        return contract
+
     @cached_property
     def step_ns(self) -> int:
         """Time from tick to tick [ns]."""
@@ -188,6 +213,18 @@ def _observation(spec: ObservationSpec, config: RobotConfig) -> ObservationPart:
         raise ContractError(f"{spec.key}: {error}") from None
     feature = Feature("float32", (selection.size,), selection.names)
     return ObservationPart(spec.key, topic, type_, selection.paths, None, align, feature)
+
+
+def _recorded_observation(key: str, part: Mapping[str, Any]) -> ObservationPart:
+    """A part as `_canonical` gives it."""
+    align = Align(**part["align"])
+    if part["encoding"] is None:
+        selection = Selection(part["type"], part["select"])
+        feature = Feature("float32", (selection.size,), selection.names)
+        return ObservationPart(key, part["topic"], part["type"], selection.paths, None, align, feature)
+    height, width, _ = part["shape"]
+    image = ImageSpec((height, width) if min(height, width) > 0 else None, part["encoding"])
+    return ObservationPart(key, part["topic"], part["type"], (), image, align, _image_feature(image, None))
 
 
 def _image_feature(image: ImageSpec, camera: Any) -> Feature:

@@ -209,7 +209,7 @@ def join_videos(parts: Sequence[VideoFile], path: Path, fps: int) -> None:
                 with av.open(str(part.path)) as container:
                     source: Any = container.streams.video[0]
                     if stream is None:
-                        stream = joined.add_stream_from_template(source)
+                        stream = joined.add_stream_from_template(source, opaque=True)
                         stream.time_base = source.time_base
                     offset = round(begin / (fps * source.time_base))
                     found = 0

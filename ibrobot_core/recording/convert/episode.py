@@ -1,0 +1,244 @@
+"""One episode -> a dataset of one episode in the staging folder: what a job does, in any process."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import os
+import shutil
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import attrs
+import numpy as np
+from numpy.typing import NDArray
+
+from ibrobot_core.calibration import Calibration, JointCalibration
+from ibrobot_core.clock import RealClock
+from ibrobot_core.contract.specs import Contract
+from ibrobot_core.errors import ContractError, DatasetError, IbrobotError, RecorderError
+from ibrobot_core.interfaces import Context, DatasetWriter, EpisodeReader, EpisodeSummary, Feature
+from ibrobot_core.plugins import installed
+from ibrobot_core.recording.convert.joint_units import JointUnits
+from ibrobot_core.recording.convert.request import EpisodeReport, Request
+from ibrobot_core.recording.convert.ticks import Ticks
+from ibrobot_core.robot import Robot
+
+SUCCESS = "next.success"
+DATASET = "dataset"
+"""The dataset within a unit."""
+_RECORD = "episode.json"
+_VERSION = 1
+"""Of what a unit is made of; older ones are made anew."""
+
+
+@attrs.frozen
+class Job:
+    """One episode to convert, and the unit that it becomes: a folder that is there whole or not at all."""
+
+    request: Request
+    episode: Path
+    source: str
+    unit: Path
+
+
+@attrs.frozen
+class Unit:
+    """A converted episode, staged."""
+
+    path: Path
+    key: str
+    """Of the request and the episode's files: an equal one need not be converted again."""
+    report: EpisodeReport
+    fps: float
+    features: Mapping[str, Feature]
+    contract: Mapping[str, Any]
+    robot_type: str
+    calibration: Mapping[str, Mapping[str, int]]
+
+    @property
+    def dataset(self) -> Path:
+        """The dataset of this episode alone."""
+        return self.path / DATASET
+
+
+def make_writer(request: Request) -> DatasetWriter:
+    """The dataset writer that is asked for.
+
+    Raises:
+        PluginError: when it is not installed.
+    """
+    descriptor = installed().find("dataset", request.type)
+    ctx = Context("convert", RealClock(), logging.getLogger("ibrobot.convert"), Robot("convert", ()))
+    writer: DatasetWriter = descriptor.make(request.options, ctx)
+    return writer
+
+
+def unit_key(job: Job) -> str:
+    """What a unit was made of: the request, as far as it shapes the data, and the episode's files."""
+    request = job.request
+    contract = request.contract.canonical() if request.contract is not None else None
+    shaping = [
+        _VERSION, request.type, attrs.asdict(request.options), contract, request.force_contract,
+        request.document, request.calibration, request.norm_mode, request.missing, request.prompt, request.success,
+    ]  # fmt: skip
+    files = sorted(p for p in job.episode.rglob("*") if p.is_file()) if job.episode.is_dir() else [job.episode]
+    stats = [(str(path.relative_to(job.episode)), path.stat().st_size, path.stat().st_mtime_ns) for path in files]
+    return hashlib.sha256(json.dumps([shaping, stats], sort_keys=True, default=str).encode()).hexdigest()
+
+
+def read_unit(path: Path) -> Unit | None:
+    """The unit at `path`; None where there is none."""
+    try:
+        record = json.loads((path / _RECORD).read_bytes())
+    except FileNotFoundError:
+        return None
+    features = {
+        key: Feature(each["dtype"], tuple(each["shape"]), tuple(each["names"]))
+        for key, each in record.pop("features").items()
+    }
+    return Unit(path, report=EpisodeReport(**record.pop("report")), features=features, **record)
+
+
+def convert_episode(job: Job, progress: Callable[[int], None]) -> EpisodeReport:
+    """Convert an episode into its unit; a fault is told in the report and leaves nothing.
+
+    Args:
+        job: what to convert.
+        progress: is called with the frames done since the last time.
+    """
+    making = job.unit.with_name(f"{job.unit.name}.making")
+    shutil.rmtree(making, ignore_errors=True)
+    reader: EpisodeReader | None = None
+    report = EpisodeReport(job.source)
+    try:
+        key = unit_key(job)
+        reader = installed().open_episode(job.episode)
+        summary = reader.summary()
+        report = _described(report, summary, job.request)
+        unit = _write(job, key, reader, summary, report, making, progress)
+        shutil.rmtree(job.unit, ignore_errors=True)
+        _sync(making)
+        making.rename(job.unit)
+    except (IbrobotError, OSError) as error:
+        shutil.rmtree(making, ignore_errors=True)
+        return attrs.evolve(report, error=str(error))
+    finally:
+        if reader is not None:
+            reader.close()
+    return unit.report
+
+
+def _described(report: EpisodeReport, summary: EpisodeSummary, request: Request) -> EpisodeReport:
+    return attrs.evolve(
+        report, outcome=summary.outcome, prompt=summary.metadata.get("prompt") or request.prompt,
+        start_ns=summary.start_ns, lost={topic: each.dropped for topic, each in summary.topics.items() if each.dropped},
+    )  # fmt: skip
+
+
+def _write(
+    job: Job, key: str, reader: EpisodeReader, summary: EpisodeSummary, report: EpisodeReport, folder: Path,
+    progress: Callable[[int], None],
+) -> Unit:  # fmt: skip
+    """Write the dataset of one episode, and beside it what the unit is."""
+    request = job.request
+    contract = _contract(request, summary)
+    document = request.document or _recorded(summary, "config")
+    calibration = request.calibration or _joined(_recorded(summary, "calibration"))
+    units = JointUnits(request.norm_mode, contract, calibration, document)
+    robot_type = (document.get("robot") or {}).get("robot_type") or summary.metadata.get("robot_type", "")
+    if request.success and report.outcome == "unknown":
+        raise DatasetError(f"{SUCCESS} cannot be told: the episode's outcome is unknown")
+    ticks = Ticks(reader, contract, request.missing)
+    writer = make_writer(request)
+    features: dict[str, Feature] = {}
+    waiting: dict[str, NDArray[Any]] | None = None
+    frames = 0
+    try:
+        for row in ticks:
+            values = units(row)
+            if waiting is None:
+                features = _features(contract, values, request.success)
+                folder.mkdir(parents=True)
+                writer.create(folder / DATASET, contract.rate_hz, features, {"robot_type": robot_type})
+            else:
+                _add(writer, waiting, request, report, last=False)
+            waiting, frames = values, frames + 1
+            progress(1)
+        assert waiting is not None
+        _add(writer, waiting, request, report, last=True)
+        writer.save_episode()
+    finally:
+        writer.finalize()
+    report = attrs.evolve(
+        report, frames=frames, skipped=ticks.skipped, held=ticks.held, gaps=ticks.gaps, resets=dict(ticks.resets)
+    )
+    unit = Unit(job.unit, key, report, contract.rate_hz, features, contract.canonical(), robot_type, calibration)
+    record = {name: value for name, value in attrs.asdict(unit).items() if name != "path"}
+    (folder / _RECORD).write_text(json.dumps(record, indent=2), encoding="utf-8")
+    return unit
+
+
+def _add(
+    writer: DatasetWriter, values: dict[str, NDArray[Any]], request: Request, report: EpisodeReport, *, last: bool
+) -> None:
+    if request.success:
+        values = values | {SUCCESS: np.array([last and report.outcome == "success"])}
+    writer.add_frame(values, report.prompt)
+
+
+def _features(contract: Contract, values: Mapping[str, NDArray[Any]], success: bool) -> dict[str, Feature]:
+    """The contract's features, with the sizes that only the messages know."""
+    features = {key: attrs.evolve(each, shape=values[key].shape) for key, each in contract.features().items()}
+    return features | ({SUCCESS: Feature("bool", (1,))} if success else {})
+
+
+def _contract(request: Request, summary: EpisodeSummary) -> Contract:
+    text = summary.metadata.get("contract")
+    if text is None:
+        if request.contract is None:
+            raise ContractError("the episode brings no contract; name the robot YAML that has it by --config")
+        return request.contract
+    try:
+        recorded = Contract.from_canonical(json.loads(text))
+    except ValueError as error:
+        raise ContractError(f"the recorded contract cannot be read: {error}") from None
+    if request.contract is None:
+        return recorded
+    if request.contract.fingerprint() != recorded.fingerprint() and not request.force_contract:
+        difference = request.contract.difference(recorded, names=("--config", "recorded"))
+        raise ContractError(f"recorded with another contract; --force-contract takes --config's:\n{difference}")
+    return request.contract
+
+
+def _recorded(summary: EpisodeSummary, name: str) -> Mapping[str, Any]:
+    """A JSON object from the episode's metadata; empty where there is none."""
+    try:
+        document = json.loads(summary.metadata.get(name, "{}"))
+    except ValueError as error:
+        raise RecorderError(f"its metadata {name!r} cannot be read: {error}") from None
+    return document if isinstance(document, dict) else {}
+
+
+def _joined(calibrations: Mapping[str, Any]) -> dict[str, dict[str, int]]:
+    """The calibrations of all hardware as one."""
+    joined = {joint: numbers for each in calibrations.values() for joint, numbers in each.items()}
+    for joint, numbers in joined.items():
+        try:
+            Calibration({joint: JointCalibration(**numbers)})
+        except (TypeError, ValueError) as error:
+            raise RecorderError(f"the recorded calibration of {joint!r} cannot be true: {error}") from None
+    return joined
+
+
+def _sync(folder: Path) -> None:
+    """See that every file is on the disk."""
+    for path in folder.rglob("*"):
+        if path.is_file():
+            descriptor = os.open(path, os.O_RDONLY)
+            try:
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)

@@ -1,0 +1,120 @@
+"""Joint positions at the dataset's edge: radians as they were recorded, or in one of LeRobot's units."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import attrs
+import numpy as np
+from numpy.typing import NDArray
+
+from ibrobot_core.calibration import JointCalibration
+from ibrobot_core.contract.specs import Contract
+from ibrobot_core.errors import CalibrationError
+from ibrobot_core.messages import JointState
+from ibrobot_core.units import radians_to_lerobot
+
+NORM_MODES = ("radians", "degrees", "range_m100_100")
+_CLOSED_MODE = "range_0_100"
+_POSITION = "position."
+
+
+@attrs.frozen
+class _Elements:
+    """Elements of a vector that are joints' positions of one unit."""
+
+    indices: NDArray[np.intp]
+    mode: str
+    range_min: NDArray[np.float64]
+    range_max: NDArray[np.float64]
+    zero: NDArray[np.float64]
+    inverted: NDArray[np.bool_]
+
+
+class JointUnits:
+    """Converts the joint positions of observations and actions; velocities, efforts and all else stay as they are.
+
+    `degrees` and `range_m100_100` are LeRobot's units of an arm's joints. A joint that is anchored at its closed end
+    (the hardware's option `anchored`, by default the gripper) is 0 to 100 in both, as LeRobot has it.
+
+    Args:
+        norm_mode: one of `NORM_MODES`.
+        contract: which elements are joints' positions.
+        calibration: joint -> LeRobot's numbers.
+        document: the robot YAML as plain values: which joints are anchored, and their lower limits.
+
+    Raises:
+        CalibrationError: when a joint's calibration is needed and missing.
+    """
+
+    def __init__(
+        self,
+        norm_mode: str,
+        contract: Contract,
+        calibration: Mapping[str, Mapping[str, int]],
+        document: Mapping[str, Any],
+    ) -> None:
+        self._elements: dict[str, list[_Elements]] = {}
+        if norm_mode == "radians":
+            return
+        closed = _closed_ends(document)
+        for key, joints in _position_joints(contract).items():
+            modes: dict[str, dict[int, str]] = {}
+            for index, joint in joints.items():
+                modes.setdefault(_CLOSED_MODE if joint in closed else norm_mode, {})[index] = joint
+            self._elements[key] = [_elements(mode, named, calibration, closed) for mode, named in modes.items()]
+
+    def __call__(self, values: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+        """The values of a tick with their joint positions converted; arrays that change are copied."""
+        converted = dict(values)
+        for key, groups in self._elements.items():
+            vector = values[key].astype(np.float64)
+            for group in groups:
+                vector[group.indices] = radians_to_lerobot(
+                    vector[group.indices], group.mode, range_min=group.range_min, range_max=group.range_max,
+                    zero=group.zero, inverted=group.inverted,
+                )  # fmt: skip
+            converted[key] = vector.astype(values[key].dtype)
+        return converted
+
+
+def _position_joints(contract: Contract) -> dict[str, dict[int, str]]:
+    """Key -> element -> joint, of all elements that are a joint's position."""
+    found: dict[str, dict[int, str]] = {"action": dict(enumerate(contract.action_joints))}
+    for key in contract.observations:
+        at = 0
+        for part in contract.parts(key):
+            if part.type == JointState.ros_type:
+                for i, path in enumerate(part.select):
+                    if path.startswith(_POSITION):
+                        found.setdefault(key, {})[at + i] = path.removeprefix(_POSITION)
+            at += part.feature.shape[0]
+    return {key: joints for key, joints in found.items() if joints}
+
+
+def _elements(
+    mode: str, named: Mapping[int, str], calibration: Mapping[str, Mapping[str, int]], closed: Mapping[str, float]
+) -> _Elements:
+    for joint in named.values():
+        if joint not in calibration:
+            has = f"it has: {', '.join(calibration)}" if calibration else "there is none; give it by --calibration"
+            raise CalibrationError(f"{mode} needs the calibration of joint {joint!r}; {has}")
+    each = {joint: JointCalibration(**calibration[joint]) for joint in named.values()}
+    return _Elements(
+        np.array(list(named), np.intp),
+        mode,
+        np.array([joint.range_min for joint in each.values()], np.float64),
+        np.array([joint.range_max for joint in each.values()], np.float64),
+        np.array([joint.zero(closed.get(name)) for name, joint in each.items()]),
+        np.array([joint.inverted for joint in each.values()]),
+    )
+
+
+def _closed_ends(document: Mapping[str, Any]) -> dict[str, float]:
+    """Joint -> its lower limit [rad], of the joints that are anchored at their closed end."""
+    hardware = document.get("hardware") or {}
+    components = [hardware] if "type" in hardware else list(hardware.values())
+    anchored = {name for each in components for name in each.get("anchored", ("gripper",))}
+    joints = (document.get("robot") or {}).get("joints", ())
+    return {joint["name"]: float(joint["lower"]) for joint in joints if joint["name"] in anchored}

@@ -1,0 +1,114 @@
+"""What is asked of a conversion, and what it tells at its end."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import attrs
+
+from ibrobot_core.contract.specs import Contract
+from ibrobot_core.options import option
+from ibrobot_core.recording.convert.joint_units import NORM_MODES
+
+MISSING = ("refuse", "skip", "hold")
+OUTCOMES = ("success", "failure", "unknown")
+
+
+@attrs.frozen
+class Request:
+    """One conversion. Equal requests over equal episodes give equal bytes, whatever the number of jobs."""
+
+    out: Path
+    """Where the dataset is or shall be."""
+    options: Any
+    """Of the dataset writer."""
+    type: str = "lerobot"
+    """Of the dataset writer."""
+    contract: Contract | None = None
+    """In place of the recorded ones; episodes that were not recorded by ibrobot need it."""
+    document: Mapping[str, Any] | None = None
+    """The robot YAML that `contract` is of, as plain values."""
+    force_contract: bool = False
+    """Whether `contract` may differ from the recorded ones."""
+    calibration: Mapping[str, Mapping[str, int]] | None = None
+    """Joint -> LeRobot's numbers, in place of the recorded ones."""
+    norm_mode: str = option("radians", choices=NORM_MODES)
+    missing: str = option("refuse", choices=MISSING)
+    """What a tick is worth at which something is missing: the episode is refused, the tick left out, or the last
+    value held."""
+    outcomes: tuple[str, ...] = OUTCOMES
+    """Episodes of other outcomes are passed over."""
+    prompt: str = ""
+    """Task of the episodes that were recorded without one."""
+    success: bool = False
+    """Whether to add `next.success`: true at the last row of a successful episode."""
+    append: bool = False
+    """Whether `out` may have a dataset that grows."""
+    jobs: int = option(1, ge=1)
+    """Episodes converted side by side, each in a process of its own."""
+
+
+@attrs.frozen
+class EpisodeReport:
+    """What became of one episode."""
+
+    source: str
+    """`DATASET/EPISODE`, or the folder's name."""
+    frames: int = 0
+    skipped: int = 0
+    """Ticks left out because something was missing."""
+    held: int = 0
+    """Ticks at which something was missing and its last value stands."""
+    gaps: Mapping[str, int] = attrs.field(factory=dict)
+    """Key -> how often it went missing."""
+    resets: Mapping[str, int] = attrs.field(factory=dict)
+    """Topic -> how often its stamps jumped."""
+    lost: Mapping[str, int] = attrs.field(factory=dict)
+    """Topic -> messages that the recorder says it lost."""
+    outcome: str = "unknown"
+    prompt: str = ""
+    start_ns: int = 0
+    """Of the episode's first message [ns]; with `source` it tells episodes apart."""
+    error: str = ""
+    """Why it was left out; empty where it was not."""
+    passed_over: str = ""
+    """Why it was not looked at; empty where it was."""
+
+
+@attrs.frozen
+class Report:
+    """What became of a conversion."""
+
+    out: Path
+    episodes: tuple[EpisodeReport, ...]
+    """In the order given."""
+    size_bytes: int
+    """Of the whole dataset; 0 where there is none."""
+    seconds: float
+    resumed: int
+    """Episodes that an earlier, interrupted run had converted."""
+
+    @property
+    def converted(self) -> tuple[EpisodeReport, ...]:
+        """The episodes that are in the dataset now and were not before."""
+        return tuple(each for each in self.episodes if not each.error and not each.passed_over)
+
+    @property
+    def failed(self) -> tuple[EpisodeReport, ...]:
+        """The episodes that were left out for a fault."""
+        return tuple(each for each in self.episodes if each.error)
+
+    def summary(self) -> dict[str, Any]:
+        """As JSON values."""
+        done = self.converted
+        return {
+            "out": str(self.out), "episodes": len(done), "frames": sum(each.frames for each in done),
+            "failed": len(self.failed), "passed_over": len(self.episodes) - len(done) - len(self.failed),
+            "resumed": self.resumed, "skipped_ticks": sum(each.skipped for each in done),
+            "held_ticks": sum(each.held for each in done), "gaps": sum(sum(each.gaps.values()) for each in done),
+            "lost_messages": sum(sum(each.lost.values()) for each in done),
+            "size_bytes": self.size_bytes, "seconds": round(self.seconds, 3),
+            "reports": [attrs.asdict(each) for each in self.episodes],
+        }  # fmt: skip

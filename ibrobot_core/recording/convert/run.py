@@ -1,0 +1,317 @@
+"""A whole conversion: finds episodes, converts them side by side into staged units, and merges these in order."""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import multiprocessing
+import re
+import shutil
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import attrs
+
+from ibrobot_core.contract.specs import Contract
+from ibrobot_core.errors import DatasetError, IbrobotError, RecorderError
+from ibrobot_core.interfaces import DatasetSummary
+from ibrobot_core.plugins import installed
+from ibrobot_core.recording.convert.episode import Job, Unit, convert_episode, make_writer, read_unit, unit_key
+from ibrobot_core.recording.convert.request import EpisodeReport, Report, Request
+from ibrobot_core.units import seconds
+
+STAGING = ".staging"
+"""Where converted episodes wait within the dataset's folder."""
+_POLL_S = 0.2
+
+Watch = Callable[[int, int, EpisodeReport | None], None]
+"""Told frames done, frames in all by estimate, and the episode that has just been done, if any."""
+
+
+def find_episodes(paths: Sequence[Path]) -> list[Path]:
+    """The episodes that `paths` name, which are episodes or folders of them; each once, numbers in order.
+
+    Raises:
+        RecorderError: for a path that is none, or has none below.
+    """
+    readers = installed().readers
+
+    def below(path: Path) -> Iterator[Path]:
+        if any(reader.reads(path) for reader in readers):
+            yield path
+        elif path.is_dir():
+            for child in sorted(path.iterdir(), key=_natural):
+                if child.is_dir():
+                    yield from below(child)
+
+    found: dict[Path, Path] = {}
+    for path in paths:
+        if not path.exists():
+            raise RecorderError(f"{path}: there is no such episode")
+        here = list(below(path))
+        if not here:
+            installed().open_episode(path)  # says what would have been an episode
+        found |= {each.resolve(): each for each in here}
+    return list(found.values())
+
+
+def convert(request: Request, episodes: Sequence[Path], watch: Watch = lambda done, total, report: None) -> Report:
+    """Convert episodes into the dataset at `request.out`, in the order given.
+
+    An episode that cannot be converted is told in the report and left out. Converted episodes are kept until all are
+    done: after an interruption, the same call goes on from there.
+
+    Raises:
+        DatasetError: when `out` has a dataset and `append` is not asked for, or one that these episodes do not fit;
+            or it cannot be written.
+        PluginError: when the dataset writer is not installed.
+    """
+    begin = time.monotonic()
+    with _staging(request) as (staging, old):
+        plan = _Plan(request, staging, old, episodes)
+        reports = plan.run(watch)
+        units = [unit for unit in plan.units() if not reports[unit.report.source].error]
+        reports |= _refuse_misfits(units, old)
+        units = [unit for unit in units if not reports.get(unit.report.source, unit.report).error]
+        if units:
+            metadata = _metadata(request, old, units)
+            make_writer(request).merge(request.out, [unit.dataset for unit in units], metadata)
+            shutil.rmtree(staging)
+    size = sum(path.stat().st_size for path in request.out.rglob("*") if path.is_file()) if request.out.exists() else 0
+    ordered = tuple(reports[source] for source in plan.sources)
+    return Report(request.out, ordered, size, time.monotonic() - begin, plan.resumed)
+
+
+@contextmanager
+def _staging(request: Request) -> Iterator[tuple[Path, DatasetSummary | None]]:
+    """The staging folder, for this conversion alone, and the dataset that is there already."""
+    out = request.out
+    try:
+        if out.exists() and not (out / STAGING).exists() and any(out.iterdir()):
+            if (old := make_writer(request).summary(out)) is None:
+                raise DatasetError(f"{out} is not empty and has no dataset of writer {request.type!r}")
+        else:
+            old = make_writer(request).summary(out)
+        if old is not None:
+            _check_old(request, old)
+        (out / STAGING).mkdir(parents=True, exist_ok=True)
+        with (out / STAGING / "lock").open("w") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise DatasetError(f"{out}: another conversion into it is running") from None
+            yield out / STAGING, old
+    except OSError as error:
+        raise DatasetError(f"{out}: cannot be written: {error.strerror}") from error
+    finally:
+        _tidy(out)
+
+
+def _tidy(out: Path) -> None:
+    """Take folders away again in which nothing came to be."""
+    staging = out / STAGING
+    if staging.is_dir() and all(path.name == "lock" for path in staging.iterdir()):
+        shutil.rmtree(staging)
+    if out.is_dir() and not any(out.iterdir()):
+        out.rmdir()
+
+
+def _check_old(request: Request, old: DatasetSummary) -> None:
+    if not request.append:
+        raise DatasetError(f"{request.out}: there is a dataset already; --append adds to it")
+    known = old.metadata.get("conversion")
+    if known is None:
+        raise DatasetError(f"{request.out}: was not made by ibrobot convert, which does not know what is in it")
+    asked = _conversion(request)
+    wrong = [f"{name} {known.get(name)}, now {asked[name]}" for name in asked if known.get(name) != asked[name]]
+    if wrong:
+        raise DatasetError(f"{request.out}: was made otherwise: {'; '.join(wrong)}")
+
+
+class _Plan:
+    """Which episodes there are, and what is still to be done for each."""
+
+    def __init__(self, request: Request, staging: Path, old: DatasetSummary | None, episodes: Sequence[Path]) -> None:
+        self._request = request
+        self._reports: dict[str, EpisodeReport] = {}
+        self._jobs: dict[str, Job] = {}
+        self._expected: dict[str, int] = {}
+        """Source -> frames, by its length."""
+        self.resumed = 0
+        self.sources: list[str] = []
+        known = {(each["source"], each["start_ns"]) for each in old.metadata["episodes"]} if old is not None else set()
+        for path in episodes:
+            source = _source(path, self.sources)
+            self.sources.append(source)
+            mark = hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:12]
+            self._add(Job(request, path, source, staging / f"{path.name}-{mark}"), known)
+
+    def _add(self, job: Job, known: set[tuple[str, int]]) -> None:
+        source, report = job.source, EpisodeReport(job.source)
+        try:
+            reader = installed().open_episode(job.episode)
+            try:
+                summary = reader.summary()
+            finally:
+                reader.close()
+        except IbrobotError as error:
+            self._reports[source] = attrs.evolve(report, error=str(error))
+            return
+        report = attrs.evolve(report, outcome=summary.outcome, start_ns=summary.start_ns)
+        if (source, summary.start_ns) in known:
+            self._reports[source] = attrs.evolve(report, passed_over="in the dataset already")
+        elif summary.outcome not in self._request.outcomes:
+            self._reports[source] = attrs.evolve(report, passed_over=f"its outcome is {summary.outcome}")
+        else:
+            self._jobs[source] = job
+            text = summary.metadata.get("contract", "")
+            rate = re.search(r'"rate_hz": ([0-9.]+)', text)
+            rate_hz = self._request.contract.rate_hz if self._request.contract else float(rate[1]) if rate else 30.0
+            self._expected[source] = round(seconds(summary.end_ns - summary.start_ns) * rate_hz) + 1
+
+    def units(self) -> list[Unit]:
+        """The units that are staged now, in the order of the episodes."""
+        found = [read_unit(self._jobs[source].unit) for source in self.sources if source in self._jobs]
+        return [unit for unit in found if unit is not None]
+
+    def run(self, watch: Watch) -> dict[str, EpisodeReport]:
+        """Convert what is not staged yet; source -> report."""
+        todo = []
+        for source, job in self._jobs.items():
+            unit = read_unit(job.unit)
+            if unit is not None and unit.key == unit_key(job):
+                self._reports[source] = unit.report
+                self.resumed += 1
+            else:
+                shutil.rmtree(job.unit, ignore_errors=True)
+                todo.append(job)
+        total = sum(self._expected[job.source] for job in todo)
+        run = _run_here if min(self._request.jobs, len(todo)) <= 1 else _run_in_processes
+        for report in run(todo, self._request.jobs, lambda done, report: watch(done, total, report)):
+            self._reports[report.source] = report
+        return self._reports
+
+
+def _run_here(
+    jobs: Sequence[Job], limit: int, watch: Callable[[int, EpisodeReport | None], None]
+) -> Iterator[EpisodeReport]:
+    done = 0
+
+    def progress(frames: int) -> None:
+        nonlocal done
+        done += frames
+        watch(done, None)
+
+    for job in jobs:
+        report = convert_episode(job, progress)
+        watch(done, report)
+        yield report
+
+
+_done: Any = None
+"""Frames done by all processes together; set in each of them."""
+
+
+def _begin_process(done: Any) -> None:
+    global _done  # noqa: PLW0603 - how a pool gives its processes what cannot be sent with each job
+    _done = done
+
+
+def _count(frames: int) -> None:
+    with _done.get_lock():
+        _done.value += frames
+
+
+def _convert_in_process(job: Job) -> EpisodeReport:
+    return convert_episode(job, _count)
+
+
+def _run_in_processes(
+    jobs: Sequence[Job], limit: int, watch: Callable[[int, EpisodeReport | None], None]
+) -> Iterator[EpisodeReport]:
+    context = multiprocessing.get_context("spawn")
+    done = context.Value("q", 0)
+    pool = ProcessPoolExecutor(min(limit, len(jobs)), context, _begin_process, (done,))
+    try:
+        waiting: set[Future[EpisodeReport]] = {pool.submit(_convert_in_process, job) for job in jobs}
+        while waiting:
+            finished, waiting = wait(waiting, _POLL_S, FIRST_COMPLETED)
+            watch(done.value, None)
+            for future in finished:
+                report = future.result()
+                watch(done.value, report)
+                yield report
+    except BrokenProcessPool:
+        raise DatasetError(
+            "a converting process was killed, e.g. for want of memory; the episodes done are kept: "
+            "the same command goes on from there, with fewer --jobs if need be"
+        ) from None
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _refuse_misfits(units: Sequence[Unit], old: DatasetSummary | None) -> dict[str, EpisodeReport]:
+    """The reports of units that do not fit the dataset, or the first unit where there is none yet."""
+    if not units:
+        return {}
+    fps, features, contract = units[0].fps, units[0].features, units[0].contract
+    first = units[0].report.source
+    if old is not None:
+        fps, features, contract, first = old.fps, old.features, old.metadata["contract"], "the dataset"
+    refused = {}
+    for unit in units:
+        wrong = ""
+        if Contract.from_canonical(unit.contract).fingerprint() != Contract.from_canonical(contract).fingerprint():
+            difference = Contract.from_canonical(unit.contract).difference(contract, names=("this episode", first))
+            wrong = f"its contract differs from that of {first}:\n{difference}"
+        elif unit.fps != fps or dict(unit.features) != dict(features):
+            keys = [key for key in {**features, **unit.features} if features.get(key) != unit.features.get(key)]
+            each = ", ".join(f"{key} is {unit.features.get(key)}, not {features.get(key)}" for key in keys)
+            wrong = f"its features differ from those of {first}: {each}"
+        if wrong:
+            refused[unit.report.source] = attrs.evolve(unit.report, error=wrong)
+    return refused
+
+
+def _conversion(request: Request) -> dict[str, Any]:
+    """What all episodes of a dataset must have been asked for alike."""
+    options = attrs.asdict(request.options)
+    return {"writer": request.type, "options": options, "norm_mode": request.norm_mode, "success": request.success}
+
+
+def _metadata(request: Request, old: DatasetSummary | None, units: Sequence[Unit]) -> dict[str, Any]:
+    """What the dataset keeps of its making: contract, calibrations, and where each episode comes from."""
+    before: Mapping[str, Any] = old.metadata if old is not None else {}
+    calibrations = dict(before.get("calibrations", {}))
+    episodes = list(before.get("episodes", ()))
+    for unit in units:
+        report = attrs.asdict(unit.report)
+        kept = {name: value for name, value in report.items() if name not in ("error", "passed_over")}
+        name = hashlib.sha256(json.dumps(unit.calibration, sort_keys=True).encode()).hexdigest()[:12]
+        if unit.calibration:
+            calibrations[name] = unit.calibration
+        episodes.append(kept | {"calibration": name if unit.calibration else ""})
+    contract = before.get("contract", units[0].contract)
+    return {
+        "robot_type": before.get("robot_type", units[0].robot_type), "contract": contract,
+        "fingerprint": Contract.from_canonical(contract).fingerprint(), "conversion": _conversion(request),
+        "calibrations": calibrations, "episodes": episodes,
+    }  # fmt: skip
+
+
+def _source(path: Path, taken: Sequence[str]) -> str:
+    """A short name of an episode: `DATASET/EPISODE` for ibrobot's own, else its folder or file."""
+    path = path.resolve()
+    name = f"{path.parent.parent.name}/{path.name}" if path.parent.name == "episodes" else path.name
+    return name if name not in taken else f"{name} ({len(taken) + 1})"
+
+
+def _natural(path: Path) -> list[tuple[int, str]]:
+    """Orders names by the numbers in them."""
+    return [(int(piece), "") if piece.isdigit() else (-1, piece) for piece in re.split(r"(\d+)", path.name)]
