@@ -43,7 +43,7 @@ _MIB = 1 << 20
 @click.option("--outcome", "outcomes", multiple=True, type=click.Choice(OUTCOMES), help="Only these; repeatable.")
 @click.option("--prompt", default="", metavar="TEXT", help="Task of episodes recorded without one.")
 @click.option("--success", is_flag=True, help="Add next.success: true in the last row of a success.")
-@click.option("--jobs", type=click.IntRange(min=1), metavar="N", help="Episodes side by side; one for each CPU core.")
+@click.option("--jobs", type=click.IntRange(min=1), metavar="N", help="Episodes side by side; one for two CPU cores.")
 @click.option("--json", "as_json", is_flag=True, help="Print the report as JSON.")
 def convert(
     episodes: tuple[Path, ...], out: Path, type_: str, config: str | None, calibration: str | None, as_json: bool,
@@ -62,7 +62,7 @@ def convert(
     overrides = tuple(f"{name}={value}" for name, value in shorthand.items() if value is not None)
     request = Request(
         out, _options(type_, (*overrides, *sets)), type_,
-        outcomes=outcomes or OUTCOMES, jobs=jobs or os.cpu_count() or 1, calibration=_calibration(calibration),
+        outcomes=outcomes or OUTCOMES, jobs=jobs or _jobs(), calibration=_calibration(calibration),
         **_contract(config), **asked,
     )  # fmt: skip
     found = find_episodes(episodes)
@@ -74,6 +74,11 @@ def convert(
         _tell(report)
     if report.failed or not (report.converted or all(each.passed_over for each in report.episodes)):
         sys.exit(1)
+
+
+def _jobs() -> int:
+    """One for two CPU cores: a job decodes while its cameras are encoded beside it."""
+    return max(1, (os.cpu_count() or 1) // 2)
 
 
 def _options(type_: str, overrides: tuple[str, ...]) -> Any:

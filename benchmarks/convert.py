@@ -1,0 +1,248 @@
+"""What `ibrobot convert` costs beside LeRobot's own writer: the same pictures, the same encoder.
+
+    python benchmarks/convert.py [--lerobot PYTHON] [--frames 300] [--only speed|memory]
+
+Two 640x480 cameras at 30 Hz, joint states and actions at 100 Hz, recorded as raw bags; synthetic pictures with texture,
+motion and sensor noise. `--lerobot` is an interpreter that has `lerobot[dataset]`; by default this one. In one run:
+
+- `ibrobot convert` of two episodes, the whole command from its start;
+- LeRobot's `LeRobotDataset` as `lerobot-record` uses it by default (pictures as PNG files, encoded at the end of an
+  episode) and streaming, fed with the same pictures from memory; its imports, which take longer than many a
+  conversion, are not counted. Streaming is fed no faster than it encodes, since it drops pictures otherwise.
+
+Then the memory of `ibrobot convert` for episodes of 60 and 600 frames, and for 1, 10 and 50 of them. Memory is the
+proportional share of all processes of the command together. Exits with 1 below 3x the frames a second of LeRobot's
+default, below its streaming, or when memory grows by more than a quarter.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+HEIGHT, WIDTH, FPS = 480, 640, 30
+CAMERAS = ("top", "wrist")
+JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
+ENOUGH, GROWTH = 3.0, 1.25
+
+
+def pictures(camera: int, count: int) -> Iterator[np.ndarray[Any, np.dtype[np.uint8]]]:
+    """A textured table, a thing that moves over it, and the noise of a sensor."""
+    rng = np.random.default_rng(camera)
+    coarse = rng.normal(128, 40, (HEIGHT // 16, WIDTH // 16, 3)).repeat(16, 0).repeat(16, 1)
+    table = coarse + rng.normal(0, 12, (HEIGHT, WIDTH, 3))
+    noise = rng.normal(0, 2, (8, HEIGHT, WIDTH, 3))
+    for i in range(count):
+        picture = table + noise[i % len(noise)]
+        x = int((0.5 + 0.4 * np.sin(i / 20 + camera)) * (WIDTH - 80))
+        picture[200:280, x : x + 80] = (220, 40, 60)
+        yield picture.clip(0, 255).astype(np.uint8)
+
+
+def record(folder: Path, frames: int) -> None:
+    """An episode as `ibrobot record` leaves it."""
+    from ibrobot_mcap.options import McapOptions
+    from ibrobot_mcap.recorder import McapRecorder
+
+    from ibrobot_core.clock import SteppedClock
+    from ibrobot_core.config.schema import Align, ImageSpec
+    from ibrobot_core.contract.specs import ActionPart, Contract, ObservationPart
+    from ibrobot_core.interfaces import EpisodeEnd, EpisodeStart, Feature
+    from ibrobot_core.messages import Float64MultiArray, Header, Image, JointState
+    from ibrobot_core.testing.contexts import host_context
+
+    recorder_clock = SteppedClock(start_ns := 1_700_000_000_000_000_000)
+    state = "sensor_msgs/msg/JointState"
+    select = tuple(f"position.{joint}" for joint in JOINTS)
+    parts = [
+        ObservationPart("observation.state", "/joint_states", state, select, None, Align(), Feature("float32", (6,)))
+    ]
+    for camera in CAMERAS:
+        feature = Feature("image", (HEIGHT, WIDTH, 3))
+        align, key = Align("asof", tol_ms=100.0), f"observation.images.{camera}"
+        parts.append(ObservationPart(key, f"/{camera}", "sensor_msgs/msg/Image", (), ImageSpec(), align, feature))
+    action = ActionPart("arm", "/commands", "std_msgs/msg/Float64MultiArray", "hold", JOINTS)
+    contract = Contract(float(FPS), tuple(parts), (action,))
+    recorder = McapRecorder(McapOptions(), host_context(clock=recorder_clock))
+    metadata = {
+        "robot_type": "so101_follower", "prompt": "push the block", "contract": json.dumps(contract.canonical()),
+        "fingerprint": contract.fingerprint(), "config": "{}", "calibration": "{}",
+    }  # fmt: skip
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    recorder.begin(EpisodeStart(folder, start_ns, contract.topics, metadata))
+    streams = [pictures(number, frames) for number in range(len(CAMERAS))]
+    for i, images in enumerate(zip(*streams, strict=True)):
+        for sub in range(3):
+            t_ns = start_ns + (3 * i + sub) * contract.step_ns // 3
+            position = np.sin(np.arange(6) + t_ns % 10**10 / 1e9)
+            recorder.write("/joint_states", JointState(Header(t_ns), JOINTS, position), t_ns)
+            recorder.write("/commands", Float64MultiArray(position + 0.01), t_ns)
+        for camera, image in zip(CAMERAS, images, strict=True):
+            recorder.write(f"/{camera}", Image(Header(t_ns), HEIGHT, WIDTH, "rgb8", WIDTH * 3, image.ravel()), t_ns)
+    recorder.end(EpisodeEnd(t_ns, "success"))
+    recorder.close()
+
+
+def measure(command: Sequence[str]) -> dict[str, float]:
+    """Run a command: seconds, seconds of CPU, and the most memory of its processes together [MiB]."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    begin = time.monotonic()
+    environment = {**os.environ, "TQDM_DISABLE": "1", "SVT_LOG": "1", "HF_HUB_OFFLINE": "1"}
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
+    peak, ended = 0.0, threading.Event()
+
+    def watch() -> None:
+        nonlocal peak
+        while not ended.wait(0.05):
+            peak = max(peak, _pss_mib(process.pid))
+
+    watcher = threading.Thread(target=watch)
+    watcher.start()
+    out, err = process.communicate()
+    seconds = time.monotonic() - begin
+    ended.set()
+    watcher.join()
+    if process.returncode:
+        sys.exit(f"{' '.join(command)}: exit {process.returncode}\n{err[-2000:]}")
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    found = {"seconds": seconds, "cpu_s": cpu, "peak_mib": peak}
+    last = out.strip().splitlines()[-1] if out.strip() else ""
+    return found | (json.loads(last) if last.startswith('{"measured"') else {})
+
+
+def _pss_mib(pid: int) -> float:
+    """Proportional memory of a process and all its children."""
+    try:
+        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+        lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+    except OSError:
+        return 0.0
+    own = next((int(line.split()[1]) for line in lines if line.startswith("Pss:")), 0) / 1024
+    return own + sum(_pss_mib(int(child)) for child in children)
+
+
+def ours(episodes: Path, out: Path, *more: str) -> dict[str, float]:
+    """`ibrobot convert`, the whole command."""
+    shutil.rmtree(out, ignore_errors=True)
+    program = "from ibrobot_core.cli.main import main; main()"
+    command = [sys.executable, "-c", program, "convert", str(episodes), "--out", str(out), "--json", *more]
+    found = measure(command)
+    info = json.loads((out / "meta/info.json").read_bytes())
+    return found | {"frames": info["total_frames"], "frames_s": info["total_frames"] / found["seconds"]}
+
+
+def lerobot(mode: str, out: Path, frames: int, episodes: int) -> None:
+    """LeRobot's writer, in a process of its own: `default` or `streaming`."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    vector = {"dtype": "float32", "shape": (6,), "names": list(JOINTS)}
+    video = {"dtype": "video", "shape": (HEIGHT, WIDTH, 3), "names": ["height", "width", "channels"]}
+    features = {"observation.state": vector, "action": vector}
+    features |= {f"observation.images.{camera}": video for camera in CAMERAS}
+    # As lerobot-record makes it: four threads a camera write the PNG files.
+    options = {"streaming_encoding": True} if mode == "streaming" else {"image_writer_threads": 4 * len(CAMERAS)}
+    stored = [np.stack(list(pictures(number, frames))) for number in range(len(CAMERAS))]
+    dataset = LeRobotDataset.create("local/benchmark", FPS, features, root=out, robot_type="so101", **options)
+    begin, cpu = time.monotonic(), _cpu()
+    for _ in range(episodes):
+        for i in range(frames):
+            if mode == "streaming":
+                _wait_for_encoders(dataset)
+            row: dict[str, Any] = {"observation.state": np.full(6, i, np.float32), "action": np.zeros(6, np.float32)}
+            row |= {f"observation.images.{camera}": stored[n][i] for n, camera in enumerate(CAMERAS)}
+            dataset.add_frame(row | {"task": "push the block"})
+        dataset.save_episode()
+    dataset.finalize()
+    measured = {"measured": mode, "seconds": time.monotonic() - begin, "cpu_s": _cpu() - cpu}
+    pictures_mib = sum(each.nbytes for each in stored) / 2**20
+    print(json.dumps(measured | {"frames": frames * episodes, "pictures_mib": pictures_mib}))
+
+
+def _wait_for_encoders(dataset: Any) -> None:
+    """Its queues drop pictures when they are full."""
+    queues = dataset.writer._streaming_encoder._frame_queues.values()
+    while any(queue.qsize() >= queue.maxsize - 1 for queue in queues):
+        time.sleep(0.001)
+
+
+def _cpu() -> float:
+    each = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(usage.ru_utime + usage.ru_stime for usage in each)
+
+
+def speed(python: str, folder: Path, frames: int) -> bool:
+    """Ours and LeRobot's, the same pictures."""
+    source = folder / "two"
+    for number in (1, 2):
+        record(source / f"episode_{number:06d}", frames)
+    rows = {"ibrobot convert": ours(source, folder / "ours")}
+    rows["ibrobot convert --jobs 1"] = ours(source, folder / "ours", "--jobs", "1")
+    for mode in ("streaming", "default"):
+        command = [python, __file__, "--child", mode, "--out", str(folder / mode), "--frames", str(frames)]
+        found = measure(command)
+        found["frames_s"] = found["frames"] / found["seconds"]
+        # What it was fed from is not its own.
+        found["peak_mib"] -= found.pop("pictures_mib")
+        rows[f"LeRobot, {mode}"] = found
+    for name, row in rows.items():
+        cpu_s = row["cpu_s"] * 300 / row["frames"]
+        figures = f"{row['frames_s']:6.1f} frames/s  {cpu_s:6.1f} CPU s per 300 frames  {row['peak_mib']:6.0f} MiB"
+        print(f"{name:26} {figures}", flush=True)
+    best = rows["ibrobot convert"]["frames_s"]
+    ratios = {mode: best / rows[f"LeRobot, {mode}"]["frames_s"] for mode in ("default", "streaming")}
+    print(f"{ratios['default']:.2f} times LeRobot's default, {ratios['streaming']:.2f} times its streaming")
+    return ratios["default"] >= ENOUGH and ratios["streaming"] >= 1.0
+
+
+def memory(folder: Path) -> bool:
+    """Whether memory depends on the length or the number of episodes."""
+    found = {}
+    record(folder / "short" / "episode_000001", 60)
+    record(folder / "long" / "episode_000001", 600)
+    for number in range(2, 51):
+        shutil.copytree(folder / "short/episode_000001", folder / f"short/episode_{number:06d}", copy_function=os.link)
+    for count in (1, 10, 50):
+        some = folder / f"some_{count}"
+        for number in range(1, count + 1):
+            name = f"episode_{number:06d}"
+            shutil.copytree(folder / "short" / name, some / name, copy_function=os.link)
+        found[f"{count} of 60 frames"] = ours(some, folder / "ours", "--jobs", "1")["peak_mib"]
+    found["1 of 600 frames"] = ours(folder / "long", folder / "ours", "--jobs", "1")["peak_mib"]
+    for name, mib in found.items():
+        print(f"{name:16} {mib:6.0f} MiB", flush=True)
+    return max(found.values()) <= GROWTH * found["1 of 60 frames"]
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--lerobot", default=sys.executable, metavar="PYTHON")
+    parser.add_argument("--frames", type=int, default=300)
+    parser.add_argument("--only", choices=("speed", "memory"))
+    parser.add_argument("--child", help=argparse.SUPPRESS)
+    parser.add_argument("--out", type=Path, help=argparse.SUPPRESS)
+    asked = parser.parse_args()
+    if asked.child:
+        lerobot(asked.child, asked.out, asked.frames, 2)
+        return 0
+    with tempfile.TemporaryDirectory() as folder:
+        good = asked.only == "memory" or speed(asked.lerobot, Path(folder), asked.frames)
+        good = (asked.only == "speed" or memory(Path(folder))) and good
+    return 0 if good else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
