@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator, Mapping
+from itertools import islice
 from typing import Any
 
 import attrs
@@ -12,7 +14,7 @@ from ibrobot_core.config.schema import Align
 from ibrobot_core.contract.frames import FrameAssembler, assemble
 from ibrobot_core.contract.specs import Contract, ObservationPart
 from ibrobot_core.errors import RecorderError
-from ibrobot_core.interfaces import EpisodeReader, Feature
+from ibrobot_core.interfaces import EpisodeReader, Feature, Recorded
 from ibrobot_core.messages import Message
 from ibrobot_core.units import seconds
 
@@ -37,31 +39,39 @@ def with_action(contract: Contract) -> Contract:
 
 
 class _Source:
-    """An episode's messages, one ahead, so that the end is known when the last one is given."""
+    """An episode's messages, and the ticks from the first to the last of them."""
 
     def __init__(self, reader: EpisodeReader, contract: Contract) -> None:
         self._messages = reader.messages(contract.topics)
-        self._coming = next(self._messages, None)
-        self.first_ns = self._coming.received_ns if self._coming is not None else 0
-        self.given_ns = self.first_ns
-        """Receipt of the message given last [ns]."""
-
-    @property
-    def ended(self) -> bool:
-        return self._coming is None
+        self._read: deque[Recorded] = deque(islice(self._messages, 1))
+        """Read ahead, to know whether there is a message at or after a tick."""
+        self._newest_ns = self.first_ns = self._read[0].received_ns if self._read else 0
 
     def __iter__(self) -> Iterator[tuple[str, Message, int]]:
-        while (recorded := self._coming) is not None:
-            self._coming = next(self._messages, None)
-            self.given_ns = recorded.received_ns
+        while self._read or self._read_on():
+            recorded = self._read.popleft()
             yield recorded.topic, recorded.message, recorded.received_ns
 
     def ticks(self, step_ns: int) -> Iterator[int]:
         """From the first message to the last."""
         t_ns = self.first_ns
-        while not self.ended or t_ns <= self.given_ns:
+        while self._newest_ns >= t_ns or self._reaches(t_ns):
             yield t_ns
             t_ns += step_ns
+
+    def _reaches(self, t_ns: int) -> bool:
+        while self._read_on():
+            if self._newest_ns >= t_ns:
+                return True
+        return False
+
+    def _read_on(self) -> bool:
+        recorded = next(self._messages, None)
+        if recorded is None:
+            return False
+        self._read.append(recorded)
+        self._newest_ns = recorded.received_ns
+        return True
 
 
 class Ticks:
