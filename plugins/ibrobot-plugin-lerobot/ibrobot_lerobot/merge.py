@@ -24,6 +24,7 @@ _MERGING = ".merging"
 _MERGED = ".merged"
 """Where a merge is certain: its files need only be moved to their places."""
 _EPISODES_AT_ONCE = 64
+_MIB = 1 << 20
 
 
 def complete(root: Path) -> None:
@@ -167,7 +168,7 @@ class _Merge:
     def _append_table(self, path: Path, tasks: np.ndarray[Any, Any]) -> int:
         """Append a table of a part, renumbered; returns the number of the file that it became a part of."""
         size = path.stat().st_size
-        limit = self._info["data_files_size_in_mb"] << 20
+        limit = self._info["data_files_size_in_mb"] * _MIB
         if self._table is not None and self._data.bytes + size > limit:
             self._table.close()
             self._table, self._data = None, _Place(self._data.number + 1)
@@ -187,7 +188,7 @@ class _Merge:
 
     def _append_videos(self, part: OnDisk, key: str, rows: list[dict[str, Any]]) -> list[tuple[int, float]]:
         """Note a part's videos of a camera for joining; returns file and beginning [s] of each."""
-        limit = self._info["video_files_size_in_mb"] << 20
+        limit = self._info["video_files_size_in_mb"] * _MIB
         frames: dict[int, int] = {}
         for row in rows:
             number = _number(row, f"videos/{key}")

@@ -60,21 +60,24 @@ def choose_encoder(options: LeRobotOptions) -> Encoder:
 def _encoder(codec: str, options: LeRobotOptions) -> Encoder:
     preset = options.preset or (_SVT_PRESET if codec == "libsvtav1" else "")
     told = {"g": str(options.gop)} | ({"preset": preset} if preset else {})
-    if codec == "libsvtav1":
-        told |= {"crf": str(options.crf), "svtav1-params": f"fast-decode=0:lp={options.threads}"}
-    elif codec in ("h264", "hevc"):
-        told |= {"crf": str(options.crf), "threads": str(options.threads)}
-        if codec == "hevc":
-            told["x265-params"] = f"log-level=error:pools={options.threads}"
-    elif codec.endswith("nvenc"):
-        told |= {"rc": "constqp", "qp": str(options.crf)}
-    else:
-        told["q:v"] = str(max(1, 100 - 2 * options.crf))
     described: dict[str, Any] = {
         "video.g": options.gop, "video.crf": options.crf,
         "video.preset": int(preset) if preset.isdigit() else preset or None,
         "video.fast_decode": 0, "video.video_backend": "pyav", "video.extra_options": {},
     }  # fmt: skip
+    if codec == "libsvtav1":
+        told |= {"crf": str(options.crf), "svtav1-params": f"fast-decode=0:lp={options.threads}"}
+        return Encoder(codec, told, described)
+    # Pictures in the order of display, so that files can be joined at any of them.
+    told["bf"] = "0"
+    if codec in ("h264", "hevc"):
+        told |= {"crf": str(options.crf), "threads": str(options.threads)}
+        if codec == "hevc":
+            told["x265-params"] = f"log-level=error:bframes=0:pools={options.threads}"
+    elif codec.endswith("nvenc"):
+        told |= {"rc": "constqp", "qp": str(options.crf)}
+    else:
+        told["q:v"] = str(max(1, 100 - 2 * options.crf))
     return Encoder(codec, told, described)
 
 
