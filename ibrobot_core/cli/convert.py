@@ -22,9 +22,7 @@ _MIB = 1 << 20
 @click.command()
 @click.argument("episodes", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="The dataset: a new folder.")
-@click.option(
-    "--append", is_flag=True, help="Add to the dataset that is there what is not in it yet."
-)
+@click.option("--append", is_flag=True, help="Add to the dataset that is there what is not in it yet.")
 @click.option("--type", "type_", default="lerobot", show_default=True, help="Dataset writer.")
 @click.option("--codec", metavar="NAME", help="Video encoder, e.g. h264; auto takes a GPU's where one opens.")
 @click.option("--crf", type=int, metavar="N", help="Video quality; lower is better and larger.")
