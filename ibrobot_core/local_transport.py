@@ -2,116 +2,88 @@
 
 from __future__ import annotations
 
-import logging
 import queue
 import threading
 from collections.abc import Callable
 from typing import override
 
+import attrs
+
 from ibrobot_core.errors import TransportError
-from ibrobot_core.interfaces.transport import Transport
-
-_log = logging.getLogger("ibrobot.transport.local")
-
-_END_S = 1.0
+from ibrobot_core.interfaces.transport import WORKERS, Payload, Transport
+from ibrobot_core.workers import Workers
 
 
-class _Subscriber:
-    """A callback with a queue and a thread of its own, so that a slow one delays nobody else."""
-
-    def __init__(self, topic: str, callback: Callable[[bytes], None]) -> None:
-        self._topic = topic
-        self._callback = callback
-        self._waiting: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
-        self._ended = False
-        self._thread = threading.Thread(target=self._deliver, name=f"subscriber of {topic}", daemon=True)
-        self._thread.start()
-
-    def put(self, payload: bytes) -> None:
-        self._waiting.put(payload)
-
-    def end(self) -> None:
-        """Deliver nothing more. Waits a little for a callback that is running, unless it is the one that calls this."""
-        self._ended = True
-        self._waiting.put(None)
-        if threading.current_thread() is not self._thread:
-            self._thread.join(_END_S)
-
-    def _deliver(self) -> None:
-        while (payload := self._waiting.get()) is not None and not self._ended:
-            try:
-                self._callback(payload)
-            except Exception:  # noqa: BLE001 - contained: a subscriber's fault must not reach the others
-                _log.exception("a subscriber of %s failed", self._topic)
+@attrs.frozen(eq=False)
+class _Request:
+    payload: bytes
+    answer: queue.SimpleQueue[Payload | Exception] = attrs.field(factory=queue.SimpleQueue)
 
 
 class LocalTransport(Transport):
-    """Delivers to each subscriber in its own thread, and answers each request in one, so that a timeout can end it.
+    """Each subscriber is called in a thread of its own, and each server in several.
 
-    What a slow subscriber has not taken yet waits for it in memory.
+    What a slow one has not taken yet waits for it in memory.
     """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._subscribers: dict[str, list[_Subscriber]] = {}
-        self._servers: dict[str, Callable[[bytes], bytes]] = {}
+        self._subscribers: dict[str, list[Workers[bytes]]] = {}
+        self._servers: dict[str, Workers[_Request]] = {}
+        self._watchers: dict[str, list[Workers[bool]]] = {}
         self._closed = False
 
     @override
-    def publish(self, topic: str, payload: bytes) -> None:
+    def publish(self, topic: str, payload: Payload) -> None:
+        kept = bytes(payload)
         with self._lock:
             self._check_open()
             for subscriber in self._subscribers.get(topic, ()):
-                subscriber.put(payload)
+                subscriber.put(kept)
 
     @override
-    def subscribe(self, topic: str, callback: Callable[[bytes], None]) -> Callable[[], None]:
+    def subscribe(self, topic: str, callback: Callable[[Payload], object]) -> Callable[[], None]:
+        subscriber = Workers[bytes](callback, f"a subscriber of {topic}")
         with self._lock:
             self._check_open()
-            subscriber = _Subscriber(topic, callback)
             self._subscribers.setdefault(topic, []).append(subscriber)
-
-        def end() -> None:
-            with self._lock:
-                if subscriber in self._subscribers.get(topic, ()):
-                    self._subscribers[topic].remove(subscriber)
-            subscriber.end()
-
-        return end
+        return lambda: self._end(self._subscribers, topic, subscriber)
 
     @override
-    def serve(self, name: str, handler: Callable[[bytes], bytes]) -> Callable[[], None]:
+    def serve(self, name: str, handler: Callable[[Payload], Payload], *, workers: int = WORKERS) -> Callable[[], None]:
+        def answer(request: _Request) -> None:
+            try:
+                request.answer.put(handler(request.payload))
+            except Exception as error:  # noqa: BLE001 - it is the requester's to see
+                request.answer.put(error)
+
+        server = Workers(answer, f"the server of {name}", workers)
         with self._lock:
             self._check_open()
             if name in self._servers:
                 raise TransportError(f"{name} is served already")
-            self._servers[name] = handler
+            self._servers[name] = server
+            self._tell(name, True)
 
         def end() -> None:
             with self._lock:
-                if self._servers.get(name) is handler:
+                if self._servers.get(name) is server:
                     del self._servers[name]
+                    self._tell(name, False)
+            server.end()
 
         return end
 
     @override
-    def request(self, name: str, payload: bytes, timeout_s: float) -> bytes:
+    def request(self, name: str, payload: Payload, timeout_s: float) -> Payload:
         with self._lock:
             self._check_open()
-            handler = self._servers.get(name)
-        if handler is None:
+            server = self._servers.get(name)
+        request = _Request(bytes(payload))
+        if server is None or server.put(request) is not None:
             raise TransportError(f"nobody serves {name}")
-        answer: queue.SimpleQueue[bytes | Exception] = queue.SimpleQueue()
-
-        def serve() -> None:
-            try:
-                answer.put(handler(payload))
-            except Exception as error:  # noqa: BLE001 - it is the requester's to see
-                answer.put(error)
-
-        threading.Thread(target=serve, name=f"serve {name}", daemon=True).start()
         try:
-            result = answer.get(timeout=timeout_s)
+            result = request.answer.get(timeout=timeout_s)
         except queue.Empty:
             raise TransportError(f"no answer from {name} within {timeout_s} s") from None
         if isinstance(result, Exception):
@@ -119,14 +91,46 @@ class LocalTransport(Transport):
         return result
 
     @override
+    def watch(self, name: str, changed: Callable[[bool], object]) -> Callable[[], None]:
+        turn = threading.Lock()  # held until the present state was told, which comes first
+
+        def tell(served: bool) -> None:
+            with turn:
+                changed(served)
+
+        watcher = Workers(tell, f"a watch of {name}")
+        with turn:
+            with self._lock:
+                self._check_open()
+                served = name in self._servers
+                self._watchers.setdefault(name, []).append(watcher)
+            changed(served)
+        return lambda: self._end(self._watchers, name, watcher)
+
+    @override
     def close(self) -> None:
         with self._lock:
             self._closed = True
-            ended = [subscriber for subscribers in self._subscribers.values() for subscriber in subscribers]
+            ended: list[Workers[bytes] | Workers[_Request] | Workers[bool]] = [*self._servers.values()]
+            for subscribers in self._subscribers.values():
+                ended += subscribers
+            for watchers in self._watchers.values():
+                ended += watchers
             self._subscribers.clear()
             self._servers.clear()
-        for subscriber in ended:
-            subscriber.end()
+            self._watchers.clear()
+        for workers in ended:
+            workers.end()
+
+    def _end[T](self, of: dict[str, list[Workers[T]]], key: str, workers: Workers[T]) -> None:
+        with self._lock:
+            if workers in of.get(key, ()):
+                of[key].remove(workers)
+        workers.end()
+
+    def _tell(self, name: str, served: bool) -> None:
+        for watcher in self._watchers.get(name, ()):
+            watcher.put(served)
 
     def _check_open(self) -> None:
         if self._closed:

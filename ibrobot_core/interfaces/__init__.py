@@ -10,7 +10,7 @@ from ibrobot_core.interfaces.reader import EpisodeReader, EpisodeSummary, Record
 from ibrobot_core.interfaces.recorder import EpisodeEnd, EpisodeStart, Recorder
 from ibrobot_core.interfaces.sensor import Sensor
 from ibrobot_core.interfaces.teleop import Teleop, TeleopCommand
-from ibrobot_core.interfaces.transport import Transport
+from ibrobot_core.interfaces.transport import Payload, Transport
 from ibrobot_core.interfaces.viewer import Viewer
 
 __all__ = [
@@ -30,6 +30,7 @@ __all__ = [
     "Hardware",
     "JointGoal",
     "JointReading",
+    "Payload",
     "Plan",
     "PlanRequest",
     "Planner",

@@ -11,7 +11,7 @@ from typing import ClassVar
 import pytest
 
 from ibrobot_core.errors import TransportError
-from ibrobot_core.interfaces import Context, Transport
+from ibrobot_core.interfaces import Context, Payload, Transport
 from ibrobot_core.testing.suite import Suite
 
 
@@ -45,7 +45,7 @@ class TransportSuite(Suite[Transport]):
         """Every payload arrives once, whole, in the order sent; empty and large ones too."""
         payloads = [b"", b"\x00\xff" * 500_000, *(str(i).encode() for i in range(200))]
         with self.ends() as (near, far):
-            arrived: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+            arrived: queue.SimpleQueue[Payload] = queue.SimpleQueue()
             far.subscribe("topic", arrived.put)
             self.settle(near, far)
             for payload in payloads:
@@ -55,8 +55,8 @@ class TransportSuite(Suite[Transport]):
     def test_every_subscriber_gets_its_topic_only(self) -> None:
         """Each subscriber of a topic gets every payload on it, and none of another."""
         with self.ends() as (near, far):
-            first: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-            second: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+            first: queue.SimpleQueue[Payload] = queue.SimpleQueue()
+            second: queue.SimpleQueue[Payload] = queue.SimpleQueue()
             far.subscribe("a", first.put)
             far.subscribe("a", second.put)
             self.settle(near, far)
@@ -67,8 +67,8 @@ class TransportSuite(Suite[Transport]):
     def test_an_ended_subscription_is_silent(self) -> None:
         """After its end a subscriber gets nothing; others do."""
         with self.ends() as (near, far):
-            ended: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-            going: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+            ended: queue.SimpleQueue[Payload] = queue.SimpleQueue()
+            going: queue.SimpleQueue[Payload] = queue.SimpleQueue()
             end = far.subscribe("topic", ended.put)
             far.subscribe("topic", going.put)
             self.settle(near, far)
@@ -83,9 +83,9 @@ class TransportSuite(Suite[Transport]):
         """`publish` returns and others are served while one callback does not return."""
         with self.ends() as (near, far):
             release = threading.Event()
-            arrived: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+            arrived: queue.SimpleQueue[Payload] = queue.SimpleQueue()
 
-            def slow(payload: bytes) -> None:
+            def slow(payload: Payload) -> None:
                 release.wait(self.wait_s)
 
             far.subscribe("topic", slow)
@@ -105,10 +105,10 @@ class TransportSuite(Suite[Transport]):
     def test_a_failing_subscriber_harms_nobody(self) -> None:
         """A callback that raises reaches neither the publisher nor other subscribers, and is called again."""
         with self.ends() as (near, far):
-            calls: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-            arrived: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+            calls: queue.SimpleQueue[Payload] = queue.SimpleQueue()
+            arrived: queue.SimpleQueue[Payload] = queue.SimpleQueue()
 
-            def failing(payload: bytes) -> None:
+            def failing(payload: Payload) -> None:
                 calls.put(payload)
                 raise ValueError("the callback failed")
 
@@ -123,9 +123,9 @@ class TransportSuite(Suite[Transport]):
     def test_each_request_gets_its_own_answer(self) -> None:
         """Requests made at the same time are each answered with their own."""
         with self.ends() as (near, far):
-            far.serve("echo", lambda payload: payload + b"!")
+            far.serve("echo", lambda payload: bytes(payload) + b"!")
             self.settle(near, far)
-            answers: dict[int, bytes] = {}
+            answers: dict[int, Payload] = {}
 
             def ask(i: int) -> None:
                 answers[i] = near.request("echo", str(i).encode(), self.wait_s)
@@ -137,12 +137,75 @@ class TransportSuite(Suite[Transport]):
                 thread.join(self.wait_s)
             assert answers == {i: f"{i}!".encode() for i in range(20)}
 
+    def test_sent_buffers_are_free_again(self) -> None:
+        """A bytearray or a view of one can be sent, and written to again once the call has returned."""
+        with self.ends() as (near, far):
+            arrived: queue.SimpleQueue[Payload] = queue.SimpleQueue()
+            going_on, served = threading.Event(), threading.Event()
+
+            def slow(payload: Payload) -> None:
+                going_on.wait(self.wait_s)
+                arrived.put(bytes(payload))
+
+            def answer(payload: Payload) -> Payload:
+                if payload == b"late":
+                    going_on.wait(self.wait_s)
+                    arrived.put(bytes(payload))
+                    served.set()
+                return bytearray(payload)
+
+            far.subscribe("topic", slow)
+            far.serve("echo", answer)
+            self.settle(near, far)
+            buffer = bytearray(b"sent")
+            near.publish("topic", memoryview(buffer))
+            assert near.request("echo", buffer, self.wait_s) == b"sent"
+            buffer[:] = b"late"
+            with pytest.raises(TransportError):
+                near.request("echo", memoryview(buffer), self.short_s)
+            buffer[:] = b"next"
+            going_on.set()
+            assert served.wait(self.wait_s)
+            assert {bytes(arrived.get(timeout=self.wait_s)) for _ in range(2)} == {b"sent", b"late"}
+
+    def test_a_slow_answer_delays_no_other(self) -> None:
+        """While one request is being answered, others are; no more at a time than there are workers."""
+        with self.ends() as (near, far):
+            release = threading.Event()
+            begun: queue.SimpleQueue[Payload] = queue.SimpleQueue()
+
+            def answer(payload: Payload) -> Payload:
+                begun.put(payload)
+                if payload != b"quick":
+                    release.wait(self.wait_s)
+                return payload
+
+            far.serve("echo", answer, workers=2)
+            self.settle(near, far)
+            threads = [
+                threading.Thread(target=near.request, args=("echo", name, self.wait_s)) for name in (b"slow", b"slower")
+            ]
+            threads[0].start()
+            try:
+                assert begun.get(timeout=self.wait_s) == b"slow"
+                assert near.request("echo", b"quick", self.wait_s / 2) == begun.get() == b"quick"
+                threads[1].start()
+                assert begun.get(timeout=self.wait_s) == b"slower"
+                with pytest.raises(TransportError):
+                    near.request("echo", b"quick", self.short_s)
+                assert begun.empty()
+            finally:
+                release.set()
+                for thread in threads:
+                    if thread.ident is not None:
+                        thread.join()
+
     def test_a_late_answer_is_dropped(self) -> None:
         """A request that is answered too late fails, and its answer is not given to the next one."""
         with self.ends() as (near, far):
             release, done = threading.Event(), threading.Event()
 
-            def answer(payload: bytes) -> bytes:
+            def answer(payload: Payload) -> Payload:
                 if payload == b"slow":
                     release.wait(self.wait_s)
                     done.set()
@@ -161,7 +224,7 @@ class TransportSuite(Suite[Transport]):
         """An exception of the server is a TransportError with its text at the requester; the service goes on."""
         with self.ends() as (near, far):
 
-            def answer(payload: bytes) -> bytes:
+            def answer(payload: Payload) -> Payload:
                 if payload == b"bad":
                     raise ValueError("no such thing as bad")
                 return payload
@@ -197,12 +260,39 @@ class TransportSuite(Suite[Transport]):
             self.settle(near, far)
             assert near.request("echo", b"", self.wait_s) == b"third"
 
+    def test_a_watch_tells_who_serves(self) -> None:
+        """The present state at once, then every change, until the watch ends."""
+        with self.ends() as (near, far):
+            early: queue.SimpleQueue[bool] = queue.SimpleQueue()
+            late: queue.SimpleQueue[bool] = queue.SimpleQueue()
+            end_early = near.watch("echo", early.put)
+            assert early.get_nowait() is False
+            near.watch("other", lambda served: early.put(served) if served else None)
+            for _ in range(2):
+                end = far.serve("echo", lambda payload: payload)
+                assert early.get(timeout=self.wait_s) is True
+                end_late = near.watch("echo", late.put)
+                assert late.get_nowait() is True
+                end()
+                assert early.get(timeout=self.wait_s) is False
+                assert late.get(timeout=self.wait_s) is False
+                end_late()
+            end_early()
+            end_early()
+            last = near.watch("echo", late.put)
+            assert late.get_nowait() is False
+            far.serve("echo", lambda payload: payload)
+            assert late.get(timeout=self.wait_s) is True
+            with pytest.raises(queue.Empty):
+                early.get(timeout=self.short_s)
+            last()
+
     def test_a_server_may_use_the_transport(self) -> None:
         """Callbacks and servers may publish and request themselves."""
         with self.ends() as (near, far):
-            arrived: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+            arrived: queue.SimpleQueue[Payload] = queue.SimpleQueue()
 
-            def answer(payload: bytes) -> bytes:
+            def answer(payload: Payload) -> Payload:
                 far.publish("asked", payload)
                 return payload
 
@@ -225,3 +315,5 @@ class TransportSuite(Suite[Transport]):
                 near.serve("name", lambda payload: payload)
             with pytest.raises(TransportError):
                 near.request("name", b"", self.short_s)
+            with pytest.raises(TransportError):
+                near.watch("name", lambda served: None)

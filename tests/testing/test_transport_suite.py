@@ -9,7 +9,7 @@ from typing import override
 import pytest
 
 from ibrobot_core.errors import TransportError
-from ibrobot_core.local_transport import LocalTransport
+from ibrobot_core.local_transport import LocalTransport, _Request
 from ibrobot_core.testing import TransportSuite, checks, failed_checks
 
 
@@ -80,10 +80,10 @@ class SharesAnswers(LocalTransport):
         self.answers = queue.SimpleQueue()
 
     def request(self, name, payload, timeout_s):
-        handler = self._servers.get(name)
-        if self._closed or handler is None:
+        server = self._servers.get(name)
+        if self._closed or server is None:
             raise TransportError(f"nobody serves {name}")
-        threading.Thread(target=lambda: self.answers.put(handler(payload)), daemon=True).start()
+        server.put(_Request(payload, self.answers))
         try:
             return self.answers.get(timeout=timeout_s)
         except queue.Empty:
@@ -116,9 +116,10 @@ class EmptyForNobody(LocalTransport):
 
 
 class LastServerWins(LocalTransport):
-    def serve(self, name, handler):
-        self._servers.pop(name, None)
-        return super().serve(name, handler)
+    def serve(self, name, handler, *, workers=16):
+        if name in self._servers:
+            self._servers.pop(name).end()
+        return super().serve(name, handler, workers=workers)
 
 
 class OneCallAtATime(LocalTransport):
@@ -137,6 +138,26 @@ class OneCallAtATime(LocalTransport):
             return super().request(name, payload, timeout_s)
 
 
+class KeepsBuffers(LocalTransport):
+    """Hands the sender's own memory on."""
+
+    def publish(self, topic, payload):
+        for subscriber in self._subscribers.get(topic, ()):
+            subscriber.put(payload)
+
+
+class OneWorker(LocalTransport):
+    def serve(self, name, handler, *, workers=16):
+        return super().serve(name, handler, workers=1)
+
+
+class WatchesOnce(LocalTransport):
+    def watch(self, name, changed):
+        end = super().watch(name, changed)
+        end()
+        return end
+
+
 class WorksWhileClosed(LocalTransport):
     def _check_open(self):
         pass
@@ -150,6 +171,9 @@ WRONG = {
     CallsInTheSendersThread: "a_slow_subscriber_blocks_nobody",
     DropsFailingSubscribers: "a_failing_subscriber_harms_nobody",
     MixesAnswers: "each_request_gets_its_own_answer",
+    KeepsBuffers: "sent_buffers_are_free_again",
+    OneWorker: "a_slow_answer_delays_no_other",
+    WatchesOnce: "a_watch_tells_who_serves",
     SharesAnswers: "a_late_answer_is_dropped",
     EmptyForErrors: "a_servers_error_reaches_the_requester",
     EmptyForNobody: "nobody_serves",

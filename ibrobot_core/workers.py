@@ -1,0 +1,83 @@
+"""Worker threads: items are worked on in the order of arrival, by a bounded number of threads."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+
+_log = logging.getLogger("ibrobot.workers")
+
+_END_S = 1.0
+
+
+class Workers[T]:
+    """Calls `work` with each item, in at most `count` threads, which start when they are needed.
+
+    An exception of `work` is logged, and reaches no other item.
+
+    Args:
+        work: what to do with an item.
+        name: what the log and the threads are called, e.g. `a subscriber of topic`.
+        count: how many items are worked on at the same time; one keeps them in order.
+        depth: how many items may wait; None for any number.
+    """
+
+    def __init__(self, work: Callable[[T], object], name: str, count: int = 1, depth: int | None = None) -> None:
+        self._work = work
+        self._name = name
+        self._count = count
+        self._depth = depth
+        self._waiting: deque[T] = deque()
+        self._arrived = threading.Condition()
+        self._threads: list[threading.Thread] = []
+        self._idle = 0
+        self._ended = False
+
+    def put(self, item: T) -> T | None:
+        """Have `item` worked on.
+
+        Returns:
+            What will not be worked on: the oldest item waiting, where it had to give way, or `item` itself after `end`;
+            None otherwise.
+        """
+        with self._arrived:
+            if self._ended:
+                return item
+            full = self._depth is not None and len(self._waiting) >= self._depth
+            gave_way = self._waiting.popleft() if full else None
+            self._waiting.append(item)
+            if len(self._waiting) > self._idle and len(self._threads) < self._count:
+                thread = threading.Thread(target=self._run, name=self._name, daemon=True)
+                self._threads.append(thread)
+                thread.start()
+            self._arrived.notify()
+        return gave_way
+
+    def end(self) -> None:
+        """Begin nothing more. Waits a little for what is being worked on, unless called from there."""
+        with self._arrived:
+            self._ended = True
+            self._waiting.clear()
+            self._arrived.notify_all()
+        if threading.current_thread() not in self._threads:
+            deadline = time.monotonic() + _END_S
+            for thread in self._threads:
+                thread.join(max(0.0, deadline - time.monotonic()))
+
+    def _run(self) -> None:
+        while True:
+            with self._arrived:
+                self._idle += 1
+                self._arrived.wait_for(lambda: self._ended or self._waiting)
+                self._idle -= 1
+                if self._ended:
+                    return
+                item = self._waiting.popleft()
+            try:
+                self._work(item)
+            except Exception:  # noqa: BLE001 - contained: one item's fault must not reach the others
+                _log.exception("%s failed", self._name)
+            del item  # it may hold memory, or somebody who waits for its end

@@ -1,0 +1,79 @@
+"""Workers: order, the bound on threads and on what waits, contained exceptions, the end."""
+
+from __future__ import annotations
+
+import queue
+import threading
+
+import pytest
+
+from ibrobot_core.workers import Workers
+
+
+def test_one_worker_keeps_the_order():
+    done = queue.SimpleQueue()
+    workers = Workers(done.put, "numbers")
+    for i in range(100):
+        assert workers.put(i) is None
+    assert [done.get(timeout=5) for _ in range(100)] == list(range(100))
+    workers.end()
+
+
+def test_threads_start_when_needed_and_no_more_than_allowed():
+    begun, release = queue.SimpleQueue(), threading.Event()
+
+    def work(item):
+        begun.put(threading.current_thread())
+        release.wait(5)
+
+    workers = Workers(work, "busy", count=2)
+    for i in range(3):
+        workers.put(i)
+    assert begun.get(timeout=5) is not begun.get(timeout=5)
+    with pytest.raises(queue.Empty):
+        begun.get(timeout=0.02)
+    release.set()
+    begun.get(timeout=5)
+    workers.end()
+
+
+def test_the_oldest_gives_way():
+    begun, release = queue.SimpleQueue(), threading.Event()
+
+    def work(item):
+        begun.put(item)
+        release.wait(5)
+
+    workers = Workers(work, "slow", depth=2)
+    workers.put("a")
+    assert begun.get(timeout=5) == "a"
+    assert [workers.put(item) for item in "bcde"] == [None, None, "b", "c"]
+    release.set()
+    assert [begun.get(timeout=5) for _ in range(2)] == ["d", "e"]
+    workers.end()
+
+
+def test_an_exception_is_logged_and_the_next_item_worked_on(caplog: pytest.LogCaptureFixture):
+    done = queue.SimpleQueue()
+
+    def work(item):
+        if item == 1:
+            raise ValueError("one is bad")
+        done.put(item)
+
+    workers = Workers(work, "the picky one")
+    workers.put(1)
+    workers.put(2)
+    assert done.get(timeout=5) == 2
+    workers.end()
+    assert "the picky one failed" in caplog.text
+    assert "one is bad" in caplog.text
+
+
+def test_after_the_end_nothing_is_begun():
+    done = queue.SimpleQueue()
+    workers = Workers(done.put, "ended")
+    workers.end()
+    workers.end()
+    assert workers.put(1) == 1
+    assert done.empty()
