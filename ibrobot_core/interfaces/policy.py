@@ -9,6 +9,8 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
+from ibrobot_core.robot import Vector
+
 Tensors = Mapping[str, NDArray[np.generic]]
 
 
@@ -23,6 +25,13 @@ class Frame:
     values: Mapping[str, NDArray[np.generic]]
     missing: frozenset[str] = frozenset()
     prompt: str = ""
+    prefix: Vector | None = None
+    """The plan's actions still to be executed from this tick on, shape (K, A) with 1 <= K <= `chunk_size`, in the
+    contract's units and order: row i is for the same time as action i of the chunk. None where nothing is planned, or
+    the policy does not want it; never padded."""
+    delay_steps: int = 0
+    """The latency to expect, in actions: so many of the prefix, 0 <= delay_steps <= K, are executed before the chunk
+    comes."""
 
 
 @attrs.frozen
@@ -40,6 +49,9 @@ class PolicySpec:
     """Rate of the actions in a chunk [Hz]; None: the contract's."""
     prompt: bool = False
     """Whether it wants a prompt."""
+    prefix: bool = False
+    """Whether it continues `Frame.prefix`: its chunk follows the first `delay_steps` actions of the prefix, and leads
+    from there to what it would do by itself (real-time chunking)."""
 
 
 class Policy(ABC):

@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from ibrobot_core.errors import PolicyError
-from ibrobot_core.interfaces import Context, Frame, Policy, Tensors
+from ibrobot_core.interfaces import Context, Frame, Policy, PolicySpec, Tensors
 from ibrobot_core.testing.suite import Suite
 
 
@@ -68,11 +68,18 @@ class PolicySuite(Suite[Policy]):
         """A chunk is (N, A) float64 with 1 <= N <= chunk_size, all finite."""
         with self.loaded() as (policy, ctx):
             for chunk in self._run(policy, ctx, 1):
-                assert chunk.ndim == 2
-                assert 1 <= chunk.shape[0] <= policy.spec.chunk_size, f"a chunk of {chunk.shape[0]}"
-                assert chunk.shape[1] == policy.spec.action_size
-                assert chunk.dtype == np.float64
-                assert np.isfinite(chunk).all()
+                _check_chunk(chunk, policy.spec)
+
+    def test_a_prefix_of_any_length_is_taken(self) -> None:
+        """A policy that says `prefix` gives chunks as specified for one action, some, and a whole chunk."""
+        with self.loaded() as (policy, ctx):
+            if not policy.spec.prefix:
+                pytest.skip("takes no prefix")
+            plan = self._run(policy, ctx, 1)[0]
+            for length in sorted({1, (len(plan) + 1) // 2, len(plan)}):
+                for delay in sorted({0, 1, length}):
+                    frame = attrs.evolve(self.frame(policy, ctx, 1), prefix=plan[:length], delay_steps=delay)
+                    _check_chunk(policy.postprocess(policy.infer(policy.preprocess(frame))), policy.spec)
 
     def test_a_missing_key_is_refused(self) -> None:
         """A frame without one of the keys that the spec names is a PolicyError that says which."""
@@ -139,6 +146,14 @@ class PolicySuite(Suite[Policy]):
         policy.load()
         policy.close()
         policy.close()
+
+
+def _check_chunk(chunk: NDArray[np.float64], spec: PolicySpec) -> None:
+    assert chunk.ndim == 2
+    assert 1 <= chunk.shape[0] <= spec.chunk_size, f"a chunk of {chunk.shape[0]}"
+    assert chunk.shape[1] == spec.action_size
+    assert chunk.dtype == np.float64
+    assert np.isfinite(chunk).all()
 
 
 def _copy(tensors: Tensors) -> dict[str, NDArray[np.generic]]:

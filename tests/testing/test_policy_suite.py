@@ -102,11 +102,28 @@ class ClosesOnce(FakePolicy):
         self.closed = True
 
 
+class TrustsThePrefixsLength(FakePolicy):
+    def __init__(self, ctx):
+        super().__init__(ctx)
+        self.spec = attrs.evolve(self.spec, prefix=True)
+
+    def preprocess(self, frame):
+        prefix = frame.prefix
+        return super().preprocess(frame) | ({} if prefix is None else {"pace": prefix[-1] - prefix[-2:][0]})
+
+    def postprocess(self, tensors):
+        return super().postprocess(tensors) / tensors.get("pace", 1.0)
+
+    def infer(self, tensors):
+        return super().infer(tensors) | {key: tensors[key] for key in ("pace",) if key in tensors}
+
+
 WRONG = {
     MiscountsItsActions: "spec_agrees_with_itself",
     LongChunks: "chunks_are_as_specified",
     SingleActions: "chunks_are_as_specified",
     SinglePrecision: "chunks_are_as_specified",
+    TrustsThePrefixsLength: "a_prefix_of_any_length_is_taken",
     ZerosForMissing: "a_missing_key_is_refused",
     RandomWithoutSeed: "equal_seeds_act_alike",
     RemembersTheLastEpisode: "equal_seeds_act_alike",
