@@ -1,0 +1,27 @@
+"""The plugin's hooks: transport `zenoh`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+from ibrobot_core.descriptors import TransportDescriptor
+from ibrobot_core.hookspecs import hookimpl
+from ibrobot_zenoh.options import ZenohOptions
+
+if TYPE_CHECKING:
+    from ibrobot_core.interfaces import Context, Transport
+
+
+def _zenoh(options: Any, ctx: Context) -> Transport:
+    from ibrobot_zenoh.transport import ZenohTransport
+
+    return ZenohTransport(options, ctx)
+
+
+@hookimpl
+def ibrobot_transports() -> Iterable[TransportDescriptor]:
+    """Between machines."""
+    yield TransportDescriptor(
+        type="zenoh", options=ZenohOptions, make=_zenoh, summary="between machines; ROS 2 nodes with rmw_zenoh join in"
+    )

@@ -1,0 +1,202 @@
+"""A Zenoh session that is there as soon as somebody answers, and what was declared on it before and after."""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import zenoh
+
+from ibrobot_core.errors import TransportError
+from ibrobot_zenoh.options import ZenohOptions
+
+_RETRY_MS = (50, 500)
+"""First and longest time between attempts to connect."""
+_ATTEMPT_MS = 1000
+"""How long a client tries before it looks whether it was closed meanwhile."""
+_FIRST_WAIT_S = 0.3
+"""How long making a client waits for somebody to answer, so that what is there can be used at once."""
+
+
+class Declared(Protocol):
+    """A subscriber, queryable or token."""
+
+    def undeclare(self) -> Any:
+        """End it."""
+
+
+def zenoh_config(options: ZenohOptions) -> zenoh.Config:
+    """Zenoh's settings: the user's own file, and over it what the options say. No scouting of any kind.
+
+    Raises:
+        TransportError: for a file that cannot be read.
+    """
+    try:
+        config = zenoh.Config() if options.settings is None else zenoh.Config.from_file(options.settings)
+    except zenoh.ZError as error:
+        raise TransportError(f"settings {options.settings}: {first_line(error)}") from error
+    client = options.mode == "client"
+    first_ms, longest_ms = _RETRY_MS
+    lease_ms = round(options.lease * 1000)
+    settings: dict[str, Any] = {
+        "mode": options.mode,
+        "connect/endpoints": list(options.connect),
+        "connect/timeout_ms": _ATTEMPT_MS if client else -1,
+        "connect/exit_on_failure": client,
+        "connect/retry": {"period_init_ms": first_ms, "period_max_ms": longest_ms, "period_increase_factor": 2},
+        "listen/endpoints": list(options.listen),
+        "listen/exit_on_failure": True,
+        "open/return_conditions": {"connect_scouted": False, "declares": client},
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "scouting/delay": 0,
+        "transport/link/tx/lease": lease_ms,
+        "transport/link/rx/max_message_size": options.max_message_size,
+        "transport/shared_memory/enabled": options.shared_memory,
+    }
+    if (tls := options.tls) is not None:
+        for path in (tls.ca, tls.certificate, tls.key):
+            _check_readable(path)
+        settings["transport/link/tls"] = {
+            "root_ca_certificate": str(tls.ca), "enable_mtls": True, "verify_name_on_connect": True,
+            "connect_certificate": str(tls.certificate), "connect_private_key": str(tls.key),
+            "listen_certificate": str(tls.certificate), "listen_private_key": str(tls.key),
+        }  # fmt: skip
+    if options.user is not None:
+        settings["transport/auth/usrpwd/user"] = options.user
+        settings["transport/auth/usrpwd/password"] = options.password
+    if options.users is not None:
+        _check_readable(options.users)
+        settings["transport/auth/usrpwd/dictionary_file"] = str(options.users)
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+def first_line(error: BaseException) -> str:
+    """What Zenoh says, without where in its source."""
+    return str(error).partition(" at /")[0].strip()
+
+
+def _check_readable(path: Any) -> None:
+    try:
+        with open(path, "rb"):
+            pass
+    except OSError as error:
+        raise TransportError(f"{path}: cannot be read: {error.strerror}") from error
+
+
+class Connection:
+    """A Zenoh session. A peer or router has it at once; a client once the other side answers, and it keeps trying.
+
+    After that Zenoh connects again by itself, and declares again what was declared.
+
+    Raises:
+        TransportError: e.g. for an address to listen on that is taken, or a certificate that cannot be read.
+    """
+
+    def __init__(self, options: ZenohOptions, log: logging.Logger) -> None:
+        self._log = log
+        self._endpoints = ", ".join(options.connect or options.listen)
+        self._config = zenoh_config(options)
+        self._lock = threading.Lock()
+        self._session: zenoh.Session | None = None
+        self._pending: dict[object, Callable[[zenoh.Session], Declared]] = {}
+        self._declared: dict[object, Declared] = {}
+        self._closed = threading.Event()
+        self._thread: threading.Thread | None = None
+        if options.mode != "client":
+            try:
+                self._session = zenoh.open(self._config)
+            except zenoh.ZError as error:
+                raise TransportError(f"{self._endpoints}: {first_line(error)}") from error
+            return
+        answered = threading.Event()
+        self._thread = threading.Thread(target=self._connect, args=(answered,), name="zenoh connects", daemon=True)
+        self._thread.start()
+        answered.wait(_FIRST_WAIT_S)
+
+    def session(self) -> zenoh.Session:
+        """The session.
+
+        Raises:
+            TransportError: when closed, or not connected yet.
+        """
+        session = self._session
+        if self._closed.is_set():
+            raise TransportError("the transport is closed")
+        if session is None:
+            raise TransportError(f"not connected: nobody answers at {self._endpoints}")
+        return session
+
+    @property
+    def open_session(self) -> zenoh.Session | None:
+        """The session, or None before the other side answered.
+
+        Raises:
+            TransportError: when closed.
+        """
+        if self._closed.is_set():
+            raise TransportError("the transport is closed")
+        return self._session
+
+    def declare(self, make: Callable[[zenoh.Session], Declared]) -> Callable[[], None]:
+        """Have `make` declare something on the session, now or when there is one; returns a function that ends it.
+
+        Raises:
+            TransportError: when closed.
+        """
+        key = object()
+        with self._lock:
+            if (session := self.open_session) is None:
+                self._pending[key] = make
+            else:
+                self._declared[key] = make(session)
+
+        def end() -> None:
+            with self._lock:
+                self._pending.pop(key, None)
+                declared = self._declared.pop(key, None)
+            if declared is not None and not self._closed.is_set():
+                declared.undeclare()
+
+        return end
+
+    def close(self) -> None:
+        """End the session, and all that was declared."""
+        with self._lock:
+            if self._closed.is_set():
+                return
+            self._closed.set()
+            session, self._session = self._session, None
+            self._pending.clear()
+            self._declared.clear()
+        if self._thread is not None:
+            self._thread.join(2 * _ATTEMPT_MS / 1000)
+        if session is not None:
+            session.close()  # type: ignore[no-untyped-call]  # its stub has no types
+
+    def _connect(self, answered: threading.Event) -> None:
+        """Try until somebody answers; every new reason why nobody does is logged once."""
+        told = ""
+        while not self._closed.is_set():
+            try:
+                session = zenoh.open(self._config)
+            except zenoh.ZError as error:
+                if (reason := first_line(error)) != told:
+                    self._log.warning("not connected to %s yet: %s", self._endpoints, told := reason)
+                self._closed.wait(_RETRY_MS[0] / 1000)
+                continue
+            with self._lock:
+                if not self._closed.is_set():
+                    self._session = session
+                    self._declared |= {key: make(session) for key, make in self._pending.items()}
+                    self._pending.clear()
+                    answered.set()
+                    if told:
+                        self._log.info("connected to %s", self._endpoints)
+                    return
+            session.close()  # type: ignore[no-untyped-call]  # its stub has no types

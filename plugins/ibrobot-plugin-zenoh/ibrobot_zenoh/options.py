@@ -1,0 +1,101 @@
+"""Options of the transport `zenoh`: whom to connect to, where to listen, and how both prove who they are."""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+from pathlib import Path
+
+import attrs
+
+from ibrobot_core.options import option
+
+MIB = 1024 * 1024
+
+_ENDPOINT = re.compile(r"(?P<protocol>tcp|tls|quic|unixsock-stream)/(?P<address>.+)")
+_ENCRYPTED = ("tls", "quic")
+
+
+def is_local(endpoint: str) -> bool:
+    """Whether only this machine can reach an endpoint to listen on."""
+    protocol, _, address = endpoint.partition("/")
+    if protocol == "unixsock-stream":
+        return True
+    host = address.rpartition(":")[0].strip("[]")
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def _check_endpoints(instance: object, attribute: attrs.Attribute[tuple[str, ...]], value: tuple[str, ...]) -> None:
+    for endpoint in value:
+        found = _ENDPOINT.fullmatch(endpoint)
+        if found is None:
+            raise ValueError(f"{endpoint!r} is no endpoint, give PROTOCOL/HOST:PORT, e.g. tcp/127.0.0.1:7447")
+        port = found["address"].rpartition(":")[2].partition("#")[0]
+        if found["protocol"] != "unixsock-stream" and not port.isdecimal():
+            raise ValueError(f"{endpoint!r} has no port, give PROTOCOL/HOST:PORT, e.g. {endpoint}:7447")
+
+
+@attrs.frozen
+class Tls:
+    """Certificates, as `ibrobot certs` makes them; both sides must have one that `ca` signed."""
+
+    ca: Path = option(help="certificate of the authority that signed everybody's")
+    certificate: Path = option(help="this machine's certificate")
+    key: Path = option(help="its private key")
+
+
+@attrs.frozen
+class ZenohOptions:
+    """What the YAML may say."""
+
+    connect: tuple[str, ...] = option(
+        (), validator=_check_endpoints, help="whom to connect to, e.g. tls/gpu.lab:7447; tried in this order"
+    )
+    listen: tuple[str, ...] = option(
+        (), validator=_check_endpoints, help="where others may connect to, e.g. tcp/127.0.0.1:7447; nowhere by default"
+    )
+    mode: str = option(
+        "client",
+        choices=("client", "peer", "router"),
+        help="client: connects; peer: may listen as well; router: also passes on what its clients tell one another",
+    )
+    tls: Tls | None = option(None, help="certificates, for tls and quic endpoints")
+    user: str | None = option(None, help="name to connect with, where the other side asks for one")
+    password: str | None = option(None, help="password to connect with, e.g. ${IBROBOT_PASSWORD}")
+    users: Path | None = option(None, help="who may connect to us: a file of lines NAME:PASSWORD")
+    trusted_network: bool = option(
+        False, help="allows to listen beyond this machine without tls or users: everybody there may do everything"
+    )
+    settings: Path | None = option(None, help="a JSON5 file of Zenoh's own settings, e.g. access_control")
+    max_message_size: int = option(64 * MIB, unit="bytes", ge=1024, help="larger messages are neither sent nor taken")
+    lease: float = option(2.0, unit="s", ge=0.2, le=60, help="silence after which a connection counts as lost")
+    shared_memory: bool = option(True, help="large messages to processes of this machine go through shared memory")
+    domain: int = option(0, ge=0, le=232, help="ROS 2 domain of shared topics")
+    namespace: str = option("", help="put before the names of shared topics, e.g. robot1 makes /robot1/joint_states")
+    type_hashes: bool = option(True, help="false: as ROS 2 Humble names topics, without the hash of their type")
+
+    def __attrs_post_init__(self) -> None:
+        if self.mode == "client" and self.listen:
+            raise ValueError("a client does not listen; give mode: router (or peer) beside listen")
+        if self.mode == "client" and not self.connect:
+            raise ValueError("needs whom to connect to, e.g. connect: [tcp/127.0.0.1:7447]; or mode: router and listen")
+        for endpoint in (*self.connect, *self.listen):
+            encrypted = endpoint.partition("/")[0] in _ENCRYPTED
+            if encrypted and self.tls is None:
+                raise ValueError(f"{endpoint} needs tls: {{ca: …, certificate: …, key: …}}; `ibrobot certs` makes them")
+            if not encrypted and self.tls is not None and not is_local(endpoint):
+                raise ValueError(f"{endpoint} would not use tls; write tls/{endpoint.partition('/')[2]}")
+        if (self.user is None) != (self.password is None):
+            raise ValueError("user and password belong together, one of them is missing")
+        if not (self.trusted_network or self.tls or self.users):
+            for endpoint in self.listen:
+                if not is_local(endpoint):
+                    raise ValueError(
+                        f"listen: {endpoint} can be reached by other machines: give tls or users, or "
+                        "trusted_network: true where everybody may do everything"
+                    )
+        if not re.fullmatch(r"(/?[A-Za-z_][A-Za-z0-9_]*)*", self.namespace):
+            raise ValueError(f"namespace {self.namespace!r} is no ROS 2 name, e.g. robot1 or lab/robot1")

@@ -1,0 +1,198 @@
+"""The transport: publish and subscribe, requests answered by several threads, and who is alive."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any, override
+
+import zenoh
+
+from ibrobot_core.errors import TransportError
+from ibrobot_core.interfaces import Context, Payload, Transport
+from ibrobot_core.interfaces.transport import WORKERS
+from ibrobot_core.workers import Workers
+from ibrobot_zenoh.connection import Connection, first_line
+from ibrobot_zenoh.options import ZenohOptions
+
+SUBSCRIBER_DEPTH = 1000
+"""How many payloads may wait for a subscriber; beyond, the oldest gives way."""
+REQUESTS_WAITING = 64
+"""How many requests may wait for a server's workers; beyond, the oldest is told that it is overloaded."""
+_WATCH_S = 1.0
+_FAILED = zenoh.Encoding.TEXT_PLAIN
+"""Marks a server's own words, which Zenoh's about a timeout are not."""
+
+
+def _key(prefix: str, name: str) -> zenoh.KeyExpr:
+    try:
+        key = zenoh.KeyExpr(f"ibrobot/{prefix}/{name.removeprefix('/')}")
+    except zenoh.ZError as error:
+        raise TransportError(f"{name!r} cannot be a name here: {first_line(error)}") from error
+    if "*" in name:
+        raise TransportError(f"{name!r} cannot be a name here: it has a *")
+    return key
+
+
+def _sendable(payload: Payload) -> bytes | bytearray:
+    return payload.tobytes() if isinstance(payload, memoryview) else payload
+
+
+class ZenohTransport(Transport):
+    """Payloads over Zenoh. Keys are `ibrobot/topic/TOPIC` and `ibrobot/service/NAME`.
+
+    Raises:
+        TransportError: see `Connection`.
+    """
+
+    def __init__(self, options: ZenohOptions, ctx: Context) -> None:
+        self._log = ctx.log
+        self._largest = options.max_message_size
+        self._connection = Connection(options, ctx.log)
+        self._lock = threading.Lock()
+        self._served: set[str] = set()
+        self._workers: list[Workers[Any]] = []
+
+    @override
+    def publish(self, topic: str, payload: Payload) -> None:
+        self._check_size(len(payload), topic)
+        key = _key("topic", topic)
+        session = self._connection.open_session
+        if session is not None:  # else there is nobody who could have subscribed
+            # What waits here is the link, never a subscriber: those have queues of their own.
+            session.put(key, _sendable(payload), congestion_control=zenoh.CongestionControl.BLOCK)
+
+    @override
+    def subscribe(self, topic: str, callback: Callable[[Payload], object]) -> Callable[[], None]:
+        name = f"a subscriber of {topic}"
+        subscriber = Workers[zenoh.Sample](
+            lambda sample: callback(sample.payload.to_bytes()), name, 1, SUBSCRIBER_DEPTH
+        )
+
+        def take(sample: zenoh.Sample) -> None:
+            if subscriber.put(sample) is not None:
+                self._log.warning("%s is too slow: a payload was dropped", name)
+
+        key = _key("topic", topic)
+        return self._keep(self._connection.declare(lambda session: session.declare_subscriber(key, take)), subscriber)
+
+    @override
+    def serve(self, name: str, handler: Callable[[Payload], Payload], *, workers: int = WORKERS) -> Callable[[], None]:
+        key, token = _key("service", name), _key("served", name)
+
+        def answer(query: zenoh.Query) -> None:
+            with query:  # dropping it is what tells the requester that nothing more comes
+                try:
+                    request = query.payload
+                    reply = handler(request.to_bytes() if request is not None else b"")
+                    self._check_size(len(reply), name)
+                except Exception as error:  # noqa: BLE001 - it is the requester's to see
+                    query.reply_err(f"{type(error).__name__}: {error}", encoding=_FAILED)
+                else:
+                    query.reply(key, _sendable(reply))
+
+        server = Workers(answer, f"the server of {name}", workers, REQUESTS_WAITING)
+
+        def take(query: zenoh.Query) -> None:
+            turned_away = server.put(query)
+            if turned_away is not None:
+                with turned_away:
+                    turned_away.reply_err("it is overloaded, or about to end", encoding=_FAILED)
+
+        with self._lock:
+            if name in self._served:
+                raise TransportError(f"{name} is served already")
+            end_queries = self._connection.declare(lambda session: session.declare_queryable(key, take, complete=True))
+            self._served.add(name)
+        end_token = self._connection.declare(
+            lambda session: session.liveliness().declare_token(token.join(str(session.info.zid())))
+        )
+
+        def end() -> None:
+            end_token()
+            end_queries()
+            with self._lock:
+                self._served.discard(name)
+
+        return self._keep(end, server)
+
+    @override
+    def request(self, name: str, payload: Payload, timeout_s: float) -> Payload:
+        key = _key("service", name)
+        self._check_size(len(payload), name)
+        session = self._connection.session()
+        try:
+            # Replies go to a channel of this call's own: once it is gone, a late one has nowhere to go.
+            replies = session.get(
+                key, payload=_sendable(payload), timeout=timeout_s, consolidation=zenoh.ConsolidationMode.NONE,
+                congestion_control=zenoh.CongestionControl.BLOCK, priority=zenoh.Priority.INTERACTIVE_HIGH,
+            )  # fmt: skip
+        except zenoh.ZError as error:
+            raise TransportError(f"{name}: {first_line(error)}") from error
+        for reply in replies:
+            if (sample := reply.ok) is not None:
+                return sample.payload.to_bytes()
+            failure = reply.err
+            if failure is not None and failure.encoding == _FAILED:
+                raise TransportError(f"{name} failed: {failure.payload.to_bytes().decode(errors='replace')}")
+            raise TransportError(f"no answer from {name} within {timeout_s} s")
+        raise TransportError(f"nobody serves {name}")
+
+    @override
+    def watch(self, name: str, changed: Callable[[bool], object]) -> Callable[[], None]:
+        tokens = _key("served", name).join("*")
+        turn = threading.Lock()  # held until the present state was told, which comes first
+        alive: set[str] = set()
+        told: bool | None = None
+
+        def tell(served: bool) -> None:
+            with turn:
+                changed(served)
+
+        watcher = Workers(tell, f"a watch of {name}")
+
+        def take(sample: zenoh.Sample) -> None:
+            nonlocal told
+            change = alive.add if sample.kind == zenoh.SampleKind.PUT else alive.discard
+            with self._lock:
+                change(str(sample.key_expr))
+                if told is not None and told != bool(alive):
+                    told = not told
+                    watcher.put(told)
+
+        with turn:
+            end = self._connection.declare(
+                lambda session: session.liveliness().declare_subscriber(tokens, take, history=True)
+            )
+            # Asked for after `take` began to listen, so that no change can fall between the two.
+            session = self._connection.open_session
+            present = session is not None and bool(list(session.liveliness().get(tokens, timeout=_WATCH_S)))
+            with self._lock:
+                told = present
+            changed(present)
+        return self._keep(end, watcher)
+
+    @override
+    def close(self) -> None:
+        with self._lock:
+            workers, self._workers = self._workers, []
+        for each in workers:
+            each.end()
+        self._connection.close()
+
+    def _keep(self, end_declared: Callable[[], None], workers: Workers[Any]) -> Callable[[], None]:
+        with self._lock:
+            self._workers.append(workers)
+
+        def end() -> None:
+            end_declared()
+            workers.end()
+            with self._lock:
+                if workers in self._workers:
+                    self._workers.remove(workers)
+
+        return end
+
+    def _check_size(self, size: int, name: str) -> None:
+        if size > self._largest:
+            raise TransportError(f"{name}: a message of {size} bytes is larger than max_message_size, {self._largest}")

@@ -1,0 +1,18 @@
+"""Every test of this plugin leaves nothing open, but for what Zenoh opens once and keeps."""
+
+from __future__ import annotations
+
+import pytest
+
+from ibrobot_core.testing.leaks import no_leaks  # noqa: F401
+
+from .pair import client, free_endpoint, router
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _zenoh_runs() -> None:
+    """Zenoh's own threads run, with the files that they keep."""
+    endpoint = free_endpoint()
+    first, second = router(endpoint), client(endpoint)
+    second.close()
+    first.close()

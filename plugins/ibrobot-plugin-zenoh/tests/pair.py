@@ -1,0 +1,60 @@
+"""Two connected ends on this machine, for the tests."""
+
+from __future__ import annotations
+
+import itertools
+import socket
+import threading
+from collections.abc import Callable
+from typing import Any
+
+from ibrobot_zenoh.options import ZenohOptions
+from ibrobot_zenoh.transport import ZenohTransport
+
+from ibrobot_core.interfaces import Transport
+from ibrobot_core.testing import host_context
+
+WAIT_S = 10.0
+"""How long a test waits for what must come [s]."""
+
+_numbers = itertools.count()
+
+
+def free_endpoint(protocol: str = "tcp") -> str:
+    """An endpoint of this machine that nobody listens on."""
+    with socket.socket() as found:
+        found.bind(("127.0.0.1", 0))
+        return f"{protocol}/127.0.0.1:{found.getsockname()[1]}"
+
+
+def router(endpoint: str, **options: Any) -> ZenohTransport:
+    """One that listens at `endpoint`."""
+    return make(listen=(endpoint,), mode="router", **options)
+
+
+def client(endpoint: str, **options: Any) -> ZenohTransport:
+    """One that connects to `endpoint`."""
+    return make(connect=(endpoint,), **options)
+
+
+def make(**options: Any) -> ZenohTransport:
+    """A transport; without shared memory, whose files Zenoh keeps open after it was closed."""
+    return ZenohTransport(ZenohOptions(**{"shared_memory": False, **options}), host_context())
+
+
+def settle(near: Transport, far: Transport) -> None:
+    """Wait until all that `far` declared is known to `near`: what is declared later becomes known later."""
+    topic, known = f"settle/{next(_numbers)}", threading.Event()
+    end = far.subscribe(topic, lambda payload: known.set())
+    wait_for(lambda: near.publish(topic, b"") or known.is_set())
+    end()
+
+
+def wait_for(condition: Callable[[], object]) -> None:
+    """Ask until `condition` holds; it must within `WAIT_S`."""
+    pause = threading.Event()
+    for _ in range(int(WAIT_S / 0.005)):
+        if condition():
+            return
+        pause.wait(0.005)
+    raise AssertionError("it did not come true")
