@@ -40,10 +40,14 @@ ENOUGH, GROWTH = 3.0, 1.25
 
 
 def pictures(camera: int, count: int) -> Iterator[np.ndarray[Any, np.dtype[np.uint8]]]:
-    """A textured table, a thing that moves over it, and the noise of a sensor."""
+    """A table with the 1/f spectrum of natural pictures, a thing that moves over it, and the noise of a sensor."""
     rng = np.random.default_rng(camera)
-    coarse = rng.normal(128, 40, (HEIGHT // 16, WIDTH // 16, 3)).repeat(16, 0).repeat(16, 1)
-    table = coarse + rng.normal(0, 12, (HEIGHT, WIDTH, 3))
+    frequency = np.hypot(np.fft.fftfreq(HEIGHT)[:, None], np.fft.rfftfreq(WIDTH)[None, :])
+    frequency[0, 0] = np.inf
+    field = np.fft.irfft2(
+        np.fft.rfft2(rng.normal(size=(HEIGHT, WIDTH, 3)), axes=(0, 1)) / frequency[..., None], axes=(0, 1)
+    )
+    table = 128 + 40 * field / field.std()
     noise = rng.normal(0, 2, (8, HEIGHT, WIDTH, 3))
     for i in range(count):
         picture = table + noise[i % len(noise)]
@@ -98,16 +102,16 @@ def record(folder: Path, frames: int) -> None:
 
 def measure(command: Sequence[str]) -> dict[str, float]:
     """Run a command: seconds, seconds of CPU, and the most memory of its processes together [MiB]."""
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
     begin = time.monotonic()
     environment = {**os.environ, "TQDM_DISABLE": "1", "SVT_LOG": "1", "HF_HUB_OFFLINE": "1"}
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
-    peak, ended = 0.0, threading.Event()
+    peak, cpu, ended = 0.0, 0.0, threading.Event()
 
     def watch() -> None:
-        nonlocal peak
+        nonlocal peak, cpu
         while not ended.wait(0.05):
-            peak = max(peak, _pss_mib(process.pid))
+            memory, used = _usage(process.pid)
+            peak, cpu = max(peak, memory), max(cpu, used)
 
     watcher = threading.Thread(target=watch)
     watcher.start()
@@ -117,22 +121,28 @@ def measure(command: Sequence[str]) -> dict[str, float]:
     watcher.join()
     if process.returncode:
         sys.exit(f"{' '.join(command)}: exit {process.returncode}\n{err[-2000:]}")
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     found = {"seconds": seconds, "cpu_s": cpu, "peak_mib": peak}
     last = out.strip().splitlines()[-1] if out.strip() else ""
     return found | (json.loads(last) if last.startswith('{"measured"') else {})
 
 
-def _pss_mib(pid: int) -> float:
-    """Proportional memory of a process and all its children."""
+def _usage(pid: int) -> tuple[float, float]:
+    """Of a process and all its children: proportional memory [MiB], and CPU time, that of ended children included [s].
+
+    Sampled rather than asked for at the end, since a server that forks processes outlives the command.
+    """
     try:
         children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
         lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+        times = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[11:15]
     except OSError:
-        return 0.0
-    own = next((int(line.split()[1]) for line in lines if line.startswith("Pss:")), 0) / 1024
-    return own + sum(_pss_mib(int(child)) for child in children)
+        return 0.0, 0.0
+    memory = next((int(line.split()[1]) for line in lines if line.startswith("Pss:")), 0) / 1024
+    cpu = sum(map(int, times)) / os.sysconf("SC_CLK_TCK")
+    for child in children:
+        more = _usage(int(child))
+        memory, cpu = memory + more[0], cpu + more[1]
+    return memory, cpu
 
 
 def ours(episodes: Path, out: Path, *more: str) -> dict[str, float]:

@@ -6,8 +6,11 @@ import fcntl
 import hashlib
 import json
 import multiprocessing
+import os
 import re
 import shutil
+import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -192,26 +195,9 @@ class _Plan:
                 shutil.rmtree(job.unit, ignore_errors=True)
                 todo.append(job)
         total = sum(self._expected[job.source] for job in todo)
-        run = _run_here if min(self._request.jobs, len(todo)) <= 1 else _run_in_processes
-        for report in run(todo, self._request.jobs, lambda done, report: watch(done, total, report)):
+        for report in _run_in_processes(todo, self._request.jobs, lambda done, report: watch(done, total, report)):
             self._reports[report.source] = report
         return self._reports
-
-
-def _run_here(
-    jobs: Sequence[Job], limit: int, watch: Callable[[int, EpisodeReport | None], None]
-) -> Iterator[EpisodeReport]:
-    done = 0
-
-    def progress(frames: int) -> None:
-        nonlocal done
-        done += frames
-        watch(done, None)
-
-    for job in jobs:
-        report = convert_episode(job, progress)
-        watch(done, report)
-        yield report
 
 
 _done: Any = None
@@ -221,6 +207,15 @@ _done: Any = None
 def _begin_process(done: Any) -> None:
     global _done  # noqa: PLW0603 - how a pool gives its processes what cannot be sent with each job
     _done = done
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """A process whose parent was killed must not write beside the next run."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
 
 
 def _count(frames: int) -> None:
@@ -235,9 +230,14 @@ def _convert_in_process(job: Job) -> EpisodeReport:
 def _run_in_processes(
     jobs: Sequence[Job], limit: int, watch: Callable[[int, EpisodeReport | None], None]
 ) -> Iterator[EpisodeReport]:
-    context = multiprocessing.get_context("spawn")
+    """Each episode in a process of its own, so that what encoders leave in memory goes with it."""
+    if not jobs:
+        return
+    context = multiprocessing.get_context("forkserver")
+    # Reader and writer have been imported here by now: a fork of a server that has them too begins at once.
+    context.set_forkserver_preload([name for name in sys.modules if name.startswith("ibrobot_")])
     done = context.Value("q", 0)
-    pool = ProcessPoolExecutor(min(limit, len(jobs)), context, _begin_process, (done,))
+    pool = ProcessPoolExecutor(min(limit, len(jobs)), context, _begin_process, (done,), max_tasks_per_child=1)
     try:
         waiting: set[Future[EpisodeReport]] = {pool.submit(_convert_in_process, job) for job in jobs}
         while waiting:
