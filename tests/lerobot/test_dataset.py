@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 from pathlib import Path
@@ -11,80 +10,20 @@ from typing import Any
 import numpy as np
 import pytest
 from ibrobot_lerobot.options import LeRobotOptions
-from ibrobot_mcap.options import McapOptions
-from ibrobot_mcap.recorder import McapRecorder
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from mcap.reader import make_reader
 from numpy.typing import NDArray
+from recordings import CAMERAS, SIZE, record
 from rosbags.typesys import Stores, get_typestore
 from tqdm import tqdm
 
-from ibrobot_core.clock import SteppedClock
-from ibrobot_core.config.schema import Align, ImageSpec
-from ibrobot_core.contract.specs import ActionPart, Contract, ObservationPart
-from ibrobot_core.interfaces import EpisodeEnd, EpisodeStart, Feature
-from ibrobot_core.messages import Float64MultiArray, Header, Image, JointState
 from ibrobot_core.recording.convert import Request, convert, find_episodes
-from ibrobot_core.testing.contexts import host_context
 
 pytestmark = pytest.mark.lerobot
 tqdm.monitor_interval = 0  # no thread that outlives the test
 
 LOSSY = 0.15
 """Mean difference to what went into a codec, of values 0 to 1; another picture is about 0.37 away."""
-START_NS = 1_700_000_000_000_000_000
-JOINTS = ("pan", "lift", "gripper")
-BLOCK = 32
-SIZE = (3 * BLOCK, 4 * BLOCK)
-CAMERAS = ("top", "wrist")
-CONTRACT = Contract(
-    30.0,
-    (
-        ObservationPart(
-            "observation.state", "/joint_states", JointState.ros_type, tuple(f"position.{j}" for j in JOINTS), None,
-            Align(), Feature("float32", (3,), tuple(f"{j}.pos" for j in JOINTS)),
-        ),
-        *(
-            ObservationPart(
-                f"observation.images.{camera}", f"/{camera}", Image.ros_type, (), ImageSpec(),
-                Align("asof", tol_ms=200.0), Feature("image", (*SIZE, 3), ("height", "width", "channels")),
-            )
-            for camera in CAMERAS
-        ),
-    ),
-    (ActionPart("arm", "/commands", Float64MultiArray.ros_type, "hold", JOINTS),),
-)  # fmt: skip
-
-
-def numbered(number: int) -> NDArray[np.uint8]:
-    """A picture of blocks that are others for each number, so that no codec can hide which one it is."""
-    shape = (SIZE[0] // BLOCK, SIZE[1] // BLOCK, 3)
-    blocks = np.random.default_rng(number).choice(np.array([30, 220], np.uint8), shape)
-    return blocks.repeat(BLOCK, 0).repeat(BLOCK, 1)
-
-
-def record(folder: Path, seed: int, seconds: float, prompt: str) -> None:
-    """Streams of their own rates, stamps ahead of their receipt by a few jittered milliseconds."""
-    rng = np.random.default_rng(seed)
-    recorder = McapRecorder(McapOptions(), host_context(clock=SteppedClock(START_NS)))
-    metadata = {"contract": json.dumps(CONTRACT.canonical()), "prompt": prompt, "robot_type": "so101_follower"}
-    recorder.begin(EpisodeStart(folder, START_NS, CONTRACT.topics, metadata))
-    events: list[tuple[int, str, Any]] = []
-    for topic, rate in (("/joint_states", 100), ("/commands", 50), ("/top", 30), ("/wrist", 24)):
-        for i in range(int(seconds * rate)):
-            stamp = START_NS + round(i * 1e9 / rate)
-            received = stamp + int(rng.integers(0, 9_000_000))
-            if topic == "/joint_states":
-                message: Any = JointState(Header(stamp), JOINTS, rng.normal(size=3))
-            elif topic == "/commands":
-                message = Float64MultiArray(rng.normal(size=3))
-            else:
-                pixels = numbered(seed * 1000 + i + (500 if topic == "/wrist" else 0))
-                message = Image(Header(stamp), *SIZE, "rgb8", SIZE[1] * 3, pixels.ravel())
-            events.append((received, topic, message))
-    for received, topic, message in sorted(events, key=lambda event: event[0]):
-        recorder.write(topic, message, received)
-    recorder.end(EpisodeEnd(START_NS + round(seconds * 1e9), "success"))
 
 
 def independently(folder: Path) -> list[dict[str, NDArray[Any]]]:

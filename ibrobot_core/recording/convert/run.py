@@ -109,11 +109,12 @@ def _staging(request: Request) -> Iterator[tuple[Path, DatasetSummary | None]]:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 raise DatasetError(f"{out}: another conversion into it is running") from None
-            yield out / STAGING, old
+            try:
+                yield out / STAGING, old
+            finally:
+                _tidy(out)
     except OSError as error:
         raise DatasetError(f"{out}: cannot be written: {error.strerror}") from error
-    finally:
-        _tidy(out)
 
 
 def _tidy(out: Path) -> None:

@@ -177,6 +177,7 @@ class VideoTrack:
             with self._container:
                 while (frame := self._queue.get()) is not None:
                     if self._failure is not None:
+                        self._stream.encode(None)  # an encoder that is not told of its end complains on stderr
                         return
                     self._stats.add(frame.to_ndarray())
                     self._container.mux(self._stream.encode(frame))

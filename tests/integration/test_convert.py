@@ -1,0 +1,299 @@
+"""`ibrobot convert`: many episodes, some of them bad, interrupted and gone on with; bags of others."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import attrs
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from ibrobot_ros2 import encode
+from recordings import CONTRACT, JOINTS, SIZE, START_NS, numbered, record
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from ibrobot_core.messages import Float64MultiArray, Header, Image, JointState
+from ibrobot_core.recording.convert.run import STAGING
+from ibrobot_core.testing.terminal import Terminal
+
+pytestmark = pytest.mark.integration
+
+PROGRAM = "from ibrobot_core.cli.main import main; main()"
+LAMP = "lamp_msgs/msg/Lamp"
+CALIBRATION = {
+    joint: {"id": i + 1, "drive_mode": 0, "homing_offset": 0, "range_min": 1048, "range_max": 3048}
+    for i, joint in enumerate(JOINTS)
+}
+ROBOT = f"""\
+robot:
+  name: bench
+  robot_type: bench_follower
+  joints:
+    - {{name: pan, lower: -2, upper: 2, max_velocity: 3, max_acceleration: 10}}
+    - {{name: lift, lower: -2, upper: 2, max_velocity: 3, max_acceleration: 10}}
+    - {{name: gripper, lower: -0.1, upper: 2, max_velocity: 3, max_acceleration: 10}}
+  groups: {{arm: [pan, lift, gripper]}}
+simulation: {{type: mujoco}}
+executors:
+  arm: {{type: position, group: arm}}
+control_modes:
+  idle: {{executors: [arm]}}
+default_control_mode: idle
+contract:
+  rate_hz: 30
+  observations:
+    - key: observation.state
+      topic: /joint_states
+      select: [position.pan, position.lift, position.gripper]
+      align: {{strategy: hold, stamp: header}}
+    - key: observation.images.top
+      topic: /top
+      type: sensor_msgs/msg/Image
+      image: {{resize: [{SIZE[0]}, {SIZE[1]}]}}
+      align: {{strategy: asof, stamp: header, tol_ms: 200}}
+  actions:
+    - {{key: action, executor: arm, topic: /commands}}
+"""
+
+
+@attrs.frozen
+class Ran:
+    """What the command printed, and its exit code."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def report(self) -> dict[str, Any]:
+        found: dict[str, Any] = json.loads(self.out.splitlines()[-1])
+        return found
+
+
+def run(*arguments: object) -> Ran:
+    command = [sys.executable, "-c", PROGRAM, "convert", *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    return Ran(done.returncode, done.stdout, done.stderr)
+
+
+def digest(dataset: Path) -> dict[str, str]:
+    files = sorted(path for path in dataset.rglob("*") if path.is_file())
+    return {str(path.relative_to(dataset)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+def rows(dataset: Path) -> dict[str, np.ndarray[Any, Any]]:
+    table = pq.read_table(dataset / "data/chunk-000/file-000.parquet").to_pydict()
+    return {name: np.array(table[name]) for name in table if not name.startswith("observation.images")}
+
+
+@pytest.fixture(scope="module")
+def bags(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("bags") / "blocks/episodes"
+    for number in range(1, 5):
+        record(root / f"episode_{number:06d}", number, 0.3 + 0.2 * number, "sort the blocks")
+    return root
+
+
+def test_the_number_of_jobs_changes_no_byte(bags: Path, tmp_path: Path) -> None:
+    for jobs in (1, 3):
+        result = run(bags, "--out", tmp_path / f"jobs{jobs}", "--jobs", jobs)
+        assert result.code == 0, result.err
+    assert digest(tmp_path / "jobs1") == digest(tmp_path / "jobs3")
+    assert not (tmp_path / "jobs1" / STAGING).exists()
+
+
+def test_killed_it_keeps_what_was_done_and_goes_on_from_there(bags: Path, tmp_path: Path) -> None:
+    whole, out = tmp_path / "whole", tmp_path / "killed"
+    arguments = [str(bags), "--jobs", "1", "--out"]
+    assert run(*arguments, whole).code == 0
+    with subprocess.Popen(
+        [sys.executable, "-c", PROGRAM, "convert", *arguments, str(out)], stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stderr is not None
+        lines = [process.stderr.readline() for _ in range(2)]
+        os.kill(process.pid, signal.SIGKILL)
+        # The pipe is at its end when the processes that it started are gone too.
+        lines += process.stderr.read().splitlines()
+    assert "frames (2 of 4" in lines[1]
+    assert not (out / "meta").exists(), "a dataset that is not whole looks like none"
+    result = run(*arguments, out, "--json")
+    assert result.code == 0, result.err
+    assert 2 <= result.report["resumed"] < 4
+    assert digest(out) == digest(whole)
+
+
+def test_a_bad_episode_is_told_and_left_out(bags: Path, tmp_path: Path) -> None:
+    episodes = tmp_path / "mixed/episodes"
+    for number in (1, 3):
+        record(episodes / f"episode_{number:06d}", number, 0.5, "sort the blocks")
+    record(episodes / "episode_000002", 2, 0.5, gap={"/wrist": (0.0, 9.9)})
+    record(episodes / "episode_000004", 4, 0.5, contract=attrs.evolve(CONTRACT, rate_hz=20.0))
+    (episodes / "episode_000005").mkdir()
+    (episodes / "episode_000005/metadata.yaml").write_text("rosbag2_bagfile_information: [")
+    result = run(episodes, "--out", tmp_path / "set")
+    assert result.code == 1
+    assert "left out mixed/episode_000002: no message of /wrist, which the contract has; there are: " in result.err
+    assert "left out mixed/episode_000004: its contract differs from that of mixed/episode_000001:" in result.err
+    assert "left out mixed/episode_000005: " in result.err
+    assert "2 episodes, " in result.out
+    assert set(rows(tmp_path / "set")["episode_index"]) == {0, 1}
+
+
+def test_a_contract_that_differs_from_the_recorded_one_is_refused(bags: Path, tmp_path: Path) -> None:
+    (tmp_path / "robot.yaml").write_text(ROBOT)
+    arguments = (bags / "episode_000001", "--config", tmp_path / "robot.yaml", "--out", tmp_path / "set")
+    result = run(*arguments)
+    assert result.code == 1
+    assert "recorded with another contract; --force-contract takes --config's:" in result.err
+    assert "/wrist" in result.err
+    result = run(*arguments, "--force-contract", "--prompt", "x")
+    assert result.code == 0, result.err
+    info = json.loads((tmp_path / "set/meta/info.json").read_bytes())
+    assert "observation.images.top" in info["features"]
+    assert "observation.images.wrist" not in info["features"]
+
+
+def test_a_gap_is_refused_skipped_or_held(tmp_path: Path) -> None:
+    record(tmp_path / "bag", 1, 2.0, gap={"/wrist": (0.8, 1.4)})
+    result = run(tmp_path / "bag", "--out", tmp_path / "refuse")
+    assert result.code == 1
+    assert "observation.images.wrist is missing 1.000 s after the beginning" in result.err
+    assert "--missing skip" in result.err
+    found = {way: run(tmp_path / "bag", "--out", tmp_path / way, "--missing", way, "--json").report for way in
+             ("skip", "hold")}  # fmt: skip
+    assert (found["skip"]["gaps"], found["hold"]["gaps"]) == (1, 1)
+    assert found["skip"]["skipped_ticks"] == found["hold"]["held_ticks"] > 10
+    assert found["skip"]["frames"] == found["hold"]["frames"] - found["hold"]["held_ticks"]
+
+
+def test_appending_takes_what_is_new_and_fits(bags: Path, tmp_path: Path) -> None:
+    out = tmp_path / "set"
+    assert run(bags / "episode_000001", bags / "episode_000002", "--out", out).code == 0
+    before = digest(out)
+    refused = run(bags, "--out", out)
+    assert refused.code != 0
+    assert "--append" in refused.err
+    result = run(bags, "--out", out, "--append", "--json")
+    assert result.code == 0, result.err
+    assert (result.report["episodes"], result.report["passed_over"]) == (2, 2)
+    assert set(rows(out)["episode_index"]) == {0, 1}, "old tables stay as they are"
+    again = run(bags, "--out", out, "--append")
+    assert again.code == 0
+    assert "nothing was added" in again.out
+    assert all(digest(out)[name] == known for name, known in before.items() if not name.startswith("meta"))
+    otherwise = run(bags, "--out", out, "--append", "--success")
+    assert "was made otherwise: success False, now True" in otherwise.err
+
+
+def test_joints_in_lerobots_units(bags: Path, tmp_path: Path) -> None:
+    document = {
+        "robot": {"joints": [{"name": name, "lower": -0.1} for name in JOINTS]},
+        "hardware": {"type": "feetech_so101"},
+    }
+    metadata = {"config": json.dumps(document), "calibration": json.dumps({"arm": CALIBRATION})}
+    record(tmp_path / "bag", 1, 0.5, **metadata)
+    for mode in ("radians", "degrees", "range_m100_100"):
+        result = run(tmp_path / "bag", "--out", tmp_path / mode, "--norm-mode", mode)
+        assert result.code == 0, result.err
+    radians, degrees, percent = (
+        np.concatenate([rows(tmp_path / mode)[key] for key in ("observation.state", "action")])
+        for mode in ("radians", "degrees", "range_m100_100")
+    )
+    # LeRobot's degrees have 4095 ticks to a turn.
+    # The middle of 1048..3048 is tick 2048, where radians are zero too; 1000 ticks to either side are 100 %.
+    np.testing.assert_allclose(degrees[:, :2], np.degrees(radians[:, :2]) * 4096 / 4095, atol=1e-3)
+    ticks = np.clip(radians[:, :2] * 4096 / (2 * np.pi), -1000, 1000)
+    np.testing.assert_allclose(percent[:, :2], ticks / 10, atol=1e-3)
+    gripper = np.clip((radians[:, 2] + 0.1) * 4096 / (2 * np.pi), 0, 2000)
+    np.testing.assert_allclose(percent[:, 2], gripper / 20, atol=1e-3)
+    np.testing.assert_array_equal(degrees[:, 2], percent[:, 2])
+    kept = json.loads((tmp_path / "degrees/meta/ibrobot.json").read_bytes())
+    assert list(kept["calibrations"].values()) == [CALIBRATION]
+    assert (kept["fingerprint"], kept["conversion"]["norm_mode"]) == (CONTRACT.fingerprint(), "degrees")
+    without = run(bags, "--out", tmp_path / "none", "--norm-mode", "degrees")
+    assert "needs the calibration of joint 'pan'; there is none; give it by --calibration" in without.err
+
+
+@pytest.mark.parametrize("storage", list(StoragePlugin))
+@pytest.mark.parametrize("compression", [None, CompressionMode.MESSAGE, CompressionMode.FILE])
+def test_bags_of_others_by_the_contract_alone(
+    tmp_path: Path, storage: StoragePlugin, compression: CompressionMode | None
+) -> None:
+    store = get_typestore(Stores.ROS2_JAZZY)
+    store.register(get_types_from_msg("string[] marks\n", LAMP))
+    writer = Writer(tmp_path / "bag", version=9, storage_plugin=storage)
+    if compression is not None:
+        writer.set_compression(compression, CompressionFormat.ZSTD)
+    with writer:
+        types = {"/joint_states": JointState, "/top": Image, "/commands": Float64MultiArray}
+        topics = {
+            topic: writer.add_connection(topic, type_.ros_type, typestore=store) for topic, type_ in types.items()
+        }
+        lamp = writer.add_connection("/lamp", LAMP, typestore=store)
+        for i in range(30):
+            t_ns = START_NS + i * 33_333_333
+            pixels = numbered(i)
+            picture = Image(Header(t_ns), *SIZE, "rgb8", 3 * SIZE[1], pixels.ravel())
+            writer.write(lamp, t_ns, store.serialize_cdr(store.types["lamp_msgs/msg/Lamp"](["a"]), LAMP))
+            writer.write(topics["/joint_states"], t_ns, bytes(encode(JointState(Header(t_ns), JOINTS, [i, 1.0, 2.0]))))
+            writer.write(topics["/commands"], t_ns, bytes(encode(Float64MultiArray([i + 0.5, 1.0, 2.0]))))
+            writer.write(topics["/top"], t_ns, bytes(encode(picture)))
+    (tmp_path / "robot.yaml").write_text(ROBOT)
+    result = run(
+        tmp_path / "bag", "--config", tmp_path / "robot.yaml", "--prompt", "blink", "--no-videos",
+        "--out", tmp_path / "set",
+    )  # fmt: skip
+    assert result.code == 0, result.err
+    found = rows(tmp_path / "set")
+    np.testing.assert_array_equal(found["observation.state"][:, 0], np.arange(30))
+    np.testing.assert_array_equal(found["action"][:, 0], np.arange(30) + 0.5)
+    assert json.loads((tmp_path / "set/meta/info.json").read_bytes())["robot_type"] == "bench_follower"
+
+
+def test_a_bar_moves_on_a_terminal(bags: Path, tmp_path: Path) -> None:
+    with Terminal("convert", str(bags), "--out", str(tmp_path / "set")) as terminal:
+        assert terminal.end() == 0
+    assert "4 of 4 episodes" in terminal.screen
+    assert "frames/s" in terminal.screen
+
+
+def test_where_things_lie_is_checked_first(bags: Path, tmp_path: Path) -> None:
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other/thesis.txt").write_text("mine")
+    for arguments, message in (
+        ((bags, "--out", tmp_path / "other"), "is not empty and has no dataset"),
+        ((tmp_path / "nowhere", "--out", tmp_path / "set"), "there is no such episode"),
+        ((bags, "--out", tmp_path / "set", "--codec", "mpeg9"), "mpeg9"),
+    ):
+        result = run(*arguments)
+        assert result.code != 0
+        assert message in result.err
+    assert [path.name for path in (tmp_path / "other").iterdir()] == ["thesis.txt"]
+    assert not (tmp_path / "set").exists()
+
+
+def test_an_episode_without_a_contract_needs_one(tmp_path: Path) -> None:
+    record(tmp_path / "bag", 1, 0.4, contract=None)
+    result = run(tmp_path / "bag", "--out", tmp_path / "set")
+    assert result.code == 1
+    assert "the episode brings no contract; name the robot YAML that has it by --config" in result.err
+
+
+def test_only_episodes_of_an_outcome(tmp_path: Path) -> None:
+    for number, outcome in ((1, "success"), (2, "failure"), (3, "unknown")):
+        record(tmp_path / f"bags/episode_{number:06d}", number, 0.4, outcome=outcome)
+    result = run(tmp_path / "bags", "--out", tmp_path / "set", "--outcome", "success", "--success", "--json")
+    assert result.code == 0, result.err
+    found = rows(tmp_path / "set")["next.success"].ravel()
+    assert found[-1]
+    assert not found[:-1].any()
+    result = run(tmp_path / "bags", "--out", tmp_path / "all", "--success")
+    assert "cannot be told: the episode's outcome is unknown" in result.err
