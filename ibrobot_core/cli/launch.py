@@ -12,14 +12,13 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from pathlib import Path
 from typing import Any
 
 import attrs
 import click
 
 from ibrobot_core.cli.panel import RecentLog, panel, plain_line
-from ibrobot_core.config import find_config, load
+from ibrobot_core.config import RobotConfig, find_config, load
 from ibrobot_core.control.core import EMERGENCY_STOP
 from ibrobot_core.errors import IbrobotError
 from ibrobot_core.launch.runtime import Runtime
@@ -59,38 +58,57 @@ class Watcher:
         """The keys, for the panel."""
         return ""
 
-    def told(self) -> str:
-        """For the summary of the run."""
-        return ""
+    def told(self) -> list[tuple[str, str]]:
+        """Heading and text, for the summary of the run."""
+        return []
+
+    def facts(self) -> dict[str, Any]:
+        """What it adds to the summary as JSON."""
+        return {}
+
+
+_OPTIONS: dict[str, Callable[..., Any]] = {
+    "sim": click.option("--sim", is_flag=True, help="Use the simulation section in place of hardware."),
+    "lockstep": click.option(
+        "--lockstep", is_flag=True, help="Simulated time, as fast as the machine goes; equal seeds, equal runs."
+    ),
+    "seed": click.option(
+        "--seed", type=int, default=0, show_default=True, help="Of the first episode; later ones count up."
+    ),
+    "mode": click.option("--mode", help="In place of default_control_mode."),
+    "overrides": click.option(
+        "--set", "overrides", multiple=True, metavar="PATH=VALUE", help="Override a key, e.g. control.rate_hz=50."
+    ),
+    "duration": click.option(
+        "--duration", type=click.FloatRange(min=0), metavar="S", help="Stop after so many seconds."
+    ),
+    "episodes": click.option(
+        "--episodes", type=click.IntRange(min=1), metavar="N", help="Stop after so many episodes."
+    ),
+    "goals": click.option(
+        "--goal", "goals", multiple=True, metavar="GOAL", help="For planning modes: a pose, or joint=rad,…"
+    ),
+    "window": click.option("--window", is_flag=True, help="Show the simulation in a desktop window."),
+    "headless": click.option("--headless", is_flag=True, help="No window, no viewer, no panel: plain lines."),
+    "dry_run": click.option("--dry-run", is_flag=True, help="Print the plan and start nothing."),
+    "as_json": click.option("--json", "as_json", is_flag=True, help="Print a summary as JSON, in the last line."),
+}
 
 
 def launch_options[C: Callable[..., Any]](command: C) -> C:
     """The argument and the options that every command has which runs a robot."""
-    for add in reversed((
-        click.argument("config", required=False),
-        click.option("--sim", is_flag=True, help="Use the simulation section in place of hardware."),
-        click.option(
-            "--lockstep", is_flag=True, help="Simulated time, as fast as the machine goes; equal seeds, equal runs."
-        ),
-        click.option(
-            "--seed", type=int, default=0, show_default=True, help="Of the first episode; later ones count up."
-        ),
-        click.option("--mode", help="In place of default_control_mode."),
-        click.option(
-            "--set", "overrides", multiple=True, metavar="PATH=VALUE", help="Override a key, e.g. control.rate_hz=50."
-        ),
-        click.option("--duration", type=click.FloatRange(min=0), metavar="S", help="Stop after so many seconds."),
-        click.option("--episodes", type=click.IntRange(min=1), metavar="N", help="Stop after so many episodes."),
-        click.option(
-            "--goal", "goals", multiple=True, metavar="GOAL", help="For planning modes: a pose, or joint=rad,…"
-        ),
-        click.option("--window", is_flag=True, help="Show the simulation in a desktop window."),
-        click.option("--headless", is_flag=True, help="No window, no viewer, no panel: plain lines."),
-        click.option("--dry-run", is_flag=True, help="Print the plan and start nothing."),
-        click.option("--json", "as_json", is_flag=True, help="Print a summary as JSON, in the last line."),
-    )):  # fmt: skip
-        command = add(command)
-    return command
+    return click.argument("config", required=False)(run_options(*_OPTIONS)(command))
+
+
+def run_options[C: Callable[..., Any]](*names: str) -> Callable[[C], C]:
+    """Some of the options of `launch_options`."""
+
+    def add(command: C) -> C:
+        for name in reversed(names):
+            command = _OPTIONS[name](command)
+        return command
+
+    return add
 
 
 @click.command()
@@ -124,35 +142,58 @@ def run_robot(
     Raises:
         IbrobotError: e.g. for a YAML with mistakes, or when a component fails.
     """
-    if options["window"] and options["headless"]:
-        raise click.UsageError("--window and --headless exclude each other")
-    if options["window"]:
-        options["overrides"] = (*options["overrides"], "viewer={type: mujoco}")
     registry = installed()
     path = find_config(config, registry)
-    changes, chosen = options["overrides"], {"mode": options["mode"], "sim": options["sim"], "registry": registry}
+    changes, chosen = overrides_of(options), {"mode": options["mode"], "sim": options["sim"], "registry": registry}
     robot = load(path, overrides=changes, **chosen)
     if recording:
         default, *more = recording
         robot = load(path, overrides=(*([default] if robot.recording is None else []), *changes, *more), **chosen)
-    if options["lockstep"] and not robot.simulated:
+    request = Request(
+        options["lockstep"], options["seed"], options["duration"], options["episodes"], options["goals"],
+        prompt=prompt, by_operator=bool(recording),
+    )  # fmt: skip
+    run_loaded(robot, request, options, watcher or Watcher())
+
+
+def overrides_of(options: dict[str, Any]) -> tuple[str, ...]:
+    """The overrides of a robot YAML that a command line asks for.
+
+    Raises:
+        click.UsageError: for options that exclude each other.
+    """
+    if options["window"] and options["headless"]:
+        raise click.UsageError("--window and --headless exclude each other")
+    return (*options["overrides"], *(["viewer={type: mujoco}"] if options["window"] else []))
+
+
+def run_loaded(robot: RobotConfig, request: Request, options: dict[str, Any], watcher: Watcher) -> None:
+    """Run a robot whose YAML has been read, to the end of the process.
+
+    Args:
+        robot: the robot.
+        request: what is asked of the run.
+        options: `headless`, `dry_run` and `as_json` of `launch_options`.
+        watcher: what looks after the run.
+
+    Raises:
+        IbrobotError: e.g. when a component fails.
+    """
+    if request.lockstep and not robot.simulated:
         raise click.UsageError("--lockstep is for simulation: add --sim")
     if options["headless"] and robot.viewer is not None:
         robot = attrs.evolve(robot, viewer=None)
-    watcher = watcher or Watcher()
     with ExitStack() as stack:
         keys = None if options["headless"] or options["dry_run"] else _terminal_keys(stack)
-        request = Request(
-            options["lockstep"], options["seed"], options["duration"], options["episodes"], options["goals"],
-            keys.subscribe if keys is not None else None, prompt, bool(recording),
-        )  # fmt: skip
-        runtime = Runtime(Session(robot, registry, request))
+        if keys is not None:
+            request = attrs.evolve(request, keys=keys.subscribe)
+        runtime = Runtime(Session(robot, installed(), request))
         if options["dry_run"]:
             click.echo("\n".join(runtime.plan.lines()))
             return
         watcher.attach(runtime)
         _stop_on_signals(runtime.session, keys)
-        status = _run(runtime, path, watcher, live=not options["headless"] and sys.stdout.isatty())
+        status = _run(runtime, watcher, live=not options["headless"] and sys.stdout.isatty())
     _tell(runtime, watcher, options["as_json"])
     runtime.raise_failure()
     sys.exit(status)
@@ -165,13 +206,14 @@ def _terminal_keys(stack: ExitStack) -> Keys | None:
     return stack.enter_context(Keys())
 
 
-def _run(runtime: Runtime, path: Path, watcher: Watcher, *, live: bool) -> int:
+def _run(runtime: Runtime, watcher: Watcher, *, live: bool) -> int:
     """Start, run and stop; returns the exit status of a run in which nothing failed."""
     session = runtime.session
     where = "simulation" if session.config.simulated else "hardware"
     with ExitStack() as stack:
         display = _Panel(runtime, watcher, stack) if live else _Lines(session, watcher)
-        session.log.info("%s from %s: %s, mode %s", session.config.robot.name, path, where, session.mode)
+        robot = session.config
+        session.log.info("%s from %s: %s, mode %s", robot.robot.name, robot.source, where, session.mode)
         runtime.start(display.starting)
         stack.callback(runtime.stop)
         if session.request.lockstep:
@@ -293,6 +335,7 @@ def _tell(runtime: Runtime, watcher: Watcher, as_json: bool) -> None:
     """The summary of a run."""
     summary = runtime.summary()
     if as_json:
+        summary |= watcher.facts()
         click.echo(json.dumps(summary))
         return
     loop = summary["loop"]
@@ -306,6 +349,6 @@ def _tell(runtime: Runtime, watcher: Watcher, as_json: bool) -> None:
             f"loop       {loop['rate_hz']:.2f} Hz, lateness p50 {loop['lateness_p50_us']:.0f} us, "
             f"p99 {loop['lateness_p99_us']:.0f} us, missed {loop['missed']}"
         )
-    if told := watcher.told():
-        click.echo(f"recorded   {told}")
+    for heading, text in watcher.told():
+        click.echo(f"{heading:10} {text}")
     click.echo(f"faults     {'; '.join(summary['faults']) or 'none'}")

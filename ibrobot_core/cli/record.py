@@ -125,9 +125,9 @@ class Operator(Watcher):
         return "Tab start, and end as success   F11 end as failure   F12 discard"
 
     @override
-    def told(self) -> str:
+    def told(self) -> list[tuple[str, str]]:
         """For the summary of the run."""
-        return f"{self._saved()} episodes into {self._desk.folder}"
+        return [("recorded", f"{self._saved()} episodes into {self._desk.folder}")]
 
     def _state(self) -> str:
         desk = self._desk

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
@@ -61,24 +62,36 @@ def load(
     if not isinstance(document.root, Mapping):
         document.add((), f"expected a mapping of sections, got {shown(document.root)}")
         document.raise_problems()
+    _override(document, overrides, mode)
+    return _build(document, Path(path), sim, registry or installed())
+
+
+def from_document(
+    document: Mapping[str, Any],
+    *,
+    source: Path,
+    sim: bool,
+    registry: Registry | None = None,
+    overrides: Sequence[str] = (),
+    mode: str | None = None,
+) -> RobotConfig:
+    """A config from the `document` of another, e.g. in another process, or of an earlier run; else as `load`.
+
+    Raises:
+        ConfigError: e.g. when the plugins installed are not those it was made with.
+    """
+    copied = Document(copy.deepcopy(dict(document)), {}, [], str(source))
+    _override(copied, overrides, mode)
+    return _build(copied, source, sim, registry or installed())
+
+
+def _override(document: Document, overrides: Sequence[str], mode: str | None) -> None:
     apply(document, overrides)
     if mode is not None:
         place = Place(len(overrides) + 1, 0, 0, f"--mode {mode}")
         put(document, "default_control_mode", Document(mode, {}, [], place.file), place)
         if isinstance(simulation := document.root.get("simulation"), dict):
             simulation.pop("default_control_mode", None)
-    return _build(document, Path(path), sim, registry or installed())
-
-
-def from_document(
-    document: Mapping[str, Any], *, source: Path, sim: bool, registry: Registry | None = None
-) -> RobotConfig:
-    """A config from the `document` of another, e.g. in another process.
-
-    Raises:
-        ConfigError: e.g. when the plugins installed are not those it was made with.
-    """
-    return _build(Document(dict(document), {}, [], str(source)), source, sim, registry or installed())
 
 
 def _build(document: Document, source: Path, sim: bool, registry: Registry) -> RobotConfig:

@@ -11,6 +11,8 @@ from ibrobot_core.launch.builders.execution import InferenceFeeder, Model
 from ibrobot_core.launch.builders.perception import SensorWorker
 from ibrobot_core.launch.builders.planning import PlanningFeeder
 from ibrobot_core.launch.builders.recording import Recording
+from ibrobot_core.launch.builders.replay import MODE as REPLAY
+from ibrobot_core.launch.builders.replay import ReplayFeeder
 from ibrobot_core.launch.builders.simulation import SimulatedEpisodes
 from ibrobot_core.launch.builders.status import Status
 from ibrobot_core.launch.builders.teleop import TeleopFeeder
@@ -59,6 +61,8 @@ def mode_parts(session: Session, name: str, sensors: tuple[str, ...]) -> ModePar
     """The components of a mode; nothing is loaded yet."""
     mode = session.config.control_modes[name]
     needs = (CONTROL, *sensors)
+    if session.request.replay is not None and name == REPLAY:
+        return ModeParts((), ReplayFeeder(session, mode, session.request.replay, (CONTROL,)))
     if mode.inference is not None:
         model = Model(session, mode.inference.model)
         return ModeParts((model,), InferenceFeeder(session, mode, mode.inference, model, needs))

@@ -24,6 +24,7 @@ from ibrobot_core.units import ns
 if TYPE_CHECKING:
     from ibrobot_core.control.host import ControlHost
     from ibrobot_core.dispatch.dispatcher import DispatchStats
+    from ibrobot_core.launch.builders.replay import Replay
 
 
 @attrs.frozen
@@ -40,6 +41,8 @@ class Request:
     """What episodes are recorded under."""
     by_operator: bool = False
     """Whether an operator begins and ends episodes, rather than the mode."""
+    replay: Replay | None = None
+    """The episode that mode `replay` plays."""
 
 
 @attrs.define

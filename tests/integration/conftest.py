@@ -66,7 +66,7 @@ def prompt_threads() -> Iterator[None]:
     sys.setswitchinterval(before)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def ibrobot() -> tuple[str, ...]:
     """The command `ibrobot`, of the interpreter that runs the tests."""
     return IBROBOT

@@ -162,7 +162,7 @@ class TestOperator:
         assert "set the scene up anew" in operator.line()
         self.step(run, operator, 200)
         assert run.session.finished.is_set()
-        assert operator.told().startswith("2 of 2 episodes into")
+        assert operator.told()[0][1].startswith("2 of 2 episodes into")
         ended = [event for event in runs.parts.EVENTS if event[0] == "ended"]
         assert ended == [("ended", 1, "unknown"), ("ended", 2, "unknown")]
 

@@ -1,0 +1,134 @@
+"""`ibrobot replay`: play the commands of a recorded episode on a robot, real or simulated."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, override
+
+import attrs
+import click
+
+from ibrobot_core.cli.launch import Watcher, overrides_of, run_loaded, run_options
+from ibrobot_core.config import RobotConfig, find_config, from_document, load
+from ibrobot_core.contract.specs import Contract
+from ibrobot_core.errors import ContractError, RecorderError
+from ibrobot_core.interfaces import EpisodeSummary
+from ibrobot_core.launch.builders.replay import MODE, Replay, ReplayFeeder
+from ibrobot_core.launch.runtime import Runtime
+from ibrobot_core.launch.session import Request
+from ibrobot_core.plugins import installed
+from ibrobot_core.recording.playback import read_playback
+
+
+class _Comparison(Watcher):
+    """Tells how near the replay came."""
+
+    @override
+    def attach(self, runtime: Runtime) -> None:
+        feeder = runtime.plan.mode.feeder
+        assert isinstance(feeder, ReplayFeeder)
+        self._feeder = feeder
+
+    @override
+    def told(self) -> list[tuple[str, str]]:
+        report = self._feeder.report()
+        rows = [("replayed", f"{report['source']}, {report['recorded_s']:.1f} s at speed {report['speed']:g}")]
+        if report["success"] is not None:
+            again = "success" if report["success"] else "no success"
+            rows.append(("scene", f"{again}; recorded: {report['recorded_outcome']}"))
+        if not report["tracking"]:
+            rows.append(("tracking", "nothing to compare"))
+        for joint, away in report["tracking"].items():
+            off = f"rms {away['rms_rad']:.4f} rad, max {away['max_rad']:.4f} rad off the recording"
+            rows.append(("tracking", f"{joint:14} {off}"))
+        return rows
+
+    @override
+    def facts(self) -> dict[str, Any]:
+        return {"replay": self._feeder.report()}
+
+
+@click.command()
+@click.argument("episode", type=click.Path(path_type=Path))
+@click.argument("config", required=False)
+@run_options("sim", "lockstep")
+@click.option(
+    "--speed", type=click.FloatRange(min=0, min_open=True), default=1.0, show_default=True, metavar="X",
+    help="Seconds of the recording in a second.",
+)  # fmt: skip
+@click.option("--force-contract", is_flag=True, help="Replay where only the observations of CONFIG differ.")
+@run_options("overrides", "window", "headless", "dry_run", "as_json")
+def replay(episode: Path, config: str | None, speed: float, force_contract: bool, **options: Any) -> None:
+    """Play the commands of a recorded EPISODE, and tell how near the joints came to the recorded ones.
+
+    CONFIG is a robot YAML as for `ibrobot launch`; the one that the episode was recorded with when left out. The robot
+    goes slowly to where the episode begins, follows its commands by their times, within the limits of the safety layer,
+    and stops. With --sim the scene is set up by the recorded seed.
+
+    Exits as `ibrobot launch` does; with 3 where the recorded episode was a success in its scene and this one is not.
+    """
+    changes = overrides_of(options)
+    reader = installed().open_episode(episode)
+    try:
+        summary = reader.summary()
+        robot = _robot(summary, config, changes, sim=options["sim"])
+        contract = Contract.from_config(robot)
+        _check(contract, summary, str(robot.source), force=force_contract)
+        playback = read_playback(reader, contract)
+    finally:
+        reader.close()
+    request = Request(
+        options["lockstep"], playback.seed or 0, replay=Replay(str(episode), playback, speed),
+    )  # fmt: skip
+    # Cameras have no part in it.
+    run_loaded(attrs.evolve(robot, peripherals={}, recording=None), request, options, _Comparison())
+
+
+def _robot(summary: EpisodeSummary, config: str | None, changes: tuple[str, ...], *, sim: bool) -> RobotConfig:
+    """The robot, with one mode more: that of the replay."""
+    registry = installed()
+    chosen: dict[str, Any] = {"sim": sim, "registry": registry}
+    if config is not None:
+        path = find_config(config, registry)
+        robot = load(path, overrides=changes, **chosen)
+        return load(path, overrides=(*changes, _mode(robot)), mode=MODE, **chosen)
+    text = summary.metadata.get("config")
+    if text is None:
+        raise RecorderError(f"{summary.path}: brings no robot YAML; name one: ibrobot replay {summary.path} CONFIG")
+    try:
+        document = json.loads(text)
+    except ValueError as error:
+        raise RecorderError(f"{summary.path}: its robot YAML cannot be read: {error}; name one as CONFIG") from None
+    chosen["source"] = Path("recorded config")
+    robot = from_document(document, overrides=changes, **chosen)
+    return from_document(document, overrides=(*changes, _mode(robot)), mode=MODE, **chosen)
+
+
+def _mode(robot: RobotConfig) -> str:
+    """The override that adds the mode of the replay: the executors of the contract's actions, with nothing else."""
+    executors = ", ".join(dict.fromkeys(spec.executor for spec in robot.contract.actions))
+    return f"control_modes.{MODE}={{executors: [{executors}]}}"
+
+
+def _check(contract: Contract, summary: EpisodeSummary, name: str, *, force: bool) -> None:
+    """See that the episode was recorded with this contract; one without its own goes by CONFIG's."""
+    text = summary.metadata.get("contract")
+    if text is None:
+        return
+    try:
+        recorded = Contract.from_canonical(json.loads(text))
+    except ValueError as error:
+        raise ContractError(f"{summary.path}: the recorded contract cannot be read: {error}") from None
+    if recorded.fingerprint() == contract.fingerprint():
+        return
+    actions = [[(part.topic, part.type, part.joints) for part in each.action_parts] for each in (recorded, contract)]
+    if force and actions[0] == actions[1]:
+        return
+    remark = "its actions differ, which --force-contract does not change" if force else (
+        "CONFIG must be of the same robot; --force-contract replays where only observations differ"
+    )  # fmt: skip
+    raise ContractError(
+        f"{summary.path}: was recorded with another contract than that of {name}; {remark}:\n"
+        f"{contract.difference(recorded, names=(name, 'recorded'))}"
+    )

@@ -1,0 +1,161 @@
+"""Replay: gives control the commands of a recorded episode, after a slow way to the first of them."""
+
+from __future__ import annotations
+
+from typing import Any, override
+
+import attrs
+import numpy as np
+
+from ibrobot_core.bus import Subscription
+from ibrobot_core.config.schema import ControlMode
+from ibrobot_core.control.link import ControlState
+from ibrobot_core.launch.feeder import Feeder
+from ibrobot_core.launch.session import Session
+from ibrobot_core.recording.playback import Playback, Track
+from ibrobot_core.robot import Vector
+from ibrobot_core.units import NS_PER_S, ns, seconds
+
+MODE = "replay"
+"""The name of the mode in which an episode is replayed."""
+_APPROACH_SPEED = 0.5
+"""Greatest speed on the way to the first command [rad/s]; `max_velocity` bounds it too."""
+_PEAK_SPEED, _PEAK_ACCELERATION = 1.5, 6.0
+"""Greatest first and second derivative of `_ease`."""
+_AHEAD_NS = NS_PER_S
+"""How much of the motion control is given at a time [ns]."""
+_SETTLE_NS = NS_PER_S
+"""How long a scene may take to succeed after the last command, where it did in the recording [ns]."""
+
+
+@attrs.frozen(eq=False)
+class Replay:
+    """What is to be replayed, and how fast."""
+
+    source: str
+    """What the user calls it."""
+    playback: Playback
+    speed: float = 1.0
+    """Seconds of the recording in a second."""
+
+
+class ReplayFeeder(Feeder):
+    """Plays an episode once, and ends the run. The commands go the way of a teleop's, through executors and safety.
+
+    In simulation the scene is set up by the recorded seed first. A fault ends the replay.
+    """
+
+    def __init__(self, session: Session, mode: ControlMode, replay: Replay, needs: tuple[str, ...]) -> None:
+        super().__init__(session, mode, f"{replay.source}, {replay.playback.duration / replay.speed:.1f} s", needs)
+        self._replay = replay
+        self._period_ns = ns(1.0 / session.config.control.rate_hz)
+        self._columns = session.config.robot.indices(replay.playback.joints)
+        self._states: Subscription | None = None
+        self._begun_ns: int | None = None
+        """When the way to the first command began [ns]; None before."""
+        self._rows: Vector = np.empty((0, 0))
+        """One setpoint for each control period from then on [rad], shape (N, J)."""
+        self._approach_ns = 0
+        self._sent = 0
+        """Rows that control has."""
+        self._measured: list[tuple[int, Vector]] = []
+        self._success: bool | None = None
+
+    @override
+    def setup(self) -> None:
+        self._states = self.session.bus.subscribe("/joint_states", 1)
+
+    @override
+    def begin_feeding(self, seed: int) -> None:
+        self._begun_ns, self._measured, self._success = None, [], None
+        recorded = self._replay.playback.seed
+        if self.session.config.simulated and recorded is not None:
+            self.session.command("reset_episode", seed=recorded)
+
+    @override
+    def work(self, timeout_s: float) -> None:
+        assert self._states is not None
+        if self._states.get(timeout_s) is None:
+            return
+        with self.lock:
+            session, state = self.session, self.session.state
+            if not self.active or state is None:
+                return
+            if session.outcome.faults:
+                self.active = False
+                session.finish()
+            elif state.epoch == session.epoch:
+                self._follow(state)
+
+    def _follow(self, state: ControlState) -> None:
+        if self._begun_ns is None:
+            self._begun_ns, self._sent = state.stamp_ns, 0
+            self._rows = self._setpoints(state.position[self._columns])
+        elapsed_ns = state.stamp_ns - self._begun_ns
+        if not state.stale and elapsed_ns >= self._approach_ns:
+            self._measured.append((elapsed_ns - self._approach_ns, state.position[self._columns]))
+        here, ahead = elapsed_ns // self._period_ns, _AHEAD_NS // self._period_ns
+        if self._sent < min(here + ahead // 2, len(self._rows)):
+            rows = self._rows[here : here + ahead]
+            if len(rows):
+                start_ns = self._begun_ns + here * self._period_ns
+                self.session.send_plan(start_ns, self._period_ns, self._replay.playback.joints, rows)
+            self._sent = here + len(rows)
+        if state.success is not None:
+            self._success = bool(self._success or state.success)
+        self._end_when_done(elapsed_ns - (len(self._rows) - 1) * self._period_ns)
+
+    def _setpoints(self, begin: Vector) -> Vector:
+        """The way to the first command from `begin` [rad], shape (J,), and the commands, at every control period."""
+        playback, session = self._replay.playback, self.session
+        away = playback.commands.positions[0] - begin
+        robot = session.config.robot
+        speed = np.minimum(_APPROACH_SPEED, robot.max_velocity[self._columns])
+        acceleration = 0.5 * robot.max_acceleration[self._columns]
+        by_speed = _PEAK_SPEED * np.abs(away) / speed
+        by_acceleration = np.sqrt(_PEAK_ACCELERATION * np.abs(away) / acceleration)
+        steps = int(np.ceil(max(by_speed.max(), by_acceleration.max()) * session.config.control.rate_hz))
+        self._approach_ns = steps * self._period_ns
+        approach = begin + _ease(np.arange(steps) / max(steps, 1))[:, None] * away
+        period_s = seconds(self._period_ns) * self._replay.speed
+        played: Vector = np.arange(np.ceil(playback.duration / period_s) + 1) * period_s
+        return np.concatenate([approach, playback.commands.at(played)])
+
+    def _end_when_done(self, late_ns: int) -> None:
+        """End the run, `late_ns` [ns] after the last setpoint was due."""
+        session = self.session
+        hoped = session.config.simulated and self._replay.playback.outcome == "success" and self._success is False
+        if late_ns < (_SETTLE_NS if hoped else 0):
+            return
+        self.active = False
+        if self._success is not None and self._replay.playback.outcome == "success":
+            session.outcome.episodes += 1
+            session.outcome.successes += self._success
+        session.finish()
+
+    def report(self) -> dict[str, Any]:
+        """What became of it, as JSON values."""
+        replay = self._replay
+        tracking = {}
+        if self._measured:
+            times = np.array([elapsed_ns for elapsed_ns, _ in self._measured]) / NS_PER_S * replay.speed
+            tracking = replay.playback.tracking(Track(times, np.stack([position for _, position in self._measured])))
+        return {
+            "source": replay.source, "speed": replay.speed, "recorded_s": round(replay.playback.duration, 3),
+            "recorded_outcome": replay.playback.outcome, "success": self._success, "tracking": tracking,
+        }  # fmt: skip
+
+    @override
+    def teardown(self) -> None:
+        if self._states is not None:
+            self._states.close()
+
+    @override
+    def help(self) -> str:
+        return f"replays {self._replay.source}; Esc stops"
+
+
+def _ease(share: Vector) -> Vector:
+    """From 0 to 1, at rest at both ends."""
+    eased: Vector = share * share * (3 - 2 * share)
+    return eased

@@ -1,0 +1,85 @@
+"""`ibrobot replay` as a user runs it: recorded picks, played again in the same scene."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.integration
+
+Command = Callable[..., "subprocess.CompletedProcess[str]"]
+
+
+@pytest.fixture(scope="module")
+def picks(tmp_path_factory: pytest.TempPathFactory, ibrobot: tuple[str, ...]) -> Path:
+    """Two recorded episodes in which the cube came into the bin."""
+    folder = tmp_path_factory.mktemp("picks")
+    command = [*ibrobot, "record", "so101_blind", "--sim", "--lockstep", "--headless", "--episodes", "2", "--seed", "3"]
+    subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120, check=True)
+    return folder / "episodes/default/episodes"
+
+
+@pytest.fixture
+def replay(ibrobot: tuple[str, ...], tmp_path: Path) -> Command:
+    def run(*arguments: object) -> subprocess.CompletedProcess[str]:
+        command = [*ibrobot, "replay", "--headless", *map(str, arguments)]
+        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
+
+    return run
+
+
+def test_in_lockstep_the_cube_comes_into_the_bin_again(replay: Command, picks: Path):
+    for episode in sorted(picks.iterdir()):
+        done = replay(episode, "--sim", "--lockstep", "--json")
+        assert done.returncode == 0, done.stderr
+        summary = json.loads(done.stdout.splitlines()[-1])
+        assert summary["replay"]["success"] is True
+        assert len(summary["replay"]["tracking"]) == 6
+        assert max(each["max_rad"] for each in summary["replay"]["tracking"].values()) < 1e-6
+
+
+def test_in_real_time_at_another_speed_it_ends_and_tells_the_difference(replay: Command, picks: Path):
+    done = replay(picks / "episode_000001", "so101_blind", "--sim", "--speed", "2")
+    assert done.returncode in (0, 3), done.stderr
+    lines = [line for line in done.stdout.splitlines() if line.startswith("tracking")]
+    assert len(lines) == 6
+    assert "shoulder_pan" in lines[0]
+
+
+def test_another_contract_is_refused_with_both_sides(replay: Command, picks: Path):
+    done = replay(picks / "episode_000001", "so101_blind", "--sim", "--set", "contract.rate_hz=50")
+    assert done.returncode == 2
+    assert "was recorded with another contract than that of" in done.stderr
+    assert "so101_blind.yaml: 50" in done.stderr
+    assert "recorded: 30" in done.stderr
+    done = replay(
+        picks / "episode_000001", "so101_blind", "--sim", "--lockstep", "--force-contract", "--set",
+        "contract.rate_hz=50",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+
+
+def test_other_joints_are_refused_also_by_force(replay: Command, picks: Path, tmp_path: Path):
+    shipped = Path(__file__).parents[2] / "configs/so101_blind.yaml"
+    (tmp_path / "clawed.yaml").write_text(shipped.read_text().replace("wrist_roll", "wrist_turn"))
+    done = replay(picks / "episode_000001", "clawed.yaml", "--sim", "--force-contract")
+    assert done.returncode == 2
+    assert "its actions differ, which --force-contract does not change" in done.stderr
+    assert "clawed.yaml: topic: /arm_position_controller/commands" in done.stderr
+    assert done.stderr.count("wrist_turn") == done.stderr.count("wrist_roll") > 0
+
+
+def test_the_recorded_robot_is_taken_where_none_is_named(replay: Command, picks: Path):
+    done = replay(picks / "episode_000001", "--sim", "--dry-run")
+    assert done.returncode == 0, done.stderr
+    assert "mode:replay" in done.stdout
+    assert "sensor:" not in done.stdout
+
+
+def test_an_episode_that_is_not_there(replay: Command):
+    done = replay("nowhere/episode_000001")
+    assert (done.returncode, done.stderr) == (1, "error: nowhere/episode_000001: there is no such episode\n")
