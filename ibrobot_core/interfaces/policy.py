@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import attrs
 import numpy as np
@@ -52,10 +54,21 @@ class PolicySpec:
     prefix: bool = False
     """Whether it continues `Frame.prefix`: its chunk follows the first `delay_steps` actions of the prefix, and leads
     from there to what it would do by itself (real-time chunking)."""
+    stateful: bool = False
+    """Whether `infer` remembers the earlier requests of an episode, until `reset`. Such a policy serves one robot at a
+    time."""
 
 
 class Policy(ABC):
-    """Three pure steps, so that `infer` can run in another process or on another machine."""
+    """Three steps, so that `infer` can run in another process or on another machine than the other two.
+
+    The constructor reads configuration and statistics only; `load` reads the weights. Where `infer` runs elsewhere, the
+    robot's side is constructed, reset, and asked to `preprocess` and `postprocess`, but never loaded.
+
+    `infer` is pure: whatever it depends on comes in its tensors, e.g. the seed of its noise, so that one server answers
+    many robots, and one that was restarted goes on. What an episode must remember, e.g. earlier observations, belongs
+    to `preprocess`. A policy whose `infer` remembers all the same says so by `PolicySpec.stateful`.
+    """
 
     spec: PolicySpec
 
@@ -69,11 +82,29 @@ class Policy(ABC):
 
     @abstractmethod
     def infer(self, tensors: Tensors) -> Tensors:
-        """Inputs -> raw outputs. The heavy step. Pure but for the state that `reset` clears."""
+        """Inputs -> raw outputs. The heavy step.
+
+        Tensors are plain arrays of booleans, integers or floats; those that came from elsewhere cannot be written to.
+        """
 
     @abstractmethod
     def postprocess(self, tensors: Tensors) -> NDArray[np.float64]:
         """Raw outputs -> actions, shape (N, A) with 1 <= N <= `chunk_size`, in the contract's units and order."""
+
+    def infer_batch(self, batch: Sequence[Tensors]) -> list[Tensors]:
+        """Outputs of several inputs, in their order. All have the same names, dtypes and shapes.
+
+        One after the other, where a policy does not know better.
+        """
+        return [self.infer(tensors) for tensors in batch]
+
+    def fingerprint(self) -> str:
+        """What both sides of `infer` must agree on; of the spec, where a policy does not add e.g. its weights' hash.
+
+        Known once constructed. It has at most 128 bytes.
+        """
+        spec = attrs.asdict(self.spec)
+        return hashlib.sha256(json.dumps(spec, sort_keys=True).encode()).hexdigest()[:16]
 
     def load(self) -> None:
         """Load weights and warm up; when it returns the policy is ready.

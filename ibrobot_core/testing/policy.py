@@ -139,6 +139,45 @@ class PolicySuite(Suite[Policy]):
             there = policy.postprocess(_wire(policy.infer(_wire(policy.preprocess(frame)))))
             np.testing.assert_array_equal(here, there)
 
+    def test_a_batch_is_as_good_as_one_by_one(self) -> None:
+        """`infer_batch` gives as many outputs as inputs, in their order, as `infer` would."""
+        with self.loaded() as (policy, ctx):
+            if policy.spec.stateful:
+                pytest.skip("each request changes what it remembers")
+            batch = [policy.preprocess(self.frame(policy, ctx, i)) for i in range(3)]
+            together = policy.infer_batch(batch)
+            assert len(together) == len(batch)
+            for inputs, outputs in zip(batch, together, strict=True):
+                alone = policy.postprocess(policy.infer(inputs)).copy()
+                np.testing.assert_allclose(policy.postprocess(outputs), alone, rtol=1e-4, atol=1e-5)
+
+    def test_the_edge_needs_no_weights(self) -> None:
+        """One that was never loaded pre- and postprocesses for another's `infer`, and both agree on the fingerprint."""
+        with self.loaded() as (policy, ctx):
+            edge = self.make(ctx)
+            try:
+                edge.reset(0)
+                assert edge.fingerprint() == policy.fingerprint()
+                assert len(edge.fingerprint().encode()) <= 128
+                frame = self.frame(policy, ctx, 1)
+                policy.reset(0)
+                here = policy.postprocess(policy.infer(policy.preprocess(frame))).copy()
+                policy.reset(0)
+                there = edge.postprocess(policy.infer(edge.preprocess(frame)))
+                np.testing.assert_array_equal(here, there)
+            finally:
+                edge.close()
+
+    def test_infer_remembers_nothing(self) -> None:
+        """The same input gives the same output, whatever came between, unless the spec says that it is stateful."""
+        with self.loaded() as (policy, ctx):
+            if policy.spec.stateful:
+                pytest.skip("says that it remembers")
+            inputs = policy.preprocess(self.frame(policy, ctx, 1))
+            first = _copy(policy.infer(inputs))
+            policy.infer(policy.preprocess(self.frame(policy, ctx, 2)))
+            assert _equal(first, policy.infer(inputs))
+
     def test_close_is_safe_twice(self) -> None:
         """`close` may come before `load` and twice."""
         policy = self.make(self.context())

@@ -118,7 +118,34 @@ class TrustsThePrefixsLength(FakePolicy):
         return super().infer(tensors) | {key: tensors[key] for key in ("pace",) if key in tensors}
 
 
+class CountsRequests(FakePolicy):
+    count = 0
+
+    def infer(self, tensors):
+        self.count += 1
+        outputs = super().infer(tensors)
+        return {**outputs, "delta": outputs["delta"] * self.count}
+
+
+class ReversesBatches(FakePolicy):
+    def infer_batch(self, batch):
+        return super().infer_batch(batch)[::-1]
+
+
+class NeedsWeightsAtTheEdge(FakePolicy):
+    scale = None
+
+    def load(self):
+        self.scale = 1.0
+
+    def preprocess(self, frame):
+        return {key: value * self.scale for key, value in super().preprocess(frame).items()}
+
+
 WRONG = {
+    CountsRequests: "infer_remembers_nothing",
+    ReversesBatches: "a_batch_is_as_good_as_one_by_one",
+    NeedsWeightsAtTheEdge: "the_edge_needs_no_weights",
     MiscountsItsActions: "spec_agrees_with_itself",
     LongChunks: "chunks_are_as_specified",
     SingleActions: "chunks_are_as_specified",

@@ -113,11 +113,12 @@ class FakePolicy(Policy):
         for key in self.spec.observations:
             if key not in frame.values:
                 raise PolicyError(f"the frame lacks {key}")
-        return {"state": frame.values["observation.state"].astype(np.float64)}
+        return {"state": frame.values["observation.state"].astype(np.float64), "goal": self._goal}
 
     @override
     def infer(self, tensors: Tensors) -> Tensors:
-        return {"delta": self._goal - np.asarray(tensors["state"], np.float64), "state": tensors["state"]}
+        state = np.asarray(tensors["state"], np.float64)
+        return {"delta": np.asarray(tensors["goal"], np.float64) - state, "state": state}
 
     @override
     def postprocess(self, tensors: Tensors) -> NDArray[np.float64]:

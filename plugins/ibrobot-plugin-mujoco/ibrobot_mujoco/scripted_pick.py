@@ -85,6 +85,7 @@ class ScriptedPick(Policy):
             action_size=size,
             chunk_size=options.chunk_size,
             rate_hz=options.rate_hz,
+            stateful=True,
         )
         self._planner: PickPlanner | None = None
         self._episode: _Episode | None = None
