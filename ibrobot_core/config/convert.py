@@ -180,7 +180,12 @@ def _union_hook(kind: Any, converter: Converter) -> Hook:
                 reasons.append(str(error))
         if len(reasons) == 1:
             raise ValueError(reasons[0])
-        expected = [reason.removeprefix("expected ").partition(", got")[0] for reason in reasons]
+        expected = [
+            " or ".join(map(str, get_args(member)))
+            if is_literal(member)
+            else reason.removeprefix("expected ").partition(", got")[0]
+            for member, reason in zip(members, reasons, strict=True)
+        ]
         raise _wrong(" or ".join(expected), value)
 
     return structure

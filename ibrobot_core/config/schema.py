@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import attrs
 
@@ -125,12 +125,38 @@ class Smoothing:
     temporal_ensemble_coeff: float = option(0.01, help="c in w_k = exp(-c k), k = 0 the oldest prediction")
 
 
+def _check_watermark(_: object, __: object, value: int | str) -> None:
+    if isinstance(value, int) and value < 0:
+        raise ValueError(f"{value} is too small, must be at least 0 actions, or auto")
+
+
 @attrs.frozen
 class Dispatch:
     """How the plan is kept filled."""
 
-    watermark: int = option(20, unit="actions", ge=0, help="ask for a chunk when no more than this remains of the plan")
+    watermark: int | Literal["auto"] = option(
+        "auto",
+        unit="actions",
+        validator=_check_watermark,
+        help="ask for a chunk when no more than this remains of the plan; auto: half a chunk, or what the model's "
+        "measured latency takes where that is more",
+    )
+    strategy: str | None = option(
+        None,
+        choices=("replace", "ensemble", "rtc"),
+        help="how a chunk joins the plan: replace it; ensemble: blend with it; rtc (real-time chunking): the policy "
+        "continues it, where it can. None: ensemble, or replace with smoothing off",
+    )
     smoothing: Smoothing = option(factory=Smoothing, help="how chunks blend")
+
+    def __attrs_post_init__(self) -> None:
+        if self.strategy == "ensemble" and not self.smoothing.enabled:
+            raise ValueError("strategy ensemble blends: it does not go with smoothing: {enabled: false}")
+
+    @property
+    def joins_by(self) -> str:
+        """The strategy that holds: replace, ensemble or rtc."""
+        return self.strategy or ("ensemble" if self.smoothing.enabled else "replace")
 
 
 @attrs.frozen

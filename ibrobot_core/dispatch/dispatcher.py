@@ -11,14 +11,19 @@ from ibrobot_core.bus import Bus
 from ibrobot_core.config.schema import Dispatch
 from ibrobot_core.contract.frames import FrameSampler
 from ibrobot_core.contract.specs import Contract
+from ibrobot_core.dispatch.latency import LatencyEstimate
+from ibrobot_core.dispatch.resume import LeadIn
 from ibrobot_core.dispatch.smoother import TemporalSmoother
+from ibrobot_core.errors import ContractError
 from ibrobot_core.inference.client import Chunk, DispatchInfer, InferenceClient
 from ibrobot_core.interfaces import Frame, PolicySpec
-from ibrobot_core.robot import Vector
-from ibrobot_core.units import ns
+from ibrobot_core.robot import Robot, Vector
+from ibrobot_core.units import ns, seconds
 
-_RETRY_NS = 500_000_000
-"""Pause after a failed request."""
+_FIRST_PAUSE_NS = 100_000_000
+"""Pause after a failed request; it doubles with each one that fails next."""
+_LONGEST_PAUSE_NS = 1_000_000_000
+"""Also between requests that are not answered: so soon is a model used again that was away."""
 _SILENCE_NS = 2_000_000_000
 """After which missing observations are told."""
 
@@ -29,66 +34,110 @@ SendPlan = Callable[[int, int, Vector], None]
 class DispatchStats:
     """What happened, for diagnostics."""
 
+    strategy: str = "ensemble"
+    smoothing: bool = True
+    """Whether chunks blend."""
+    plan_length: int = 0
+    """Actions still to come."""
+    watermark: int = 0
+    """At which plan length a chunk is asked for."""
+    latency_ms: float = 0.0
+    """From the observation to its chunk, of the last one."""
+    latency_p50_ms: float = 0.0
+    """Of the newest hundred."""
+    latency_p99_ms: float = 0.0
     requests: int = 0
+    retries: int = 0
+    """Requests sent because the one before was overdue."""
     chunks: int = 0
     late_chunks: int = 0
     """Chunks wholly in the past when they came."""
     dropped_answers: int = 0
-    """Answers to requests that had timed out or were from before a reset."""
+    """Answers to requests that had timed out, were overtaken by a newer answer, or were from before a reset."""
     failures: int = 0
+    """Requests that gave no chunk, those that timed out among them."""
     timeouts: int = 0
     holds: int = 0
     """Times the plan ran dry."""
-    plan_length: int = 0
-    latency_ms: float = 0.0
-    """From the observation to its chunk, of the last one."""
-    smoothing: bool = True
+
+
+def check_strategy(options: Dispatch, spec: PolicySpec) -> None:
+    """Whether the policy can do what `dispatch` asks.
+
+    Raises:
+        ContractError: for `strategy: rtc` with a policy that cannot continue a plan.
+    """
+    if options.joins_by == "rtc" and not spec.prefix:
+        raise ContractError(
+            "dispatch.strategy: rtc needs a policy that continues the plan it is given (flow matching or diffusion), "
+            "and this one does not; use ensemble or replace"
+        )
 
 
 class Dispatcher:
-    """Pull: one request in flight, sent when no more than the watermark remains of the plan.
+    """Pull: a chunk is asked for when no more than the watermark remains of the plan.
+
+    One request is in flight; another is sent for newer observations when that is overdue, and the answer that comes
+    first is used. After failures it asks with growing pauses. Without an answer the plan ends and the arm holds; what
+    comes then leads over from there.
 
     Args:
         contract: the robot's contract, with the model's extra observations.
         spec: what the policy reads; only that is sampled.
-        options: watermark and smoothing.
+        options: watermark, strategy and smoothing.
+        robot: for the limits of its joints.
         bus: where observations are.
         client: where the model is.
         send: takes the plan: time of the first action [ns], step [ns], actions (N, A).
         request_timeout_s: after which a request has failed.
         prompt: the task, for policies that want one.
+
+    Raises:
+        ContractError: as `check_strategy`.
     """
 
     def __init__(
-        self, contract: Contract, spec: PolicySpec, options: Dispatch, bus: Bus, client: InferenceClient,
+        self, contract: Contract, spec: PolicySpec, options: Dispatch, robot: Robot, bus: Bus, client: InferenceClient,
         send: SendPlan, request_timeout_s: float, prompt: str = "",
     ) -> None:  # fmt: skip
+        check_strategy(options, spec)
         self._contract = contract
-        self._keys = tuple(spec.observations)
+        self._spec = spec
+        self._options = options
         self._bus = bus
         self._client = client
         self._send = send
         self._timeout_ns = ns(request_timeout_s)
-        self._watermark = options.watermark
         self._prompt = prompt
         step_ns = round(1e9 / (spec.rate_hz or contract.rate_hz))
-        smoothing = options.smoothing
+        joints = contract.action_joints
+        columns = robot.indices(joints)
+        lead_in = LeadIn(seconds(step_ns), robot.max_velocity[columns], robot.max_acceleration[columns])
+        holds = all(part.safety_behavior == "hold" for part in contract.action_parts)
+        blends = options.joins_by == "ensemble"
         self._smoother = TemporalSmoother(
-            step_ns, len(contract.action_joints), coeff=smoothing.temporal_ensemble_coeff, enabled=smoothing.enabled
-        )
-        self.stats = DispatchStats(smoothing=smoothing.enabled)
+            step_ns, len(joints), coeff=options.smoothing.temporal_ensemble_coeff, enabled=blends,
+            lead_in=lead_in if holds else None,
+        )  # fmt: skip
+        self._latency = LatencyEstimate()
+        self._chunk_length = spec.chunk_size
+        self.stats = DispatchStats(options.joins_by, blends)
         self._log = logging.getLogger("ibrobot.dispatch")
         self._request_id = 0
         self._sampler: FrameSampler | None = None
+        self._open: dict[int, int] = {}
+        """Requests that may still be answered, oldest first: id -> time of the observation [ns]."""
+        self._pause_ns = self._overdue_ns = 0
 
     def begin(self, seed: int) -> None:
-        """A new episode, or a mode entered: forget plan, request and observations, and start asking."""
+        """A new episode, or a mode entered: forget plan, requests and observations, and start asking."""
         if self._sampler is not None:
             self._sampler.close()
-        self._sampler = FrameSampler(self._contract, self._bus, self._keys)
+        self._sampler = FrameSampler(self._contract, self._bus, tuple(self._spec.observations))
         self._smoother.reset()
         self._client.reset(seed)
-        self._in_flight: DispatchInfer | None = None
+        self._open = {}
+        self._settle()
         self._ask_after_ns = 0
         self._waiting_since_ns: int | None = None
         self._dry = True
@@ -99,7 +148,6 @@ class Dispatcher:
         if self._sampler is not None:
             self._sampler.close()
             self._sampler = None
-        self._in_flight = None
 
     def toggle_smoothing(self, enabled: bool) -> None:
         """Switch blending on or off for the chunks to come."""
@@ -116,31 +164,36 @@ class Dispatcher:
         if not remaining and not self._dry:
             self.stats.holds += 1
         self._dry = not remaining
-        if self._in_flight is not None:
-            if t_ns - self._in_flight.frame.stamp_ns > self._timeout_ns:
-                self.stats.timeouts += 1
-                self._fail(t_ns, f"no chunk within {self._timeout_ns / 1e9:g} s")
-        elif remaining <= self._watermark and t_ns >= self._ask_after_ns:
+        for number in [number for number, asked_ns in self._open.items() if t_ns - asked_ns > self._timeout_ns]:
+            self.stats.timeouts += 1
+            self._fail(number, t_ns, f"no chunk within {self._timeout_ns / 1e9:g} s")
+        self.stats.watermark = self._watermark()
+        if self._open:
+            if t_ns - max(self._open.values()) > self._overdue_ns > 0:
+                self._overdue_ns = max(self._overdue_ns, min(2 * self._overdue_ns, _LONGEST_PAUSE_NS))
+                self.stats.retries += self._ask(t_ns)
+        elif remaining <= self.stats.watermark and t_ns >= self._ask_after_ns:
             self._ask(t_ns)
 
     def accept(self, chunk: Chunk, now_ns: int) -> None:
         """Join an answer to the plan, and send the plan; one that nobody waits for any more is dropped."""
-        request = self._in_flight
-        if self._sampler is None or request is None or chunk.id != request.id:
+        asked_ns = self._open.get(chunk.id) if self._sampler is not None else None
+        if asked_ns is None:
             self.stats.dropped_answers += 1
             return
         if chunk.actions is None:
-            self._fail(now_ns, chunk.error)
+            self._fail(chunk.id, now_ns, chunk.error)
             return
         self._smoother.trim(now_ns)
         try:
             joined = self._smoother.update(chunk.actions, chunk.start_ns)
         except ValueError as error:
-            self._fail(now_ns, str(error))
+            self._fail(chunk.id, now_ns, str(error))
             return
-        self._in_flight = None
-        self.stats.chunks += 1
-        self.stats.latency_ms = (now_ns - chunk.start_ns) / 1e6
+        # A chunk for older observations is of no use any more.
+        self._open = {number: stamp_ns for number, stamp_ns in self._open.items() if number > chunk.id}
+        self._count(now_ns - asked_ns, len(chunk.actions))
+        self._settle()
         if not joined:
             self.stats.late_chunks += 1
             return
@@ -149,17 +202,63 @@ class Dispatcher:
         self.stats.plan_length = self._smoother.remaining(now_ns)
         self._dry = False
 
-    def _ask(self, t_ns: int) -> None:
+    def _ask(self, t_ns: int) -> bool:
+        """Send a request, unless an observation is missing."""
         assert self._sampler is not None
         frame = self._sampler.sample(t_ns)
         if frame.missing:
             self._wait_for(frame)
-            return
+            return False
         self._waiting_since_ns = None
         self._request_id += 1
         self.stats.requests += 1
-        self._in_flight = DispatchInfer(self._request_id, attrs.evolve(frame, prompt=self._prompt))
-        self._client.submit(self._in_flight)
+        self._open[self._request_id] = t_ns
+        prefix, delay_steps = self._continued(t_ns)
+        frame = attrs.evolve(frame, prompt=self._prompt, prefix=prefix, delay_steps=delay_steps)
+        self._client.submit(DispatchInfer(self._request_id, frame))
+        return True
+
+    def _continued(self, t_ns: int) -> tuple[Vector | None, int]:
+        """For real-time chunking, what the arm will be told from `t_ns` on, and how much of it before a chunk comes."""
+        if self._options.joins_by != "rtc":
+            return None, 0
+        size = self._spec.chunk_size
+        delay = self._steps(self._latency.upper_ns)
+        # While the arm is held, half of the chunk at least must move it.
+        prefix = self._smoother.ahead(t_ns, min(max(delay, 1), (size + 1) // 2))
+        if prefix is None:
+            return None, 0
+        return prefix[:size], min(delay, len(prefix), size)
+
+    def _watermark(self) -> int:
+        """The plan length at which to ask."""
+        if self._options.watermark != "auto":
+            return int(self._options.watermark)
+        # Time for an answer, and, should that be lost, for another once the first is overdue.
+        return max(self._chunk_length // 2, self._steps(self._usual_ns() + self._latency.upper_ns))
+
+    def _steps(self, time_ns: int) -> int:
+        """A time in actions, rounded up."""
+        return -(-time_ns // self._smoother.step_ns)
+
+    def _count(self, latency_ns: int, length: int) -> None:
+        """An answer came."""
+        self._latency.add(latency_ns)
+        self._chunk_length = length
+        stats = self.stats
+        stats.chunks += 1
+        stats.latency_ms = latency_ns / 1e6
+        stats.latency_p50_ms = self._latency.quantile_ns(0.5) / 1e6
+        stats.latency_p99_ms = self._latency.quantile_ns(0.99) / 1e6
+
+    def _settle(self) -> None:
+        """The model answers: no pause, and the next answer is expected in the usual time; 0 when that is not known."""
+        self._pause_ns = _FIRST_PAUSE_NS
+        self._overdue_ns = self._usual_ns() if self.stats.chunks else 0
+
+    def _usual_ns(self) -> int:
+        """Within what time an answer comes [ns]; a tick is for the asking, and one for the rounding."""
+        return self._latency.upper_ns + 2 * self._contract.step_ns
 
     def _wait_for(self, frame: Frame) -> None:
         """Nothing is asked, and the arm holds, while an observation is missing."""
@@ -170,8 +269,9 @@ class Dispatcher:
             self._log.warning("holding: nothing new on %s", ", ".join(sorted(topics)))
             self._waiting_since_ns = frame.stamp_ns
 
-    def _fail(self, now_ns: int, why: str) -> None:
+    def _fail(self, number: int, now_ns: int, why: str) -> None:
         self.stats.failures += 1
-        self._in_flight = None
-        self._ask_after_ns = now_ns + _RETRY_NS
+        del self._open[number]
+        self._ask_after_ns = now_ns + self._pause_ns
+        self._pause_ns = min(2 * self._pause_ns, _LONGEST_PAUSE_NS)
         self._log.warning("inference failed, the arm holds when its plan ends: %s", why)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,8 @@ from numpy.typing import NDArray
 from ibrobot_core.robot import Vector
 
 _FIRST_GAINS = 256
+
+Lead = Callable[[Vector, Vector], Vector]
 
 
 class TemporalSmoother:
@@ -36,12 +39,16 @@ class TemporalSmoother:
         action_size: numbers in an action, A.
         coeff: `c` in `w_k = exp(-c k)`; positive favours old predictions, negative new ones, 0 is the plain mean.
         enabled: whether chunks blend.
+        lead_in: after the plan ran dry, makes the new one go on from the last action of the old, which is held; takes
+            that, shape (A,), and the new plan, shape (M, A). None where it is not held, or may jump.
 
     Raises:
         ValueError: for a step or a size below one, or a coefficient out of range.
     """
 
-    def __init__(self, step_ns: int, action_size: int, *, coeff: float = 0.01, enabled: bool = True) -> None:
+    def __init__(
+        self, step_ns: int, action_size: int, *, coeff: float = 0.01, enabled: bool = True, lead_in: Lead | None = None
+    ) -> None:
         if step_ns < 1:
             raise ValueError(f"step_ns must be at least 1, got {step_ns}")
         if action_size < 1:
@@ -51,6 +58,7 @@ class TemporalSmoother:
         self.step_ns = step_ns
         self.action_size = action_size
         self.enabled = enabled
+        self._lead_in = lead_in
         self._ratio = math.exp(-coeff)
         self._gains = _gains(self._ratio, _FIRST_GAINS)
         self.reset()
@@ -59,6 +67,7 @@ class TemporalSmoother:
         """Forget the plan and the time: a new episode begins."""
         self._set(0, np.empty((0, self.action_size)), np.empty(0, dtype=np.intp))
         self._now_ns: int | None = None
+        self._held: Vector | None = None
 
     def toggle(self, enabled: bool) -> None:
         """Switch smoothing on or off for the chunks to come; the plan stays."""
@@ -73,11 +82,27 @@ class TemporalSmoother:
         begun = (now_ns - self._start_ns) // self.step_ns + 1
         return min(max(len(self._positions) - begun, 0), len(self._positions))
 
+    def ahead(self, t_ns: int, held: int) -> Vector | None:
+        """What the arm will be told from `t_ns` on: the plan's actions, shape (K, A), the first that nearest to `t_ns`.
+
+        Where the plan ran dry it is told the last action, which stands there `held` times, K = held. None before the
+        first plan, where the last action is not held, and where the plan begins later.
+        """
+        offset = (t_ns - self._start_ns + self.step_ns // 2) // self.step_ns
+        if len(self._positions) and offset < 0:
+            return None
+        if offset < len(self._positions):
+            return self._positions[offset:]
+        last = self._positions[-1] if len(self._positions) else self._held
+        return None if last is None or self._lead_in is None else np.tile(last, (held, 1))
+
     def trim(self, now_ns: int) -> None:
         """Drop the actions whose step is over at `now_ns`; the one in effect stays: interpolation starts there."""
         self._now_ns = now_ns if self._now_ns is None else max(now_ns, self._now_ns)
         over = (now_ns - self._start_ns) // self.step_ns
         if over >= len(self._positions):
+            if len(self._positions):
+                self._held = self._positions[-1]
             self._set(0, self._positions[:0], self._counts[:0])
         elif over > 0:
             self._set(self._start_ns + over * self.step_ns, self._positions[over:], self._counts[over:])
@@ -124,7 +149,10 @@ class TemporalSmoother:
         rest = len(actions) - past
         if rest <= 0:
             return 0
-        self._set(start_ns + past * self.step_ns, actions[past:].copy(), np.ones(rest, dtype=np.intp))
+        plan = actions[past:].copy()
+        if not len(self._positions) and self._held is not None and self._lead_in is not None:
+            plan = self._lead_in(self._held, plan)
+        self._set(start_ns + past * self.step_ns, plan, np.ones(rest, dtype=np.intp))
         return rest
 
     def _blend(self, actions: Vector, offset: int) -> None:

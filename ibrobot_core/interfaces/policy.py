@@ -28,9 +28,10 @@ class Frame:
     missing: frozenset[str] = frozenset()
     prompt: str = ""
     prefix: Vector | None = None
-    """The plan's actions still to be executed from this tick on, shape (K, A) with 1 <= K <= `chunk_size`, in the
-    contract's units and order: row i is for the same time as action i of the chunk. None where nothing is planned, or
-    the policy does not want it; never padded."""
+    """What the arm will be told from this tick on, shape (K, A) with 1 <= K <= `chunk_size`, in the contract's units
+    and order; row i is for the same time as action i of the chunk. It is the actions still in the plan, never padded;
+    where the plan ran dry, the last one, which is held meanwhile. None at the beginning, and for a policy that does
+    not want it."""
     delay_steps: int = 0
     """The latency to expect, in actions: so many of the prefix, 0 <= delay_steps <= K, are executed before the chunk
     comes."""

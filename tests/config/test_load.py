@@ -26,7 +26,7 @@ def test_sections_become_objects(load_text: Load, base: str) -> None:
     assert config.hardware["hardware"].joints == ("pan", "lift", "grip")
     assert config.hardware["hardware"].options.max_speed == 3.0
     assert config.control_modes["plan"].planner is not None
-    assert config.control_modes["policy"].dispatch.watermark == 20
+    assert config.control_modes["policy"].dispatch.watermark == "auto"
     assert not config.simulated
     assert config.simulation is None
 

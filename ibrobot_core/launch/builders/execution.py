@@ -7,7 +7,7 @@ from typing import override
 from ibrobot_core.config.schema import ControlMode, Inference
 from ibrobot_core.contract.check import check_policy
 from ibrobot_core.contract.specs import Contract
-from ibrobot_core.dispatch.dispatcher import Dispatcher
+from ibrobot_core.dispatch.dispatcher import Dispatcher, check_strategy
 from ibrobot_core.errors import ContractError
 from ibrobot_core.inference.client import InferenceClient, LockstepClient, MonolithicClient
 from ibrobot_core.interfaces import Policy
@@ -47,6 +47,12 @@ class Model(Component):
             raise ContractError(
                 f"model {model.name!r} does not fit the contract of {session.config.source}\n{error}"
             ) from None
+        for mode in session.config.control_modes.values():
+            if mode.inference is not None and mode.inference.model == model.name:
+                try:
+                    check_strategy(mode.dispatch, policy.spec)
+                except ContractError as error:
+                    raise ContractError(f"{session.config.source}: control_modes.{mode.name}.{error}") from None
         policy.load()
         self._policy = policy
 
@@ -81,8 +87,8 @@ class InferenceFeeder(Feeder):
         policy, contract = self._model.policy, self._model.contract
         self._client = LockstepClient(policy) if self.session.request.lockstep else MonolithicClient(policy)
         self._dispatcher = Dispatcher(
-            contract, policy.spec, self.mode.dispatch, self.session.bus, self._client, self._send,
-            self._inference.request_timeout, self._inference.prompt,
+            contract, policy.spec, self.mode.dispatch, self.session.config.robot, self.session.bus, self._client,
+            self._send, self._inference.request_timeout, self._inference.prompt,
         )  # fmt: skip
         self._step_ns = contract.step_ns
 
