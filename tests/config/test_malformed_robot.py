@@ -158,6 +158,29 @@ CASES = {
         "teleop: stick, dispatch: {watermark: 5}}",
         "robot.yaml:27: control_modes.teleop.dispatch: has a meaning only beside inference",
     ),
+    "watermark_word": (
+        "{model: net}",
+        "{model: net}\n    dispatch: {watermark: early}",
+        "robot.yaml:27: control_modes.policy.dispatch.watermark: expected a whole number or auto, got 'early'",
+    ),
+    "watermark_negative": (
+        "{model: net}",
+        "{model: net}\n    dispatch: {watermark: -1}",
+        "robot.yaml:27: control_modes.policy.dispatch.watermark: -1 is too small, must be at least 0 actions, or auto",
+    ),
+    "strategy": (
+        "{model: net}",
+        "{model: net}\n    dispatch: {strategy: blend}",
+        "robot.yaml:27: control_modes.policy.dispatch.strategy: 'blend' is not one of: replace, ensemble, rtc",
+    ),
+    "strategy_against_smoothing": (
+        "{model: net}",
+        "{model: net}\n    dispatch: {strategy: ensemble, smoothing: {enabled: false}}",
+        (
+            "robot.yaml:27: control_modes.policy.dispatch: strategy ensemble blends: it does not go with "
+            "smoothing: {enabled: false}"
+        ),
+    ),
     "mode_planner_missing": (
         "planner: {type: straight}",
         "planner: {type: ompll}",

@@ -223,3 +223,11 @@ def test_a_reset_fails_the_goal_under_way_and_the_next_is_tried(runs: Runs):
         pass
     assert runtime.summary()["goals_failed"] == 1
     assert position(runtime)[0] == pytest.approx(-0.3, abs=0.03)
+
+
+def test_real_time_chunking_with_a_policy_that_cannot_is_refused_before_anything_moves(runs: Runs):
+    runtime = runs.make("control_modes.policy.dispatch.strategy=rtc")
+    with pytest.raises(ComponentFailed, match=r"mini.yaml: control_modes.policy.dispatch.strategy: rtc needs a policy"):
+        runtime.start()
+    assert not runtime.session.has_control
+    assert "load net" not in runs.parts.CALLS
