@@ -154,6 +154,8 @@ def _tell(report: Report) -> None:
     if not done:
         click.echo(f"nothing was added to {report.out}")
         return
+    if not all(each.prompt for each in done):
+        click.echo("some episodes have no prompt; --prompt TEXT makes it their task", err=True)
     resumed = f", {report.resumed} of them by an earlier run" if report.resumed else ""
     click.echo(f"{len(done)} episodes, {summary['frames']} frames{resumed} -> {report.out}")
     click.echo(
