@@ -34,6 +34,9 @@ def radians(degrees: float) -> float:
 TICKS_PER_TURN = 4096
 """Positions of a servo's encoder in one turn (12 bit)."""
 
+NORM_MODES = ("radians", "degrees", "range_m100_100")
+"""Units that a dataset or a policy may have joint positions in: SI, or LeRobot's for an arm."""
+
 LEROBOT_MODES = ("range_m100_100", "range_0_100", "degrees")
 """Units of joint positions in LeRobot, by the names of its `MotorNormMode`."""
 

@@ -13,8 +13,8 @@ from typing import Any
 
 import click
 
-from ibrobot_core.recording.convert.joint_units import NORM_MODES
 from ibrobot_core.recording.convert.request import MISSING, OUTCOMES, EpisodeReport, Report, Request
+from ibrobot_core.units import NORM_MODES
 
 _MIB = 1 << 20
 
@@ -154,8 +154,6 @@ def _tell(report: Report) -> None:
     if not done:
         click.echo(f"nothing was added to {report.out}")
         return
-    if not all(each.prompt for each in done):
-        click.echo("some episodes have no prompt; --prompt TEXT makes it their task", err=True)
     resumed = f", {report.resumed} of them by an earlier run" if report.resumed else ""
     click.echo(f"{len(done)} episodes, {summary['frames']} frames{resumed} -> {report.out}")
     click.echo(

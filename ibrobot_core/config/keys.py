@@ -10,6 +10,7 @@ import attrs
 from ibrobot_core.config.schema import ContractConfig, Control, Dispatch, Inference, ObservationSpec
 from ibrobot_core.options import option
 from ibrobot_core.robot import Robot
+from ibrobot_core.units import NORM_MODES
 
 
 @attrs.frozen
@@ -60,7 +61,8 @@ class ModelKeys:
     """Keys of a policy."""
 
     type: str = option(help="which plugin; `ibrobot plugins` lists them")
-    norm_mode: str = option("radians", choices=("radians",), help="unit of the joints in its vectors")
+    norm_mode: str = option("radians", choices=NORM_MODES, help="unit of the joints in its vectors")
+    calibration: str | None = option(None, help="in place of the hardware's, for norm_mode: a name, or a path to one")
     extra_observations: tuple[ObservationSpec, ...] = option((), help="what it sees beyond the contract")
 
 

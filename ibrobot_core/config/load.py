@@ -122,7 +122,7 @@ def _build(document: Document, source: Path, sim: bool, registry: Registry) -> R
         },
         models={
             name: ModelConfig(
-                part.descriptor.type, part.options, name, part.keys.norm_mode,
+                part.descriptor.type, part.options, name, part.keys.norm_mode, part.keys.calibration,
                 contract_checks.observations(part.key, part.keys.extra_observations),
             )
             for name, part in parts.models.items()

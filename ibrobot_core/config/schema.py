@@ -114,6 +114,8 @@ class ModelConfig(Component):
 
     name: str
     norm_mode: str = "radians"
+    calibration: str | None = None
+    """In place of the hardware's."""
     extra_observations: tuple[ObservationSpec, ...] = ()
 
 

@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import ContractError
 from ibrobot_core.interfaces.policy import PolicySpec
 
 
-def check_policy(contract: Contract, spec: PolicySpec) -> None:
+def check_policy(contract: Contract, spec: PolicySpec, norm_mode: str = "radians") -> None:
     """Compare what a policy reads and gives with what the robot has.
+
+    Args:
+        contract: the robot's, with the model's extra observations.
+        spec: the policy's.
+        norm_mode: unit of the joints in the policy's vectors, as the robot YAML says it.
 
     Raises:
         ContractError: for an observation that the contract lacks or has in another shape, and for an action of another
-            size or other joints, e.g. the same ones in another order; every difference with both sides.
+            size or other joints, e.g. the same ones in another order; where the policy says what it was trained on,
+            also for another unit, rate, topic, selection or alignment. Every difference with both sides.
     """
     faults = []
     for key, wanted in spec.observations.items():
@@ -29,8 +36,20 @@ def check_policy(contract: Contract, spec: PolicySpec) -> None:
         faults.append(_fault("action", ", ".join(spec.actions), ", ".join(joints)))
     elif spec.action_size != len(joints):
         faults.append(_fault("action", f"{spec.action_size} numbers", f"{len(joints)}: {', '.join(joints)}"))
+    if spec.norm_mode not in (None, norm_mode):
+        faults.append(_fault("norm_mode", f"trained in {spec.norm_mode}", f"the model's norm_mode is {norm_mode}"))
+    if spec.contract is not None and not faults:
+        trained = Contract.from_canonical(_restricted(spec.contract, spec))
+        here = Contract.from_canonical(_restricted(contract.canonical(), spec))
+        faults += [trained.difference(here, names=("policy", "contract"))] if trained != here else []
     if faults:
         raise ContractError("the policy does not fit the contract:\n" + "\n".join(faults))
+
+
+def _restricted(canonical: Mapping[str, Any], spec: PolicySpec) -> dict[str, Any]:
+    """A contract with no more observations than the policy reads."""
+    seen = {key: parts for key, parts in canonical["observations"].items() if key in spec.observations}
+    return {**canonical, "observations": seen}
 
 
 def _fits(wanted: Sequence[int], given: Sequence[int]) -> bool:

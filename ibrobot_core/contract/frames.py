@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from functools import partial
 from typing import Any
 
+import attrs
 import numpy as np
 from numpy.typing import NDArray
 
@@ -141,13 +143,19 @@ class FrameSampler:
         contract: what to sample.
         bus: where the messages are.
         keys: the observations wanted; all when None.
+        history: how many ticks before its own a frame has in `Frame.history`. Every tick is then decoded, also those
+            that neither `sample` nor `advance` were called for.
 
     Raises:
         ContractError: for a key that the contract does not have.
     """
 
-    def __init__(self, contract: Contract, bus: Bus, keys: Collection[str] | None = None) -> None:
+    def __init__(self, contract: Contract, bus: Bus, keys: Collection[str] | None = None, history: int = 0) -> None:
         self._assembler = FrameAssembler(contract, keys)
+        self._step_ns = contract.step_ns
+        self._history = history
+        self._recent: deque[Frame] = deque(maxlen=history + 1)
+        """The frames of the newest ticks, all complete, each one step after the other."""
         depths = {True: _IMAGE_DEPTH, False: _VECTOR_DEPTH}
         topics = self._assembler.topics()
         self._subscriptions = [bus.subscribe(topic, depths[is_image]) for topic, is_image in topics.items()]
@@ -159,13 +167,22 @@ class FrameSampler:
         Raises:
             ContractError: for a message that does not fit the contract.
         """
-        self._drain(t_ns)
-        return self._assembler.frame(t_ns)
+        if not self._history:
+            self._drain(t_ns)
+            return self._assembler.frame(t_ns)
+        if self._recent:
+            begin_ns = max(self._recent[-1].stamp_ns + self._step_ns, t_ns - self._history * self._step_ns)
+            for skipped_ns in range(begin_ns, t_ns, self._step_ns):
+                self._remember(skipped_ns)
+        return self._remember(t_ns)
 
     def advance(self, t_ns: int) -> None:
-        """Take in what was received by tick `t_ns` [ns], decoding nothing."""
-        self._drain(t_ns)
-        self._assembler.advance(t_ns)
+        """Take in what was received by tick `t_ns` [ns], decoding nothing that no history needs."""
+        if self._history:
+            self.sample(t_ns)
+        else:
+            self._drain(t_ns)
+            self._assembler.advance(t_ns)
 
     def resets(self) -> dict[str, int]:
         """How often the stamps of a topic jumped, per topic; topics without a jump left out."""
@@ -175,6 +192,19 @@ class FrameSampler:
         """Leave the bus. Safe to call twice."""
         for subscription in self._subscriptions:
             subscription.close()
+
+    def _remember(self, t_ns: int) -> Frame:
+        """The frame at `t_ns` with those before it; what comes before a gap is not history of what comes after."""
+        self._drain(t_ns)
+        frame = self._assembler.frame(t_ns)
+        if self._recent and self._recent[-1].stamp_ns == t_ns:
+            self._recent.pop()
+        if frame.missing:
+            self._recent.clear()
+            return frame
+        past = tuple(self._recent)[-self._history :]
+        self._recent.append(frame)
+        return attrs.evolve(frame, history=past)
 
     def _drain(self, t_ns: int) -> None:
         """Move what was received by `t_ns` from the queues to the streams; the rest waits in the bounded queues."""

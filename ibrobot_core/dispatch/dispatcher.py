@@ -133,7 +133,7 @@ class Dispatcher:
         """A new episode, or a mode entered: forget plan, requests and observations, and start asking."""
         if self._sampler is not None:
             self._sampler.close()
-        self._sampler = FrameSampler(self._contract, self._bus, tuple(self._spec.observations))
+        self._sampler = FrameSampler(self._contract, self._bus, tuple(self._spec.observations), self._spec.history)
         self._smoother.reset()
         self._client.reset(seed)
         self._open = {}

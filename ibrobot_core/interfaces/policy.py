@@ -6,6 +6,7 @@ import hashlib
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import attrs
 import numpy as np
@@ -35,6 +36,9 @@ class Frame:
     delay_steps: int = 0
     """The latency to expect, in actions: so many of the prefix, 0 <= delay_steps <= K, are executed before the chunk
     comes."""
+    history: tuple[Frame, ...] = ()
+    """The frames of the ticks just before, oldest first, each complete and without prompt, prefix and history of its
+    own; at most `PolicySpec.history` of them, fewer where an episode begins or an observation was missing."""
 
 
 @attrs.frozen
@@ -58,6 +62,12 @@ class PolicySpec:
     stateful: bool = False
     """Whether `infer` remembers the earlier requests of an episode, until `reset`. Such a policy serves one robot at a
     time."""
+    history: int = 0
+    """How many ticks before the frame's own it sees, in `Frame.history`."""
+    contract: Mapping[str, Any] | None = None
+    """What `Contract.canonical` gave of the contract that it was trained on; None when the checkpoint does not say."""
+    norm_mode: str | None = None
+    """Unit of joint positions that it was trained in, as `models:` says it; None when the checkpoint does not say."""
 
 
 class Policy(ABC):
@@ -67,8 +77,8 @@ class Policy(ABC):
     robot's side is constructed, reset, and asked to `preprocess` and `postprocess`, but never loaded.
 
     `infer` is pure: whatever it depends on comes in its tensors, e.g. the seed of its noise, so that one server answers
-    many robots, and one that was restarted goes on. What an episode must remember, e.g. earlier observations, belongs
-    to `preprocess`. A policy whose `infer` remembers all the same says so by `PolicySpec.stateful`.
+    many robots, and one that was restarted goes on. Earlier observations come in `Frame.history`. A policy whose
+    `infer` remembers all the same says so by `PolicySpec.stateful`.
     """
 
     spec: PolicySpec

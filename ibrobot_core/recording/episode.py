@@ -5,12 +5,11 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import ibrobot_core
-from ibrobot_core.calibration import load_calibration
 from ibrobot_core.config import RobotConfig
 from ibrobot_core.config.schema import Recording
+from ibrobot_core.contract.joint_units import calibrations
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import RecorderError
 from ibrobot_core.interfaces import EpisodeStart
@@ -49,7 +48,7 @@ def episode_start(
     metadata = {
         "robot": config.robot.name, "robot_type": config.robot.robot_type, "mode": mode, "prompt": prompt,
         "contract": json.dumps(contract.canonical()), "fingerprint": contract.fingerprint(),
-        "config": json.dumps(config.document, default=str), "calibration": json.dumps(_calibrations(config)),
+        "config": json.dumps(config.document, default=str), "calibration": json.dumps(calibrations(config)),
         "ibrobot_version": ibrobot_core.__version__, "seed": str(seed),
     }  # fmt: skip
     if recording.topics == "contract":
@@ -65,13 +64,6 @@ def is_kept(topic: str, recording: Recording, contract: Contract) -> bool:
     if recording.topics == "contract":
         return topic in contract.topics
     return recording.topics == "all" or topic in recording.topics
-
-
-def _calibrations(config: RobotConfig) -> dict[str, Any]:
-    """The calibrations of the hardware in use, by its name; nothing for a simulation."""
-    options = {name: component.options for name, component in config.hardware.items()}
-    names = {name: getattr(each, "calibration", None) for name, each in options.items()}
-    return {name: load_calibration(found).numbers() for name, found in names.items() if found is not None}
 
 
 def _next_number(root: Path) -> int:

@@ -15,6 +15,8 @@ from ibrobot_core.errors import PolicyError
 from ibrobot_core.interfaces import Context, Frame, Policy, PolicySpec, Tensors
 from ibrobot_core.testing.suite import Suite
 
+_STEP_NS = 33_333_333
+
 
 class PolicySuite(Suite[Policy]):
     """What every `Policy` must do."""
@@ -25,6 +27,12 @@ class PolicySuite(Suite[Policy]):
     def frame(self, policy: Policy, ctx: Context, seed: int) -> Frame:
         """A frame with all that the policy's spec asks for; override where random numbers will not do."""
         rng = np.random.default_rng(seed)
+        now_ns = ctx.clock.now_ns()
+        past = tuple(Frame(now_ns - i * _STEP_NS, self._values(policy, rng)) for i in range(policy.spec.history, 0, -1))
+        prompt = "pick up the cube" if policy.spec.prompt else ""
+        return Frame(now_ns, self._values(policy, rng), prompt=prompt, history=past)
+
+    def _values(self, policy: Policy, rng: np.random.Generator) -> dict[str, NDArray[np.generic]]:
         values: dict[str, NDArray[np.generic]] = {}
         for key, shape in policy.spec.observations.items():
             sizes = tuple(self.any_size if n == -1 else n for n in shape)
@@ -32,7 +40,7 @@ class PolicySuite(Suite[Policy]):
                 values[key] = rng.integers(0, 256, sizes, dtype=np.uint8)
             else:
                 values[key] = rng.uniform(-1, 1, sizes).astype(np.float32)
-        return Frame(ctx.clock.now_ns(), values, prompt="pick up the cube" if policy.spec.prompt else "")
+        return values
 
     @contextmanager
     def loaded(self) -> Iterator[tuple[Policy, Context]]:
@@ -89,6 +97,16 @@ class PolicySuite(Suite[Policy]):
                 values = {k: v for k, v in whole.values.items() if k != key}
                 with pytest.raises(PolicyError, match=key):
                     policy.preprocess(attrs.evolve(whole, values=values, missing=frozenset({key})))
+
+    def test_a_history_of_any_length_is_taken(self) -> None:
+        """A policy that says `history` gives chunks as specified at an episode's first tick, and soon after."""
+        with self.loaded() as (policy, ctx):
+            if not policy.spec.history:
+                pytest.skip("sees no history")
+            frame = self.frame(policy, ctx, 1)
+            for length in range(policy.spec.history):
+                short = attrs.evolve(frame, history=frame.history[policy.spec.history - length :])
+                _check_chunk(policy.postprocess(policy.infer(policy.preprocess(short))), policy.spec)
 
     def test_equal_seeds_act_alike(self) -> None:
         """After `reset` with the same seed the same frames give the same bits, whatever happened before."""

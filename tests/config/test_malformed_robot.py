@@ -272,8 +272,8 @@ CASES = {
     ),
     "norm_mode": (
         "net: {type: net}",
-        "net: {type: net, norm_mode: range_m100_100}",
-        "robot.yaml:22: models.net.norm_mode: 'range_m100_100' is not one of: radians",
+        "net: {type: net, norm_mode: ticks}",
+        "robot.yaml:22: models.net.norm_mode: 'ticks' is not one of: radians, degrees, range_m100_100",
     ),
     "recording_topics": (
         "recording: {type: log}",

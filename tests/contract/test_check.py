@@ -78,3 +78,23 @@ def test_every_difference_is_told_with_both_sides(contract: Contract, changes: d
     with pytest.raises(ContractError) as caught:
         check_policy(contract, attrs.evolve(FITS, **changes))
     assert str(caught.value) == f"the policy does not fit the contract:\n{message}"
+
+
+def test_what_it_was_trained_on_is_compared(contract: Contract, make_config: Callable[..., Any]) -> None:
+    trained = attrs.evolve(FITS, contract=contract.canonical(), norm_mode="degrees")
+    check_policy(contract, trained, "degrees")
+    with pytest.raises(ContractError, match=r"policy: trained in degrees\n    contract: the model's norm_mode is rad"):
+        check_policy(contract, trained)
+    faster = Contract.from_config(make_config(rate_hz=50.0))
+    with pytest.raises(ContractError, match=r"rate_hz\n    policy: 30.0\n  contract: 50.0"):
+        check_policy(faster, trained, "degrees")
+
+
+def test_observations_that_it_does_not_read_are_not_compared(contract: Contract) -> None:
+    canonical = contract.canonical()
+    other = {**canonical, "observations": {**canonical["observations"]}}
+    other["observations"]["observation.images.top"] = [{**canonical["observations"]["observation.images.top"][0]}]
+    other["observations"]["observation.images.top"][0]["topic"] = "/camera/chest/image_raw"
+    check_policy(contract, attrs.evolve(FITS, observations={"observation.state": (6,)}, contract=other))
+    with pytest.raises(ContractError, match="/camera/chest/image_raw"):
+        check_policy(contract, attrs.evolve(FITS, contract=other))

@@ -264,3 +264,55 @@ def test_offline_messages_must_be_in_the_order_of_receipt(contract: Contract) ->
 def test_ticks_may_go_on_for_ever(contract: Contract) -> None:
     endless = frames(contract, [("/joint_states", joint_state(0, 1.0), 0)], itertools.count(0, contract.step_ns))
     assert [len(frame.values) for frame in itertools.islice(endless, 3)] == [1, 1, 1]
+
+
+def test_history_is_the_ticks_just_before(contract: Contract) -> None:
+    clock = SteppedClock(START_NS)
+    bus = Bus(clock)
+    sampler = FrameSampler(contract, bus, ["observation.state"], history=2)
+    step, t_ns = contract.step_ns, START_NS
+
+    def publish(value: float) -> None:
+        bus.publish("/joint_states", joint_state(clock.advance(1), value))
+
+    def tick(value: float | None, *, ask: bool = True) -> Frame | None:
+        """A joint state, and a tick a little after it; none with the value None."""
+        nonlocal t_ns
+        if value is not None:
+            publish(value)
+        t_ns = clock.advance(step - (clock.now_ns() - START_NS) % step)
+        return sampler.sample(t_ns) if ask else sampler.advance(t_ns)
+
+    def seen(frame: Frame | None) -> list[float]:
+        assert frame is not None
+        assert [each.stamp_ns for each in frame.history] == [t_ns - k * step for k in range(len(frame.history), 0, -1)]
+        return [float(each.values["observation.state"][5]) for each in (*frame.history, frame)]
+
+    assert tick(None).missing  # nothing was measured yet
+    assert seen(tick(1)) == [1]
+    assert seen(tick(2)) == [1, 2]
+    tick(3, ask=False)
+    assert seen(tick(4)) == [2, 3, 4]
+    assert seen(sampler.sample(t_ns)) == [2, 3, 4]  # the same tick again
+    publish(5)
+    clock.advance(step - 1)  # a tick that nobody asked for
+    assert seen(tick(6)) == [4, 5, 6]
+    for value in (7, 8, 9):
+        publish(value)
+        clock.advance(step - 1)
+    assert seen(tick(10)) == [8, 9, 10]  # more of them than there is history
+
+
+def test_history_does_not_reach_over_a_gap(make_config: Make) -> None:
+    spec = ObservationSpec("observation.state", topic="/joint_states", align=Align("drop"))
+    contract = Contract.from_config(make_config([spec]))
+    clock = SteppedClock(START_NS)
+    bus = Bus(clock)
+    sampler = FrameSampler(contract, bus, history=3)
+    lengths = []
+    for k in range(8):
+        if k != 4:
+            bus.publish("/joint_states", joint_state(clock.now_ns() + 1, float(k)))
+        frame = sampler.sample(clock.advance(contract.step_ns))
+        lengths.append(None if frame.missing else len(frame.history))
+    assert lengths == [0, 1, 2, 3, None, 0, 1, 2]

@@ -219,7 +219,7 @@ def test_joints_in_lerobots_units(bags: Path, tmp_path: Path) -> None:
     assert list(kept["calibrations"].values()) == [CALIBRATION]
     assert (kept["fingerprint"], kept["conversion"]["norm_mode"]) == (CONTRACT.fingerprint(), "degrees")
     without = run(bags, "--out", tmp_path / "none", "--norm-mode", "degrees")
-    assert "needs the calibration of joint 'pan'; there is none; give it by --calibration" in without.err
+    assert "needs the calibration of joint 'pan'; there is none; name one by `calibration`" in without.err
 
 
 @pytest.mark.parametrize("storage", list(StoragePlugin))

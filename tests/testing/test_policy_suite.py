@@ -127,6 +127,19 @@ class CountsRequests(FakePolicy):
         return {**outputs, "delta": outputs["delta"] * self.count}
 
 
+class WantsAWholeHistory(FakePolicy):
+    def __init__(self, ctx):
+        super().__init__(ctx)
+        self.spec = attrs.evolve(self.spec, history=2)
+
+    def postprocess(self, tensors):
+        return super().postprocess(tensors)[:, : self.spec.action_size * self._seen]
+
+    def preprocess(self, frame):
+        self._seen = len(frame.history) == self.spec.history
+        return super().preprocess(frame)
+
+
 class ReversesBatches(FakePolicy):
     def infer_batch(self, batch):
         return super().infer_batch(batch)[::-1]
@@ -150,6 +163,7 @@ WRONG = {
     LongChunks: "chunks_are_as_specified",
     SingleActions: "chunks_are_as_specified",
     SinglePrecision: "chunks_are_as_specified",
+    WantsAWholeHistory: "a_history_of_any_length_is_taken",
     TrustsThePrefixsLength: "a_prefix_of_any_length_is_taken",
     ZerosForMissing: "a_missing_key_is_refused",
     RandomWithoutSeed: "equal_seeds_act_alike",

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from typing import override
 
+from ibrobot_core.calibration import load_calibration
 from ibrobot_core.config.schema import ControlMode, Inference
 from ibrobot_core.contract.check import check_policy
+from ibrobot_core.contract.joint_units import JointUnits, calibrations
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.dispatch.dispatcher import Dispatcher, check_strategy
 from ibrobot_core.errors import ContractError
 from ibrobot_core.inference.client import InferenceClient, LockstepClient, MonolithicClient
+from ibrobot_core.inference.policy_units import PolicyInItsUnits
 from ibrobot_core.interfaces import Policy
 from ibrobot_core.launch.component import Component
 from ibrobot_core.launch.feeder import Feeder
@@ -42,7 +45,7 @@ class Model(Component):
         model, session = self._model, self._session
         policy = session.registry.find("policy", model.type).make(model.options, session.context(model.name))
         try:
-            check_policy(self.contract, policy.spec)
+            check_policy(self.contract, policy.spec, model.norm_mode)
         except ContractError as error:
             raise ContractError(
                 f"model {model.name!r} does not fit the contract of {session.config.source}\n{error}"
@@ -53,8 +56,16 @@ class Model(Component):
                     check_strategy(mode.dispatch, policy.spec)
                 except ContractError as error:
                     raise ContractError(f"{session.config.source}: control_modes.{mode.name}.{error}") from None
+        if model.norm_mode != "radians":
+            policy = PolicyInItsUnits(policy, self._units())
         policy.load()
         self._policy = policy
+
+    def _units(self) -> JointUnits:
+        config, name = self._session.config, self._model.calibration
+        each = {"model": load_calibration(name).numbers()} if name is not None else calibrations(config)
+        joined = {joint: numbers for joints in each.values() for joint, numbers in joints.items()}
+        return JointUnits(self._model.norm_mode, self.contract, joined, config.document)
 
     @override
     def stop(self) -> None:

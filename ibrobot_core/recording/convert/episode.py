@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 from ibrobot_core.calibration import Calibration, JointCalibration
 from ibrobot_core.clock import RealClock
+from ibrobot_core.contract.joint_units import JointUnits
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import ContractError, DatasetError, IbrobotError, RecorderError
 from ibrobot_core.interfaces import Context, DatasetWriter, EpisodeReader, EpisodeSummary, Feature
 from ibrobot_core.plugins import installed
-from ibrobot_core.recording.convert.joint_units import JointUnits
 from ibrobot_core.recording.convert.request import EpisodeReport, Request
 from ibrobot_core.recording.convert.ticks import Ticks
 from ibrobot_core.robot import Robot

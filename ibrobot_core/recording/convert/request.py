@@ -10,7 +10,7 @@ import attrs
 
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.options import option
-from ibrobot_core.recording.convert.joint_units import NORM_MODES
+from ibrobot_core.units import NORM_MODES
 
 MISSING = ("refuse", "skip", "hold")
 OUTCOMES = ("success", "failure", "unknown")

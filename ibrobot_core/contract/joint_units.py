@@ -1,21 +1,23 @@
-"""Joint positions at the dataset's edge: radians as they were recorded, or in one of LeRobot's units."""
+"""Joint positions at the edge of datasets and policies: radians, or one of LeRobot's units."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.calibration import JointCalibration
+from ibrobot_core.calibration import JointCalibration, load_calibration
+from ibrobot_core.config.schema import RobotConfig
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import CalibrationError
 from ibrobot_core.messages import JointState
-from ibrobot_core.units import radians_to_lerobot
+from ibrobot_core.units import lerobot_to_radians, radians_to_lerobot
 
-NORM_MODES = ("radians", "degrees", "range_m100_100")
+ACTION = "action"
+"""Key of the action vector."""
 _CLOSED_MODE = "range_0_100"
 _POSITION = "position."
 
@@ -39,7 +41,7 @@ class JointUnits:
     (the hardware's option `anchored`, by default the gripper) is 0 to 100 in both, as LeRobot has it.
 
     Args:
-        norm_mode: one of `NORM_MODES`.
+        norm_mode: one of `units.NORM_MODES`.
         contract: which elements are joints' positions.
         calibration: joint -> LeRobot's numbers.
         document: the robot YAML as plain values: which joints are anchored, and their lower limits.
@@ -66,22 +68,39 @@ class JointUnits:
             self._elements[key] = [_elements(mode, named, calibration, closed) for mode, named in modes.items()]
 
     def __call__(self, values: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-        """The values of a tick with their joint positions converted; arrays that change are copied."""
-        converted = dict(values)
-        for key, groups in self._elements.items():
-            vector = values[key].astype(np.float64)
-            for group in groups:
-                vector[group.indices] = radians_to_lerobot(
-                    vector[group.indices], group.mode, range_min=group.range_min, range_max=group.range_max,
-                    zero=group.zero, inverted=group.inverted,
-                )  # fmt: skip
-            converted[key] = vector.astype(values[key].dtype)
-        return converted
+        """Radians -> the unit: the values of a tick, or any of them, joints last; arrays that change are copied."""
+        return {key: self._converted(key, value, radians_to_lerobot) for key, value in values.items()}
+
+    def radians(self, key: str, value: NDArray[Any]) -> NDArray[Any]:
+        """The unit -> radians, of the vectors of one key, joints last."""
+        return self._converted(key, value, lerobot_to_radians)
+
+    def _converted(self, key: str, value: NDArray[Any], convert: Callable[..., NDArray[Any]]) -> NDArray[Any]:
+        if key not in self._elements:
+            return value
+        vector = value.astype(np.float64)
+        for group in self._elements[key]:
+            vector[..., group.indices] = convert(
+                vector[..., group.indices], group.mode, range_min=group.range_min, range_max=group.range_max,
+                zero=group.zero, inverted=group.inverted,
+            )  # fmt: skip
+        return vector.astype(value.dtype)
+
+
+def calibrations(config: RobotConfig) -> dict[str, dict[str, dict[str, int]]]:
+    """The calibrations of the hardware in use, by its name; nothing for a simulation.
+
+    Raises:
+        CalibrationError: when one cannot be read.
+    """
+    options = {name: component.options for name, component in config.hardware.items()}
+    names = {name: getattr(each, "calibration", None) for name, each in options.items()}
+    return {name: load_calibration(found).numbers() for name, found in names.items() if found is not None}
 
 
 def _position_joints(contract: Contract) -> dict[str, dict[int, str]]:
     """Key -> element -> joint, of all elements that are a joint's position."""
-    found: dict[str, dict[int, str]] = {"action": dict(enumerate(contract.action_joints))}
+    found: dict[str, dict[int, str]] = {ACTION: dict(enumerate(contract.action_joints))}
     for key in contract.observations:
         at = 0
         for part in contract.parts(key):
@@ -98,7 +117,7 @@ def _elements(
 ) -> _Elements:
     for joint in named.values():
         if joint not in calibration:
-            has = f"it has: {', '.join(calibration)}" if calibration else "there is none; give it by --calibration"
+            has = f"it has: {', '.join(calibration)}" if calibration else "there is none; name one by `calibration`"
             raise CalibrationError(f"{mode} needs the calibration of joint {joint!r}; {has}")
     each = {joint: JointCalibration(**calibration[joint]) for joint in named.values()}
     return _Elements(
