@@ -84,6 +84,10 @@ class TransportError(IbrobotError):
     """A message that cannot be sent, e.g. a request that nobody serves."""
 
 
+class WireError(IbrobotError):
+    """Bytes that are no frame of the wire format, or a frame that has no bytes, e.g. one that was cut short."""
+
+
 class RecorderError(IbrobotError):
     """A recording that cannot be written or read, e.g. a full disk."""
 

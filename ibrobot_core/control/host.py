@@ -25,11 +25,11 @@ from ibrobot_core.control.link import (
     Layout,
     PlanRecord,
     SharedMemory,
-    create_memory,
     raise_error,
 )
 from ibrobot_core.control.timing import REPORT_TICKS, Punctuality
 from ibrobot_core.errors import ComponentFailed, HardwareError, IbrobotError
+from ibrobot_core.memory import create_memory
 from ibrobot_core.plugins import Registry
 
 _START_TIMEOUT_S = 60.0

@@ -11,7 +11,6 @@ import mmap
 import os
 import select
 import socket
-import tempfile
 import threading
 import time
 from collections.abc import Mapping
@@ -94,14 +93,6 @@ class Layout:
     def size(self) -> int:
         """Bytes of shared memory."""
         return STATE_SLOTS * self.state.itemsize + 2 * self.plan.itemsize
-
-
-def create_memory() -> int:
-    """The descriptor of an empty unnamed file."""
-    if hasattr(os, "memfd_create"):
-        return os.memfd_create("ibrobot-link")
-    with tempfile.TemporaryFile() as file:
-        return os.dup(file.fileno())
 
 
 class SharedMemory:

@@ -1,10 +1,11 @@
-"""Inference: what takes a frame and gives back a chunk, wherever the model runs; here in the host process."""
+"""Inference: what takes a frame and gives back a chunk, wherever the model runs."""
 
 from __future__ import annotations
 
 import logging
 import queue
 import threading
+import time
 from abc import ABC, abstractmethod
 from typing import override
 
@@ -12,10 +13,14 @@ import attrs
 import numpy as np
 
 from ibrobot_core.errors import PolicyError
+from ibrobot_core.inference.engine import Engine, LocalEngine
 from ibrobot_core.interfaces import Frame, Policy
 from ibrobot_core.robot import Vector
+from ibrobot_core.units import ns
 
 _CLOSE_TIMEOUT_S = 1.0
+_PATIENCE_S = 600.0
+"""How long a request is waited for where nothing else says so."""
 
 
 @attrs.frozen(eq=False)
@@ -60,11 +65,14 @@ class InferenceClient(ABC):
         """End; safe to call twice."""
 
 
-def run_policy(policy: Policy, request: DispatchInfer) -> Chunk:
+def run_policy(policy: Policy, engine: Engine, request: DispatchInfer, deadline_ns: int) -> Chunk:
     """The three steps, one after the other. A policy that raises gives a chunk with its error: the arm holds."""
     stamp_ns = request.frame.stamp_ns
     try:
-        actions = np.asarray(policy.postprocess(policy.infer(policy.preprocess(request.frame))), dtype=np.float64)
+        outputs = engine.infer(policy.preprocess(request.frame), request.id, deadline_ns)
+        actions = np.asarray(policy.postprocess(outputs), dtype=np.float64)
+    except PolicyError as error:
+        return Chunk(request.id, stamp_ns, None, str(error))
     except Exception as error:
         logging.getLogger("ibrobot.inference").exception("the policy failed")
         return Chunk(request.id, stamp_ns, None, f"{type(error).__name__}: {error}")
@@ -72,15 +80,21 @@ def run_policy(policy: Policy, request: DispatchInfer) -> Chunk:
 
 
 class LockstepClient(InferenceClient):
-    """Runs the policy in `submit`, so that a chunk costs no simulated time: for lockstep."""
+    """Runs the policy in `submit`, so that a chunk costs no simulated time: for lockstep.
 
-    def __init__(self, policy: Policy) -> None:
+    Args:
+        policy: pre- and postprocesses.
+        engine: where `infer` runs; here where left out.
+    """
+
+    def __init__(self, policy: Policy, engine: Engine | None = None) -> None:
         self._policy = policy
+        self._engine = engine or LocalEngine(policy)
         self._chunk: Chunk | None = None
 
     @override
     def submit(self, request: DispatchInfer) -> None:
-        self._chunk = run_policy(self._policy, request)
+        self._chunk = run_policy(self._policy, self._engine, request, time.monotonic_ns() + ns(_PATIENCE_S))
 
     @override
     def poll(self, timeout_s: float = 0.0) -> Chunk | None:
@@ -91,29 +105,37 @@ class LockstepClient(InferenceClient):
     def reset(self, seed: int) -> None:
         self._chunk = None
         self._policy.reset(seed)
+        self._engine.reset(seed)
 
     @override
     def close(self) -> None:
         self._chunk = None
 
 
-class MonolithicClient(InferenceClient):
-    """Runs the policy in a thread of the host process, with no serialisation between the steps.
+class EngineClient(InferenceClient):
+    """Runs the policy in a thread of the host process; `infer` where its engine is.
 
     A request that waits behind a slow one is not run at all when a newer one, or a reset, waits behind it: nobody
     waits for its answer any more.
+
+    Args:
+        policy: pre- and postprocesses.
+        engine: where `infer` runs; here where left out.
+        timeout_s: for how long the answer of a request is waited for, from its submission on.
     """
 
-    def __init__(self, policy: Policy) -> None:
+    def __init__(self, policy: Policy, engine: Engine | None = None, timeout_s: float = _PATIENCE_S) -> None:
         self._policy = policy
-        self._work: queue.SimpleQueue[DispatchInfer | int | None] = queue.SimpleQueue()
+        self._engine = engine or LocalEngine(policy)
+        self._timeout_ns = ns(timeout_s)
+        self._work: queue.SimpleQueue[tuple[DispatchInfer, int] | int | None] = queue.SimpleQueue()
         self._chunks: queue.SimpleQueue[Chunk | PolicyError] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name="inference", daemon=True)
         self._thread.start()
 
     @override
     def submit(self, request: DispatchInfer) -> None:
-        self._work.put(request)
+        self._work.put((request, time.monotonic_ns() + self._timeout_ns))
 
     @override
     def poll(self, timeout_s: float = 0.0) -> Chunk | None:
@@ -137,12 +159,13 @@ class MonolithicClient(InferenceClient):
 
     def _run(self) -> None:
         while (work := self._work.get()) is not None:
-            if isinstance(work, DispatchInfer):
+            if not isinstance(work, int):
                 if self._work.empty():
-                    self._chunks.put(run_policy(self._policy, work))
+                    self._chunks.put(run_policy(self._policy, self._engine, *work))
                 continue
             try:
                 self._policy.reset(work)
+                self._engine.reset(work)
             except Exception as error:
                 logging.getLogger("ibrobot.inference").exception("the policy failed")
                 self._chunks.put(PolicyError(f"the policy's reset failed: {type(error).__name__}: {error}"))

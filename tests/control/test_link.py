@@ -21,10 +21,10 @@ from ibrobot_core.control.link import (
     Layout,
     PlanRecord,
     SharedMemory,
-    create_memory,
     raise_error,
 )
 from ibrobot_core.errors import ComponentFailed, HardwareError
+from ibrobot_core.memory import create_memory
 
 LAYOUT = Layout(joints=3, signals=2)
 FLOATS = st.floats(width=64)

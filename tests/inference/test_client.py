@@ -11,7 +11,7 @@ import pytest
 
 from ibrobot_core.errors import PolicyError
 from ibrobot_core.inference import client as module
-from ibrobot_core.inference.client import Chunk, DispatchInfer, InferenceClient, LockstepClient, MonolithicClient
+from ibrobot_core.inference.client import Chunk, DispatchInfer, EngineClient, InferenceClient, LockstepClient
 from ibrobot_core.interfaces import Frame
 from ibrobot_core.testing import host_context
 from ibrobot_core.testing.fakes import FakePolicy
@@ -58,14 +58,14 @@ def policy() -> GatedPolicy:
 
 
 @pytest.fixture
-def monolithic(policy: GatedPolicy) -> Iterator[MonolithicClient]:
-    client = MonolithicClient(policy)
+def monolithic(policy: GatedPolicy) -> Iterator[EngineClient]:
+    client = EngineClient(policy)
     yield client
     policy.gate.release(100)
     client.close()
 
 
-def test_the_answer_carries_the_id_and_the_observations_time(policy: GatedPolicy, monolithic: MonolithicClient):
+def test_the_answer_carries_the_id_and_the_observations_time(policy: GatedPolicy, monolithic: EngineClient):
     monolithic.submit(request(3))
     assert monolithic.poll() is None, "submit does not wait for the policy"
     policy.gate.release()
@@ -78,7 +78,7 @@ def test_the_answer_carries_the_id_and_the_observations_time(policy: GatedPolicy
 
 
 def test_the_policy_never_runs_twice_at_once_and_only_the_newest_of_those_waiting_runs(
-    policy: GatedPolicy, monolithic: MonolithicClient
+    policy: GatedPolicy, monolithic: EngineClient
 ):
     monolithic.submit(request(1))
     assert policy.entered.acquire(timeout=PATIENCE_S)
@@ -91,7 +91,7 @@ def test_the_policy_never_runs_twice_at_once_and_only_the_newest_of_those_waitin
     assert policy.most == 1
 
 
-def test_the_policy_is_reset_before_it_sees_a_later_request(policy: GatedPolicy, monolithic: MonolithicClient):
+def test_the_policy_is_reset_before_it_sees_a_later_request(policy: GatedPolicy, monolithic: EngineClient):
     monolithic.submit(request(1))
     assert policy.entered.acquire(timeout=PATIENCE_S)
     monolithic.submit(request(2))
@@ -104,7 +104,7 @@ def test_the_policy_is_reset_before_it_sees_a_later_request(policy: GatedPolicy,
 
 
 def test_closing_returns_while_the_policy_hangs(policy: GatedPolicy, monkeypatch: pytest.MonkeyPatch):
-    client = MonolithicClient(policy)
+    client = EngineClient(policy)
     client.submit(request(1))
     assert policy.entered.acquire(timeout=PATIENCE_S)
     monkeypatch.setattr(module, "_CLOSE_TIMEOUT_S", 0.01)
@@ -119,7 +119,7 @@ def test_closing_returns_while_the_policy_hangs(policy: GatedPolicy, monkeypatch
     assert policy.calls == ["infer 1"], "what waited behind is never run"
 
 
-def test_a_reset_that_fails_is_told_at_the_next_poll(policy: GatedPolicy, monolithic: MonolithicClient, caplog):
+def test_a_reset_that_fails_is_told_at_the_next_poll(policy: GatedPolicy, monolithic: EngineClient, caplog):
     with caplog.at_level(logging.CRITICAL):
         monolithic.reset(-1)
         with pytest.raises(PolicyError, match="reset failed: ValueError: seed must not be negative"):
@@ -145,7 +145,7 @@ def test_lockstep_forgets_an_answer_at_reset_and_close(policy: GatedPolicy, end:
     assert client.poll() is None
 
 
-@pytest.mark.parametrize("kind", [LockstepClient, MonolithicClient])
+@pytest.mark.parametrize("kind", [LockstepClient, EngineClient])
 def test_a_policy_that_raises_answers_with_its_error(kind: type[InferenceClient], policy: GatedPolicy, caplog):
     policy.error = RuntimeError("out of memory")
     policy.gate.release()
@@ -153,7 +153,7 @@ def test_a_policy_that_raises_answers_with_its_error(kind: type[InferenceClient]
     assert "the policy failed" in caplog.text
 
 
-@pytest.mark.parametrize("kind", [LockstepClient, MonolithicClient])
+@pytest.mark.parametrize("kind", [LockstepClient, EngineClient])
 @pytest.mark.parametrize("actions", [{"action": 1}, "nonsense", [[1, 2], [3]]], ids=["mapping", "text", "ragged"])
 def test_a_policy_that_gives_no_numbers_answers_with_an_error(
     kind: type[InferenceClient], policy: GatedPolicy, actions: object, monkeypatch: pytest.MonkeyPatch

@@ -11,7 +11,7 @@ from ibrobot_core.contract.joint_units import JointUnits, calibrations
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.dispatch.dispatcher import Dispatcher, check_strategy
 from ibrobot_core.errors import ContractError
-from ibrobot_core.inference.client import InferenceClient, LockstepClient, MonolithicClient
+from ibrobot_core.inference.client import EngineClient, InferenceClient, LockstepClient
 from ibrobot_core.inference.policy_units import PolicyInItsUnits
 from ibrobot_core.interfaces import Policy
 from ibrobot_core.launch.component import Component
@@ -96,7 +96,7 @@ class InferenceFeeder(Feeder):
     @override
     def setup(self) -> None:
         policy, contract = self._model.policy, self._model.contract
-        self._client = LockstepClient(policy) if self.session.request.lockstep else MonolithicClient(policy)
+        self._client = LockstepClient(policy) if self.session.request.lockstep else EngineClient(policy)
         self._dispatcher = Dispatcher(
             contract, policy.spec, self.mode.dispatch, self.session.config.robot, self.session.bus, self._client,
             self._send, self._inference.request_timeout, self._inference.prompt,

@@ -1,0 +1,91 @@
+"""Engines: where a policy's `infer` runs. In this process here; others are in `process` and `remote`."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from typing import override
+
+import attrs
+
+from ibrobot_core.interfaces import Policy, Tensors
+
+
+@attrs.define
+class EngineStats:
+    """What happened, for diagnostics."""
+
+    mode: str
+    alive: bool = False
+    """Whether there is a model that answers."""
+    requests: int = 0
+    failures: int = 0
+    restarts: int = 0
+    """Times that the model's process was started again, or its server came back."""
+    infer_ms: float = 0.0
+    """From the tensors to the outputs, of the last request."""
+    model_ms: float = 0.0
+    """As much of it as the other side says that it took."""
+
+
+class Engine(ABC):
+    """Runs `infer` for one robot: one request at a time, from one thread."""
+
+    def __init__(self, mode: str) -> None:
+        self.stats = EngineStats(mode)
+
+    def start(self) -> None:
+        """Return when the model is ready.
+
+        Raises:
+            PolicyError: e.g. no such checkpoint, or nobody serves it.
+            ContractError: when the model is not the one that the robot expects, with both sides.
+        """
+
+    def infer(self, tensors: Tensors, request_id: int, deadline_ns: int) -> Tensors:
+        """Inputs -> raw outputs.
+
+        Args:
+            tensors: what `preprocess` made.
+            request_id: its answer is given to no other request.
+            deadline_ns: when nobody waits any more, by `time.monotonic_ns()`.
+
+        Raises:
+            PolicyError: when there is no answer in time; a later request may well have one.
+        """
+        begun_ns = time.monotonic_ns()
+        self.stats.requests += 1
+        try:
+            outputs = self.run(tensors, request_id, deadline_ns)
+        except Exception:
+            self.stats.failures += 1
+            raise
+        self.stats.infer_ms = (time.monotonic_ns() - begun_ns) / 1e6
+        return outputs
+
+    @abstractmethod
+    def run(self, tensors: Tensors, request_id: int, deadline_ns: int) -> Tensors:
+        """As `infer`, which counts."""
+
+    def reset(self, seed: int) -> None:
+        """A new episode begins: a policy that remembers forgets the last before the next request."""
+
+    def close(self) -> None:
+        """Release what it took; a request that goes on fails soon. Safe to call twice."""
+
+
+class LocalEngine(Engine):
+    """The policy itself. Whoever owns it resets and closes it."""
+
+    def __init__(self, policy: Policy) -> None:
+        super().__init__("monolithic")
+        self._policy = policy
+
+    @override
+    def start(self) -> None:
+        self._policy.load()
+        self.stats.alive = True
+
+    @override
+    def run(self, tensors: Tensors, request_id: int, deadline_ns: int) -> Tensors:
+        return self._policy.infer(tensors)

@@ -1,0 +1,132 @@
+"""Execution mode `distributed`: `infer` on a server, over a transport."""
+
+from __future__ import annotations
+
+import json
+import time
+import uuid
+from collections.abc import Callable, Mapping
+from typing import Any, override
+
+import attrs
+
+from ibrobot_core.errors import ContractError, PolicyError, TransportError, WireError
+from ibrobot_core.inference.engine import Engine
+from ibrobot_core.inference.service import health_name, service_name
+from ibrobot_core.inference.wire import LIMITS, Encoder, Kind, Limits, Message, PictureCodec, decode
+from ibrobot_core.interfaces import Policy, Tensors, Transport
+from ibrobot_core.units import NS_PER_S
+
+_HEALTH_TIMEOUT_S = 2.0
+_HEALTH_SIZE = 1 << 20
+_RETRY_S = 0.2
+
+
+class RemoteEngine(Engine):
+    """The model on a server; the robot's side has no weights.
+
+    A server that goes away fails requests, and the arm holds; once it is back, requests are answered again, since each
+    says all that a server must know. The transport connects again by itself.
+
+    Args:
+        policy: the robot's side, which must have the fingerprint of the server's.
+        transport: the way to the server; whoever made it closes it.
+        model: what the server calls the model.
+        robot: this robot's name; made unique among the server's robots.
+        start_timeout_s: how long `start` waits for a server [s].
+        codec: makes JPEG of camera pictures on thin links.
+        limits: the server's.
+    """
+
+    def __init__(
+        self, policy: Policy, transport: Transport, model: str, robot: str, start_timeout_s: float = 5.0,
+        codec: PictureCodec | None = None, limits: Limits = LIMITS,
+    ) -> None:  # fmt: skip
+        super().__init__("distributed")
+        self._policy = policy
+        self._fingerprint = policy.fingerprint()
+        self._transport = transport
+        self._model = model
+        self._robot = f"{robot}-{uuid.uuid4().hex[:8]}"
+        self._start_timeout_s = start_timeout_s
+        self._encoder = Encoder(limits, codec)
+        self._limits = limits
+        self._episode, self._seed = 0, 0
+        self._end_watch: Callable[[], None] | None = None
+
+    @override
+    def start(self) -> None:
+        deadline_s = time.monotonic() + self._start_timeout_s
+        while True:
+            try:
+                health = self._health()
+                break
+            except TransportError as error:
+                if time.monotonic() >= deadline_s:
+                    raise PolicyError(f"no server for model {self._model!r}: {error}") from None
+                time.sleep(_RETRY_S)
+        if health.get("fingerprint") != self._fingerprint:
+            raise ContractError(self._differences(health))
+        self._end_watch = self._transport.watch(service_name(self._model), self._served)
+
+    @override
+    def run(self, tensors: Tensors, request_id: int, deadline_ns: int) -> Tensors:
+        left_ns = deadline_ns - time.monotonic_ns()
+        if left_ns <= 0:
+            raise PolicyError(f"request {request_id} expired before it was sent")
+        message = Message(
+            Kind.REQUEST, request_id, tensors, self._robot, self._fingerprint, stamp_ns=time.time_ns(),
+            deadline_ns=left_ns, episode=self._episode, seed=self._seed,
+        )  # fmt: skip
+        frame = self._encoder.encode(message)
+        try:
+            answer = decode(
+                self._transport.request(service_name(self._model), frame, left_ns / NS_PER_S), limits=self._limits
+            )
+        except (TransportError, WireError) as error:
+            raise PolicyError(str(error)) from None
+        if answer.kind is Kind.FAILURE:
+            raise PolicyError(f"the server of {self._model}: {answer.text}")
+        if answer.id != request_id or answer.fingerprint != self._fingerprint:
+            raise PolicyError(
+                f"the server of {self._model} answered request {answer.id} by policy {answer.fingerprint!r}, "
+                f"asked was {request_id} by {self._fingerprint!r}"
+            )
+        self.stats.model_ms = answer.latency_ms
+        return answer.tensors
+
+    @override
+    def reset(self, seed: int) -> None:
+        self._episode += 1
+        self._seed = seed
+
+    @override
+    def close(self) -> None:
+        end, self._end_watch = self._end_watch, None
+        if end is not None:
+            end()
+
+    def _served(self, alive: bool) -> None:
+        self.stats.restarts += alive and self.stats.requests > 0
+        self.stats.alive = alive
+
+    def _health(self) -> Mapping[str, Any]:
+        reply = self._transport.request(health_name(self._model), b"", _HEALTH_TIMEOUT_S)
+        try:
+            health = json.loads(bytes(reply)) if len(reply) <= _HEALTH_SIZE else None
+        except ValueError:
+            health = None
+        if not isinstance(health, dict):
+            raise PolicyError(f"what serves {health_name(self._model)} is no server of ibrobot: {bytes(reply)[:40]!r}…")
+        return health
+
+    def _differences(self, health: Mapping[str, Any]) -> str:
+        """Both policies, where they differ."""
+        known = health["spec"] if isinstance(health.get("spec"), dict) else {}
+        ours = json.loads(json.dumps(attrs.asdict(self._policy.spec)))
+        lines = [f"the policy on the server is not the robot's model {self._model!r}:"]
+        for field in known:
+            if known[field] != ours.get(field):
+                lines.append(f"  {field}\n      robot: {ours.get(field)}\n     server: {known[field]}")
+        lines.append(f"  fingerprint\n      robot: {self._fingerprint}\n     server: {health.get('fingerprint')}")
+        return "\n".join(lines)

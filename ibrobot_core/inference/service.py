@@ -1,0 +1,300 @@
+"""The cloud side of inference: one model, loaded once, answers many robots over a transport."""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+import time
+import traceback
+from collections import Counter, OrderedDict, deque
+from collections.abc import Callable
+from typing import Any
+
+import attrs
+import numpy as np
+
+from ibrobot_core.errors import IbrobotError, PolicyError, WireError
+from ibrobot_core.inference.fair_queue import FairQueue
+from ibrobot_core.inference.wire import LIMITS, Kind, Limits, Message, PictureCodec, decode, encode
+from ibrobot_core.interfaces import Payload, Policy, Tensors, Transport
+from ibrobot_core.units import NS_PER_S
+
+_ROBOTS_KEPT = 256
+"""Robots whose counts are kept; those heard of last."""
+_LATENCIES_KEPT = 1000
+_LEASE_NS = 5 * NS_PER_S
+"""How long a model that remembers stays with a silent robot, where another asks."""
+_LONGEST_WAIT_S = 600.0
+
+
+def service_name(model: str) -> str:
+    """What a transport calls the service of a model."""
+    return f"infer/{model}"
+
+
+def health_name(model: str) -> str:
+    """What a transport calls its health."""
+    return f"{service_name(model)}/health"
+
+
+@attrs.frozen
+class ServiceOptions:
+    """How requests are queued and put together."""
+
+    batch: int = 8
+    """The most requests for one `infer_batch`."""
+    queue: int = 64
+    """The most requests that wait."""
+    patience_s: float = 0.0
+    """How long a batch that is not full waits for more requests [s]; 0: only what waits already goes together."""
+    limits: Limits = LIMITS
+
+
+@attrs.define
+class RobotCounts:
+    """What one robot asked, and how long its answers took."""
+
+    requests: int = 0
+    answered: int = 0
+    failed: int = 0
+    """Answered with why there is no chunk; `expired` ones among them."""
+    expired: int = 0
+    """Begun too late, so never begun."""
+    heard_ns: int = 0
+    latencies_ms: deque[float] = attrs.field(factory=lambda: deque(maxlen=_LATENCIES_KEPT))
+
+    def summary(self) -> dict[str, Any]:
+        """For people and programs."""
+        p50, p99 = np.percentile(self.latencies_ms or [0.0], [50, 99])
+        counts = {name: getattr(self, name) for name in ("requests", "answered", "failed", "expired")}
+        return {**counts, "latency_p50_ms": round(float(p50), 2), "latency_p99_ms": round(float(p99), 2)}
+
+
+@attrs.define(eq=False)
+class _Ticket:
+    """A request that waits for its turn, and what came of it."""
+
+    message: Message
+    deadline_ns: int
+    alike: tuple[Any, ...]
+    outputs: Tensors | None = None
+    error: str = ""
+    expired: bool = False
+    done: threading.Event = attrs.field(factory=threading.Event)
+
+    def answer(self, outputs: Tensors) -> None:
+        self.outputs = outputs
+        self.done.set()
+
+    def fail(self, error: str, *, expired: bool = False) -> None:
+        self.error, self.expired = error, expired
+        self.done.set()
+
+
+class InferenceService:
+    """Serves `infer` of a loaded policy under `service_name(model)`, and its statistics under `health_name(model)`.
+
+    Args:
+        policy: loaded; whoever made it closes it, after the service.
+        transport: where robots are; whoever made it closes it, after the service.
+        model: what robots call it.
+        options: how requests are queued.
+        codec: for pictures that come as JPEG.
+    """
+
+    def __init__(
+        self, policy: Policy, transport: Transport, model: str, options: ServiceOptions | None = None,
+        codec: PictureCodec | None = None,
+    ) -> None:  # fmt: skip
+        self._policy = policy
+        self._transport = transport
+        self._model = model
+        self._options = options or ServiceOptions()
+        self._codec = codec
+        self._fingerprint = policy.fingerprint()
+        self._queue: FairQueue[_Ticket] = FairQueue(self._options.queue)
+        self._lock = threading.Lock()
+        self._all = RobotCounts()
+        self._robots: OrderedDict[str, RobotCounts] = OrderedDict()
+        self._batches: Counter[int] = Counter()
+        self._malformed = 0
+        self._at_work = 0
+        self._idle = threading.Condition(self._lock)
+        self._draining = False
+        self._owner: tuple[str, int] | None = None
+        self._owner_heard_ns = 0
+        self._begun_ns = time.monotonic_ns()
+        self._log = logging.getLogger("ibrobot.inference")
+        self._ends: list[Callable[[], None]] = []
+        self._thread = threading.Thread(target=self._infer_all, name=f"model {model}", daemon=True)
+
+    def start(self) -> None:
+        """Begin to answer.
+
+        Raises:
+            TransportError: when the name is served already.
+        """
+        options = self._options
+        # Each request that waits holds a worker: there must be one left to say that the queue is full.
+        workers = options.queue + options.batch + 1
+        self._ends.append(self._transport.serve(health_name(self._model), self._health, workers=1))
+        self._ends.append(self._transport.serve(service_name(self._model), self._answer, workers=workers))
+        self._thread.start()
+
+    def drain(self, timeout_s: float) -> bool:
+        """Refuse what comes from now on, and wait for what is there to be answered; whether all was, in time [s]."""
+        with self._idle:
+            self._draining = True
+            return self._idle.wait_for(lambda: self._at_work == 0, timeout_s)
+
+    def close(self) -> None:
+        """End; what still waits is answered with an error. Safe to call twice."""
+        self._draining = True
+        self._queue.end()
+        ends, self._ends = self._ends, []
+        for end in ends:
+            end()
+        if self._thread.is_alive():
+            self._thread.join(1.0)
+
+    def statistics(self) -> dict[str, Any]:
+        """What `…/health` answers."""
+        with self._lock:
+            robots = {name: counts.summary() for name, counts in self._robots.items()}
+            batches = {str(size): count for size, count in sorted(self._batches.items())}
+            return {
+                "model": self._model, "state": "draining" if self._draining else "ready",
+                "fingerprint": self._fingerprint, "spec": attrs.asdict(self._policy.spec),
+                "uptime_s": round((time.monotonic_ns() - self._begun_ns) / NS_PER_S, 1), "waiting": len(self._queue),
+                "malformed": self._malformed, **self._all.summary(), "batches": batches, "robots": robots,
+            }  # fmt: skip
+
+    def _health(self, payload: Payload) -> Payload:
+        return json.dumps(self.statistics()).encode()
+
+    def _answer(self, payload: Payload) -> Payload:
+        """Called by the transport, once for every request, in several threads."""
+        arrived_ns = time.monotonic_ns()
+        try:
+            message = decode(payload, limits=self._options.limits, codec=self._codec)
+            if message.kind is not Kind.REQUEST:
+                raise WireError(f"a frame of kind {message.kind.name}; robots send requests")
+        except WireError as error:
+            with self._lock:
+                self._malformed += 1
+            return encode(Message(Kind.FAILURE, 0, text=str(error)))
+        with self._idle:
+            refused = self._refusal(message)
+            self._at_work += 1
+        try:
+            ticket = self._wait_for(message, arrived_ns, refused)
+            return self._reply(ticket, arrived_ns)
+        finally:
+            with self._idle:
+                self._at_work -= 1
+                self._idle.notify_all()
+
+    def _refusal(self, message: Message) -> str:
+        if self._draining:
+            return "the server is stopping"
+        if message.fingerprint != self._fingerprint:
+            return (
+                f"another policy: the robot's is {message.fingerprint!r}, the server's {self._fingerprint!r}; "
+                "start the robot anew to see where they differ"
+            )
+        return ""
+
+    def _wait_for(self, message: Message, arrived_ns: int, refused: str) -> _Ticket:
+        patience_ns = min(message.deadline_ns, round(_LONGEST_WAIT_S * NS_PER_S))
+        alike = tuple((name, array.dtype, array.shape) for name, array in sorted(message.tensors.items()))
+        ticket = _Ticket(message, arrived_ns + patience_ns, alike)
+        if refused:
+            ticket.fail(refused)
+        elif (gave_way := self._queue.put(message.robot, ticket)) is not None:
+            gave_way.fail(f"the server is full: {self._options.queue} requests wait")
+        if not ticket.done.wait(max(0.0, (ticket.deadline_ns - time.monotonic_ns()) / NS_PER_S)):
+            ticket.fail("no outputs within the deadline", expired=True)
+        return ticket
+
+    def _reply(self, ticket: _Ticket, arrived_ns: int) -> Payload:
+        message = ticket.message
+        latency_ms = (time.monotonic_ns() - arrived_ns) / 1e6
+        said = Message(
+            Kind.FAILURE, message.id, {}, message.robot, self._fingerprint, ticket.error, message.stamp_ns,
+            latency_ms=latency_ms,
+        )  # fmt: skip
+        reply = None
+        if ticket.outputs is not None and not ticket.error:
+            try:
+                reply = encode(
+                    attrs.evolve(said, kind=Kind.ANSWER, tensors=ticket.outputs), limits=self._options.limits
+                )
+            except WireError as error:
+                said = attrs.evolve(said, text=f"the policy's outputs: {error}")
+        with self._lock:
+            for counts in (self._all, self._counts(message.robot)):
+                counts.requests += 1
+                counts.answered += reply is not None
+                counts.failed += reply is None
+                counts.expired += ticket.expired
+                counts.latencies_ms.append(latency_ms)
+        return reply if reply is not None else encode(said)
+
+    def _counts(self, robot: str) -> RobotCounts:
+        counts = self._robots.setdefault(robot, RobotCounts())
+        self._robots.move_to_end(robot)
+        if len(self._robots) > _ROBOTS_KEPT:
+            self._robots.popitem(last=False)
+        return counts
+
+    def _infer_all(self) -> None:
+        """The model's one thread."""
+        most = 1 if self._policy.spec.stateful else self._options.batch
+        while batch := self._queue.take(most, lambda a, b: a.alike == b.alike, self._options.patience_s):
+            now_ns = time.monotonic_ns()
+            live = [ticket for ticket in batch if ticket.deadline_ns > now_ns]
+            for ticket in batch:
+                if ticket not in live:
+                    ticket.fail("expired before its turn came; it was not begun", expired=True)
+            if live and (not self._policy.spec.stateful or self._enter(live[0], now_ns)):
+                self._infer(live)
+
+    def _infer(self, live: list[_Ticket]) -> None:
+        with self._lock:
+            self._batches[len(live)] += 1
+        try:
+            outputs = self._policy.infer_batch([ticket.message.tensors for ticket in live])
+            if len(outputs) != len(live):
+                raise PolicyError(f"{len(outputs)} outputs for a batch of {len(live)}")
+        except Exception as error:  # noqa: BLE001 - contained: a request that the policy cannot take is told so
+            if len(live) == 1:
+                live[0].fail(self._told(error))
+            else:  # one of them must not spoil the others
+                for ticket in live:
+                    self._infer([ticket])
+            return
+        for ticket, output in zip(live, outputs, strict=True):
+            ticket.answer(output)
+
+    def _enter(self, ticket: _Ticket, now_ns: int) -> bool:
+        """Give a model that remembers to the robot that asks, reset where its episode is a new one."""
+        robot, episode = ticket.message.robot, ticket.message.episode
+        if self._owner is not None and self._owner[0] != robot and now_ns - self._owner_heard_ns < _LEASE_NS:
+            ticket.fail(f"this policy remembers its requests, so it serves one robot, now {self._owner[0]!r}")
+            return False
+        self._owner_heard_ns = now_ns
+        if self._owner != (robot, episode):
+            try:
+                self._policy.reset(ticket.message.seed)
+            except Exception as error:  # noqa: BLE001 - contained: the robot is told
+                ticket.fail(f"the policy's reset failed: {self._told(error)}")
+                return False
+            self._owner = (robot, episode)
+        return True
+
+    def _told(self, error: Exception) -> str:
+        if isinstance(error, IbrobotError):
+            return str(error)
+        self._log.error("%s", "".join(traceback.format_exception(error)))
+        return f"{type(error).__name__}: {error}"

@@ -1,0 +1,193 @@
+"""The model in a process of its own: the same outputs, its death told and mended, nothing left behind."""
+
+from __future__ import annotations
+
+import os
+import signal
+import textwrap
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from ibrobot_core.config import RobotConfig, load
+from ibrobot_core.errors import PolicyError
+from ibrobot_core.inference.process import ProcessEngine
+from ibrobot_core.plugins import discover
+
+if TYPE_CHECKING:
+    from conftest import Site
+
+pytestmark = pytest.mark.integration
+
+PATIENCE_NS = 30_000_000_000
+PARTS = '''
+import os, signal, time
+import numpy as np
+from ibrobot_core import hookimpl
+from ibrobot_core.descriptors import HardwareDescriptor, PolicyDescriptor
+from ibrobot_core.errors import PolicyError
+from ibrobot_core.testing.fakes import FakeHardware, FakePolicy
+
+class Net(FakePolicy):
+    """Does what the tensor `do` says."""
+    seeds = ()
+    def load(self):
+        print(end="")
+        self.loaded = True
+    def reset(self, seed):
+        self.seeds += (seed,)
+    def infer(self, tensors):
+        assert self.loaded
+        do = tensors["do"].tobytes().decode() if "do" in tensors else ""
+        if do == "die":
+            os.kill(os.getpid(), signal.SIGKILL)
+        if do == "exit":
+            os._exit(3)
+        if do == "hang":
+            while True:
+                signal.pause()
+        if do == "fail":
+            raise ValueError("not today")
+        if do == "object":
+            return {"o": np.array([object()])}
+        return {"twice": tensors["x"] * 2, "pid": np.array([os.getpid()]), "seeds": np.array(self.seeds, np.int64)}
+
+class Lost(FakePolicy):
+    def load(self):
+        raise PolicyError("no such checkpoint: nowhere")
+
+@hookimpl
+def ibrobot_hardware():
+    yield HardwareDescriptor("scene", lambda options, ctx: FakeHardware(ctx), "a scene", simulated=True)
+
+@hookimpl
+def ibrobot_policies():
+    yield PolicyDescriptor("net", lambda options, ctx: Net(ctx), "a network")
+    yield PolicyDescriptor("lost", lambda options, ctx: Lost(ctx), "a network that is not there")
+'''
+ROBOT = textwrap.dedent("""\
+    robot:
+      name: mini
+      joints: [{name: pan, lower: -1.0, upper: 1.0, max_velocity: 2.0, max_acceleration: 10.0}]
+      groups: {arm: [pan]}
+    simulation: {type: scene}
+    executors: {arm_position: {type: position, group: arm}}
+    models: {net: {type: net}, lost: {type: lost}}
+    control_modes: {idle: {executors: [arm_position]}}
+    default_control_mode: idle
+    """)
+
+
+@pytest.fixture
+def config(site: Site, tmp_path: Path) -> RobotConfig:
+    site.add("net-parts", PARTS)
+    (tmp_path / "mini.yaml").write_text(ROBOT)
+    return load(tmp_path / "mini.yaml", sim=True, registry=discover(site.entry_points()))
+
+
+@pytest.fixture
+def engine(config: RobotConfig) -> Iterator[ProcessEngine]:
+    engine = ProcessEngine(config, "net")
+    engine.start()
+    yield engine
+    engine.close()
+    engine.close()
+
+
+@pytest.fixture
+def ask(engine: ProcessEngine) -> Callable[..., Any]:
+    count = 0
+
+    def infer(do: str = "", patience_ns: int = PATIENCE_NS, **tensors: np.ndarray) -> Any:
+        nonlocal count
+        count += 1
+        told = {"do": np.frombuffer(do.encode(), np.uint8)} if do else {}
+        return engine.infer({"x": np.arange(3), **tensors, **told}, count, time.monotonic_ns() + patience_ns)
+
+    return infer
+
+
+def test_outputs_come_from_another_process_and_stay_as_they_are(engine: ProcessEngine, ask: Callable[..., Any]):
+    outputs = ask(x=np.arange(6, dtype=np.float32).reshape(2, 3))
+    ask(x=np.full((2, 3), 9, np.float32))
+    np.testing.assert_array_equal(outputs["twice"], [[0, 2, 4], [6, 8, 10]])
+    assert outputs["twice"].dtype == np.float32
+    assert outputs["pid"] == engine.pid != os.getpid()
+    assert engine.stats.alive
+    assert (engine.stats.requests, engine.stats.failures, engine.stats.restarts) == (2, 0, 0)
+
+
+def test_the_policy_is_reset_with_the_seed_of_the_episode(engine: ProcessEngine, ask: Callable[..., Any]):
+    engine.reset(7)
+    ask()
+    engine.reset(8)
+    engine.reset(9)
+    assert ask()["seeds"].tolist() == ask()["seeds"].tolist() == [7, 9]
+
+
+@pytest.mark.parametrize(("do", "said"), [("fail", "ValueError: not today"), ("object", "'o' has dtype object")])
+def test_a_policy_that_raises_fails_its_request_only(do: str, said: str, ask: Callable[..., Any], caplog: Any):
+    with pytest.raises(PolicyError, match=said):
+        ask(do)
+    assert ask()["twice"].tolist() == [0, 2, 4]
+
+
+@pytest.mark.parametrize(("do", "how"), [("die", "killed by SIGKILL"), ("exit", "exit status 3")])
+def test_a_process_that_dies_is_told_and_starts_again(
+    do: str, how: str, engine: ProcessEngine, ask: Callable[..., Any], caplog: pytest.LogCaptureFixture
+):
+    engine.reset(5)
+    died = engine.pid
+    with pytest.raises(PolicyError, match=f"process {died} died: {how}"):
+        ask(do)
+    assert not engine.stats.alive
+    assert f"process {died} died: {how}; it starts again in 0 s" in caplog.text
+    outputs = ask()
+    assert outputs["pid"] == engine.pid != died
+    assert outputs["seeds"].tolist() == [5], "it knows the episode"
+    assert engine.stats.restarts == 1
+
+
+def test_one_that_keeps_dying_is_started_less_and_less_often(engine: ProcessEngine, ask: Callable[..., Any]):
+    for _ in range(2):
+        with pytest.raises(PolicyError, match="killed by SIGKILL"):
+            ask("die")
+    with pytest.raises(PolicyError, match=r"starts again in (1\.0|0\.\d) s"):
+        ask()
+
+
+def test_one_that_was_killed_between_requests_is_noticed(engine: ProcessEngine, ask: Callable[..., Any]):
+    assert engine.pid is not None
+    os.kill(engine.pid, signal.SIGKILL)
+    with pytest.raises(PolicyError, match="killed by SIGKILL"):
+        ask()
+    assert ask()["twice"].tolist() == [0, 2, 4]
+
+
+def test_a_late_answer_is_nobody_elses(engine: ProcessEngine, ask: Callable[..., Any]):
+    assert engine.pid is not None
+    os.kill(engine.pid, signal.SIGSTOP)
+    for number in range(3):
+        with pytest.raises(PolicyError, match=f"process {engine.pid} did not answer in time"):
+            ask(patience_ns=1_000_000, x=np.array([number]))
+    os.kill(engine.pid, signal.SIGCONT)
+    assert ask(x=np.array([21]))["twice"].tolist() == [42]
+
+
+def test_a_model_that_cannot_be_loaded_says_why(config: RobotConfig):
+    engine = ProcessEngine(config, "lost")
+    with pytest.raises(PolicyError, match="no such checkpoint: nowhere"):
+        engine.start()
+    engine.close()
+
+
+def test_closing_ends_a_model_that_hangs(engine: ProcessEngine, ask: Callable[..., Any]):
+    with pytest.raises(PolicyError, match="did not answer in time"):
+        ask("hang", patience_ns=50_000_000)
+    engine.close()
+    with pytest.raises(PolicyError, match="was closed"):
+        ask()

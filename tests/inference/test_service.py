@@ -1,0 +1,350 @@
+"""The cloud side and its clients over the local transport: batches, turns, deadlines, one model, many robots."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import Any, override
+
+import attrs
+import numpy as np
+import pytest
+
+from ibrobot_core.errors import ContractError, PolicyError, TransportError
+from ibrobot_core.inference.remote import RemoteEngine
+from ibrobot_core.inference.service import InferenceService, ServiceOptions, health_name, service_name
+from ibrobot_core.inference.wire import Kind, Message, decode, encode
+from ibrobot_core.interfaces import Tensors
+from ibrobot_core.local_transport import LocalTransport
+from ibrobot_core.testing import host_context
+from ibrobot_core.testing.fakes import FakePolicy
+
+PATIENCE_S = 20.0
+SOON_NS = round(PATIENCE_S * 1e9)
+
+
+class Net(FakePolicy):
+    """Doubles `x`; each batch waits for the gate."""
+
+    def __init__(self, *, stateful: bool = False) -> None:
+        super().__init__(host_context())
+        self.spec = attrs.evolve(self.spec, stateful=stateful)
+        self.batches: list[list[float]] = []
+        self.seeds: list[int] = []
+        self.entered = threading.Semaphore(0)
+        self.gate = threading.Semaphore(0)
+
+    @override
+    def reset(self, seed: int) -> None:
+        self.seeds.append(seed)
+        if seed < 0:
+            raise ValueError("a negative seed")
+
+    @override
+    def infer(self, tensors: Tensors) -> Tensors:
+        return {"twice": tensors["x"] * 2}
+
+    @override
+    def infer_batch(self, batch: Any) -> list[Tensors]:
+        self.batches.append([float(tensors["x"].ravel()[0]) for tensors in batch])
+        self.entered.release()
+        assert self.gate.acquire(timeout=PATIENCE_S)
+        if any((tensors["x"] == 13).any() for tensors in batch):
+            raise ValueError("thirteen")
+        return super().infer_batch(batch)
+
+
+class Cloud:
+    """A service with its transport, and robots that ask it in threads of their own."""
+
+    def __init__(self, policy: Net, options: ServiceOptions | None = None) -> None:
+        self.policy = policy
+        self.transport = LocalTransport()
+        self.service = InferenceService(policy, self.transport, "net", options)
+        self.service.start()
+        self.pool = ThreadPoolExecutor(80)
+
+    def ask(self, robot: str, x: Any, *, wait_ns: int = SOON_NS, **changes: Any) -> Future[Message]:
+        """Send a request; its answer comes later."""
+        message = Message(
+            Kind.REQUEST, 5, {"x": np.atleast_1d(np.asarray(x, np.float64))}, robot, self.policy.fingerprint(),
+            deadline_ns=wait_ns,
+        )  # fmt: skip
+        return self.send(bytes(encode(attrs.evolve(message, **changes))))
+
+    def send(self, payload: bytes) -> Future[Message]:
+        return self.pool.submit(lambda: decode(self.transport.request(service_name("net"), payload, PATIENCE_S)))
+
+    def asked(self, robot: str, x: Any, **changes: Any) -> Future[Message]:
+        """As `ask`; returns once the request waits for its turn."""
+        before = self.health()["waiting"]
+        future = self.ask(robot, x, **changes)
+        self.until(lambda: self.health()["waiting"] > before)
+        return future
+
+    def busy(self) -> Future[Message]:
+        """A request that keeps the model busy until the gate opens."""
+        future = self.ask("busy", 0)
+        assert self.policy.entered.acquire(timeout=PATIENCE_S)
+        return future
+
+    def health(self) -> dict[str, Any]:
+        health = json.loads(bytes(self.transport.request(health_name("net"), b"", PATIENCE_S)))
+        assert isinstance(health, dict)
+        return health
+
+    @staticmethod
+    def until(condition: Callable[[], bool]) -> None:
+        deadline = time.monotonic() + PATIENCE_S
+        pause = threading.Event()
+        while not condition():
+            assert time.monotonic() < deadline
+            pause.wait(0.002)
+
+    def close(self) -> None:
+        self.policy.gate.release(1000)
+        self.service.close()
+        self.service.close()
+        self.pool.shutdown()
+        self.transport.close()
+
+
+@contextmanager
+def served(policy: Net | None = None, **options: Any) -> Iterator[Cloud]:
+    cloud = Cloud(policy or Net(), ServiceOptions(**options))
+    try:
+        yield cloud
+    finally:
+        cloud.close()
+
+
+def outputs(future: Future[Message]) -> list[float]:
+    message = future.result(PATIENCE_S)
+    assert message.kind is Kind.ANSWER, message.text
+    twice: list[float] = message.tensors["twice"].tolist()
+    return twice
+
+
+def failure(future: Future[Message]) -> str:
+    message = future.result(PATIENCE_S)
+    assert message.kind is Kind.FAILURE
+    return message.text
+
+
+def test_what_waits_goes_together_up_to_the_limit_and_each_gets_its_own():
+    with served(batch=3) as cloud:
+        first = cloud.busy()
+        futures = [cloud.asked(f"robot {i}", i) for i in range(1, 5)]
+        cloud.policy.gate.release(3)
+        assert [outputs(future) for future in futures] == [[2], [4], [6], [8]]
+        assert outputs(first) == [0]
+        assert cloud.policy.batches == [[0], [1, 2, 3], [4]]
+        assert cloud.health()["batches"] == {"1": 2, "3": 1}
+
+
+def test_a_robot_that_asks_often_waits_for_itself_only():
+    with served(batch=1) as cloud:
+        cloud.busy()
+        greedy = [cloud.asked("greedy", 20 + i) for i in range(3)]
+        others = [cloud.asked(f"robot {i}", i) for i in (1, 2)]
+        cloud.policy.gate.release(10)
+        for future in (*greedy, *others):
+            outputs(future)
+        assert cloud.policy.batches == [[0], [20], [1], [2], [21], [22]]
+
+
+def test_unlike_requests_are_not_put_together():
+    with served() as cloud:
+        cloud.busy()
+        futures = [cloud.asked("a", 1), cloud.asked("b", [2, 3]), cloud.asked("c", 4)]
+        cloud.policy.gate.release(3)
+        assert [outputs(future) for future in futures] == [[2], [4, 6], [8]]
+        assert cloud.policy.batches == [[0], [1, 4], [2]]
+
+
+def test_one_that_the_policy_cannot_take_does_not_spoil_its_batch(caplog: pytest.LogCaptureFixture):
+    with served() as cloud:
+        cloud.busy()
+        futures = [cloud.asked("a", 1), cloud.asked("b", 13), cloud.asked("c", 3)]
+        cloud.policy.gate.release(10)
+        assert [outputs(futures[0]), outputs(futures[2])] == [[2], [6]]
+        assert failure(futures[1]) == "ValueError: thirteen"
+        assert "ValueError: thirteen" in caplog.text
+
+
+def test_expired_work_is_not_begun():
+    with served() as cloud:
+        first = cloud.busy()
+        late = cloud.ask("late", 7, wait_ns=1_000_000)
+        assert "within the deadline" in failure(late)
+        cloud.policy.gate.release(10)
+        outputs(first)
+        assert outputs(cloud.ask("next", 1)) == [2]
+        assert cloud.policy.batches == [[0], [1]]
+        assert cloud.health()["robots"]["late"]["expired"] == 1
+
+
+def test_a_full_queue_turns_the_oldest_of_the_greediest_away():
+    with served(queue=3, batch=1) as cloud:
+        cloud.busy()
+        greedy = [cloud.asked("greedy", 10), cloud.asked("greedy", 11)]
+        modest = cloud.asked("modest", 1)
+        newest = cloud.ask("newest", 2)
+        assert failure(greedy[0]) == "the server is full: 3 requests wait"
+        cloud.policy.gate.release(10)
+        assert [outputs(future) for future in (greedy[1], modest, newest)] == [[22], [2], [4]]
+
+
+def test_garbage_is_counted_told_and_harmless():
+    with served() as cloud:
+        cloud.policy.gate.release(10)
+        answer = encode(Message(Kind.ANSWER, 1))
+        for payload, said in ((b"", "0 bytes"), (b"GET / HTTP/1.1" * 10, "no frame"), (answer, "kind ANSWER")):
+            assert said in failure(cloud.send(bytes(payload)))
+        assert outputs(cloud.ask("robot", 3)) == [6]
+        health = cloud.health()
+        assert (health["malformed"], health["requests"], health["answered"]) == (3, 1, 1)
+        assert set(health["robots"]) == {"robot"}
+
+
+def test_another_policy_is_refused():
+    with served() as cloud:
+        text = failure(cloud.ask("robot", 1, fingerprint="other"))
+        assert "'other'" in text
+        assert cloud.policy.fingerprint() in text
+
+
+def test_answers_say_whose_they_are_and_how_long_they_took():
+    with served() as cloud:
+        cloud.policy.gate.release()
+        answer = cloud.ask("robot", 1, id=2**63, stamp_ns=77).result(PATIENCE_S)
+        assert (answer.id, answer.stamp_ns, answer.robot) == (2**63, 77, "robot")
+        assert answer.fingerprint == cloud.policy.fingerprint()
+        assert answer.latency_ms > 0
+
+
+def test_draining_finishes_what_is_there_and_refuses_what_comes():
+    with served() as cloud:
+        first = cloud.busy()
+        waiting = cloud.asked("robot", 1)
+        assert not cloud.service.drain(0.0)
+        assert failure(cloud.ask("robot", 2)) == "the server is stopping"
+        assert cloud.health()["state"] == "draining"
+        cloud.policy.gate.release(10)
+        assert cloud.service.drain(PATIENCE_S)
+        assert [outputs(first), outputs(waiting)] == [[0], [2]]
+
+
+def test_a_policy_that_remembers_serves_one_robot_and_is_reset_for_each_episode():
+    with served(Net(stateful=True)) as cloud:
+        cloud.policy.gate.release(10)
+        for episode, seed in ((1, 7), (1, 7), (2, 8)):
+            outputs(cloud.ask("first", 1, episode=episode, seed=seed))
+        assert cloud.policy.seeds == [7, 8]
+        assert "serves one robot, now 'first'" in failure(cloud.ask("second", 1))
+        assert "reset failed: ValueError: a negative seed" in failure(cloud.ask("first", 1, episode=3, seed=-1))
+
+
+def test_a_name_is_served_once():
+    with served() as cloud, pytest.raises(TransportError, match="served already"):
+        InferenceService(Net(), cloud.transport, "net").start()
+
+
+@contextmanager
+def engine(cloud: Cloud, policy: Net | None = None, **changes: Any) -> Iterator[RemoteEngine]:
+    made = RemoteEngine(policy or cloud.policy, cloud.transport, "net", "so101", **changes)
+    try:
+        yield made
+    finally:
+        made.close()
+
+
+def deadline(wait_s: float = PATIENCE_S) -> int:
+    return time.monotonic_ns() + round(wait_s * 1e9)
+
+
+def test_the_engine_gets_the_servers_outputs_and_its_latency():
+    with served() as cloud, engine(cloud) as remote:
+        remote.start()
+        cloud.policy.gate.release(10)
+        assert remote.infer({"x": np.arange(3.0)}, 1, deadline())["twice"].tolist() == [0, 2, 4]
+        stats = remote.stats
+        assert (stats.mode, stats.alive, stats.requests, stats.failures) == ("distributed", True, 1, 0)
+        assert 0 < stats.model_ms <= stats.infer_ms
+        (robot,) = cloud.health()["robots"]
+        assert robot.startswith("so101-")
+
+
+def test_the_engine_tells_both_sides_where_the_policies_differ():
+    other = Net()
+    other.spec = attrs.evolve(other.spec, chunk_size=99)
+    with served() as cloud, engine(cloud, other) as remote:
+        with pytest.raises(ContractError, match=r"chunk_size\n +robot: 99\n +server: 10") as caught:
+            remote.start()
+        assert "observations" not in str(caught.value)
+        with pytest.raises(PolicyError, match="another policy"):
+            remote.infer({"x": np.zeros(1)}, 1, deadline())
+
+
+def test_the_engine_says_that_nobody_serves_its_model():
+    transport = LocalTransport()
+    remote = RemoteEngine(Net(), transport, "net", "so101", start_timeout_s=0.0)
+    with pytest.raises(PolicyError, match="no server for model 'net': nobody serves infer/net/health"):
+        remote.start()
+    with pytest.raises(PolicyError, match="nobody serves infer/net"):
+        remote.infer({"x": np.zeros(1)}, 1, deadline())
+    transport.serve(health_name("net"), lambda payload: b"<html>")
+    with pytest.raises(PolicyError, match="is no server of ibrobot: b'<html>'"):
+        remote.start()
+    transport.close()
+
+
+def test_the_engine_goes_on_with_a_server_that_was_started_again():
+    with served() as cloud, engine(cloud) as remote:
+        cloud.policy.gate.release(10)
+        remote.start()
+        remote.reset(4)
+        remote.infer({"x": np.zeros(1)}, 1, deadline())
+        cloud.service.close()
+        with pytest.raises(PolicyError, match="nobody serves"):
+            remote.infer({"x": np.zeros(1)}, 2, deadline())
+        cloud.until(lambda: not remote.stats.alive)
+        again = Net(stateful=False)
+        again.gate.release(10)
+        service = InferenceService(again, cloud.transport, "net")
+        service.start()
+        try:
+            cloud.until(lambda: remote.stats.alive)
+            assert remote.infer({"x": np.ones(1)}, 3, deadline())["twice"].tolist() == [2]
+            assert remote.stats.restarts == 1
+        finally:
+            service.close()
+
+
+@pytest.mark.parametrize(
+    ("answer", "said"),
+    [
+        (b"nonsense", "8 bytes; a frame has"),
+        (encode(Message(Kind.ANSWER, 8)), "answered request 8"),
+        (encode(Message(Kind.FAILURE, 1, text="out of memory")), "the server of net: out of memory"),
+    ],
+)
+def test_the_engine_believes_no_answer_but_its_own(answer: bytes, said: str):
+    transport = LocalTransport()
+    transport.serve(service_name("net"), lambda payload: answer)
+    remote = RemoteEngine(Net(), transport, "net", "so101")
+    with pytest.raises(PolicyError, match=said):
+        remote.infer({"x": np.zeros(1)}, 1, deadline())
+    assert remote.stats.failures == 1
+    transport.close()
+
+
+def test_the_engine_sends_nothing_that_nobody_waits_for():
+    with served() as cloud, engine(cloud) as remote:
+        with pytest.raises(PolicyError, match="expired before it was sent"):
+            remote.infer({"x": np.zeros(1)}, 1, time.monotonic_ns())
+        assert cloud.health()["requests"] == 0
