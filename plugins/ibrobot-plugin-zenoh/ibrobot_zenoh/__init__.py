@@ -1,15 +1,17 @@
-"""The plugin's hooks: transport `zenoh`."""
+"""The plugin's hooks: transport `zenoh`, command `ibrobot certs`."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.descriptors import TransportDescriptor
+from ibrobot_core.descriptors import Command, TransportDescriptor
 from ibrobot_core.hookspecs import hookimpl
 from ibrobot_zenoh.options import ZenohOptions
 
 if TYPE_CHECKING:
+    import click
+
     from ibrobot_core.interfaces import Context, Transport
 
 
@@ -25,3 +27,15 @@ def ibrobot_transports() -> Iterable[TransportDescriptor]:
     yield TransportDescriptor(
         type="zenoh", options=ZenohOptions, make=_zenoh, summary="between machines; ROS 2 nodes with rmw_zenoh join in"
     )
+
+
+def _certs() -> click.Command:
+    from ibrobot_zenoh.commands.certs import certs
+
+    return certs
+
+
+@hookimpl
+def ibrobot_commands() -> Iterable[Command]:
+    """What a lab's network needs."""
+    yield Command("certs", "Make certificates for a server and its robots.", _certs)

@@ -15,8 +15,8 @@ from ibrobot_zenoh.options import ZenohOptions
 
 _RETRY_MS = (50, 500)
 """First and longest time between attempts to connect."""
-_ATTEMPT_MS = 1000
-"""How long a client tries before it looks whether it was closed meanwhile."""
+_CLOSE_WAIT_S = 1.0
+"""How long closing waits for an attempt to connect, which nothing can interrupt."""
 _FIRST_WAIT_S = 0.3
 """How long making a client waits for somebody to answer, so that what is there can be used at once."""
 
@@ -44,7 +44,7 @@ def zenoh_config(options: ZenohOptions) -> zenoh.Config:
     settings: dict[str, Any] = {
         "mode": options.mode,
         "connect/endpoints": list(options.connect),
-        "connect/timeout_ms": _ATTEMPT_MS if client else -1,
+        "connect/timeout_ms": 0 if client else -1,
         "connect/exit_on_failure": client,
         "connect/retry": {"period_init_ms": first_ms, "period_max_ms": longest_ms, "period_increase_factor": 2},
         "listen/endpoints": list(options.listen),
@@ -175,20 +175,22 @@ class Connection:
             self._pending.clear()
             self._declared.clear()
         if self._thread is not None:
-            self._thread.join(2 * _ATTEMPT_MS / 1000)
+            self._thread.join(_CLOSE_WAIT_S)
         if session is not None:
             session.close()  # type: ignore[no-untyped-call]  # its stub has no types
 
     def _connect(self, answered: threading.Event) -> None:
         """Try until somebody answers; every new reason why nobody does is logged once."""
         told = ""
+        pause_ms, longest_ms = _RETRY_MS
         while not self._closed.is_set():
             try:
                 session = zenoh.open(self._config)
             except zenoh.ZError as error:
                 if (reason := first_line(error)) != told:
                     self._log.warning("not connected to %s yet: %s", self._endpoints, told := reason)
-                self._closed.wait(_RETRY_MS[0] / 1000)
+                self._closed.wait(pause_ms / 1000)
+                pause_ms = min(2 * pause_ms, longest_ms)
                 continue
             with self._lock:
                 if not self._closed.is_set():

@@ -136,13 +136,14 @@ class ZenohTransport(Transport):
             if failure is not None and failure.encoding == _FAILED:
                 raise TransportError(f"{name} failed: {failure.payload.to_bytes().decode(errors='replace')}")
             raise TransportError(f"no answer from {name} within {timeout_s} s")
-        raise TransportError(f"nobody serves {name}")
+        raise TransportError(f"nobody serves {name}, or not any more")
 
     @override
     def watch(self, name: str, changed: Callable[[bool], object]) -> Callable[[], None]:
         tokens = _key("served", name).join("*")
         turn = threading.Lock()  # held until the present state was told, which comes first
         alive: set[str] = set()
+        gone: set[str] = set()
         told: bool | None = None
 
         def tell(served: bool) -> None:
@@ -153,9 +154,10 @@ class ZenohTransport(Transport):
 
         def take(sample: zenoh.Sample) -> None:
             nonlocal told
-            change = alive.add if sample.kind == zenoh.SampleKind.PUT else alive.discard
+            now, before = (alive, gone) if sample.kind == zenoh.SampleKind.PUT else (gone, alive)
             with self._lock:
-                change(str(sample.key_expr))
+                now.add(str(sample.key_expr))
+                before.discard(str(sample.key_expr))
                 if told is not None and told != bool(alive):
                     told = not told
                     watcher.put(told)
@@ -164,11 +166,12 @@ class ZenohTransport(Transport):
             end = self._connection.declare(
                 lambda session: session.liveliness().declare_subscriber(tokens, take, history=True)
             )
-            # Asked for after `take` began to listen, so that no change can fall between the two.
+            # What `take` is told of the past comes at any time: ask as well, for what is there now.
             session = self._connection.open_session
-            present = session is not None and bool(list(session.liveliness().get(tokens, timeout=_WATCH_S)))
+            replies = () if session is None else session.liveliness().get(tokens, timeout=_WATCH_S)
+            found = {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
             with self._lock:
-                told = present
+                told = present = bool(found - gone | alive)
             changed(present)
         return self._keep(end, watcher)
 

@@ -1,0 +1,137 @@
+"""Certificates for a lab: a private authority, and a certificate and key for each machine."""
+
+from __future__ import annotations
+
+import ipaddress
+import os
+from collections.abc import Sequence
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.serialization import (
+    Encoding,
+    NoEncryption,
+    PrivateFormat,
+    load_pem_private_key,
+)
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from ibrobot_core.errors import TransportError
+
+CA, CA_KEY = "ca.pem", "ca.key"
+CERTIFICATE, KEY = "certificate.pem", "key.pem"
+
+_EARLY = timedelta(days=2)
+"""Certificates are valid from before they are made, for machines whose clock is behind."""
+
+
+class Authority:
+    """Who signs: the certificate and key in a folder, made there where there are none.
+
+    Args:
+        folder: where `ca.pem` and `ca.key` are.
+        days: how long what is made here is valid.
+
+    Raises:
+        TransportError: when only one of the two is there, or they cannot be read.
+    """
+
+    def __init__(self, folder: Path, days: int) -> None:
+        self._folder = folder
+        self._days = days
+        certificate, key = folder / CA, folder / CA_KEY
+        self.is_new = not certificate.exists() and not key.exists()
+        if self.is_new:
+            self._key = ec.generate_private_key(ec.SECP256R1())
+            self._certificate = self._make()
+            folder.mkdir(parents=True, exist_ok=True)
+            _write_key(key, self._key)
+            _write(certificate, self._certificate)
+            return
+        try:
+            self._certificate = x509.load_pem_x509_certificate(certificate.read_bytes())
+            loaded = load_pem_private_key(key.read_bytes(), password=None)
+        except (OSError, ValueError) as error:
+            raise TransportError(f"{folder}: its {CA} and {CA_KEY} cannot be read: {error}") from error
+        if not isinstance(loaded, ec.EllipticCurvePrivateKey) or loaded.public_key() != self._certificate.public_key():
+            raise TransportError(f"{key}: not the key of {certificate}")
+        self._key = loaded
+
+    def issue(self, name: str, hosts: Sequence[str] = ()) -> Path:
+        """Make a folder `name` with `ca.pem`, `certificate.pem` and `key.pem`.
+
+        Args:
+            name: the certificate's common name, by which access control knows the machine.
+            hosts: names and addresses under which it is connected to; none for one that only connects.
+
+        Raises:
+            TransportError: when the folder is there already.
+        """
+        folder = self._folder / name
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            raise TransportError(f"{folder} is there already; nothing is overwritten") from None
+        key = ec.generate_private_key(ec.SECP256R1())
+        names = x509.SubjectAlternativeName([_general_name(host) for host in hosts or (name,)])
+        usages = [ExtendedKeyUsageOID.CLIENT_AUTH, *([ExtendedKeyUsageOID.SERVER_AUTH] if hosts else [])]
+        certificate = (
+            self._builder(name, key)
+            .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+            .add_extension(x509.ExtendedKeyUsage(usages), critical=False)
+            .add_extension(names, critical=False)
+            .sign(self._key, hashes.SHA256())
+        )
+        _write_key(folder / KEY, key)
+        _write(folder / CERTIFICATE, certificate)
+        _write(folder / CA, self._certificate)
+        return folder
+
+    def _make(self) -> x509.Certificate:
+        usage = {
+            name: name in ("key_cert_sign", "crl_sign")
+            for name in (
+                "digital_signature", "content_commitment", "key_encipherment", "data_encipherment", "key_agreement",
+                "key_cert_sign", "crl_sign", "encipher_only", "decipher_only",
+            )
+        }  # fmt: skip
+        return (
+            self._builder("ibrobot authority", self._key)
+            .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+            .add_extension(x509.KeyUsage(**usage), critical=True)
+            .sign(self._key, hashes.SHA256())
+        )
+
+    def _builder(self, name: str, key: ec.EllipticCurvePrivateKey) -> x509.CertificateBuilder:
+        now = datetime.now(UTC)
+        subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+        return (
+            x509.CertificateBuilder()
+            .subject_name(subject)
+            .issuer_name(subject if key is self._key else self._certificate.subject)
+            .public_key(key.public_key())
+            .serial_number(x509.random_serial_number())
+            .not_valid_before(now - _EARLY)
+            .not_valid_after(now + timedelta(days=self._days))
+        )
+
+
+def _general_name(host: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ipaddress.ip_address(host))
+    except ValueError:
+        return x509.DNSName(host)
+
+
+def _write(path: Path, certificate: x509.Certificate) -> None:
+    with open(path, "xb") as file:
+        file.write(certificate.public_bytes(Encoding.PEM))
+
+
+def _write_key(path: Path, key: ec.EllipticCurvePrivateKey) -> None:
+    """Only the owner may read it, from the first moment on."""
+    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+        file.write(key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()))

@@ -1,0 +1,1 @@
+"""The commands `ibrobot topic …` and `ibrobot certs`."""

@@ -1,0 +1,54 @@
+"""`ibrobot certs`: a private authority and certificates for a lab's machines, and the YAML that uses them."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import click
+
+from ibrobot_core.errors import TransportError
+from ibrobot_zenoh.certificates import CA, CERTIFICATE, KEY, Authority
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+_PORT = 7447
+
+
+@click.command()
+@click.argument("out_dir", type=click.Path(path_type=Path, file_okay=False))
+@click.option("--server", "servers", multiple=True, metavar="HOST[,IP…]", help="What others connect to; repeat it.")
+@click.option("--robot", "robots", multiple=True, metavar="NAME", help="What only connects; repeat it.")
+@click.option("--days", default=1825, show_default=True, type=click.IntRange(1, 7300), help="How long they are valid.")
+def certs(out_dir: Path, servers: tuple[str, ...], robots: tuple[str, ...], days: int) -> None:
+    """Make certificates for a lab in OUT_DIR: an authority of its own, and a folder to copy to each machine.
+
+    With the authority in OUT_DIR already, it signs the new ones. Nothing is overwritten. Whoever has OUT_DIR/ca.key
+    can make more: it belongs on none of the machines.
+    """
+    if not servers and not robots:
+        raise click.UsageError("name a --server or a --robot, e.g. --server gpu.lab,192.168.1.5 --robot robot1")
+    hosts = {names[0]: names for server in servers for names in (server.split(","),)}
+    machines = [*hosts, *robots]
+    for name in (*(host for names in hosts.values() for host in names), *robots):
+        if not _NAME.fullmatch(name.replace(":", "")):
+            raise click.UsageError(f"{name!r} is no name: letters, digits, '.', '_' and '-' only")
+    taken = [name for name in machines if (out_dir / name).exists() or machines.count(name) > 1]
+    if taken:
+        raise TransportError(f"{out_dir / taken[0]} is there already, or named twice; nothing is overwritten")
+    authority = Authority(out_dir, days)
+    click.echo(f"{'made' if authority.is_new else 'signed by'} the authority {out_dir / CA}")
+    for name, names in hosts.items():
+        _tell(authority.issue(name, names), "mode: router", f"listen: [tls/0.0.0.0:{_PORT}]")
+    server = next(iter(hosts), "SERVER")
+    for name in robots:
+        _tell(authority.issue(name), f"connect: [tls/{server}:{_PORT}]")
+
+
+def _tell(folder: Path, *lines: str) -> None:
+    """What a machine's YAML says."""
+    click.echo(f"\n# {folder.name}: copy {folder}/ there, beside its YAML, which says:\ntransport:\n  type: zenoh")
+    for line in lines:
+        click.echo(f"  {line}")
+    click.echo("  tls:")
+    for key, file in (("ca", CA), ("certificate", CERTIFICATE), ("key", KEY)):
+        click.echo(f"    {key}: {folder.name}/{file}")

@@ -1,0 +1,164 @@
+"""`ibrobot certs`: what it makes, what it refuses, and that nobody gets anything without it."""
+
+from __future__ import annotations
+
+import json
+import stat
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+import zenoh
+from click.testing import CliRunner, Result
+from cryptography import x509
+from ibrobot_zenoh.commands.certs import certs
+from ibrobot_zenoh.options import Tls
+
+from ibrobot_core.errors import TransportError
+
+from .pair import client, free_endpoint, router, settle, wait_for
+
+
+def run(*arguments: Any) -> Result:
+    return CliRunner().invoke(certs, [str(argument) for argument in arguments])
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("lab") / "certificates"
+    result = run(folder, "--server", "localhost,127.0.0.1", "--robot", "robot1", "--robot", "robot2")
+    assert result.exit_code == 0, result.output
+    return folder
+
+
+def tls(folder: Path, name: str) -> Tls:
+    return Tls(folder / name / "ca.pem", folder / name / "certificate.pem", folder / name / "key.pem")
+
+
+def test_requests_pass_with_certificates(lab: Path):
+    endpoint = free_endpoint("tls")
+    server = router(endpoint, tls=tls(lab, "localhost"))
+    server.serve("echo", lambda payload: payload)
+    robots = [client(endpoint, tls=tls(lab, name)) for name in ("robot1", "robot2")]
+    for robot in robots:
+        settle(robot, server)
+        assert robot.request("echo", b"hello", 5.0) == b"hello"
+    for end in (*robots, server):
+        end.close()
+
+
+def test_another_authority_s_certificate_gets_nothing(lab: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    assert run(tmp_path / "other", "--server", "localhost,127.0.0.1", "--robot", "robot1").exit_code == 0
+    endpoint = free_endpoint("tls")
+    server = router(endpoint, tls=tls(lab, "localhost"))
+    server.serve("echo", lambda payload: payload)
+    # One that trusts the server, so that it is the server that refuses; and one that does not.
+    stranger = Tls(lab / "ca.pem", tmp_path / "other/robot1/certificate.pem", tmp_path / "other/robot1/key.pem")
+    for wrong in (stranger, tls(tmp_path / "other", "robot1")):
+        caplog.clear()
+        robot = client(endpoint, tls=wrong)
+        wait_for(lambda: "not connected" in caplog.text)
+        with pytest.raises(TransportError, match=f"not connected: nobody answers at {endpoint}"):
+            robot.request("echo", b"hello", 1.0)
+        robot.close()
+    server.close()
+
+
+def test_a_connection_without_a_certificate_gets_nothing(lab: Path):
+    endpoint = free_endpoint("tls")
+    server = router(endpoint, tls=tls(lab, "localhost"))
+    config = zenoh.Config()
+    for key, value in {
+        "mode": "client",
+        "connect/endpoints": [endpoint],
+        "connect/timeout_ms": 0,
+        "scouting/multicast/enabled": False,
+        "transport/link/tls/root_ca_certificate": str(lab / "ca.pem"),
+    }.items():
+        config.insert_json5(key, json.dumps(value))
+    with pytest.raises(zenoh.ZError, match="Unable to connect"):
+        zenoh.open(config).close()
+    server.close()
+
+
+def test_a_server_of_another_name_is_not_believed(lab: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    assert run(lab, "--server", "elsewhere.lab").exit_code == 0
+    endpoint = free_endpoint("tls")
+    server = router(endpoint, tls=tls(lab, "elsewhere.lab"))
+    robot = client(endpoint, tls=tls(lab, "robot1"))
+    wait_for(lambda: "not connected" in caplog.text)
+    robot.close()
+    server.close()
+
+
+def test_what_is_made(lab: Path):
+    for key in (lab / "ca.key", lab / "localhost/key.pem", lab / "robot1/key.pem"):
+        assert stat.S_IMODE(key.stat().st_mode) == 0o600
+    server = x509.load_pem_x509_certificate((lab / "localhost/certificate.pem").read_bytes())
+    names = server.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    assert names.get_values_for_type(x509.DNSName) == ["localhost"]
+    assert [str(address) for address in names.get_values_for_type(x509.IPAddress)] == ["127.0.0.1"]
+    robot = x509.load_pem_x509_certificate((lab / "robot1/certificate.pem").read_bytes())
+    assert robot.subject.rfc4514_string() == "CN=robot1"
+    usages = robot.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
+    assert [usage._name for usage in usages] == ["clientAuth"]  # it cannot pretend to be the server
+    authority = x509.load_pem_x509_certificate((lab / "ca.pem").read_bytes())
+    for made in (server, robot):
+        made.verify_directly_issued_by(authority)
+
+
+def test_the_yaml_to_paste(tmp_path: Path):
+    result = run(tmp_path / "lab", "--server", "gpu.lab,192.168.1.5", "--robot", "arm")
+    server, robot = (yaml.safe_load(part.partition("\n")[2]) for part in result.output.split("\n# ")[1:])
+    files = {"ca": "ca.pem", "certificate": "certificate.pem", "key": "key.pem"}
+    assert server["transport"] == {
+        "type": "zenoh",
+        "mode": "router",
+        "listen": ["tls/0.0.0.0:7447"],
+        "tls": {key: f"gpu.lab/{file}" for key, file in files.items()},
+    }
+    assert robot["transport"] == {
+        "type": "zenoh",
+        "connect": ["tls/gpu.lab:7447"],
+        "tls": {key: f"arm/{file}" for key, file in files.items()},
+    }
+
+
+def test_the_same_authority_signs_what_comes_later(lab: Path):
+    before = (lab / "ca.pem").read_bytes()
+    assert "signed by the authority" in run(lab, "--robot", "robot9").output
+    assert (lab / "ca.pem").read_bytes() == (lab / "robot9/ca.pem").read_bytes() == before
+
+
+def test_nothing_is_overwritten(lab: Path):
+    before = {path: path.read_bytes() for path in lab.rglob("*.pem")}
+    result = run(lab, "--robot", "new", "--robot", "robot1")
+    assert isinstance(result.exception, TransportError)
+    assert "robot1 is there already" in str(result.exception)
+    assert {path: path.read_bytes() for path in lab.rglob("*.pem")} == before
+
+
+@pytest.mark.parametrize("damage", ["missing", "garbage", "another"])
+def test_an_authority_that_cannot_sign_is_refused(damage: str, tmp_path: Path):
+    assert run(tmp_path, "--robot", "robot1").exit_code == 0
+    key = tmp_path / "ca.key"
+    if damage == "missing":
+        key.unlink()
+    elif damage == "garbage":
+        key.write_text("no key")
+    else:
+        key.write_bytes((tmp_path / "robot1/key.pem").read_bytes())
+    result = run(tmp_path, "--robot", "robot2")
+    assert isinstance(result.exception, TransportError)
+    assert "ca.key" in str(result.exception)
+    assert not (tmp_path / "robot2").exists()
+
+
+@pytest.mark.parametrize(
+    "arguments", [(), ("--robot", "../up"), ("--server", "a b"), ("--robot", ""), ("--server", ",")]
+)
+def test_wrong_arguments(arguments: tuple[str, ...], tmp_path: Path):
+    result = run(tmp_path / "lab", *arguments)
+    assert result.exit_code == 2
+    assert not (tmp_path / "lab").exists()

@@ -1,0 +1,146 @@
+"""Options: what is refused and why; passwords; access control."""
+
+from __future__ import annotations
+
+import json
+import queue
+from pathlib import Path
+
+import pytest
+from ibrobot_zenoh.options import Tls, ZenohOptions
+
+from ibrobot_core.errors import TransportError
+from ibrobot_core.plugins import installed
+from ibrobot_core.testing import host_context
+
+from .pair import WAIT_S, client, free_endpoint, make, router, settle, wait_for
+
+TLS = Tls(Path("ca.pem"), Path("certificate.pem"), Path("key.pem"))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({}, "needs whom to connect to"),
+        ({"connect": ("gpu.lab:7447",)}, "is no endpoint, give PROTOCOL/HOST:PORT"),
+        ({"connect": ("tcp/gpu.lab",)}, "has no port, give PROTOCOL/HOST:PORT, e.g. tcp/gpu.lab:7447"),
+        ({"connect": ("tcp/a:1",), "listen": ("tcp/127.0.0.1:1",)}, "a client does not listen"),
+        ({"connect": ("tls/a:1",)}, "tls/a:1 needs tls"),
+        ({"connect": ("tcp/a:1",), "tls": TLS}, "tcp/a:1 would not use tls; write tls/a:1"),
+        ({"connect": ("tcp/a:1",), "user": "me"}, "user and password belong together"),
+        ({"mode": "router", "listen": ("tcp/0.0.0.0:1",)}, "can be reached by other machines: give tls or users, or"),
+        ({"mode": "router", "listen": ("tcp/[::]:1",)}, "can be reached by other machines"),
+        ({"mode": "peer", "listen": ("tcp/gpu.lab:1",)}, "can be reached by other machines"),
+        ({"connect": ("tcp/a:1",), "namespace": "a b"}, "is no ROS 2 name"),
+    ],
+)
+def test_refused(options: dict[str, object], message: str):
+    with pytest.raises(ValueError, match=message):
+        ZenohOptions(**options)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"mode": "router", "listen": ("tcp/127.0.0.1:1", "tcp/[::1]:1", "tcp/localhost:1", "unixsock-stream/a.sock")},
+        {"mode": "router", "listen": ("tcp/0.0.0.0:1",), "trusted_network": True},
+        {"mode": "router", "listen": ("tcp/0.0.0.0:1",), "users": Path("users.txt")},
+        {"mode": "router", "listen": ("tls/0.0.0.0:1",), "tls": TLS},
+        {"mode": "peer", "connect": ("tcp/gpu.lab:7447#iface=eth0",)},
+    ],
+)
+def test_accepted(options: dict[str, object]):
+    ZenohOptions(**options)
+
+
+def test_the_yaml_s_type():
+    endpoint = free_endpoint()
+    descriptor = installed().find("transport", "zenoh")
+    transport = descriptor.make(ZenohOptions(listen=(endpoint,), mode="peer", shared_memory=False), host_context())
+    transport.close()
+
+
+@pytest.mark.parametrize(
+    "options", [{"tls": TLS, "listen": ("tls/127.0.0.1:1",)}, {"users": Path("none.txt")}, {"settings": Path("none")}]
+)
+def test_files_that_are_not_there(options: dict[str, object]):
+    with pytest.raises(TransportError, match=r"ca\.pem: cannot be read|none"):
+        make(mode="router", **options)
+
+
+def test_passwords(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    users = tmp_path / "users.txt"
+    users.write_text("robot1:secret\n")
+    endpoint = free_endpoint()
+    server = router(endpoint, users=users)
+    server.serve("echo", lambda payload: payload)
+    known = client(endpoint, user="robot1", password="secret")
+    settle(known, server)
+    assert known.request("echo", b"x", WAIT_S) == b"x"
+    for wrong in ({"user": "robot1", "password": "guess"}, {}):
+        caplog.clear()
+        stranger = client(endpoint, **wrong)
+        wait_for(lambda: "not connected" in caplog.text)
+        with pytest.raises(TransportError, match="not connected"):
+            stranger.request("echo", b"x", WAIT_S)
+        stranger.close()
+    known.close()
+    server.close()
+
+
+def test_access_control(tmp_path: Path):
+    """As in the README: robots ask for inference and share under their own name, and no more."""
+    settings, users = tmp_path / "access.json5", tmp_path / "users.txt"
+    users.write_text("robot1:a\nrobot2:b\n")
+    rules = [
+        {"id": name, "permission": "allow", "flows": ["ingress", "egress"], "messages": MESSAGES, "key_exprs": keys}
+        for name, keys in (
+            ("everybody", ["ibrobot/service/inference", "ibrobot/served/inference/*"]),
+            ("robot1", ["ibrobot/topic/robot1/**"]),
+        )
+    ]
+    settings.write_text(
+        json.dumps(
+            {
+                "access_control": {
+                    "enabled": True,
+                    "default_permission": "deny",
+                    "rules": rules,
+                    "subjects": [{"id": "all"}, {"id": "robot1", "usernames": ["robot1"]}],
+                    "policies": [
+                        {"rules": ["everybody"], "subjects": ["all"]},
+                        {"rules": ["robot1"], "subjects": ["robot1"]},
+                    ],
+                }
+            }
+        )
+    )
+    endpoint = free_endpoint()
+    server = router(endpoint, users=users, settings=settings)
+    server.serve("inference", lambda payload: payload)
+    server.serve("stop_the_lab", lambda payload: payload)
+    arrived: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    server.subscribe("robot1/state", lambda payload: arrived.put(bytes(payload)))
+    robot1 = client(endpoint, user="robot1", password="a")
+    robot2 = client(endpoint, user="robot2", password="b")
+    for robot in (robot1, robot2):
+        served: queue.SimpleQueue[bool] = queue.SimpleQueue()
+        robot.watch("inference", served.put)
+        while not served.get(timeout=WAIT_S):
+            pass
+        assert robot.request("inference", b"x", WAIT_S) == b"x"
+        with pytest.raises(TransportError, match="nobody serves stop_the_lab"):
+            robot.request("stop_the_lab", b"x", WAIT_S)
+    robot2.publish("robot1/state", b"false")
+    robot2.request("inference", b"after it", WAIT_S)
+    robot1.publish("robot1/state", b"true")
+    assert arrived.get(timeout=WAIT_S) == b"true"
+    for end in (robot1, robot2, server):
+        end.close()
+
+
+MESSAGES = [
+    "put", "delete", "declare_subscriber", "query", "reply", "declare_queryable",
+    "liveliness_token", "liveliness_query", "declare_liveliness_subscriber",
+]  # fmt: skip
+"""Everything that can be said under a key."""
