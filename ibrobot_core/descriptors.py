@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from ibrobot_core.interfaces import (
         Context,
         DatasetWriter,
+        EpisodeAddress,
         EpisodeReader,
         Executor,
         Hardware,
@@ -114,12 +115,14 @@ class ReaderDescriptor:
     summary: str
     reads: Callable[[Path], bool]
     """Whether what lies at a path is of this format; looks at names and first bytes only."""
-    make: Callable[[Path], EpisodeReader]
+    make: Callable[[EpisodeAddress], EpisodeReader]
     """Opens an episode.
 
     Raises:
         RecorderError: when it cannot be read.
     """
+    numbered: bool = False
+    """Whether many episodes lie at a path, which go by their numbers: `PATH:0`, `PATH:1`, …"""
 
 
 @attrs.frozen

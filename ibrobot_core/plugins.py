@@ -112,17 +112,24 @@ class Registry:
             raise PluginError(self._why_missing(kind, type_))
         return entry.descriptor
 
-    def open_episode(self, path: Path) -> EpisodeReader:
-        """A reader of the episode at `path`.
+    def open_episode(self, path: Path, told: Mapping[str, str] | None = None) -> EpisodeReader:
+        """A reader of an episode.
+
+        Args:
+            path: where it is; `DATASET:N` is episode N, from 0, of a dataset.
+            told: what its metadata is, for one without; see `EpisodeAddress`.
 
         Raises:
             RecorderError: when nothing is there, no installed plugin reads it, or it cannot be read.
         """
-        if not path.exists():
-            raise RecorderError(f"{path}: there is no such episode")
+        from ibrobot_core.interfaces import EpisodeAddress
+
+        address = EpisodeAddress.of(path, told)
         for reader in self.readers:
-            if reader.reads(path):
-                return reader.make(path)
+            if reader.reads(address.path):
+                if address.number is not None and not reader.numbered:
+                    raise RecorderError(f"{path}: {address.path} is a single episode; leave :{address.number} out")
+                return reader.make(address)
         formats = ", ".join(f"{reader.type} ({reader.summary})" for reader in self.readers)
         hint = "" if formats else "; pip install ibrobot-plugin-mcap reads rosbag2"
         raise RecorderError(f"{path}: not an episode of a known format; installed: {formats or 'none'}{hint}")

@@ -4,24 +4,37 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import sys
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
+from ibrobot_core.contract.specs import Contract
+from ibrobot_core.errors import DatasetError
 from ibrobot_core.recording.convert.request import MISSING, OUTCOMES, EpisodeReport, Report, Request
 from ibrobot_core.units import NORM_MODES
 
+if TYPE_CHECKING:
+    from ibrobot_core.config import RobotConfig
+
 _MIB = 1 << 20
+_ONLY_TO_BAG = ("numbers",)
+_ONLY_TO_DATASET = (
+    "append", "type_", "codec", "crf", "no_videos", "force_contract", "missing", "outcomes", "success", "jobs",
+)  # fmt: skip
 
 
 @click.command()
 @click.argument("episodes", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="The dataset: a new folder.")
+@click.option("--to", type=click.Choice(("dataset", "bag")), default="dataset", show_default=True, help="What to make.")
+@click.option("--episodes", "numbers", metavar="N,N-M", help="Which of a dataset's, from 0; all when left out.")
 @click.option("--append", is_flag=True, help="Add to the dataset that is there what is not in it yet.")
 @click.option("--type", "type_", default="lerobot", show_default=True, help="Dataset writer.")
 @click.option("--codec", metavar="NAME", help="Video encoder, e.g. h264; auto takes a GPU's where one opens.")
@@ -30,9 +43,7 @@ _MIB = 1 << 20
 @click.option("--set", "sets", multiple=True, metavar="OPTION=VALUE", help="Any other option of the dataset writer.")
 @click.option("--config", metavar="CONFIG", help="Robot YAML with the contract; needed for bags of others.")
 @click.option("--force-contract", is_flag=True, help="Take --config's contract where the recorded one differs.")
-@click.option(
-    "--norm-mode", type=click.Choice(NORM_MODES), default="radians", show_default=True, help="Unit of joints."
-)
+@click.option("--norm-mode", type=click.Choice(NORM_MODES), help="Unit of the dataset's joints, else radians.")
 @click.option("--calibration", metavar="NAME", help="In place of the recorded one, for --norm-mode.")
 @click.option(
     "--missing", type=click.Choice(MISSING), default="refuse", show_default=True,
@@ -43,29 +54,19 @@ _MIB = 1 << 20
 @click.option("--success", is_flag=True, help="Add next.success: true in the last row of a success.")
 @click.option("--jobs", type=click.IntRange(min=1), metavar="N", help="Episodes side by side; one for two CPU cores.")
 @click.option("--json", "as_json", is_flag=True, help="Print the report as JSON.")
-def convert(
-    episodes: tuple[Path, ...], out: Path, type_: str, config: str | None, calibration: str | None, as_json: bool,
-    outcomes: tuple[str, ...], jobs: int | None, codec: str | None, crf: int | None, no_videos: bool,
-    sets: tuple[str, ...], **asked: Any,
-) -> None:  # fmt: skip
-    """Make a dataset for training from recorded episodes.
+@click.pass_context
+def convert(context: click.Context, /, to: str, as_json: bool, **asked: Any) -> None:
+    """Make a dataset for training from recorded episodes, or with --to bag the way back.
 
-    EPISODES are episodes, or folders of them such as episodes/default. Interrupted, the same command goes on where it
-    was. An episode that cannot be converted is told and left out; the command then exits with 1.
+    EPISODES are episodes, folders of them such as episodes/default, or DATASET:N; with --to bag it is one dataset.
+    Interrupted, the same command goes on where it was. An episode that cannot be converted is told and left out; the
+    command then exits with 1.
     """
-    from ibrobot_core.recording.convert.run import convert as run
-    from ibrobot_core.recording.convert.run import find_episodes
-
-    shorthand = {"codec": codec, "crf": crf, "videos": "false" if no_videos else None}
-    overrides = tuple(f"{name}={value}" for name, value in shorthand.items() if value is not None)
-    request = Request(
-        out, _options(type_, (*overrides, *sets)), type_,
-        outcomes=outcomes or OUTCOMES, jobs=jobs or _jobs(), calibration=_calibration(calibration),
-        **_contract(config), **asked,
-    )  # fmt: skip
-    found = find_episodes(episodes)
-    with _progress(len(found), as_json) as watch:
-        report = run(request, found, watch)
+    given = [name for name in asked if context.get_parameter_source(name) is ParameterSource.COMMANDLINE]
+    if wrong := [name for name in given if name in (_ONLY_TO_BAG if to == "dataset" else _ONLY_TO_DATASET)]:
+        option = next(each.opts[0] for each in context.command.params if each.name == wrong[0])
+        raise click.UsageError(f"{option} has no meaning for --to {to}")
+    report = (_to_bags if to == "bag" else _to_dataset)(as_json=as_json, **asked)
     if as_json:
         click.echo(json.dumps(report.summary()))
     else:
@@ -74,26 +75,97 @@ def convert(
         sys.exit(1)
 
 
+def _to_dataset(
+    *, episodes: tuple[Path, ...], out: Path, type_: str, config: str | None, calibration: str | None, as_json: bool,
+    outcomes: tuple[str, ...], jobs: int | None, codec: str | None, crf: int | None, no_videos: bool,
+    sets: tuple[str, ...], norm_mode: str | None, numbers: str | None, **asked: Any,
+) -> Report:  # fmt: skip
+    from ibrobot_core.recording.convert.run import convert as run
+    from ibrobot_core.recording.convert.run import find_episodes
+
+    shorthand = {"codec": codec, "crf": crf, "videos": "false" if no_videos else None}
+    overrides = tuple(f"{name}={value}" for name, value in shorthand.items() if value is not None)
+    request = Request(
+        out, _options("dataset", type_, (*overrides, *sets)), type_,
+        outcomes=outcomes or OUTCOMES, jobs=jobs or _jobs(), calibration=_calibration(calibration),
+        norm_mode=norm_mode or "radians", **_contract(config), **asked,
+    )  # fmt: skip
+    found = find_episodes(episodes)
+    with _progress(len(found), as_json) as watch:
+        return run(request, found, watch)
+
+
+def _to_bags(
+    *, episodes: tuple[Path, ...], out: Path, config: str | None, calibration: str | None, as_json: bool,
+    sets: tuple[str, ...], norm_mode: str | None, numbers: str | None, prompt: str, **_: Any,
+) -> Report:  # fmt: skip
+    from ibrobot_core.interfaces import EpisodeAddress
+    from ibrobot_core.recording.convert.episode import make_writer
+    from ibrobot_core.recording.convert.provenance import told_by
+    from ibrobot_core.recording.convert.to_bags import RECORDER, BagRequest, convert_to_bags
+
+    if len(episodes) != 1:
+        raise click.UsageError("--to bag takes one dataset at a time")
+    address = EpisodeAddress.of(episodes[0])
+    lerobot = Request(address.path, _options("dataset", "lerobot", ()))
+    if (summary := make_writer(lerobot).summary(address.path)) is None:
+        raise DatasetError(f"{address.path}: there is no LeRobot dataset")
+    chosen = (address.number,) if address.number is not None else _numbers(numbers, summary.episodes)
+    robot = _robot(config) if config is not None else None
+    request = BagRequest(
+        address.path, chosen, out, _options("recorder", RECORDER, sets), prompt=prompt,
+        contract=Contract.from_config(robot) if robot is not None else None,
+        told=told_by(robot, norm_mode, _calibration(calibration)) if robot is not None else {},
+    )  # fmt: skip
+    with _progress(len(chosen), as_json) as watch:
+        return convert_to_bags(request, watch)
+
+
+def _numbers(text: str | None, total: int) -> tuple[int, ...]:
+    """The numbers that e.g. `0,3-5` means, in order.
+
+    Raises:
+        click.BadParameter: for other words, or a number that the dataset does not have.
+    """
+    if text is None:
+        return tuple(range(total))
+    found: set[int] = set()
+    for piece in text.split(","):
+        ends = re.fullmatch(r"\s*(\d+)\s*(?:-\s*(\d+)\s*)?", piece)
+        if ends is None:
+            raise click.BadParameter(
+                f"{piece!r} is no number, nor two with a dash, e.g. 0,3-5", param_hint="--episodes"
+            )
+        found |= set(range(int(ends[1]), int(ends[2] or ends[1]) + 1))
+    if not found or max(found) >= total:
+        there = f"0 to {total - 1}" if total else "none"
+        raise click.BadParameter(f"{text}: the dataset's episodes are {there}", param_hint="--episodes")
+    return tuple(sorted(found))
+
+
 def _jobs() -> int:
     """One for two CPU cores: a job decodes while its cameras are encoded beside it."""
     return max(1, (os.cpu_count() or 1) // 2)
 
 
-def _options(type_: str, overrides: tuple[str, ...]) -> Any:
+def _options(kind: str, type_: str, overrides: tuple[str, ...]) -> Any:
     from ibrobot_core.config.single import single_options
     from ibrobot_core.plugins import installed
 
-    return single_options(installed().find("dataset", type_).options, overrides, type_)
+    return single_options(installed().find(kind, type_).options, overrides, type_)
+
+
+def _robot(config: str) -> RobotConfig:
+    from ibrobot_core.config import find_config, load
+    from ibrobot_core.plugins import installed
+
+    return load(find_config(config, installed()))
 
 
 def _contract(config: str | None) -> dict[str, Any]:
     if config is None:
         return {}
-    from ibrobot_core.config import find_config, load
-    from ibrobot_core.contract.specs import Contract
-    from ibrobot_core.plugins import installed
-
-    robot = load(find_config(config, installed()))
+    robot = _robot(config)
     return {"contract": Contract.from_config(robot), "document": json.loads(json.dumps(robot.document, default=str))}
 
 

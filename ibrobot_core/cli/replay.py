@@ -9,6 +9,7 @@ from typing import Any, override
 import attrs
 import click
 
+from ibrobot_core.calibration import load_calibration
 from ibrobot_core.cli.launch import Watcher, overrides_of, run_loaded, run_options
 from ibrobot_core.config import RobotConfig, find_config, from_document, load
 from ibrobot_core.contract.specs import Contract
@@ -18,7 +19,9 @@ from ibrobot_core.launch.builders.replay import MODE, Replay, ReplayFeeder
 from ibrobot_core.launch.runtime import Runtime
 from ibrobot_core.launch.session import Request
 from ibrobot_core.plugins import installed
+from ibrobot_core.recording.convert.provenance import told_by
 from ibrobot_core.recording.playback import read_playback
+from ibrobot_core.units import NORM_MODES
 
 
 class _Comparison(Watcher):
@@ -58,21 +61,29 @@ class _Comparison(Watcher):
     help="Seconds of the recording in a second.",
 )  # fmt: skip
 @click.option("--force-contract", is_flag=True, help="Replay where only the observations of CONFIG differ.")
+@click.option("--norm-mode", type=click.Choice(NORM_MODES), help="Unit of joints in a dataset that does not say it.")
+@click.option("--calibration", metavar="NAME", help="Of such a dataset, where its unit needs one.")
 @run_options("overrides", "window", "headless", "dry_run", "as_json")
-def replay(episode: Path, config: str | None, speed: float, force_contract: bool, **options: Any) -> None:
+def replay(
+    episode: Path, config: str | None, speed: float, force_contract: bool, norm_mode: str | None,
+    calibration: str | None, **options: Any,
+) -> None:  # fmt: skip
     """Play the commands of a recorded EPISODE, and tell how near the joints came to the recorded ones.
 
+    EPISODE is a folder such as episodes/pick/episodes/episode_000001, or DATASET:N, episode N from 0 of a dataset.
     CONFIG is a robot YAML as for `ibrobot launch`; the one that the episode was recorded with when left out. The robot
     goes slowly to where the episode begins, follows its commands by their times, within the limits of the safety layer,
     and stops. With --sim the scene is set up by the recorded seed.
 
     Exits as `ibrobot launch` does; with 3 where the recorded episode was a success in its scene and this one is not.
     """
-    changes = overrides_of(options)
-    reader = installed().open_episode(episode)
+    changes, sim = overrides_of(options), options["sim"]
+    robot = _named(config, changes, sim=sim) if config is not None else None
+    numbers = load_calibration(calibration).numbers() if calibration is not None else None
+    reader = installed().open_episode(episode, told_by(robot, norm_mode, numbers) if robot is not None else None)
     try:
         summary = reader.summary()
-        robot = _robot(summary, config, changes, sim=options["sim"])
+        robot = robot or _recorded(summary, changes, sim=sim)
         contract = Contract.from_config(robot)
         _check(contract, summary, str(robot.source), force=force_contract)
         playback = read_playback(reader, contract)
@@ -85,14 +96,16 @@ def replay(episode: Path, config: str | None, speed: float, force_contract: bool
     run_loaded(attrs.evolve(robot, peripherals={}, recording=None), request, options, _Comparison())
 
 
-def _robot(summary: EpisodeSummary, config: str | None, changes: tuple[str, ...], *, sim: bool) -> RobotConfig:
-    """The robot, with one mode more: that of the replay."""
+def _named(config: str, changes: tuple[str, ...], *, sim: bool) -> RobotConfig:
+    """The robot of a YAML, with one mode more: that of the replay."""
     registry = installed()
-    chosen: dict[str, Any] = {"sim": sim, "registry": registry}
-    if config is not None:
-        path = find_config(config, registry)
-        robot = load(path, overrides=changes, **chosen)
-        return load(path, overrides=(*changes, _mode(robot)), mode=MODE, **chosen)
+    path = find_config(config, registry)
+    robot = load(path, overrides=changes, sim=sim, registry=registry)
+    return load(path, overrides=(*changes, _mode(robot)), mode=MODE, sim=sim, registry=registry)
+
+
+def _recorded(summary: EpisodeSummary, changes: tuple[str, ...], *, sim: bool) -> RobotConfig:
+    """The robot that an episode was recorded with, likewise."""
     text = summary.metadata.get("config")
     if text is None:
         raise RecorderError(f"{summary.path}: brings no robot YAML; name one: ibrobot replay {summary.path} CONFIG")
@@ -100,9 +113,9 @@ def _robot(summary: EpisodeSummary, config: str | None, changes: tuple[str, ...]
         document = json.loads(text)
     except ValueError as error:
         raise RecorderError(f"{summary.path}: its robot YAML cannot be read: {error}; name one as CONFIG") from None
-    chosen["source"] = Path("recorded config")
-    robot = from_document(document, overrides=changes, **chosen)
-    return from_document(document, overrides=(*changes, _mode(robot)), mode=MODE, **chosen)
+    source = Path("recorded config")
+    robot = from_document(document, source=source, overrides=changes, sim=sim)
+    return from_document(document, source=source, overrides=(*changes, _mode(robot)), mode=MODE, sim=sim)
 
 
 def _mode(robot: RobotConfig) -> str:

@@ -33,7 +33,7 @@ type _Read = Callable[[Any], NDArray[np.generic]]
 
 
 @attrs.frozen
-class _Leaf:
+class Leaf:
     """One path, resolved: a number, an element of an array, a joint's element, or a whole array."""
 
     field: str
@@ -72,6 +72,8 @@ class Selection:
             raise ContractError(f"unknown message type {type_name!r}{_close(type_name, MESSAGE_TYPES)}")
         self.paths = tuple(select) or _default(message_type, joints)
         leaves = [leaf for path in self.paths for leaf in _resolve(message_type, path)]
+        self.leaves = tuple(leaves)
+        """What each number of the vector is, in its order; one for a whole array."""
         unknown = any(leaf.kind == "array" for leaf in leaves)
         self.size = -1 if unknown else len(leaves)
         """Length of the vector; -1 where a whole array is taken, whose length only the messages know."""
@@ -100,7 +102,7 @@ def _default(message_type: type[Message], joints: Sequence[str]) -> tuple[str, .
     return _WHOLE[message_type.ros_type]
 
 
-def _resolve(message_type: type[Any], path: str) -> list[_Leaf]:
+def _resolve(message_type: type[Any], path: str) -> list[Leaf]:
     """The leaves that `path` leads to."""
     owner: type[Any] = message_type
     tokens = path.split(".")
@@ -112,7 +114,7 @@ def _resolve(message_type: type[Any], path: str) -> list[_Leaf]:
         if attrs.has(kind):
             owner = kind
         elif kind in (int, float, bool) and not rest:
-            return [_Leaf(field, "number")]
+            return [Leaf(field, "number")]
         elif "ndarray" in str(kind).lower():
             return [_array_leaf(message_type, path, field, rest)]
         else:
@@ -120,19 +122,19 @@ def _resolve(message_type: type[Any], path: str) -> list[_Leaf]:
     return [leaf for name in attrs.fields_dict(owner) for leaf in _resolve(message_type, f"{path}.{name}")]
 
 
-def _array_leaf(message_type: type[Any], path: str, field: str, rest: str) -> _Leaf:
+def _array_leaf(message_type: type[Any], path: str, field: str, rest: str) -> Leaf:
     if message_type is JointState:
         if not rest:
             raise ContractError(f"{path!r} has the joints in the sender's order; name them, e.g. {path}.shoulder_pan")
-        return _Leaf(field, "joint", rest)
+        return Leaf(field, "joint", rest)
     if not rest:
-        return _Leaf(field, "array")
+        return Leaf(field, "array")
     if not (rest.isascii() and rest.isdigit()):
         raise ContractError(f"{path!r}: {field} is an array, its elements go by number, e.g. {field}.0")
-    return _Leaf(field, "element", rest)
+    return Leaf(field, "element", rest)
 
 
-def _reader(kind: str, leaves: list[_Leaf]) -> _Read:
+def _reader(kind: str, leaves: list[Leaf]) -> _Read:
     """Reads a run of leaves of one kind, and one array where they are of arrays."""
     field = leaves[0].field
     if kind == "number":

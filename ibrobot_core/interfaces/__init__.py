@@ -6,7 +6,7 @@ from ibrobot_core.interfaces.executor import Executor, GoalState, GoalStatus, Pl
 from ibrobot_core.interfaces.hardware import Episode, Hardware, JointReading, Signal, SimulatedHardware, nan_vector
 from ibrobot_core.interfaces.planner import JointGoal, Planner, PlanRequest, PoseGoal
 from ibrobot_core.interfaces.policy import Frame, Policy, PolicySpec, Tensors
-from ibrobot_core.interfaces.reader import EpisodeReader, EpisodeSummary, Recorded, TopicSummary
+from ibrobot_core.interfaces.reader import EpisodeAddress, EpisodeReader, EpisodeSummary, Recorded, TopicSummary
 from ibrobot_core.interfaces.recorder import EpisodeEnd, EpisodeStart, Recorder
 from ibrobot_core.interfaces.sensor import Sensor
 from ibrobot_core.interfaces.teleop import Teleop, TeleopCommand
@@ -18,6 +18,7 @@ __all__ = [
     "DatasetSummary",
     "DatasetWriter",
     "Episode",
+    "EpisodeAddress",
     "EpisodeEnd",
     "EpisodeReader",
     "EpisodeStart",

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 
 import attrs
 
+from ibrobot_core.errors import RecorderError
 from ibrobot_core.messages import Message
 
 
@@ -49,6 +51,32 @@ class EpisodeSummary:
     metadata: Mapping[str, str]
     """What the recorder was told: prompt, contract, fingerprint, calibration, versions; empty in foreign bags."""
     outcome: str = "unknown"
+
+
+@attrs.frozen
+class EpisodeAddress:
+    """Which episode is meant."""
+
+    path: Path
+    number: int | None = None
+    """From 0, in a dataset of many; None where none is said."""
+    told: Mapping[str, str] = attrs.field(factory=dict)
+    """What the metadata of an episode is that has none, by the recorder's names: `contract`, `config`, `calibration`;
+    and `norm_mode`, the unit of its joints."""
+
+    @classmethod
+    def of(cls, path: Path, told: Mapping[str, str] | None = None) -> EpisodeAddress:
+        """The address of what a user calls `path`: an episode, or `DATASET:N`.
+
+        Raises:
+            RecorderError: when nothing is there.
+        """
+        named = re.fullmatch(r"(.+):(\d+)", path.name)
+        if path.exists():
+            return cls(path, None, told or {})
+        if named is None or not (dataset := path.with_name(named[1])).exists():
+            raise RecorderError(f"{path}: there is no such episode")
+        return cls(dataset, int(named[2]), told or {})
 
 
 class EpisodeReader(ABC):

@@ -7,7 +7,6 @@ from typing import Any
 
 import yaml
 
-from ibrobot_core.config import RobotConfig
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import RecorderError
 
@@ -36,8 +35,13 @@ class Dataset:
     def prompt(self, prompt: str) -> None:
         self._write({**self._read(), "prompt": prompt})
 
-    def join(self, config: RobotConfig, contract: Contract) -> None:
+    def join(self, contract: Contract, robot: str, robot_type: str) -> None:
         """See that an episode of this contract may join the others, and make the dataset for the first.
+
+        Args:
+            contract: of the episode.
+            robot: the robot's name.
+            robot_type: as LeRobot names it.
 
         Raises:
             RecorderError: when they have another contract, or the file cannot be written.
@@ -45,7 +49,7 @@ class Dataset:
         self.check(contract)
         known = self._read()
         if "fingerprint" not in known:
-            facts = {"name": self._folder.name, "robot": config.robot.name, "robot_type": config.robot.robot_type}
+            facts = {"name": self._folder.name, "robot": robot, "robot_type": robot_type}
             self._write({**facts, "fingerprint": contract.fingerprint(), "contract": contract.canonical(), **known})
 
     def check(self, contract: Contract) -> None:

@@ -18,6 +18,11 @@ from ibrobot_core.recording.dataset import Dataset
 _PREFIX = "episode_"
 
 
+def episode_folder(dataset: Path, number: int) -> Path:
+    """Where episode `number`, from 1, of a dataset lies."""
+    return dataset / "episodes" / f"{_PREFIX}{number:06d}"
+
+
 def episode_start(
     config: RobotConfig, recording: Recording, topics: Mapping[str, str], *, mode: str, seed: int, stamp_ns: int,
     prompt: str = "",
@@ -44,7 +49,7 @@ def episode_start(
         root.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RecorderError(f"recording.root: {root} cannot be made: {error.strerror}") from None
-    Dataset(root.parent).join(config, contract)
+    Dataset(root.parent).join(contract, config.robot.name, config.robot.robot_type)
     metadata = {
         "robot": config.robot.name, "robot_type": config.robot.robot_type, "mode": mode, "prompt": prompt,
         "contract": json.dumps(contract.canonical()), "fingerprint": contract.fingerprint(),
@@ -55,7 +60,7 @@ def episode_start(
         kept = contract.topics
     else:
         kept = {topic: type_ for topic, type_ in topics.items() if is_kept(topic, recording, contract)}
-    directory = root / f"{_PREFIX}{_next_number(root):06d}"
+    directory = episode_folder(root.parent, _next_number(root))
     return EpisodeStart(directory, stamp_ns, kept, metadata, any_topic=recording.topics != "contract")
 
 

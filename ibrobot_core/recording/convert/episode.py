@@ -20,7 +20,7 @@ from ibrobot_core.clock import RealClock
 from ibrobot_core.contract.joint_units import JointUnits
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import ContractError, DatasetError, IbrobotError, RecorderError
-from ibrobot_core.interfaces import Context, DatasetWriter, EpisodeReader, EpisodeSummary, Feature
+from ibrobot_core.interfaces import Context, DatasetWriter, EpisodeAddress, EpisodeReader, EpisodeSummary, Feature
 from ibrobot_core.plugins import installed
 from ibrobot_core.recording.convert.request import EpisodeReport, Request
 from ibrobot_core.recording.convert.ticks import Ticks
@@ -30,7 +30,7 @@ SUCCESS = "next.success"
 DATASET = "dataset"
 """The dataset within a unit."""
 _RECORD = "episode.json"
-_VERSION = 1
+_VERSION = 2
 """Of what a unit is made of; older ones are made anew."""
 
 
@@ -57,6 +57,10 @@ class Unit:
     contract: Mapping[str, Any]
     robot_type: str
     calibration: Mapping[str, Mapping[str, int]]
+    document: Mapping[str, Any]
+    """The robot YAML as plain values; empty where it is not known."""
+    recorded: Mapping[str, str]
+    """The episode's metadata."""
 
     @property
     def dataset(self) -> Path:
@@ -84,9 +88,12 @@ def unit_key(job: Job) -> str:
         _VERSION, request.type, attrs.asdict(request.options), contract, request.force_contract,
         request.document, request.calibration, request.norm_mode, request.missing, request.prompt, request.success,
     ]  # fmt: skip
-    files = sorted(p for p in job.episode.rglob("*") if p.is_file()) if job.episode.is_dir() else [job.episode]
-    stats = [(str(path.relative_to(job.episode)), path.stat().st_size, path.stat().st_mtime_ns) for path in files]
-    return hashlib.sha256(json.dumps([shaping, stats], sort_keys=True, default=str).encode()).hexdigest()
+    address = EpisodeAddress.of(job.episode)
+    root = address.path
+    files = sorted(p for p in root.rglob("*") if p.is_file()) if root.is_dir() else [root]
+    stats = [(str(path.relative_to(root)), path.stat().st_size, path.stat().st_mtime_ns) for path in files]
+    made_of = [shaping, address.number, stats]
+    return hashlib.sha256(json.dumps(made_of, sort_keys=True, default=str).encode()).hexdigest()
 
 
 def read_unit(path: Path) -> Unit | None:
@@ -175,7 +182,10 @@ def _write(
     report = attrs.evolve(
         report, frames=frames, skipped=ticks.skipped, held=ticks.held, gaps=ticks.gaps, resets=dict(ticks.resets)
     )
-    unit = Unit(job.unit, key, report, contract.rate_hz, features, contract.canonical(), robot_type, calibration)
+    unit = Unit(
+        job.unit, key, report, contract.rate_hz, features, contract.canonical(), robot_type, calibration, document,
+        summary.metadata,
+    )  # fmt: skip
     record = {name: value for name, value in attrs.asdict(unit).items() if name != "path"}
     (folder / _RECORD).write_text(json.dumps(record, indent=2), encoding="utf-8")
     return unit

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import fcntl
 import hashlib
-import json
 import multiprocessing
 import os
 import re
@@ -12,7 +11,7 @@ import shutil
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -22,10 +21,11 @@ from typing import Any
 import attrs
 
 from ibrobot_core.contract.specs import Contract
-from ibrobot_core.errors import DatasetError, IbrobotError, RecorderError
-from ibrobot_core.interfaces import DatasetSummary
+from ibrobot_core.errors import DatasetError, IbrobotError
+from ibrobot_core.interfaces import DatasetSummary, EpisodeAddress
 from ibrobot_core.plugins import installed
 from ibrobot_core.recording.convert.episode import Job, Unit, convert_episode, make_writer, read_unit, unit_key
+from ibrobot_core.recording.convert.provenance import conversion, provenance
 from ibrobot_core.recording.convert.request import EpisodeReport, Report, Request
 from ibrobot_core.units import seconds
 
@@ -38,12 +38,12 @@ Watch = Callable[[int, int, EpisodeReport | None], None]
 
 
 def find_episodes(paths: Sequence[Path]) -> list[Path]:
-    """The episodes that `paths` name, which are episodes or folders of them; each once, numbers in order.
+    """The episodes that `paths` name: episodes, `DATASET:N`, or folders of them; each once, numbers in order.
 
     Raises:
         RecorderError: for a path that is none, or has none below.
     """
-    readers = installed().readers
+    readers = [reader for reader in installed().readers if not reader.numbered]
 
     def below(path: Path) -> Iterator[Path]:
         if any(reader.reads(path) for reader in readers):
@@ -55,11 +55,10 @@ def find_episodes(paths: Sequence[Path]) -> list[Path]:
 
     found: dict[Path, Path] = {}
     for path in paths:
-        if not path.exists():
-            raise RecorderError(f"{path}: there is no such episode")
-        here = list(below(path))
+        address = EpisodeAddress.of(path)
+        here = [path] if address.number is not None else list(below(path))
         if not here:
-            installed().open_episode(path)  # says what would have been an episode
+            installed().open_episode(path).close()  # says what would have been an episode
         found |= {each.resolve(): each for each in here}
     return list(found.values())
 
@@ -83,7 +82,7 @@ def convert(request: Request, episodes: Sequence[Path], watch: Watch = lambda do
         reports |= _refuse_misfits(units, old)
         units = [unit for unit in units if not reports.get(unit.report.source, unit.report).error]
         if units:
-            metadata = _metadata(request, old, units)
+            metadata = provenance(request, old, units)
             make_writer(request).merge(request.out, [unit.dataset for unit in units], metadata)
             shutil.rmtree(staging)
     size = sum(path.stat().st_size for path in request.out.rglob("*") if path.is_file()) if request.out.exists() else 0
@@ -132,7 +131,7 @@ def _check_old(request: Request, old: DatasetSummary) -> None:
     known = old.metadata.get("conversion")
     if known is None:
         raise DatasetError(f"{request.out}: was not made by ibrobot convert, which does not know what is in it")
-    asked = _conversion(request)
+    asked = conversion(request)
     wrong = [f"{name} {known.get(name)}, now {asked[name]}" for name in asked if known.get(name) != asked[name]]
     if wrong:
         raise DatasetError(f"{request.out}: was made otherwise: {'; '.join(wrong)}")
@@ -278,32 +277,6 @@ def _refuse_misfits(units: Sequence[Unit], old: DatasetSummary | None) -> dict[s
         if wrong:
             refused[unit.report.source] = attrs.evolve(unit.report, error=wrong)
     return refused
-
-
-def _conversion(request: Request) -> dict[str, Any]:
-    """What all episodes of a dataset must have been asked for alike."""
-    options = attrs.asdict(request.options)
-    return {"writer": request.type, "options": options, "norm_mode": request.norm_mode, "success": request.success}
-
-
-def _metadata(request: Request, old: DatasetSummary | None, units: Sequence[Unit]) -> dict[str, Any]:
-    """What the dataset keeps of its making: contract, calibrations, and where each episode comes from."""
-    before: Mapping[str, Any] = old.metadata if old is not None else {}
-    calibrations = dict(before.get("calibrations", {}))
-    episodes = list(before.get("episodes", ()))
-    for unit in units:
-        report = attrs.asdict(unit.report)
-        kept = {name: value for name, value in report.items() if name not in ("error", "passed_over")}
-        name = hashlib.sha256(json.dumps(unit.calibration, sort_keys=True).encode()).hexdigest()[:12]
-        if unit.calibration:
-            calibrations[name] = unit.calibration
-        episodes.append(kept | {"calibration": name if unit.calibration else ""})
-    contract = before.get("contract", units[0].contract)
-    return {
-        "robot_type": before.get("robot_type", units[0].robot_type), "contract": contract,
-        "fingerprint": Contract.from_canonical(contract).fingerprint(), "conversion": _conversion(request),
-        "calibrations": calibrations, "episodes": episodes,
-    }  # fmt: skip
 
 
 def _source(path: Path, taken: Sequence[str]) -> str:

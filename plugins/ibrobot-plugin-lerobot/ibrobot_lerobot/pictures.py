@@ -7,8 +7,12 @@ from fractions import Fraction
 from typing import Any
 
 import av
+import av.error
 import numpy as np
 from numpy.typing import NDArray
+
+from ibrobot_core.errors import DatasetError
+from ibrobot_core.interfaces import Feature
 
 _PNG_FORMATS = {1: "gray", 3: "rgb24"}
 _TIFF_SAMPLES = {np.dtype(np.uint16): 1, np.dtype(np.float32): 3}
@@ -37,6 +41,38 @@ class PngEncoder:
         pixels = image[..., 0] if self._format == "gray" else image
         packets = self._codec.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels), self._format))
         return b"".join(bytes(packet) for packet in packets)
+
+
+_DECODERS = {b"\x89PNG": "png", b"\xff\xd8\xff": "mjpeg", b"II*\0": "tiff", b"MM\0*": "tiff"}
+"""First bytes of a file -> decoder."""
+
+
+def decode_picture(content: bytes, feature: Feature) -> NDArray[Any]:
+    """The pixels of a file in a table.
+
+    Args:
+        content: a PNG, JPEG or TIFF file.
+        feature: its shape (H, W, C), and the type of its elements.
+
+    Raises:
+        DatasetError: when it cannot be read, or is no such picture.
+    """
+    codec = next((name for begin, name in _DECODERS.items() if content.startswith(begin)), None)
+    if codec is None:
+        raise DatasetError(f"a picture begins with {content[:4]!r}, which is neither PNG, JPEG nor TIFF")
+    pixels = {"image": {1: "gray", 3: "rgb24"}[feature.shape[2]], "uint16": "gray16le", "float32": "grayf32le"}
+    try:
+        decoder: Any = av.CodecContext.create(codec, "r")
+        frame: Any = next(iter([*decoder.decode(av.Packet(content)), *decoder.decode(None)]), None)
+        if frame is None:
+            raise ValueError("there is none in the file")
+        array: NDArray[Any] = frame.to_ndarray(format=pixels[feature.dtype])
+    except (av.error.FFmpegError, ValueError) as error:
+        raise DatasetError(f"a picture cannot be decoded: {error}") from error
+    array = array.reshape(*array.shape[:2], -1)
+    if array.shape != feature.shape:
+        raise DatasetError(f"a picture has shape {array.shape}, must be {feature.shape}")
+    return array
 
 
 def tiff(depth: NDArray[Any]) -> bytes:

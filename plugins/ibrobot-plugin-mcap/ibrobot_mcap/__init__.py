@@ -13,7 +13,7 @@ from ibrobot_mcap.options import McapOptions
 if TYPE_CHECKING:
     import click
 
-    from ibrobot_core.interfaces import Context, EpisodeReader, Recorder
+    from ibrobot_core.interfaces import Context, EpisodeAddress, EpisodeReader, Recorder
 
 
 def _record(options: Any, ctx: Context) -> Recorder:
@@ -28,10 +28,10 @@ def _reads(path: Path) -> bool:
     return is_rosbag2(path)
 
 
-def _read(path: Path) -> EpisodeReader:
+def _read(address: EpisodeAddress) -> EpisodeReader:
     from ibrobot_mcap.reader import Rosbag2Reader
 
-    return Rosbag2Reader(path)
+    return Rosbag2Reader(address.path)
 
 
 @hookimpl

@@ -1,0 +1,164 @@
+"""Composing: the values of a tick -> messages; the way back from what `select` and `image` took out of them."""
+
+from __future__ import annotations
+
+import typing
+from collections.abc import Collection, Mapping
+from typing import Any
+
+import attrs
+import numpy as np
+from numpy.typing import NDArray
+
+from ibrobot_core.contract.encode import action_messages
+from ibrobot_core.contract.image import encode_image
+from ibrobot_core.contract.select import Leaf, Selection
+from ibrobot_core.contract.specs import Contract, ObservationPart
+from ibrobot_core.errors import ContractError
+from ibrobot_core.messages import MESSAGE_TYPES, Header, JointState, Message
+
+_ACTION = "action"
+
+
+class Composer:
+    """Makes the messages of a tick, from which the contract's frames are the same values again.
+
+    Numbers of a message that no path selects are NaN: they are not known.
+
+    Args:
+        contract: which values lie where in which messages.
+
+    Raises:
+        ContractError: for a part whose values do not say where they belong, e.g. two whole arrays in one vector.
+    """
+
+    def __init__(self, contract: Contract) -> None:
+        self._contract = contract
+        self._topics: dict[str, list[ObservationPart]] = {}
+        for part in contract.observation_parts:
+            self._topics.setdefault(part.topic, []).append(part)
+        self._leaves = {id(part): _leaves(part) for part in contract.observation_parts if part.image is None}
+        for key in contract.observations:
+            unknown = [part for part in contract.parts(key) if part.image is None and part.feature.shape == (-1,)]
+            if len(unknown) > 1:
+                raise ContractError(f"{key}: the lengths of {len(unknown)} whole arrays cannot be told apart")
+
+    def keys(self, topics: Collection[str]) -> set[str]:
+        """The keys whose values the messages of `topics` are made of."""
+        keys = {part.key for part in self._contract.observation_parts if part.topic in topics}
+        return keys | ({_ACTION} if any(part.topic in topics for part in self._contract.action_parts) else set())
+
+    def __call__(self, values: Mapping[str, NDArray[Any]], stamp_ns: int) -> dict[str, Message]:
+        """Topic -> message, of the topics all of whose keys are in `values`.
+
+        Args:
+            values: key -> value, vectors in SI units, images as the contract's encoding says.
+            stamp_ns: for headers [ns].
+
+        Raises:
+            ContractError: for a value that does not fit the contract.
+        """
+        messages: dict[str, Message] = {}
+        header = Header(stamp_ns)
+        for topic, parts in self._topics.items():
+            if all(part.key in values for part in parts):
+                messages[topic] = self._message(parts, values, header)
+        if _ACTION in values:
+            messages |= action_messages(self._contract, values[_ACTION])
+        return messages
+
+    def _message(self, parts: list[ObservationPart], values: Mapping[str, NDArray[Any]], header: Header) -> Message:
+        first = parts[0]
+        if first.image is not None:
+            return encode_image(values[first.key], first.image.encoding, header)
+        pairs: list[tuple[Leaf, Any]] = []
+        for part in parts:
+            leaves, vector = self._leaves[id(part)], self._slice(part, values[part.key])
+            pairs += [(leaves[0], vector)] if leaves[0].kind == "array" else zip(leaves, vector.tolist(), strict=True)
+        message_type = MESSAGE_TYPES[first.type]
+        if message_type is JointState:
+            return _joint_state(pairs, header)
+        message: Message = _build(message_type, "", _fields(pairs), header)
+        return message
+
+    def _slice(self, part: ObservationPart, vector: NDArray[Any]) -> NDArray[Any]:
+        """The piece of a key's vector that is the part's."""
+        sizes = {id(each): each.feature.shape[0] for each in self._contract.parts(part.key)}
+        known = sum(size for size in sizes.values() if size >= 0)
+        rest = len(vector) - known
+        if rest < 0 or (rest and -1 not in sizes.values()):
+            raise ContractError(f"{part.key} has {known} values by the contract, got {len(vector)}")
+        begin = 0
+        for each, size in sizes.items():
+            length = rest if size < 0 else size
+            if each == id(part):
+                return vector[begin : begin + length]
+            begin += length
+        raise AssertionError(part)
+
+
+def _leaves(part: ObservationPart) -> tuple[Leaf, ...]:
+    leaves = Selection(part.type, part.select).leaves
+    if len(leaves) > 1 and any(leaf.kind == "array" for leaf in leaves):
+        raise ContractError(f"{part.key}: where {', '.join(part.select)} begin in a vector cannot be told")
+    return leaves
+
+
+def _joint_state(pairs: list[tuple[Leaf, Any]], header: Header) -> JointState:
+    names = tuple(dict.fromkeys(leaf.part for leaf, _ in pairs))
+    arrays: dict[str, NDArray[np.float64]] = {}
+    for leaf, value in pairs:
+        array = arrays.setdefault(leaf.field, np.full(len(names), np.nan))
+        array[names.index(leaf.part)] = value
+    return JointState(header, names, **arrays)
+
+
+def _fields(pairs: list[tuple[Leaf, Any]]) -> dict[str, Any]:
+    """Path -> value; elements gathered into arrays."""
+    known: dict[str, Any] = {}
+    for leaf, value in pairs:
+        if leaf.kind != "element":
+            known[leaf.field] = value
+            continue
+        index = int(leaf.part)
+        array = known.get(leaf.field, np.empty(0))
+        known[leaf.field] = np.pad(array, (0, max(0, index + 1 - len(array))), constant_values=np.nan)
+        known[leaf.field][index] = value
+    return known
+
+
+def _build(owner: type[Any], prefix: str, known: Mapping[str, Any], header: Header) -> Any:
+    """An `owner` with the values whose paths begin with `prefix`."""
+    given: dict[str, Any] = {}
+    for name, kind in _hints(owner).items():
+        path = prefix + name
+        if kind is Header:
+            given[name] = header
+        elif path in known:
+            given[name] = _cast(path, known[path], kind)
+        elif attrs.has(kind) and (_is_numeric(kind) or any(each.startswith(f"{path}.") for each in known)):
+            given[name] = _build(kind, f"{path}.", known, header)
+        elif kind in (float, str):
+            given[name] = np.nan if kind is float else ""
+        elif attrs.fields_dict(owner)[name].default is attrs.NOTHING:
+            raise ContractError(f"no {owner.__name__} can be made of {', '.join(known)}: {path} is not known")
+    return owner(**given)
+
+
+def _cast(path: str, value: Any, kind: Any) -> Any:
+    if kind in (int, float, bool):
+        return kind(value)
+    whole = "int" in str(kind)
+    if whole and not np.isfinite(value).all():
+        raise ContractError(f"{path}: elements that no path selects are not known, and integers have no NaN")
+    return value
+
+
+def _hints(owner: type[Any]) -> dict[str, Any]:
+    hints = typing.get_type_hints(owner)
+    return {name: kind for name, kind in hints.items() if typing.get_origin(kind) is not typing.ClassVar}
+
+
+def _is_numeric(kind: type[Any]) -> bool:
+    """Whether a class is all floats, e.g. a Vector3."""
+    return all(each is float or (attrs.has(each) and _is_numeric(each)) for each in _hints(kind).values())

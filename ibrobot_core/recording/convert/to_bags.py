@@ -1,0 +1,174 @@
+"""The way back: episodes of a dataset -> recorded episodes, one message of each topic at every tick."""
+
+from __future__ import annotations
+
+import json
+import logging
+import shutil
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import attrs
+
+import ibrobot_core
+from ibrobot_core.clock import SteppedClock
+from ibrobot_core.contract.specs import Contract
+from ibrobot_core.errors import ContractError, IbrobotError, RecorderError
+from ibrobot_core.interfaces import Context, EpisodeEnd, EpisodeReader, EpisodeStart, EpisodeSummary, Recorder
+from ibrobot_core.plugins import installed
+from ibrobot_core.recording.convert.request import EpisodeReport, Report
+from ibrobot_core.recording.dataset import Dataset
+from ibrobot_core.recording.episode import episode_folder
+from ibrobot_core.robot import Robot
+
+RECORDER = "mcap"
+"""What writes episodes."""
+_STAGING = ".staging"
+"""Where an episode is written within the folder, until it is whole."""
+_TOLD_EVERY = 30
+"""Messages of a topic from one sign of life to the next."""
+
+type Watch = Callable[[int, int, EpisodeReport | None], None]
+
+
+@attrs.frozen
+class BagRequest:
+    """One conversion of a dataset into recorded episodes."""
+
+    dataset: Path
+    numbers: tuple[int, ...]
+    """The episodes, from 0."""
+    out: Path
+    """`OUT/episodes/episode_000001` becomes episode 0 of the dataset."""
+    options: Any
+    """Of the recorder."""
+    type: str = RECORDER
+    """Of the recorder."""
+    contract: Contract | None = None
+    """What the dataset's contract must be; None takes it as it is."""
+    told: Mapping[str, str] = attrs.field(factory=dict)
+    """Of a dataset that says nothing of itself; see `EpisodeAddress`."""
+    prompt: str = ""
+    """Task of episodes without one."""
+
+
+def convert_to_bags(request: BagRequest, watch: Watch = lambda done, total, report: None) -> Report:
+    """Write episodes of a dataset as recorded ones; an episode appears whole or not at all.
+
+    Those that are there already are passed over, so that an interrupted conversion goes on from there.
+
+    Raises:
+        PluginError: when the recorder is not installed.
+    """
+    begin = time.monotonic()
+    reports: list[EpisodeReport] = []
+    done = 0
+    for number in request.numbers:
+        job = _Job(request, number)
+
+        def progress(frames: int, before: int = done) -> None:
+            watch(before + frames, before + frames, None)
+
+        report = job.run(progress)
+        done += report.frames
+        watch(done, done, report)
+        reports.append(report)
+    shutil.rmtree(request.out / _STAGING, ignore_errors=True)
+    if request.out.is_dir() and not any(request.out.iterdir()):
+        request.out.rmdir()
+    files = [path for path in request.out.rglob("*") if path.is_file()] if request.out.exists() else []
+    size = sum(path.stat().st_size for path in files)
+    return Report(request.out, tuple(reports), size, time.monotonic() - begin, resumed=0)
+
+
+class _Job:
+    """One episode."""
+
+    def __init__(self, request: BagRequest, number: int) -> None:
+        self._request = request
+        self._path = request.dataset.with_name(f"{request.dataset.name}:{number}")
+        self._target = episode_folder(request.out, number + 1)
+        self._making = request.out / _STAGING / self._target.name
+
+    def run(self, progress: Callable[[int], None]) -> EpisodeReport:
+        """Convert it; a fault is told in the report and leaves nothing."""
+        report = EpisodeReport(self._path.name)
+        reader: EpisodeReader | None = None
+        try:
+            reader = installed().open_episode(self._path, self._request.told)
+            summary = reader.summary()
+            prompt = summary.metadata.get("prompt") or self._request.prompt
+            report = attrs.evolve(report, outcome=summary.outcome, prompt=prompt, start_ns=summary.start_ns)
+            if self._target.exists():
+                return attrs.evolve(report, passed_over=self._known(summary))
+            contract = self._check(summary)
+            frames = self._write(reader, summary, contract, prompt, progress)
+        except (IbrobotError, OSError) as error:
+            return attrs.evolve(report, error=str(error))
+        finally:
+            if reader is not None:
+                reader.close()
+            shutil.rmtree(self._making, ignore_errors=True)
+        return attrs.evolve(report, frames=frames)
+
+    def _known(self, summary: EpisodeSummary) -> str:
+        """Why it need not be converted: what lies there is it."""
+        reader = installed().open_episode(self._target)
+        try:
+            there = reader.summary()
+        finally:
+            reader.close()
+        found = there.metadata.get("source", "a recording"), there.start_ns
+        if found != (self._source(summary), summary.start_ns):
+            raise RecorderError(f"{self._target}: is another episode ({found[0]}); convert into another folder")
+        return "there already"
+
+    def _source(self, summary: EpisodeSummary) -> str:
+        return summary.metadata.get("source", self._path.name)
+
+    def _check(self, summary: EpisodeSummary) -> Contract:
+        request, contract = self._request, Contract.from_canonical(json.loads(summary.metadata["contract"]))
+        if request.contract is not None and request.contract.fingerprint() != contract.fingerprint():
+            difference = request.contract.difference(contract, names=("--config", "dataset"))
+            raise ContractError(f"{self._path}: was made with another contract than --config's:\n{difference}")
+        Dataset(request.out).check(contract)
+        return contract
+
+    def _write(
+        self, reader: EpisodeReader, summary: EpisodeSummary, contract: Contract, prompt: str,
+        progress: Callable[[int], None],
+    ) -> int:  # fmt: skip
+        metadata = {
+            "ibrobot_version": ibrobot_core.__version__, **summary.metadata, "prompt": prompt,
+            "source": self._source(summary),
+        }  # fmt: skip
+        self._making.parent.mkdir(parents=True, exist_ok=True)
+        shutil.rmtree(self._making, ignore_errors=True)
+        recorder = _make_recorder(self._request)
+        counts = dict.fromkeys(contract.topics, 0)
+        try:
+            recorder.begin(EpisodeStart(self._making, summary.start_ns, contract.topics, metadata))
+            for item in reader.messages(contract.topics):
+                recorder.write(item.topic, item.message, item.received_ns)
+                counts[item.topic] += 1
+                if counts[item.topic] % _TOLD_EVERY == 0:
+                    progress(max(counts.values()))
+            recorder.end(EpisodeEnd(summary.end_ns, summary.outcome))
+        except BaseException:
+            with suppress(RecorderError):  # what it could not write either is no news
+                recorder.close()
+            raise
+        Dataset(self._request.out).join(contract, metadata.get("robot", ""), metadata.get("robot_type", ""))
+        self._target.parent.mkdir(parents=True, exist_ok=True)
+        self._making.rename(self._target)
+        return max(counts.values(), default=0)
+
+
+def _make_recorder(request: BagRequest) -> Recorder:
+    # A stepped clock makes it write at once, and equal datasets give equal files.
+    ctx = Context("convert", SteppedClock(0), logging.getLogger("ibrobot.convert"), Robot("convert", ()))
+    recorder: Recorder = installed().find("recorder", request.type).make(request.options, ctx)
+    return recorder

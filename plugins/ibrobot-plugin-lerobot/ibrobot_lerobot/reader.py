@@ -1,0 +1,105 @@
+"""Reader `lerobot`: an episode of a dataset, as the messages that its contract would make the same rows of."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+from pathlib import Path
+from typing import Any, override
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ibrobot_core.contract.compose import Composer
+from ibrobot_core.contract.joint_units import JointUnits
+from ibrobot_core.contract.specs import Contract
+from ibrobot_core.errors import ContractError, DatasetError, RecorderError
+from ibrobot_core.interfaces import EpisodeAddress, EpisodeReader, EpisodeSummary, Feature, Recorded, TopicSummary
+from ibrobot_core.recording.convert.provenance import origin
+from ibrobot_core.units import NS_PER_S
+from ibrobot_lerobot import layout
+from ibrobot_lerobot.rows import EpisodeRows
+
+
+class LeRobotReader(EpisodeReader):
+    """Reads an episode of a dataset in LeRobot's format v3.0: at every tick one message of each topic of the contract.
+
+    Datasets of `ibrobot convert` say themselves which contract, units, robot and prompt an episode has; others are
+    told. Stamps count from when the episode was recorded; where that is not known, from the dataset's first frame.
+
+    Raises:
+        RecorderError: when it cannot be read, or the address has no number.
+        ContractError: when the dataset's features are not the contract's.
+        CalibrationError: when the unit of the joints needs a calibration that is missing.
+    """
+
+    def __init__(self, address: EpisodeAddress) -> None:
+        root = address.path
+        try:
+            dataset = layout.open_dataset(root)
+            assert dataset is not None
+            total = dataset.info["total_episodes"]
+            if address.number is None:
+                raise RecorderError(f"{root}: is a dataset of {total} episodes; name one, e.g. {root}:0")
+            self._rows = EpisodeRows(dataset, address.number)
+        except DatasetError as error:
+            raise RecorderError(str(error)) from error
+        self._path = root.with_name(f"{root.name}:{address.number}")
+        self._origin = found = origin(root, dataset.metadata, address.number, address.told)
+        self._contract = found.contract
+        _check_features(root, dataset.features, found.contract)
+        self._units = JointUnits(found.norm_mode, found.contract, found.calibration, found.document)
+        self._composer = Composer(found.contract)
+        self._step_ns = round(NS_PER_S / dataset.info["fps"])
+        start_ns = found.start_ns
+        self._start_ns = self._rows.begin * self._step_ns if start_ns is None else start_ns
+
+    @override
+    def summary(self) -> EpisodeSummary:
+        rows, found = self._rows, self._origin
+        topics = {topic: TopicSummary(type_, rows.length) for topic, type_ in sorted(self._contract.topics.items())}
+        metadata = {"prompt": "; ".join(rows.tasks), **found.metadata}
+        end_ns = self._start_ns + (rows.length - 1) * self._step_ns
+        return EpisodeSummary(self._path, True, self._start_ns, end_ns, topics, metadata, found.outcome)
+
+    @override
+    def messages(self, topics: Collection[str] | None = None) -> Iterator[Recorded]:
+        wanted = set(self._contract.topics if topics is None else topics)
+        try:
+            for row, values in enumerate(self._rows.read(self._composer.keys(wanted))):
+                stamp_ns = self._start_ns + row * self._step_ns
+                for topic, message in self._composer(self._in_radians(values), stamp_ns).items():
+                    if topic in wanted:
+                        yield Recorded(topic, message, stamp_ns, stamp_ns)
+        except DatasetError as error:
+            raise RecorderError(f"{self._path}: {error}") from error
+
+    @override
+    def close(self) -> None:
+        pass
+
+    def _in_radians(self, values: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+        """In full precision, so that the unit's own values come out again."""
+        return {
+            key: self._units.radians(key, value.astype(np.float64)) if value.ndim == 1 else value
+            for key, value in values.items()
+        }
+
+
+def _check_features(root: Path, features: Mapping[str, Feature], contract: Contract) -> None:
+    """See that what the contract has is there, in the same order."""
+    for key, wanted in contract.features().items():
+        found = features.get(key)
+        if found is None:
+            raise ContractError(
+                f"{root}: has no {key}, which the contract has; it has: {', '.join(features)}; "
+                f"the contract: {', '.join(contract.features())}"
+            )
+        named = len(wanted.shape) == 1 and len(found.names) == len(wanted.names) == found.shape[0]
+        shapes = zip(wanted.shape, found.shape, strict=False)
+        same = len(wanted.shape) == len(found.shape) and all(a in (-1, b) for a, b in shapes)
+        if not same or (named and found.names != wanted.names):
+            raise ContractError(
+                f"{root}: {key} is not what the contract says:\n"
+                f"   dataset: {found.shape} {', '.join(found.names)}\n"
+                f"  contract: {wanted.shape} {', '.join(wanted.names)}"
+            )

@@ -1,0 +1,126 @@
+"""The rows of an episode on disk: vectors and pictures from the tables, pictures from the videos, in step."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Generator, Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import av
+import av.error
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from ibrobot_core.errors import DatasetError
+from ibrobot_core.interfaces import Feature
+from ibrobot_lerobot import layout
+from ibrobot_lerobot.layout import OnDisk
+from ibrobot_lerobot.pictures import decode_picture
+
+_ROWS_AT_ONCE = 32
+
+
+class EpisodeRows:
+    """One episode of a dataset.
+
+    Args:
+        dataset: the dataset.
+        number: the episode, from 0.
+
+    Raises:
+        DatasetError: when there is no such episode.
+    """
+
+    def __init__(self, dataset: OnDisk, number: int) -> None:
+        total = dataset.info["total_episodes"]
+        found = next((row for row in dataset.episodes() if row["episode_index"] == number), None)
+        if found is None:
+            there = f"0 to {total - 1}" if total else "none"
+            raise DatasetError(f"{dataset.root}: has no episode {number}; there are: {there}")
+        self._dataset = dataset
+        self._number = number
+        self._row = found
+        self.length: int = found["length"]
+        self.tasks: list[str] = list(found["tasks"])
+        self.begin: int = found["dataset_from_index"]
+        """Frames of the dataset before it."""
+
+    def read(self, keys: Collection[str]) -> Iterator[dict[str, NDArray[Any]]]:
+        """Key -> value of each row: vectors as they are stored, shape (N,), pictures (H, W, C).
+
+        Raises:
+            DatasetError: for a file that cannot be read, or has fewer rows or pictures than the episode.
+        """
+        videos = [key for key in self._dataset.videos if key in keys]
+        features = {key: each for key, each in self._dataset.features.items() if key in keys and key not in videos}
+        pictures = {key: self._pictures(key) for key in videos}
+        rows = 0
+        try:
+            for values in self._table(features):
+                rows += 1
+                yield values | {key: next(each) for key, each in pictures.items()}
+        finally:
+            for each in pictures.values():
+                each.close()
+        if rows != self.length:
+            raise DatasetError(f"{self._dataset.root}: episode {self._number} has {rows} rows, must have {self.length}")
+
+    def _file(self, what: str, folder: str, suffix: str) -> Path:
+        number = self._row[f"{what}/chunk_index"] * layout.FILES_PER_CHUNK + self._row[f"{what}/file_index"]
+        return self._dataset.root / layout.chunk_file(folder, number, suffix)
+
+    def _table(self, features: dict[str, Feature]) -> Iterator[dict[str, NDArray[Any]]]:
+        path = self._file("data", layout.DATA, "parquet")
+        try:
+            with pq.ParquetFile(path) as file:
+                for group in range(file.num_row_groups):
+                    if self._number not in file.read_row_group(group, ["episode_index"]).column(0).to_pylist():
+                        continue
+                    columns = ["episode_index", *features]
+                    for batch in file.iter_batches(_ROWS_AT_ONCE, [group], columns):
+                        for row in batch.to_pylist():
+                            if row["episode_index"] == self._number:
+                                yield {key: _value(key, row[key], feature) for key, feature in features.items()}
+        except (OSError, pa.ArrowException) as error:
+            raise DatasetError(f"{path}: cannot be read: {error}") from error
+
+    def _pictures(self, key: str) -> Generator[NDArray[Any]]:
+        """The episode's part of a camera's video."""
+        path = self._file(f"videos/{key}", f"{layout.VIDEOS}/{key}", "mp4")
+        fps = self._dataset.info["fps"]
+        begin = round(self._row[f"videos/{key}/from_timestamp"] * fps)
+        wanted = begin
+        try:
+            with av.open(str(path)) as container, closing(_decoded(container, begin / fps)) as frames:
+                for frame in frames:
+                    number = round(float(frame.time) * fps)
+                    if number < wanted:
+                        continue
+                    if number > wanted:
+                        break
+                    yield frame.to_ndarray(format="rgb24")
+                    wanted += 1
+                    if wanted == begin + self.length:
+                        return
+        except (av.error.FFmpegError, OSError) as error:
+            raise DatasetError(f"{path}: cannot be read: {error}") from error
+        raise DatasetError(f"{path}: has no picture at {wanted / fps:.3f} s, within episode {self._number}")
+
+
+def _decoded(container: Any, begin_s: float) -> Generator[Any]:
+    """The pictures from the last key picture before `begin_s` [s] on."""
+    stream = container.streams.video[0]
+    container.seek(max(0, int(begin_s / stream.time_base)), stream=stream)
+    yield from container.decode(stream)
+
+
+def _value(key: str, stored: Any, feature: Feature) -> NDArray[Any]:
+    if len(feature.shape) == 3:
+        content = (stored or {}).get("bytes")
+        if content is None:
+            raise DatasetError(f"{key}: its pictures do not lie in the tables")
+        return decode_picture(content, feature)
+    return np.asarray(stored, np.dtype(feature.dtype)).reshape(-1)
