@@ -42,6 +42,17 @@ def test_in_lockstep_the_cube_comes_into_the_bin_again(replay: Command, picks: P
         assert max(each["max_rad"] for each in summary["replay"]["tracking"].values()) < 1e-6
 
 
+def test_an_episode_of_a_dataset_brings_the_cube_into_the_bin_too(
+    replay: Command, picks: Path, ibrobot: tuple[str, ...], tmp_path: Path
+):
+    convert = [*ibrobot, "convert", str(picks), "--out", str(tmp_path / "set"), "--norm-mode", "radians"]
+    subprocess.run(convert, capture_output=True, timeout=120, check=True)
+    done = replay("set:1", "--sim", "--lockstep", "--json")
+    assert done.returncode == 0, done.stderr
+    tracking = json.loads(done.stdout.splitlines()[-1])["replay"]["tracking"]
+    assert 1e-4 < max(each["max_rad"] for each in tracking.values()) < 0.1, "commands at 30 Hz, interpolated"
+
+
 def test_in_real_time_at_another_speed_it_ends_and_tells_the_difference(replay: Command, picks: Path):
     done = replay(picks / "episode_000001", "so101_blind", "--sim", "--speed", "2")
     assert done.returncode in (0, 3), done.stderr

@@ -43,36 +43,65 @@ class PngEncoder:
         return b"".join(bytes(packet) for packet in packets)
 
 
-_DECODERS = {b"\x89PNG": "png", b"\xff\xd8\xff": "mjpeg", b"II*\0": "tiff", b"MM\0*": "tiff"}
+_DECODERS = {b"\x89PNG": "png", b"\xff\xd8\xff": "mjpeg"}
 """First bytes of a file -> decoder."""
+_TIFF_ORDERS = {b"II*\0": "<", b"MM\0*": ">"}
+_TIFF_KINDS = {1: "B", 3: "H", 4: "I"}
+"""TIFF's number for a type of values -> that of `struct`."""
 
 
 def decode_picture(content: bytes, feature: Feature) -> NDArray[Any]:
     """The pixels of a file in a table.
 
     Args:
-        content: a PNG, JPEG or TIFF file.
+        content: a PNG, JPEG or uncompressed TIFF file.
         feature: its shape (H, W, C), and the type of its elements.
 
     Raises:
         DatasetError: when it cannot be read, or is no such picture.
     """
     codec = next((name for begin, name in _DECODERS.items() if content.startswith(begin)), None)
-    if codec is None:
-        raise DatasetError(f"a picture begins with {content[:4]!r}, which is neither PNG, JPEG nor TIFF")
-    pixels = {"image": {1: "gray", 3: "rgb24"}[feature.shape[2]], "uint16": "gray16le", "float32": "grayf32le"}
     try:
-        decoder: Any = av.CodecContext.create(codec, "r")
-        frame: Any = next(iter([*decoder.decode(av.Packet(content)), *decoder.decode(None)]), None)
-        if frame is None:
-            raise ValueError("there is none in the file")
-        array: NDArray[Any] = frame.to_ndarray(format=pixels[feature.dtype])
-    except (av.error.FFmpegError, ValueError) as error:
-        raise DatasetError(f"a picture cannot be decoded: {error}") from error
+        array = _decode_tiff(content, feature) if codec is None else _decode(content, codec, feature)
+    except (av.error.FFmpegError, ValueError, struct.error) as error:
+        raise DatasetError(f"a picture of {len(content)} bytes cannot be decoded: {error}") from error
     array = array.reshape(*array.shape[:2], -1)
     if array.shape != feature.shape:
         raise DatasetError(f"a picture has shape {array.shape}, must be {feature.shape}")
     return array
+
+
+def _decode(content: bytes, codec: str, feature: Feature) -> NDArray[Any]:
+    pixels = {"image": {1: "gray", 3: "rgb24"}[feature.shape[2]], "uint16": "gray16le"}
+    decoder: Any = av.CodecContext.create(codec, "r")
+    frame: Any = next(iter([*decoder.decode(av.Packet(content)), *decoder.decode(None)]), None)
+    if frame is None or feature.dtype not in pixels:
+        raise ValueError(f"it has no picture of {feature.dtype}")
+    array: NDArray[Any] = frame.to_ndarray(format=pixels[feature.dtype])
+    return array
+
+
+def _decode_tiff(content: bytes, feature: Feature) -> NDArray[Any]:
+    """FFmpeg's decoder knows no float32."""
+    order = _TIFF_ORDERS.get(content[:4])
+    if order is None:
+        raise ValueError(f"it begins with {content[:4]!r}, which is neither PNG, JPEG nor TIFF")
+    (begin,) = struct.unpack_from(f"{order}I", content, 4)
+    (count,) = struct.unpack_from(f"{order}H", content, begin)
+    tags: dict[int, tuple[int, ...]] = {259: (1,)}
+    for at in range(begin + 2, begin + 2 + 12 * count, 12):
+        tag, kind, number = struct.unpack_from(f"{order}HHI", content, at)
+        if kind not in _TIFF_KINDS:
+            continue
+        layout = f"{order}{number}{_TIFF_KINDS[kind]}"
+        place = at + 8 if struct.calcsize(layout) <= 4 else struct.unpack_from(f"{order}I", content, at + 8)[0]
+        tags[tag] = struct.unpack_from(layout, content, place)
+    if tags[259] != (1,) or not tags.keys() >= {256, 257, 273, 279}:
+        raise ValueError("it is compressed, or not in strips")
+    strips = b"".join(content[o : o + n] for o, n in zip(tags[273], tags[279], strict=True))
+    dtype = np.dtype(feature.dtype)
+    pixels = np.frombuffer(strips, dtype.newbyteorder("<" if order == "<" else ">")).astype(dtype)
+    return pixels.reshape(tags[257][0], tags[256][0])
 
 
 def tiff(depth: NDArray[Any]) -> bytes:
