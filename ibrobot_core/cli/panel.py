@@ -45,12 +45,23 @@ def _sensor_text(session: Session, name: str) -> str:
     return f"{name} {session.rates[name]:.1f} Hz{age}"
 
 
+def _model_text(session: Session) -> str | None:
+    """Where the model runs, unless it is in the host, and whether it answers."""
+    stats = session.engine_stats
+    if stats is None or stats.mode == "monolithic":
+        return None
+    state = f"answers in {stats.infer_ms:.0f} ms" if stats.alive else "IS GONE"
+    return f"{state} ({stats.mode}, {stats.failures} failures, {stats.restarts} restarts)"
+
+
 def plain_line(session: Session) -> str:
     """One line of status."""
     outcome, stats = session.outcome, session.stats
     pieces = [f"mode {session.mode}", f"loop {_loop_text(session)}"]
     if stats is not None:
         pieces.append(f"plan {stats.plan_length}, latency {stats.latency_ms:.0f} ms")
+    if (model := _model_text(session)) is not None:
+        pieces.append(f"model {model}")
     pieces += [_sensor_text(session, name) for name in session.rates]
     pieces.append(f"episodes {outcome.episodes}, successes {outcome.successes}")
     if outcome.faults:
@@ -76,6 +87,8 @@ def panel(session: Session, log: RecentLog, help_text: str, more: Sequence[tuple
             "plan", f"{stats.plan_length} actions, latency {stats.latency_ms:.0f} ms, "
             f"holds {stats.holds}, failures {stats.failures + stats.timeouts}",
         )  # fmt: skip
+    if (model := _model_text(session)) is not None:
+        facts.add_row("model", model)
     if session.rates:
         facts.add_row("sensors", "  ".join(_sensor_text(session, name) for name in session.rates))
     facts.add_row("episodes", f"{outcome.episodes} done, {outcome.successes} successful")

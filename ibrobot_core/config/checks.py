@@ -9,7 +9,7 @@ import attrs
 
 from ibrobot_core.config.convert import hint
 from ibrobot_core.config.keys import ModeKeys
-from ibrobot_core.config.schema import Control
+from ibrobot_core.config.schema import Control, Inference
 from ibrobot_core.config.structure import Part, Parts
 from ibrobot_core.config.yaml_nodes import Document, Key
 from ibrobot_core.descriptors import ExecutorDescriptor
@@ -138,6 +138,7 @@ class Checks:
             self._refer((*key, "teleop"), mode.teleop, self._known("teleoperation"), "teleoperation device")
         if mode.inference is not None:
             self._refer((*key, "inference", "model"), mode.inference.model, self._known("models"), "model")
+            self._execution((*key, "inference"), mode.inference)
         sources = [source for source in ("teleop", "inference", "planner") if getattr(mode, source) is not None]
         if len(sources) > 1:
             self.document.add((*key, sources[1]), f"{sources[0]} drives this mode already; make a mode for each")
@@ -145,6 +146,19 @@ class Checks:
             self._drives(key, mode, sources[0])
         if mode.dispatch is not None and mode.inference is None:
             self.document.add((*key, "dispatch"), "has a meaning only beside inference")
+
+    def _execution(self, key: Key, inference: Inference) -> None:
+        if inference.execution_mode == "distributed":
+            transport = self.document.root.get("transport")
+            if not isinstance(transport, Mapping) or transport.get("type") == "local":
+                message = (
+                    "distributed needs a transport to the server, "
+                    "e.g. transport: {type: zenoh, connect: [tcp/127.0.0.1:7447]}"
+                )
+                self.document.add((*key, "execution_mode"), message)
+        elif inference.server_model:
+            message = "has a meaning only with execution_mode: distributed"
+            self.document.add((*key, "server_model"), message)
 
     def _claims(self, key: Key, mode: ModeKeys, robot: Robot) -> None:
         owners: dict[str, str] = {}

@@ -166,7 +166,12 @@ class Inference:
     """Which model a mode runs, and where."""
 
     model: str = option(help="a name under models")
-    execution_mode: str = option("monolithic", choices=("monolithic",), help="where infer runs")
+    execution_mode: str = option(
+        "monolithic",
+        choices=("monolithic", "process", "distributed"),
+        help="where infer runs: in the host, in a process of its own, or on a server over the transport",
+    )
+    server_model: str = option("", help="what the server calls the model, where that is not its name here")
     request_timeout: float = option(5.0, unit="s", gt=0, help="after it a request has failed and the arm holds")
     prompt: str = option("", help="task for language-conditioned policies")
 

@@ -41,9 +41,10 @@ class ProcessEngine(Engine):
         config: the robot YAML.
         model: the model's name there.
         seed: the run's.
+        given_up: set when nobody waits for it any more, e.g. while it loads.
     """
 
-    def __init__(self, config: RobotConfig, model: str, seed: int = 0) -> None:
+    def __init__(self, config: RobotConfig, model: str, seed: int = 0, given_up: threading.Event | None = None) -> None:
         super().__init__("process")
         self._order = {
             "document": config.document, "source": str(config.source), "sim": config.simulated, "model": model,
@@ -53,6 +54,7 @@ class ProcessEngine(Engine):
         self._robot = config.robot.name
         self._lock = threading.Lock()
         self._closed = threading.Event()
+        self._given_up = given_up or self._closed
         self._process: subprocess.Popen[bytes] | None = None
         self._failure = ""
         self._deaths = 0
@@ -152,7 +154,7 @@ class ProcessEngine(Engine):
                     continue
             except (EOFError, OSError):
                 raise self._died() from None
-            if self._closed.is_set():
+            if self._closed.is_set() or self._given_up.is_set():
                 raise PolicyError("the model was closed")
             if time.monotonic() >= deadline_s:
                 state = "did not answer" if self.stats.alive else "is still loading"

@@ -17,6 +17,7 @@ from ibrobot_core.launch.builders.simulation import SimulatedEpisodes
 from ibrobot_core.launch.builders.status import Status
 from ibrobot_core.launch.builders.teleop import TeleopFeeder
 from ibrobot_core.launch.builders.transforms import Transforms
+from ibrobot_core.launch.builders.transport import TransportLink
 from ibrobot_core.launch.builders.viewer import ViewerWorker
 from ibrobot_core.launch.component import Component
 from ibrobot_core.launch.episodes import Episodes
@@ -64,7 +65,7 @@ def mode_parts(session: Session, name: str, sensors: tuple[str, ...]) -> ModePar
     if session.request.replay is not None and name == REPLAY:
         return ModeParts((), ReplayFeeder(session, mode, session.request.replay, (CONTROL,)))
     if mode.inference is not None:
-        model = Model(session, mode.inference.model)
+        model = Model(session, mode.inference)
         return ModeParts((model,), InferenceFeeder(session, mode, mode.inference, model, needs))
     if mode.teleop is not None:
         return ModeParts((), TeleopFeeder(session, mode, mode.teleop, (CONTROL,)))
@@ -80,11 +81,18 @@ def build_plan(session: Session) -> LaunchPlan:
         NotSupported: for a transport that would not be used.
     """
     config = session.config
-    if config.transport is not None and config.transport.type != "local":
-        raise NotSupported(f"transport: {config.transport.type}: a run shares its topics within one process; use local")
+    modes = config.control_modes.values()
+    distributed = any(mode.inference and mode.inference.execution_mode == "distributed" for mode in modes)
+    if config.transport is not None and config.transport.type != "local" and not distributed:
+        raise NotSupported(
+            f"transport: {config.transport.type}: nothing would use it; a model does with execution_mode: distributed"
+        )
     names = tuple(f"sensor:{name}" for name in config.peripherals)
     parts = mode_parts(session, session.mode, names)
-    components: list[Component] = [*parts.models]
+    components: list[Component] = []
+    if config.transport is not None and distributed:
+        components.append(TransportLink(session, config.transport))
+    components += parts.models
     components.append(Control(session, tuple(model.name for model in parts.models)))
     components += [SensorWorker(session, p, (CONTROL,)) for p in config.peripherals.values()]
     recording = Recording(session, config.recording) if config.recording is not None else None

@@ -16,7 +16,7 @@ from ibrobot_core.clock import Clock, RealClock, SteppedClock
 from ibrobot_core.config import RobotConfig
 from ibrobot_core.control.link import ControlState, PlanRecord
 from ibrobot_core.errors import ComponentFailed
-from ibrobot_core.interfaces import Context, JointReading
+from ibrobot_core.interfaces import Context, JointReading, Transport
 from ibrobot_core.plugins import Registry
 from ibrobot_core.robot import Vector
 from ibrobot_core.units import ns
@@ -24,6 +24,7 @@ from ibrobot_core.units import ns
 if TYPE_CHECKING:
     from ibrobot_core.control.host import ControlHost
     from ibrobot_core.dispatch.dispatcher import DispatchStats
+    from ibrobot_core.inference.engine import EngineStats
     from ibrobot_core.launch.builders.replay import Replay
 
 
@@ -101,6 +102,7 @@ class Session:
         self.feeder: Feed | None = None
         self.state: ControlState | None = None
         self.stats: DispatchStats | None = None
+        self.engine_stats: EngineStats | None = None
         self.rates: dict[str, float] = {}
         """Measured rate of each sensor [Hz]."""
         self.ages: dict[str, float] = {}
@@ -110,6 +112,7 @@ class Session:
         """Set when the run should stop."""
         self.log = logging.getLogger("ibrobot")
         self._control: ControlHost | None = None
+        self._transport: Transport | None = None
         self._commanding = threading.Lock()
 
     @property
@@ -131,6 +134,21 @@ class Session:
     def has_control(self) -> bool:
         """Whether control was made."""
         return self._control is not None
+
+    @property
+    def transport(self) -> Transport:
+        """The way to other machines.
+
+        Raises:
+            ComponentFailed: before it was opened.
+        """
+        if self._transport is None:
+            raise ComponentFailed("the transport is not there yet")
+        return self._transport
+
+    @transport.setter
+    def transport(self, transport: Transport) -> None:
+        self._transport = transport
 
     def context(self, name: str, *, seed: int | None = None) -> Context:
         """The context for a plugin's `make` in the host."""

@@ -189,7 +189,8 @@ CASES = {
     "execution_mode": (
         "{model: net}",
         "{model: net, execution_mode: cloud}",
-        "robot.yaml:26: control_modes.policy.inference.execution_mode: 'cloud' is not one of: monolithic",
+        "robot.yaml:26: control_modes.policy.inference.execution_mode: 'cloud' is not one of: "
+        "monolithic, process, distributed",
     ),
     "default_mode": (
         "default_control_mode: teleop",

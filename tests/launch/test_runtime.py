@@ -259,7 +259,7 @@ def test_a_goal_that_cannot_be_meant_is_refused_before_anything_starts(runs: Run
 def test_a_transport_that_a_run_does_not_use_is_refused(runs: Runs):
     session = runs.make().session
     shared = Component(type="shared", options=NoOptions())
-    with pytest.raises(NotSupported, match="transport: shared: a run shares its topics within one process; use local"):
+    with pytest.raises(NotSupported, match="transport: shared: nothing would use it"):
         Runtime(Session(attrs.evolve(session.config, transport=shared), session.registry, session.request))
     runs.make("transport={type: local}")
 

@@ -12,8 +12,12 @@ from ibrobot_core.contract.specs import Contract
 from ibrobot_core.dispatch.dispatcher import Dispatcher, check_strategy
 from ibrobot_core.errors import ContractError
 from ibrobot_core.inference.client import EngineClient, InferenceClient, LockstepClient
+from ibrobot_core.inference.engine import Engine, LocalEngine
 from ibrobot_core.inference.policy_units import PolicyInItsUnits
+from ibrobot_core.inference.process import ProcessEngine
+from ibrobot_core.inference.remote import RemoteEngine
 from ibrobot_core.interfaces import Policy
+from ibrobot_core.launch.builders.transport import NAME as TRANSPORT
 from ibrobot_core.launch.component import Component
 from ibrobot_core.launch.feeder import Feeder
 from ibrobot_core.launch.session import Session
@@ -24,21 +28,32 @@ TOGGLE_SMOOTHING = "/action_dispatcher/toggle_smoothing"
 
 
 class Model(Component):
-    """Loads a policy and compares it with the contract, before anything is powered."""
+    """Makes a policy, compares it with the contract, and has it loaded where it runs, before anything is powered."""
 
-    def __init__(self, session: Session, name: str) -> None:
-        model = session.config.models[name]
-        super().__init__(f"model:{name}", f"policy {model.type}")
+    def __init__(self, session: Session, inference: Inference) -> None:
+        model = session.config.models[inference.model]
+        distributed = inference.execution_mode == "distributed"
+        where = {"monolithic": "", "process": ", in a process of its own", "distributed": ", on a server"}
+        summary = f"policy {model.type}{where[inference.execution_mode]}"
+        super().__init__(f"model:{model.name}", summary, (TRANSPORT,) if distributed else ())
         self._session = session
+        self._inference = inference
         self._model = model
         self.contract = Contract.from_config(session.config, model.extra_observations)
         self._policy: Policy | None = None
+        self._engine: Engine | None = None
 
     @property
     def policy(self) -> Policy:
-        """The policy, loaded."""
+        """The policy; loaded where its `infer` runs here."""
         assert self._policy is not None
         return self._policy
+
+    @property
+    def engine(self) -> Engine:
+        """Where its `infer` runs, ready."""
+        assert self._engine is not None
+        return self._engine
 
     @override
     def start(self) -> None:
@@ -58,8 +73,22 @@ class Model(Component):
                     raise ContractError(f"{session.config.source}: control_modes.{mode.name}.{error}") from None
         if model.norm_mode != "radians":
             policy = PolicyInItsUnits(policy, self._units())
-        policy.load()
         self._policy = policy
+        self._engine = self._made_engine(policy)
+        self._engine.start()
+
+    def _made_engine(self, policy: Policy) -> Engine:
+        session, inference = self._session, self._inference
+        match inference.execution_mode:
+            case "process":
+                return ProcessEngine(session.config, inference.model, session.request.seed, session.finished)
+            case "distributed":
+                return RemoteEngine(
+                    policy, session.transport, inference.server_model or inference.model, session.config.robot.name,
+                    start_timeout_s=inference.request_timeout,
+                )  # fmt: skip
+            case _:
+                return LocalEngine(policy)
 
     def _units(self) -> JointUnits:
         config, name = self._session.config, self._model.calibration
@@ -69,6 +98,9 @@ class Model(Component):
 
     @override
     def stop(self) -> None:
+        if self._engine is not None:
+            self._engine.close()
+            self._engine = None
         if self._policy is not None:
             self._policy.close()
             self._policy = None
@@ -95,11 +127,13 @@ class InferenceFeeder(Feeder):
 
     @override
     def setup(self) -> None:
-        policy, contract = self._model.policy, self._model.contract
-        self._client = LockstepClient(policy) if self.session.request.lockstep else EngineClient(policy)
+        policy, engine, contract = self._model.policy, self._model.engine, self._model.contract
+        timeout_s = self._inference.request_timeout
+        lockstep = self.session.request.lockstep
+        self._client = LockstepClient(policy, engine) if lockstep else EngineClient(policy, engine, timeout_s)
         self._dispatcher = Dispatcher(
             contract, policy.spec, self.mode.dispatch, self.session.config.robot, self.session.bus, self._client,
-            self._send, self._inference.request_timeout, self._inference.prompt,
+            self._send, timeout_s, self._inference.prompt,
         )  # fmt: skip
         self._step_ns = contract.step_ns
 
@@ -111,6 +145,7 @@ class InferenceFeeder(Feeder):
     @override
     def begin_feeding(self, seed: int) -> None:
         self.session.stats = self.dispatcher.stats
+        self.session.engine_stats = self._model.engine.stats
         self._next_ns = self.session.bus.snapshot_ns() + self._step_ns
         self.dispatcher.begin(seed)
         self.session.bus.serve(TOGGLE_SMOOTHING, self.toggle_smoothing)
@@ -120,6 +155,7 @@ class InferenceFeeder(Feeder):
         self.session.bus.unserve(TOGGLE_SMOOTHING)
         self.dispatcher.end()
         self.session.stats = None
+        self.session.engine_stats = None
 
     @override
     def work(self, timeout_s: float) -> None:

@@ -64,6 +64,8 @@ class Status(Worker):
         groups |= {f"hardware {name}": counts for name, counts in counters.get("hardware", {}).items()}
         if session.stats is not None:
             groups["dispatch"] = attrs.asdict(session.stats)
+        if session.engine_stats is not None:
+            groups["inference"] = attrs.asdict(session.engine_stats)
         for name, rate in session.rates.items():
             age = {"age_ms": round(session.ages[name] * 1e3, 1)} if name in session.ages else {}
             groups[f"sensor {name}"] = {"rate_hz": round(rate, 2), **age}

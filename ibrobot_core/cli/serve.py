@@ -1,0 +1,187 @@
+"""`ibrobot serve`: the cloud side of `execution_mode: distributed`; loads a model and answers robots."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+from ibrobot_core.clock import RealClock
+from ibrobot_core.config import find_config, load
+from ibrobot_core.config.single import single_options
+from ibrobot_core.inference.build import build_policy
+from ibrobot_core.inference.service import InferenceService, ServiceOptions
+from ibrobot_core.interfaces import Context, Policy, Transport
+from ibrobot_core.plugins import Registry, installed
+from ibrobot_core.robot import Robot
+
+DEFAULT_LISTEN = "tcp/127.0.0.1:7447"
+_PLAIN_PERIOD_S = 10.0
+_PANEL_PERIOD_S = 0.5
+
+
+@click.command()
+@click.argument("what", metavar="CONFIG|MODEL_DIR")
+@click.option("--model", help="Which of the models in CONFIG; may be left out where there is one.")
+@click.option("--sim", is_flag=True, help="Read CONFIG as for a simulation: plugins of its hardware are not needed.")
+@click.option("--type", "type_", help="Plugin of the policy in MODEL_DIR, e.g. lerobot.")
+@click.option("--name", help="What robots call the model; its name in CONFIG, or the folder's.")
+@click.option(
+    "--set", "overrides", multiple=True, metavar="PATH=VALUE",
+    help="Override a key of CONFIG, e.g. control.rate_hz=50, or an option of the policy in MODEL_DIR, e.g. device=cpu.",
+)  # fmt: skip
+@click.option(
+    "--listen", multiple=True, metavar="ENDPOINT",
+    help=f"Where robots connect to, in place of the transport's connect. {DEFAULT_LISTEN} with MODEL_DIR.",
+)  # fmt: skip
+@click.option(
+    "--transport", "transport_options", multiple=True, metavar="OPTION=VALUE",
+    help="Option of the transport, e.g. users=users.txt.",
+)  # fmt: skip
+@click.option("--batch", type=click.IntRange(min=1), default=8, show_default=True, help="Most requests at a time.")
+@click.option("--queue", type=click.IntRange(min=1), default=64, show_default=True, help="Most requests that wait.")
+@click.option(
+    "--patience", type=click.FloatRange(0, 1000), default=0.0, show_default=True, metavar="MS",
+    help="How long a batch that is not full waits for more requests.",
+)  # fmt: skip
+@click.option(
+    "--drain", type=click.FloatRange(min=0), default=10.0, show_default=True, metavar="S",
+    help="At the end, how long to wait for requests that are there.",
+)  # fmt: skip
+def serve(what: str, **options: Any) -> None:
+    """Run a model for robots elsewhere.
+
+    CONFIG is a robot YAML, whose model and transport are used; MODEL_DIR is a folder with a model, for --type.
+    Robots reach it by `execution_mode: distributed`. Ctrl-C or SIGTERM answers what is there, then ends.
+    """
+    registry = installed()
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(logging.Formatter("%(levelname).1s %(message)s"))
+    logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
+    logging.getLogger("ibrobot").setLevel(logging.INFO)
+    stopping = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stopping.set())
+    name, policy, make_transport = (
+        _from_folder(Path(what), registry, options) if options["type_"] else _from_config(what, registry, options)
+    )
+    transport: Transport | None = None
+    try:
+        begun_s = time.monotonic()
+        policy.load()
+        logging.getLogger("ibrobot").info("%s loaded in %.1f s", name, time.monotonic() - begun_s)
+        transport = make_transport()
+        limits = ServiceOptions(options["batch"], options["queue"], options["patience"] / 1000)
+        service = InferenceService(policy, transport, name, limits)
+        try:
+            service.start()
+            click.echo(f"serving {name} (policy {policy.fingerprint()}); Ctrl-C ends")
+            _show(service, stopping)
+            if not service.drain(options["drain"]):
+                logging.getLogger("ibrobot").warning("requests that were there were not answered in time")
+        finally:
+            service.close()
+        click.echo(_line(service.statistics()))
+    finally:
+        if transport is not None:
+            transport.close()
+        policy.close()
+
+
+def _from_config(what: str, registry: Registry, options: dict[str, Any]) -> tuple[str, Policy, Callable[[], Transport]]:
+    """Name, policy and transport of a robot YAML."""
+    changes = [*options["overrides"]]
+    if options["listen"]:
+        changes += [
+            "transport.connect=[]",
+            f"transport.listen=[{', '.join(options['listen'])}]",
+            "transport.mode=router",
+        ]
+    changes += [f"transport.{option}" for option in options["transport_options"]]
+    path = find_config(what, registry)
+    config = load(path, overrides=changes, sim=options["sim"], registry=registry)
+    model: str = options["model"] or (next(iter(config.models)) if len(config.models) == 1 else "")
+    if model not in config.models:
+        raise click.UsageError(
+            f"--model: one of {', '.join(config.models) or 'none'} in {path}, got {options['model']}"
+        )
+    section = config.transport
+    if section is None or section.type == "local":
+        raise click.UsageError(
+            f"{path} names no transport to robots: add --set 'transport={{type: zenoh}}' --listen {DEFAULT_LISTEN}"
+        )
+
+    def make_transport() -> Transport:
+        made: Transport = registry.find("transport", section.type).make(section.options, _context(config.robot))
+        return made
+
+    return options["name"] or model, build_policy(config, registry, model), make_transport
+
+
+def _from_folder(
+    folder: Path, registry: Registry, options: dict[str, Any]
+) -> tuple[str, Policy, Callable[[], Transport]]:
+    """Name, policy and transport of a folder with a model."""
+    if not folder.is_dir():
+        raise click.UsageError(f"{folder}: no such folder; with --type it must be one with a model")
+    if options["model"]:
+        raise click.UsageError("--model chooses one of CONFIG's models; MODEL_DIR has but one, which --name names")
+    context = _context(Robot("server", ()))
+    policies = registry.find("policy", options["type_"])
+    overrides = [f"path={folder.absolute()}", *options["overrides"]]
+    policy: Policy = policies.make(single_options(policies.options, overrides, str(folder)), context)
+    transports = registry.find("transport", "zenoh")
+    listen = ", ".join(options["listen"] or (DEFAULT_LISTEN,))
+    settings = single_options(
+        transports.options, ["mode=router", f"listen=[{listen}]", *options["transport_options"]], "--transport"
+    )
+
+    def make_transport() -> Transport:
+        made: Transport = transports.make(settings, context)
+        return made
+
+    return options["name"] or folder.absolute().name, policy, make_transport
+
+
+def _context(robot: Robot) -> Context:
+    return Context("serve", RealClock(), logging.getLogger("ibrobot.serve"), robot)
+
+
+def _show(service: InferenceService, stopping: threading.Event) -> None:
+    """Tell how it goes, until it is to stop: as a table in a terminal, else as a line now and then."""
+    if not sys.stdout.isatty():
+        while not stopping.wait(_PLAIN_PERIOD_S):
+            click.echo(_line(service.statistics()))
+        return
+    from rich.live import Live
+
+    with Live(auto_refresh=False) as display:
+        while not stopping.wait(_PANEL_PERIOD_S):
+            display.update(_table(service.statistics()), refresh=True)
+
+
+def _line(statistics: dict[str, Any]) -> str:
+    return (
+        "{requests} requests, {answered} answered, {expired} expired, {malformed} malformed, {waiting} waiting | "
+        "latency p50 {latency_p50_ms:.1f} ms, p99 {latency_p99_ms:.1f} ms | ".format_map(statistics)
+        + f"{len(statistics['robots'])} robots"
+    )
+
+
+def _table(statistics: dict[str, Any]) -> Any:
+    from rich.table import Table
+
+    table = Table(title=f"{statistics['model']}: {_line(statistics)}")
+    for heading in ("robot", "requests", "answered", "expired", "failed", "p50 ms", "p99 ms"):
+        table.add_column(heading, justify="left" if heading == "robot" else "right")
+    for robot, counts in statistics["robots"].items():
+        numbers = ("requests", "answered", "expired", "failed", "latency_p50_ms", "latency_p99_ms")
+        table.add_row(robot, *(str(counts[number]) for number in numbers))
+    return table

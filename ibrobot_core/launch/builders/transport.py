@@ -1,0 +1,34 @@
+"""Transport: the run's way to other machines."""
+
+from __future__ import annotations
+
+from typing import override
+
+from ibrobot_core.config.schema import Component as Section
+from ibrobot_core.interfaces import Transport
+from ibrobot_core.launch.component import Component
+from ibrobot_core.launch.session import Session
+
+NAME = "transport"
+
+
+class TransportLink(Component):
+    """Opens the transport that the YAML names, for whatever in the run talks to other machines."""
+
+    def __init__(self, session: Session, section: Section) -> None:
+        super().__init__(NAME, f"transport {section.type}")
+        self._session = session
+        self._section = section
+        self._transport: Transport | None = None
+
+    @override
+    def start(self) -> None:
+        session, section = self._session, self._section
+        descriptor = session.registry.find("transport", section.type)
+        self._transport = session.transport = descriptor.make(section.options, session.context(NAME))
+
+    @override
+    def stop(self) -> None:
+        if self._transport is not None:
+            self._transport.close()
+            self._transport = None
