@@ -1,0 +1,247 @@
+"""Parity: a frame converted from the bag of a run is the frame that the policy saw in that run, bit by bit."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from ibrobot_mcap.options import McapOptions
+from ibrobot_mcap.recorder import McapRecorder
+from numpy.typing import NDArray
+
+from ibrobot_core.bus import Bus
+from ibrobot_core.clock import SteppedClock
+from ibrobot_core.config import find_config, load
+from ibrobot_core.config.schema import Align, ImageSpec
+from ibrobot_core.contract.frames import FrameSampler, frames
+from ibrobot_core.contract.image import encode_image
+from ibrobot_core.contract.specs import ActionPart, Contract, ObservationPart
+from ibrobot_core.interfaces import EpisodeEnd, EpisodeStart, Feature, Frame
+from ibrobot_core.launch.runtime import Runtime
+from ibrobot_core.launch.session import Request, Session
+from ibrobot_core.messages import Float64MultiArray, Header, Imu, JointState, Message, Vector3
+from ibrobot_core.plugins import installed
+from ibrobot_core.recording.convert.ticks import Ticks
+from ibrobot_core.testing.contexts import host_context
+
+pytestmark = pytest.mark.integration
+
+RUNS = 200
+START_NS = 1_700_000_000_000_000_000
+MS = 1_000_000
+JOINTS = ("pan", "lift")
+PIXELS = (6, 8)
+COMMANDS = "/commands"
+
+
+def contract(rng: np.random.Generator) -> Contract:
+    """A rate, and how each observation is aligned, by chance."""
+
+    def align(*stamps: str) -> Align:
+        strategy = str(rng.choice(["hold", "asof", "drop"]))
+        tolerance = float(rng.choice([0.0, 60.0, 150.0, 300.0])) if strategy == "asof" else None
+        return Align(strategy, str(rng.choice(stamps)), tolerance)
+
+    resize = ((4, 4), None)[rng.integers(2)]
+    return Contract(
+        float(rng.choice([7.5, 10.0, 24.0, 30.0, 50.0])),
+        (
+            ObservationPart(
+                "observation.state", "/joint_states", JointState.ros_type, ("position.lift", "position.pan"), None,
+                align("header", "receive"), Feature("float32", (2,)),
+            ),
+            ObservationPart(
+                "observation.motion", "/imu", Imu.ros_type, ("angular_velocity",), None,
+                align("header", "receive"), Feature("float32", (3,)),
+            ),
+            ObservationPart(
+                "observation.motion", "/joint_states", JointState.ros_type, ("velocity.pan",), None,
+                align("header", "receive"), Feature("float32", (1,)),
+            ),
+            ObservationPart(
+                "observation.images.top", "/top", "sensor_msgs/msg/Image", (), ImageSpec(resize),
+                align("header", "receive"), Feature("image", (*(resize or PIXELS), 3)),
+            ),
+            ObservationPart(
+                "observation.environment_state", "/scene", Float64MultiArray.ros_type, ("data",), None,
+                align("receive"), Feature("float32", (3,)),
+            ),
+        ),
+        (ActionPart("arm", COMMANDS, Float64MultiArray.ros_type, "hold", JOINTS),),
+    )  # fmt: skip
+
+
+def message(topic: str, stamp_ns: int, rng: np.random.Generator) -> Message:
+    if topic == "/joint_states":
+        return JointState(Header(stamp_ns), JOINTS, rng.normal(size=2), rng.normal(size=2))
+    if topic == "/imu":
+        return Imu(Header(stamp_ns), angular_velocity=Vector3(*rng.normal(size=3)))
+    if topic == "/top":
+        encoding = str(rng.choice(["rgb8", "bgr8", "rgba8", "mono8"]))
+        channels = {"rgba8": 4, "mono8": 1}.get(encoding, 3)
+        pixels = rng.integers(0, 256, (*PIXELS, channels), np.uint8)
+        return encode_image(pixels, encoding, Header(stamp_ns), padding=int(rng.integers(3)))
+    return Float64MultiArray(rng.normal(size=2 if topic == COMMANDS else 3))
+
+
+def publications(rng: np.random.Generator, duration_ns: int) -> list[tuple[int, str, Message]]:
+    """Time of receipt [ns], topic and message: jittered, late, out of order, twice, and not at all."""
+    found = []
+    for topic, rate in (("/joint_states", 100), ("/imu", 60), ("/top", 30), ("/scene", 20), (COMMANDS, 50)):
+        skew_ns = int(rng.choice([0, 3 * MS, -40 * MS, 5_000 * MS], p=[0.75, 0.12, 0.1, 0.03]))
+        jump = int(rng.integers(duration_ns)) if rng.random() < 0.1 else duration_ns
+        for i in range(duration_ns * rate // 10**9):
+            if rng.random() < 0.1:
+                continue
+            due_ns = round(i * 1e9 / rate)
+            late_ns = int(
+                rng.choice([0, rng.integers(5 * MS), rng.integers(80 * MS), 700 * MS], p=[0.2, 0.6, 0.18, 0.02])
+            )
+            stamp_ns = START_NS + due_ns + skew_ns - (3_000 * MS if due_ns > jump else 0)
+            made = message(topic, stamp_ns, rng)
+            found += [(START_NS + due_ns + late_ns, topic, made)] * (2 if rng.random() < 0.1 else 1)
+    return sorted(found, key=lambda publication: publication[0])
+
+
+def record(path: Path, contract: Contract, sent: list[tuple[int, str, Message]]) -> list[Frame]:
+    """Publish on a real bus, with a sampler and a recorder on it; the frames at the contract's ticks."""
+    clock = SteppedClock(sent[0][0])
+    bus = Bus(clock)
+    sampler = FrameSampler(contract, bus)
+    everything = bus.subscribe(None, 1000)
+    recorder = McapRecorder(McapOptions(), host_context(clock=clock))
+    recorder.begin(EpisodeStart(path, clock.now_ns(), contract.topics, {"contract": json.dumps(contract.canonical())}))
+    seen: list[Frame] = []
+    tick_ns = sent[0][0]
+
+    def sample_until(t_ns: int) -> None:
+        nonlocal tick_ns
+        while tick_ns <= t_ns:
+            clock.advance(tick_ns - clock.now_ns())
+            seen.append(sampler.sample(bus.snapshot_ns()))
+            tick_ns += contract.step_ns
+
+    for received_ns, topic, made in sent:
+        sample_until(received_ns - 1)
+        clock.advance(received_ns - clock.now_ns())
+        bus.publish(topic, made)
+        for item in everything.drain():
+            recorder.write(item.topic, item.message, item.received_ns)
+    sample_until(sent[-1][0])
+    recorder.end(EpisodeEnd(sent[-1][0], "success"))
+    recorder.close()
+    return seen
+
+
+def same(one: NDArray[Any], other: NDArray[Any]) -> bool:
+    return one.dtype == other.dtype and one.shape == other.shape and one.tobytes() == other.tobytes()
+
+
+def assert_equal(seen: Frame, converted: Frame) -> None:
+    assert (seen.stamp_ns, seen.missing, list(seen.values)) == (
+        converted.stamp_ns, converted.missing, list(converted.values),
+    )  # fmt: skip
+    for key, value in seen.values.items():
+        assert same(value, converted.values[key]), f"{key} at {seen.stamp_ns}"
+
+
+@pytest.mark.parametrize("block", range(10))
+def test_frames_from_the_bag_are_those_of_the_run(tmp_path: Path, block: int) -> None:
+    complete = 0
+    for seed in range(block * RUNS // 10, (block + 1) * RUNS // 10):
+        rng = np.random.default_rng(seed)
+        spec = contract(rng)
+        sent = publications(rng, 1_200 * MS)
+        seen = record(tmp_path / f"bag_{seed}", spec, sent)
+        reader = installed().open_episode(tmp_path / f"bag_{seed}")
+        messages = ((each.topic, each.message, each.received_ns) for each in reader.messages(spec.topics))
+        converted = list(frames(spec, messages, [frame.stamp_ns for frame in seen]))
+        assert len(converted) == len(seen)
+        for live, later in zip(seen, converted, strict=True):
+            assert_equal(live, later)
+        complete += check_rows(reader, spec, seen, sent)
+        reader.close()
+    assert complete > 100, "runs in which nothing is ever whole show nothing"
+
+
+def check_rows(reader: Any, spec: Contract, seen: list[Frame], sent: list[tuple[int, str, Message]]) -> int:
+    """The rows of a conversion are the frames in which nothing is missing, with the newest command beside."""
+    wanted = []
+    for frame in seen:
+        commands = [made for received, topic, made in sent if topic == COMMANDS and received <= frame.stamp_ns]
+        if commands and not frame.missing:
+            wanted.append(frame.values | {"action": np.asarray(commands[-1].data, np.float32)})  # type: ignore[attr-defined]
+    if not wanted:
+        return 0
+    rows = list(Ticks(reader, spec, "skip"))
+    assert len(rows) == len(wanted)
+    for row, frame in zip(rows, wanted, strict=True):
+        assert row.keys() == frame.keys()
+        assert all(same(row[key], frame[key]) for key in frame)
+    return len(rows)
+
+
+KEEPER = '''
+import attrs
+import numpy as np
+from ibrobot_core.descriptors import PolicyDescriptor
+from ibrobot_core.hookspecs import hookimpl
+from ibrobot_core.interfaces import Policy, PolicySpec
+
+KEPT = []
+
+
+class Keeper(Policy):
+    """Keeps every frame that it is given, and moves the arm a little."""
+
+    def __init__(self, options, ctx):
+        image = (240, 320, 3)
+        keys = {"observation.state": (6,), "observation.images.top": image, "observation.images.wrist": image}
+        self.spec = PolicySpec(keys, None, 6, 1)
+
+    def preprocess(self, frame):
+        KEPT.append(frame)
+        return {"state": frame.values["observation.state"]}
+
+    def infer(self, tensors):
+        return tensors
+
+    def postprocess(self, tensors):
+        return tensors["state"][None].astype(np.float64) + 0.02
+
+
+@hookimpl
+def ibrobot_policies():
+    yield PolicyDescriptor(type="keeper", make=Keeper, summary="keeps frames")
+'''
+
+
+def test_a_whole_run_in_simulation(site: Any, tmp_path: Path) -> None:
+    site.add("frame-keeper", KEEPER)
+    registry = installed()
+    robot = find_config("so101", registry)
+    overrides = (
+        "models={keeper: {type: keeper}}", "control_modes.model_inference.inference.model=keeper",
+        f"recording={{type: mcap, root: {tmp_path}}}",
+    )  # fmt: skip
+    config = load(robot, overrides=overrides, mode="model_inference", sim=True)
+    runtime = Runtime(Session(config, registry, Request(lockstep=True, duration_s=1.5)))
+    runtime.start()
+    try:
+        while not runtime.step():
+            pass
+    finally:
+        runtime.stop()
+    kept = sys.modules["frame_keeper"].KEPT
+    assert len(kept) > 40
+    [path] = (tmp_path / "default/episodes").iterdir()
+    spec = Contract.from_config(config)
+    reader = registry.open_episode(path)
+    messages = ((each.topic, each.message, each.received_ns) for each in reader.messages(spec.topics))
+    for live, later in zip(kept, frames(spec, messages, [frame.stamp_ns for frame in kept]), strict=True):
+        assert_equal(live, later)
+    reader.close()
