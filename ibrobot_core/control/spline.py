@@ -8,8 +8,34 @@ from numpy.typing import NDArray
 from ibrobot_core.robot import Vector
 from ibrobot_core.units import NS_PER_S
 
+_TAPS = 16
+"""How many points to each side count for a velocity; those beyond would change it by a billionth."""
+_RATIO = 3**0.5 - 2
+_KERNEL = 3 * _RATIO ** np.abs(np.arange(-_TAPS, _TAPS + 1)) / (2 * 3**0.5)
+
 Sample = tuple[Vector, Vector, Vector]
 """Position [rad], velocity [rad/s] and acceleration [rad/s^2], each shape (J,)."""
+
+
+def smooth_velocities(positions: Vector, step_s: float) -> Vector:
+    """Velocities [rad/s], shape (N, J), with which a cubic spline has continuous accelerations too.
+
+    It begins without acceleration and ends at rest.
+
+    Args:
+        positions: [rad], shape (N, J), N >= 2.
+        step_s: time from each to the next [s].
+    """
+    # m[i-1] + 4 m[i] + m[i+1] = 3 (p[i+1] - p[i-1]) for the velocities m, on positions that go on for ever, mirrored at
+    # the end and at the beginning, there with the other sign. The inverse of that is the kernel.
+    last = len(positions) - 1
+    phase = np.arange(-_TAPS - 1, last + _TAPS + 2) % (4 * last)
+    half = phase % (2 * last)
+    rows = positions[np.minimum(half, 2 * last - half)] - positions[0]
+    rows[phase >= 2 * last] *= -1.0
+    rises = rows[2:] - rows[:-2]
+    result: Vector = np.lib.stride_tricks.sliding_window_view(rises, len(_KERNEL), axis=0) @ _KERNEL / step_s
+    return result
 
 
 class Spline:

@@ -117,7 +117,7 @@ class Dispatcher:
         blends = options.joins_by == "ensemble"
         self._smoother = TemporalSmoother(
             step_ns, len(joints), coeff=options.smoothing.temporal_ensemble_coeff, enabled=blends,
-            lead_in=lead_in if holds else None,
+            lead_in=lead_in if holds else None, continues=options.joins_by == "rtc",
         )  # fmt: skip
         self._latency = LatencyEstimate()
         self._chunk_length = spec.chunk_size

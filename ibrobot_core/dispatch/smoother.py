@@ -39,16 +39,18 @@ class TemporalSmoother:
         action_size: numbers in an action, A.
         coeff: `c` in `w_k = exp(-c k)`; positive favours old predictions, negative new ones, 0 is the plain mean.
         enabled: whether chunks blend.
-        lead_in: after the plan ran dry, makes the new one go on from the last action of the old, which is held; takes
-            that, shape (A,), and the new plan, shape (M, A). None where it is not held, or may jump.
+        lead_in: leads over from the old plan, its action for the first of the new and the next, shape (2, A), to the
+            new one, shape (M, A); after it ran dry from its last, shape (1, A), which is held. None where it is not.
+        continues: whether a chunk that replaces a running plan continues it: what it misses it by is led over too.
 
     Raises:
         ValueError: for a step or a size below one, or a coefficient out of range.
     """
 
     def __init__(
-        self, step_ns: int, action_size: int, *, coeff: float = 0.01, enabled: bool = True, lead_in: Lead | None = None
-    ) -> None:
+        self, step_ns: int, action_size: int, *, coeff: float = 0.01, enabled: bool = True,
+        lead_in: Lead | None = None, continues: bool = False,
+    ) -> None:  # fmt: skip
         if step_ns < 1:
             raise ValueError(f"step_ns must be at least 1, got {step_ns}")
         if action_size < 1:
@@ -59,6 +61,7 @@ class TemporalSmoother:
         self.action_size = action_size
         self.enabled = enabled
         self._lead_in = lead_in
+        self._continues = continues
         self._ratio = math.exp(-coeff)
         self._gains = _gains(self._ratio, _FIRST_GAINS)
         self.reset()
@@ -93,7 +96,7 @@ class TemporalSmoother:
             return None
         if offset < len(self._positions):
             return self._positions[offset:]
-        last = self._positions[-1] if len(self._positions) else self._held
+        last = self._positions[-1:] if len(self._positions) else self._held
         return None if last is None or self._lead_in is None else np.tile(last, (held, 1))
 
     def trim(self, now_ns: int) -> None:
@@ -102,7 +105,7 @@ class TemporalSmoother:
         over = (now_ns - self._start_ns) // self.step_ns
         if over >= len(self._positions):
             if len(self._positions):
-                self._held = self._positions[-1]
+                self._held = self._positions[-1:]
             self._set(0, self._positions[:0], self._counts[:0])
         elif over > 0:
             self._set(self._start_ns + over * self.step_ns, self._positions[over:], self._counts[over:])
@@ -138,6 +141,8 @@ class TemporalSmoother:
         if self.enabled:
             self._blend(actions, offset)
         else:
+            if self._continues and offset < length:
+                actions = self._led(self._positions[offset : offset + 2], actions)
             counts = np.ones(offset + len(actions), dtype=np.intp)
             counts[:offset] = self._counts[:offset]
             self._set(self._start_ns, np.concatenate((self._positions[:offset], actions)), counts)
@@ -150,10 +155,15 @@ class TemporalSmoother:
         if rest <= 0:
             return 0
         plan = actions[past:].copy()
-        if not len(self._positions) and self._held is not None and self._lead_in is not None:
-            plan = self._lead_in(self._held, plan)
+        if not len(self._positions):
+            plan = self._led(self._held, plan)
+        elif self._continues:
+            plan = self._led(self._positions[:2], plan)
         self._set(start_ns + past * self.step_ns, plan, np.ones(rest, dtype=np.intp))
         return rest
+
+    def _led(self, before: Vector | None, actions: Vector) -> Vector:
+        return actions if before is None or self._lead_in is None else self._lead_in(before, actions)
 
     def _blend(self, actions: Vector, offset: int) -> None:
         """Blend `actions` into the plan from its step `offset` on; what reaches beyond its end is appended."""

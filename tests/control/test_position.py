@@ -54,18 +54,82 @@ def test_after_activation_it_holds_the_measured_position_without_growing_stale()
 
 
 @given(
-    st.lists(st.tuples(st.floats(-3, 3), st.floats(-3, 3)), min_size=1, max_size=20),
+    st.lists(st.tuples(st.floats(-3, 3), st.floats(-3, 3)), min_size=2, max_size=20),
     st.integers(1, 100 * MS),
     st.floats(0, 1),
 )
-def test_the_plan_is_interpolated_linearly(rows: list[tuple[float, float]], step_ns: int, share: float) -> None:
+def test_the_plan_is_followed_through_its_setpoints_and_never_beyond_the_limits(
+    rows: list[tuple[float, float]], step_ns: int, share: float
+) -> None:
+    positions = np.array(rows)
+    within_ns = round(share * step_ns * (len(rows) - 2))
+    for now_ns in (step_ns + within_ns, step_ns * (1 + within_ns // step_ns)):
+        executor = make(stale_timeout=10.0)
+        executor.activate(reading(0))
+        executor.set_plan(Plan(0, step_ns, positions))
+        setpoint = executor.update(reading(now_ns))
+        assert (np.abs(setpoint) <= 3.0).all()
+    np.testing.assert_allclose(setpoint, positions[now_ns // step_ns], atol=1e-8)
+
+
+def test_setpoints_at_a_limit_are_not_passed_and_those_beyond_are_reached() -> None:
     executor = make(stale_timeout=10.0)
-    executor.activate(reading(0))
-    executor.set_plan(Plan(0, step_ns, np.array(rows)))
-    now_ns = round(share * step_ns * len(rows))
-    times = np.arange(len(rows)) * step_ns
-    expected = [np.interp(now_ns, times, np.array(rows)[:, joint]) for joint in range(2)]
-    np.testing.assert_allclose(executor.update(reading(now_ns)), expected, atol=1e-12)
+    executor.activate(reading(0, 2.0, 2.0))
+    rows = ((2.0, 2.0), (3.0, 2.5), (3.0, 3.0), (2.0, 3.2), (1.0, 1.0))
+    executor.set_plan(plan(0, 10, *rows))
+    told = follow(executor, 10, 40)
+    assert told.max(axis=0).tolist() == [3.0, 3.2]
+    assert told[20].tolist() == pytest.approx([2.0, 3.2])
+
+
+def follow(executor: PositionExecutor, begin_ms: int, end_ms: int) -> np.ndarray:
+    return np.array([at(executor, ms) for ms in range(begin_ms, end_ms)])
+
+
+def wave(first: int, last: int, offset: float = 0.0) -> np.ndarray:
+    """A sine of 4 s, a setpoint every 30 ms."""
+    phase = np.arange(first, last) * 0.03 * np.pi / 2
+    return offset + np.stack((np.sin(phase), np.cos(phase)), axis=1)
+
+
+def wave_at(ms: np.ndarray) -> np.ndarray:
+    return np.stack((np.sin(ms * np.pi / 2000), np.cos(ms * np.pi / 2000)), axis=1)
+
+
+def test_a_smooth_plan_is_followed_smoothly() -> None:
+    executor = make()
+    executor.activate(reading(0, *wave(0, 1)[0]))
+    executor.set_plan(Plan(0, 30 * MS, wave(0, 60)))
+    told = follow(executor, 30, 1500)
+    np.testing.assert_allclose(told, wave_at(np.arange(30, 1500)), atol=1e-4)
+    accelerations = np.diff(told[200:], 2, axis=0) * 1e6
+    assert np.abs(accelerations).max() < 1.01 * (np.pi / 2) ** 2, "linearly it would be 33 times that"
+
+
+def test_the_rest_of_the_same_plan_changes_nothing() -> None:
+    executor, renewed = make(), make()
+    for each in (executor, renewed):
+        each.activate(reading(0, *wave(0, 1)[0]))
+        each.set_plan(Plan(0, 30 * MS, wave(0, 60)))
+    whole, pieces = follow(executor, 0, 1200), []
+    for first in range(0, 1200, 45):
+        pieces.append(follow(renewed, first, min(first + 45, 1200)))
+        begun = (first + 44) // 30
+        renewed.set_plan(Plan(begun * 30 * MS, 30 * MS, wave(begun, 60)))
+    np.testing.assert_allclose(np.concatenate(pieces), whole, atol=2e-4)
+
+
+def test_a_plan_beside_the_old_one_is_joined_within_a_step_without_a_jump() -> None:
+    executor = make()
+    executor.activate(reading(0, *wave(0, 1)[0]))
+    executor.set_plan(Plan(0, 30 * MS, wave(0, 60)))
+    before = follow(executor, 0, 500)
+    executor.set_plan(Plan(480 * MS, 30 * MS, wave(16, 60, offset=0.1)))
+    after = follow(executor, 500, 600)
+    np.testing.assert_allclose(after[30:], wave_at(np.arange(530, 600)) + 0.1, atol=1e-3)
+    speeds = np.diff(np.concatenate((before[-50:], after[:40])), axis=0)
+    assert np.abs(speeds).max() < 1.5 * 0.1 / 30 + 0.002
+    assert np.abs(np.diff(speeds, axis=0)).max() < 6 * 0.1 / 30**2 + 1e-4
 
 
 def test_setpoints_are_given_exactly_at_their_times() -> None:
@@ -165,7 +229,7 @@ def test_a_bad_plan_is_refused_counted_and_the_old_one_stays(positions: Any, ste
     executor.activate(reading(0))
     executor.set_plan(plan(0, 100, (0.0, 0.0), (1.0, 1.0)))
     executor.set_plan(Plan(0, step_ns, positions))
-    assert at(executor, 50) == [0.5, 0.5]
+    assert at(executor, 100) == [1.0, 1.0]
     assert {name: count for name, count in executor.counters().items() if count} == {counter: 1}
 
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ibrobot_core.control.spline import Spline
+from ibrobot_core.control.spline import Spline, smooth_velocities
 
 MS = 1_000_000
 rows = st.tuples(st.floats(-2, 2), st.floats(-2, 2))
@@ -53,3 +53,18 @@ def test_the_velocity_and_acceleration_of_a_spline_are_its_derivatives(points: l
     for order in (0, 1):
         slope = (after[order] - before[order]) / (2e-9 * step_ns)
         np.testing.assert_allclose(here[order + 1], slope, atol=0.5, rtol=1e-3)
+
+
+@settings(deadline=None)
+@given(count=st.integers(2, 60), seed=st.integers(0, 999))
+def test_smooth_velocities_make_accelerations_continuous(count: int, seed: int) -> None:
+    """The tridiagonal system that says so, solved in full: no acceleration at the beginning, rest at the end."""
+    positions = np.random.default_rng(seed).uniform(-1, 1, (count, 2))
+    system = 4 * np.eye(count) + np.eye(count, k=1) + np.eye(count, k=-1)
+    system[0, :2], system[-1] = (2, 1), 0
+    system[-1, -1] = 1
+    right = np.zeros_like(positions)
+    right[0] = 3 * (positions[1] - positions[0])
+    right[1:-1] = 3 * (positions[2:] - positions[:-2])
+    expected = np.linalg.solve(system, right) / 0.1
+    np.testing.assert_allclose(smooth_velocities(positions, 0.1), expected, atol=1e-7)

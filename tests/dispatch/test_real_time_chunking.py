@@ -64,7 +64,8 @@ def test_a_policy_that_continues_the_plan_leaves_no_seam(make_rig: type[Rig], la
     run(rig, latencies, 60, LENGTH - 1, seed)
     assert rig.stats.holds == 0
     steps = np.abs(np.diff(setpoints(rig, 60), axis=0))
-    assert steps.max() <= STRIDE + 1e-12
+    # A request sent since the one before was overdue knows nothing of the answer to that.
+    assert steps.max() <= (2 if rig.stats.retries else 1) * STRIDE + 1e-12
     assert np.count_nonzero(steps.any(axis=1)) > 40, "and it moves"
 
 

@@ -7,31 +7,42 @@ from typing import ClassVar, override
 
 import numpy as np
 
+from ibrobot_core.control.spline import Spline, smooth_velocities
 from ibrobot_core.executor_options import PositionOptions
 from ibrobot_core.interfaces import Context, Executor, JointReading, Plan
 from ibrobot_core.robot import Vector
-from ibrobot_core.units import ns
+from ibrobot_core.units import ns, seconds
 
 
 class PositionExecutor(Executor):
-    """Interpolates linearly between the setpoints of its plan; a plan of length one is a teleop command.
+    """Goes through the setpoints of its plan with continuous acceleration; a plan of length one is a teleop command.
 
-    Before the plan's first setpoint is due it holds, and goes there over the last step before it. After the last one it
-    holds it; once that is older than `stale_timeout`, the plan is stale and `safety_behavior` applies: `hold` keeps the
-    last setpoint that was given out, `relax` asks for torque off until another plan comes.
+    Between setpoints it follows a cubic spline, never beyond the joints' limits where they are within. A plan that has
+    begun already is joined within one step, with neither a jump nor a change of speed. Before the plan's first setpoint
+    is due it holds, and goes there over the last step before it. After the last one it holds it; once that is older
+    than `stale_timeout`, the plan is stale and `safety_behavior` applies: `hold` keeps the last setpoint that was given
+    out, `relax` asks for torque off until another plan comes.
     """
 
     accepts_plans: ClassVar[bool] = True
 
     def __init__(self, options: PositionOptions, ctx: Context) -> None:
         self.joints = ctx.joints
+        columns = ctx.robot.indices(ctx.joints)
+        self._lower, self._upper = ctx.robot.lower[columns], ctx.robot.upper[columns]
         self._stale_ns = ns(options.stale_timeout)
         self._relaxes = options.safety_behavior == "relax"
         self._log = ctx.log
         self._counters = {"stale": 0, "refused_shape": 0, "refused_nonfinite": 0, "refused_step": 0}
         self._setpoint: Vector = np.full(len(self.joints), np.nan)
+        self._velocity: Vector = np.zeros(len(self.joints))
         self._stamp_ns = 0
         self._plan: Plan | None = None
+        self._curve: Spline | None = None
+        self._joining: Vector | None = None
+        """What the setpoint had to the plan when that came, and its speed, over a step, to the plan's; shape (2, J)."""
+        self._joined_at_ns = 0
+        self._lowest = self._highest = self._setpoint
         self._approach_ns = 0
         self._approach_from = self._setpoint
         self._stale = False
@@ -40,6 +51,7 @@ class PositionExecutor(Executor):
     def activate(self, measured: JointReading) -> None:
         self.deactivate()
         self._setpoint = measured.position.copy()
+        self._velocity = np.zeros(len(self.joints))
         self._stamp_ns = measured.stamp_ns
 
     @override
@@ -64,11 +76,17 @@ class PositionExecutor(Executor):
             self._plan = Plan(start_ns=plan.start_ns, step_ns=plan.step_ns, positions=positions)
             self._approach_ns = max(self._stamp_ns, plan.start_ns - plan.step_ns)
             self._approach_from = self._setpoint
+            self._curve = _curve(self._plan) if len(positions) > 1 else None
+            # A spline swings a little beyond its points.
+            self._lowest = np.minimum(self._lower, positions.min(axis=0))
+            self._highest = np.maximum(self._upper, positions.max(axis=0))
+            self._join()
             self._stale = False
 
     @override
     def update(self, measured: JointReading) -> Vector:
-        now_ns = self._stamp_ns = measured.stamp_ns
+        now_ns, before_ns, before = measured.stamp_ns, self._stamp_ns, self._setpoint
+        self._stamp_ns = now_ns
         plan = self._plan
         if plan is not None:
             last_ns = plan.start_ns + (len(plan.positions) - 1) * plan.step_ns
@@ -81,6 +99,8 @@ class PositionExecutor(Executor):
         if self.wants_relax:
             # The arm falls: whatever comes next starts from where it lies.
             self._setpoint = np.where(np.isfinite(measured.position), measured.position, self._setpoint)
+        if now_ns > before_ns:
+            self._velocity = (self._setpoint - before) / seconds(now_ns - before_ns)
         return self._setpoint.copy()
 
     @property
@@ -98,11 +118,25 @@ class PositionExecutor(Executor):
         if now_ns < plan.start_ns:
             done = max(0, now_ns - self._approach_ns) / (plan.start_ns - self._approach_ns)
             return _between(self._approach_from, plan.positions[0], done)
-        index, rest_ns = divmod(now_ns - plan.start_ns, plan.step_ns)
-        if index >= len(plan.positions) - 1:
-            index, rest_ns = len(plan.positions) - 1, 0
-        there = min(index + 1, len(plan.positions) - 1)
-        return _between(plan.positions[index], plan.positions[there], rest_ns / plan.step_ns)
+        if self._curve is None:
+            only: Vector = plan.positions[0]
+            return only
+        setpoint = np.clip(self._curve.at(now_ns)[0], self._lowest, self._highest)
+        share = (now_ns - self._joined_at_ns) / plan.step_ns
+        if self._joining is not None and share < 1.0:
+            gap, lag = self._joining
+            setpoint += (1 - share**2 * (3 - 2 * share)) * gap + share * (1 - share) ** 2 * lag
+        return setpoint
+
+    def _join(self) -> None:
+        """Keep what the setpoint that was given out has to the plan, to let it fade over a step."""
+        plan, curve = self._plan, self._curve
+        self._joining = None
+        if plan is not None and curve is not None and plan.start_ns <= self._stamp_ns:
+            position, velocity, _ = curve.at(self._stamp_ns)
+            lag = (self._velocity - velocity) * seconds(plan.step_ns)
+            self._joining = np.array((self._setpoint - np.clip(position, self._lowest, self._highest), lag))
+            self._joined_at_ns = self._stamp_ns
 
     def _refuse(self, counter: str, why: str) -> None:
         self._counters[counter] += 1
@@ -114,3 +148,8 @@ def _between(here: Vector, there: Vector, done: float) -> Vector:
     """Linear between two setpoints, `done` in 0..1."""
     result: Vector = here + done * (there - here)
     return result
+
+
+def _curve(plan: Plan) -> Spline:
+    times_ns = plan.start_ns + plan.step_ns * np.arange(len(plan.positions))
+    return Spline(times_ns, plan.positions, smooth_velocities(plan.positions, seconds(plan.step_ns)))
