@@ -359,6 +359,15 @@ class RobotStatus(Message):
     episode: int = 0
     plan_length: int = 0
     latency_ms: float = 0.0
+    strategy: str = ""
+    smoothing: bool = False
+    latency_p50_ms: float = 0.0
+    latency_p99_ms: float = 0.0
+    requests: int = 0
+    holds: int = 0
+    failures: int = 0
+    timeouts: int = 0
+    late_chunks: int = 0
 
 
 MESSAGE_TYPES: dict[str, type[Message]] = {

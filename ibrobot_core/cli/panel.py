@@ -84,8 +84,8 @@ def panel(session: Session, log: RecentLog, help_text: str, more: Sequence[tuple
     facts.add_row("loop", _loop_text(session))
     if stats is not None:
         facts.add_row(
-            "plan", f"{stats.plan_length} actions, latency {stats.latency_ms:.0f} ms, "
-            f"holds {stats.holds}, failures {stats.failures + stats.timeouts}",
+            "plan", f"{stats.plan_length} actions by {stats.strategy}, latency p50 {stats.latency_p50_ms:.0f}, "
+            f"p99 {stats.latency_p99_ms:.0f} ms, holds {stats.holds}, failures {stats.failures}",
         )  # fmt: skip
     if (model := _model_text(session)) is not None:
         facts.add_row("model", model)

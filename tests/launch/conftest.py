@@ -93,6 +93,21 @@ class Net(FakePolicy):
         super().reset(seed)
         self.seeds = (*self.seeds, seed)
 
+class Continuing(Net):
+    """Does what is planned already, and then what `Net` would."""
+    def __init__(self, ctx):
+        super().__init__(ctx)
+        self.spec = attrs.evolve(self.spec, prefix=True)
+    def preprocess(self, frame):
+        prefix = frame.values["observation.state"][:0].reshape(0, 2) if frame.prefix is None else frame.prefix
+        return {**super().preprocess(frame), "prefix": prefix}
+    def infer(self, tensors):
+        return {**super().infer(tensors), "prefix": tensors["prefix"]}
+    def postprocess(self, tensors):
+        chunk = super().postprocess(tensors)
+        chunk[:len(tensors["prefix"])] = tensors["prefix"]
+        return chunk
+
 class Lost(Net):
     def load(self):
         raise PolicyError("no such checkpoint")
@@ -116,6 +131,7 @@ def ibrobot_sensors():
 @hookimpl
 def ibrobot_policies():
     yield PolicyDescriptor("net", make(Net), "a network")
+    yield PolicyDescriptor("continuing", make(Continuing), "a network that continues the plan")
     yield PolicyDescriptor("lost", make(Lost), "a network that is not there")
 
 @hookimpl

@@ -74,6 +74,45 @@ def test_every_execution_mode_moves_alike(mode: str, runs: Runs, cloud: Inferenc
     assert runs.parts.CALLS.count("load net") == loads, "the robot's side loads no weights"
 
 
+@pytest.mark.parametrize("mode", [pytest.param("process", marks=pytest.mark.integration), "distributed"])
+def test_the_plan_to_be_continued_travels_with_the_request(mode: str, runs: Runs, site: Site):
+    def told(*overrides: str, strategy: str) -> np.ndarray:
+        dispatch = f"control_modes.policy.dispatch={{watermark: 7, strategy: {strategy}}}"
+        return motion(runs.start("models.net.type=continuing", dispatch, *overrides, episodes=2, seed=5))
+
+    site.add("shared-network", SHARED)
+    here = told(strategy="rtc")
+    assert not np.array_equal(told(strategy="replace"), here)
+    robot, network = runs.made[-1].session.config.robot, sys.modules["shared_network"].NETWORK
+    service = InferenceService(runs.parts.Continuing(host_context(robot=robot)), network, "net")
+    service.start()
+    try:
+        transport = NETWORK if mode == "distributed" else "transport={type: local}"
+        np.testing.assert_array_equal(told(MODE.format(mode), transport, strategy="rtc"), here)
+    finally:
+        service.close()
+        type(network).__mro__[1].close(network)
+
+
+def test_the_status_and_the_diagnostics_tell_how_the_plan_is_kept_filled(runs: Runs):
+    runtime = runs.start(duration_s=1.0)
+    bus = runtime.session.bus
+    received = [bus.subscribe("/robot_status", 1), bus.subscribe("/diagnostics", 1)]
+    motion(runtime)
+    status, diagnostics = (subscription.get().message for subscription in received)
+    for subscription in received:
+        subscription.close()
+    (dispatch,) = (each for each in diagnostics.status if each.name == "dispatch")
+    values = {pair.key: pair.value for pair in dispatch.values}
+    told = {
+        "plan_length", "latency_ms", "strategy", "smoothing", "latency_p50_ms", "latency_p99_ms", "requests", "holds",
+        "failures", "timeouts", "late_chunks",
+    }  # fmt: skip
+    assert {name: str(getattr(status, name)) for name in told} == {name: values[name] for name in told}
+    assert (status.strategy, status.smoothing, values["watermark"]) == ("ensemble", True, "5")
+    assert status.requests > 1
+
+
 def test_diagnostics_tell_where_the_model_is_and_whether_it_answers(runs: Runs, cloud: InferenceService):
     runtime = runs.start(MODE.format("distributed"), NETWORK, duration_s=1.0)
     diagnostics = runtime.session.bus.subscribe("/diagnostics", 1)

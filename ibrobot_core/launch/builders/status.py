@@ -13,6 +13,10 @@ from ibrobot_core.messages import DiagnosticArray, DiagnosticStatus, Header, Key
 from ibrobot_core.units import NS_PER_S
 
 _PERIOD_NS = NS_PER_S // 5
+_OF_DISPATCH = (
+    "plan_length", "latency_ms", "strategy", "smoothing", "latency_p50_ms", "latency_p99_ms", "requests", "holds",
+    "failures", "timeouts", "late_chunks",
+)  # fmt: skip
 
 
 class Status(Worker):
@@ -47,12 +51,12 @@ class Status(Worker):
 
     def _status(self, now_ns: int) -> RobotStatus:
         session, stats = self._session, self._session.stats
+        dispatch = {name: getattr(stats, name) for name in _OF_DISPATCH} if stats is not None else {}
         return RobotStatus(
             Header(now_ns), session.config.robot.name, session.mode,
             active_executors=session.config.control_modes[session.mode].executors,
             estop=session.state is not None and session.state.estop, faults=tuple(session.outcome.faults),
-            episode=session.outcome.episodes + 1, plan_length=stats.plan_length if stats else 0,
-            latency_ms=stats.latency_ms if stats else 0.0,
+            episode=session.outcome.episodes + 1, **dispatch,
         )  # fmt: skip
 
     def _diagnostics(self, now_ns: int) -> DiagnosticArray:
