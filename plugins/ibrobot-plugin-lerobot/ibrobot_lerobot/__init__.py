@@ -1,4 +1,4 @@
-"""The plugin's hooks: writer and reader of LeRobot v3 datasets, without LeRobot and torch."""
+"""The plugin's hooks: LeRobot's datasets, written and read without it and torch, and its policies."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.descriptors import DatasetDescriptor, ReaderDescriptor
+from ibrobot_core.descriptors import DatasetDescriptor, PolicyDescriptor, ReaderDescriptor
 from ibrobot_core.hookspecs import hookimpl
-from ibrobot_lerobot.options import LeRobotOptions
+from ibrobot_lerobot.options import LeRobotOptions, LeRobotPolicyOptions
 
 if TYPE_CHECKING:
-    from ibrobot_core.interfaces import Context, DatasetWriter, EpisodeAddress, EpisodeReader
+    from ibrobot_core.interfaces import Context, DatasetWriter, EpisodeAddress, EpisodeReader, Policy
 
 
 def _write(options: Any, ctx: Context) -> DatasetWriter:
@@ -30,6 +30,12 @@ def _read(address: EpisodeAddress) -> EpisodeReader:
     return LeRobotReader(address)
 
 
+def _policy(options: Any, ctx: Context) -> Policy:
+    from ibrobot_lerobot.policy import LeRobotPolicy
+
+    return LeRobotPolicy(options, ctx)
+
+
 @hookimpl
 def ibrobot_datasets() -> Iterable[DatasetDescriptor]:
     """What writes datasets that LeRobot trains on."""
@@ -42,3 +48,12 @@ def ibrobot_datasets() -> Iterable[DatasetDescriptor]:
 def ibrobot_readers() -> Iterable[ReaderDescriptor]:
     """What reads episodes of datasets."""
     yield ReaderDescriptor("lerobot", "LeRobot v3.0 datasets, as DATASET:N", _reads, _read, numbered=True)
+
+
+@hookimpl
+def ibrobot_policies() -> Iterable[PolicyDescriptor]:
+    """What runs the policies that LeRobot trains."""
+    yield PolicyDescriptor(
+        type="lerobot", options=LeRobotPolicyOptions, make=_policy,
+        summary="a checkpoint of LeRobot's: ACT, Diffusion, VQ-BeT, SmolVLA, pi0, …",
+    )  # fmt: skip

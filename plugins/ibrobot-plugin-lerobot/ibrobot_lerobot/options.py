@@ -1,6 +1,8 @@
-"""Options of the dataset writer `lerobot`; the defaults are LeRobot's own."""
+"""Options of the dataset writer and of the policy `lerobot`; the writer's defaults are LeRobot's own."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import attrs
 
@@ -26,3 +28,22 @@ class LeRobotOptions:
     threads: int = option(1, ge=1, help="threads of each encoder; equal numbers give equal bytes")
     table_file_mb: int = option(100, unit="MiB", ge=1, help="size at which a new table begins")
     video_file_mb: int = option(200, unit="MiB", ge=1, help="size at which a new video begins")
+
+
+@attrs.frozen
+class LeRobotPolicyOptions:
+    """Which checkpoint, and how it is computed."""
+
+    path: Path = option(help="folder of the checkpoint: config.json, the processors, and to load it, model.safetensors")
+    device: str = option(
+        "auto", choices=("auto", "cuda", "mps", "cpu"), help="auto: a GPU where there is one, else the CPU"
+    )
+    dtype: str = option(
+        "auto", choices=("auto", "float32", "bfloat16", "float16"),
+        help="of the arithmetic; auto: as the checkpoint has it",
+    )  # fmt: skip
+    compile: bool = option(False, help="torch.compile: a slow start, then faster")
+    threads: int | None = option(
+        None, ge=1, help="CPU threads of torch; by default one less than the cores, at least 1"
+    )
+    n_action_steps: int | None = option(None, ge=1, help="actions of a chunk that are used; by default all")

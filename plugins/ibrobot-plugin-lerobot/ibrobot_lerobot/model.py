@@ -1,0 +1,160 @@
+"""The network of a checkpoint, in torch: loaded by LeRobot, asked for chunks without keeping state between them."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from collections.abc import Sequence
+from contextlib import nullcontext, redirect_stdout
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+# Threads that wait by spinning make torch slower by a multiple where they share cores with anything; read by OpenMP
+# when it is loaded, so before torch.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies import get_policy_class
+from lerobot.policies.rtc.configuration_rtc import RTCConfig
+
+from ibrobot_core.errors import PolicyError
+from ibrobot_core.interfaces import Tensors
+from ibrobot_lerobot.checkpoint import ACTION, Checkpoint
+from ibrobot_lerobot.options import LeRobotPolicyOptions
+
+_IMAGES, _IMAGE = "observation.images", "observation.image"
+_OWN = ("seed", "task", "prefix", "delay_steps")
+"""Tensors that are not the network's own inputs."""
+
+
+class Model:
+    """A loaded network.
+
+    Args:
+        checkpoint: with its weights.
+        options: device, arithmetic, threads.
+        log: where to say what it runs on.
+
+    Raises:
+        PolicyError: when the device is not there, or LeRobot cannot load the checkpoint.
+    """
+
+    def __init__(self, checkpoint: Checkpoint, options: LeRobotPolicyOptions, log: logging.Logger) -> None:
+        self._checkpoint = checkpoint
+        self._device = torch.device(_device(options.device))
+        threads = options.threads or max(1, _cores() - 1)
+        torch.set_num_threads(threads)
+        self._policy = self._load(options)
+        self._autocast = getattr(torch, options.dtype) if options.dtype in ("bfloat16", "float16") else None
+        self._chunk = torch.compile(self._policy.predict_action_chunk) if options.compile else None
+        self._draws = False
+        """Whether it draws random numbers, so that each request needs a run with a seed of its own."""
+        log.info("%s on %s, %d threads", checkpoint.type, self._device, threads)
+
+    def warm_up(self, tensors: Tensors) -> None:
+        """Run once, and see whether the result is a chunk of actions.
+
+        Raises:
+            PolicyError: when it is not, as with a policy that plans step by step.
+        """
+        [action] = self.predict([tensors])
+        size, length = self._checkpoint.action_size, self._checkpoint.chunk_size
+        if action.ndim != 3 or action.shape[0] != 1 or action.shape[2] != size or not 1 <= action.shape[1] <= length:
+            raise PolicyError(
+                f"{self._checkpoint.path}: {self._checkpoint.type} gives actions of shape {action.shape}, "
+                f"a chunk has (1, up to {length}, {size})"
+            )
+
+    def predict(self, batch: Sequence[Tensors]) -> list[NDArray[np.float32]]:
+        """Chunks, each of shape (1, N, A), of requests whose tensors have equal names and shapes."""
+        if len(batch) > 1 and (self._draws or "prefix" in batch[0]):
+            return [self.predict([tensors])[0] for tensors in batch]
+        inputs: dict[str, Any] = {
+            name: torch.from_numpy(np.concatenate([tensors[name] for tensors in batch])).to(self._device)
+            for name in batch[0]
+            if name not in _OWN
+        }
+        devices = [self._device] if self._device.type == "cuda" else []
+        with torch.random.fork_rng(devices), torch.no_grad(), self._arithmetic():
+            torch.manual_seed(int(batch[0]["seed"][0]))
+            before = self._random_states()
+            actions = self._run(inputs, batch)
+            after = self._random_states()
+        self._draws |= any(not torch.equal(a, b) for a, b in zip(before, after, strict=True))
+        result = actions.float().numpy(force=True)
+        return [np.array(result[i : i + 1]) for i in range(len(batch))]
+
+    def _run(self, inputs: dict[str, Any], batch: Sequence[Tensors]) -> torch.Tensor:
+        policy, request = self._policy, batch[0]
+        policy.reset()
+        if "task" in request:
+            inputs["task"] = [tensors["task"].tobytes().decode() for tensors in batch]
+        self._fill_queues(inputs)
+        arguments: dict[str, Any] = {}
+        if "prefix" in request:
+            prefix = torch.from_numpy(np.array(request["prefix"])).to(self._device)
+            arguments = {"inference_delay": int(request["delay_steps"][0]), "prev_chunk_left_over": prefix}
+        actions: torch.Tensor = (self._chunk or policy.predict_action_chunk)(inputs, **arguments)
+        return actions
+
+    def _fill_queues(self, inputs: dict[str, Any]) -> None:
+        """Where LeRobot keeps the last observations in queues, put in those of the request, oldest first."""
+        queues = {key: queue for key, queue in getattr(self._policy, "_queues", {}).items() if key != ACTION}
+        cameras = [inputs[key] for key in self._policy.config.image_features if key in inputs]
+        if not queues:
+            return
+        if self._checkpoint.n_obs_steps == 1:
+            cameras = [camera.unsqueeze(1) for camera in cameras]
+        for key, queue in queues.items():
+            if key == _IMAGES:
+                seen = torch.stack(cameras, dim=-4)
+            elif key == _IMAGE:
+                seen = cameras[0]
+            else:
+                seen = inputs[key] if self._checkpoint.n_obs_steps > 1 else inputs[key].unsqueeze(1)
+            queue.extend(seen.unbind(1))
+            inputs[key] = seen[:, -1]
+
+    def _load(self, options: LeRobotPolicyOptions) -> Any:
+        path = self._checkpoint.path
+        try:
+            config = PreTrainedConfig.from_pretrained(path)
+            config.device = str(self._device)
+            if hasattr(config, "pretrained_backbone_weights"):
+                config.pretrained_backbone_weights = None  # they are in the checkpoint, and would be downloaded
+            chunked = hasattr(config, "rtc_config")
+            if chunked:
+                config.rtc_config = config.rtc_config or RTCConfig()
+            with redirect_stdout(sys.stderr):
+                policy = get_policy_class(config.type).from_pretrained(str(path), config=config, strict=True)
+            if chunked and hasattr(policy, "init_rtc_processor"):
+                policy.init_rtc_processor()
+        except Exception as error:
+            raise PolicyError(f"{path}: LeRobot cannot load it: {error}") from error
+        policy.to(self._device, torch.float32 if options.dtype == "float32" else None)
+        return policy.eval()
+
+    def _arithmetic(self) -> Any:
+        return torch.autocast(self._device.type, self._autocast) if self._autocast is not None else nullcontext()
+
+    def _random_states(self) -> list[torch.Tensor]:
+        cuda = [torch.cuda.get_rng_state(self._device)] if self._device.type == "cuda" else []
+        return [torch.get_rng_state(), *cuda]
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _device(asked: str) -> str:
+    there = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available(), "cpu": True}
+    if asked == "auto":
+        return next(name for name, found in there.items() if found)
+    if not there[asked]:
+        has = ", ".join(name for name, found in there.items() if found)
+        raise PolicyError(f"torch finds no device {asked!r} here; there is: {has}")
+    return asked

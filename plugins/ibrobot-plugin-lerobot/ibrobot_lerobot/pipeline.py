@@ -1,0 +1,61 @@
+"""LeRobot's own processors, for steps that are not standard, e.g. a tokeniser; needs LeRobot and torch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies import make_pre_post_processors
+from numpy.typing import NDArray
+
+from ibrobot_core.errors import PolicyError
+from ibrobot_lerobot.checkpoint import POSTPROCESSOR, PREPROCESSOR, Checkpoint
+
+_DEVICE = {"device_processor": {"device": "cpu"}}
+
+
+class LeRobotSteps:
+    """The saved processors, run by LeRobot on the CPU.
+
+    Raises:
+        PolicyError: when LeRobot cannot make them, e.g. for want of a tokeniser's files.
+    """
+
+    def __init__(self, checkpoint: Checkpoint) -> None:
+        overrides = {
+            file: _DEVICE if any(step.get("registry_name") == "device_processor" for step in each["steps"]) else {}
+            for file, each in checkpoint.processors.items()
+        }
+        try:
+            config = PreTrainedConfig.from_pretrained(checkpoint.path)
+            self._pre, self._post = make_pre_post_processors(
+                config, pretrained_path=str(checkpoint.path), preprocessor_overrides=overrides[PREPROCESSOR],
+                postprocessor_overrides=overrides[POSTPROCESSOR],
+            )  # fmt: skip
+        except Exception as error:
+            raise PolicyError(f"{checkpoint.path}: LeRobot cannot make its processors: {error}") from error
+
+    def preprocess(self, batch: Mapping[str, NDArray[Any]], prompt: str, robot_type: str) -> dict[str, NDArray[Any]]:
+        """A batch of one through the preprocessor: arrays in, arrays out.
+
+        Raises:
+            PolicyError: when a step gives what is no array, and so cannot travel to a model elsewhere.
+        """
+        tensors: dict[str, Any] = {key: torch.from_numpy(np.array(value)) for key, value in batch.items()}
+        found = self._pre({**tensors, "task": prompt, "robot_type": robot_type})
+        result: dict[str, NDArray[Any]] = {}
+        for key, value in found.items():
+            if isinstance(value, torch.Tensor):
+                tensor = value.float() if value.dtype == torch.bfloat16 else value
+                result[key] = np.array(tensor.numpy(force=True))
+            elif key.startswith("observation."):
+                raise PolicyError(f"the preprocessor gives {key} as {type(value).__name__}, which is no tensor")
+        return result
+
+    def postprocess(self, action: NDArray[Any]) -> NDArray[Any]:
+        """Actions, shape (1, N, A), through the postprocessor."""
+        found = self._post(torch.from_numpy(np.array(action)))
+        return np.array(found.numpy(force=True))

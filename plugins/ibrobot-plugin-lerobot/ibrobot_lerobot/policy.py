@@ -1,0 +1,174 @@
+"""Policy `lerobot`: a checkpoint of LeRobot's in three pure steps; only `load` and `infer` need torch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, override
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ibrobot_core.errors import PolicyError
+from ibrobot_core.interfaces import Context, Frame, Policy, Tensors
+from ibrobot_lerobot.checkpoint import ACTION, POSTPROCESSOR, PREPROCESSOR, check_weights, read_checkpoint
+from ibrobot_lerobot.options import LeRobotPolicyOptions
+from ibrobot_lerobot.steps import read_steps
+
+if TYPE_CHECKING:
+    from ibrobot_lerobot.model import Model
+    from ibrobot_lerobot.pipeline import LeRobotSteps
+
+SEED = "seed"
+"""What the model's noise is drawn from, shape (1,)."""
+TASK = "task"
+"""The prompt in UTF-8, shape (1, L)."""
+PREFIX = "prefix"
+"""`Frame.prefix`, normalised, shape (1, K, A)."""
+DELAY = "delay_steps"
+
+
+class LeRobotPolicy(Policy):
+    """Runs what LeRobot trained, with the processors that were saved with it.
+
+    Standard processor steps (rename, batch, device, normalise, unnormalise) are done in NumPy; where there are others,
+    LeRobot runs the processor.
+
+    Args:
+        options: which checkpoint, and how it is computed.
+        ctx: for the log, the robot's type and the seed.
+
+    Raises:
+        PolicyError: when the folder is no checkpoint, or LeRobot is needed and missing.
+    """
+
+    def __init__(self, options: LeRobotPolicyOptions, ctx: Context) -> None:
+        self._options = options
+        self._ctx = ctx
+        self._checkpoint = checkpoint = read_checkpoint(options.path)
+        self.spec = checkpoint.spec(options.n_action_steps)
+        self._pre = read_steps(checkpoint, PREPROCESSOR)
+        self._post = read_steps(checkpoint, POSTPROCESSOR)
+        others = {PREPROCESSOR: self._pre.others, POSTPROCESSOR: self._post.others}
+        if "absolute_actions_processor" in self._post.others:
+            raise PolicyError(f"{options.path}: actions relative to the state (use_relative_actions) are not known")
+        self._lerobot: LeRobotSteps | None = None
+        if any(others.values()):
+            told = "; ".join(f"{file}: {', '.join(names)}" for file, names in others.items() if names)
+            ctx.log.info("%s has steps that only LeRobot runs, so this process loads torch (%s)", options.path, told)
+            self._lerobot = _import_pipeline().LeRobotSteps(checkpoint)
+        self._model: Model | None = None
+        self._seed = ctx.seed
+
+    @override
+    def load(self) -> None:
+        check_weights(self._options.path)
+        model = _import_model().Model(self._checkpoint, self._options, self._ctx.log)
+        model.warm_up(self.preprocess(self._zeros()))
+        self._model = model
+
+    @override
+    def reset(self, seed: int) -> None:
+        self._seed = seed
+
+    @override
+    def close(self) -> None:
+        self._model = None
+
+    @override
+    def fingerprint(self) -> str:
+        return self._checkpoint.fingerprint()
+
+    @override
+    def preprocess(self, frame: Frame) -> Tensors:
+        if self.spec.prompt and not frame.prompt:
+            raise PolicyError(f"{self._checkpoint.type} wants a prompt: what is the robot to do?")
+        frames = [*frame.history[-self.spec.history :], frame] if self.spec.history else [frame]
+        # An episode's first frame stands for those before it, as in LeRobot.
+        frames = [frames[0]] * (self._checkpoint.n_obs_steps - len(frames)) + frames
+        each = [self._run_pre(self._batch(one), frame.prompt) for one in frames[:-1]]
+        tensors = self._run_pre(self._batch(frames[-1], frame.prefix), frame.prompt)
+        for name in self._checkpoint.inputs if each else ():
+            tensors[name] = np.stack([*(one[name] for one in each), tensors[name]], axis=1)
+        if frame.prefix is not None and self.spec.prefix:
+            tensors[PREFIX] = tensors.pop(ACTION)
+            tensors[DELAY] = np.array([frame.delay_steps], np.int64)
+        if self.spec.prompt:
+            tensors[TASK] = np.frombuffer(frame.prompt.encode(), np.uint8)[None]
+        tensors[SEED] = _seed(self._seed, frame.stamp_ns)
+        return tensors
+
+    @override
+    def infer(self, tensors: Tensors) -> Tensors:
+        return self.infer_batch([tensors])[0]
+
+    @override
+    def infer_batch(self, batch: Sequence[Tensors]) -> list[Tensors]:
+        if self._model is None:
+            raise PolicyError(f"{self._options.path} is not loaded: call load() first")
+        return [{ACTION: action} for action in self._model.predict(batch)]
+
+    @override
+    def postprocess(self, tensors: Tensors) -> NDArray[np.float64]:
+        action = np.asarray(tensors[ACTION])
+        if self._lerobot is not None and self._post.others:
+            action = self._lerobot.postprocess(action)
+        else:
+            action = self._post({ACTION: action})[ACTION]
+        return action[0, : self.spec.chunk_size].astype(np.float64)
+
+    def _batch(self, frame: Frame, prefix: NDArray[Any] | None = None) -> dict[str, NDArray[Any]]:
+        """A batch of one, as LeRobot makes it of an observation: images (1, C, H, W) from 0 to 1."""
+        batch: dict[str, NDArray[Any]] = {}
+        for key, shape in self.spec.observations.items():
+            if key not in frame.values:
+                raise PolicyError(f"the policy needs {key}, which the frame at {frame.stamp_ns} ns lacks")
+            value = frame.values[key]
+            if value.shape != shape:
+                raise PolicyError(f"the policy needs {key} of shape {shape}, got {value.shape}")
+            if len(shape) == 3:
+                if value.dtype != np.uint8:
+                    raise PolicyError(f"the policy needs {key} with pixels of 8 bit, got {value.dtype}")
+                value = np.ascontiguousarray(value.transpose(2, 0, 1)).astype(np.float32) / np.float32(255)
+            batch[key] = value.astype(np.float32)[None]
+        if prefix is not None and self.spec.prefix:
+            batch[ACTION] = prefix.astype(np.float32)[None]
+        return batch
+
+    def _run_pre(self, batch: Mapping[str, NDArray[Any]], prompt: str) -> dict[str, NDArray[Any]]:
+        if self._lerobot is not None and self._pre.others:
+            return self._lerobot.preprocess(batch, prompt, self._ctx.robot.robot_type)
+        return self._pre(batch)
+
+    def _zeros(self) -> Frame:
+        """A frame of the right shapes, to warm up with."""
+        values: dict[str, NDArray[np.generic]] = {
+            key: np.zeros(shape, np.uint8 if len(shape) == 3 else np.float32)
+            for key, shape in self.spec.observations.items()
+        }
+        return Frame(0, values, prompt="warm up" if self.spec.prompt else "")
+
+
+def _seed(episode: int, stamp_ns: int) -> NDArray[np.int64]:
+    """A seed for one request: of the episode's, and another one at each tick."""
+    words = np.random.SeedSequence([episode % 2**64, stamp_ns % 2**64]).generate_state(1, np.uint64)
+    return (words >> np.uint64(1)).astype(np.int64)
+
+
+def _import_pipeline() -> Any:
+    try:
+        from ibrobot_lerobot import pipeline
+    except ImportError as error:
+        raise PolicyError(_missing(error)) from error
+    return pipeline
+
+
+def _import_model() -> Any:
+    try:
+        from ibrobot_lerobot import model
+    except ImportError as error:
+        raise PolicyError(_missing(error)) from error
+    return model
+
+
+def _missing(error: ImportError) -> str:
+    return f"policies of LeRobot need LeRobot ({error}); install it with: pip install 'lerobot>=0.6.1,<0.7'"

@@ -1,0 +1,143 @@
+"""LeRobot's standard processor steps in NumPy: rename, batch, device, normalise, unnormalise; equal bit for bit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import attrs
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.numpy import load_file
+
+from ibrobot_core.errors import PolicyError
+from ibrobot_lerobot.checkpoint import ACTION, RENAME, Checkpoint
+
+type Array = NDArray[Any]
+
+_SPANS = {"MIN_MAX": ("min", "max"), "QUANTILES": ("q01", "q99"), "QUANTILE10": ("q10", "q90")}
+_STATISTICS = {"MEAN_STD": ("mean", "std"), **_SPANS}
+
+
+@attrs.frozen
+class Rename:
+    """Observations by the policy's names."""
+
+    names: Mapping[str, str]
+
+    def __call__(self, batch: Mapping[str, Array]) -> dict[str, Array]:
+        """The batch under its new names."""
+        return {self.names.get(key, key): value for key, value in batch.items()}
+
+
+@attrs.frozen(eq=False)
+class Normalise:
+    """Observations and action to what the network was trained on; or back.
+
+    Every operation is LeRobot's, in its order and in single precision, so that the bits agree.
+    """
+
+    modes: Mapping[str, str]
+    """Key -> how; only of keys with statistics."""
+    statistics: Mapping[str, tuple[Array, Array]]
+    """Key -> mean and standard deviation, or the ends of the range; float32."""
+    eps: float
+    inverse: bool
+
+    def __call__(self, batch: Mapping[str, Array]) -> dict[str, Array]:
+        """The batch with what has statistics normalised; the rest as it is."""
+        return {key: self._apply(key, value) if key in self.modes else value for key, value in batch.items()}
+
+    def _apply(self, key: str, value: Array) -> Array:
+        mode, (low, high) = self.modes[key], self.statistics[key]
+        if mode == "MEAN_STD":
+            normal: Array = value * high + low if self.inverse else (value - low) / (high + np.float32(self.eps))
+            return normal
+        span = np.where(high == low, np.float32(self.eps), high - low)
+        if not self.inverse:
+            scaled: Array = np.float32(2) * (value - low) / span - np.float32(1)
+        elif mode == "MIN_MAX":
+            scaled = (value + np.float32(1)) / np.float32(2) * span + low
+        else:
+            scaled = (value + np.float32(1)) * span / np.float32(2) + low
+        return scaled
+
+
+type Step = Rename | Normalise
+
+
+@attrs.frozen
+class Steps:
+    """A processor: what NumPy does of it, and what it cannot."""
+
+    steps: Sequence[Step]
+    others: Sequence[str]
+    """Steps that are not standard, by LeRobot's names; where there are any, LeRobot must run the whole processor."""
+
+    def __call__(self, batch: Mapping[str, Array]) -> dict[str, Array]:
+        """All steps, one after the other."""
+        result = dict(batch)
+        for step in self.steps:
+            result = step(result)
+        return result
+
+
+def read_steps(checkpoint: Checkpoint, file: str) -> Steps:
+    """The steps of a processor.
+
+    Args:
+        checkpoint: whose processor.
+        file: `PREPROCESSOR` or `POSTPROCESSOR`.
+
+    Raises:
+        PolicyError: when its statistics cannot be read.
+    """
+    steps: list[Step] = []
+    others = []
+    for entry in checkpoint.processors[file]["steps"]:
+        name, config = str(entry.get("registry_name") or entry.get("class")), entry.get("config", {})
+        if name == RENAME:
+            steps.append(Rename(config.get("rename_map", {})))
+        elif name in ("normalizer_processor", "unnormalizer_processor"):
+            steps.append(_normalise(checkpoint.path / file, entry, inverse=name.startswith("un")))
+        elif not _does_nothing(name, config):
+            others.append(name)
+    return Steps(steps, others)
+
+
+def _does_nothing(name: str, config: Mapping[str, Any]) -> bool:
+    """Whether a step changes no number here: there is one device, and a batch of one already."""
+    if name == "device_processor":
+        return config.get("float_dtype") in (None, "float32", "float")
+    return name == "to_batch_processor" or (name == "absolute_actions_processor" and not config.get("enabled"))
+
+
+def _normalise(path: Path, entry: Mapping[str, Any], *, inverse: bool) -> Normalise:
+    config, flat = entry["config"], {}
+    if "state_file" in entry:
+        try:
+            flat = load_file(path.parent / entry["state_file"])
+        except (OSError, SafetensorError) as error:
+            raise PolicyError(f"{path.parent / entry['state_file']}: cannot be read: {error}") from None
+    only = config.get("normalize_observation_keys")
+    modes, statistics = {}, {}
+    for name, feature in config["features"].items():
+        kind = feature["type"]
+        mode = config["norm_map"].get(kind, "IDENTITY")
+        key = ACTION if kind == "ACTION" else name
+        if mode == "IDENTITY" or not any(each.rpartition(".")[0] == key for each in flat):
+            continue
+        if only is not None and kind != "ACTION" and key not in only:
+            continue
+        if mode not in _STATISTICS:
+            raise PolicyError(f"{path}: {key} is normalised by {mode!r}; LeRobot 0.6 has: {', '.join(_STATISTICS)}")
+        names = [f"{key}.{statistic}" for statistic in _STATISTICS[mode]]
+        if missing := [each for each in names if each not in flat]:
+            raise PolicyError(f"{path.parent / entry['state_file']}: {mode} needs {missing[0]}, which is missing")
+        low, high = (flat[each].astype(np.float32) for each in names)
+        if kind == "VISUAL" and low.ndim == 1:
+            low, high = low.reshape(-1, 1, 1), high.reshape(-1, 1, 1)
+        modes[key], statistics[key] = mode, (low, high)
+    return Normalise(modes, statistics, float(config.get("eps", 1e-8)), inverse)

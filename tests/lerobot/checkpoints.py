@@ -1,0 +1,122 @@
+"""Small checkpoints of random weights, made and run by LeRobot itself."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
+from lerobot.policies import get_policy_class, make_pre_post_processors
+from lerobot.policies.act.configuration_act import ACTConfig
+from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
+from lerobot.policies.utils import prepare_observation_for_inference
+from lerobot.policies.vqbet.configuration_vqbet import VQBeTConfig
+from numpy.typing import NDArray
+
+from ibrobot_core.testing.contexts import ARM, GRIPPER
+
+STATE, TOP, WRIST, SCENE = (
+    "observation.state", "observation.images.top", "observation.images.wrist", "observation.environment_state",
+)  # fmt: skip
+SIZE = len(ARM + GRIPPER)
+CHUNK = 8
+
+_FEATURES = {
+    STATE: PolicyFeature(FeatureType.STATE, (SIZE,)),
+    TOP: PolicyFeature(FeatureType.VISUAL, (3, 96, 96)),
+    WRIST: PolicyFeature(FeatureType.VISUAL, (3, 96, 96)),
+    SCENE: PolicyFeature(FeatureType.ENV, (4,)),
+}
+_ACTION = {"action": PolicyFeature(FeatureType.ACTION, (SIZE,))}
+_OF_TYPE = {STATE: FeatureType.STATE, TOP: FeatureType.VISUAL, WRIST: FeatureType.VISUAL, SCENE: FeatureType.ENV}
+
+
+def _features(*keys: str) -> dict[str, Any]:
+    return {"input_features": {key: _FEATURES[key] for key in keys}, "output_features": _ACTION, "device": "cpu"}
+
+
+def act(**changes: Any) -> ACTConfig:
+    """Two cameras, state and scene."""
+    small = {"dim_model": 32, "n_heads": 2, "dim_feedforward": 32, "n_encoder_layers": 1, "n_vae_encoder_layers": 1}
+    given = _features(STATE, TOP, WRIST, SCENE) | small | {"chunk_size": CHUNK, "n_action_steps": CHUNK} | changes
+    return ACTConfig(pretrained_backbone_weights=None, **given)
+
+
+def diffusion(**changes: Any) -> DiffusionConfig:
+    """Two cameras; three observations of history, and five of sixteen actions."""
+    small = {"down_dims": (16, 32), "diffusion_step_embed_dim": 16, "spatial_softmax_num_keypoints": 4}
+    steps = {"n_obs_steps": 3, "horizon": 16, "n_action_steps": 5, "num_inference_steps": 3, "n_groups": 4}
+    given = _features(STATE, TOP, WRIST) | small | steps | changes
+    return DiffusionConfig(pretrained_backbone_weights=None, **given)
+
+
+def vqbet(**changes: Any) -> VQBeTConfig:
+    """One camera, five observations."""
+    small = {
+        "gpt_n_layer": 1, "gpt_n_head": 2, "gpt_hidden_dim": 32, "gpt_input_dim": 32, "gpt_output_dim": 32,
+        "vqvae_embedding_dim": 16, "vqvae_enc_hidden_dim": 16, "offset_loss_weight": 1.0,
+    }  # fmt: skip
+    given = _features(STATE, TOP) | small | {"crop_shape": (84, 84)} | changes
+    return VQBeTConfig(pretrained_backbone_weights=None, **given)
+
+
+CONFIGS = {"act": act, "diffusion": diffusion, "vqbet": vqbet}
+
+
+def statistics(seed: int = 0) -> dict[str, dict[str, NDArray[np.float32]]]:
+    """Of every kind that a mode of normalisation needs; one joint has not moved in the dataset."""
+    rng = np.random.default_rng(seed)
+    found = {}
+    for key, shape in {STATE: (SIZE,), TOP: (3, 1, 1), WRIST: (3, 1, 1), SCENE: (4,), "action": (SIZE,)}.items():
+        low, spread = rng.uniform(-1, 0, shape), rng.uniform(0.1, 1, shape)
+        spread.flat[1] = 0.0
+        quantiles = {"min": 0.0, "q01": 0.05, "q10": 0.2, "mean": 0.45, "q90": 0.8, "q99": 0.95, "max": 1.0}
+        each = {name: low + spread * at for name, at in quantiles.items()} | {"std": spread / 4}
+        found[key] = {name: value.astype(np.float32) for name, value in each.items()}
+    return found
+
+
+def save(config: PreTrainedConfig, path: Path) -> Path:
+    """A checkpoint of random weights, as lerobot-train saves it."""
+    torch.manual_seed(7)
+    policy = get_policy_class(config.type)(config)
+    if config.type == "vqbet":
+        policy.vqbet.action_head.vqvae_model.discretized.fill_(True)
+    policy.save_pretrained(path)
+    for processor in make_pre_post_processors(config, dataset_stats=statistics()):
+        processor.save_pretrained(path)
+    return path
+
+
+class Theirs:
+    """LeRobot alone: one observation at each control step, as its own inference loop does."""
+
+    def __init__(self, path: Path) -> None:
+        self.config = PreTrainedConfig.from_pretrained(path)
+        self.policy = get_policy_class(self.config.type).from_pretrained(str(path), config=self.config)
+        self.pre, self.post = make_pre_post_processors(self.config, pretrained_path=str(path))
+
+    def batch(self, values: Mapping[str, NDArray[Any]], prompt: str = "") -> dict[str, Any]:
+        """An observation through the preprocessor."""
+        copied = {key: np.array(value) for key, value in values.items()}
+        return self.pre(prepare_observation_for_inference(copied, torch.device("cpu"), prompt, "tester"))
+
+    def chunk(self, values: Mapping[str, NDArray[Any]], seed: int, prompt: str = "", **arguments: Any) -> NDArray[Any]:
+        """Its chunk of actions, shape (N, A)."""
+        torch.manual_seed(seed)
+        return self.post(self.policy.predict_action_chunk(self.batch(values, prompt), **arguments)).numpy()[0]
+
+    def select(self, values: Mapping[str, NDArray[Any]], seed: int) -> NDArray[Any]:
+        """Its action at this control step, shape (A,)."""
+        torch.manual_seed(seed)
+        return self.post(self.policy.select_action(self.batch(values))).numpy()[0]
+
+
+def normalised_by(mode: str, config: PreTrainedConfig) -> PreTrainedConfig:
+    """The configuration with every feature normalised by one mode."""
+    kinds = ("STATE", "VISUAL", "ENV", "ACTION")
+    config.normalization_mapping = dict.fromkeys(kinds, NormalizationMode(mode))
+    return config

@@ -1,0 +1,233 @@
+"""Policies that LeRobot trained act as they do in LeRobot alone, bit for bit on the CPU."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, override
+
+import attrs
+import numpy as np
+import pytest
+import torch
+from ibrobot_lerobot.options import LeRobotPolicyOptions
+from ibrobot_lerobot.policy import SEED, LeRobotPolicy
+from numpy.typing import NDArray
+
+from ibrobot_core.errors import PolicyError
+from ibrobot_core.interfaces import Frame, Policy
+from ibrobot_core.testing import PolicySuite
+from ibrobot_core.testing.contexts import START_NS, host_context
+
+sys.path.insert(0, str(Path(__file__).parent))
+from checkpoints import CONFIGS, STATE, TOP, WRIST, Theirs, act, diffusion, normalised_by, save
+
+pytestmark = pytest.mark.lerobot
+
+STEP = 33_333_333
+
+
+@pytest.fixture(scope="session")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    root = tmp_path_factory.mktemp("checkpoints")
+    return {name: save(config(), root / name) for name, config in CONFIGS.items()}
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    """As many for LeRobot as for us, since sums depend on it."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def make(path: Path, **options: Any) -> LeRobotPolicy:
+    return LeRobotPolicy(LeRobotPolicyOptions(path, threads=1, device="cpu", **options), host_context())
+
+
+def loaded(path: Path, **options: Any) -> LeRobotPolicy:
+    policy = make(path, **options)
+    policy.load()
+    policy.reset(3)
+    return policy
+
+
+def run(policy: Policy, frame: Frame) -> tuple[NDArray[np.float64], int]:
+    """The chunk, and the seed of its noise."""
+    tensors = policy.preprocess(frame)
+    return policy.postprocess(policy.infer(tensors)), int(tensors[SEED][0])
+
+
+def frames(policy: Policy, count: int) -> list[Frame]:
+    """Consecutive ticks, each with the history that a sampler gives it."""
+    rng = np.random.default_rng(5)
+    plain: list[Frame] = []
+    for i in range(count):
+        values = {
+            key: rng.integers(0, 256, shape, np.uint8) if len(shape) == 3 else rng.uniform(-1, 1, shape)
+            for key, shape in policy.spec.observations.items()
+        }
+        floats = {key: value if value.dtype == np.uint8 else value.astype(np.float32) for key, value in values.items()}
+        plain.append(Frame(START_NS + i * STEP, floats))
+    past = policy.spec.history
+    return [attrs.evolve(frame, history=tuple(plain[max(0, i - past) : i])) for i, frame in enumerate(plain)]
+
+
+def test_act_gives_lerobots_chunks(folders: dict[str, Path]) -> None:
+    policy, theirs = loaded(folders["act"]), Theirs(folders["act"])
+    for frame in frames(policy, 3):
+        ours, seed = run(policy, frame)
+        np.testing.assert_array_equal(ours, theirs.chunk(frame.values, seed).astype(np.float64))
+
+
+@pytest.mark.parametrize("name", ["act", "diffusion", "vqbet"])
+def test_actions_are_those_that_lerobot_selects(folders: dict[str, Path], name: str) -> None:
+    """LeRobot sees every control step and predicts when its queue is empty; we are asked at those steps alone."""
+    policy, theirs = loaded(folders[name]), Theirs(folders[name])
+    length = policy.spec.chunk_size
+    ticks = frames(policy, 2 * length + 1)
+    chunk = np.empty((0, 0))
+    for i, frame in enumerate(ticks):
+        if i % length == 0:
+            chunk, seed = run(policy, frame)
+            assert len(chunk) == length
+        selected = theirs.select(frame.values, seed)
+        np.testing.assert_array_equal(chunk[i % length], selected.astype(np.float64), err_msg=f"{name} at step {i}")
+    first, later = (run(policy, frame)[0] for frame in (ticks[0], ticks[-1]))
+    assert np.abs(first - later).max() > 1e-4, "the network answers to what it sees"
+
+
+@pytest.mark.parametrize("mode", ["IDENTITY", "MEAN_STD", "MIN_MAX", "QUANTILES", "QUANTILE10"])
+def test_processors_in_numpy_are_lerobots(tmp_path: Path, mode: str) -> None:
+    path = save(normalised_by(mode, act(dim_model=16)), tmp_path / "act")
+    policy, theirs = make(path), Theirs(path)
+    [frame] = frames(policy, 1)
+    ours, wanted = policy.preprocess(frame), theirs.batch(frame.values)
+    for key in policy.spec.observations:
+        np.testing.assert_array_equal(ours[key], wanted[key].numpy(), err_msg=key)
+        assert ours[key].dtype == np.float32
+    action = np.random.default_rng(1).normal(size=(1, 8, 6)).astype(np.float32)
+    theirs_action = theirs.post(torch.from_numpy(action)).numpy()[0]
+    np.testing.assert_array_equal(policy.postprocess({"action": action}), theirs_action.astype(np.float64))
+    changed = mode == "IDENTITY" or not np.array_equal(ours[STATE][0], frame.values[STATE])
+    assert changed, "the mode does something"
+
+
+def test_a_renamed_camera_is_asked_for_by_the_robots_name(tmp_path: Path) -> None:
+    path = save(act(), tmp_path / "act")
+    file = path / "policy_preprocessor.json"
+    file.write_text(file.read_text().replace('"rename_map": {}', f'"rename_map": {{"observation.images.x": "{TOP}"}}'))
+    policy, theirs = make(path), Theirs(path)
+    assert "observation.images.x" in policy.spec.observations
+    assert TOP not in policy.spec.observations
+    [frame] = frames(policy, 1)
+    ours, wanted = policy.preprocess(frame), theirs.batch(frame.values)
+    for key in (TOP, WRIST):
+        np.testing.assert_array_equal(ours[key], wanted[key].numpy())
+
+
+def test_noise_depends_on_the_episodes_seed_and_the_tick(folders: dict[str, Path]) -> None:
+    policy = loaded(folders["diffusion"])
+    first, second = frames(policy, 2)
+    one = run(policy, first)[0]
+    np.testing.assert_array_equal(one, run(policy, first)[0])
+    assert not np.array_equal(one, run(policy, attrs.evolve(first, stamp_ns=second.stamp_ns))[0])
+    policy.reset(4)
+    assert not np.array_equal(one, run(policy, first)[0])
+
+
+def test_inference_leaves_the_processs_random_numbers_alone(folders: dict[str, Path]) -> None:
+    policy = loaded(folders["diffusion"])
+    tensors = policy.preprocess(frames(policy, 1)[0])
+    torch.manual_seed(1)
+    wanted = torch.rand(3)
+    torch.manual_seed(1)
+    policy.infer(tensors)
+    assert torch.equal(torch.rand(3), wanted)
+
+
+def test_a_batch_of_act_is_one_run(folders: dict[str, Path]) -> None:
+    policy = loaded(folders["act"])
+    batch = [policy.preprocess(frame) for frame in frames(policy, 4)]
+    model = policy._model._policy  # type: ignore[union-attr]
+    sizes: list[int] = []
+    model.register_forward_pre_hook(lambda *_: sizes.append(0))
+    model.model.register_forward_pre_hook(lambda _, inputs: sizes.append(len(inputs[0][STATE])))
+    together = [policy.postprocess(each) for each in policy.infer_batch(batch)]
+    assert sizes == [4]
+    for chunk, tensors in zip(together, batch, strict=True):
+        np.testing.assert_allclose(chunk, policy.postprocess(policy.infer(tensors)), atol=1e-5)
+
+
+def test_fewer_actions_on_demand(folders: dict[str, Path]) -> None:
+    policy = loaded(folders["act"], n_action_steps=3)
+    [frame] = frames(policy, 1)
+    assert policy.spec.chunk_size == 3
+    np.testing.assert_array_equal(run(policy, frame)[0], run(loaded(folders["act"]), frame)[0][:3])
+
+
+def test_half_precision_is_near(folders: dict[str, Path]) -> None:
+    whole, half = loaded(folders["act"]), loaded(folders["act"], dtype="bfloat16")
+    [frame] = frames(whole, 1)
+    a, b = run(whole, frame)[0], run(half, frame)[0]
+    assert 0 < np.abs(a - b).max() < 0.1
+
+
+def test_threads_are_set(folders: dict[str, Path]) -> None:
+    policy = LeRobotPolicy(LeRobotPolicyOptions(folders["act"], threads=2, device="cpu"), host_context())
+    policy.load()
+    assert torch.get_num_threads() == 2
+
+
+def test_weights_that_can_run_code_are_refused(tmp_path: Path) -> None:
+    path = save(act(), tmp_path / "act")
+    (path / "model.safetensors").rename(path / "pytorch_model.bin")
+    with pytest.raises(PolicyError, match=r"weights in pytorch_model.bin, which can run any code"):
+        make(path).load()
+    (path / "pytorch_model.bin").unlink()
+    with pytest.raises(PolicyError, match="has no weights: model.safetensors is missing"):
+        make(path).load()
+
+
+def test_weights_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    path = save(act(), tmp_path / "act")
+    save(act(dim_model=16), tmp_path / "other")
+    (tmp_path / "other/model.safetensors").replace(path / "model.safetensors")
+    with pytest.raises(PolicyError, match="LeRobot cannot load it"):
+        make(path).load()
+
+
+class Conformance(PolicySuite):
+    """The suite, of one checkpoint."""
+
+    name: str
+
+    @pytest.fixture(autouse=True)
+    def _folders(self, folders: dict[str, Path]) -> None:
+        self.folders = folders
+
+    @override
+    def make(self, ctx):
+        return LeRobotPolicy(LeRobotPolicyOptions(self.folders[self.name], threads=1, device="cpu"), ctx)
+
+
+class TestAct(Conformance):
+    name = "act"
+
+
+class TestDiffusion(Conformance):
+    name = "diffusion"
+
+
+class TestVqbet(Conformance):
+    name = "vqbet"
+
+
+def test_a_single_observation_step_of_diffusion(tmp_path: Path) -> None:
+    path = save(diffusion(n_obs_steps=1), tmp_path / "diffusion")
+    policy, theirs = loaded(path), Theirs(path)
+    [frame] = frames(policy, 1)
+    chunk, seed = run(policy, frame)
+    np.testing.assert_array_equal(chunk[0], theirs.select(frame.values, seed).astype(np.float64))
