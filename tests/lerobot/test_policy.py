@@ -187,7 +187,7 @@ def test_weights_that_can_run_code_are_refused(tmp_path: Path) -> None:
     with pytest.raises(PolicyError, match=r"weights in pytorch_model.bin, which can run any code"):
         make(path).load()
     (path / "pytorch_model.bin").unlink()
-    with pytest.raises(PolicyError, match="has no weights: model.safetensors is missing"):
+    with pytest.raises(PolicyError, match=r"has no weights: model.safetensors is missing"):
         make(path).load()
 
 

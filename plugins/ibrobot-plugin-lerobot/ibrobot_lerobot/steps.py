@@ -136,8 +136,11 @@ def _normalise(path: Path, entry: Mapping[str, Any], *, inverse: bool) -> Normal
         names = [f"{key}.{statistic}" for statistic in _STATISTICS[mode]]
         if missing := [each for each in names if each not in flat]:
             raise PolicyError(f"{path.parent / entry['state_file']}: {mode} needs {missing[0]}, which is missing")
-        low, high = (flat[each].astype(np.float32) for each in names)
-        if kind == "VISUAL" and low.ndim == 1:
-            low, high = low.reshape(-1, 1, 1), high.reshape(-1, 1, 1)
+        low, high = (_of_channels(flat[each], kind).astype(np.float32) for each in names)
         modes[key], statistics[key] = mode, (low, high)
     return Normalise(modes, statistics, float(config.get("eps", 1e-8)), inverse)
+
+
+def _of_channels(statistic: Array, kind: str) -> Array:
+    """A camera's statistic with a number for each channel, to go with (C, H, W)."""
+    return statistic.reshape(-1, 1, 1) if kind == "VISUAL" and statistic.ndim == 1 else statistic

@@ -1,0 +1,292 @@
+"""Checkpoints read without torch: what they need, what they were trained on, and how their numbers are processed."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import attrs
+import numpy as np
+import pytest
+from ibrobot_lerobot.checkpoint import read_checkpoint
+from ibrobot_lerobot.options import LeRobotPolicyOptions
+from ibrobot_lerobot.policy import LeRobotPolicy
+from safetensors.numpy import save_file
+
+from ibrobot_core.config.schema import Align
+from ibrobot_core.contract.specs import ActionPart, Contract, ObservationPart
+from ibrobot_core.errors import PolicyError
+from ibrobot_core.interfaces import Feature, Frame
+from ibrobot_core.messages import Float64MultiArray, JointState
+from ibrobot_core.testing.contexts import ARM, GRIPPER, START_NS, host_context
+
+STATE, TOP = "observation.state", "observation.images.top"
+JOINTS = ARM + GRIPPER
+FEATURES = {
+    STATE: {"type": "STATE", "shape": [6]},
+    TOP: {"type": "VISUAL", "shape": [3, 4, 5]},
+    "action": {"type": "ACTION", "shape": [6]},
+}
+MODES = {"STATE": "MIN_MAX", "VISUAL": "MEAN_STD", "ACTION": "MEAN_STD"}
+STATISTICS = {
+    f"{STATE}.min": np.full(6, -1, np.float32),
+    f"{STATE}.max": np.array([1, 1, 1, 1, 1, -1], np.float32),
+    f"{TOP}.mean": np.array([0.5, 0.25, 0.0], np.float32).reshape(3, 1, 1),
+    f"{TOP}.std": np.array([0.5, 0.25, 1.0], np.float32),
+    "action.mean": np.arange(6, dtype=np.float32),
+    "action.std": np.full(6, 2, np.float32),
+}
+CONTRACT = Contract(
+    25.0,
+    (
+        ObservationPart(
+            STATE, "/joint_states", JointState.ros_type, tuple(f"position.{joint}" for joint in JOINTS), None, Align(),
+            Feature("float32", (6,)),
+        ),
+    ),
+    (ActionPart("arm", "/commands", Float64MultiArray.ros_type, "hold", JOINTS),),
+)  # fmt: skip
+
+
+def step(name: str, **config: Any) -> dict[str, Any]:
+    return {"registry_name": name, "config": config}
+
+
+def write(path: Path, pre: tuple[dict[str, Any], ...] = (), **config: Any) -> Path:
+    """A checkpoint without weights; `pre` goes before the standard steps."""
+    path.mkdir(parents=True)
+    features = {"input_features": {key: FEATURES[key] for key in (STATE, TOP)}, "output_features": {}}
+    features["output_features"]["action"] = FEATURES["action"]
+    given = {"type": "act", "n_obs_steps": 1, "chunk_size": 10, "n_action_steps": 10} | features | config
+    (path / "config.json").write_text(json.dumps(given))
+    normal = {"eps": 1e-8, "features": FEATURES, "norm_map": MODES}
+    standard = (step("rename_observations_processor", rename_map={}), step("to_batch_processor"))
+    device = step("device_processor", device="cuda", float_dtype=None)
+    for name, kind, steps in (
+        ("policy_preprocessor", "normalizer_processor", (*pre, *standard, device)),
+        ("policy_postprocessor", "unnormalizer_processor", (device,)),
+    ):
+        entry = step(kind, **normal) | {"state_file": f"{name}.safetensors"}
+        document = {"name": name, "steps": [*steps, entry]}
+        (path / f"{name}.json").write_text(json.dumps(document))
+        save_file(STATISTICS, path / f"{name}.safetensors")
+    return path
+
+
+def make(path: Path, **options: Any) -> LeRobotPolicy:
+    return LeRobotPolicy(LeRobotPolicyOptions(path, **options), host_context())
+
+
+def frame(value: float = 0.0, pixel: int = 0, **changes: Any) -> Frame:
+    values = {STATE: np.full(6, value, np.float32), TOP: np.full((4, 5, 3), pixel, np.uint8)}
+    return attrs.evolve(Frame(START_NS, values), **changes)
+
+
+def test_what_it_needs_and_gives(tmp_path: Path) -> None:
+    spec = make(write(tmp_path / "act")).spec
+    assert spec.observations == {STATE: (6,), TOP: (4, 5, 3)}
+    assert (spec.actions, spec.action_size, spec.chunk_size, spec.rate_hz) == (None, 6, 10, None)
+    assert (spec.prompt, spec.prefix, spec.history) == (False, False, 0)
+    assert make(tmp_path / "act", n_action_steps=4).spec.chunk_size == 4
+    spec = read_checkpoint(write(tmp_path / "diffusion", type="diffusion", n_obs_steps=2, horizon=16)).spec(None)
+    assert (spec.history, spec.chunk_size) == (1, 10)
+    spec = read_checkpoint(write(tmp_path / "pi0", type="pi0")).spec(None)
+    assert (spec.prompt, spec.prefix) == (True, True)
+
+
+def test_numbers_are_normalised_and_back(tmp_path: Path) -> None:
+    policy = make(write(tmp_path / "act"))
+    tensors = policy.preprocess(frame(0.5, 51))
+    np.testing.assert_allclose(tensors[STATE][0, :5], 0.5)
+    assert tensors[STATE][0, 5] == pytest.approx(3e8), "a range of nothing is taken as 1e-8, as in LeRobot"
+    assert tensors[TOP].shape == (1, 3, 4, 5)
+    np.testing.assert_allclose(tensors[TOP][0, :, 0, 0], [-0.6, -0.2, 0.2], atol=1e-6)
+    actions = policy.postprocess({"action": np.ones((1, 10, 6), np.float32)})
+    assert actions.dtype == np.float64
+    np.testing.assert_allclose(actions, np.tile(2 + np.arange(6), (10, 1)))
+
+
+def test_history_begins_with_the_oldest_frame_that_there_is(tmp_path: Path) -> None:
+    policy = make(write(tmp_path / "diffusion", type="diffusion", n_obs_steps=3, horizon=16))
+    past = (frame(0.1), frame(0.2), frame(0.3))
+
+    def seen(one: Frame) -> list[float]:
+        state = policy.preprocess(one)[STATE]
+        assert state.shape == (1, 3, 6)
+        return [round(float(value), 5) for value in state[0, :, 0]]
+
+    assert seen(frame(0.4)) == [0.4, 0.4, 0.4]
+    assert seen(frame(0.4, history=past[2:])) == [0.3, 0.3, 0.4]
+    assert seen(frame(0.4, history=past[1:])) == [0.2, 0.3, 0.4]
+    assert seen(frame(0.4, history=past)) == [0.2, 0.3, 0.4]
+
+
+def test_a_prompt_and_the_plan_travel_with_the_observation(tmp_path: Path) -> None:
+    policy = make(write(tmp_path / "pi0", type="pi0"))
+    with pytest.raises(PolicyError, match="pi0 wants a prompt"):
+        policy.preprocess(frame())
+    plain = policy.preprocess(frame(prompt="piştir"))
+    assert plain["task"].tobytes().decode() == "piştir"
+    assert "prefix" not in plain
+    assert "delay_steps" not in plain
+    prefix = np.arange(18.0).reshape(3, 6)
+    tensors = policy.preprocess(frame(prompt="x", prefix=prefix, delay_steps=2))
+    np.testing.assert_allclose(tensors["prefix"], (prefix[None] - np.arange(6)) / 2)
+    assert tensors["delay_steps"].tolist() == [2]
+    assert "prefix" not in make(write(tmp_path / "act")).preprocess(frame(prefix=prefix))
+
+
+def test_a_seed_for_each_tick_of_each_episode(tmp_path: Path) -> None:
+    policy = make(write(tmp_path / "act"))
+    seeds = set()
+    for episode in (0, 1, -1):
+        policy.reset(episode)
+        for stamp_ns in (0, 1):
+            [seed] = policy.preprocess(frame(stamp_ns=stamp_ns))["seed"]
+            assert seed >= 0
+            seeds.add(int(seed))
+    assert len(seeds) == 6
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({TOP: None}, "needs observation.images.top, which the frame at"),
+        ({STATE: np.zeros(7, np.float32)}, r"needs observation.state of shape \(6,\), got \(7,\)"),
+        ({TOP: np.zeros((4, 5, 3), np.uint16)}, "with pixels of 8 bit, got uint16"),
+    ],
+)
+def test_frames_that_do_not_fit(tmp_path: Path, values: dict[str, Any], message: str) -> None:
+    policy = make(write(tmp_path / "act"))
+    changed = {key: value for key, value in {**frame().values, **values}.items() if value is not None}
+    with pytest.raises(PolicyError, match=message):
+        policy.preprocess(frame(values=changed))
+
+
+def test_what_it_was_trained_on(tmp_path: Path) -> None:
+    note = {"contract": CONTRACT.canonical(), "conversion": {"norm_mode": "degrees"}}
+    beside = write(tmp_path / "beside")
+    (beside / "ibrobot.json").write_text(json.dumps(note))
+    by_dataset = write(tmp_path / "by_dataset")
+    (tmp_path / "set/meta").mkdir(parents=True)
+    (tmp_path / "set/meta/ibrobot.json").write_text(json.dumps(note))
+    (by_dataset / "train_config.json").write_text(json.dumps({"dataset": {"root": str(tmp_path / "set")}}))
+    for path in (beside, by_dataset):
+        spec = make(path).spec
+        assert (spec.actions, spec.rate_hz, spec.norm_mode) == (JOINTS, 25.0, "degrees")
+        assert spec.contract == CONTRACT.canonical()
+    (tmp_path / "set/meta/ibrobot.json").unlink()
+    assert make(by_dataset).spec.actions is None
+    (beside / "ibrobot.json").write_text('{"contract": {}}')
+    with pytest.raises(PolicyError, match=r"beside/ibrobot.json: is no meta/ibrobot.json of `ibrobot convert`'s"):
+        make(beside)
+
+
+def test_both_sides_of_a_network_agree_by_the_fingerprint(tmp_path: Path) -> None:
+    one, same = make(write(tmp_path / "one")), make(write(tmp_path / "same"))
+    assert one.fingerprint() == same.fingerprint()
+    statistics = {**STATISTICS, "action.std": np.full(6, 3, np.float32)}
+    save_file(statistics, tmp_path / "same/policy_postprocessor.safetensors")
+    assert one.fingerprint() != make(tmp_path / "same").fingerprint()
+
+
+def _empty(path: Path) -> None:
+    (path / "config.json").rename(path / "x.json")
+
+
+def _inner(path: Path) -> None:
+    _empty(path)
+    (path / "checkpoints/last/pretrained_model").mkdir(parents=True)
+
+
+def _old(path: Path) -> None:
+    (path / "policy_preprocessor.json").unlink()
+
+
+def _cut(path: Path) -> None:
+    (path / "config.json").write_text('{"type": ')
+
+
+def _no_features(path: Path) -> None:
+    (path / "config.json").write_text('{"type": "act"}')
+
+
+def _adapter(path: Path) -> None:
+    (path / "config.json").write_text('{"use_peft": true}')
+
+
+def _no_statistics(path: Path) -> None:
+    (path / "policy_preprocessor.safetensors").unlink()
+
+
+def _too_few(path: Path) -> None:
+    save_file({f"{STATE}.min": np.zeros(6, np.float32)}, path / "policy_preprocessor.safetensors")
+
+
+def _garbage(path: Path) -> None:
+    (path / "policy_preprocessor.safetensors").write_bytes(b"\xff" * 64)
+
+
+def _relative(path: Path) -> None:
+    file = path / "policy_postprocessor.json"
+    document = json.loads(file.read_text())
+    document["steps"].append(step("absolute_actions_processor", enabled=True))
+    file.write_text(json.dumps(document))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (_empty, "is no folder with a checkpoint: it has no config.json; lerobot-train writes it to"),
+        (_inner, "did you mean .*/checkpoints/last/pretrained_model"),
+        (_old, "has no policy_preprocessor.json: a checkpoint from before LeRobot 0.4"),
+        (_cut, "config.json: cannot be read"),
+        (_no_features, "config.json: is no policy's configuration of LeRobot 0.6: KeyError"),
+        (_adapter, "has an adapter only"),
+        (_no_statistics, "policy_preprocessor.safetensors: cannot be read"),
+        (_too_few, "MIN_MAX needs observation.state.max, which is missing"),
+        (_garbage, "policy_preprocessor.safetensors: cannot be read"),
+        (_relative, "actions relative to the state"),
+    ],
+)
+def test_folders_that_are_no_checkpoints(tmp_path: Path, spoil: Any, message: str) -> None:
+    path = write(tmp_path / "act")
+    spoil(path)
+    with pytest.raises(PolicyError, match=message):
+        make(path)
+
+
+def test_the_robots_side_needs_neither_torch_nor_weights(tmp_path: Path) -> None:
+    path = write(tmp_path / "act")
+    code = f"""
+import sys
+sys.modules["torch"] = sys.modules["lerobot"] = None
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+import numpy as np
+from pathlib import Path
+from test_checkpoint import frame, make
+policy = make(Path({str(path)!r}))
+policy.preprocess(frame())
+policy.postprocess({{"action": np.zeros((1, 10, 6), np.float32)}})
+try:
+    policy.infer(policy.preprocess(frame()))
+except Exception as error:
+    print(error)
+"""
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == f"{path} is not loaded: call load() first"
+
+
+def test_without_lerobot_it_is_said_how_to_install_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write(tmp_path / "act")
+    (path / "model.safetensors").touch()
+    odd = write(tmp_path / "odd", (step("tokenizer_processor"),), type="smolvla")
+    for name in ("ibrobot_lerobot.model", "ibrobot_lerobot.pipeline"):
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(PolicyError, match=r"need LeRobot .* pip install 'lerobot>=0.6.1,<0.7'"):
+        make(path).load()
+    with pytest.raises(PolicyError, match=r"need LeRobot .* pip install 'lerobot>=0.6.1,<0.7'"):
+        make(odd)
