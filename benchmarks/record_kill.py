@@ -4,8 +4,8 @@
 
 Each recording process writes joint states and commands at 100 Hz and one raw 320x240 picture at 10 Hz. Whatever was
 handed to the recorder a second or more before the kill must be found, bit by bit and in order: as the bag lies
-there, in what `ibrobot convert` makes of it, and, after `ibrobot episodes repair`, by the MCAP library's indexed reader as well.
-Exits with 1 when anything is missing, or a command fails.
+there, in what `ibrobot convert` makes of it, and, after `ibrobot episodes repair`, by the MCAP library's indexed
+reader as well. Exits with 1 when anything is missing, or a command fails.
 """
 
 from __future__ import annotations
