@@ -1,0 +1,254 @@
+"""A server killed in the middle of a request, again and again: the arm holds, and goes on once there is a server again.
+
+    python benchmarks/server_kill.py [--kills 20]
+
+A robot in real time, its model of 60 ms in `ibrobot serve`, over Zenoh on this machine. Exits with 1 when the arm moved
+longer after a kill than its plan and one stale timeout, did not go on after a restart, when a request was answered
+twice or not at all, or when threads, files or memory grew.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import os
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from importlib.metadata import distributions
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ibrobot_core.config import load
+from ibrobot_core.launch.runtime import Runtime
+from ibrobot_core.launch.session import Request, Session
+from ibrobot_core.plugins import discover
+from ibrobot_core.units import seconds
+
+PLUGIN = '''
+import time
+import attrs
+import numpy as np
+from ibrobot_core import hookimpl
+from ibrobot_core.descriptors import HardwareDescriptor, PolicyDescriptor
+from ibrobot_core.testing.fakes import FakeHardware, FakePolicy
+
+class Endless(FakeHardware):
+    def success(self):
+        return False
+
+class Sways(FakePolicy):
+    """Sways all joints; 60 ms a request, which it numbers."""
+    def __init__(self, ctx):
+        super().__init__(ctx)
+        self.spec = attrs.evolve(self.spec, chunk_size=12)
+        self.asked, self.answered = 0, []
+    def preprocess(self, frame):
+        self.asked += 1
+        times = frame.stamp_ns / 1e9 + np.arange(12) / 30
+        return {"phase": np.fmod(times, 2.0) * np.pi, "number": np.array([self.asked])}
+    def infer(self, tensors):
+        time.sleep(0.06)
+        return {"at": 0.4 * np.sin(tensors["phase"]), "number": tensors["number"]}
+    def postprocess(self, tensors):
+        self.answered.append(int(tensors["number"][0]))
+        return np.repeat(tensors["at"][:, None], self.spec.action_size, axis=1)
+
+MADE = []
+
+def make(options, ctx):
+    MADE.append(Sways(ctx))
+    return MADE[-1]
+
+@hookimpl
+def ibrobot_hardware():
+    yield HardwareDescriptor("endless", lambda options, ctx: Endless(ctx), "an arm", simulated=True)
+
+@hookimpl
+def ibrobot_policies():
+    yield PolicyDescriptor("sways", make, "sways")
+'''
+STALE_S = 0.25
+PLAN_S = 12 / 30
+SETTLE_S = 0.1
+"""Within which the safety layer brings any motion to rest."""
+ROBOT = f"""
+robot:
+  name: mini
+  joints:
+    - {{name: pan, lower: -1.0, upper: 1.0, max_velocity: 3.0, max_acceleration: 40.0}}
+    - {{name: lift, lower: -1.0, upper: 1.0, max_velocity: 3.0, max_acceleration: 40.0}}
+  groups: {{arm: [pan, lift]}}
+simulation: {{type: endless}}
+executors: {{arm_position: {{type: position, group: arm, stale_timeout: {STALE_S}}}}}
+models: {{sways: {{type: sways}}}}
+control_modes:
+  policy:
+    executors: [arm_position]
+    inference: {{model: sways, execution_mode: distributed, request_timeout: 2.0}}
+    dispatch: {{watermark: 8}}
+default_control_mode: policy
+contract:
+  rate_hz: 30
+  max_duration_s: 100000
+  observations:
+    - {{key: observation.state, topic: /joint_states, select: [position.pan, position.lift]}}
+  actions: [{{executor: arm_position, topic: /arm/commands}}]
+transport: {{type: zenoh, connect: [tcp/127.0.0.1:PORT]}}
+"""
+
+
+class Server:
+    """`ibrobot serve` in a process of its own."""
+
+    def __init__(self, folder: Path, endpoint: str) -> None:
+        ibrobot = (sys.executable, "-c", "from ibrobot_core.cli.main import main; main()")
+        command = [*ibrobot, "serve", "mini.yaml", "--listen", endpoint]
+        self._process = subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True)
+        assert self._process.stdout is not None
+        self.said = self._process.stdout.readline()
+        if "serving" not in self.said:
+            raise SystemExit(f"the server did not start: {self.said!r}")
+
+    def kill(self) -> None:
+        """As a power cut would."""
+        self._process.kill()
+        self._process.wait()
+        assert self._process.stdout is not None
+        self._process.stdout.close()
+
+
+class Motion:
+    """What the arm was told, by time."""
+
+    def __init__(self, session: Session) -> None:
+        self._commands = session.bus.subscribe("/arm/commands", 100_000)
+        self._session = session
+        self._moved_ns: list[int] = []
+        self._last: np.ndarray | None = None
+
+    def moved_ns(self) -> np.ndarray:
+        """Times at which a setpoint differed from the one before [ns]."""
+        while (received := self._commands.get(0.0)) is not None:
+            command = np.array(received.message.data)
+            if self._last is not None and np.abs(command - self._last).max() > 1e-9:
+                self._moved_ns.append(received.received_ns)
+            self._last = command
+        return np.array(self._moved_ns)
+
+
+def until(condition: Any, timeout_s: float, what: str) -> None:
+    """Wait for `condition`."""
+    deadline_s = time.monotonic() + timeout_s
+    while not condition():
+        if time.monotonic() > deadline_s:
+            raise SystemExit(f"it did not happen within {timeout_s} s: {what}")
+        time.sleep(0.001)
+
+
+def kill_once(
+    server: Server, folder: Path, endpoint: str, session: Session, motion: Motion
+) -> tuple[Server, float, float]:
+    """Kill the server in the middle of a request; seconds until the arm held, and from the restart until it moved."""
+    stats = session.stats
+    assert stats is not None
+    chunks = stats.chunks
+    until(lambda: stats.chunks > chunks, 10, "a chunk")
+    until(lambda: stats.requests > stats.chunks + stats.failures + stats.timeouts, 10, "a request in flight")
+    time.sleep(0.02)
+    killed_ns = session.clock.now_ns()
+    server.kill()
+    time.sleep(PLAN_S + STALE_S + 3 * SETTLE_S)
+    held_ns = motion.moved_ns()[-1]
+    server = Server(folder, endpoint)
+    served_ns = session.clock.now_ns()
+    until(lambda: motion.moved_ns()[-1] > held_ns, 10, "the arm goes on")
+    moved_ns = motion.moved_ns()
+    first_ns = moved_ns[moved_ns > held_ns][0]
+    return server, seconds(held_ns - killed_ns), max(0.0, seconds(int(first_ns) - served_ns))
+
+
+def resources() -> dict[str, int]:
+    """Threads, open files, and memory [MiB] of this process."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    files = len(os.listdir("/proc/self/fd"))
+    return {"threads": threading.active_count(), "files": files, "memory_mib": pages * os.sysconf("SC_PAGE_SIZE") >> 20}
+
+
+def run(kills: int, folder: Path) -> int:
+    """Print what came of it as JSON; 1 when it is not as it must be."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    endpoint = f"tcp/127.0.0.1:{port}"
+    (folder / "mini.yaml").write_text(ROBOT.replace("PORT", str(port)))
+    mine = [entry for found in distributions(path=[str(folder)]) for entry in found.entry_points]
+    theirs = [entry for found in distributions() for entry in found.entry_points if entry.group == "ibrobot"]
+    registry = discover([entry for entry in (*theirs, *mine)])
+    server = Server(folder, endpoint)
+    runtime = Runtime(Session(load(folder / "mini.yaml", sim=True, registry=registry), registry, Request()))
+    session = runtime.session
+    held, resumed, grown = [], [], []
+    try:
+        runtime.start()
+        until(lambda: session.stats is not None, 10, "the mode begins")
+        motion = Motion(session)
+        for number in range(kills):
+            server, held_s, resumed_s = kill_once(server, folder, endpoint, session, motion)
+            held.append(held_s)
+            resumed.append(resumed_s)
+            if number >= 1:
+                grown.append(resources())
+            print(
+                f"kill {number + 1}: held after {held_s:.2f} s, went on {resumed_s:.2f} s after the restart", flush=True
+            )
+        stats = session.stats
+        assert stats is not None
+        made = sys.modules["sways_parts"].MADE[0]
+    finally:
+        runtime.stop()
+        server.kill()
+    answered = made.answered
+    told = {
+        "kills": kills, "held_worst_s": round(max(held), 3), "held_limit_s": PLAN_S + STALE_S + SETTLE_S,
+        "resumed_worst_s": round(max(resumed), 3), "requests": stats.requests, "chunks": stats.chunks,
+        "failures": stats.failures, "timeouts": stats.timeouts, "answered_twice": len(answered) - len(set(answered)),
+        "first": grown[:1], "last": grown[-1:],
+    }  # fmt: skip
+    print(json.dumps(told))
+    first, last = (grown[0], grown[-1]) if grown else (resources(), resources())
+    good = (
+        max(held) <= PLAN_S + STALE_S + SETTLE_S and told["answered_twice"] == 0
+        and 0 <= stats.requests - stats.chunks - stats.failures - stats.timeouts <= 1
+        and last["threads"] <= first["threads"] and last["files"] <= first["files"] + 2
+        and last["memory_mib"] <= first["memory_mib"] + 20
+    )  # fmt: skip
+    return int(not good)
+
+
+def main() -> int:
+    """As a made-up plugin, so that robot and server load the same policy."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--kills", type=int, default=20)
+    kills = parser.parse_args().kills
+    logging.disable(logging.CRITICAL)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "sways_parts.py").write_text(PLUGIN)
+        metadata = folder / "sways_parts-1.0.dist-info"
+        metadata.mkdir()
+        (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: sways-parts\nVersion: 1.0\n")
+        (metadata / "entry_points.txt").write_text("[ibrobot]\nsways_parts = sways_parts\n")
+        sys.path.insert(0, name)
+        os.environ["PYTHONPATH"] = os.pathsep.join([name, *filter(None, [os.environ.get("PYTHONPATH")])])
+        return run(kills, folder)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

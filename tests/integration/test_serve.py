@@ -1,0 +1,108 @@
+"""`ibrobot serve` as a user runs it: robots reach it over the network, and what becomes of models that die."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import select
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+if TYPE_CHECKING:
+    from conftest import Log, Ran
+
+pytestmark = pytest.mark.integration
+
+ROOT = Path(__file__).parents[2]
+MODE = "control_modes.model_inference.inference.execution_mode={}"
+
+
+@pytest.fixture
+def endpoint() -> str:
+    """An address of this machine that nobody listens on."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{free.getsockname()[1]}"
+
+
+@pytest.fixture
+def server(ibrobot: tuple[str, ...], endpoint: str) -> Iterator[subprocess.Popen[str]]:
+    """The scripted pick, served."""
+    command = [*ibrobot, "serve", "so101_blind", "--set", "transport={type: zenoh}", "--listen", endpoint]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert re.fullmatch(r"serving scripted_pick \(policy \w+\); Ctrl-C ends\n", process.stdout.readline())
+    yield process
+    process.kill()
+    process.communicate()
+
+
+def test_all_execution_modes_pick_the_cube_by_the_same_motion(
+    server: subprocess.Popen[str], endpoint: str, recorded: Callable[..., tuple[Ran, list[Log]]]
+):
+    network = f"transport={{type: zenoh, connect: [{endpoint}]}}"
+    motions = {}
+    for mode, more in {"monolithic": (), "process": (), "distributed": ("--set", network)}.items():
+        ran, logs = recorded(
+            "--lockstep", "--episodes", "2", "--seed", "3", "--set", MODE.format(mode), *more, dataset=mode
+        )
+        assert (ran.code, ran.summary["successes"]) == (0, 2), ran.err
+        motions[mode] = np.concatenate([log.positions for log in logs])
+    for mode in ("process", "distributed"):
+        np.testing.assert_array_equal(motions[mode], motions["monolithic"])
+    server.send_signal(signal.SIGTERM)
+    out, _ = server.communicate(timeout=30)
+    assert server.returncode == 0
+    assert re.search(r"[1-9]\d* requests, (\d+) answered, 0 expired, 0 malformed, 0 waiting", out)
+
+
+def test_a_model_process_ends_with_a_host_that_was_killed(ibrobot: tuple[str, ...], tmp_path: Path):
+    command = [*ibrobot, "launch", "so101_blind", "--sim", "--headless", "--set", MODE.format("process")]
+    host = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, text=True)
+    try:
+        assert host.stdout is not None
+        while "model answers" not in host.stdout.readline():
+            assert host.poll() is None
+        children = (Path(f"/proc/{host.pid}/task/{host.pid}/children")).read_text().split()
+        model = [int(pid) for pid in children if "model_process" in Path(f"/proc/{pid}/cmdline").read_text()]
+        assert len(model) == 1
+    finally:
+        host.kill()
+        host.communicate()
+    end = os.pidfd_open(model[0])
+    try:
+        assert select.select([end], [], [], 30.0)[0], "the model's process is still there"
+    finally:
+        os.close(end)
+
+
+def test_a_server_that_is_killed_in_the_middle_of_requests_harms_nothing():
+    command = [sys.executable, ROOT / "benchmarks/server_kill.py", "--kills", "2"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    told: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    assert told["answered_twice"] == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("so101_blind",), "names no transport to robots"),
+        (("so101_blind", "--model", "other"), "one of scripted_pick"),
+        (("nowhere", "--type", "scripted_pick"), "no such folder"),
+        ((".", "--type", "nothing_of_this_name"), "nothing_of_this_name"),
+    ],
+)
+def test_a_wrong_command_line_is_told(ibrobot: tuple[str, ...], arguments: tuple[str, ...], said: str, tmp_path: Path):
+    done = subprocess.run([*ibrobot, "serve", *arguments], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert said in done.stderr.replace("\n", " ")
