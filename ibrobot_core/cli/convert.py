@@ -223,6 +223,9 @@ def _tell(report: Report) -> None:
         if each.passed_over:
             click.echo(f"passed over {each.source}: {each.passed_over}", err=True)
     done = report.converted
+    for each in done:
+        if not each.finished:
+            click.echo(f"unfinished {each.source}: its {each.frames} frames are of what could be read", err=True)
     if not done:
         click.echo(f"nothing was added to {report.out}")
         return

@@ -145,7 +145,9 @@ def run_robot(
     registry = installed()
     path = find_config(config, registry)
     changes, chosen = overrides_of(options), {"mode": options["mode"], "sim": options["sim"], "registry": registry}
-    robot = load(path, overrides=changes, **chosen)
+    # An override within the section must not count as the section.
+    known = [change for change in changes if not (recording and change.startswith("recording."))]
+    robot = load(path, overrides=known, **chosen)
     if recording:
         default, *more = recording
         robot = load(path, overrides=(*([default] if robot.recording is None else []), *changes, *more), **chosen)

@@ -89,6 +89,8 @@ def replay(
         playback = read_playback(reader, contract)
     finally:
         reader.close()
+    if not summary.finished:
+        click.echo(f"{episode}: was never finished; {playback.duration:.2f} s of it could be read", err=True)
     request = Request(
         options["lockstep"], playback.seed or 0, replay=Replay(str(episode), playback, speed),
     )  # fmt: skip

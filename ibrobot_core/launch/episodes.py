@@ -19,13 +19,16 @@ class Episodes:
         self._recording = recording
         self.number = 0
         """Of the present episode, from 1; 0 before the first."""
-        self.saved = 0
-        """Episodes that ended, were kept, and whose recording did not end before them."""
         self.running = False
         self.prompt = session.request.prompt
         """Of the next episode."""
         self.begun_ns = 0
         """When the present episode began [ns]."""
+
+    @property
+    def saved(self) -> int:
+        """Episodes that ended, were kept, and whose recording did not end before them."""
+        return 0 if self._recording is None else self._recording.saved
 
     @property
     def recording_failure(self) -> RecorderError | None:
@@ -53,7 +56,6 @@ class Episodes:
         self.running = False
         if self._recording is not None:
             self._recording.end(outcome)
-            self.saved += outcome != "discarded" and self._recording.failure is None
         if outcome == "discarded":
             session.log.info("episode %d: discarded", self.number)
         elif outcome != "unknown":

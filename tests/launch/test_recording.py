@@ -88,6 +88,28 @@ def test_a_recorder_that_fails_costs_its_episode_and_the_robot_goes_on(
     assert runtime.plan.episodes.recording_failure is None
 
 
+def test_an_episode_that_is_not_written_to_its_end_does_not_count(runs: Runs, monkeypatch: pytest.MonkeyPatch):
+    runtime, notes = note(runs, monkeypatch)
+    saved = runtime.plan.episodes.saved
+
+    def full(end: EpisodeEnd) -> None:
+        raise RecorderError("its disk is full")
+
+    monkeypatch.setattr(runs.parts.MADE["recording"], "end", full)
+    runtime.plan.episodes.begin()
+    ticks(runtime, 3)
+    runtime.plan.episodes.end("success")
+    assert runtime.plan.episodes.saved == saved + 1, "nothing is known of it yet"
+    ticks(runtime, 1)
+    assert runtime.plan.episodes.saved == saved
+    monkeypatch.setattr(runs.parts.MADE["recording"], "end", notes.end)
+    runtime.plan.episodes.begin()
+    ticks(runtime, 3)
+    runtime.plan.episodes.end("success")
+    ticks(runtime, 1)
+    assert runtime.plan.episodes.saved == saved + 1
+
+
 def test_a_recorder_that_does_not_begin_costs_its_episode_and_the_robot_goes_on(
     runs: Runs, monkeypatch: pytest.MonkeyPatch
 ):

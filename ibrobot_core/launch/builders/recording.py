@@ -40,6 +40,18 @@ class _Begin:
         return self.start.stamp_ns
 
 
+@attrs.frozen
+class _End:
+    """An episode ends; `hoped`: nothing has gone wrong with it so far, and it is to be kept."""
+
+    end: EpisodeEnd
+    hoped: bool
+
+    @property
+    def stamp_ns(self) -> int:
+        return self.end.stamp_ns
+
+
 class Recording(Worker):
     """Writes what is on the bus while an episode is on.
 
@@ -56,7 +68,7 @@ class Recording(Worker):
         self._config = config
         self._recorder: Recorder | None = None
         self._contract = Contract.from_config(session.config)
-        self._orders: deque[_Begin | EpisodeEnd] = deque()
+        self._orders: deque[_Begin | _End] = deque()
         self._order = threading.Lock()
         """Held while an order is stamped and queued, and while orders and messages are taken: neither overtakes."""
         self._incoming: Subscription | None = None
@@ -65,6 +77,9 @@ class Recording(Worker):
         """Topic -> times of the last messages [ns]."""
         self._lost: Mapping[str, int] = {}
         """Topic -> messages lost on the way here, before the present episode."""
+        self._whole = 0
+        self._hoped = 0
+        """Episodes kept whole, and those that have ended and are not written to their ends yet."""
         self.failure: RecorderError | None = None
         """Why the recording of the present or last episode ended before it; None where it did not."""
 
@@ -96,7 +111,15 @@ class Recording(Worker):
     def end(self, outcome: str) -> None:
         """Messages up to here belong to the episode."""
         with self._order:
-            self._orders.append(EpisodeEnd(self._session.bus.snapshot_ns(), outcome))
+            hoped = outcome != "discarded" and self.failure is None
+            self._hoped += hoped
+            self._orders.append(_End(EpisodeEnd(self._session.bus.snapshot_ns(), outcome), hoped))
+
+    @property
+    def saved(self) -> int:
+        """Episodes that have ended and are kept; one that turns out not to be written to its end is taken back."""
+        with self._order:
+            return self._whole + self._hoped
 
     @override
     def work(self, timeout_s: float) -> None:
@@ -143,7 +166,7 @@ class Recording(Worker):
         if self._keeps(item.topic):
             self._seen.setdefault(item.topic, deque(maxlen=_RATE_WINDOW)).append(item.received_ns)
 
-    def _obey(self, recorder: Recorder, order: _Begin | EpisodeEnd) -> None:
+    def _obey(self, recorder: Recorder, order: _Begin | _End) -> None:
         if isinstance(order, _Begin):
             self.failure = None
             self._lost = order.lost
@@ -155,14 +178,25 @@ class Recording(Worker):
             self._open = True
             for item in order.latched:
                 self._write(recorder, item, order.stamp_ns)
-        elif self._open:
-            self._open = False
-            # Counted now: what waited when the episode ended may have been lost since.
-            lost = {topic: n - self._lost.get(topic, 0) for topic, n in self._lost_now().items() if self._keeps(topic)}
-            try:
-                recorder.end(attrs.evolve(order, dropped={topic: n for topic, n in lost.items() if n}))
-            except RecorderError as error:
-                self._fail(error)
+        else:
+            whole = self._finish(recorder, order.end)
+            with self._order:
+                self._hoped -= order.hoped
+                self._whole += order.hoped and whole
+
+    def _finish(self, recorder: Recorder, end: EpisodeEnd) -> bool:
+        """End the open episode, if any; whether it is whole."""
+        if not self._open:
+            return False
+        self._open = False
+        # Counted now: what waited when the episode ended may have been lost since.
+        lost = {topic: n - self._lost.get(topic, 0) for topic, n in self._lost_now().items() if self._keeps(topic)}
+        try:
+            recorder.end(attrs.evolve(end, dropped={topic: n for topic, n in lost.items() if n}))
+        except RecorderError as error:
+            self._fail(error)
+            return False
+        return True
 
     def _write(self, recorder: Recorder, item: Received, received_ns: int) -> None:
         if not self._open or not self._keeps(item.topic):
@@ -171,7 +205,7 @@ class Recording(Worker):
             recorder.write(item.topic, item.message, received_ns)
         except RecorderError as error:
             self._fail(error)
-            self._obey(recorder, EpisodeEnd(received_ns, "unknown"))
+            self._finish(recorder, EpisodeEnd(received_ns, "unknown"))
 
     def _fail(self, error: RecorderError) -> None:
         session = self._session

@@ -140,8 +140,9 @@ def convert_episode(job: Job, progress: Callable[[int], None]) -> EpisodeReport:
 
 def _described(report: EpisodeReport, summary: EpisodeSummary, request: Request) -> EpisodeReport:
     return attrs.evolve(
-        report, outcome=summary.outcome, prompt=summary.metadata.get("prompt") or request.prompt,
-        start_ns=summary.start_ns, lost={topic: each.dropped for topic, each in summary.topics.items() if each.dropped},
+        report, finished=summary.finished, outcome=summary.outcome,
+        prompt=summary.metadata.get("prompt") or request.prompt, start_ns=summary.start_ns,
+        lost={topic: each.dropped for topic, each in summary.topics.items() if each.dropped},
     )  # fmt: skip
 
 

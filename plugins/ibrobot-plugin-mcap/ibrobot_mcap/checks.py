@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 from collections import defaultdict
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import numpy as np
 
-from ibrobot_core.errors import RecorderError
+from ibrobot_core.contract.specs import Contract
+from ibrobot_core.errors import ContractError, RecorderError
 from ibrobot_core.units import NS_PER_S
 from ibrobot_mcap.metadata import METADATA
 from ibrobot_mcap.reader import Rosbag2Reader, stated_counts
@@ -45,6 +48,8 @@ def problems_of(path: Path, longest_gap: float) -> list[str]:
         problems.append(str(error))
     finally:
         reader.close()
+    absent = [topic for topic in _required(summary.metadata) if not stamps[topic]]
+    problems += [f"no message of {topic}, which its contract has" for topic in absent]
     for topic, stated in stated_counts(path / METADATA).items():
         if stated != len(stamps[topic]):
             problems.append(f"{topic}: {len(stamps[topic])} messages, {METADATA} says {stated}")
@@ -55,6 +60,16 @@ def problems_of(path: Path, longest_gap: float) -> list[str]:
             problems.append(f"{topic}: header stamps went back {back[topic]} times")
         problems += _pause(topic, stamps[topic], longest_gap, summary.start_ns)
     return problems
+
+
+def _required(metadata: Mapping[str, str]) -> Collection[str]:
+    """The topics of the contract that an episode was recorded by; nothing for one without."""
+    if "contract" not in metadata:
+        return ()
+    try:
+        return Contract.from_canonical(json.loads(metadata["contract"])).topics
+    except (ValueError, ContractError):
+        return ()  # somebody else's key of the same name
 
 
 def _pause(topic: str, stamps: list[int], longest_gap: float, start_ns: int) -> list[str]:

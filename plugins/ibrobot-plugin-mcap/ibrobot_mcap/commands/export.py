@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -35,11 +36,24 @@ def export(episode: Path, topic: str, output: Path) -> None:
         if output.exists():
             raise RecorderError(f"{output}: is there already")
         items = ((item.received_ns, item.message) for item in reader.messages({topic}))
+        making = output.with_name(f".{output.name}.making")
+        _remove(making)
         try:
-            count = (_pictures if topics[topic].type == Image.ros_type else _rows)(items, output)
+            count = (_pictures if topics[topic].type == Image.ros_type else _rows)(items, making)
+            making.rename(output)
         except OSError as error:
             raise RecorderError(f"{output}: cannot be written: {error.strerror}") from error
+        finally:
+            _remove(making)
     click.echo(f"{output}: {count} messages of {topic}")
+
+
+def _remove(making: Path) -> None:
+    """Leave nothing of an export that did not come to its end."""
+    if making.is_dir():
+        shutil.rmtree(making)
+    else:
+        making.unlink(missing_ok=True)
 
 
 def _rows(items: Iterator[tuple[int, Message]], output: Path) -> int:

@@ -13,9 +13,9 @@ import click
 def verify(path: Path, gap: float) -> None:
     """Read every message of the episodes in PATH, and say what is wrong; exits with 1 if something is.
 
-    Wrong are: an unfinished episode, a message that cannot be decoded, counts that differ from metadata.yaml, losses,
-    header stamps that go back, a pause in a topic longer than --gap of its median period, and episodes of one dataset
-    with different contracts.
+    Wrong are: an unfinished episode, a message that cannot be decoded, counts that differ from metadata.yaml, losses, a
+    topic of its contract without a message, header stamps that go back, a pause in a topic longer than --gap of its
+    median period, and episodes of one dataset with different contracts.
     """
     from ibrobot_mcap.checks import problems_of
     from ibrobot_mcap.commands.found import episodes_in, summary_of

@@ -1,0 +1,381 @@
+"""What goes wrong with a disk or a bag, over every command that meets it: one clear message, nothing half-written."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import shutil
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import attrs
+import pytest
+from recordings import CONTRACT, record
+
+from ibrobot_core.contract.specs import Contract
+from ibrobot_core.plugins import installed
+
+pytestmark = pytest.mark.integration
+
+FULL = "No space left on device"
+TOO_LARGE = "File too large"
+ONLY_READ = "Read-only file system"
+
+
+@attrs.frozen
+class Ran:
+    """What a command printed, and its exit code."""
+
+    code: int
+    out: str
+    err: str
+
+
+Run = Callable[..., Ran]
+
+
+@pytest.fixture(scope="module")
+def run(ibrobot: tuple[str, ...]) -> Run:
+    def execute(*arguments: object, largest: int | None = None) -> Ran:
+        """Run `ibrobot`; no file may become larger than `largest` [bytes]."""
+
+        def limit() -> None:
+            if largest is not None:
+                resource.setrlimit(resource.RLIMIT_FSIZE, (largest, largest))
+
+        command = [*ibrobot, *map(str, arguments)]
+        done = subprocess.run(
+            command, capture_output=True, text=True, timeout=120, check=False,
+            preexec_fn=limit if largest is not None else None,
+        )  # fmt: skip
+        assert "Traceback" not in done.stderr, done.stderr
+        return Ran(done.returncode, done.stdout, done.stderr)
+
+    return execute
+
+
+@pytest.fixture
+def mounted(tmp_path: Path) -> Iterator[Callable[[str], Path]]:
+    """Mounts a small file system; skips where that is not permitted."""
+    places: list[Path] = []
+
+    def mount(options: str) -> Path:
+        place = tmp_path / f"disk{len(places)}"
+        place.mkdir()
+        command = ["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(place)]
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, check=False)
+        except FileNotFoundError:
+            pytest.skip("there is no mount")
+        if done.returncode:
+            pytest.skip(f"a file system cannot be mounted here: {done.stderr.strip()}")
+        places.append(place)
+        return place
+
+    yield mount
+    for place in places:
+        subprocess.run(["umount", str(place)], check=True)
+
+
+@pytest.fixture
+def read_only(mounted: Callable[[str], Path]) -> Path:
+    return mounted("ro")
+
+
+@pytest.fixture(scope="module")
+def bags(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset of two episodes, a megabyte each."""
+    root = tmp_path_factory.mktemp("bags") / "blocks"
+    for number in (1, 2):
+        record(root / f"episodes/episode_{number:06d}", number, 0.5, "sort")
+    return root
+
+
+@pytest.fixture(scope="module")
+def dataset(bags: Path, run: Run) -> Path:
+    made = run("convert", bags, "--out", bags.parent / "set", "--no-videos")
+    assert made.code == 0, made.err
+    return bags.parent / "set"
+
+
+def record_picks(run: Run, root: Path, *more: object, **limits: Any) -> Ran:
+    arguments = ("record", "so101_blind", "--sim", "--lockstep", "--headless", "--root", root, "--dataset", "picks")
+    return run(*arguments, "--episodes", "3", "--set", "recording.min_free=0", *more, **limits)
+
+
+def states(folder: Path) -> list[tuple[bool, int]]:
+    """Of each episode: whether it is whole, and its messages."""
+    found = []
+    for path in sorted((folder / "episodes").iterdir()):
+        reader = installed().open_episode(path)
+        summary = reader.summary()
+        assert sum(1 for _ in reader.messages()) == sum(each.count for each in summary.topics.values())
+        reader.close()
+        found.append((summary.finished, sum(each.count for each in summary.topics.values())))
+    return found
+
+
+@pytest.fixture(scope="module")
+def other(bags: Path) -> Path:
+    """A dataset with an episode of the contract, and one of another rate."""
+    root = bags.parent / "mixed"
+    shutil.copytree(bags / "episodes/episode_000001", root / "episodes/episode_000001")
+    slower = attrs.evolve(CONTRACT, rate_hz=20.0)
+    record(root / "episodes/episode_000002", 5, 0.5, "sort", contract=slower, fingerprint=slower.fingerprint())
+    return root
+
+
+@pytest.fixture(scope="module")
+def silent(bags: Path) -> Path:
+    """An episode whose top camera never sent a picture, and whose arm had no command."""
+    path = bags.parent / "silent/episodes/episode_000001"
+    never = (0.0, 10.0)
+    record(path, 1, 0.5, "sort", gap={"/top": never, "/commands": never})
+    return path
+
+
+class TestFullDisk:
+    def test_record_ends_the_recording_and_the_robot_goes_on(self, run: Run, mounted: Callable[[str], Path]):
+        disk = mounted("size=500k")
+        done = record_picks(run, disk)
+        assert done.code == 1
+        assert done.out.splitlines()[-1].startswith("faults     recording ended: ")
+        assert f"cannot be written: {FULL}; it stays unfinished, with what was written before" in done.err
+        assert "episodes   3, of which 3 succeeded" in done.out, "the robot went on"
+        whole = [count for finished, count in states(disk / "picks") if finished]
+        assert f"recorded   {len(whole)} of 3 episodes" in done.out
+        assert not all(finished for finished, _ in states(disk / "picks"))
+
+    def test_record_refuses_to_begin_where_there_is_too_little_room(self, run: Run, mounted: Callable[[str], Path]):
+        disk = mounted("size=2m")
+        done = record_picks(run, disk, "--set", "recording.min_free=67108864")
+        assert done.code == 1
+        assert "its disk has 1 MiB left, recording needs 64 MiB (min_free); make room" in done.err
+        assert list((disk / "picks/episodes").iterdir()) == []
+
+    def test_record_with_a_bounded_file_size(self, run: Run, tmp_path: Path):
+        done = record_picks(run, tmp_path, largest=150_000)
+        assert done.code == 1
+        assert f"cannot be written: {TOO_LARGE}; it stays unfinished" in done.err
+        kept = states(tmp_path / "picks")
+        assert not any(finished for finished, _ in kept)
+        assert all(count > 50 for _, count in kept), "what was written before is there"
+        listed = run("episodes", "verify", tmp_path / "picks")
+        assert listed.code == 1
+        assert listed.out.count("unfinished; `ibrobot episodes repair` makes it whole") == len(kept)
+        assert run("episodes", "repair", tmp_path / "picks").code == 0
+        assert all(finished for finished, _ in states(tmp_path / "picks"))
+
+    @pytest.mark.parametrize("videos", ["--no-videos", "--codec=h264"])
+    def test_convert_leaves_no_dataset(self, run: Run, bags: Path, mounted: Callable[[str], Path], videos: str):
+        disk = mounted("size=200k")
+        done = run("convert", bags, "--out", disk / "set", videos)
+        assert done.code == 1
+        assert FULL in done.err
+        assert not (disk / "set/meta/info.json").exists()
+        again = run("convert", disk / "set:0", "--out", disk / "other")
+        assert again.code == 1
+
+    def test_convert_with_a_bounded_file_size(self, run: Run, bags: Path, tmp_path: Path):
+        done = run("convert", bags, "--out", tmp_path / "set", "--no-videos", "--jobs", 1, largest=10_000)
+        assert done.code == 1
+        assert done.err.count(f"{TOO_LARGE}") >= 2, "one an episode"
+        assert not (tmp_path / "set").exists()
+
+    def test_convert_back_leaves_no_episode(self, run: Run, dataset: Path, mounted: Callable[[str], Path]):
+        disk = mounted("size=400k")
+        done = run("convert", dataset, "--to", "bag", "--out", disk / "back", "--set", "min_free=0")
+        assert done.code == 1
+        assert f"left out set:0: {disk}/back" in done.err
+        assert FULL in done.err
+        assert list(disk.rglob("*.mcap")) == []
+        done = run("convert", dataset, "--to", "bag", "--out", disk / "back")
+        assert "MiB left, recording needs 512 MiB (min_free)" in done.err
+        assert list(disk.iterdir()) == []
+
+    def test_convert_back_with_a_bounded_file_size(self, run: Run, dataset: Path, tmp_path: Path):
+        done = run("convert", dataset, "--to", "bag", "--out", tmp_path / "back", largest=100_000)
+        assert done.code == 1
+        assert TOO_LARGE in done.err
+        assert not (tmp_path / "back").exists()
+
+    def test_repair_keeps_the_original(self, run: Run, bags: Path, mounted: Callable[[str], Path]):
+        disk = mounted("size=1500k")
+        path = disk / "episode_000001"
+        shutil.copytree(bags / "episodes/episode_000001", path)
+        (path / "metadata.yaml").unlink()
+        before = (path / "episode_000001_0.mcap").read_bytes()
+        (path / "episode_000001_0.mcap").write_bytes(before[:-20])
+        done = run("episodes", "repair", path)
+        assert done.code == 1
+        assert f"cannot be written: {FULL}" in done.err
+        assert (path / "episode_000001_0.mcap").read_bytes() == before[:-20]
+        assert [each.name for each in disk.iterdir()] == ["episode_000001"]
+
+    def test_trim_and_export_leave_nothing(self, run: Run, bags: Path, tmp_path: Path):
+        episode = bags / "episodes/episode_000001"
+        for number, arguments in enumerate((
+            ("trim", episode, "--to", "0.4", "-o", tmp_path / "part"),
+            ("export", episode, "/joint_states", "-o", tmp_path / "joints.csv"),
+            ("export", episode, "/top", "-o", tmp_path / "top"),
+        )):  # fmt: skip
+            done = run("episodes", *arguments, largest=100 if number else 50_000)
+            assert done.code == 1
+            assert f"cannot be written: {TOO_LARGE}" in done.err
+            assert list(tmp_path.iterdir()) == []
+
+
+class TestReadOnlyFolder:
+    def test_record(self, run: Run, read_only: Path):
+        done = record_picks(run, read_only)
+        assert done.code == 1
+        assert f"recording.root: {read_only}/picks/episodes cannot be made: {ONLY_READ}" in done.err
+
+    def test_convert_and_the_way_back(self, run: Run, bags: Path, dataset: Path, read_only: Path):
+        done = run("convert", bags, "--out", read_only / "set")
+        assert (done.code, done.err) == (1, f"error: {read_only}/set: cannot be written: {ONLY_READ}\n")
+        done = run("convert", dataset, "--to", "bag", "--out", read_only / "back")
+        assert done.code == 1
+        assert ONLY_READ in done.err
+
+    def test_a_file_where_a_folder_should_be(self, run: Run, bags: Path, dataset: Path, tmp_path: Path):
+        (tmp_path / "file").write_text("in the way")
+        for arguments in ((bags,), (dataset, "--to", "bag")):
+            done = run("convert", *arguments, "--out", tmp_path / "file/set")
+            assert done.code == 1
+            assert "Not a directory" in done.err
+        done = record_picks(run, tmp_path / "file")
+        assert done.code == 1
+        assert "Not a directory" in done.err
+
+    def test_episodes_are_read_where_nothing_can_be_written(self, run: Run, bags: Path, mounted: Callable[[str], Path]):
+        disk = mounted("size=4m")
+        path = disk / "episode_000001"
+        shutil.copytree(bags / "episodes/episode_000001", path)
+        (path / "metadata.yaml").unlink()
+        subprocess.run(["mount", "-o", "remount,ro", str(disk)], check=True)
+        assert run("episodes", "info", path).code == 0
+        done = run("episodes", "repair", path)
+        assert done.code == 1
+        assert f"cannot be repaired: {ONLY_READ}" in done.err
+
+
+class TestTruncatedChunk:
+    @pytest.fixture(params=["", "metadata.yaml"])
+    def cut(self, tmp_path: Path, request: pytest.FixtureRequest) -> Path:
+        """An episode whose last chunk is cut; with its `metadata.yaml` it looks whole."""
+        path = tmp_path / "cut/episodes/episode_000001"
+        record(path, 1, 1.6, "sort")
+        if not request.param:
+            (path / "metadata.yaml").unlink()
+        file = path / "episode_000001_0.mcap"
+        os.truncate(file, int(file.stat().st_size * 0.7))
+        return path
+
+    def test_info_and_verify_tell(self, run: Run, cut: Path):
+        assert "unfinished; `ibrobot episodes repair` makes it whole" in run("episodes", "info", cut).out
+        done = run("episodes", "verify", cut)
+        assert done.code == 1
+        assert "unfinished" in done.out
+        if (cut / "metadata.yaml").exists():
+            assert "metadata.yaml says" in done.out
+
+    def test_convert_takes_what_is_there_and_tells(self, run: Run, cut: Path, tmp_path: Path):
+        done = run("convert", cut, "--out", tmp_path / "set", "--no-videos", "--missing", "hold", "--json")
+        assert done.code == 0, done.err
+        (report,) = json.loads(done.out)["reports"]
+        assert report["finished"] is False
+        assert 10 < report["frames"] < 40
+        again = run("convert", cut, "--out", tmp_path / "told", "--no-videos", "--missing", "hold")
+        assert f"unfinished cut/episode_000001: its {report['frames']} frames are of what could be read" in again.err
+
+    def test_repair_makes_it_whole(self, run: Run, cut: Path):
+        done = run("episodes", "repair", cut)
+        assert done.code == 0, done.err
+        assert "repaired" in done.out
+        assert run("episodes", "repair", cut).out.endswith("is whole\n")
+
+    def test_replay_tells(self, run: Run, tmp_path: Path):
+        assert record_picks(run, tmp_path, "--set", "contract.max_duration_s=20").code == 0
+        path = tmp_path / "picks/episodes/episode_000001"
+        file = path / "episode_000001_0.mcap"
+        os.truncate(file, int(file.stat().st_size * 0.6))
+        done = run("replay", path, "so101_blind", "--sim", "--lockstep", "--headless")
+        assert "was never finished; " in done.err
+        assert done.code in (0, 3)
+
+
+class TestOtherContract:
+    def test_convert_leaves_it_out(self, run: Run, other: Path, tmp_path: Path):
+        done = run("convert", other, "--out", tmp_path / "set", "--no-videos")
+        assert done.code == 1
+        assert "left out mixed/episode_000002: its contract differs from that of mixed/episode_000001:" in done.err
+        assert "this episode: 20.0" in done.err
+        assert "1 episodes, " in done.out
+
+    def test_verify_tells(self, run: Run, other: Path):
+        done = run("episodes", "verify", other)
+        assert done.code == 1
+        assert f"its contract is {attrs.evolve(CONTRACT, rate_hz=20.0).fingerprint()[:12]}" in done.out
+
+    def test_record_into_a_dataset_of_another_contract(self, run: Run, tmp_path: Path):
+        assert record_picks(run, tmp_path).code == 0
+        done = record_picks(run, tmp_path, "--set", "contract.rate_hz=20")
+        assert done.code == 1
+        assert "dataset.yaml: its episodes have another contract; record into another dataset" in done.err
+        assert "this run: 20" in done.err
+        assert "the dataset: 30" in done.err
+        assert len(states(tmp_path / "picks")) == 3
+
+    def test_convert_back_with_another_contract(self, run: Run, dataset: Path, tmp_path: Path):
+        done = run("convert", dataset, "--to", "bag", "--out", tmp_path / "back", "--config", "so101_blind")
+        assert done.code == 1
+        assert "was made with another contract than --config's:" in done.err
+        assert "--config: " in done.err
+        assert "dataset: " in done.err
+        assert not (tmp_path / "back").exists()
+
+    def test_replay_is_refused(self, run: Run, bags: Path):
+        done = run("replay", bags / "episodes/episode_000001", "so101_blind", "--sim", "--headless")
+        assert done.code == 2
+        assert "was recorded with another contract than that of" in done.err
+        assert "recorded: topic: /commands" in done.err
+
+
+class TestMissingTopic:
+    def test_record_does_not_begin(self, run: Run, tmp_path: Path):
+        lamp = "contract.observations=[{key: observation.lamp, topic: /lamp, type: std_msgs/msg/Int32}]"
+        done = run(
+            "record", "so101_blind", "--sim", "--lockstep", "--headless", "--mode", "teleop", "--auto", "--root",
+            tmp_path, "--set", lamp, "--duration", "2", "--set", "recording.min_free=0",
+            "--set", "control_modes.teleop={executors: [arm_position, gripper_position]}",
+        )  # fmt: skip
+        assert "not recording: the contract's topics are silent: /lamp (nothing yet)" in done.err
+        assert list(tmp_path.rglob("*.mcap")) == []
+
+    def test_convert_names_it(self, run: Run, silent: Path, tmp_path: Path):
+        done = run("convert", silent, "--out", tmp_path / "set")
+        assert done.code == 1
+        assert "no message of /top, /commands, which the contract has; there are: /joint_states, /wrist" in done.err
+        assert not (tmp_path / "set").exists()
+
+    def test_verify_names_it(self, run: Run, silent: Path):
+        done = run("episodes", "verify", silent)
+        assert done.code == 1
+        assert "no message of /top, which its contract has; no message of /commands" in done.out
+
+    def test_replay_names_it(self, run: Run, tmp_path: Path):
+        assert record_picks(run, tmp_path).code == 0
+        path = tmp_path / "picks/episodes/episode_000001"
+        reader = installed().open_episode(path)
+        metadata = dict(reader.summary().metadata)
+        reader.close()
+        wanted = Contract.from_canonical(json.loads(metadata["contract"]))
+        metadata = {name: metadata[name] for name in ("config", "fingerprint", "seed")}
+        record(tmp_path / "unheard", 1, 0.5, contract=wanted, **{n: v for n, v in metadata.items() if n != "seed"})
+        done = run("replay", tmp_path / "unheard", "--sim", "--lockstep", "--headless")
+        assert done.code == 1
+        assert "no message of /arm_position_controller/commands, so nothing to replay; there are: /comm" in done.err
