@@ -1,0 +1,341 @@
+"""From a request to its chunk with a policy that does nothing: each way to a model, and LeRobot's own, in one run.
+
+    python benchmarks/inference_transport.py [--count 200] [--lerobot PYTHON]
+
+Every way carries the same observations: two raw pictures of 640x480, two of 224x224 in float32, two JPEGs of 38 kB,
+each with six joint positions; a chunk of 50x6 comes back. `tcp` echoes a frame of the same bytes over a plain socket
+between two processes: the floor. `process` is execution mode process; `zenoh` and `zenoh mTLS` are execution mode
+distributed as between machines, `zenoh shm` as within one. `lerobot` is its RobotClient and PolicyServer, in the interpreter PYTHON
+which has `lerobot[async]==0.6.1`: it has no JPEG there and sends raw pictures of as many bytes.
+
+Times are in ms: request to chunk p50 and p99, how long the control loop is blocked in asking, and processor time of
+both sides together for a request. Exits with 1 where ours is less than 5 times as fast as LeRobot (when given), raw
+cameras over Zenoh take more than 5 times the floor, `process` more than 3 times, or asking blocks for over 1 ms.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import os
+import socket
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ibrobot_core.config import load
+from ibrobot_core.inference.client import DispatchInfer, EngineClient
+from ibrobot_core.inference.engine import Engine
+from ibrobot_core.inference.process import ProcessEngine
+from ibrobot_core.inference.remote import RemoteEngine
+from ibrobot_core.inference.service import InferenceService
+from ibrobot_core.inference.wire import Kind, Message, encode
+from ibrobot_core.interfaces import Frame, Transport
+from ibrobot_core.plugins import installed
+from ibrobot_core.testing import host_context
+
+PLUGIN = '''
+import numpy as np
+from ibrobot_core import hookimpl
+from ibrobot_core.descriptors import HardwareDescriptor, PolicyDescriptor
+from ibrobot_core.testing.fakes import FakeHardware, FakePolicy
+
+class Null(FakePolicy):
+    """Hands on what it is given and answers with zeros."""
+    chunk = np.zeros((50, 6), np.float32)
+    def preprocess(self, frame):
+        return frame.values
+    def infer(self, tensors):
+        return {"actions": self.chunk}
+    def postprocess(self, tensors):
+        return tensors["actions"].astype(np.float64)
+
+@hookimpl
+def ibrobot_hardware():
+    yield HardwareDescriptor("still", lambda options, ctx: FakeHardware(ctx), "an arm", simulated=True)
+
+@hookimpl
+def ibrobot_policies():
+    yield PolicyDescriptor("null", lambda options, ctx: Null(ctx), "does nothing")
+'''
+ROBOT = """
+robot:
+  name: mini
+  joints: [{name: pan, lower: -1.0, upper: 1.0, max_velocity: 3.0, max_acceleration: 40.0}]
+  groups: {arm: [pan]}
+simulation: {type: still}
+executors: {arm_position: {type: position, group: arm}}
+models: {null: {type: "null"}}
+control_modes: {idle: {executors: [arm_position]}}
+default_control_mode: idle
+"""
+CHANCE = np.random.default_rng(0)
+STATE = np.full(6, 0.5, np.float32)
+PAYLOADS = {
+    "2x640x480 uint8": CHANCE.integers(0, 255, (2, 480, 640, 3), dtype=np.uint8),
+    "2x224x224 float32": CHANCE.random((2, 3, 224, 224), dtype=np.float32),
+    "2 JPEGs": CHANCE.integers(0, 255, (2, 38_400), dtype=np.uint8),
+}
+WARM_UP = 20
+LEROBOT_RATIO, ZENOH_RATIO, PROCESS_RATIO, BLOCKED_MS = 5.0, 5.0, 3.0, 1.0
+
+
+def cpu_s(pid: int | str) -> float:
+    """Processor time of a process so far [s]."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def measure(ask: Callable[[int], float], other: int, count: int, pause_s: float) -> dict[str, Any]:
+    """Ask again and again; `ask` returns how long it was blocked [s], and `other` is the process that answers."""
+    latencies, blocked = [], []
+    for number in range(1, count + WARM_UP + 1):
+        if number == WARM_UP + 1:
+            begun_s = cpu_s("self") + cpu_s(other)
+        time.sleep(pause_s)
+        asked_s = time.perf_counter()
+        blocked.append(ask(number) * 1e3)
+        latencies.append((time.perf_counter() - asked_s) * 1e3)
+    used_s = cpu_s("self") + cpu_s(other) - begun_s
+    return {"latencies": latencies[WARM_UP:], "blocked": blocked[WARM_UP:], "cpu_ms": used_s / count * 1e3}
+
+
+def asking(client: EngineClient, pictures: np.ndarray) -> Callable[[int], float]:
+    """As the dispatcher asks: submit, and wait for the chunk."""
+    values = {
+        "observation.state": STATE,
+        "observation.images.top": pictures[0],
+        "observation.images.wrist": pictures[1],
+    }
+
+    def ask(number: int) -> float:
+        frame = Frame(time.time_ns(), values)
+        begun_s = time.perf_counter()
+        client.submit(DispatchInfer(number, frame))
+        blocked_s = time.perf_counter() - begun_s
+        chunk = client.poll(10.0)
+        if chunk is None or chunk.actions is None or chunk.id != number:
+            raise SystemExit(f"no chunk: {chunk}")
+        return blocked_s
+
+    return ask
+
+
+@contextmanager
+def started(*arguments: str) -> Iterator[int]:
+    """This file in a process of its own, ready; its process id."""
+    process = subprocess.Popen([sys.executable, __file__, *arguments], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    assert process.stdin is not None
+    assert process.stdout is not None
+    try:
+        if process.stdout.readline() != b"ready\n":
+            raise SystemExit(f"{arguments} did not start")
+        yield process.pid
+    finally:
+        process.stdin.close()
+        process.wait()
+        process.stdout.close()
+
+
+def free_port() -> int:
+    """A port of this machine that nobody listens on."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port: int = free.getsockname()[1]
+        return port
+
+
+def receive(connection: socket.socket, buffer: memoryview) -> int:
+    """A payload with its size before it; returns the size, 0 at the end."""
+    head = bytearray(8)
+    got = 0
+    while got < 8:
+        got += (n := connection.recv_into(memoryview(head)[got:]))
+        if not n:
+            return 0
+    size: int = struct.unpack("<Q", head)[0]
+    got = 0
+    while got < size:
+        got += connection.recv_into(buffer[got:size])
+    return size
+
+
+def echo(port: int) -> None:
+    """The other end of the floor: takes a payload, answers with a chunk's bytes."""
+    buffer, answer = memoryview(bytearray(1 << 24)), bytes(1280)
+    with socket.create_server(("127.0.0.1", port)) as listening:
+        print("ready", flush=True)
+        connection, _ = listening.accept()
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        while receive(connection, buffer):
+            connection.sendall(struct.pack("<Q", len(answer)) + answer)
+
+
+def floor(pictures: np.ndarray, count: int, pause_s: float) -> dict[str, Any]:
+    """A plain socket."""
+    tensors = {"state": STATE, "top": pictures[0], "wrist": pictures[1]}
+    frame = bytes(encode(Message(Kind.REQUEST, 1, tensors)))
+    buffer = memoryview(bytearray(1 << 20))
+    port = free_port()
+    with started("--echo", str(port)) as pid, socket.create_connection(("127.0.0.1", port)) as connection:
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+        def ask(number: int) -> float:
+            connection.sendall(struct.pack("<Q", len(frame)))
+            connection.sendall(frame)
+            receive(connection, buffer)
+            return 0.0
+
+        return measure(ask, pid, count, pause_s)
+
+
+def transport(**options: Any) -> Transport:
+    """One of type zenoh."""
+    descriptor = installed().find("transport", "zenoh")
+    made: Transport = descriptor.make(descriptor.options(**options), host_context())
+    return made
+
+
+def tls(folder: Path | None, machine: str) -> dict[str, Any]:
+    """The options of a machine's certificates."""
+    if folder is None:
+        return {}
+    from ibrobot_zenoh.options import Tls
+
+    place = folder / machine
+    return {"tls": Tls(place / "ca.pem", place / "certificate.pem", place / "key.pem")}
+
+
+def serve(endpoint: str, certificates: Path | None) -> None:
+    """The server, until its standard input ends."""
+    null = installed().find("policy", "null").make(None, host_context())
+    network = transport(mode="router", listen=(endpoint,), **tls(certificates, "localhost"))
+    service = InferenceService(null, network, "null")
+    service.start()
+    print("ready", flush=True)
+    sys.stdin.read()
+    service.close()
+    network.close()
+
+
+def through(
+    engine: Engine, other: Callable[[], int], pictures: np.ndarray, count: int, pause_s: float
+) -> dict[str, Any]:
+    """The client of the host over an engine that is ready."""
+    with ExitStack() as stack:
+        stack.callback(engine.close)
+        engine.start()
+        client = EngineClient(installed().find("policy", "null").make(None, host_context()), engine)
+        stack.callback(client.close)
+        return measure(asking(client, pictures), other(), count, pause_s)
+
+
+def over_zenoh(
+    pictures: np.ndarray, count: int, pause_s: float, certificates: Path | None = None, *, shared: bool = False
+) -> dict[str, Any]:
+    """Execution mode distributed."""
+    endpoint = f"{'tls/localhost' if certificates else 'tcp/127.0.0.1'}:{free_port()}"
+    with started("--serve", endpoint, *(["--certificates", str(certificates)] if certificates else [])) as pid:
+        network = transport(connect=(endpoint,), shared_memory=shared, **tls(certificates, "robot"))
+        try:
+            null = installed().find("policy", "null").make(None, host_context())
+            return through(RemoteEngine(null, network, "null", "robot"), lambda: pid, pictures, count, pause_s)
+        finally:
+            network.close()
+
+
+def in_process(pictures: np.ndarray, count: int, pause_s: float, folder: Path) -> dict[str, Any]:
+    """Execution mode process."""
+    (folder / "mini.yaml").write_text(ROBOT)
+    engine = ProcessEngine(load(folder / "mini.yaml", sim=True), "null")
+    return through(engine, lambda: engine.pid or 0, pictures, count, pause_s)
+
+
+def summary(payload: str, way: str, told: dict[str, Any]) -> dict[str, Any]:
+    """One row of the table."""
+    p50, p99 = np.percentile(told["latencies"], [50, 99])
+    blocked = np.percentile(told["blocked"], 50)
+    row = {"payload": payload, "way": way, "p50_ms": float(p50), "p99_ms": float(p99), "blocked_ms": float(blocked)}
+    return {**row, "cpu_ms": told["cpu_ms"]}
+
+
+def run(given: argparse.Namespace, folder: Path) -> int:
+    """Print the table; 1 when a limit is missed."""
+    certificates = folder / "certificates"
+    ibrobot = (sys.executable, "-c", "from ibrobot_core.cli.main import main; main()")
+    made = ("certs", certificates, "--server", "localhost", "--robot", "robot")
+    subprocess.run([*ibrobot, *made], check=True, stdout=subprocess.DEVNULL)
+    rows = []
+    for payload, pictures in PAYLOADS.items():
+        how = (pictures, given.count, given.pause)
+        rows.append(summary(payload, "tcp", floor(*how)))
+        rows.append(summary(payload, "process", in_process(*how, folder)))
+        rows.append(summary(payload, "zenoh", over_zenoh(*how)))
+        rows.append(summary(payload, "zenoh shm", over_zenoh(*how, shared=True)))
+        rows.append(summary(payload, "zenoh mTLS", over_zenoh(*how, certificates)))
+    if given.lerobot:
+        script = Path(__file__).with_name("lerobot_async.py")
+        command = [given.lerobot, script, "--count", str(given.count), "--pause", str(given.pause)]
+        lines = subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()
+        for told in (json.loads(line) for line in lines if line.startswith('{"payload"')):
+            rows.append(summary(told["payload"], "lerobot", told))
+    print(f"{'':18} {'':11} {'p50':>8} {'p99':>8} {'blocked':>8} {'CPU':>8} {'x tcp':>7}")
+    missed = []
+    for payload in PAYLOADS:
+        mine = {row["way"]: row for row in rows if row["payload"] == payload}
+        for way, row in mine.items():
+            ratio = row["p50_ms"] / mine["tcp"]["p50_ms"]
+            numbers = " ".join(f"{row[key]:8.2f}" for key in ("p50_ms", "p99_ms", "blocked_ms", "cpu_ms"))
+            print(f"{payload:18} {way:11} {numbers} {ratio:7.1f}")
+            limit = {"process": PROCESS_RATIO, "zenoh": ZENOH_RATIO}.get(way)
+            if limit is not None and "uint8" in payload and ratio > limit:
+                missed.append(f"{payload} {way}: {ratio:.1f} times tcp, more than {limit:g}")
+            if way not in ("tcp", "lerobot"):
+                if row["blocked_ms"] > BLOCKED_MS:
+                    missed.append(f"{payload} {way}: asking blocks for {row['blocked_ms']:.2f} ms")
+                if "lerobot" in mine and mine["lerobot"]["p50_ms"] < LEROBOT_RATIO * row["p50_ms"]:
+                    faster = mine["lerobot"]["p50_ms"] / row["p50_ms"]
+                    missed.append(f"{payload} {way}: only {faster:.1f} times as fast as LeRobot")
+    print("\n".join(missed) or "all within the limits")
+    return int(bool(missed))
+
+
+def main() -> int:
+    """With a made-up plugin, so that both sides find the same policy."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--count", type=int, default=200)
+    parser.add_argument("--pause", type=float, default=0.02)
+    parser.add_argument("--lerobot", metavar="PYTHON")
+    for hidden in ("--echo", "--serve", "--certificates"):
+        parser.add_argument(hidden, help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    logging.disable(logging.CRITICAL)
+    if given.echo:
+        echo(int(given.echo))
+        return 0
+    if given.serve:
+        serve(given.serve, Path(given.certificates) if given.certificates else None)
+        return 0
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "null_parts.py").write_text(PLUGIN)
+        metadata = folder / "null_parts-1.0.dist-info"
+        metadata.mkdir()
+        (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: null-parts\nVersion: 1.0\n")
+        (metadata / "entry_points.txt").write_text("[ibrobot]\nnull_parts = null_parts\n")
+        sys.path.insert(0, name)
+        os.environ["PYTHONPATH"] = os.pathsep.join([name, *filter(None, [os.environ.get("PYTHONPATH")])])
+        return run(given, folder)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
