@@ -5,8 +5,8 @@
 Every way carries the same observations: two raw pictures of 640x480, two of 224x224 in float32, two JPEGs of 38 kB,
 each with six joint positions; a chunk of 50x6 comes back. `tcp` echoes a frame of the same bytes over a plain socket
 between two processes: the floor. `process` is execution mode process; `zenoh` and `zenoh mTLS` are execution mode
-distributed as between machines, `zenoh shm` as within one. `lerobot` is its RobotClient and PolicyServer, in the interpreter PYTHON
-which has `lerobot[async]==0.6.1`: it has no JPEG there and sends raw pictures of as many bytes.
+distributed as between machines, `zenoh shm` as within one. `lerobot` is its RobotClient and PolicyServer, in the
+interpreter PYTHON, which has `lerobot[async]==0.6.1`: it has no JPEG there and sends raw pictures of as many bytes.
 
 Times are in ms: request to chunk p50 and p99, how long the control loop is blocked in asking, and processor time of
 both sides together for a request. Exits with 1 where ours is less than 5 times as fast as LeRobot (when given), raw

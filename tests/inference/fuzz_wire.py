@@ -209,6 +209,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     logging.disable(logging.CRITICAL)
+    np.seterr(all="ignore")  # sums of damaged numbers
     begun_s = time.monotonic()
     ended, robot, grown = fuzz_frames(arguments.mutants, arguments.seed)
     told = {
