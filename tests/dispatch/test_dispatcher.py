@@ -287,3 +287,15 @@ def test_a_new_episode_does_not_blend_with_the_old_one(make_rig: type[Rig]):
     rig.tick()
     rig.answer(ramp(5) * 0 + 1)
     np.testing.assert_array_equal(rig.plans[-1][2], np.ones((5, SIZE)))
+
+
+def test_a_new_episode_does_not_go_on_from_where_the_old_one_was_held(make_rig: type[Rig]):
+    rig = make_rig(strategy="rtc")
+    rig.tick()
+    rig.answer(ramp(3))
+    rig.tick(5)
+    rig.dispatcher.begin(8)
+    rig.tick()
+    assert rig.requests[-1].frame.prefix is None
+    rig.answer(ramp(5, first=20))
+    np.testing.assert_array_equal(rig.plans[-1][2], ramp(5, first=20))

@@ -122,3 +122,18 @@ def test_while_the_arm_is_held_the_prefix_is_where_and_for_how_long(make_rig: ty
 def test_a_policy_that_cannot_continue_a_plan_is_refused(make_rig: type[Rig]) -> None:
     with pytest.raises(ContractError, match="strategy: rtc needs a policy that continues the plan"):
         make_rig(strategy="rtc", prefix=False)
+
+
+def test_what_a_chunk_misses_the_plan_by_is_led_over(make_rig: type[Rig]) -> None:
+    """A policy continues the plan about, as guided flows do."""
+    rig = make_rig(watermark=9, strategy="rtc", timeout_s=60.0)
+    rig.tick()
+    planned = np.linspace(0.0, 0.5, 10)[:, None] * np.ones(SIZE)
+    rig.answer(planned)
+    rig.tick(3)
+    rig.answer(planned[1:] + 0.01)
+    start_ns, _, positions = rig.plans[-1]
+    assert start_ns == rig.clock.now_ns()
+    np.testing.assert_allclose(positions[0], planned[3], atol=1e-12)
+    np.testing.assert_allclose(positions[-1], planned[-1] + 0.01, atol=1e-12)
+    assert np.diff(positions, axis=0).max() < np.diff(planned, axis=0).max() + 0.01
