@@ -10,7 +10,7 @@ from ibrobot_core.interfaces.reader import EpisodeAddress, EpisodeReader, Episod
 from ibrobot_core.interfaces.recorder import EpisodeEnd, EpisodeStart, Recorder
 from ibrobot_core.interfaces.sensor import Sensor
 from ibrobot_core.interfaces.teleop import Teleop, TeleopCommand
-from ibrobot_core.interfaces.transport import Payload, Transport
+from ibrobot_core.interfaces.transport import Payload, SharedTopic, TopicTransport, Transport
 from ibrobot_core.interfaces.viewer import Viewer
 
 __all__ = [
@@ -41,12 +41,14 @@ __all__ = [
     "Recorded",
     "Recorder",
     "Sensor",
+    "SharedTopic",
     "Signal",
     "SimulatedHardware",
     "Teleop",
     "TeleopCommand",
     "Tensors",
     "TopicSummary",
+    "TopicTransport",
     "Transport",
     "Viewer",
     "nan_vector",

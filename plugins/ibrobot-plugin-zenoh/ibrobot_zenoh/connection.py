@@ -53,6 +53,7 @@ def zenoh_config(options: ZenohOptions) -> zenoh.Config:
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "scouting/delay": 0,
+        "timestamping/enabled": True,  # latched topics need it
         "transport/link/tx/lease": lease_ms,
         "transport/link/rx/max_message_size": options.max_message_size,
         "transport/shared_memory/enabled": options.shared_memory,
@@ -125,10 +126,7 @@ class Connection:
         Raises:
             TransportError: when closed, or not connected yet.
         """
-        session = self._session
-        if self._closed.is_set():
-            raise TransportError("the transport is closed")
-        if session is None:
+        if (session := self.open_session) is None:
             raise TransportError(f"not connected: nobody answers at {self._endpoints}")
         return session
 
@@ -139,9 +137,17 @@ class Connection:
         Raises:
             TransportError: when closed.
         """
+        self.check_open()
+        return self._session
+
+    def check_open(self) -> None:
+        """Nothing.
+
+        Raises:
+            TransportError: when closed.
+        """
         if self._closed.is_set():
             raise TransportError("the transport is closed")
-        return self._session
 
     def declare(self, make: Callable[[zenoh.Session], Declared]) -> Callable[[], None]:
         """Have `make` declare something on the session, now or when there is one; returns a function that ends it.

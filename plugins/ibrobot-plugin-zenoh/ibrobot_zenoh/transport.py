@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import threading
+import uuid
 from collections.abc import Callable
 from typing import Any, override
 
 import zenoh
 
 from ibrobot_core.errors import TransportError
-from ibrobot_core.interfaces import Context, Payload, Transport
+from ibrobot_core.interfaces import Context, Payload, SharedTopic, TopicTransport
 from ibrobot_core.interfaces.transport import WORKERS
+from ibrobot_core.messages import Message
 from ibrobot_core.workers import Workers
 from ibrobot_zenoh.connection import Connection, first_line
 from ibrobot_zenoh.options import ZenohOptions
+from ibrobot_zenoh.presence import Presence
+from ibrobot_zenoh.topics import Topics
 
 SUBSCRIBER_DEPTH = 1000
 """How many payloads may wait for a subscriber; beyond, the oldest gives way."""
 REQUESTS_WAITING = 64
 """How many requests may wait for a server's workers; beyond, the oldest is told that it is overloaded."""
-_WATCH_S = 1.0
 _FAILED = zenoh.Encoding.TEXT_PLAIN
 """Marks a server's own words, which Zenoh's about a timeout are not."""
 
@@ -38,8 +41,8 @@ def _sendable(payload: Payload) -> bytes | bytearray:
     return payload.tobytes() if isinstance(payload, memoryview) else payload
 
 
-class ZenohTransport(Transport):
-    """Payloads over Zenoh. Keys are `ibrobot/topic/TOPIC` and `ibrobot/service/NAME`.
+class ZenohTransport(TopicTransport):
+    """Payloads over Zenoh, under `ibrobot/topic/TOPIC` and `ibrobot/service/NAME`; messages as ROS 2 nodes send them.
 
     Raises:
         TransportError: see `Connection`.
@@ -49,6 +52,8 @@ class ZenohTransport(Transport):
         self._log = ctx.log
         self._largest = options.max_message_size
         self._connection = Connection(options, ctx.log)
+        self._topics = Topics(self._connection, options, ctx)
+        self._presence = Presence(self._connection)
         self._lock = threading.Lock()
         self._served: set[str] = set()
         self._workers: list[Workers[Any]] = []
@@ -60,7 +65,10 @@ class ZenohTransport(Transport):
         session = self._connection.open_session
         if session is not None:  # else there is nobody who could have subscribed
             # What waits here is the link, never a subscriber: those have queues of their own.
-            session.put(key, _sendable(payload), congestion_control=zenoh.CongestionControl.BLOCK)
+            try:
+                session.put(key, _sendable(payload), congestion_control=zenoh.CongestionControl.BLOCK)
+            except zenoh.ZError as error:
+                raise TransportError(f"{topic}: {first_line(error)}") from error
 
     @override
     def subscribe(self, topic: str, callback: Callable[[Payload], object]) -> Callable[[], None]:
@@ -78,7 +86,7 @@ class ZenohTransport(Transport):
 
     @override
     def serve(self, name: str, handler: Callable[[Payload], Payload], *, workers: int = WORKERS) -> Callable[[], None]:
-        key, token = _key("service", name), _key("served", name)
+        key, token = _key("service", name), _key("served", name).join(uuid.uuid4().hex)
 
         def answer(query: zenoh.Query) -> None:
             with query:  # dropping it is what tells the requester that nothing more comes
@@ -104,9 +112,7 @@ class ZenohTransport(Transport):
                 raise TransportError(f"{name} is served already")
             end_queries = self._connection.declare(lambda session: session.declare_queryable(key, take, complete=True))
             self._served.add(name)
-        end_token = self._connection.declare(
-            lambda session: session.liveliness().declare_token(token.join(str(session.info.zid())))
-        )
+        end_token = self._connection.declare(lambda session: session.liveliness().declare_token(token))
 
         def end() -> None:
             end_token()
@@ -140,40 +146,21 @@ class ZenohTransport(Transport):
 
     @override
     def watch(self, name: str, changed: Callable[[bool], object]) -> Callable[[], None]:
-        tokens = _key("served", name).join("*")
-        turn = threading.Lock()  # held until the present state was told, which comes first
-        alive: set[str] = set()
-        gone: set[str] = set()
-        told: bool | None = None
+        _key("served", name)  # refuses what cannot be a name
+        self._connection.check_open()
+        return self._keep(*self._presence.watch(name.removeprefix("/"), changed))
 
-        def tell(served: bool) -> None:
-            with turn:
-                changed(served)
+    @override
+    def publish_message(self, topic: str, message: Message, *, latched: bool = False) -> None:
+        self._topics.publish(topic, message, latched=latched)
 
-        watcher = Workers(tell, f"a watch of {name}")
+    @override
+    def subscribe_messages(self, topic: str, callback: Callable[[Message], object]) -> Callable[[], None]:
+        return self._keep(*self._topics.subscribe(topic, callback))
 
-        def take(sample: zenoh.Sample) -> None:
-            nonlocal told
-            now, before = (alive, gone) if sample.kind == zenoh.SampleKind.PUT else (gone, alive)
-            with self._lock:
-                now.add(str(sample.key_expr))
-                before.discard(str(sample.key_expr))
-                if told is not None and told != bool(alive):
-                    told = not told
-                    watcher.put(told)
-
-        with turn:
-            end = self._connection.declare(
-                lambda session: session.liveliness().declare_subscriber(tokens, take, history=True)
-            )
-            # What `take` is told of the past comes at any time: ask as well, for what is there now.
-            session = self._connection.open_session
-            replies = () if session is None else session.liveliness().get(tokens, timeout=_WATCH_S)
-            found = {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
-            with self._lock:
-                told = present = bool(found - gone | alive)
-            changed(present)
-        return self._keep(end, watcher)
+    @override
+    def shared_topics(self, timeout_s: float) -> list[SharedTopic]:
+        return self._topics.shared(timeout_s)
 
     @override
     def close(self) -> None:

@@ -95,7 +95,7 @@ def test_access_control(tmp_path: Path):
     rules = [
         {"id": name, "permission": "allow", "flows": ["ingress", "egress"], "messages": MESSAGES, "key_exprs": keys}
         for name, keys in (
-            ("everybody", ["ibrobot/service/inference", "ibrobot/served/inference/*"]),
+            ("everybody", ["ibrobot/service/inference", "ibrobot/served/**"]),
             ("robot1", ["ibrobot/topic/robot1/**"]),
         )
     ]

@@ -1,0 +1,118 @@
+"""How ROS 2 nodes with rmw_zenoh name topics on Zenoh, what they attach to messages, and how they tell who is there."""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections import Counter
+from collections.abc import Iterable
+
+import attrs
+from ibrobot_ros2 import type_hash
+
+from ibrobot_core.errors import TransportError
+from ibrobot_core.interfaces.transport import SharedTopic
+
+ADMIN = "@ros2_lv"
+NO_HASH = "TypeHashNotSupported"
+"""What ROS 2 Humble says for the hash of a type."""
+
+_NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
+_ATTACHMENT = struct.Struct("<qqB16s")
+_ENDPOINTS = {"MP": "publisher", "MS": "subscriber"}
+_TOKEN_PARTS = 13
+_QOS = ":{durability}:,{depth}:,:,:,,"
+"""Reliable; empty is the default of each field."""
+
+
+def absolute(topic: str, namespace: str = "") -> str:
+    """A topic's full name, e.g. `/robot1/joint_states`.
+
+    Raises:
+        TransportError: for what is no ROS 2 name.
+    """
+    name = "/" + "/".join(part.strip("/") for part in (namespace, topic) if part.strip("/"))
+    if not _NAME.fullmatch(name):
+        raise TransportError(f"{topic!r} is no name of a ROS 2 topic, e.g. /joint_states")
+    return name
+
+
+def dds_type(ros_type: str) -> str:
+    """`sensor_msgs/msg/Image` -> `sensor_msgs::msg::dds_::Image_`."""
+    *packages, name = ros_type.split("/")
+    return "::".join((*packages, "dds_", f"{name}_"))
+
+
+def ros_type(dds: str) -> str:
+    """`sensor_msgs::msg::dds_::Image_` -> `sensor_msgs/msg/Image`.
+
+    Raises:
+        TransportError: for what is no such name.
+    """
+    *packages, mark, name = dds.split("::")
+    if mark != "dds_" or not packages or not name.endswith("_"):
+        raise TransportError(f"{dds!r} is no name of a message type")
+    return "/".join((*packages, name[:-1]))
+
+
+def typed(type_name: str, *, hashed: bool) -> str:
+    """How keys name a type: in DDS' words, and with its hash."""
+    return f"{dds_type(type_name)}/{type_hash(type_name) if hashed else NO_HASH}"
+
+
+def topic_key(domain: int, topic: str, type_name: str, *, hashed: bool) -> str:
+    """The key under which messages of a topic are published."""
+    return f"{domain}/{topic.strip('/')}/{typed(type_name, hashed=hashed)}"
+
+
+def type_of_key(key: str) -> str:
+    """The message type in a topic's key.
+
+    Raises:
+        TransportError: where there is none.
+    """
+    return ros_type(key.rsplit("/", 2)[-2] if key.count("/") > 1 else "")
+
+
+def attachment(sequence: int, stamp_ns: int, gid: bytes) -> bytes:
+    """What goes with a message: its number from 1, when it was sent [ns], and the publisher's id of 16 bytes."""
+    return _ATTACHMENT.pack(sequence, stamp_ns, len(gid), gid)
+
+
+@attrs.frozen
+class Node:
+    """Under whose name topics are published.
+
+    Attributes:
+        domain: the ROS 2 domain.
+        session: Zenoh's id of the session.
+        name: the node's name.
+    """
+
+    domain: int
+    session: str
+    name: str
+
+    def node_token(self) -> str:
+        """Tells that the node is there."""
+        return f"{ADMIN}/{self.domain}/{self.session}/0/0/NN/%/%/{self.name}"
+
+    def publisher_token(self, number: int, topic: str, type_name: str, *, hashed: bool, latched: bool) -> str:
+        """Tells that publisher `number` (from 1) of the node is there."""
+        qos = _QOS.format(durability="1" if latched else "", depth=1 if latched else 10)
+        mangled, kind = topic.replace("/", "%"), typed(type_name, hashed=hashed)
+        return f"{ADMIN}/{self.domain}/{self.session}/0/{number}/MP/%/%/{self.name}/{mangled}/{kind}/{qos}"
+
+
+def topics_of_tokens(tokens: Iterable[str]) -> list[SharedTopic]:
+    """The topics that tokens tell of, by name; tokens of nodes and services, and ill-formed ones, are passed over."""
+    counts: Counter[tuple[str, str, str]] = Counter()
+    for token in set(tokens):  # one's own may come twice
+        parts = token.split("/")
+        if len(parts) == _TOKEN_PARTS and parts[5] in _ENDPOINTS:
+            try:
+                counts[parts[9].replace("%", "/"), ros_type(parts[10]), parts[5]] += 1
+            except TransportError:
+                continue
+    found = sorted({(name, type_name) for name, type_name, _ in counts})
+    return [SharedTopic(name, kind, counts[name, kind, "MP"], counts[name, kind, "MS"]) for name, kind in found]

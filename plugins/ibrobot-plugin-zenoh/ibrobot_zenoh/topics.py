@@ -1,0 +1,186 @@
+"""Messages on Zenoh, under the names and with the encoding of ROS 2 nodes that use rmw_zenoh."""
+
+from __future__ import annotations
+
+import logging
+import re
+import threading
+import time
+import uuid
+from collections.abc import Callable
+from typing import Any
+
+import zenoh
+import zenoh.ext
+from ibrobot_ros2 import decode, encode
+
+from ibrobot_core.errors import IbrobotError, TransportError
+from ibrobot_core.interfaces import Context
+from ibrobot_core.interfaces.transport import SharedTopic
+from ibrobot_core.messages import Message
+from ibrobot_core.workers import Workers
+from ibrobot_zenoh.connection import Connection, Declared, first_line
+from ibrobot_zenoh.options import ZenohOptions
+from ibrobot_zenoh.ros2 import ADMIN, Node, absolute, attachment, topic_key, topics_of_tokens, type_of_key
+
+DEPTH = 100
+"""How many messages may wait for a subscriber; beyond, the oldest gives way."""
+_LARGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/PointCloud2")
+"""Types that others of less size overtake."""
+
+
+class _Group:
+    """Several things that were declared together."""
+
+    def __init__(self, *declared: Declared) -> None:
+        self._declared = declared
+
+    def undeclare(self) -> None:
+        for each in self._declared:
+            each.undeclare()
+
+
+class _Publisher:
+    """One topic. The newest message of a latched one is also sent to who comes later, and after connecting."""
+
+    def __init__(self, topics: Topics, topic: str, type_name: str, *, latched: bool) -> None:
+        self.type_name = type_name
+        self.latched = latched
+        self._topics = topics
+        self._topic = topic
+        self._gid = uuid.uuid4().bytes
+        self._lock = threading.Lock()
+        self._sequence = 0
+        self._newest: bytes | None = None
+        self._publisher: zenoh.Publisher | zenoh.ext.AdvancedPublisher | None = None
+        topics.connection.declare(self._declare)
+
+    def publish(self, payload: bytes) -> None:
+        with self._lock:
+            if self._publisher is not None:
+                self._put(self._publisher, payload)
+            elif self.latched:
+                self._newest = payload
+
+    def _put(self, publisher: zenoh.Publisher | zenoh.ext.AdvancedPublisher, payload: bytes) -> None:
+        self._sequence += 1
+        try:
+            publisher.put(payload, attachment=attachment(self._sequence, time.time_ns(), self._gid))
+        except zenoh.ZError as error:
+            raise TransportError(f"{self._topic}: {first_line(error)}") from error
+
+    def _declare(self, session: zenoh.Session) -> Declared:
+        options = self._topics.options
+        hashed = options.type_hashes
+        key = topic_key(options.domain, self._topic, self.type_name, hashed=hashed)
+        qos: dict[str, Any] = {
+            "congestion_control": zenoh.CongestionControl.BLOCK,
+            "priority": zenoh.Priority.DATA_LOW if self.type_name in _LARGE else zenoh.Priority.DATA,
+        }
+        publisher: zenoh.Publisher | zenoh.ext.AdvancedPublisher
+        if self.latched:
+            cache = zenoh.ext.CacheConfig(max_samples=1)
+            publisher = zenoh.ext.declare_advanced_publisher(session, key, cache=cache, publisher_detection=True, **qos)
+        else:
+            publisher = session.declare_publisher(key, **qos)
+        token = self._topics.node(session).publisher_token(
+            self._topics.next_number(), self._topic, self.type_name, hashed=hashed, latched=self.latched
+        )
+        alive = session.liveliness().declare_token(token)
+        with self._lock:
+            self._publisher = publisher
+            if self._newest is not None:
+                self._put(publisher, self._newest)
+        return _Group(alive, publisher)
+
+
+class Topics:
+    """Publishes and receives messages; knows which topics there are.
+
+    Args:
+        connection: the session.
+        options: domain, namespace, and whether types have hashes.
+        ctx: whose robot's name the node has.
+    """
+
+    def __init__(self, connection: Connection, options: ZenohOptions, ctx: Context) -> None:
+        self.connection = connection
+        self.options = options
+        self._log = ctx.log
+        self._name = "ibrobot_" + re.sub(r"\W", "_", ctx.robot.name)
+        self._lock = threading.Lock()
+        self._publishers: dict[str, _Publisher] = {}
+        self._number = 0
+
+    def publish(self, topic: str, message: Message, *, latched: bool) -> None:
+        """See `TopicTransport.publish_message`."""
+        self.connection.check_open()
+        name = absolute(topic, self.options.namespace)
+        payload = encode(message).tobytes()
+        if len(payload) > self.options.max_message_size:
+            limit = self.options.max_message_size
+            raise TransportError(f"{name}: a message of {len(payload)} bytes is larger than max_message_size, {limit}")
+        with self._lock:
+            publisher = self._publishers.get(name)
+            if publisher is None:
+                if not self._publishers:
+                    self.connection.declare(
+                        lambda session: session.liveliness().declare_token(self.node(session).node_token())
+                    )
+                publisher = self._publishers[name] = _Publisher(self, name, message.ros_type, latched=latched)
+        if publisher.type_name != message.ros_type:
+            raise TransportError(f"topic {name} carries {publisher.type_name}, not {message.ros_type}")
+        publisher.publish(payload)
+
+    def subscribe(self, topic: str, callback: Callable[[Message], object]) -> tuple[Callable[[], None], Workers[Any]]:
+        """What ends it, and the thread that calls `callback`; see `TopicTransport.subscribe_messages`."""
+        name = absolute(topic, self.options.namespace)
+        told = _Once(self._log)
+
+        def deliver(sample: zenoh.Sample) -> None:
+            try:
+                message = decode(type_of_key(str(sample.key_expr)), sample.payload.to_bytes())
+            except IbrobotError as error:
+                told.warning("a message on %s was passed over: %s", name, error)
+                return
+            callback(message)
+
+        subscriber = Workers(deliver, f"a subscriber of {name}", depth=DEPTH)
+
+        def take(sample: zenoh.Sample) -> None:
+            if subscriber.put(sample) is not None:
+                told.warning("a subscriber of %s is too slow: messages are dropped", name)
+
+        key = f"{self.options.domain}{name}/*/*"
+        history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
+        end = self.connection.declare(
+            lambda session: zenoh.ext.declare_advanced_subscriber(session, key, take, history=history)
+        )
+        return end, subscriber
+
+    def shared(self, timeout_s: float) -> list[SharedTopic]:
+        """See `TopicTransport.shared_topics`."""
+        tokens = self.connection.session().liveliness().get(f"{ADMIN}/{self.options.domain}/**", timeout=timeout_s)
+        return topics_of_tokens(str(reply.ok.key_expr) for reply in tokens if reply.ok is not None)
+
+    def node(self, session: zenoh.Session) -> Node:
+        """Whose publishers there are on `session`."""
+        return Node(self.options.domain, str(session.info.zid()), self._name)
+
+    def next_number(self) -> int:
+        """A number for a publisher, from 1."""
+        self._number += 1  # always under the connection's lock
+        return self._number
+
+
+class _Once:
+    """Warns once of each kind of thing."""
+
+    def __init__(self, log: logging.Logger) -> None:
+        self._log = log
+        self._told: set[str] = set()
+
+    def warning(self, text: str, *arguments: object) -> None:
+        if text not in self._told:
+            self._told.add(text)
+            self._log.warning(text, *arguments)
