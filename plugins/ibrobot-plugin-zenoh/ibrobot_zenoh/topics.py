@@ -25,6 +25,7 @@ from ibrobot_zenoh.ros2 import ADMIN, Node, absolute, attachment, topic_key, top
 
 DEPTH = 100
 """How many messages may wait for a subscriber; beyond, the oldest gives way."""
+_AGAIN_S = 0.02
 _LARGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/PointCloud2")
 """Types that others of less size overtake."""
 
@@ -160,8 +161,17 @@ class Topics:
 
     def shared(self, timeout_s: float) -> list[SharedTopic]:
         """See `TopicTransport.shared_topics`."""
-        tokens = self.connection.session().liveliness().get(f"{ADMIN}/{self.options.domain}/**", timeout=timeout_s)
-        return topics_of_tokens(str(reply.ok.key_expr) for reply in tokens if reply.ok is not None)
+        deadline = time.monotonic() + timeout_s
+        found, before = self._tokens(timeout_s), None
+        # The first answer after connecting may come before the other side has told all that it knows.
+        while found != before and time.monotonic() + _AGAIN_S < deadline:
+            time.sleep(_AGAIN_S)
+            found, before = self._tokens(timeout_s), found
+        return topics_of_tokens(found)
+
+    def _tokens(self, timeout_s: float) -> set[str]:
+        replies = self.connection.session().liveliness().get(f"{ADMIN}/{self.options.domain}/**", timeout=timeout_s)
+        return {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
 
     def node(self, session: zenoh.Session) -> Node:
         """Whose publishers there are on `session`."""

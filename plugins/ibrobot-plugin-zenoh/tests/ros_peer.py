@@ -15,5 +15,8 @@ subscriber = ROS2Subscriber(
     "/lab/chatter", "std_msgs/msg/String", lambda message: publisher.publish(data=f"heard {message.data}"), DEFINITION,
     domain_id=0, router_port=port,
 )  # fmt: skip
-print(*(name for name, _ in get_topic_names_and_types(domain_id=0, router_port=port)), flush=True)
+topics: list[str] = []
+while "/lab/chatter" not in topics or "/reply" not in topics:
+    topics = [name for name, _ in get_topic_names_and_types(domain_id=0, router_port=port)]
+print(*topics, flush=True)
 sys.stdin.read()
