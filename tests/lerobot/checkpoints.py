@@ -12,6 +12,7 @@ from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTr
 from lerobot.policies import get_policy_class, make_pre_post_processors
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
+from lerobot.policies.smolvla.configuration_smolvla import SmolVLAConfig
 from lerobot.policies.utils import prepare_observation_for_inference
 from lerobot.policies.vqbet.configuration_vqbet import VQBeTConfig
 from numpy.typing import NDArray
@@ -120,3 +121,64 @@ def normalised_by(mode: str, config: PreTrainedConfig) -> PreTrainedConfig:
     kinds = ("STATE", "VISUAL", "ENV", "ACTION")
     config.normalization_mapping = dict.fromkeys(kinds, NormalizationMode(mode))
     return config
+
+
+_WORDS = (
+    "<unk>",
+    "<pad>",
+    "<image>",
+    "<fake_token_around_image>",
+    "<global-img>",
+    "<end>",
+    "pick",
+    "up",
+    "the",
+    "cube",
+)
+
+
+def language_model(path: Path) -> Path:
+    """A vision-language model of SmolVLA's kind that knows four words; its weights are drawn with the policy's."""
+    from tokenizers import Tokenizer
+    from tokenizers.models import WordLevel
+    from tokenizers.pre_tokenizers import Whitespace
+    from transformers import (
+        PreTrainedTokenizerFast,
+        SmolVLMConfig,
+        SmolVLMImageProcessor,
+        SmolVLMProcessor,
+        SmolVLMVideoProcessor,
+    )
+
+    words = Tokenizer(WordLevel({word: i for i, word in enumerate(_WORDS)}, unk_token="<unk>"))
+    words.pre_tokenizer = Whitespace()
+    special = ("image_token", "fake_image_token", "global_image_token", "end_of_utterance_token")
+    tokenizer = PreTrainedTokenizerFast(
+        tokenizer_object=words, unk_token="<unk>", pad_token="<pad>",
+        extra_special_tokens=dict(zip(special, _WORDS[2:6], strict=True)),
+    )  # fmt: skip
+    SmolVLMProcessor(
+        image_processor=SmolVLMImageProcessor(), tokenizer=tokenizer, video_processor=SmolVLMVideoProcessor(),
+        image_seq_len=4,
+    ).save_pretrained(path)  # fmt: skip
+    text = {
+        "model_type": "llama", "hidden_size": 32, "intermediate_size": 32, "num_hidden_layers": 2, "head_dim": 8,
+        "num_attention_heads": 4, "num_key_value_heads": 2, "vocab_size": len(_WORDS), "pad_token_id": 1,
+    }  # fmt: skip
+    vision = {
+        "hidden_size": 16, "intermediate_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2, "image_size": 32,
+        "patch_size": 8,
+    }  # fmt: skip
+    SmolVLMConfig(
+        text_config=text, vision_config=vision, scale_factor=2, image_token_id=2, pad_token_id=1
+    ).save_pretrained(path)
+    return path
+
+
+def smolvla(language: Path, **changes: Any) -> SmolVLAConfig:
+    """One camera and a prompt."""
+    small = {"num_vlm_layers": 2, "num_steps": 3, "resize_imgs_with_padding": (32, 32), "max_state_dim": 8}
+    given = (
+        _features(STATE, TOP) | small | {"chunk_size": CHUNK, "n_action_steps": CHUNK, "max_action_dim": 8} | changes
+    )
+    return SmolVLAConfig(vlm_model_name=str(language), **given)

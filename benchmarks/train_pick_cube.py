@@ -1,0 +1,96 @@
+"""The whole path of a policy: record demonstrations, convert them, train on them, run the result, and count.
+
+    python benchmarks/train_pick_cube.py [--episodes 100] [--steps 5000] [--trials 50] [--work pick_cube]
+
+1. `ibrobot record`: the scripted pick in simulation, in lockstep, without cameras; the cube's pose is an observation.
+2. `ibrobot convert`: a LeRobot dataset of the successes.
+3. `lerobot-train`: a small ACT (0.5 million parameters) on the CPU.
+4. `ibrobot launch`: the trained policy in the same simulation, with cubes at places that were in no demonstration.
+
+Needs LeRobot in the same environment: `pip install 'lerobot[dataset,training]>=0.6.1,<0.7'`. A stage whose result is in
+the folder `--work` is not done again. Prints one JSON object, the rate of success in it, whatever it is.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from time import perf_counter
+
+CONFIG = Path(__file__).with_name("pick_cube.yaml")
+FIRST_TRAINING_SEED = 1000
+"""Trials have the seeds from 0 on."""
+
+
+def run(*command: str | Path, **environment: str) -> str:
+    """Run a command of this environment and return its last line."""
+    program = Path(sys.executable).with_name(str(command[0]))
+    print(f"$ {' '.join(str(word) for word in command)}", file=sys.stderr)
+    found = subprocess.run(
+        [program, *command[1:]], stdout=subprocess.PIPE, text=True, check=True, env={**os.environ, **environment}
+    )
+    return found.stdout.strip().splitlines()[-1]
+
+
+def train(dataset: Path, out: Path, steps: int) -> None:
+    """Train ACT on what `ibrobot convert` wrote."""
+    # Threads that spin, or more of them than cores that are free, cost a multiple.
+    run(
+        "lerobot-train", "--dataset.repo_id=local/pick_cube", f"--dataset.root={dataset}", "--policy.type=act",
+        "--policy.device=cpu", "--policy.push_to_hub=false", "--policy.use_vae=false", "--policy.dim_model=128",
+        "--policy.n_heads=4", "--policy.dim_feedforward=256", "--policy.n_encoder_layers=2", "--policy.dropout=0.0",
+        "--policy.chunk_size=30", "--policy.n_action_steps=30", "--policy.optimizer_lr=5e-4", "--batch_size=64",
+        f"--steps={steps}", "--num_workers=1", "--save_freq=1000", "--wandb.enable=false", f"--output_dir={out}",
+        HF_HUB_OFFLINE="1", OMP_WAIT_POLICY="PASSIVE", OMP_NUM_THREADS="1",
+    )  # fmt: skip
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--episodes", type=int, default=100, help="demonstrations")
+    parser.add_argument("--steps", type=int, default=5000, help="of training")
+    parser.add_argument("--trials", type=int, default=50, help="runs of the trained policy")
+    parser.add_argument("--work", type=Path, default=Path("pick_cube"), help="folder of all that comes to be")
+    arguments = parser.parse_args()
+    work = arguments.work.absolute()
+    episodes, dataset, trained = work / "episodes", work / "dataset", work / "train"
+    times_s = {}
+    stages = {
+        "record": (
+            episodes,
+            lambda: run(
+                "ibrobot", "record", CONFIG, "--sim", "--lockstep", "--headless", "--episodes",
+                str(arguments.episodes), "--seed", str(FIRST_TRAINING_SEED), "--root", episodes, "--dataset", "pick",
+                "--prompt", "put the cube into the bin",
+            ),
+        ),
+        "convert": (
+            dataset,
+            lambda: run("ibrobot", "convert", episodes / "pick", "--out", dataset, "--outcome", "success"),
+        ),
+        "train": (trained, lambda: train(dataset, trained, arguments.steps)),
+    }  # fmt: skip
+    for name, (result, work_on) in stages.items():
+        if not result.exists():
+            begin = perf_counter()
+            work_on()
+            times_s[name] = round(perf_counter() - begin)
+    begin = perf_counter()
+    model = f"models.act.path={trained}/checkpoints/last/pretrained_model"
+    told = run(
+        "ibrobot", "launch", CONFIG, "--sim", "--lockstep", "--headless", "--mode", "learnt", "--episodes",
+        str(arguments.trials), "--json", "--set", model,
+    )  # fmt: skip
+    summary = json.loads(told)
+    times_s["run"] = round(perf_counter() - begin)
+    rate = summary["successes"] / summary["episodes"]
+    print(json.dumps({"successes": summary["successes"], "trials": summary["episodes"], "rate": rate, "s": times_s}))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,98 @@
+"""In this process, in a child, or on a server: the same actions as LeRobot alone, bit for bit."""
+
+from __future__ import annotations
+
+import sys
+import textwrap
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import attrs
+import numpy as np
+import pytest
+import torch
+from ibrobot_lerobot.options import LeRobotPolicyOptions
+from ibrobot_lerobot.policy import SEED, LeRobotPolicy
+
+from ibrobot_core.config import load
+from ibrobot_core.inference.engine import Engine, LocalEngine
+from ibrobot_core.inference.process import ProcessEngine
+from ibrobot_core.inference.remote import RemoteEngine
+from ibrobot_core.inference.service import InferenceService
+from ibrobot_core.interfaces import Frame
+from ibrobot_core.local_transport import LocalTransport
+from ibrobot_core.testing.contexts import START_NS, host_context
+
+sys.path.insert(0, str(Path(__file__).parent))
+from checkpoints import CONFIGS, Theirs, save
+
+pytestmark = pytest.mark.lerobot
+
+PATIENCE_NS = 60_000_000_000
+ROBOT = """\
+robot:
+  name: mini
+  joints: [{{name: pan, lower: -1.0, upper: 1.0, max_velocity: 2.0, max_acceleration: 10.0}}]
+  groups: {{arm: [pan]}}
+simulation: {{type: mujoco}}
+executors: {{arm_position: {{type: position, group: arm}}}}
+models: {{net: {{type: lerobot, path: {path}, threads: 1, device: cpu}}}}
+control_modes: {{idle: {{executors: [arm_position]}}}}
+default_control_mode: idle
+"""
+
+
+@pytest.fixture(params=["act", "diffusion"])
+def path(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    return save(CONFIGS[request.param](), tmp_path / request.param)
+
+
+def make(path: Path) -> LeRobotPolicy:
+    return LeRobotPolicy(LeRobotPolicyOptions(path, threads=1, device="cpu"), host_context())
+
+
+@pytest.fixture
+def engines(path: Path, tmp_path: Path) -> Iterator[dict[str, Engine]]:
+    """One of each, with weights of its own."""
+    here, cloud, transport = make(path), make(path), LocalTransport()
+    here.load()
+    cloud.load()
+    (tmp_path / "robot.yaml").write_text(textwrap.dedent(ROBOT.format(path=path)))
+    service = InferenceService(cloud, transport, "net")
+    service.start()
+    made: dict[str, Engine] = {
+        "monolithic": LocalEngine(here),
+        "process": ProcessEngine(load(tmp_path / "robot.yaml", sim=True), "net"),
+        "distributed": RemoteEngine(make(path), transport, "net", "mini"),
+    }
+    try:
+        for engine in made.values():
+            engine.start()
+        yield made
+    finally:
+        for engine in made.values():
+            engine.close()
+        service.close()
+
+
+def test_every_execution_mode_acts_as_lerobot_alone(path: Path, engines: dict[str, Engine]) -> None:
+    torch.set_num_threads(1)
+    theirs, edge = Theirs(path), make(path)
+    edge.reset(11)
+    rng = np.random.default_rng(2)
+    past: list[Frame] = []
+    selected = []
+    for i in range(edge.spec.chunk_size):
+        values = {
+            key: rng.integers(0, 256, shape, np.uint8) if len(shape) == 3 else rng.normal(size=shape).astype(np.float32)
+            for key, shape in edge.spec.observations.items()
+        }
+        past.append(Frame(START_NS + i, values))
+        if i == 0:
+            tensors = edge.preprocess(attrs.evolve(past[0]))
+        selected.append(theirs.select(values, int(tensors[SEED][0])))
+    wanted = np.stack(selected).astype(np.float64)
+    for mode, engine in engines.items():
+        outputs = engine.infer(tensors, 1, time.monotonic_ns() + PATIENCE_NS)
+        np.testing.assert_array_equal(edge.postprocess(outputs), wanted, err_msg=mode)

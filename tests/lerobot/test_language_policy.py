@@ -1,0 +1,100 @@
+"""A policy with a prompt, LeRobot's own tokeniser and real-time chunking: SmolVLA, with a tiny language model."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import override
+
+import attrs
+import numpy as np
+import pytest
+import torch
+from ibrobot_lerobot.checkpoint import ACTION
+from ibrobot_lerobot.options import LeRobotPolicyOptions
+from ibrobot_lerobot.policy import SEED, LeRobotPolicy
+from lerobot.policies.rtc.configuration_rtc import RTCConfig
+
+from ibrobot_core.interfaces import Frame
+from ibrobot_core.testing import PolicySuite
+from ibrobot_core.testing.contexts import START_NS, host_context
+
+sys.path.insert(0, str(Path(__file__).parent))
+from checkpoints import CHUNK, SIZE, STATE, TOP, Theirs, language_model, save, smolvla
+
+pytestmark = [pytest.mark.lerobot, pytest.mark.filterwarnings("default")]  # transformers warns of its own
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("language")
+    return save(smolvla(language_model(root / "vlm")), root / "smolvla")
+
+
+@pytest.fixture(scope="module")
+def policy(path: Path) -> Iterator[LeRobotPolicy]:
+    torch.set_num_threads(1)
+    policy = LeRobotPolicy(LeRobotPolicyOptions(path, threads=1, device="cpu"), host_context())
+    policy.load()
+    yield policy
+    policy.close()
+
+
+def frame(prompt: str = "pick up the cube") -> Frame:
+    rng = np.random.default_rng(4)
+    values = {
+        STATE: rng.uniform(-1, 1, SIZE).astype(np.float32),
+        TOP: rng.integers(0, 256, (96, 96, 3), np.uint8),
+    }
+    return Frame(START_NS, values, prompt=prompt)
+
+
+def test_a_prompt_gives_lerobots_chunk(path: Path, policy: LeRobotPolicy) -> None:
+    theirs = Theirs(path)
+    chunks = []
+    for prompt in ("pick up the cube", "cube the up pick"):
+        tensors = policy.preprocess(frame(prompt))
+        assert all(value.dtype.kind in "biuf" for value in tensors.values())
+        chunks.append(policy.postprocess(policy.infer(tensors)))
+        wanted = theirs.chunk(frame().values, int(tensors[SEED][0]), prompt)
+        np.testing.assert_array_equal(chunks[-1], wanted.astype(np.float64))
+    assert not np.array_equal(*chunks)
+
+
+def test_the_plan_is_continued_as_lerobot_does(path: Path, policy: LeRobotPolicy) -> None:
+    assert policy.spec.prefix
+    prefix = np.random.default_rng(1).uniform(-0.5, 0.5, (5, SIZE))
+    tensors = policy.preprocess(attrs.evolve(frame(), prefix=prefix, delay_steps=2))
+    assert tensors["prefix"].shape == (1, 5, SIZE)
+    ours = policy.postprocess(policy.infer(tensors))
+    theirs = Theirs(path)
+    theirs.policy.config.rtc_config = RTCConfig()
+    theirs.policy.init_rtc_processor()
+    batch = {**theirs.batch(frame().values, frame().prompt), ACTION: torch.from_numpy(prefix.astype(np.float32))[None]}
+    left_over = theirs.pre({**batch, "task": frame().prompt})[ACTION]
+    wanted = theirs.chunk(
+        frame().values, int(tensors[SEED][0]), frame().prompt, inference_delay=2, prev_chunk_left_over=left_over
+    )
+    np.testing.assert_array_equal(ours, wanted.astype(np.float64))
+    alone = policy.postprocess(policy.infer(policy.preprocess(frame())))
+    assert np.abs(ours[:2] - prefix[:2]).mean() < 0.5 * np.abs(alone[:2] - prefix[:2]).mean()
+    assert len(ours) == CHUNK
+
+
+def test_steps_that_are_not_standard_are_said(path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.INFO):
+        LeRobotPolicy(LeRobotPolicyOptions(path), host_context())
+    assert "steps that only LeRobot runs, so this process loads torch" in caplog.text
+    assert "smolvla_new_line_processor, tokenizer_processor" in caplog.text
+
+
+class TestSmolVla(PolicySuite):
+    @pytest.fixture(autouse=True)
+    def _path(self, path: Path) -> None:
+        self.path = path
+
+    @override
+    def make(self, ctx):
+        return LeRobotPolicy(LeRobotPolicyOptions(self.path, threads=1, device="cpu"), ctx)
