@@ -256,7 +256,9 @@ def over_zenoh(
 def in_process(pictures: np.ndarray, count: int, pause_s: float, folder: Path) -> dict[str, Any]:
     """Execution mode process."""
     (folder / "mini.yaml").write_text(ROBOT)
-    engine = ProcessEngine(load(folder / "mini.yaml", sim=True), "null")
+    config = load(folder / "mini.yaml", sim=True)
+    fingerprint = installed().find("policy", "null").make(None, host_context(robot=config.robot)).fingerprint()
+    engine = ProcessEngine(config, "null", fingerprint)
     return through(engine, lambda: engine.pid or 0, pictures, count, pause_s)
 
 
@@ -283,9 +285,10 @@ def run(given: argparse.Namespace, folder: Path) -> int:
         rows.append(summary(payload, "zenoh shm", over_zenoh(*how, shared=True)))
         rows.append(summary(payload, "zenoh mTLS", over_zenoh(*how, certificates)))
     if given.lerobot:
-        script = Path(__file__).with_name("lerobot_async.py")
+        script = Path(__file__).absolute().with_name("lerobot_async.py")
         command = [given.lerobot, script, "--count", str(given.count), "--pause", str(given.pause)]
-        lines = subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()
+        # Its logger makes a folder where it runs.
+        lines = subprocess.run(command, check=True, capture_output=True, text=True, cwd=folder).stdout.splitlines()
         for told in (json.loads(line) for line in lines if line.startswith('{"payload"')):
             rows.append(summary(told["payload"], "lerobot", told))
     print(f"{'':18} {'':11} {'p50':>8} {'p99':>8} {'blocked':>8} {'CPU':>8} {'x tcp':>7}")

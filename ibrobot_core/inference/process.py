@@ -40,16 +40,20 @@ class ProcessEngine(Engine):
     Args:
         config: the robot YAML.
         model: the model's name there.
+        fingerprint: of the policy on this side.
         seed: the run's.
         given_up: set when nobody waits for it any more, e.g. while it loads.
     """
 
-    def __init__(self, config: RobotConfig, model: str, seed: int = 0, given_up: threading.Event | None = None) -> None:
+    def __init__(
+        self, config: RobotConfig, model: str, fingerprint: str, seed: int = 0, given_up: threading.Event | None = None
+    ) -> None:
         super().__init__("process")
         self._order = {
             "document": config.document, "source": str(config.source), "sim": config.simulated, "model": model,
             "seed": seed, "host": os.getpid(),
         }  # fmt: skip
+        self._fingerprint = fingerprint
         self._log = logging.getLogger("ibrobot.inference")
         self._robot = config.robot.name
         self._lock = threading.Lock()
@@ -148,7 +152,7 @@ class ProcessEngine(Engine):
                     elif event["event"] == "failed":
                         self._failure = event["error"]
                     elif event["event"] == "ready":
-                        self.stats.alive = True
+                        self._check(event["fingerprint"])
                     if event["event"] == wanted:
                         return dict(event)
                     continue
@@ -159,6 +163,16 @@ class ProcessEngine(Engine):
             if time.monotonic() >= deadline_s:
                 state = "did not answer" if self.stats.alive else "is still loading"
                 raise PolicyError(f"the model's process {self.pid} {state} in time")
+
+    def _check(self, fingerprint: str) -> None:
+        """Take a process that is ready, unless its model is another: the files may have changed since the start."""
+        if fingerprint != self._fingerprint:
+            self._bury()
+            raise PolicyError(
+                f"the model's process has another policy, {fingerprint!r}, than the host, {self._fingerprint!r}; "
+                "start the run anew"
+            )
+        self.stats.alive = True
 
     def _revive(self, deadline_s: float) -> None:
         """See to it that there is a process, and that it has loaded."""
@@ -189,11 +203,11 @@ class ProcessEngine(Engine):
         if self._process is None:
             return 0
         process, self._process = self._process, None
+        self._pipe.close()  # for one that is well, the end
         try:
             process.wait(0.0 if self._closed.is_set() else _END_TIMEOUT_S)
         except subprocess.TimeoutExpired:
             process.kill()
         status = process.wait()
-        self._pipe.close()
         self._request = self._answer = memoryview(b"")
         return status

@@ -249,6 +249,8 @@ def decode(payload: Payload, *, limits: Limits = LIMITS, codec: PictureCodec | N
         raise WireError(f"no frame: it begins with {magic!r}, not {MAGIC!r}")
     if version != VERSION:
         raise WireError(f"a frame of version {version}; this side speaks version {VERSION}")
+    if frame[7] or any(frame[_HEAD.size - 6 : _HEAD.size]):
+        raise WireError("a frame whose reserved bytes are not 0")
     if kind not in Kind:
         raise WireError(f"a frame of the unknown kind {kind}")
     if size != len(frame):

@@ -17,6 +17,8 @@ from ibrobot_core.config import RobotConfig, load
 from ibrobot_core.errors import PolicyError
 from ibrobot_core.inference.process import ProcessEngine
 from ibrobot_core.plugins import discover
+from ibrobot_core.testing import host_context
+from ibrobot_core.testing.fakes import FakePolicy
 
 if TYPE_CHECKING:
     from conftest import Site
@@ -89,9 +91,13 @@ def config(site: Site, tmp_path: Path) -> RobotConfig:
     return load(tmp_path / "mini.yaml", sim=True, registry=discover(site.entry_points()))
 
 
+def fingerprint(config: RobotConfig) -> str:
+    return FakePolicy(host_context(robot=config.robot)).fingerprint()
+
+
 @pytest.fixture
 def engine(config: RobotConfig) -> Iterator[ProcessEngine]:
-    engine = ProcessEngine(config, "net")
+    engine = ProcessEngine(config, "net", fingerprint(config))
     engine.start()
     yield engine
     engine.close()
@@ -179,9 +185,17 @@ def test_a_late_answer_is_nobody_elses(engine: ProcessEngine, ask: Callable[...,
 
 
 def test_a_model_that_cannot_be_loaded_says_why(config: RobotConfig):
-    engine = ProcessEngine(config, "lost")
+    engine = ProcessEngine(config, "lost", "")
     with pytest.raises(PolicyError, match="no such checkpoint: nowhere"):
         engine.start()
+    engine.close()
+
+
+def test_a_process_with_another_policy_than_the_host_is_refused(config: RobotConfig):
+    engine = ProcessEngine(config, "net", "0123")
+    with pytest.raises(PolicyError, match=rf"another policy, '{fingerprint(config)}', than the host, '0123'"):
+        engine.start()
+    assert engine.pid is None
     engine.close()
 
 

@@ -99,6 +99,8 @@ TABLE = 80 + len("so101") + len("3f2a")
         (0, "4s", b"HTTP", "no frame"),
         (4, "<H", 2, "version 2; this side speaks version 1"),
         (6, "B", 9, "unknown kind 9"),
+        (7, "B", 1, "reserved bytes"),
+        (79, "B", 1, "reserved bytes"),
         (24, "<q", -1, "deadline"),
         (48, "<d", float("nan"), "latency of nan"),
         (56, "<Q", 10 * 2**30, f"says {10 * 2**30} bytes has"),
@@ -241,7 +243,7 @@ def test_a_small_jpeg_that_claims_a_large_picture_is_not_decoded():
 
 
 def test_the_documented_example_is_what_is_sent():
-    dump = PAGE.read_text().split("```hex\n")[1].split("```")[0]
+    dump = PAGE.read_text().split("```text\n")[1].split("```")[0]
     documented = bytes.fromhex("".join(line.split("|")[0].partition(":")[2] for line in dump.splitlines()))
     assert documented == bytes(encode(EXAMPLE))
     same(decode(documented), EXAMPLE)

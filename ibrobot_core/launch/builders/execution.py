@@ -81,7 +81,9 @@ class Model(Component):
         session, inference = self._session, self._inference
         match inference.execution_mode:
             case "process":
-                return ProcessEngine(session.config, inference.model, session.request.seed, session.finished)
+                return ProcessEngine(
+                    session.config, inference.model, policy.fingerprint(), session.request.seed, session.finished
+                )
             case "distributed":
                 return RemoteEngine(
                     policy, session.transport, inference.server_model or inference.model, session.config.robot.name,
