@@ -89,7 +89,9 @@ class PlannerDescriptor(Descriptor["Planner"]):
 
 @attrs.frozen
 class TransportDescriptor(Descriptor["Transport"]):
-    """A transport."""
+    """A transport; `topics` says that it is a `TopicTransport`."""
+
+    topics: bool = False
 
 
 @attrs.frozen

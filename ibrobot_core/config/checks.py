@@ -9,10 +9,10 @@ import attrs
 
 from ibrobot_core.config.convert import hint
 from ibrobot_core.config.keys import ModeKeys
-from ibrobot_core.config.schema import Control, Inference
+from ibrobot_core.config.schema import Control, Inference, Share
 from ibrobot_core.config.structure import Part, Parts
 from ibrobot_core.config.yaml_nodes import Document, Key
-from ibrobot_core.descriptors import ExecutorDescriptor
+from ibrobot_core.descriptors import ExecutorDescriptor, TransportDescriptor
 from ibrobot_core.robot import Robot
 
 
@@ -35,6 +35,7 @@ class Checks:
             self._mode(name, mode, robot)
         self._default_mode()
         self._recording()
+        self._transport()
 
     def _known(self, section: str) -> list[str]:
         """The names that a section gives, faulty or not, so that one fault is told once."""
@@ -191,6 +192,14 @@ class Checks:
         if self.parts.simulation is not None and (name := self.parts.simulation.keys.default_control_mode) is not None:
             key = ("simulation", "default_control_mode")
             self._refer(key, name, self._known("control_modes"), "control mode")
+
+    def _transport(self) -> None:
+        part = self.parts.transport
+        if part is None or part.keys.share == Share():
+            return
+        if not (isinstance(part.descriptor, TransportDescriptor) and part.descriptor.topics):
+            message = f"transport {part.descriptor.type!r} carries no topics to other machines; zenoh does"
+            self.document.add(("transport", "share"), message)
 
     def _recording(self) -> None:
         topics: Any = self.parts.recording.keys.topics if self.parts.recording else ()

@@ -20,6 +20,7 @@ from ibrobot_core.config.keys import (
     RecordingKeys,
     Sections,
     SimulationKeys,
+    TransportKeys,
 )
 from ibrobot_core.config.show import plain
 from ibrobot_core.descriptors import HardwareDescriptor
@@ -146,7 +147,7 @@ def json_schema(registry: Registry) -> Schema:
         "control_modes": _named(mode),
         "teleoperation": _named(_component(registry, "teleop", ComponentKeys)),
         "recording": _component(registry, "recorder", RecordingKeys),
-        "transport": _component(registry, "transport", ComponentKeys),
+        "transport": _component(registry, "transport", TransportKeys),
         "viewer": _component(registry, "viewer", ComponentKeys),
     }
     for name, section in sections.items():

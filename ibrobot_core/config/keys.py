@@ -7,7 +7,7 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.config.schema import ContractConfig, Control, Dispatch, Inference, ObservationSpec
+from ibrobot_core.config.schema import ContractConfig, Control, Dispatch, Inference, ObservationSpec, Share
 from ibrobot_core.options import option
 from ibrobot_core.robot import Robot
 from ibrobot_core.units import NORM_MODES
@@ -85,6 +85,14 @@ class RecordingKeys:
     root: str = option("episodes", help="where episodes go; relative to the working directory")
     dataset: str = option("default", help="folder of one task's episodes, below root")
     topics: str | tuple[str, ...] = option("contract", help="contract, all, or a list of topics")
+
+
+@attrs.frozen
+class TransportKeys:
+    """Keys of the transport."""
+
+    type: str = option(help="which plugin; `ibrobot plugins` lists them")
+    share: Share = option(factory=Share, help="topics shared with other machines")
 
 
 @attrs.frozen

@@ -24,6 +24,7 @@ from ibrobot_core.config.schema import (
     Peripheral,
     Recording,
     RobotConfig,
+    TransportConfig,
 )
 from ibrobot_core.config.structure import Part, Parts, Structurer
 from ibrobot_core.config.yaml_nodes import Document, Place, parse
@@ -130,7 +131,7 @@ def _build(document: Document, source: Path, sim: bool, registry: Registry) -> R
         teleoperation={name: part.component for name, part in parts.teleoperation.items()},
         contract=contract,
         recording=_recording(parts.recording),
-        transport=_component(parts.transport),
+        transport=_transport(parts.transport),
         viewer=_component(parts.viewer),
         simulated=parts.simulated,
         source=source,
@@ -164,6 +165,10 @@ def _recording(part: Part | None) -> Recording | None:
         return None
     keys = part.keys
     return Recording(part.descriptor.type, part.options, Path(keys.root), keys.dataset, keys.topics)
+
+
+def _transport(part: Part | None) -> TransportConfig | None:
+    return None if part is None else TransportConfig(part.descriptor.type, part.options, part.keys.share)
 
 
 def shipped_configs(registry: Registry) -> dict[str, Path]:

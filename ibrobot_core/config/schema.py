@@ -197,6 +197,37 @@ class Recording(Component):
     topics: str | tuple[str, ...] = "contract"
 
 
+def _check_topics(instance: Any, attribute: attrs.Attribute[tuple[str, ...]], value: tuple[str, ...]) -> None:
+    for topic in value:
+        if not topic.startswith("/"):
+            raise ValueError(f"{topic!r} is no full name of a topic, did you mean '/{topic}'?")
+        if value.count(topic) > 1:
+            raise ValueError(f"{topic} is given twice")
+
+
+@attrs.frozen
+class Share:
+    """Topics shared with other machines."""
+
+    publish: tuple[str, ...] = option(
+        (), validator=_check_topics, help="topics of this robot for others, e.g. /joint_states"
+    )
+    subscribe: tuple[str, ...] = option(
+        (), validator=_check_topics, help="topics of others for this robot's bus, e.g. /force_torque"
+    )
+
+    def __attrs_post_init__(self) -> None:
+        if both := [topic for topic in self.publish if topic in self.subscribe]:
+            raise ValueError(f"{both[0]} is both published and subscribed; it can only go one way")
+
+
+@attrs.frozen
+class TransportConfig(Component):
+    """The `transport:` section."""
+
+    share: Share = attrs.field(factory=Share)
+
+
 @attrs.frozen
 class Control:
     """The `control:` section."""
@@ -223,7 +254,7 @@ class RobotConfig:
     teleoperation: Mapping[str, Component] = attrs.field(factory=dict)
     contract: ContractConfig = attrs.field(factory=ContractConfig)
     recording: Recording | None = None
-    transport: Component | None = None
+    transport: TransportConfig | None = None
     viewer: Component | None = None
     control: Control = attrs.field(factory=Control)
     simulated: bool = False

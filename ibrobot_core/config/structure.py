@@ -21,6 +21,7 @@ from ibrobot_core.config.keys import (
     RecordingKeys,
     Sections,
     SimulationKeys,
+    TransportKeys,
 )
 from ibrobot_core.config.schema import Component
 from ibrobot_core.config.yaml_nodes import Document, Key
@@ -100,9 +101,10 @@ class Structurer:
             if mode.planner is not None:
                 planner = self._component("planner", ("control_modes", name, "planner"), ComponentKeys)
                 parts.planners |= {name: planner} if planner is not None else {}
-        for section, kind in (("transport", "transport"), ("viewer", "viewer")):
-            if section in given:
-                setattr(parts, section, self._component(kind, (section,), ComponentKeys))
+        if "transport" in given:
+            parts.transport = self._component("transport", ("transport",), TransportKeys)
+        if "viewer" in given:
+            parts.viewer = self._component("viewer", ("viewer",), ComponentKeys)
         if "recording" in given:
             parts.recording = self._component("recorder", ("recording",), RecordingKeys)
         return parts

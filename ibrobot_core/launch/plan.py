@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import attrs
 
+from ibrobot_core.config.schema import Share
 from ibrobot_core.errors import ComponentFailed, NotSupported
 from ibrobot_core.launch.builders.control import NAME as CONTROL
 from ibrobot_core.launch.builders.control import Control
@@ -13,6 +14,7 @@ from ibrobot_core.launch.builders.planning import PlanningFeeder
 from ibrobot_core.launch.builders.recording import Recording
 from ibrobot_core.launch.builders.replay import MODE as REPLAY
 from ibrobot_core.launch.builders.replay import ReplayFeeder
+from ibrobot_core.launch.builders.sharing import PublishedTopic, SubscribedTopics
 from ibrobot_core.launch.builders.simulation import SimulatedEpisodes
 from ibrobot_core.launch.builders.status import Status
 from ibrobot_core.launch.builders.teleop import TeleopFeeder
@@ -83,14 +85,19 @@ def build_plan(session: Session) -> LaunchPlan:
     config = session.config
     modes = config.control_modes.values()
     distributed = any(mode.inference and mode.inference.execution_mode == "distributed" for mode in modes)
-    if config.transport is not None and config.transport.type != "local" and not distributed:
+    share = config.transport.share if config.transport is not None else Share()
+    used = distributed or share != Share()
+    if config.transport is not None and config.transport.type != "local" and not used:
         raise NotSupported(
-            f"transport: {config.transport.type}: nothing would use it; a model does with execution_mode: distributed"
+            f"transport: {config.transport.type}: nothing would use it; a model does with execution_mode: distributed, "
+            "and topics under share"
         )
+    if session.request.lockstep and share.subscribe:
+        raise NotSupported("transport.share.subscribe: in lockstep nothing may come from other machines, at any time")
     names = tuple(f"sensor:{name}" for name in config.peripherals)
     parts = mode_parts(session, session.mode, names)
     components: list[Component] = []
-    if config.transport is not None and distributed:
+    if config.transport is not None and used:
         components.append(TransportLink(session, config.transport))
     components += parts.models
     components.append(Control(session, tuple(model.name for model in parts.models)))
@@ -106,6 +113,9 @@ def build_plan(session: Session) -> LaunchPlan:
         components.append(Transforms(session, urdf, (CONTROL,)))
     if config.viewer is not None:
         components.append(ViewerWorker(session, config.viewer, (CONTROL,)))
+    components += [PublishedTopic(session, topic) for topic in share.publish]
+    if share.subscribe:
+        components.append(SubscribedTopics(session, share.subscribe))
     worker = None
     if config.simulated and isinstance(parts.feeder, InferenceFeeder):
         worker = SimulatedEpisodes(session, episodes, (parts.feeder.name,))

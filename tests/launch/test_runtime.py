@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import attrs
 import pytest
 
-from ibrobot_core.config.schema import Component
+from ibrobot_core.config.schema import TransportConfig
 from ibrobot_core.errors import ComponentFailed, NotSupported, PlanningError, TeleopError
 from ibrobot_core.launch.runtime import ESTOP, RESET, Runtime
 from ibrobot_core.launch.session import Session
@@ -258,7 +258,7 @@ def test_a_goal_that_cannot_be_meant_is_refused_before_anything_starts(runs: Run
 
 def test_a_transport_that_a_run_does_not_use_is_refused(runs: Runs):
     session = runs.make().session
-    shared = Component(type="shared", options=NoOptions())
+    shared = TransportConfig(type="shared", options=NoOptions())
     with pytest.raises(NotSupported, match="transport: shared: nothing would use it"):
         Runtime(Session(attrs.evolve(session.config, transport=shared), session.registry, session.request))
     runs.make("transport={type: local}")

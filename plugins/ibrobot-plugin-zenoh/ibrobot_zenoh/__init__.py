@@ -25,8 +25,9 @@ def _zenoh(options: Any, ctx: Context) -> Transport:
 def ibrobot_transports() -> Iterable[TransportDescriptor]:
     """Between machines."""
     yield TransportDescriptor(
-        type="zenoh", options=ZenohOptions, make=_zenoh, summary="between machines; ROS 2 nodes with rmw_zenoh join in"
-    )
+        type="zenoh", options=ZenohOptions, make=_zenoh, topics=True,
+        summary="between machines; ROS 2 nodes with rmw_zenoh join in",
+    )  # fmt: skip
 
 
 def _certs() -> click.Command:

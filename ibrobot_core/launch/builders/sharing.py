@@ -1,0 +1,100 @@
+"""Sharing: topics between this run and other machines, over the transport. The bus never waits for it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import override
+
+from ibrobot_core.bus import Subscription
+from ibrobot_core.errors import IbrobotError, NotSupported
+from ibrobot_core.interfaces import TopicTransport
+from ibrobot_core.launch.builders.transport import NAME as TRANSPORT
+from ibrobot_core.launch.component import Component, Worker
+from ibrobot_core.launch.session import Session
+from ibrobot_core.messages import Message
+
+_DEPTH = 10
+"""Messages of a topic that may wait for the network; beyond, the oldest is dropped and counted by the bus."""
+
+
+def _topics(session: Session) -> TopicTransport:
+    transport = session.transport
+    if not isinstance(transport, TopicTransport):
+        raise NotSupported(f"transport.share: {type(transport).__name__} carries no topics")
+    return transport
+
+
+class PublishedTopic(Worker):
+    """What is on one topic of the bus, to other machines. A message that cannot be sent is told once, and left out."""
+
+    def __init__(self, session: Session, topic: str) -> None:
+        super().__init__(
+            f"share:{topic}", "to other machines", (TRANSPORT,), on_failure=session.fail,
+            lockstep=session.request.lockstep,
+        )  # fmt: skip
+        self._session = session
+        self._topic = topic
+        self._waiting: Subscription | None = None
+        self._told = False
+
+    @override
+    def setup(self) -> None:
+        self._transport = _topics(self._session)
+        self._waiting = self._session.bus.subscribe(self._topic, _DEPTH)
+
+    @override
+    def work(self, timeout_s: float) -> None:
+        assert self._waiting is not None
+        received = self._waiting.get(timeout_s)
+        while received is not None:
+            self._send(received.message)
+            received = self._waiting.get()
+
+    def _send(self, message: Message) -> None:
+        try:
+            self._transport.publish_message(self._topic, message, latched=self._topic in self._session.bus.latched())
+        except IbrobotError as error:
+            if not self._told:
+                self._told = True
+                self._session.log.warning("%s is not shared: %s", self._topic, error)
+
+    @override
+    def teardown(self) -> None:
+        if self._waiting is not None:
+            self._waiting.close()
+
+
+class SubscribedTopics(Component):
+    """What other machines publish on some topics, to the bus."""
+
+    def __init__(self, session: Session, topics: tuple[str, ...]) -> None:
+        super().__init__("share", f"{', '.join(topics)} from other machines", (TRANSPORT,))
+        self._session = session
+        self._topics = topics
+        self._ends: list[Callable[[], None]] = []
+
+    @override
+    def start(self) -> None:
+        transport = _topics(self._session)
+        for topic in self._topics:
+            self._ends.append(transport.subscribe_messages(topic, self._to_bus(topic)))
+
+    def _to_bus(self, topic: str) -> Callable[[Message], None]:
+        told = False
+
+        def take(message: Message) -> None:
+            nonlocal told
+            try:
+                self._session.bus.publish(topic, message)
+            except IbrobotError as error:
+                if not told:
+                    told = True
+                    self._session.log.warning("from another machine: %s", error)
+
+        return take
+
+    @override
+    def stop(self) -> None:
+        ends, self._ends = self._ends, []
+        for end in ends:
+            end()

@@ -1,0 +1,143 @@
+"""Topics shared with other machines: both ways, latched ones, a network that hangs or refuses, and what is refused."""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from ibrobot_core.errors import ConfigError, NotSupported
+from ibrobot_core.messages import Bool, String
+
+if TYPE_CHECKING:
+    from conftest import Runs, Site
+
+NETWORK = """
+import threading
+
+from ibrobot_core import hookimpl
+from ibrobot_core.descriptors import TransportDescriptor
+from ibrobot_core.errors import TransportError
+from ibrobot_core.interfaces import TopicTransport
+from ibrobot_core.local_transport import LocalTransport
+
+class Network(LocalTransport, TopicTransport):
+    def __init__(self):
+        super().__init__()
+        self.sent, self.callbacks, self.refuses, self.goes_on = [], {}, False, threading.Event()
+        self.goes_on.set()
+        self.closed = False
+
+    def publish_message(self, topic, message, *, latched=False):
+        self.goes_on.wait(10)
+        if self.refuses:
+            raise TransportError("the network says no")
+        self.sent.append((topic, message, latched))
+
+    def subscribe_messages(self, topic, callback):
+        self.callbacks[topic] = callback
+        return lambda: self.callbacks.pop(topic)
+
+    def shared_topics(self, timeout_s):
+        return []
+
+    def close(self):
+        super().close()
+        self.closed = True
+
+MADE = []
+
+def make(options, ctx):
+    MADE.append(Network())
+    return MADE[-1]
+
+@hookimpl
+def ibrobot_transports():
+    yield TransportDescriptor("network", make, "a network", topics=True)
+"""
+
+
+@pytest.fixture
+def network(site: Site) -> Any:
+    """The module of a plugin with the transport `network`; what it made is in `MADE`."""
+    site.add("a-network", NETWORK)
+
+
+def made() -> Any:
+    return sys.modules["a_network"].MADE[-1]
+
+
+def test_what_is_published_goes_out(runs: Runs, network: None):
+    runtime = runs.start("transport={type: network, share: {publish: [/joint_states, /note]}}")
+    runtime.session.bus.publish("/note", String("kept"), latched=True)
+    runtime.session.bus.publish("/secret", String("not shared"))
+    for _ in range(5):
+        runtime.step()
+    sent = made().sent
+    assert ("/note", String("kept"), True) in sent
+    states = [(message, latched) for topic, message, latched in sent if topic == "/joint_states"]
+    assert len(states) >= 4
+    assert not any(latched for _, latched in states)
+    assert {topic for topic, *_ in sent} == {"/joint_states", "/note"}
+    runtime.stop()
+    assert made().closed
+
+
+def test_a_network_that_refuses_is_told_once(runs: Runs, network: None, caplog: pytest.LogCaptureFixture):
+    runtime = runs.start("transport={type: network, share: {publish: [/joint_states]}}")
+    made().refuses = True
+    for _ in range(5):
+        runtime.step()
+    assert caplog.text.count("/joint_states is not shared: the network says no") == 1
+    made().refuses = False
+    made().sent.clear()
+    runtime.step()
+    assert made().sent
+    runtime.stop()
+
+
+def test_a_network_that_hangs_costs_counted_messages_only(runs: Runs, network: None):
+    runtime = runs.start("transport={type: network, share: {publish: [/note]}}", lockstep=False)
+    bus = runtime.session.bus
+    made().goes_on.clear()
+    for i in range(50):
+        bus.publish("/note", String(str(i)))
+    assert bus.dropped()["/note"] >= 39
+    made().goes_on.set()
+    runtime.stop()
+
+
+def test_what_others_publish_comes_in(runs: Runs, network: None, caplog: pytest.LogCaptureFixture):
+    runtime = runs.start("transport={type: network, share: {subscribe: [/lamp]}}", lockstep=False)
+    lamp = runtime.session.bus.subscribe("/lamp")
+    take = made().callbacks["/lamp"]
+    take(Bool(True))
+    received = lamp.get(5.0)
+    assert received is not None
+    assert received.message == Bool(True)
+    for _ in range(2):
+        take(String("of another type"))
+    assert caplog.text.count("topic /lamp carries std_msgs/msg/Bool, not std_msgs/msg/String") == 1
+    runtime.stop()
+    assert made().callbacks == {}
+
+
+def test_nothing_comes_in_in_lockstep(runs: Runs, network: None):
+    with pytest.raises(NotSupported, match=r"transport\.share\.subscribe: in lockstep nothing may come"):
+        runs.make("transport={type: network, share: {subscribe: [/lamp]}}", lockstep=True)
+
+
+@pytest.mark.parametrize(
+    ("transport", "told"),
+    [
+        ("{type: local, share: {publish: [/a]}}", "transport 'local' carries no topics to other machines"),
+        ("{type: network, share: {publish: [a]}}", "'a' is no full name of a topic, did you mean '/a'?"),
+        ("{type: network, share: {publish: [/a, /a]}}", "/a is given twice"),
+        ("{type: network, share: {publish: [/a], subscribe: [/a]}}", "/a is both published and subscribed"),
+        ("{type: network, share: {publishes: [/a]}}", "did you mean 'publish'?"),
+    ],
+)
+def test_mistakes_in_the_yaml(transport: str, told: str, runs: Runs, network: None):
+    with pytest.raises(ConfigError, match=told.replace("?", r"\?")):
+        runs.make(f"transport={transport}")
