@@ -92,6 +92,10 @@ class RecorderError(IbrobotError):
     """A recording that cannot be written or read, e.g. a full disk."""
 
 
+class DiskFull(RecorderError):
+    """A disk with less space than an episode takes."""
+
+
 class DatasetError(IbrobotError):
     """A dataset that cannot be written or read, e.g. a frame of another shape than the first."""
 

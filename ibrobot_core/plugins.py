@@ -101,6 +101,10 @@ class Registry:
         """The types offered of a kind, sorted."""
         return sorted(t for k, t in self.entries if k == kind)
 
+    def versions(self) -> dict[str, str]:
+        """Package -> version, of those that offer something, sorted."""
+        return dict(sorted({entry.package: entry.version for entry in self.entries.values()}.items()))
+
     def find(self, kind: str, type_: str) -> Descriptor[Any]:
         """The descriptor of `type_`.
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from math import inf
 from pathlib import Path
 from typing import Any, override
 
 import click
 
 from ibrobot_core.cli.launch import Watcher, launch_options, run_robot
-from ibrobot_core.errors import IbrobotError
+from ibrobot_core.errors import DiskFull, IbrobotError
 from ibrobot_core.launch.desk import EpisodeDesk
 from ibrobot_core.launch.runtime import Runtime
 from ibrobot_core.units import seconds
@@ -29,15 +30,21 @@ class Operator(Watcher):
         count: episodes to record; None: until Ctrl-C.
         reset_time_s: pause after an episode, for setting the scene up anew [s].
         prompt: of all episodes; None asks for it, with Enter for the last one.
-        auto: begin every episode by itself, and end it after the contract's `max_duration_s`.
+        auto: begin every episode by itself, and end it after the contract's `max_duration_s`. Where the recorder
+            fails, or the disk has no room for another one, the run ends.
+        continuous: one episode, from when everything is there to the end of the run.
         keys: whether there is a terminal whose keys the operator presses.
     """
 
-    def __init__(self, count: int | None, reset_time_s: float, prompt: str | None, *, auto: bool, keys: bool) -> None:
+    def __init__(
+        self, count: int | None, reset_time_s: float, prompt: str | None, *, auto: bool, keys: bool,
+        continuous: bool = False,
+    ) -> None:  # fmt: skip
         self._count = count
         self._reset_time_s = reset_time_s
         self._prompt = prompt
-        self._auto = auto
+        self._auto = auto or continuous
+        self._continuous = continuous
         self._keys = keys
         self._not_before_s = 0.0
         self._typed: str | None = None
@@ -50,8 +57,10 @@ class Operator(Watcher):
         assert runtime.desk is not None
         self._runtime = runtime
         self._desk: EpisodeDesk = runtime.desk
-        self._longest_s = runtime.session.config.contract.max_duration_s
+        self._longest_s = inf if self._continuous else runtime.session.config.contract.max_duration_s
         self._by_mode = runtime.plan.episodes_worker is not None
+        if self._by_mode and self._continuous:
+            raise click.UsageError(f"--continuous: mode {runtime.session.mode} begins and ends its episodes itself")
         if not (self._by_mode or self._auto or self._keys):
             raise click.UsageError("without a terminal nobody can begin an episode: add --auto")
 
@@ -68,6 +77,8 @@ class Operator(Watcher):
             if desk.failure is not None:
                 self._end(lambda: desk.stop("unknown"))
                 self._refuse(f"recording ended: {desk.failure}")
+                if self._auto:  # nobody is there to put it right
+                    self._runtime.session.finish()
             elif desk.elapsed_s() >= self._longest_s:
                 log = self._runtime.session.log
                 log.info("the episode is %g s long (contract.max_duration_s): ended", self._longest_s)
@@ -80,7 +91,7 @@ class Operator(Watcher):
     @override
     def key(self, key: str) -> bool:
         """Obey a key; False for one that means nothing here."""
-        if self._by_mode:
+        if self._by_mode or self._continuous:
             return False
         if self._typed is not None:
             self._type(key)
@@ -106,7 +117,12 @@ class Operator(Watcher):
             ("record", self._state()),
             ("saved", f"{self._saved()} into {self._desk.folder}"),
             ("topics", rates or "none yet"),
-            ("lost", f"{lost} messages, {status['free_bytes'] // _MIB} MiB left on the disk"),
+            ("lost", f"{lost} messages"),
+            (
+                "disk",
+                f"{status['free_bytes'] // _MIB} MiB left at {status['bytes_per_s'] / _MIB:.1f} MiB/s, "
+                f"{status['waiting_bytes'] / _MIB:.1f} MiB wait for it",
+            ),
         ]
         if self._complaint:
             rows.append(("", self._complaint))
@@ -120,7 +136,7 @@ class Operator(Watcher):
     @override
     def help(self) -> str:
         """The keys."""
-        if self._by_mode:
+        if self._by_mode or self._continuous:
             return ""
         return "Tab start, and end as success   F11 end as failure   F12 discard"
 
@@ -134,9 +150,9 @@ class Operator(Watcher):
         if self._typed is not None:
             return f"prompt (Enter alone takes “{desk.last_prompt}”, Tab goes back): {self._typed}_"
         if desk.recording:
-            left_s = max(0.0, self._longest_s - desk.elapsed_s())
             prompt = f" “{desk.last_prompt}”" if desk.last_prompt else ""
-            return f"recording{prompt}, {desk.elapsed_s():.0f} s, {left_s:.0f} s left"
+            left = "" if self._continuous else f", {max(0.0, self._longest_s - desk.elapsed_s()):.0f} s left"
+            return f"recording{prompt}, {desk.elapsed_s():.0f} s{left}"
         pause_s = self._not_before_s - self._clock_s()
         if pause_s > 0:
             return f"set the scene up anew, {pause_s:.0f} s"
@@ -186,6 +202,9 @@ class Operator(Watcher):
             if str(error) != self._complaint:
                 self._runtime.session.log.error("%s", error)
             self._refuse(str(error))
+            if self._auto and isinstance(error, DiskFull):
+                self._runtime.session.outcome.faults.append(str(error))
+                self._runtime.session.finish()
         else:
             self._complaint = ""
 
@@ -205,6 +224,7 @@ class Operator(Watcher):
 @click.option("--root", type=click.Path(path_type=Path), help="Folder of all datasets.")
 @click.option("--prompt", metavar="TEXT", help="What the task is called; asked for where it is left out.")
 @click.option("--auto", is_flag=True, help="Begin episodes by itself; end them after contract.max_duration_s.")
+@click.option("--continuous", is_flag=True, help="One episode, from the start of the run to its end.")
 @click.option(
     "--reset-time", type=click.FloatRange(min=0), default=0.0, metavar="S", help="Pause between episodes [s]."
 )
@@ -213,12 +233,16 @@ def record(config: str | None, dataset: str | None, root: Path | None, **options
 
     CONFIG is a robot YAML as for `ibrobot launch`; where it has no `recording` section, episodes go to
     episodes/default. In simulation a policy's episodes are recorded unattended, with the scene's own judgement. In all
-    other modes keys begin and end them; without a terminal --auto does.
+    other modes keys begin and end them; without a terminal --auto does, or --continuous records without a break, in
+    files as recording.split_size and recording.split_duration say.
 
     Exits as `ibrobot launch` does.
     """
     prompt, auto, reset_time = options.pop("prompt"), options.pop("auto"), options.pop("reset_time")
+    continuous = options.pop("continuous")
+    if continuous and (auto or options["episodes"] is not None or reset_time):
+        raise click.UsageError("--continuous records one episode: leave --auto, --episodes and --reset-time out")
     overrides = tuple(f"recording.{key}={value}" for key, value in (("dataset", dataset), ("root", root)) if value)
     live = sys.stdin.isatty() and sys.stdout.isatty() and not options["headless"]
-    operator = Operator(options["episodes"], reset_time, prompt, auto=auto, keys=live)
+    operator = Operator(options["episodes"], reset_time, prompt, auto=auto, keys=live, continuous=continuous)
     run_robot(config, options, watcher=operator, recording=(DEFAULT, *overrides), prompt=prompt or "")

@@ -5,8 +5,10 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import attrs
+import numpy as np
 
 from ibrobot_core.messages import Message
 
@@ -38,7 +40,10 @@ class EpisodeEnd:
 
 
 class Recorder(ABC):
-    """Writes one episode at a time. All methods are called from the recorder's own thread."""
+    """Writes one episode at a time. All methods are called from its own thread, unless they say otherwise."""
+
+    min_free = 0
+    """Space on the disk that it leaves free [bytes]."""
 
     @abstractmethod
     def begin(self, episode: EpisodeStart) -> None:
@@ -60,5 +65,26 @@ class Recorder(ABC):
     def end(self, episode: EpisodeEnd) -> Path | None:
         """Close the episode; returns where it is, or None when it was discarded (and nothing is left)."""
 
+    def size_of(self, message: Message) -> int:
+        """About how much a message takes on the disk [bytes]. Called from any thread, also between episodes."""
+        return _size(message)
+
+    def waiting(self) -> int:
+        """What was written and is not with the disk yet [bytes]. Called from any thread."""
+        return 0
+
     def close(self) -> None:
         """Release everything; an episode still open is ended as `unknown`. Safe to call twice."""
+
+
+def _size(value: Any) -> int:
+    """Of a message, or of a value in one [bytes]."""
+    if isinstance(value, np.ndarray):
+        return int(value.nbytes)
+    if isinstance(value, bytes | str):
+        return len(value)
+    if isinstance(value, tuple | list):
+        return sum(_size(each) for each in value)
+    if attrs.has(type(value)):
+        return sum(_size(getattr(value, field.name)) for field in attrs.fields(type(value)))
+    return 8

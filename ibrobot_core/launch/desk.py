@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ibrobot_core.contract.specs import Contract
-from ibrobot_core.errors import NotSupported, RecorderError
+from ibrobot_core.errors import DiskFull, NotSupported, RecorderError
 from ibrobot_core.launch.builders.recording import Recording
 from ibrobot_core.launch.episodes import Episodes
 from ibrobot_core.launch.session import Session
@@ -25,6 +25,7 @@ DISCARD = "/record_episode/discard"
 STATUS = "/record_episode/status"
 """Request: None. Returns what `EpisodeDesk.status` says."""
 OUTCOMES = ("success", "failure", "unknown")
+_MIB = 1 << 20
 
 
 class EpisodeDesk:
@@ -83,7 +84,8 @@ class EpisodeDesk:
             prompt: what the task is called; the last one's when None.
 
         Raises:
-            RecorderError: when one is on, a topic of the contract is silent, or the disk is full; says which.
+            RecorderError: when one is on, or a topic of the contract is silent; says which.
+            DiskFull: when the disk has no room for an episode of `contract.max_duration_s` at the rates of now.
             NotSupported: where the mode begins episodes itself.
         """
         with self._lock:
@@ -96,6 +98,7 @@ class EpisodeDesk:
                     for topic, age in silent.items()
                 )
                 raise RecorderError(f"not recording: the contract's topics are silent: {told}")
+            self._check_space()
             self._episodes.prompt = self.last_prompt if prompt is None else prompt
             self._episodes.begin()
             if self._episodes.prompt:
@@ -144,7 +147,8 @@ class EpisodeDesk:
             "max_duration_s": self._session.config.contract.max_duration_s,
             "rates_hz": {topic: round(rate, 1) for topic, rate in self._recording.rates().items()},
             "silent": list(self._recording.silent()), "lost": self._recording.lost(),
-            "free_bytes": self.free_bytes(), "failure": str(failure) if failure is not None else "",
+            "free_bytes": self.free_bytes(), "bytes_per_s": round(self._recording.flow()),
+            "waiting_bytes": self._recording.waiting(), "failure": str(failure) if failure is not None else "",
         }  # fmt: skip
 
     def serve(self) -> None:
@@ -166,6 +170,17 @@ class EpisodeDesk:
             if not self._episodes.running:
                 raise RecorderError("no episode is being recorded")
             self._episodes.end(outcome)
+
+    def _check_space(self) -> None:
+        longest_s, flow = self._session.config.contract.max_duration_s, self._recording.flow()
+        free, kept = self.free_bytes(), self._recording.min_free
+        takes = longest_s * flow
+        if free < takes + kept:
+            raise DiskFull(
+                f"not recording: the disk of {self.folder} has {free / _MIB:.0f} MiB left; an episode of "
+                f"{longest_s:g} s (contract.max_duration_s) takes {takes / _MIB:.0f} MiB at {flow / _MIB:.1f} MiB/s, "
+                f"and {kept / _MIB:.0f} MiB stay free; make room, record elsewhere (recording.root), or shorten it"
+            )
 
     def _check_mine(self) -> None:
         if self._by_mode:

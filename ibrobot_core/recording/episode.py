@@ -25,7 +25,7 @@ def episode_folder(dataset: Path, number: int) -> Path:
 
 def episode_start(
     config: RobotConfig, recording: Recording, topics: Mapping[str, str], *, mode: str, seed: int, stamp_ns: int,
-    prompt: str = "",
+    prompt: str = "", plugins: Mapping[str, str] | None = None,
 ) -> EpisodeStart:  # fmt: skip
     """The start of the next episode of the dataset.
 
@@ -39,6 +39,7 @@ def episode_start(
         seed: of the scene.
         stamp_ns: when it begins [ns].
         prompt: what the operator calls the task.
+        plugins: packages of the plugins, and their versions.
 
     Raises:
         RecorderError: when the folder cannot be made, or the dataset has episodes of another contract.
@@ -54,7 +55,8 @@ def episode_start(
         "robot": config.robot.name, "robot_type": config.robot.robot_type, "mode": mode, "prompt": prompt,
         "contract": json.dumps(contract.canonical()), "fingerprint": contract.fingerprint(),
         "config": json.dumps(config.document, default=str), "calibration": json.dumps(calibrations(config)),
-        "ibrobot_version": ibrobot_core.__version__, "seed": str(seed),
+        "ibrobot_version": ibrobot_core.__version__, "plugin_versions": json.dumps(dict(plugins or {})),
+        "seed": str(seed),
     }  # fmt: skip
     if recording.topics == "contract":
         kept = contract.topics

@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING
 
+import click
 import pytest
 import yaml
 
 from ibrobot_core.cli.record import Operator
-from ibrobot_core.errors import NotSupported, RecorderError
+from ibrobot_core.errors import DiskFull, NotSupported, RecorderError
 from ibrobot_core.launch.desk import DISCARD, START, STATUS, STOP
 
 if TYPE_CHECKING:
@@ -68,6 +69,7 @@ def test_metadata_say_how_the_episode_was_made(run: Runtime, runs: Runs):
     assert metadata["prompt"] == "pick"
     assert json.loads(metadata["config"])["robot"]["name"] == "mini"
     assert json.loads(metadata["calibration"]) == {}
+    assert json.loads(metadata["plugin_versions"])["fake-parts"] == "1.0"
     dataset = yaml.safe_load((runs.folder / "kept" / "pick" / "dataset.yaml").read_text())
     assert (dataset["name"], dataset["robot"], dataset["prompt"]) == ("pick", "mini", "pick")
     assert dataset["fingerprint"] == metadata["fingerprint"]
@@ -92,6 +94,26 @@ def test_a_silent_topic_of_the_contract_is_named(runs: Runs, monkeypatch: pytest
     with pytest.raises(RecorderError, match=silent):
         runtime.session.bus.call(START, "")
     assert folders(runs) == []
+
+
+def test_a_disk_too_small_for_an_episode_is_refused_with_the_figures(
+    run: Runtime, runs: Runs, monkeypatch: pytest.MonkeyPatch
+):
+    flow = run.session.bus.call(STATUS, None)["bytes_per_s"]
+    assert flow > 50 * (2 * 8 + 2 * 2 * 8), "joint states and commands alone"
+    desk, kept = run.desk, runs.parts.MADE["recording"]
+    assert desk is not None
+    monkeypatch.setattr(kept, "min_free", 3 << 20)
+    monkeypatch.setattr(desk, "free_bytes", lambda: (3 << 20) + flow - 2)
+    told = (
+        r"has 3 MiB left; an episode of 1 s \(contract.max_duration_s\) takes 0 MiB at 0.\d MiB/s, and 3 MiB stay free"
+    )
+    with pytest.raises(DiskFull, match=told):
+        desk.start("")
+    assert folders(runs) == []
+    monkeypatch.setattr(desk, "free_bytes", lambda: (3 << 20) + flow + 2)
+    desk.start("")
+    assert desk.recording
 
 
 def test_a_mode_that_begins_its_own_episodes_keeps_them(runs: Runs, monkeypatch: pytest.MonkeyPatch):
@@ -191,9 +213,36 @@ class TestOperator:
             self.step(run, operator, 3)
         assert (run.desk.recording, run.desk.saved) == (False, 0)
         assert ("", "recording ended: its disk has 1 MiB left") in operator.rows()
-        assert not run.session.finished.is_set(), "the robot goes on"
+        assert run.session.finished.is_set() == auto, "the robot goes on where somebody is there"
         if not auto:
             operator.key("tab")
-        self.step(run, operator, 60 if auto else 3)
-        assert run.desk.recording, "there is room again"
-        assert operator.rows()[-1][0] != ""
+            self.step(run, operator, 3)
+            assert run.desk.recording, "there is room again"
+            assert operator.rows()[-1][0] != ""
+
+    def test_unattended_the_run_ends_where_there_is_no_room_for_another_episode(
+        self, run: Runtime, runs: Runs, monkeypatch: pytest.MonkeyPatch
+    ):
+        operator = self.watch(run, auto=True, prompt="pick")
+        self.step(run, operator, 40)
+        monkeypatch.setattr(run.desk, "free_bytes", lambda: 1)
+        self.step(run, operator, 40)
+        assert run.session.finished.is_set()
+        assert (run.desk.saved, len(run.session.outcome.faults)) == (1, 1)
+        assert "0 MiB left" in run.session.outcome.faults[0]
+
+    def test_continuous_is_one_episode_to_the_end_of_the_run(self, run: Runtime, runs: Runs):
+        operator = self.watch(run, continuous=True, keys=False, prompt="watch")
+        self.step(run, operator, 120)
+        assert run.desk.elapsed_s() > 2 * run.session.config.contract.max_duration_s
+        assert operator.line().startswith("recording “watch”, 2 s, saved")
+        assert not operator.key("tab")
+        run.stop()
+        assert [event for event in runs.parts.EVENTS if event[0] == "ended"] == [("ended", 1, "unknown")]
+        assert (run.desk.saved, folders(runs)) == (1, ["episode_000001"])
+
+    def test_continuous_means_nothing_where_the_mode_has_episodes(self, runs: Runs, monkeypatch: pytest.MonkeyPatch):
+        monkeypatch.chdir(runs.folder)
+        runtime = runs.start(RECORDING, mode="policy", by_operator=True)
+        with pytest.raises(click.UsageError, match="mode policy begins and ends its episodes itself"):
+            self.watch(runtime, continuous=True)

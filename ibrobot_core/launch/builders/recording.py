@@ -16,6 +16,7 @@ from ibrobot_core.errors import RecorderError
 from ibrobot_core.interfaces import EpisodeEnd, EpisodeStart, Recorder
 from ibrobot_core.launch.component import Worker, cause
 from ibrobot_core.launch.session import Session
+from ibrobot_core.messages import Message
 from ibrobot_core.recording.episode import episode_start, is_kept
 from ibrobot_core.units import NS_PER_S, seconds
 
@@ -75,6 +76,10 @@ class Recording(Worker):
         self._open = False
         self._seen: dict[str, deque[int]] = {}
         """Topic -> times of the last messages [ns]."""
+        self._newest: dict[str, Message] = {}
+        """Topic -> its last message."""
+        self._sizes: dict[str, int] = {}
+        """Topic -> size of a message of it [bytes], measured once an episode, since pictures may have to be encoded."""
         self._lost: Mapping[str, int] = {}
         """Topic -> messages lost on the way here, before the present episode."""
         self._whole = 0
@@ -98,12 +103,13 @@ class Recording(Worker):
         """
         session = self._session
         self.failure = None
+        self._sizes = {}
         topics = {topic: type_ for topic, (type_, _) in session.bus.topics().items()}
         seed = session.request.seed + number - 1
         with self._order:
             start = episode_start(
                 session.config, self._config, topics, mode=session.mode, seed=seed, stamp_ns=session.bus.snapshot_ns(),
-                prompt=prompt,
+                prompt=prompt, plugins=session.registry.versions(),
             )  # fmt: skip
             latched = tuple(i for i in session.bus.latched().values() if i.received_ns <= start.stamp_ns)
             self._orders.append(_Begin(start, latched, self._lost_now()))
@@ -145,6 +151,25 @@ class Recording(Worker):
             rates[topic] = (len(stamps) - 1) * NS_PER_S / span_ns if span_ns else 0.0
         return rates
 
+    def flow(self) -> float:
+        """What an episode takes on the disk, by the rates and the messages of now [bytes/s]."""
+        if self._recorder is None:
+            return 0.0
+        for topic, message in self._newest.copy().items():
+            if topic not in self._sizes:
+                self._sizes[topic] = self._recorder.size_of(message)
+        sizes = self._sizes.copy()
+        return sum(rate * sizes.get(topic, 0) for topic, rate in self.rates().items())
+
+    @property
+    def min_free(self) -> int:
+        """Space on the disk that the recorder leaves free [bytes]."""
+        return 0 if self._recorder is None else self._recorder.min_free
+
+    def waiting(self) -> int:
+        """What the recorder has taken and not written yet [bytes]."""
+        return 0 if self._recorder is None else self._recorder.waiting()
+
     def silent(self) -> dict[str, float | None]:
         """The contract's topics without a message for a second: topic -> for how long [s], None: none ever came."""
         now_ns = self._session.clock.now_ns()
@@ -164,6 +189,7 @@ class Recording(Worker):
 
     def _note(self, item: Received) -> None:
         if self._keeps(item.topic):
+            self._newest[item.topic] = item.message
             self._seen.setdefault(item.topic, deque(maxlen=_RATE_WINDOW)).append(item.received_ns)
 
     def _obey(self, recorder: Recorder, order: _Begin | _End) -> None:

@@ -29,6 +29,7 @@ class McapRecorder(Recorder):
 
     def __init__(self, options: McapOptions, ctx: Context) -> None:
         self._options = options
+        self.min_free = options.min_free
         self._ctx = ctx
         self._episode: EpisodeStart | None = None
         self._storage: Storage | None = None
@@ -80,6 +81,21 @@ class McapRecorder(Recorder):
         if failure is not None:
             self._ctx.log.warning("%s ends early: %s", start.directory, failure)
         return start.directory
+
+    @override
+    def size_of(self, message: Message) -> int:
+        """Before its chunk is compressed."""
+        try:
+            if isinstance(message, Image) and self._options.images == "jpeg" and fits_jpeg(message):
+                message = to_jpeg(message, self._options.jpeg_quality)
+            return len(encode(message))
+        except (CodecError, RecorderError):
+            return super().size_of(message)  # writing it tells what is wrong
+
+    @override
+    def waiting(self) -> int:
+        thread = self._thread
+        return 0 if thread is None else thread.size
 
     @override
     def close(self) -> None:

@@ -35,6 +35,11 @@ class WriterThread:
         self._thread = threading.Thread(target=self._run, name="mcap-writer", daemon=True)
         self._thread.start()
 
+    @property
+    def size(self) -> int:
+        """Of what waits and is being written [bytes]."""
+        return self._size
+
     def put(self, item: Item) -> None:
         """Queue an item, or drop it where there is no room.
 

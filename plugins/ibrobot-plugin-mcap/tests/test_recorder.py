@@ -12,7 +12,7 @@ import pytest
 import yaml
 from ibrobot_mcap import bagfile, ibrobot_recorders
 from ibrobot_mcap.recorder import McapRecorder
-from ibrobot_ros2 import definition, type_hash
+from ibrobot_ros2 import definition, encode, type_hash
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
@@ -301,3 +301,13 @@ def test_a_period_is_counted_by_stamps_in_lockstep(bench):
     made.write(1000)
     found = read(made.path)
     assert stamp(999) - found[-1].received_ns <= 0.5 * NS_PER_S
+
+
+@pytest.mark.parametrize(("images", "most"), [("raw", 1.01), ("jpeg", 0.5)])
+def test_what_a_message_takes_is_known_beforehand(images, most):
+    (descriptor,) = ibrobot_recorders()
+    recorder = McapRecorder(descriptor.options(images=images, min_free=7 * MIB), host_context())
+    shot = picture(0)
+    assert recorder.min_free == 7 * MIB
+    assert 0.001 < recorder.size_of(shot) / shot.data.nbytes < most
+    assert recorder.size_of(joints(0)) == len(encode(joints(0)))
