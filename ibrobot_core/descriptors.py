@@ -124,7 +124,7 @@ class ReaderDescriptor:
         RecorderError: when it cannot be read.
     """
     numbered: bool = False
-    """Whether many episodes lie at a path, which go by their numbers: `PATH:0`, `PATH:1`, …"""
+    """Whether many episodes lie at a path, which go by their numbers, from 0."""
 
 
 @attrs.frozen

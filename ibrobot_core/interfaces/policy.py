@@ -67,7 +67,7 @@ class PolicySpec:
     contract: Mapping[str, Any] | None = None
     """What `Contract.canonical` gave of the contract that it was trained on; None when the checkpoint does not say."""
     norm_mode: str | None = None
-    """Unit of joint positions that it was trained in, as `models:` says it; None when the checkpoint does not say."""
+    """Unit of joint positions that it was trained in, as under `models`; None when the checkpoint does not say."""
 
 
 class Policy(ABC):

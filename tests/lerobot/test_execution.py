@@ -63,7 +63,7 @@ def engines(path: Path, tmp_path: Path) -> Iterator[dict[str, Engine]]:
     service.start()
     made: dict[str, Engine] = {
         "monolithic": LocalEngine(here),
-        "process": ProcessEngine(load(tmp_path / "robot.yaml", sim=True), "net"),
+        "process": ProcessEngine(load(tmp_path / "robot.yaml", sim=True), "net", cloud.fingerprint()),
         "distributed": RemoteEngine(make(path), transport, "net", "mini"),
     }
     try:
