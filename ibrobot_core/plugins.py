@@ -53,6 +53,7 @@ KNOWN_PACKAGES: Mapping[tuple[str, str], str] = {
     ("sensor", "realsense"): "ibrobot-plugin-camera",
     ("recorder", "mcap"): "ibrobot-plugin-mcap",
     ("dataset", "lerobot"): "ibrobot-plugin-lerobot",
+    ("policy", "lerobot"): "ibrobot-plugin-lerobot",
     ("transport", "zenoh"): "ibrobot-plugin-zenoh",
 }
 """Types of this project's own plugins, so that a missing one can be named."""

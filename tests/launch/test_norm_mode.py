@@ -1,0 +1,63 @@
+"""A model in LeRobot's units within a run: by the calibration that it names, or the hardware's, or not at all."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from ibrobot_core.errors import ComponentFailed
+from ibrobot_core.interfaces import Frame
+from ibrobot_core.units import radians_to_lerobot
+
+if TYPE_CHECKING:
+    from conftest import Runs
+
+RANGE = {"range_min": 1000, "range_max": 3000}
+
+
+@pytest.fixture
+def calibration(tmp_path: Path) -> str:
+    numbers = {
+        joint: {"id": i + 1, "drive_mode": 0, "homing_offset": 0, **RANGE} for i, joint in enumerate(("pan", "grip"))
+    }
+    path = tmp_path / "arm.json"
+    path.write_text(json.dumps(numbers))
+    return str(path)
+
+
+def degrees(positions: Any) -> list[float]:
+    """Radians -> LeRobot's degrees by the calibration."""
+    return [radians_to_lerobot(float(each), "degrees", **RANGE) for each in positions]
+
+
+def test_the_model_lives_in_degrees_and_the_arm_in_radians(
+    runs: Runs, calibration: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runtime = runs.make("models.net.norm_mode=degrees", f"models.net.calibration={calibration}")
+    seen = []
+    real = runs.parts.Net.preprocess
+
+    def preprocess(self: Any, frame: Frame) -> Any:
+        seen.append(frame.values["observation.state"])
+        return real(self, frame)
+
+    monkeypatch.setattr(runs.parts.Net, "preprocess", preprocess)
+    runtime.start()
+    session = runtime.session
+    begun = session.measured().position.copy()
+    for _ in range(24):  # the scene's episode is over after half a second
+        runtime.step()
+    assert degrees([0.0]) == pytest.approx([48 * 360 / 4095]), "0 rad is 48 ticks off the middle"
+    assert seen[0].tolist() == pytest.approx(degrees(begun), abs=0.1)
+    goal = runs.parts.MADE["net"]._goal
+    before, after = (np.abs(degrees(at) - goal) for at in (begun, session.measured().position))
+    assert (after < before / 2).all(), "it moves to the goal, which is in degrees"
+
+
+def test_no_run_without_a_calibration(runs: Runs) -> None:
+    with pytest.raises(ComponentFailed, match="degrees needs the calibration of joint 'pan'; there is none"):
+        runs.start("models.net.norm_mode=degrees")
