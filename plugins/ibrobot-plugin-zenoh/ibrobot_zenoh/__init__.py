@@ -1,4 +1,4 @@
-"""The plugin's hooks: transport `zenoh`, command `ibrobot certs`."""
+"""The plugin's hooks: transport `zenoh`, the commands `ibrobot topic …` and `ibrobot certs`."""
 
 from __future__ import annotations
 
@@ -36,7 +36,14 @@ def _certs() -> click.Command:
     return certs
 
 
+def _topic() -> click.Command:
+    from ibrobot_zenoh.commands.topic import topic
+
+    return topic
+
+
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
     """What a lab's network needs."""
+    yield Command("topic", "List, show, measure and publish topics shared over the network.", _topic)
     yield Command("certs", "Make certificates for a server and its robots.", _certs)

@@ -109,16 +109,18 @@ class Connection:
         self._declared: dict[object, Declared] = {}
         self._closed = threading.Event()
         self._thread: threading.Thread | None = None
+        self.answered = threading.Event()
+        """Set when there is a session."""
         if options.mode != "client":
+            self.answered.set()
             try:
                 self._session = zenoh.open(self._config)
             except zenoh.ZError as error:
                 raise TransportError(f"{self._endpoints}: {first_line(error)}") from error
             return
-        answered = threading.Event()
-        self._thread = threading.Thread(target=self._connect, args=(answered,), name="zenoh connects", daemon=True)
+        self._thread = threading.Thread(target=self._connect, name="zenoh connects", daemon=True)
         self._thread.start()
-        answered.wait(_FIRST_WAIT_S)
+        self.answered.wait(_FIRST_WAIT_S)
 
     def session(self) -> zenoh.Session:
         """The session.
@@ -185,7 +187,7 @@ class Connection:
         if session is not None:
             session.close()  # type: ignore[no-untyped-call]  # its stub has no types
 
-    def _connect(self, answered: threading.Event) -> None:
+    def _connect(self) -> None:
         """Try until somebody answers; every new reason why nobody does is logged once."""
         told = ""
         pause_ms, longest_ms = _RETRY_MS
@@ -203,7 +205,7 @@ class Connection:
                     self._session = session
                     self._declared |= {key: make(session) for key, make in self._pending.items()}
                     self._pending.clear()
-                    answered.set()
+                    self.answered.set()
                     if told:
                         self._log.info("connected to %s", self._endpoints)
                     return

@@ -63,6 +63,14 @@ class _Publisher:
             elif self.latched:
                 self._newest = payload
 
+    @property
+    def is_heard(self) -> bool:
+        """Whether somebody listens; False before there is a connection."""
+        if not isinstance(self._publisher, zenoh.Publisher):
+            return False
+        status: Any = self._publisher.matching_status  # its stub says bool
+        return bool(status.matching)
+
     def _put(self, publisher: zenoh.Publisher | zenoh.ext.AdvancedPublisher, payload: bytes) -> None:
         self._sequence += 1
         try:
@@ -121,6 +129,20 @@ class Topics:
         if len(payload) > self.options.max_message_size:
             limit = self.options.max_message_size
             raise TransportError(f"{name}: a message of {len(payload)} bytes is larger than max_message_size, {limit}")
+        publisher = self._publisher(name, message.ros_type, latched=latched)
+        if publisher.type_name != message.ros_type:
+            raise TransportError(f"topic {name} carries {publisher.type_name}, not {message.ros_type}")
+        publisher.publish(payload)
+
+    def is_heard(self, topic: str, type_name: str, timeout_s: float) -> bool:
+        """See `ZenohTransport.is_heard`."""
+        publisher = self._publisher(absolute(topic, self.options.namespace), type_name, latched=False)
+        deadline = time.monotonic() + timeout_s
+        while not publisher.is_heard and time.monotonic() + _AGAIN_S < deadline:
+            time.sleep(_AGAIN_S)
+        return publisher.is_heard
+
+    def _publisher(self, name: str, type_name: str, *, latched: bool) -> _Publisher:
         with self._lock:
             publisher = self._publishers.get(name)
             if publisher is None:
@@ -128,10 +150,8 @@ class Topics:
                     self.connection.declare(
                         lambda session: session.liveliness().declare_token(self.node(session).node_token())
                     )
-                publisher = self._publishers[name] = _Publisher(self, name, message.ros_type, latched=latched)
-        if publisher.type_name != message.ros_type:
-            raise TransportError(f"topic {name} carries {publisher.type_name}, not {message.ros_type}")
-        publisher.publish(payload)
+                publisher = self._publishers[name] = _Publisher(self, name, type_name, latched=latched)
+            return publisher
 
     def subscribe(self, topic: str, callback: Callable[[Message], object]) -> tuple[Callable[[], None], Workers[Any]]:
         """What ends it, and the thread that calls `callback`; see `TopicTransport.subscribe_messages`."""

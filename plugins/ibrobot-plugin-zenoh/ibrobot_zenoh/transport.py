@@ -158,6 +158,14 @@ class ZenohTransport(TopicTransport):
     def subscribe_messages(self, topic: str, callback: Callable[[Message], object]) -> Callable[[], None]:
         return self._keep(*self._topics.subscribe(topic, callback))
 
+    def await_connection(self, timeout_s: float) -> bool:
+        """Wait up to `timeout_s` [s] for the other side; whether it has answered."""
+        return self._connection.answered.wait(timeout_s)
+
+    def is_heard(self, topic: str, type_name: str, timeout_s: float) -> bool:
+        """Whether anybody listens to messages of a type on a topic, waiting for it up to `timeout_s` [s]."""
+        return self._topics.is_heard(topic, type_name, timeout_s)
+
     @override
     def shared_topics(self, timeout_s: float) -> list[SharedTopic]:
         return self._topics.shared(timeout_s)

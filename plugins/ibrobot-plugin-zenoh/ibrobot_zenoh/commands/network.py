@@ -1,0 +1,86 @@
+"""Which network a command works on: a robot YAML's, or one named by its endpoint."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import attrs
+import click
+
+from ibrobot_core.clock import RealClock
+from ibrobot_core.errors import NotSupported, TransportError
+from ibrobot_core.interfaces import Context
+from ibrobot_core.robot import Robot
+from ibrobot_zenoh.options import ZenohOptions
+from ibrobot_zenoh.transport import ZenohTransport
+
+_CONNECT_S = 3.0
+"""How long a command waits for the other side."""
+_EVERYWHERE = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}
+"""Where to find, from this machine, what listens on all its addresses."""
+
+
+def network_options(command: Callable[..., None]) -> Callable[..., None]:
+    """The options that say which network."""
+    for decorate in (
+        click.option("--domain", type=click.IntRange(0, 232), help="ROS 2 domain.  [default: the YAML's, or 0]"),
+        click.option("--endpoint", "endpoints", multiple=True, metavar="URL", help="E.g. tcp/127.0.0.1:7447."),
+        click.option("--config", metavar="CONFIG", help="The robot YAML whose transport section to use."),
+    ):
+        command = decorate(command)
+    return command
+
+
+def options_from(config: str | None, endpoints: tuple[str, ...], domain: int | None) -> ZenohOptions:
+    """Those of a client on the network.
+
+    Raises:
+        UsageError: when nothing, or an impossible endpoint, says which network.
+        NotSupported: when the YAML's transport is none of this plugin's.
+    """
+    if config is None and not endpoints:
+        raise click.UsageError("which network? Give --config CONFIG, or --endpoint, e.g. --endpoint tcp/127.0.0.1:7447")
+    changes: dict[str, Any] = {} if domain is None else {"domain": domain}
+    if config is None:
+        try:
+            return ZenohOptions(connect=endpoints, **changes)
+        except ValueError as error:
+            raise click.UsageError(f"--endpoint: {error}") from None
+    from ibrobot_core.config import find_config, load
+    from ibrobot_core.plugins import installed
+
+    found = load(find_config(config, installed()))
+    if found.transport is None or not isinstance(found.transport.options, ZenohOptions):
+        kind = "no transport" if found.transport is None else f"transport {found.transport.type}"
+        raise NotSupported(f"{found.source}: has {kind}; topics are shared by transport: {{type: zenoh, …}}")
+    options = found.transport.options
+    connect = endpoints or options.connect or tuple(_here(endpoint) for endpoint in options.listen)
+    return attrs.evolve(options, mode="client", connect=connect, listen=(), users=None, namespace="", **changes)
+
+
+def _here(endpoint: str) -> str:
+    for everywhere, here in _EVERYWHERE.items():
+        endpoint = endpoint.replace(f"/{everywhere}:", f"/{here}:")
+    return endpoint
+
+
+@contextmanager
+def connected(config: str | None, endpoints: tuple[str, ...], domain: int | None) -> Iterator[ZenohTransport]:
+    """A transport that is connected, as long as it is used.
+
+    Raises:
+        TransportError: when nobody answers.
+    """
+    options = options_from(config, endpoints, domain)
+    log = logging.getLogger("ibrobot.topic")
+    log.setLevel(logging.ERROR)  # why nobody answers is said by the error
+    transport = ZenohTransport(options, Context("topic", RealClock(), log, Robot("command_line", ())))
+    try:
+        if not transport.await_connection(_CONNECT_S):
+            raise TransportError(f"nobody answers at {', '.join(options.connect)}: is the robot, server or router up?")
+        yield transport
+    finally:
+        transport.close()

@@ -1,0 +1,69 @@
+"""Messages as YAML text, and back."""
+
+from __future__ import annotations
+
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, get_origin
+
+import attrs
+import numpy as np
+
+from ibrobot_core.config.convert import Faults, make_converter
+from ibrobot_core.config.show import dump
+from ibrobot_core.config.yaml_nodes import parse
+from ibrobot_core.errors import NotSupported
+from ibrobot_core.messages import MESSAGE_TYPES, Message
+
+_SHOWN = 16
+"""Elements of an array that are shown."""
+
+
+def shown(message: Message, *, full: bool) -> str:
+    """A message as YAML; of long arrays the first elements, unless `full`."""
+    return dump(_plain(message, full))
+
+
+def _plain(value: Any, full: bool) -> Any:
+    if attrs.has(type(value)):
+        return {field.name: _plain(getattr(value, field.name), full) for field in attrs.fields(type(value))}
+    if isinstance(value, np.ndarray):
+        if full or value.size <= _SHOWN:
+            return value.tolist()
+        return [*value.ravel()[:_SHOWN].tolist(), f"… {value.size - _SHOWN} more"]
+    if isinstance(value, (list, tuple)):
+        return [_plain(item, full) for item in value]
+    return value
+
+
+def _is_array(kind: Any) -> bool:
+    return get_origin(kind) is np.ndarray
+
+
+def message_from(type_name: str, text: str) -> Message:
+    """The message that a YAML text says, e.g. `{data: true}`.
+
+    Raises:
+        NotSupported: for a type that cannot be written so.
+        ConfigError: with everything that is wrong in the text.
+    """
+    kind = MESSAGE_TYPES.get(type_name)
+    if kind is None:
+        close = get_close_matches(type_name, MESSAGE_TYPES, 1)
+        hint = f"did you mean {close[0]!r}?" if close else f"one of: {', '.join(sorted(MESSAGE_TYPES))}"
+        raise NotSupported(f"{type_name!r} is no type that can be published, {hint}")
+    document = parse(text, "MESSAGE")
+    document.raise_problems()
+    converter = make_converter(Path.cwd())
+    converter.register_structure_hook_func(_is_array, lambda value, _: value)
+    try:
+        message: Message = converter.structure(document.root, kind)
+    except Faults as faults:
+        for key, told in faults.found:
+            document.add(key, told)
+    except (ValueError, TypeError) as error:
+        document.add((), str(error))
+    else:
+        return message
+    document.raise_problems()
+    raise AssertionError("not reached: there was a fault")

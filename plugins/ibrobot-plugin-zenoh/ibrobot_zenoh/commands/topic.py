@@ -1,0 +1,124 @@
+"""`ibrobot topic list|echo|hz|pub`: topics that are shared over the network."""
+
+from __future__ import annotations
+
+import functools
+import queue
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from itertools import pairwise
+from typing import Any
+
+import click
+
+from ibrobot_core.errors import TransportError
+from ibrobot_core.messages import Message
+from ibrobot_zenoh.commands.network import connected, network_options
+from ibrobot_zenoh.commands.text import message_from, shown
+from ibrobot_zenoh.transport import ZenohTransport
+
+_LIST_S = 2.0
+_HEARD_S = 1.0
+"""How long `pub` waits for somebody to listen."""
+
+
+@click.group()
+def topic() -> None:
+    """List, show, measure and publish topics that robots and ROS 2 nodes share over the network."""
+
+
+@contextmanager
+def _until_interrupted() -> Iterator[None]:
+    """Ctrl-C is how these commands end."""
+    with suppress(KeyboardInterrupt):
+        yield
+
+
+def _command(function: Callable[..., None]) -> click.Command:
+    """A command of `topic` that is given a connected transport."""
+
+    @functools.wraps(function)
+    def run(config: str | None, endpoints: tuple[str, ...], domain: int | None, **arguments: Any) -> None:
+        with _until_interrupted(), connected(config, endpoints, domain) as transport:
+            function(transport, **arguments)
+
+    return topic.command(function.__name__.rstrip("_"))(network_options(run))
+
+
+@_command
+@click.option("--types", is_flag=True, help="With message types, and how many publish and listen.")
+def list_(transport: ZenohTransport, types: bool) -> None:
+    """List the topics that are shared now."""
+    for found in transport.shared_topics(_LIST_S):
+        counts = f"  {found.type}  published by {found.publishers}, heard by {found.subscribers} ROS 2 nodes"
+        click.echo(f"{found.name}{counts if types else ''}")
+
+
+@_command
+@click.argument("name", metavar="TOPIC")
+@click.option("--count", "-n", type=click.IntRange(1), help="End after so many messages.")
+@click.option("--full", is_flag=True, help="All elements of arrays.")
+def echo(transport: ZenohTransport, name: str, count: int | None, full: bool) -> None:
+    """Show the messages on TOPIC, until Ctrl-C."""
+    arrived: queue.SimpleQueue[Message] = queue.SimpleQueue()
+    transport.subscribe_messages(name, arrived.put)
+    for _ in _counted(count):
+        click.echo(f"{shown(arrived.get(), full=full)}---")
+
+
+@_command
+@click.argument("name", metavar="TOPIC")
+@click.option("--count", "-n", type=click.IntRange(1), help="End after so many measurements.")
+@click.option("--period", default=1.0, show_default=True, type=click.FloatRange(0.01), help="Seconds of each.")
+def hz(transport: ZenohTransport, name: str, count: int | None, period: float) -> None:
+    """Measure how often messages come on TOPIC, until Ctrl-C."""
+    arrived: queue.SimpleQueue[float] = queue.SimpleQueue()
+    transport.subscribe_messages(name, lambda message: arrived.put(time.monotonic()))
+    last: float | None = None
+    for _ in _counted(count):
+        times = [last] if last is not None else []
+        deadline = time.monotonic() + period
+        while (left := deadline - time.monotonic()) > 0:
+            with suppress(queue.Empty):
+                times.append(arrived.get(timeout=left))
+        gaps = [after - before for before, after in pairwise(times)]
+        last = times[-1] if times else None
+        if not gaps:
+            click.echo(f"less than two messages on {name} in {period:g} s")
+            continue
+        rate = len(gaps) / sum(gaps)
+        click.echo(f"{rate:.2f} Hz, gaps {min(gaps) * 1e3:.1f} to {max(gaps) * 1e3:.1f} ms, {len(gaps)} messages")
+
+
+@_command
+@click.argument("name", metavar="TOPIC")
+@click.argument("type_name", metavar="TYPE")
+@click.argument("text", metavar="MESSAGE")
+@click.option("--rate", type=click.FloatRange(0.01, 1000), help="Publish so often a second [Hz], until Ctrl-C.")
+@click.option("--count", "-n", type=click.IntRange(1), help="With --rate: end after so many.")
+def pub(transport: ZenohTransport, name: str, type_name: str, text: str, rate: float | None, count: int | None) -> None:
+    """Publish MESSAGE, as YAML, on TOPIC: once, or again and again.
+
+    E.g. `ibrobot topic pub /lamp std_msgs/msg/Bool '{data: true}'`.
+    """
+    message = message_from(type_name, text)
+    known = {found.type for found in transport.shared_topics(_LIST_S) if found.name == name and found.publishers}
+    if known - {message.ros_type}:
+        raise TransportError(f"topic {name} carries {', '.join(sorted(known))}, not {message.ros_type}")
+    if not transport.is_heard(name, message.ros_type, _HEARD_S):
+        click.echo(f"nobody listens to {name} yet", err=True)
+    due = time.monotonic()
+    for _ in _counted(1 if rate is None else count):
+        transport.publish_message(name, message)
+        if rate is not None:
+            due += 1 / rate
+            time.sleep(max(0.0, due - time.monotonic()))
+
+
+def _counted(count: int | None) -> Iterator[int]:
+    """As many as asked for, or without end."""
+    done = 0
+    while count is None or done < count:
+        yield done
+        done += 1

@@ -1,0 +1,203 @@
+"""`ibrobot topic …` beside a router on this machine: what is shown, counted and sent, and what is told when wrong."""
+
+from __future__ import annotations
+
+import queue
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import attrs
+import numpy as np
+import pytest
+import yaml
+from click.testing import CliRunner
+from ibrobot_zenoh.commands import network as network_module
+from ibrobot_zenoh.commands.text import message_from, shown
+from ibrobot_zenoh.commands.topic import topic
+from ibrobot_zenoh.options import ZenohOptions
+from ibrobot_zenoh.transport import ZenohTransport
+
+from ibrobot_core.config.schema import RobotConfig, TransportConfig
+from ibrobot_core.errors import ConfigError, IbrobotError, NotSupported
+from ibrobot_core.messages import Bool, Float64MultiArray, Header, JointState, Message
+from ibrobot_core.options import NoOptions
+from ibrobot_core.robot import Robot
+
+from .pair import WAIT_S, free_endpoint, router, wait_for
+
+IBROBOT = "from ibrobot_core.cli.main import main; main()"
+STATE = JointState(Header(5, "base"), ("pan",), [0.5])
+
+
+@pytest.fixture
+def endpoint() -> str:
+    return free_endpoint()
+
+
+@pytest.fixture
+def robot(endpoint: str) -> Iterator[ZenohTransport]:
+    """It shares /joint_states again and again, and listens to /lamp."""
+    transport = router(endpoint)
+    ended = threading.Event()
+
+    def share() -> None:
+        while not ended.wait(0.005):
+            transport.publish_message("/joint_states", STATE)
+
+    sharing = threading.Thread(target=share)
+    sharing.start()
+    yield transport
+    ended.set()
+    sharing.join()
+    transport.close()
+
+
+@pytest.fixture(autouse=True)
+def _without_shared_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whose files Zenoh keeps open."""
+    from_options = network_module.options_from
+
+    def options(*arguments: Any) -> ZenohOptions:
+        return attrs.evolve(from_options(*arguments), shared_memory=False)
+
+    monkeypatch.setattr(network_module, "options_from", options)
+
+
+def run(*arguments: str) -> str:
+    result = CliRunner().invoke(topic, arguments, catch_exceptions=True)
+    if result.exception is not None:
+        raise result.exception
+    return result.output
+
+
+def test_list(robot: ZenohTransport, endpoint: str):
+    wait_for(lambda: robot.shared_topics(WAIT_S))
+    assert run("list", "--endpoint", endpoint) == "/joint_states\n"
+    told = run("list", "--endpoint", endpoint, "--types").split("  ")
+    assert told[:2] == ["/joint_states", "sensor_msgs/msg/JointState"]
+    assert run("list", "--endpoint", endpoint, "--domain", "3") == ""
+
+
+def test_echo(robot: ZenohTransport, endpoint: str):
+    documents = list(yaml.safe_load_all(run("echo", "/joint_states", "--endpoint", endpoint, "-n", "2")))
+    expected = {
+        "header": {"stamp_ns": 5, "frame_id": "base"}, "name": ["pan"], "position": [0.5], "velocity": [], "effort": [],
+    }  # fmt: skip
+    assert documents == [expected, expected, None]
+
+
+def test_hz(robot: ZenohTransport, endpoint: str):
+    output = run("hz", "/joint_states", "--endpoint", endpoint, "-n", "1", "--period", "0.3")
+    rate, unit, *_ = output.split()
+    assert unit.startswith("Hz")
+    assert 1 < float(rate) <= 210
+    silent = run("hz", "/silence", "--endpoint", endpoint, "-n", "1", "--period", "0.02")
+    assert silent == "less than two messages on /silence in 0.02 s\n"
+
+
+def test_pub(robot: ZenohTransport, endpoint: str):
+    arrived: queue.SimpleQueue[Message] = queue.SimpleQueue()
+    robot.subscribe_messages("/lamp", arrived.put)
+    assert run("pub", "/lamp", "std_msgs/msg/Bool", "{data: true}", "--endpoint", endpoint) == ""
+    assert arrived.get(timeout=WAIT_S) == Bool(True)
+    run("pub", "/lamp", "std_msgs/msg/Bool", "data: false", "--endpoint", endpoint, "--rate", "500", "-n", "3")
+    assert [arrived.get(timeout=WAIT_S) for _ in range(3)] == [Bool(False)] * 3
+
+
+def test_pub_tells_that_nobody_listens(robot: ZenohTransport, endpoint: str, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("ibrobot_zenoh.commands.topic._HEARD_S", 0.05)
+    result = CliRunner().invoke(topic, ["pub", "/dark", "std_msgs/msg/Bool", "data: true", "--endpoint", endpoint])
+    assert result.exit_code == 0
+    assert result.stderr == "nobody listens to /dark yet\n"
+
+
+def test_pub_of_another_type_is_refused(robot: ZenohTransport, endpoint: str):
+    wait_for(lambda: robot.shared_topics(WAIT_S))
+    with pytest.raises(
+        IbrobotError, match="topic /joint_states carries sensor_msgs/msg/JointState, not std_msgs/msg/B"
+    ):
+        run("pub", "/joint_states", "std_msgs/msg/Bool", "data: true", "--endpoint", endpoint)
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("command", [["echo", "/joint_states"], ["hz", "/joint_states", "--period", "0.05"]])
+def test_ctrl_c_ends_it_cleanly(command: list[str], robot: ZenohTransport, endpoint: str):
+    with subprocess.Popen(
+        [sys.executable, "-c", IBROBOT, "topic", *command, "--endpoint", endpoint],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    ) as process:  # fmt: skip
+        assert process.stdout is not None
+        assert process.stdout.readline()
+        process.send_signal(signal.SIGINT)
+        _, told = process.communicate(timeout=WAIT_S)
+    assert (process.returncode, told) == (0, "")
+
+
+def test_which_network(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(network_module, "_CONNECT_S", 0.1)
+    with pytest.raises(SystemExit):
+        run("list")
+    assert "which network? Give --config CONFIG, or --endpoint" in CliRunner().invoke(topic, ["list"]).output
+    assert "is no endpoint" in CliRunner().invoke(topic, ["list", "--endpoint", "gpu"]).output
+    nobody = free_endpoint()
+    with pytest.raises(IbrobotError, match=f"nobody answers at {nobody}: is the robot, server or router up"):
+        run("list", "--endpoint", nobody)
+
+
+@pytest.mark.parametrize(
+    ("options", "connect"),
+    [
+        ({"connect": ("tcp/gpu.lab:7447",), "namespace": "robot1", "domain": 3}, ("tcp/gpu.lab:7447",)),
+        ({"mode": "router", "listen": ("tcp/0.0.0.0:1",), "users": Path("u")}, ("tcp/127.0.0.1:1",)),
+        ({"mode": "router", "listen": ("tcp/[::]:1",), "trusted_network": True}, ("tcp/[::1]:1",)),
+    ],
+)
+def test_the_network_of_a_config(options: dict[str, Any], connect: tuple[str, ...], monkeypatch: pytest.MonkeyPatch):
+    """It is a client there, whatever the robot is."""
+    use_config(monkeypatch, TransportConfig("zenoh", ZenohOptions(**options)))
+    found = network_module.options_from("robot", (), None)
+    assert (found.mode, found.connect, found.listen, found.users) == ("client", connect, (), None)
+    assert (found.namespace, found.domain) == ("", options.get("domain", 0))
+    assert network_module.options_from("robot", ("tcp/other:1",), 9).connect == ("tcp/other:1",)
+
+
+@pytest.mark.parametrize("transport", [None, TransportConfig("local", NoOptions())])
+def test_a_config_without_network(transport: TransportConfig | None, monkeypatch: pytest.MonkeyPatch):
+    use_config(monkeypatch, transport)
+    with pytest.raises(NotSupported, match=r"has (no transport|transport local); topics are shared by transport"):
+        network_module.options_from("robot", (), None)
+
+
+def use_config(monkeypatch: pytest.MonkeyPatch, transport: TransportConfig | None) -> None:
+    config = RobotConfig(Robot("r", ()), {}, {}, "m", transport=transport)
+    monkeypatch.setattr("ibrobot_core.config.find_config", lambda name, registry: Path(name))
+    monkeypatch.setattr("ibrobot_core.config.load", lambda path: config)
+
+
+def test_messages_from_text():
+    assert message_from("sensor_msgs/msg/JointState", "{header: {}, name: [a], position: [1, 2.5]}") == JointState(
+        Header(), ("a",), [1.0, 2.5]
+    )
+    with pytest.raises(NotSupported, match="did you mean 'std_msgs/msg/Bool'"):
+        message_from("std_msgs/Bool", "data: true")
+    for text, told in (
+        ("data: x", "data: expected true or false, got 'x'"),
+        ("dat: true", "did you mean 'data'"),
+        ("[1", "MESSAGE"),
+        ("5", "expected a mapping"),
+    ):
+        with pytest.raises(ConfigError, match=told):
+            message_from("std_msgs/msg/Bool", text)
+    with pytest.raises(ConfigError, match="could not convert"):
+        message_from("std_msgs/msg/Float64MultiArray", "data: [a]")
+
+
+def test_messages_as_text():
+    long = Float64MultiArray(np.arange(20.0))
+    assert yaml.safe_load(shown(long, full=True))["data"] == list(range(20))
+    assert yaml.safe_load(shown(long, full=False))["data"] == [*range(16), "… 4 more"]
