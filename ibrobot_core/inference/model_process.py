@@ -31,6 +31,8 @@ from ibrobot_core.plugins import installed
 
 _GLANCE_S = 0.5
 """How often to look whether the host is still there."""
+_NICE = 5
+"""Behind the host, which has cameras to read and a plan to send while the model computes."""
 
 
 class Events:
@@ -115,6 +117,7 @@ def _end_with(host: int) -> None:
 def main(pipe: int, request: int, answer: int) -> int:
     """Run with the host's pipe and memories; returns the exit status."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the host
+    os.nice(_NICE)
     connection = Connection(pipe)
     events = Events(connection)
     root = logging.getLogger("ibrobot")
