@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib.metadata import version
@@ -55,6 +56,8 @@ class _Output:
         self._handed = 0
         """Up to here the disk was given what is in the file [bytes]; whole pieces only."""
         self._closed = False
+        self._aside: threading.Thread | None = None
+        self._failure: OSError | None = None
 
     def write(self, data: bytes) -> int:
         rest = memoryview(data)
@@ -74,7 +77,40 @@ class _Output:
         """Nothing waits here."""
 
     def sync(self) -> None:
+        """Put what is in the file onto the disk.
+
+        Raises:
+            OSError: when the disk refuses it now, or refused it aside.
+        """
+        self._wait_aside()
         _sync(self._descriptor)
+
+    def sync_aside(self) -> None:
+        """Begin a sync in a thread: a busy disk takes seconds for it, in which messages must be written.
+
+        Raises:
+            OSError: when an earlier one failed.
+        """
+        if self._aside is not None and self._aside.is_alive():
+            return
+        self._wait_aside()
+        self._aside = threading.Thread(target=self._sync_or_fail, args=(os.dup(self._descriptor),), daemon=True)
+        self._aside.start()
+
+    def _sync_or_fail(self, descriptor: int) -> None:
+        try:
+            _sync(descriptor)
+        except OSError as error:
+            self._failure = error
+        finally:
+            os.close(descriptor)
+
+    def _wait_aside(self) -> None:
+        if self._aside is not None:
+            self._aside.join()
+            self._aside = None
+        if self._failure is not None:
+            raise self._failure
 
     def cut(self, size: int) -> None:
         os.ftruncate(self._descriptor, size)
@@ -83,6 +119,8 @@ class _Output:
         self._handed = min(self._handed, size - size % _PIECE)
 
     def close(self) -> None:
+        if self._aside is not None:
+            self._aside.join()
         if not self._closed:
             self._closed = True
             os.close(self._descriptor)
@@ -173,8 +211,8 @@ class BagFile:
         self._chunk_start_ns = None
 
     def sync(self) -> None:
-        """Put what is in the file onto the disk."""
-        self._output.sync()
+        """Begin to put what is in the file onto the disk."""
+        self._output.sync_aside()
 
     def finish(self, facts: Mapping[str, Any]) -> None:
         """Write the index, and close."""

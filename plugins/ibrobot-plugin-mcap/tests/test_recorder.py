@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import resource
 import threading
@@ -311,3 +312,40 @@ def test_what_a_message_takes_is_known_beforehand(images, most):
     assert recorder.min_free == 7 * MIB
     assert 0.001 < recorder.size_of(shot) / shot.data.nbytes < most
     assert recorder.size_of(joints(0)) == len(encode(joints(0)))
+
+
+def test_a_sync_that_takes_long_holds_up_no_message(bench, monkeypatch):
+    syncing, release, flushed = threading.Event(), threading.Event(), threading.Event()
+    flush = bagfile.BagFile.flush
+
+    def sync(descriptor):
+        syncing.set()
+        release.wait(60)
+
+    def flush_and_tell(self):
+        flush(self)
+        if syncing.is_set():
+            flushed.set()
+
+    monkeypatch.setattr(bagfile, "_sync", sync)
+    monkeypatch.setattr(bagfile.BagFile, "flush", flush_and_tell)
+    made = bench(threaded=True, chunk_period_s=0.001, sync_period_s=1e-6)
+    made.begin()
+    made.write(1)
+    assert syncing.wait(60)
+    made.write(1, start=1)
+    assert flushed.wait(60)
+    release.set()
+    made.end()
+
+
+def test_a_sync_that_the_disk_refuses_ends_the_recording(bench, monkeypatch):
+    def refused(descriptor):
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(bagfile, "_sync", refused)
+    made = bench(threaded=True, chunk_period_s=0.001, sync_period_s=1e-6)
+    made.begin()
+    made.write(1)
+    with pytest.raises(RecorderError, match="cannot be written: Input/output error; it stays unfinished"):
+        made.end()
