@@ -157,6 +157,14 @@ def test_a_robot_that_asks_often_waits_for_itself_only():
         assert cloud.policy.batches == [[0], [20], [1], [2], [21], [22]]
 
 
+def test_a_patient_batch_waits_for_more_until_it_is_full():
+    with served(batch=2, patience_s=PATIENCE_S) as cloud:
+        cloud.policy.gate.release(10)
+        first = cloud.asked("first", 1)
+        assert [outputs(cloud.ask("second", 2)), outputs(first)] == [[4], [2]]
+        assert cloud.policy.batches == [[1, 2]]
+
+
 def test_unlike_requests_are_not_put_together():
     with served() as cloud:
         cloud.busy()
