@@ -10,16 +10,11 @@ from contextlib import nullcontext, redirect_stdout
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-
-# Threads that wait by spinning make torch slower by a multiple where they share cores with anything; read by OpenMP
-# when it is loaded, so before torch.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import get_policy_class
 from lerobot.policies.rtc.configuration_rtc import RTCConfig
+from numpy.typing import NDArray
 
 from ibrobot_core.errors import PolicyError
 from ibrobot_core.interfaces import Tensors

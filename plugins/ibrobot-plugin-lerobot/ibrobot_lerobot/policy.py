@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
+from importlib import import_module
 from typing import TYPE_CHECKING, Any, override
 
 import numpy as np
@@ -55,14 +57,14 @@ class LeRobotPolicy(Policy):
         if any(others.values()):
             told = "; ".join(f"{file}: {', '.join(names)}" for file, names in others.items() if names)
             ctx.log.info("%s has steps that only LeRobot runs, so this process loads torch (%s)", options.path, told)
-            self._lerobot = _import_pipeline().LeRobotSteps(checkpoint)
+            self._lerobot = _import("pipeline").LeRobotSteps(checkpoint)
         self._model: Model | None = None
         self._seed = ctx.seed
 
     @override
     def load(self) -> None:
         check_weights(self._options.path)
-        model = _import_model().Model(self._checkpoint, self._options, self._ctx.log)
+        model = _import("model").Model(self._checkpoint, self._options, self._ctx.log)
         model.warm_up(self.preprocess(self._zeros()))
         self._model = model
 
@@ -154,21 +156,14 @@ def _seed(episode: int, stamp_ns: int) -> NDArray[np.int64]:
     return (words >> np.uint64(1)).astype(np.int64)
 
 
-def _import_pipeline() -> Any:
+def _import(name: str) -> Any:
+    """A module of this plugin that needs torch."""
+    # Threads that wait by spinning make torch slower by a multiple where they share cores with anything. OpenMP reads
+    # this when torch loads it.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
-        from ibrobot_lerobot import pipeline
+        return import_module(f"ibrobot_lerobot.{name}")
     except ImportError as error:
-        raise PolicyError(_missing(error)) from error
-    return pipeline
-
-
-def _import_model() -> Any:
-    try:
-        from ibrobot_lerobot import model
-    except ImportError as error:
-        raise PolicyError(_missing(error)) from error
-    return model
-
-
-def _missing(error: ImportError) -> str:
-    return f"policies of LeRobot need LeRobot ({error}); install it with: pip install 'lerobot>=0.6.1,<0.7'"
+        raise PolicyError(
+            f"policies of LeRobot need LeRobot ({error}); install it with: pip install 'lerobot>=0.6.1,<0.7'"
+        ) from error
