@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import queue
 import stat
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +18,9 @@ from ibrobot_zenoh.commands.certs import certs
 from ibrobot_zenoh.options import Tls
 
 from ibrobot_core.errors import TransportError
+from ibrobot_core.messages import Int32, String
 
-from .pair import client, free_endpoint, router, settle, wait_for
+from .pair import WAIT_S, client, free_endpoint, router, settle, wait_for
 
 
 def run(*arguments: Any) -> Result:
@@ -90,6 +93,41 @@ def test_a_server_of_another_name_is_not_believed(lab: Path, tmp_path: Path, cap
     wait_for(lambda: "not connected" in caplog.text)
     robot.close()
     server.close()
+
+
+def test_the_readme_s_access_control(lab: Path, tmp_path: Path):
+    """By the names in certificates: every robot asks for inference, and robot1 alone shares under its name."""
+    readme = Path(__file__).parents[1].joinpath("README.md").read_text(encoding="utf-8")
+    settings = tmp_path / "access.json5"
+    settings.write_text(readme.partition("```json5\n")[2].partition("```")[0])
+    endpoint = free_endpoint("tls")
+    server = router(endpoint, tls=tls(lab, "localhost"), settings=settings)
+    server.serve("infer/net", lambda payload: payload)
+    server.serve("secret", lambda payload: payload)
+    arrived: queue.SimpleQueue[object] = queue.SimpleQueue()
+    server.subscribe_messages("/robot1/count", arrived.put)
+    server.subscribe_messages("/robot1/name", arrived.put)
+    first, second = (client(endpoint, tls=tls(lab, name), namespace="robot1") for name in ("robot1", "robot2"))
+    for robot in (first, second):
+        served = threading.Event()
+        robot.watch("infer/net", lambda state, served=served: state and served.set())
+        assert served.wait(WAIT_S)
+        assert robot.request("infer/net", b"x", WAIT_S) == b"x"
+        with pytest.raises(TransportError, match="nobody serves secret"):
+            robot.request("secret", b"x", WAIT_S)
+    for _ in range(3):
+        second.publish_message("/count", Int32(-1))
+        second.publish_message("/name", String("a lie"), latched=True)
+    assert second.request("infer/net", b"after it", WAIT_S) == b"after it"
+    first.publish_message("/name", String("robot1"), latched=True)
+    assert arrived.get(timeout=WAIT_S) == String("robot1")
+    first.publish_message("/count", Int32(1))
+    assert arrived.get(timeout=WAIT_S) == Int32(1)
+    late: queue.SimpleQueue[object] = queue.SimpleQueue()
+    server.subscribe_messages("/robot1/name", late.put)
+    assert late.get(timeout=WAIT_S) == String("robot1")
+    for end in (first, second, server):
+        end.close()
 
 
 def test_what_is_made(lab: Path):
