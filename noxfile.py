@@ -21,7 +21,7 @@ FOLDERS = {
 """Name -> folder, of every plugin and of the library that plugins may share."""
 PLUGINS = sorted(FOLDERS)
 SHARED = "ros2"
-EXTRAS = {"camera": "[realsense]", "mcap": "[plot]"}
+EXTRAS = {"camera": "[realsense]", "mcap": "[plot]", "zenoh": "[interop]"}
 """Name -> extras that its tests use."""
 # A fixed seed: the same checks give the same result; `nox -s core -- --hypothesis-seed=random` explores.
 PYTEST = ("pytest", "--config-file=pyproject.toml", "--rootdir=.", "--hypothesis-seed=0")

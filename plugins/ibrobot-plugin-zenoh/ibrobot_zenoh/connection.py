@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import atexit
 import json
 import logging
+import queue
 import threading
 from collections.abc import Callable
 from typing import Any, Protocol
@@ -90,6 +92,29 @@ def _check_readable(path: Any) -> None:
         raise TransportError(f"{path}: cannot be read: {error.strerror}") from error
 
 
+def _by_a_daemon(make: Callable[[], Declared]) -> Declared:
+    """What `make` returns, called by a daemon thread.
+
+    Zenoh starts a thread for each callback, which is a daemon only if the one that starts it is. Any other would keep a
+    process from ending that failed before it could close its session.
+    """
+    made: queue.SimpleQueue[Declared | Exception] = queue.SimpleQueue()
+
+    def run() -> None:
+        try:
+            made.put(make())
+        except Exception as error:  # noqa: BLE001 - raised by the thread that asked
+            made.put(error)
+
+    thread = threading.Thread(target=run, name="zenoh declares", daemon=True)
+    thread.start()
+    thread.join()
+    result = made.get()
+    if isinstance(result, Exception):
+        raise result
+    return result
+
+
 class Connection:
     """A Zenoh session. A peer or router has it at once; a client once the other side answers, and it keeps trying.
 
@@ -109,6 +134,7 @@ class Connection:
         self._declared: dict[object, Declared] = {}
         self._closed = threading.Event()
         self._thread: threading.Thread | None = None
+        atexit.register(self.close)  # an interpreter cannot end well under Zenoh's threads
         self.answered = threading.Event()
         """Set when there is a session."""
         if options.mode != "client":
@@ -162,7 +188,7 @@ class Connection:
             if (session := self.open_session) is None:
                 self._pending[key] = make
             else:
-                self._declared[key] = make(session)
+                self._declared[key] = _by_a_daemon(lambda: make(session))
 
         def end() -> None:
             with self._lock:
@@ -179,6 +205,7 @@ class Connection:
             if self._closed.is_set():
                 return
             self._closed.set()
+            atexit.unregister(self.close)
             session, self._session = self._session, None
             self._pending.clear()
             self._declared.clear()

@@ -100,6 +100,28 @@ def test_a_client_that_never_connected_can_be_closed():
     lonely.close()
 
 
+FAILS = """
+import sys
+from ibrobot_core.testing import host_context
+from ibrobot_zenoh.options import ZenohOptions
+from ibrobot_zenoh.transport import ZenohTransport
+
+far = ZenohTransport(ZenohOptions(mode="router", listen=(sys.argv[1],)), host_context())
+near = ZenohTransport(ZenohOptions(connect=(sys.argv[1],)), host_context())
+near.subscribe("a", print)
+far.serve("b", print)
+near.watch("b", str)
+raise SystemExit(3)
+"""
+
+
+@pytest.mark.integration
+def test_a_process_that_fails_ends_though_nothing_was_closed():
+    command = [sys.executable, "-c", FAILS, free_endpoint()]
+    ended = subprocess.run(command, timeout=3 * WAIT_S, check=False, capture_output=True)
+    assert (ended.returncode, ended.stderr) == (3, b"")
+
+
 def test_an_address_that_is_taken():
     endpoint = free_endpoint()
     first = router(endpoint)
