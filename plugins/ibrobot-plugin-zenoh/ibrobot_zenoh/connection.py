@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import atexit
 import json
 import logging
-import queue
 import threading
 from collections.abc import Callable
+from functools import cache
 from typing import Any, Protocol
+from weakref import WeakSet
 
 import zenoh
 
@@ -92,27 +92,22 @@ def _check_readable(path: Any) -> None:
         raise TransportError(f"{path}: cannot be read: {error.strerror}") from error
 
 
-def _by_a_daemon(make: Callable[[], Declared]) -> Declared:
-    """What `make` returns, called by a daemon thread.
+_open: WeakSet[Connection] = WeakSet()
 
-    Zenoh starts a thread for each callback, which is a daemon only if the one that starts it is. Any other would keep a
-    process from ending that failed before it could close its session.
+
+@cache
+def _close_at_the_end() -> None:
+    """See to it, once, that a process ends that failed before it closed its sessions.
+
+    The interpreter waits for the threads in which Zenoh calls back, and those for the end of their session.
     """
-    made: queue.SimpleQueue[Declared | Exception] = queue.SimpleQueue()
 
-    def run() -> None:
-        try:
-            made.put(make())
-        except Exception as error:  # noqa: BLE001 - raised by the thread that asked
-            made.put(error)
+    def close_all() -> None:
+        threading.main_thread().join()
+        for connection in tuple(_open):
+            connection.close()
 
-    thread = threading.Thread(target=run, name="zenoh declares", daemon=True)
-    thread.start()
-    thread.join()
-    result = made.get()
-    if isinstance(result, Exception):
-        raise result
-    return result
+    threading.Thread(target=close_all, name="zenoh ends", daemon=True).start()
 
 
 class Connection:
@@ -134,7 +129,8 @@ class Connection:
         self._declared: dict[object, Declared] = {}
         self._closed = threading.Event()
         self._thread: threading.Thread | None = None
-        atexit.register(self.close)  # an interpreter cannot end well under Zenoh's threads
+        _open.add(self)
+        _close_at_the_end()
         self.answered = threading.Event()
         """Set when there is a session."""
         if options.mode != "client":
@@ -188,7 +184,7 @@ class Connection:
             if (session := self.open_session) is None:
                 self._pending[key] = make
             else:
-                self._declared[key] = _by_a_daemon(lambda: make(session))
+                self._declared[key] = make(session)
 
         def end() -> None:
             with self._lock:
@@ -205,7 +201,6 @@ class Connection:
             if self._closed.is_set():
                 return
             self._closed.set()
-            atexit.unregister(self.close)
             session, self._session = self._session, None
             self._pending.clear()
             self._declared.clear()
