@@ -24,6 +24,8 @@ from time import perf_counter
 CONFIG = Path(__file__).with_name("pick_cube.yaml")
 FIRST_TRAINING_SEED = 1000
 """Trials have the seeds from 0 on."""
+NOT_ALL_SUCCEEDED = 3
+"""Exit code of `ibrobot launch` when an episode failed."""
 
 
 def run(*command: str | Path, **environment: str) -> str:
@@ -31,8 +33,10 @@ def run(*command: str | Path, **environment: str) -> str:
     program = Path(sys.executable).with_name(str(command[0]))
     print(f"$ {' '.join(str(word) for word in command)}", file=sys.stderr)
     found = subprocess.run(
-        [program, *command[1:]], stdout=subprocess.PIPE, text=True, check=True, env={**os.environ, **environment}
+        [program, *command[1:]], stdout=subprocess.PIPE, text=True, check=False, env={**os.environ, **environment}
     )
+    if found.returncode not in (0, NOT_ALL_SUCCEEDED):
+        raise SystemExit(f"{command[0]} ended with {found.returncode}")
     return found.stdout.strip().splitlines()[-1]
 
 
