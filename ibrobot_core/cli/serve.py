@@ -79,7 +79,7 @@ def serve(what: str, **options: Any) -> None:
         logging.getLogger("ibrobot").info("%s loaded in %.1f s", name, time.monotonic() - begun_s)
         transport = make_transport()
         limits = ServiceOptions(options["batch"], options["queue"], options["patience"] / 1000)
-        service = InferenceService(policy, transport, name, limits)
+        service = InferenceService(policy, transport, name, limits, policy.picture_codec())
         try:
             service.start()
             click.echo(f"serving {name} (policy {policy.fingerprint()}); Ctrl-C ends")

@@ -174,6 +174,13 @@ class Inference:
     server_model: str = option("", help="what the server calls the model, where that is not its name here")
     request_timeout: float = option(5.0, unit="s", gt=0, help="after it a request has failed and the arm holds")
     prompt: str = option("", help="task for language-conditioned policies")
+    jpeg_quality: int | None = option(
+        None, ge=1, le=100, help="send pictures to the server as JPEG: far fewer bytes, other pixels; null: as they are"
+    )
+
+    def __attrs_post_init__(self) -> None:
+        if self.jpeg_quality is not None and self.execution_mode != "distributed":
+            raise ValueError(f"jpeg_quality has no meaning for execution_mode {self.execution_mode}: nothing is sent")
 
 
 @attrs.frozen

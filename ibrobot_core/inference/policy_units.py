@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ibrobot_core.contract.joint_units import ACTION, JointUnits
-from ibrobot_core.interfaces import Frame, Policy, Tensors
+from ibrobot_core.interfaces import Frame, PictureCodec, Policy, Tensors
 
 
 class PolicyInItsUnits(Policy):
@@ -41,6 +41,10 @@ class PolicyInItsUnits(Policy):
     @override
     def fingerprint(self) -> str:
         return self._policy.fingerprint()
+
+    @override
+    def picture_codec(self, quality: int = 90) -> PictureCodec | None:
+        return self._policy.picture_codec(quality)
 
     @override
     def preprocess(self, frame: Frame) -> Tensors:

@@ -13,8 +13,8 @@ import attrs
 from ibrobot_core.errors import ContractError, PolicyError, TransportError, WireError
 from ibrobot_core.inference.engine import Engine
 from ibrobot_core.inference.service import health_name, service_name
-from ibrobot_core.inference.wire import LIMITS, Encoder, Kind, Limits, Message, PictureCodec, decode
-from ibrobot_core.interfaces import Policy, Tensors, Transport
+from ibrobot_core.inference.wire import LIMITS, Encoder, Kind, Limits, Message, decode
+from ibrobot_core.interfaces import PictureCodec, Policy, Tensors, Transport
 from ibrobot_core.units import NS_PER_S
 
 _HEALTH_TIMEOUT_S = 2.0

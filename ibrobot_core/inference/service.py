@@ -16,8 +16,8 @@ import numpy as np
 
 from ibrobot_core.errors import IbrobotError, PolicyError, WireError
 from ibrobot_core.inference.fair_queue import FairQueue
-from ibrobot_core.inference.wire import LIMITS, Kind, Limits, Message, PictureCodec, decode, encode
-from ibrobot_core.interfaces import Payload, Policy, Tensors, Transport
+from ibrobot_core.inference.wire import LIMITS, Kind, Limits, Message, decode, encode
+from ibrobot_core.interfaces import Payload, PictureCodec, Policy, Tensors, Transport
 from ibrobot_core.units import NS_PER_S
 
 _ROBOTS_KEPT = 256

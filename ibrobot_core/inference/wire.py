@@ -9,7 +9,6 @@ from __future__ import annotations
 import enum
 import math
 import struct
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from typing import override
 
@@ -18,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ibrobot_core.errors import WireError
-from ibrobot_core.interfaces import Payload, Tensors
+from ibrobot_core.interfaces import Payload, PictureCodec, Tensors
 
 MAGIC = b"IBRW"
 VERSION = 1
@@ -85,18 +84,6 @@ class Message:
     seed: int = 0
     latency_ms: float = 0.0
     """In an answer: from the request's arrival at the server to its answer."""
-
-
-class PictureCodec(ABC):
-    """JPEG for tensors that are camera pictures: `uint8`, shape (H, W, 3) or (H, W, 1)."""
-
-    @abstractmethod
-    def encode(self, name: str, picture: NDArray[np.uint8]) -> bytes | None:
-        """The picture as JPEG; None where the tensor of this name is to stay as it is."""
-
-    @abstractmethod
-    def decode(self, jpeg: memoryview, shape: tuple[int, int, int]) -> NDArray[np.uint8]:
-        """The picture of a JPEG, which is to be refused before it is decoded where its size is not `shape`."""
 
 
 class NoPictures(PictureCodec):

@@ -5,7 +5,7 @@ from ibrobot_core.interfaces.dataset import DatasetSummary, DatasetWriter, Featu
 from ibrobot_core.interfaces.executor import Executor, GoalState, GoalStatus, Plan
 from ibrobot_core.interfaces.hardware import Episode, Hardware, JointReading, Signal, SimulatedHardware, nan_vector
 from ibrobot_core.interfaces.planner import JointGoal, Planner, PlanRequest, PoseGoal
-from ibrobot_core.interfaces.policy import Frame, Policy, PolicySpec, Tensors
+from ibrobot_core.interfaces.policy import Frame, PictureCodec, Policy, PolicySpec, Tensors
 from ibrobot_core.interfaces.reader import EpisodeAddress, EpisodeReader, EpisodeSummary, Recorded, TopicSummary
 from ibrobot_core.interfaces.recorder import EpisodeEnd, EpisodeStart, Recorder
 from ibrobot_core.interfaces.sensor import Sensor
@@ -32,6 +32,7 @@ __all__ = [
     "JointGoal",
     "JointReading",
     "Payload",
+    "PictureCodec",
     "Plan",
     "PlanRequest",
     "Planner",

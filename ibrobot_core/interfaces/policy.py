@@ -70,6 +70,18 @@ class PolicySpec:
     """Unit of joint positions that it was trained in, as under `models`; None when the checkpoint does not say."""
 
 
+class PictureCodec(ABC):
+    """JPEG for tensors that are camera pictures: `uint8`, shape (H, W, 3) or (H, W, 1)."""
+
+    @abstractmethod
+    def encode(self, name: str, picture: NDArray[np.uint8]) -> bytes | None:
+        """The picture as JPEG; None where the tensor of this name is to stay as it is."""
+
+    @abstractmethod
+    def decode(self, jpeg: memoryview, shape: tuple[int, int, int]) -> NDArray[np.uint8]:
+        """The picture of a JPEG, which is to be refused before it is decoded where its size is not `shape`."""
+
+
 class Policy(ABC):
     """Three steps, so that `infer` can run in another process or on another machine than the other two.
 
@@ -116,6 +128,17 @@ class Policy(ABC):
         """
         spec = attrs.asdict(self.spec)
         return hashlib.sha256(json.dumps(spec, sort_keys=True).encode()).hexdigest()[:16]
+
+    def picture_codec(self, quality: int = 90) -> PictureCodec | None:
+        """What makes JPEG of the pictures among its inputs, and pictures of JPEG, for thin links.
+
+        Args:
+            quality: of the JPEG, 1 to 100.
+
+        Returns:
+            The codec; None where `preprocess` gives no pictures as they are, which is the default.
+        """
+        return None
 
     def load(self) -> None:
         """Load weights and warm up; when it returns the policy is ready.

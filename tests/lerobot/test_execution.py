@@ -7,6 +7,7 @@ import textwrap
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import override
 
 import attrs
 import numpy as np
@@ -20,7 +21,7 @@ from ibrobot_core.inference.engine import Engine, LocalEngine
 from ibrobot_core.inference.process import ProcessEngine
 from ibrobot_core.inference.remote import RemoteEngine
 from ibrobot_core.inference.service import InferenceService
-from ibrobot_core.interfaces import Frame
+from ibrobot_core.interfaces import Frame, Payload
 from ibrobot_core.local_transport import LocalTransport
 from ibrobot_core.testing.contexts import START_NS, host_context
 
@@ -46,6 +47,17 @@ default_control_mode: idle
 @pytest.fixture(params=["act", "diffusion"])
 def path(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     return save(CONFIGS[request.param](), tmp_path / request.param)
+
+
+class Counting(LocalTransport):
+    """Knows the size of the last request."""
+
+    size = 0
+
+    @override
+    def request(self, name: str, payload: Payload, timeout_s: float) -> Payload:
+        self.size = len(payload)
+        return super().request(name, payload, timeout_s)
 
 
 def make(path: Path) -> LeRobotPolicy:
@@ -74,6 +86,30 @@ def engines(path: Path, tmp_path: Path) -> Iterator[dict[str, Engine]]:
         for engine in made.values():
             engine.close()
         service.close()
+
+
+def test_jpeg_costs_little_of_the_actions_and_most_of_the_bytes(tmp_path: Path) -> None:
+    path, transport = save(CONFIGS["act"](), tmp_path / "act"), Counting()
+    cloud, edge = make(path), make(path)
+    cloud.load()
+    service = InferenceService(cloud, transport, "net", codec=cloud.picture_codec())
+    service.start()
+    values = {
+        key: (np.indices(shape).sum(0) * 3 % 200).astype(np.uint8 if len(shape) == 3 else np.float32)
+        for key, shape in edge.spec.observations.items()
+    }
+    tensors = edge.preprocess(Frame(START_NS, values))
+    actions, sizes = [], []
+    for codec in (None, edge.picture_codec(80)):
+        engine = RemoteEngine(edge, transport, "net", "mini", codec=codec)
+        engine.start()
+        actions.append(edge.postprocess(engine.infer(tensors, 1, time.monotonic_ns() + PATIENCE_NS)))
+        sizes.append(transport.size)
+        engine.close()
+    service.close()
+    transport.close()
+    assert sizes[1] < sizes[0] / 3
+    assert 0 < np.abs(actions[0] - actions[1]).max() < 0.1
 
 
 def test_every_execution_mode_acts_as_lerobot_alone(path: Path, engines: dict[str, Engine]) -> None:

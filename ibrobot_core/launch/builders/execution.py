@@ -10,13 +10,13 @@ from ibrobot_core.contract.check import check_policy
 from ibrobot_core.contract.joint_units import JointUnits, calibrations
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.dispatch.dispatcher import Dispatcher, check_strategy
-from ibrobot_core.errors import ContractError
+from ibrobot_core.errors import ContractError, PolicyError
 from ibrobot_core.inference.client import EngineClient, InferenceClient, LockstepClient
 from ibrobot_core.inference.engine import Engine, LocalEngine
 from ibrobot_core.inference.policy_units import PolicyInItsUnits
 from ibrobot_core.inference.process import ProcessEngine
 from ibrobot_core.inference.remote import RemoteEngine
-from ibrobot_core.interfaces import Policy
+from ibrobot_core.interfaces import PictureCodec, Policy
 from ibrobot_core.launch.builders.transport import NAME as TRANSPORT
 from ibrobot_core.launch.component import Component
 from ibrobot_core.launch.feeder import Feeder
@@ -87,10 +87,24 @@ class Model(Component):
             case "distributed":
                 return RemoteEngine(
                     policy, session.transport, inference.server_model or inference.model, session.config.robot.name,
-                    start_timeout_s=inference.request_timeout,
+                    start_timeout_s=inference.request_timeout, codec=self._codec(policy),
                 )  # fmt: skip
             case _:
                 return LocalEngine(policy)
+
+    def _codec(self, policy: Policy) -> PictureCodec | None:
+        quality = self._inference.jpeg_quality
+        if quality is None:
+            return None
+        codec = policy.picture_codec(quality)
+        if codec is None:
+            raise PolicyError(
+                f"model {self._model.name!r}: jpeg_quality cannot be used, the policy sends no pictures as they are"
+            )
+        self._session.log.info(
+            "model %s: pictures are sent as JPEG of quality %d, with a loss", self._model.name, quality
+        )
+        return codec
 
     def _units(self) -> JointUnits:
         config, name = self._session.config, self._model.calibration

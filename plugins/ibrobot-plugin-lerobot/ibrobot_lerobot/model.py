@@ -20,6 +20,7 @@ from ibrobot_core.errors import PolicyError
 from ibrobot_core.interfaces import Tensors
 from ibrobot_lerobot.checkpoint import ACTION, Checkpoint
 from ibrobot_lerobot.options import LeRobotPolicyOptions
+from ibrobot_lerobot.steps import Steps
 
 _IMAGES, _IMAGE = "observation.images", "observation.image"
 _OWN = ("seed", "task", "prefix", "delay_steps")
@@ -32,15 +33,22 @@ class Model:
     Args:
         checkpoint: with its weights.
         options: device, arithmetic, threads.
+        steps: of the preprocessor, for `pictures`.
+        pictures: tensors that are cameras' pictures as they are, (H, W, C) or (T, H, W, C) of uint8.
         log: where to say what it runs on.
 
     Raises:
         PolicyError: when the device is not there, or LeRobot cannot load the checkpoint.
     """
 
-    def __init__(self, checkpoint: Checkpoint, options: LeRobotPolicyOptions, log: logging.Logger) -> None:
+    def __init__(
+        self, checkpoint: Checkpoint, options: LeRobotPolicyOptions, steps: Steps, pictures: Sequence[str],
+        log: logging.Logger,
+    ) -> None:  # fmt: skip
         self._checkpoint = checkpoint
         self._device = torch.device(_device(options.device))
+        self._steps = steps.of(lambda array: torch.from_numpy(np.array(array)).to(self._device))
+        self._pictures = pictures
         threads = options.threads or max(1, _cores() - 1)
         torch.set_num_threads(threads)
         self._policy = self._load(options)
@@ -68,11 +76,7 @@ class Model:
         """Chunks, each of shape (1, N, A), of requests whose tensors have equal names and shapes."""
         if len(batch) > 1 and (self._draws or "prefix" in batch[0]):
             return [self.predict([tensors])[0] for tensors in batch]
-        inputs: dict[str, Any] = {
-            name: torch.from_numpy(np.concatenate([tensors[name] for tensors in batch])).to(self._device)
-            for name in batch[0]
-            if name not in _OWN
-        }
+        inputs = self.inputs(batch)
         devices = [self._device] if self._device.type == "cuda" else []
         with torch.random.fork_rng(devices), torch.no_grad(), self._arithmetic():
             torch.manual_seed(int(batch[0]["seed"][0]))
@@ -82,6 +86,20 @@ class Model:
         self._draws |= any(not torch.equal(a, b) for a, b in zip(before, after, strict=True))
         result = actions.float().numpy(force=True)
         return [np.array(result[i : i + 1]) for i in range(len(batch))]
+
+    def inputs(self, batch: Sequence[Tensors]) -> dict[str, Any]:
+        """What the network sees of requests: their tensors on its device, pictures normalised."""
+        found: dict[str, Any] = {
+            name: torch.from_numpy(np.concatenate([tensors[name] for tensors in batch])).to(self._device)
+            for name in batch[0]
+            if name not in _OWN and name not in self._pictures
+        }
+        return found | self._steps({name: self._seen([tensors[name] for tensors in batch]) for name in self._pictures})
+
+    def _seen(self, pictures: Sequence[NDArray[Any]]) -> torch.Tensor:
+        """Pictures as LeRobot has them, (B, ..., C, H, W) from 0 to 1."""
+        pixels = torch.from_numpy(np.stack(pictures)).to(self._device)
+        return pixels.movedim(-1, -3).contiguous().to(torch.float32) / 255
 
     def _run(self, inputs: dict[str, Any], batch: Sequence[Tensors]) -> torch.Tensor:
         policy, request = self._policy, batch[0]

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ibrobot_core.errors import PolicyError
-from ibrobot_core.interfaces import Context, Frame, Policy, Tensors
+from ibrobot_core.interfaces import Context, Frame, PictureCodec, Policy, PolicySpec, Tensors
 from ibrobot_lerobot.checkpoint import ACTION, POSTPROCESSOR, PREPROCESSOR, check_weights, read_checkpoint
 from ibrobot_lerobot.options import LeRobotPolicyOptions
 from ibrobot_lerobot.steps import read_steps
@@ -33,7 +33,8 @@ class LeRobotPolicy(Policy):
     """Runs what LeRobot trained, with the processors that were saved with it.
 
     Standard processor steps (rename, batch, device, normalise, unnormalise) are done in NumPy; where there are others,
-    LeRobot runs the processor.
+    LeRobot runs the processor. With standard steps, cameras' pictures stay as they are until `infer`, which normalises
+    them: a quarter of the bytes on the way to a model elsewhere.
 
     Args:
         options: which checkpoint, and how it is computed.
@@ -58,13 +59,15 @@ class LeRobotPolicy(Policy):
             told = "; ".join(f"{file}: {', '.join(names)}" for file, names in others.items() if names)
             ctx.log.info("%s has steps that only LeRobot runs, so this process loads torch (%s)", options.path, told)
             self._lerobot = _import("pipeline").LeRobotSteps(checkpoint)
+        self._pictures: tuple[str, ...] = () if self._pre.others else _pictures(self.spec)
+        """Observations that `infer` normalises."""
         self._model: Model | None = None
         self._seed = ctx.seed
 
     @override
     def load(self) -> None:
         check_weights(self._options.path)
-        model = _import("model").Model(self._checkpoint, self._options, self._ctx.log)
+        model = _import("model").Model(self._checkpoint, self._options, self._pre, self._pictures, self._ctx.log)
         model.warm_up(self.preprocess(self._zeros()))
         self._model = model
 
@@ -81,6 +84,14 @@ class LeRobotPolicy(Policy):
         return self._checkpoint.fingerprint()
 
     @override
+    def picture_codec(self, quality: int = 90) -> PictureCodec | None:
+        if not self._pictures:
+            return None
+        from ibrobot_lerobot.jpeg import Jpeg
+
+        return Jpeg(quality)
+
+    @override
     def preprocess(self, frame: Frame) -> Tensors:
         if self.spec.prompt and not frame.prompt:
             raise PolicyError(f"{self._checkpoint.type} wants a prompt: what is the robot to do?")
@@ -89,8 +100,10 @@ class LeRobotPolicy(Policy):
         frames = [frames[0]] * (self._checkpoint.n_obs_steps - len(frames)) + frames
         each = [self._run_pre(self._batch(one), frame.prompt) for one in frames[:-1]]
         tensors = self._run_pre(self._batch(frames[-1], frame.prefix), frame.prompt)
-        for name in self._checkpoint.inputs if each else ():
+        for name in tensors.keys() & self._checkpoint.inputs.keys() if each else ():
             tensors[name] = np.stack([*(one[name] for one in each), tensors[name]], axis=1)
+        for key in self._pictures:
+            tensors[key] = np.stack([one.values[key] for one in frames]) if each else frames[-1].values[key]
         if frame.prefix is not None and self.spec.prefix:
             tensors[PREFIX] = tensors.pop(ACTION)
             tensors[DELAY] = np.array([frame.delay_steps], np.int64)
@@ -130,6 +143,8 @@ class LeRobotPolicy(Policy):
             if len(shape) == 3:
                 if value.dtype != np.uint8:
                     raise PolicyError(f"the policy needs {key} with pixels of 8 bit, got {value.dtype}")
+                if key in self._pictures:
+                    continue
                 value = np.ascontiguousarray(value.transpose(2, 0, 1)).astype(np.float32) / np.float32(255)
             batch[key] = value.astype(np.float32)[None]
         if prefix is not None and self.spec.prefix:
@@ -148,6 +163,10 @@ class LeRobotPolicy(Policy):
             for key, shape in self.spec.observations.items()
         }
         return Frame(0, values, prompt="warm up" if self.spec.prompt else "")
+
+
+def _pictures(spec: PolicySpec) -> tuple[str, ...]:
+    return tuple(key for key, shape in spec.observations.items() if len(shape) == 3)
 
 
 def _seed(episode: int, stamp_ns: int) -> NDArray[np.int64]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ class Rename:
 
     names: Mapping[str, str]
 
-    def __call__(self, batch: Mapping[str, Array]) -> dict[str, Array]:
+    def __call__(self, batch: Mapping[str, Any]) -> dict[str, Any]:
         """The batch under its new names."""
         return {self.names.get(key, key): value for key, value in batch.items()}
 
@@ -41,28 +41,21 @@ class Normalise:
 
     modes: Mapping[str, str]
     """Key -> how; only of keys with statistics."""
-    statistics: Mapping[str, tuple[Array, Array]]
-    """Key -> mean and standard deviation, or the ends of the range; float32."""
-    eps: float
+    statistics: Mapping[str, tuple[Any, Any]]
+    """Key -> mean and what is divided by, or the lower end and the length of the range; float32."""
     inverse: bool
 
-    def __call__(self, batch: Mapping[str, Array]) -> dict[str, Array]:
+    def __call__(self, batch: Mapping[str, Any]) -> dict[str, Any]:
         """The batch with what has statistics normalised; the rest as it is."""
         return {key: self._apply(key, value) if key in self.modes else value for key, value in batch.items()}
 
-    def _apply(self, key: str, value: Array) -> Array:
-        mode, (low, high) = self.modes[key], self.statistics[key]
+    def _apply(self, key: str, value: Any) -> Any:
+        mode, (low, span) = self.modes[key], self.statistics[key]
         if mode == "MEAN_STD":
-            normal: Array = value * high + low if self.inverse else (value - low) / (high + np.float32(self.eps))
-            return normal
-        span = np.where(high == low, np.float32(self.eps), high - low)
+            return value * span + low if self.inverse else (value - low) / span
         if not self.inverse:
-            scaled: Array = np.float32(2) * (value - low) / span - np.float32(1)
-        elif mode == "MIN_MAX":
-            scaled = (value + np.float32(1)) / np.float32(2) * span + low
-        else:
-            scaled = (value + np.float32(1)) * span / np.float32(2) + low
-        return scaled
+            return (value - low) * 2.0 / span - 1.0
+        return (value + 1.0) / 2.0 * span + low if mode == "MIN_MAX" else (value + 1.0) * span / 2.0 + low
 
 
 type Step = Rename | Normalise
@@ -76,12 +69,23 @@ class Steps:
     others: Sequence[str]
     """Steps that are not standard, by LeRobot's names; where there are any, LeRobot must run the whole processor."""
 
-    def __call__(self, batch: Mapping[str, Array]) -> dict[str, Array]:
+    def __call__(self, batch: Mapping[str, Any]) -> dict[str, Any]:
         """All steps, one after the other."""
         result = dict(batch)
         for step in self.steps:
             result = step(result)
         return result
+
+    def of(self, convert: Callable[[Array], Any]) -> Steps:
+        """The same steps for arrays of another library, to which `convert` takes the statistics."""
+
+        def converted(step: Step) -> Step:
+            if isinstance(step, Rename):
+                return step
+            statistics = {key: (convert(low), convert(span)) for key, (low, span) in step.statistics.items()}
+            return attrs.evolve(step, statistics=statistics)
+
+        return Steps([converted(step) for step in self.steps], self.others)
 
 
 def read_steps(checkpoint: Checkpoint, file: str) -> Steps:
@@ -121,7 +125,7 @@ def _normalise(path: Path, entry: Mapping[str, Any], *, inverse: bool) -> Normal
             flat = load_file(path.parent / entry["state_file"])
         except (OSError, SafetensorError) as error:
             raise PolicyError(f"{path.parent / entry['state_file']}: cannot be read: {error}") from None
-    only = config.get("normalize_observation_keys")
+    only, eps = config.get("normalize_observation_keys"), np.float32(config.get("eps", 1e-8))
     modes, statistics = {}, {}
     for name, feature in config["features"].items():
         kind = feature["type"]
@@ -137,8 +141,12 @@ def _normalise(path: Path, entry: Mapping[str, Any], *, inverse: bool) -> Normal
         if missing := [each for each in names if each not in flat]:
             raise PolicyError(f"{path.parent / entry['state_file']}: {mode} needs {missing[0]}, which is missing")
         low, high = (_of_channels(flat[each], kind).astype(np.float32) for each in names)
+        if mode != "MEAN_STD":
+            high = np.where(high == low, eps, high - low)
+        elif not inverse:
+            high = high + eps
         modes[key], statistics[key] = mode, (low, high)
-    return Normalise(modes, statistics, float(config.get("eps", 1e-8)), inverse)
+    return Normalise(modes, statistics, inverse)
 
 
 def _of_channels(statistic: Array, kind: str) -> Array:

@@ -102,8 +102,7 @@ def test_numbers_are_normalised_and_back(tmp_path: Path) -> None:
     tensors = policy.preprocess(frame(0.5, 51))
     np.testing.assert_allclose(tensors[STATE][0, :5], 0.5)
     assert tensors[STATE][0, 5] == pytest.approx(3e8), "a range of nothing is taken as 1e-8, as in LeRobot"
-    assert tensors[TOP].shape == (1, 3, 4, 5)
-    np.testing.assert_allclose(tensors[TOP][0, :, 0, 0], [-0.6, -0.2, 0.2], atol=1e-6)
+    assert (tensors[TOP].shape, tensors[TOP].dtype) == ((4, 5, 3), np.uint8), "pictures are the model's to normalise"
     actions = policy.postprocess({"action": np.ones((1, 10, 6), np.float32)})
     assert actions.dtype == np.float64
     np.testing.assert_allclose(actions, np.tile(2 + np.arange(6), (10, 1)))
