@@ -171,7 +171,7 @@ def memories(pids: list[int]) -> set[tuple[int, int]]:
         with suppress(OSError):
             for entry in Path(f"/proc/{pid}/fd").iterdir():
                 with suppress(OSError):
-                    if "ibrobot-link" in os.readlink(entry):
+                    if "memfd:ibrobot" in os.readlink(entry):
                         status = entry.stat()
                         found.add((status.st_dev, status.st_ino))
     return found
