@@ -4,7 +4,7 @@
 
 1. `ibrobot record`: the scripted pick in simulation, in lockstep, without cameras; the cube's pose is an observation.
 2. `ibrobot convert`: a LeRobot dataset of the successes.
-3. `lerobot-train`: a small ACT (0.5 million parameters) on the CPU.
+3. `lerobot-train`, twice: a small ACT (0.5 million parameters) on the CPU.
 4. `ibrobot launch`: the trained policy in the same simulation, with cubes at places that were in no demonstration.
 
 Needs LeRobot in the same environment: `pip install 'lerobot[dataset,training]>=0.6.1,<0.7'`. A stage whose result is in
@@ -41,13 +41,25 @@ def run(*command: str | Path, **environment: str) -> str:
 
 
 def train(dataset: Path, out: Path, steps: int) -> None:
-    """Train ACT on what `ibrobot convert` wrote."""
+    """Train ACT on what `ibrobot convert` wrote: `steps` at a high rate of learning, a third as many at a low one."""
+    architecture = (
+        "--policy.type=act", "--policy.use_vae=false", "--policy.dim_model=128", "--policy.n_heads=4",
+        "--policy.dim_feedforward=256", "--policy.n_encoder_layers=2", "--policy.dropout=0.0",
+        "--policy.chunk_size=30", "--policy.n_action_steps=30",
+    )  # fmt: skip
+    first = out.with_name("train_first")
+    learn(dataset, first, steps, 5e-4, *architecture)
+    learn(dataset, out, steps // 3, 5e-5, f"--policy.path={first}/checkpoints/last/pretrained_model")
+
+
+def learn(dataset: Path, out: Path, steps: int, rate: float, *policy: str) -> None:
+    """One run of `lerobot-train`; goes on where an earlier one had come to be."""
+    if out.exists():
+        return
     # Threads that spin, or more of them than cores that are free, cost a multiple.
     run(
-        "lerobot-train", "--dataset.repo_id=local/pick_cube", f"--dataset.root={dataset}", "--policy.type=act",
-        "--policy.device=cpu", "--policy.push_to_hub=false", "--policy.use_vae=false", "--policy.dim_model=128",
-        "--policy.n_heads=4", "--policy.dim_feedforward=256", "--policy.n_encoder_layers=2", "--policy.dropout=0.0",
-        "--policy.chunk_size=30", "--policy.n_action_steps=30", "--policy.optimizer_lr=5e-4", "--batch_size=64",
+        "lerobot-train", "--dataset.repo_id=local/pick_cube", f"--dataset.root={dataset}", *policy,
+        "--policy.device=cpu", "--policy.push_to_hub=false", f"--policy.optimizer_lr={rate}", "--batch_size=64",
         f"--steps={steps}", "--num_workers=1", "--save_freq=1000", "--wandb.enable=false", f"--output_dir={out}",
         HF_HUB_OFFLINE="1", OMP_WAIT_POLICY="PASSIVE", OMP_NUM_THREADS="1",
     )  # fmt: skip

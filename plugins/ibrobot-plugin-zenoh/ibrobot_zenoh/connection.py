@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
 import logging
+import os
 import threading
 from collections.abc import Callable
 from functools import cache
@@ -21,6 +23,26 @@ _CLOSE_WAIT_S = 1.0
 """How long closing waits for an attempt to connect, which nothing can interrupt."""
 _FIRST_WAIT_S = 0.3
 """How long making a client waits for somebody to answer, so that what is there can be used at once."""
+
+
+_KEPT_BYTES = 256 << 20
+_MMAP_THRESHOLD, _LARGEST_THRESHOLD = -3, 32 << 20
+_TRIM_THRESHOLD = -1
+
+
+@cache
+def keep_freed_memory() -> None:
+    """Have the C library keep what was freed, where it is glibc.
+
+    Mapping memory anew for each large message costs more than its copies do. An operator's own
+    `MALLOC_MMAP_THRESHOLD_` stands.
+    """
+    if "MALLOC_MMAP_THRESHOLD_" in os.environ:
+        return
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None:
+        mallopt(_MMAP_THRESHOLD, _LARGEST_THRESHOLD)
+        mallopt(_TRIM_THRESHOLD, _KEPT_BYTES)
 
 
 class Declared(Protocol):
@@ -121,6 +143,7 @@ class Connection:
 
     def __init__(self, options: ZenohOptions, log: logging.Logger) -> None:
         self._log = log
+        keep_freed_memory()
         self._endpoints = ", ".join(options.connect or options.listen)
         self._config = zenoh_config(options)
         self._lock = threading.Lock()
