@@ -110,7 +110,7 @@ def integration(session: nox.Session) -> None:
 @nox.session
 def lerobot(session: nox.Session) -> None:
     """LeRobot itself, unmodified, against what the plugins offer; the one session with torch."""
-    install(session, *PLUGINS, options=("lerobot[dataset,feetech,training]>=0.6.1,<0.7",))
+    install(session, *PLUGINS, options=("lerobot[dataset,diffusion,feetech,smolvla,training]>=0.6.1,<0.7",))
     session.run(*PYTEST, "-m", "lerobot", "tests", *session.posargs)
 
 
