@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from multiprocessing import forkserver
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +58,7 @@ def independently(folder: Path) -> list[dict[str, NDArray[Any]]]:
 
 @pytest.fixture(scope="module")
 def bags(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    forkserver.ensure_running()  # converting starts it, and it lives as long as the interpreter
     root = tmp_path_factory.mktemp("bags")
     for number, seconds in ((1, 1.5), (2, 0.8), (3, 2.1)):
         record(root / f"episode_{number:06d}", number, seconds, "sort the blocks" if number == 2 else "pick the cube")

@@ -7,6 +7,7 @@ import os
 import resource
 import threading
 from collections import Counter
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -255,23 +256,26 @@ def test_a_disk_that_fills_up_ends_the_episode_whole(bench, monkeypatch, threade
     assert len(read(made.end())) == 1
 
 
-@pytest.fixture
+@contextmanager
 def small_files():
-    """No file may exceed 100 000 bytes."""
+    """No file may exceed 100 000 bytes; within the test alone, since the log of the tests is a file too."""
     old = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, old[1]))
-    yield
-    resource.setrlimit(resource.RLIMIT_FSIZE, old)
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, old)
 
 
 @pytest.mark.parametrize("threaded", [False, True])
-def test_a_disk_that_refuses_leaves_an_unfinished_episode_of_whole_records(bench, small_files, threaded):
+def test_a_disk_that_refuses_leaves_an_unfinished_episode_of_whole_records(bench, threaded):
     made = bench(threaded=threaded, chunk_size=8192)
     made.begin(prompt="pick")
-    with pytest.raises(RecorderError, match="cannot be written: File too large; it stays unfinished"):
-        made.write(1_000_000)
-    with pytest.raises(RecorderError, match="cannot be written"):
-        made.end()
+    with small_files():
+        with pytest.raises(RecorderError, match="cannot be written: File too large; it stays unfinished"):
+            made.write(1_000_000)
+        with pytest.raises(RecorderError, match="cannot be written"):
+            made.end()
     kept = summary(made.path)
     assert (kept.finished, dict(kept.metadata), kept.outcome) == (False, {"prompt": "pick"}, "unknown")
     found = [r.message for r in read(made.path)]
