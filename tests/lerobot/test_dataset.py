@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from multiprocessing import forkserver
 from pathlib import Path
 from typing import Any
 
@@ -58,10 +57,11 @@ def independently(folder: Path) -> list[dict[str, NDArray[Any]]]:
 
 @pytest.fixture(scope="module")
 def bags(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    forkserver.ensure_running()  # converting starts it, and it lives as long as the interpreter
     root = tmp_path_factory.mktemp("bags")
     for number, seconds in ((1, 1.5), (2, 0.8), (3, 2.1)):
         record(root / f"episode_{number:06d}", number, seconds, "sort the blocks" if number == 2 else "pick the cube")
+    # The first conversion starts a process, and opens memory, that live as long as the interpreter.
+    convert(Request(tmp_path_factory.mktemp("first") / "set", LeRobotOptions(videos=False)), find_episodes([root])[:1])
     return root
 
 
