@@ -113,7 +113,7 @@ def test_pub_tells_that_nobody_listens(robot: ZenohTransport, endpoint: str, mon
     monkeypatch.setattr("ibrobot_zenoh.commands.topic._HEARD_S", 0.05)
     result = CliRunner().invoke(topic, ["pub", "/dark", "std_msgs/msg/Bool", "data: true", "--endpoint", endpoint])
     assert result.exit_code == 0
-    assert result.stderr == "nobody listens to /dark yet\n"
+    assert result.output == "nobody listens to /dark yet\n"
 
 
 def test_pub_of_another_type_is_refused(robot: ZenohTransport, endpoint: str):
