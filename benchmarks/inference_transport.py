@@ -9,8 +9,8 @@ distributed as between machines, `zenoh shm` as within one. `lerobot` is its Rob
 interpreter PYTHON, which has `lerobot[async]==0.6.1`: it has no JPEG there and sends raw pictures of as many bytes.
 
 Times are in ms: request to chunk p50 and p99, how long the control loop is blocked in asking, and processor time of
-both sides together for a request. Exits with 1 where ours is less than 5 times as fast as LeRobot when given, raw cameras
-over Zenoh take more than 5 times the floor, `process` more than 3 times, or asking blocks for over 1 ms.
+both sides together for a request. Exits with 1 where ours is less than 5 times as fast as LeRobot when given, raw
+cameras over Zenoh take more than 5 times the floor, `process` more than 3 times, or asking blocks for over 1 ms.
 """
 
 from __future__ import annotations
