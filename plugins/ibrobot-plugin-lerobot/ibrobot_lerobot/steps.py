@@ -1,4 +1,4 @@
-"""LeRobot's standard processor steps in NumPy: rename, batch, device, normalise, unnormalise; equal bit for bit."""
+"""LeRobot's standard processor steps, for arrays of any library: rename, normalise and back; equal bit for bit."""
 
 from __future__ import annotations
 

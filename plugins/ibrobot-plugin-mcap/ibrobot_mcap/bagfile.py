@@ -210,8 +210,8 @@ class BagFile:
             self._writer.flush()
         self._chunk_start_ns = None
 
-    def sync(self) -> None:
-        """Begin to put what is in the file onto the disk."""
+    def sync_aside(self) -> None:
+        """Begin to put what is in the file onto the disk; see `_Output.sync_aside`."""
         self._output.sync_aside()
 
     def finish(self, facts: Mapping[str, Any]) -> None:

@@ -105,7 +105,7 @@ class Storage:
             self._check_space(self._directory)
             period_s = self._options.sync_period_s
             if period_s is not None and time.monotonic() - self._synced_s >= period_s:
-                self._file.sync()
+                self._file.sync_aside()
                 self._synced_s = time.monotonic()
         except OSError as error:
             self._fail(error)
