@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib.metadata import version
@@ -16,24 +14,11 @@ from mcap.writer import CompressionType, Writer
 
 from ibrobot_mcap.metadata import RECORD, RECORD_KEY, Counted, Topic, dump, offered_qos
 from ibrobot_mcap.options import McapOptions
+from ibrobot_mcap.output import Output
 from ibrobot_mcap.scan import REPEATED
 
 LIBRARY = f"ibrobot-plugin-mcap {version('ibrobot-plugin-mcap')}"
 _COMPRESSION = {"none": CompressionType.NONE, "lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD}
-# Not everywhere is there a sync that leaves the file's times alone.
-_sync = getattr(os, "fdatasync", os.fsync)
-_PIECE = 256 * 1024
-"""What is given to the disk at a time [bytes]."""
-
-
-def _to_disk(descriptor: int, offset: int) -> None:
-    """Have the piece at `offset` written out now.
-
-    What the kernel gathers it writes in large requests, during which even processes of real-time priority wait: the
-    control loop was 2 ms late then, and a tenth of that with this.
-    """
-    if hasattr(os, "posix_fadvise"):
-        os.posix_fadvise(descriptor, offset, _PIECE, os.POSIX_FADV_DONTNEED)
 
 
 @attrs.frozen
@@ -45,85 +30,6 @@ class Item:
     """CDR."""
     received_ns: int
     published_ns: int
-
-
-class _Output:
-    """A file without a buffer of its own: what was written is with the operating system, and survives the process."""
-
-    def __init__(self, path: Path) -> None:
-        self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
-        self.size = 0
-        self._handed = 0
-        """Up to here the disk was given what is in the file [bytes]; whole pieces only."""
-        self._closed = False
-        self._aside: threading.Thread | None = None
-        self._failure: OSError | None = None
-
-    def write(self, data: bytes) -> int:
-        rest = memoryview(data)
-        while rest:
-            written = os.write(self._descriptor, rest)
-            rest = rest[written:]
-            self.size += written
-        while self._handed + _PIECE <= self.size:
-            _to_disk(self._descriptor, self._handed)
-            self._handed += _PIECE
-        return len(data)
-
-    def tell(self) -> int:
-        return self.size
-
-    def flush(self) -> None:
-        """Nothing waits here."""
-
-    def sync(self) -> None:
-        """Put what is in the file onto the disk.
-
-        Raises:
-            OSError: when the disk refuses it now, or refused it aside.
-        """
-        self._wait_aside()
-        _sync(self._descriptor)
-
-    def sync_aside(self) -> None:
-        """Begin a sync in a thread: a busy disk takes seconds for it, in which messages must be written.
-
-        Raises:
-            OSError: when an earlier one failed.
-        """
-        if self._aside is not None and self._aside.is_alive():
-            return
-        self._wait_aside()
-        self._aside = threading.Thread(target=self._sync_or_fail, args=(os.dup(self._descriptor),), daemon=True)
-        self._aside.start()
-
-    def _sync_or_fail(self, descriptor: int) -> None:
-        try:
-            _sync(descriptor)
-        except OSError as error:
-            self._failure = error
-        finally:
-            os.close(descriptor)
-
-    def _wait_aside(self) -> None:
-        if self._aside is not None:
-            self._aside.join()
-            self._aside = None
-        if self._failure is not None:
-            raise self._failure
-
-    def cut(self, size: int) -> None:
-        os.ftruncate(self._descriptor, size)
-        os.lseek(self._descriptor, size, os.SEEK_SET)
-        self.size = size
-        self._handed = min(self._handed, size - size % _PIECE)
-
-    def close(self) -> None:
-        if self._aside is not None:
-            self._aside.join()
-        if not self._closed:
-            self._closed = True
-            os.close(self._descriptor)
 
 
 class BagFile:
@@ -142,7 +48,7 @@ class BagFile:
         self._channels: dict[Topic, int] = {}
         self._schemas: dict[str, int] = {}
         self._chunk_start_ns: int | None = None
-        self._output = _Output(path)
+        self._output = Output(path)
         self._writer: Any = Writer(
             cast(IO[Any], self._output), chunk_size=options.chunk_size, compression=_COMPRESSION[options.compression]
         )
@@ -211,7 +117,7 @@ class BagFile:
         self._chunk_start_ns = None
 
     def sync_aside(self) -> None:
-        """Begin to put what is in the file onto the disk; see `_Output.sync_aside`."""
+        """Begin to put what is in the file onto the disk; see `Output.sync_aside`."""
         self._output.sync_aside()
 
     def finish(self, facts: Mapping[str, Any]) -> None:
@@ -232,11 +138,13 @@ class BagFile:
 
 
 @contextmanager
-def _whole_records(output: _Output) -> Iterator[None]:
+def _whole_records(output: Output) -> Iterator[None]:
     """What fails within leaves no part of a record behind."""
     size = output.size
     try:
         yield
+        if output.size != size:
+            output.hand_over()
     except BaseException:
         output.cut(size)
         raise

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 import yaml
-from ibrobot_mcap import bagfile, ibrobot_recorders
+from ibrobot_mcap import bagfile, ibrobot_recorders, output
 from ibrobot_mcap.recorder import McapRecorder
 from ibrobot_ros2 import definition, encode, type_hash
 from mcap.reader import make_reader
@@ -177,14 +177,14 @@ def test_a_slow_disk_costs_messages_which_are_counted_and_no_time(bench, monkeyp
     """The disk is stuck until everything was offered: what does not fit into the queue is lost, the rest is kept."""
     made = bench(threaded=True, queue_size=MIB, chunk_size=1024)
     made.begin(topics=(JOINTS, CAMERA))
-    stuck, go_on, write = threading.Event(), threading.Event(), bagfile._Output.write
+    stuck, go_on, write = threading.Event(), threading.Event(), output.Output.write
 
     def slowly(self, data):
         stuck.set()
         assert go_on.wait(60)
         return write(self, data)
 
-    monkeypatch.setattr(bagfile._Output, "write", slowly)
+    monkeypatch.setattr(output.Output, "write", slowly)
     made.write(1, CAMERA, picture)
     assert stuck.wait(60)
     size = picture(0).data.nbytes
@@ -331,7 +331,7 @@ def test_a_sync_that_takes_long_holds_up_no_message(bench, monkeypatch):
         if syncing.is_set():
             flushed.set()
 
-    monkeypatch.setattr(bagfile, "_sync", sync)
+    monkeypatch.setattr(output, "_sync", sync)
     monkeypatch.setattr(bagfile.BagFile, "flush", flush_and_tell)
     made = bench(threaded=True, chunk_period_s=0.001, sync_period_s=1e-6)
     made.begin()
@@ -347,7 +347,7 @@ def test_a_sync_that_the_disk_refuses_ends_the_recording(bench, monkeypatch):
     def refused(descriptor):
         raise OSError(errno.EIO, "Input/output error")
 
-    monkeypatch.setattr(bagfile, "_sync", refused)
+    monkeypatch.setattr(output, "_sync", refused)
     made = bench(threaded=True, chunk_period_s=0.001, sync_period_s=1e-6)
     made.begin()
     made.write(1)
