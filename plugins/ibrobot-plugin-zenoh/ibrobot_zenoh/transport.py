@@ -97,7 +97,7 @@ class ZenohTransport(TopicTransport):
                 except Exception as error:  # noqa: BLE001 - it is the requester's to see
                     query.reply_err(f"{type(error).__name__}: {error}", encoding=_FAILED)
                 else:
-                    query.reply(key, _sendable(reply))
+                    query.reply(key, _sendable(reply), express=True)
 
         server = Workers(answer, f"the server of {name}", workers, REQUESTS_WAITING)
 
@@ -132,6 +132,7 @@ class ZenohTransport(TopicTransport):
             replies = session.get(
                 key, payload=_sendable(payload), timeout=timeout_s, consolidation=zenoh.ConsolidationMode.NONE,
                 congestion_control=zenoh.CongestionControl.BLOCK, priority=zenoh.Priority.INTERACTIVE_HIGH,
+                express=True,
             )  # fmt: skip
         except zenoh.ZError as error:
             raise TransportError(f"{name}: {first_line(error)}") from error
