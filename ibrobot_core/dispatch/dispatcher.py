@@ -24,6 +24,8 @@ _FIRST_PAUSE_NS = 100_000_000
 """Pause after a failed request; it doubles with each one that fails next."""
 _LONGEST_PAUSE_NS = 1_000_000_000
 """Also between requests that are not answered: so soon is a model used again that was away."""
+_UNKNOWN = 4
+"""Requests within a chunk's time before any was answered, where the way to the model may be a long one."""
 _SILENCE_NS = 2_000_000_000
 """After which missing observations are told."""
 
@@ -78,8 +80,9 @@ class Dispatcher:
     """Pull: a chunk is asked for when no more than the watermark remains of the plan.
 
     One request is in flight; another is sent for newer observations when that is overdue, and the answer that comes
-    first is used. After failures it asks with growing pauses. Without an answer the plan ends and the arm holds; what
-    comes then leads over from there.
+    first is used. Several are, where the way to the model takes so long that one at a time would let the plan end.
+    After failures it asks with growing pauses. Without an answer the plan ends and the arm holds; what comes then leads
+    over from there.
 
     Args:
         contract: the robot's contract, with the model's extra observations.
@@ -128,6 +131,7 @@ class Dispatcher:
         self._open: dict[int, int] = {}
         """Requests that may still be answered, oldest first: id -> time of the observation [ns]."""
         self._pause_ns = self._overdue_ns = 0
+        self._returns = client.returns
 
     def begin(self, seed: int) -> None:
         """A new episode, or a mode entered: forget plan, requests and observations, and start asking."""
@@ -168,8 +172,14 @@ class Dispatcher:
             self.stats.timeouts += 1
             self._fail(number, t_ns, f"no chunk within {self._timeout_ns / 1e9:g} s")
         self.stats.watermark = self._watermark()
+        if self._client.returns != self._returns:
+            self._returns = self._client.returns
+            self._settle()
+            self._ask_after_ns = t_ns
         if self._open:
-            if t_ns - max(self._open.values()) > self._overdue_ns > 0:
+            if self._overlaps(t_ns):
+                self._ask(t_ns)
+            elif t_ns - max(self._open.values()) > self._overdue_ns > 0:
                 self._overdue_ns = max(self._overdue_ns, min(2 * self._overdue_ns, _LONGEST_PAUSE_NS))
                 self.stats.retries += self._ask(t_ns)
         elif remaining <= self.stats.watermark and t_ns >= self._ask_after_ns:
@@ -236,6 +246,22 @@ class Dispatcher:
             return int(self._options.watermark)
         # Time for an answer, and, should that be lost, for another once the first is overdue.
         return max(self._chunk_length // 2, self._steps(self._usual_ns() + self._latency.upper_ns))
+
+    def _overlaps(self, t_ns: int) -> bool:
+        """Whether it is time for a further request although some are on their way.
+
+        An answer that takes most of a chunk's time leaves too little of it for the next to come in. Then they are asked
+        for so often that the plan lasts should one be lost.
+        """
+        most, chunk_ns, upper_ns = self._client.parallel, self._chunk_length * self._smoother.step_ns, self._usual_ns()
+        if most == 1 or self._options.watermark != "auto":
+            return False
+        expected = [asked_ns for asked_ns in self._open.values() if t_ns - asked_ns <= (self._overdue_ns or t_ns)]
+        if not self.stats.chunks:
+            most, spacing_ns = min(most, _UNKNOWN), chunk_ns // _UNKNOWN
+        else:
+            spacing_ns = max((chunk_ns - upper_ns) // 2, upper_ns // most)
+        return len(expected) < most and t_ns - max(self._open.values()) >= spacing_ns
 
     def _steps(self, time_ns: int) -> int:
         """A time in actions, rounded up."""

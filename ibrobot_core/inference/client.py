@@ -7,6 +7,7 @@ import queue
 import threading
 import time
 from abc import ABC, abstractmethod
+from contextlib import AbstractContextManager, nullcontext
 from typing import override
 
 import attrs
@@ -19,6 +20,7 @@ from ibrobot_core.robot import Vector
 from ibrobot_core.units import ns
 
 _CLOSE_TIMEOUT_S = 1.0
+_ALONE = nullcontext()
 _PATIENCE_S = 600.0
 """How long a request is waited for where nothing else says so."""
 
@@ -42,7 +44,17 @@ class Chunk:
 
 
 class InferenceClient(ABC):
-    """One request in flight at a time."""
+    """Takes requests, and answers them some time later, not always in order."""
+
+    @property
+    def parallel(self) -> int:
+        """How many requests may be on their way at a time so that each is answered as soon as if it were alone."""
+        return 1
+
+    @property
+    def returns(self) -> int:
+        """How often a model that was away has come back: requests that wait for it need not wait any more."""
+        return 0
 
     @abstractmethod
     def submit(self, request: DispatchInfer) -> None:
@@ -65,12 +77,26 @@ class InferenceClient(ABC):
         """End; safe to call twice."""
 
 
-def run_policy(policy: Policy, engine: Engine, request: DispatchInfer, deadline_ns: int) -> Chunk:
-    """The three steps, one after the other. A policy that raises gives a chunk with its error: the arm holds."""
+def run_policy(
+    policy: Policy, engine: Engine, request: DispatchInfer, deadline_ns: int,
+    turn: AbstractContextManager[object] = _ALONE,
+) -> Chunk:  # fmt: skip
+    """The three steps, one after the other. A policy that raises gives a chunk with its error: the arm holds.
+
+    Args:
+        policy: pre- and postprocesses.
+        engine: runs `infer`.
+        request: what to answer.
+        deadline_ns: when nobody waits any more, by `time.monotonic_ns()`.
+        turn: entered for what the policy does here.
+    """
     stamp_ns = request.frame.stamp_ns
     try:
-        outputs = engine.infer(policy.preprocess(request.frame), request.id, deadline_ns)
-        actions = np.asarray(policy.postprocess(outputs), dtype=np.float64)
+        with turn:
+            tensors = policy.preprocess(request.frame)
+        outputs = engine.infer(tensors, request.id, deadline_ns)
+        with turn:
+            actions = np.asarray(policy.postprocess(outputs), dtype=np.float64)
     except PolicyError as error:
         return Chunk(request.id, stamp_ns, None, str(error))
     except Exception as error:
@@ -113,10 +139,10 @@ class LockstepClient(InferenceClient):
 
 
 class EngineClient(InferenceClient):
-    """Runs the policy in a thread of the host process; `infer` where its engine is.
+    """Runs the policy in threads of the host process, so many as its engine takes requests; `infer` where that is.
 
-    A request that waits behind a slow one is not run at all when a newer one, or a reset, waits behind it: nobody
-    waits for its answer any more.
+    A request that waits behind slow ones is not run at all when a newer one, or a reset, waits behind it: nobody
+    waits for its answer any more. The policy itself is called by one thread at a time.
 
     Args:
         policy: pre- and postprocesses.
@@ -130,8 +156,24 @@ class EngineClient(InferenceClient):
         self._timeout_ns = ns(timeout_s)
         self._work: queue.SimpleQueue[tuple[DispatchInfer, int] | int | None] = queue.SimpleQueue()
         self._chunks: queue.SimpleQueue[Chunk | PolicyError] = queue.SimpleQueue()
-        self._thread = threading.Thread(target=self._run, name="inference", daemon=True)
-        self._thread.start()
+        self._taking, self._turn = threading.Lock(), threading.Lock()
+        self._threads = [
+            threading.Thread(target=self._run, name="inference", daemon=True) for _ in range(self._engine.parallel)
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    @property
+    @override
+    def parallel(self) -> int:
+        # A model that takes most of the time itself would only let them wait, and look at older observations.
+        stats, most = self._engine.stats, len(self._threads)
+        return min(most, max(1, round(stats.infer_ms / stats.model_ms))) if stats.model_ms else most
+
+    @property
+    @override
+    def returns(self) -> int:
+        return self._engine.stats.restarts
 
     @override
     def submit(self, request: DispatchInfer) -> None:
@@ -153,19 +195,31 @@ class EngineClient(InferenceClient):
 
     @override
     def close(self) -> None:
-        self._work.put(None)
-        # A model that hangs must not keep the robot from stopping; the thread is a daemon.
-        self._thread.join(_CLOSE_TIMEOUT_S)
+        for _ in self._threads:
+            self._work.put(None)
+        # A model that hangs must not keep the robot from stopping; the threads are daemons.
+        deadline_s = time.monotonic() + _CLOSE_TIMEOUT_S
+        for thread in self._threads:
+            thread.join(max(0.0, deadline_s - time.monotonic()))
 
     def _run(self) -> None:
-        while (work := self._work.get()) is not None:
-            if not isinstance(work, int):
-                if self._work.empty():
-                    self._chunks.put(run_policy(self._policy, self._engine, *work))
-                continue
-            try:
-                self._policy.reset(work)
-                self._engine.reset(work)
-            except Exception as error:
-                logging.getLogger("ibrobot.inference").exception("the policy failed")
-                self._chunks.put(PolicyError(f"the policy's reset failed: {type(error).__name__}: {error}"))
+        while True:
+            with self._taking:  # what was submitted before a reset begins before it, and what follows after it
+                work = self._work.get()
+                if work is None:
+                    return
+                if isinstance(work, int):
+                    self._reset(work)
+                    continue
+                if not self._work.empty():
+                    continue
+            self._chunks.put(run_policy(self._policy, self._engine, *work, self._turn))
+
+    def _reset(self, seed: int) -> None:
+        try:
+            with self._turn:
+                self._policy.reset(seed)
+            self._engine.reset(seed)
+        except Exception as error:
+            logging.getLogger("ibrobot.inference").exception("the policy failed")
+            self._chunks.put(PolicyError(f"the policy's reset failed: {type(error).__name__}: {error}"))

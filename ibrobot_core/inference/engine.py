@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from abc import ABC, abstractmethod
 from typing import override
@@ -29,10 +30,13 @@ class EngineStats:
 
 
 class Engine(ABC):
-    """Runs `infer` for one robot: one request at a time, from one thread."""
+    """Runs `infer` for one robot: so many requests at a time as `parallel` says, each from a thread of its own."""
+
+    parallel = 1
 
     def __init__(self, mode: str) -> None:
         self.stats = EngineStats(mode)
+        self._counting = threading.Lock()
 
     def start(self) -> None:
         """Return when the model is ready.
@@ -54,11 +58,13 @@ class Engine(ABC):
             PolicyError: when there is no answer in time; a later request may well have one.
         """
         begun_ns = time.monotonic_ns()
-        self.stats.requests += 1
+        with self._counting:
+            self.stats.requests += 1
         try:
             outputs = self.run(tensors, request_id, deadline_ns)
         except Exception:
-            self.stats.failures += 1
+            with self._counting:
+                self.stats.failures += 1
             raise
         self.stats.infer_ms = (time.monotonic_ns() - begun_ns) / 1e6
         return outputs

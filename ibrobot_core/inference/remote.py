@@ -20,6 +20,8 @@ from ibrobot_core.units import NS_PER_S
 _HEALTH_TIMEOUT_S = 2.0
 _HEALTH_SIZE = 1 << 20
 _RETRY_S = 0.2
+_PARALLEL = 8
+"""Requests on their way to the server at a time, where its model does not remember them."""
 
 
 class RemoteEngine(Engine):
@@ -49,7 +51,9 @@ class RemoteEngine(Engine):
         self._model = model
         self._robot = f"{robot}-{uuid.uuid4().hex[:8]}"
         self._start_timeout_s = start_timeout_s
-        self._encoder = Encoder(limits, codec)
+        self.parallel = 1 if policy.spec.stateful else _PARALLEL
+        self._encoders = [Encoder(limits, codec) for _ in range(self.parallel)]
+        """Those that are free."""
         self._limits = limits
         self._episode, self._seed = 0, 0
         self._end_watch: Callable[[], None] | None = None
@@ -78,13 +82,15 @@ class RemoteEngine(Engine):
             Kind.REQUEST, request_id, tensors, self._robot, self._fingerprint, stamp_ns=time.time_ns(),
             deadline_ns=left_ns, episode=self._episode, seed=self._seed,
         )  # fmt: skip
-        frame = self._encoder.encode(message)
+        encoder = self._encoders.pop()
         try:
-            answer = decode(
-                self._transport.request(service_name(self._model), frame, left_ns / NS_PER_S), limits=self._limits
-            )
+            frame = encoder.encode(message)
+            reply = self._transport.request(service_name(self._model), frame, left_ns / NS_PER_S)
+            answer = decode(reply, limits=self._limits)
         except (TransportError, WireError) as error:
             raise PolicyError(str(error)) from None
+        finally:
+            self._encoders.append(encoder)
         if answer.kind is Kind.FAILURE:
             raise PolicyError(f"the server of {self._model}: {answer.text}")
         if answer.id != request_id or answer.fingerprint != self._fingerprint:

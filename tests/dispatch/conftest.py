@@ -38,6 +38,9 @@ SIZE = len(ROBOT.joints)
 class ScriptedClient(InferenceClient):
     """Keeps what it is asked; the test answers."""
 
+    parallel = 1
+    returns = 0
+
     def __init__(self) -> None:
         self.requests: list[DispatchInfer] = []
         self.seeds: list[int] = []

@@ -43,11 +43,15 @@ def run(rig: Rig, latencies: list[int], ticks: int, length: int) -> list[int]:
 
 @settings(deadline=None, max_examples=40)
 @given(
-    latencies=st.lists(st.integers(0, 8), min_size=1, max_size=12), strategy=st.sampled_from(["replace", "ensemble"])
-)
-def test_no_action_is_dropped_or_doubled_in_time(make_rig: type[Rig], latencies: list[int], strategy: str) -> None:
+    latencies=st.lists(st.integers(0, 8), min_size=1, max_size=12), strategy=st.sampled_from(["replace", "ensemble"]),
+    parallel=st.sampled_from([1, 8]),
+)  # fmt: skip
+def test_no_action_is_dropped_or_doubled_in_time(
+    make_rig: type[Rig], latencies: list[int], strategy: str, parallel: int
+) -> None:
     """Whatever the latencies, as long as they are below the chunk's length: at each time the action of that time."""
     rig = make_rig(watermark="auto", strategy=strategy, enabled=True, timeout_s=60.0, chunk_size=30)
+    rig.client.parallel = parallel
     run(rig, latencies, 80, 30)
     assert rig.stats.holds == 0
     for start_ns, step_ns, positions in rig.plans:
@@ -67,6 +71,53 @@ def test_a_lost_request_is_made_up_for_before_the_plan_ends(make_rig: type[Rig])
     rig = make_rig(watermark="auto", timeout_s=60.0, chunk_size=30)
     assert run(rig, [3, 4, 2, -1, 4, 3], 300, 30) == []
     assert rig.stats.retries == rig.stats.requests // 6 > 2
+
+
+@pytest.mark.parametrize("latencies", [[12], [12, 5, 14, 13], [14, 13, -1, 12, 6, 14, 14]])
+def test_where_the_way_is_long_several_requests_are_on_it(make_rig: type[Rig], latencies: list[int]) -> None:
+    """Answers that take most of a chunk's time, one lost among them: one request at a time would let the plan end."""
+    alone = make_rig(watermark="auto", timeout_s=60.0, chunk_size=20)
+    assert len(run(alone, latencies, 300, 20)) > 20
+    rig = make_rig(watermark="auto", timeout_s=60.0, chunk_size=20)
+    rig.client.parallel = 8
+    assert [tick for tick in run(rig, latencies, 300, 20) if tick > 40] == []
+    assert rig.stats.requests < 300 / 2
+    assert rig.stats.retries == 0
+
+
+def test_several_are_on_the_way_only_where_one_is_not_enough(make_rig: type[Rig]) -> None:
+    rig = make_rig(watermark="auto", timeout_s=60.0, chunk_size=20)
+    rig.client.parallel = 8
+    assert run(rig, [3], 100, 20) == []
+    asked = [rig.tick_of(request) for request in rig.requests]
+    assert np.diff(asked).min() > 3, "never before the answer"
+    assert np.diff(asked)[-5:].min() >= 9, "and then as seldom as half a chunk allows"
+    fixed = make_rig(watermark=5, timeout_s=60.0, chunk_size=20)
+    fixed.client.parallel = 8
+    run(fixed, [12], 100, 20)
+    asked = [fixed.tick_of(request) for request in fixed.requests]
+    assert np.diff(asked).min() >= 12, "who gives a number is asked no oftener"
+
+
+def test_a_model_that_does_not_answer_at_first_is_asked_for_one_chunks_time(make_rig: type[Rig]) -> None:
+    rig = make_rig(watermark="auto", timeout_s=60.0, chunk_size=20)
+    rig.client.parallel = 8
+    rig.tick(100)
+    assert [rig.tick_of(request) for request in rig.requests] == [1, 6, 11, 16]
+
+
+def test_a_model_that_came_back_is_asked_at_once(make_rig: type[Rig]) -> None:
+    rig = make_rig()
+    for _ in range(30):
+        rig.tick()
+        if len(rig.requests) > rig.stats.failures:
+            rig.dispatcher.accept(Chunk(rig.requests[-1].id, 0, None, "no server"), rig.clock.now_ns())
+    asked = len(rig.requests)
+    rig.tick()
+    assert len(rig.requests) == asked, "the pause is long by now"
+    rig.client.returns += 1
+    rig.tick()
+    assert len(rig.requests) == asked + 1
 
 
 def test_a_fixed_watermark_below_the_latency_runs_dry(make_rig: type[Rig]) -> None:

@@ -12,6 +12,7 @@ import pytest
 from ibrobot_core.errors import PolicyError
 from ibrobot_core.inference import client as module
 from ibrobot_core.inference.client import Chunk, DispatchInfer, EngineClient, InferenceClient, LockstepClient
+from ibrobot_core.inference.engine import LocalEngine
 from ibrobot_core.interfaces import Frame
 from ibrobot_core.testing import host_context
 from ibrobot_core.testing.fakes import FakePolicy
@@ -101,6 +102,83 @@ def test_the_policy_is_reset_before_it_sees_a_later_request(policy: GatedPolicy,
     answers = [monolithic.poll(PATIENCE_S), monolithic.poll(PATIENCE_S)]
     assert [chunk and chunk.id for chunk in answers] == [1, 3]
     assert policy.calls == ["infer 1", "reset 5", "infer 3"]
+
+
+class FarEngine(LocalEngine):
+    """Takes three requests at a time; `model_ms` of each are the model's."""
+
+    parallel = 3
+
+    def __init__(self, policy: FakePolicy, model_ms: float) -> None:
+        super().__init__(policy)
+        self._model_ms = model_ms
+
+    def run(self, tensors, request_id, deadline_ns):
+        outputs = super().run(tensors, request_id, deadline_ns)
+        self.stats.model_ms = self._model_ms
+        return outputs
+
+
+def test_a_far_model_is_asked_several_times_at_once_and_reset_in_between(policy: GatedPolicy):
+    client = EngineClient(policy, FarEngine(policy, 0.0))
+    try:
+        for number in (1, 2, 3):
+            client.submit(request(number))
+            assert policy.entered.acquire(timeout=PATIENCE_S)
+        for number in (4, 5):
+            client.submit(request(number))
+        client.reset(7)
+        client.submit(request(6))
+        assert not policy.entered.acquire(timeout=0.01)
+        policy.gate.release(4)
+        answers = [client.poll(PATIENCE_S) for _ in range(4)]
+        assert sorted(chunk.id for chunk in answers if chunk) == [1, 2, 3, 6]
+        assert policy.calls[:3] == ["infer 1", "infer 2", "infer 3"]
+        assert policy.calls[3:] == ["reset 7", "infer 6"]
+        assert policy.most == 3
+    finally:
+        policy.gate.release(100)
+        client.close()
+
+
+def test_nothing_overtakes_a_reset_that_takes_long(policy: GatedPolicy, monkeypatch: pytest.MonkeyPatch):
+    begun, go_on = threading.Event(), threading.Event()
+
+    def reset(seed):
+        begun.set()
+        assert go_on.wait(PATIENCE_S)
+        policy.calls.append("reset")
+
+    monkeypatch.setattr(policy, "reset", reset)
+    policy.gate.release(100)
+    client = EngineClient(policy, FarEngine(policy, 0.0))
+    client.reset(7)
+    assert begun.wait(PATIENCE_S)
+    client.submit(request(1))
+    assert client.poll(0.01) is None
+    go_on.set()
+    assert client.poll(PATIENCE_S) is not None
+    assert policy.calls == ["reset", "infer 1"]
+    client.close()
+
+
+@pytest.mark.parametrize(("model_ms", "parallel"), [(1e-6, 3), (1e9, 1)])
+def test_what_waits_for_the_model_itself_gains_nothing_by_company(policy: GatedPolicy, model_ms: float, parallel: int):
+    client = EngineClient(policy, FarEngine(policy, model_ms))
+    assert client.parallel == 3, "as long as nothing is known"
+    policy.gate.release(100)
+    client.submit(request(1))
+    assert client.poll(PATIENCE_S) is not None
+    assert client.parallel == parallel
+    client.close()
+
+
+def test_the_model_that_came_back_is_told(policy: GatedPolicy):
+    engine = FarEngine(policy, 0.0)
+    client = EngineClient(policy, engine)
+    engine.stats.restarts += 1
+    assert client.returns == 1
+    client.close()
 
 
 def test_closing_returns_while_the_policy_hangs(policy: GatedPolicy, monkeypatch: pytest.MonkeyPatch):
