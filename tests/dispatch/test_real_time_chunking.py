@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from ibrobot_core.errors import ContractError
 from ibrobot_core.inference.client import Chunk, DispatchInfer
+from ibrobot_core.testing import make_robot
 from ibrobot_core.testing.contexts import START_NS
 
 if TYPE_CHECKING:
@@ -64,8 +65,9 @@ def test_a_policy_that_continues_the_plan_leaves_no_seam(make_rig: type[Rig], la
     run(rig, latencies, 60, LENGTH - 1, seed)
     assert rig.stats.holds == 0
     steps = np.abs(np.diff(setpoints(rig, 60), axis=0))
-    # A request sent since the one before was overdue knows nothing of the answer to that.
-    assert steps.max() <= (2 if rig.stats.retries else 1) * STRIDE + 1e-12
+    # A request sent since the one before was overdue knows nothing of the answer to that: what it misses is led over.
+    led_over = 0.5 * make_robot().max_velocity * STEP * 1e-9 if rig.stats.retries else np.zeros(SIZE)
+    assert (steps <= STRIDE + led_over + 1e-12).all()
     assert np.count_nonzero(steps.any(axis=1)) > 40, "and it moves"
 
 
