@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import IO, Any, cast
 
 import attrs
-from ibrobot_ros2 import definition, type_hash
+from ibrobot_ros2 import definition, is_idl
 from mcap.writer import CompressionType, Writer
 
 from ibrobot_mcap.metadata import RECORD, RECORD_KEY, Counted, Topic, dump, offered_qos
@@ -75,11 +75,12 @@ class BagFile:
         if topic in self._channels:
             return
         if topic.type not in self._schemas:
-            text = definition(topic.type).encode()
-            self._schemas[topic.type] = self._writer.register_schema(topic.type, "ros2msg", text)
+            text = topic.definition or definition(topic.type)
+            encoding = "ros2idl" if is_idl(text) else "ros2msg"
+            self._schemas[topic.type] = self._writer.register_schema(topic.type, encoding, text.encode())
         metadata = {
             "offered_qos_profiles": dump(offered_qos(topic.latched)),
-            "topic_type_hash": type_hash(topic.type),
+            "topic_type_hash": topic.type_hash(),
         }
         with _whole_records(self._output):
             number = self._writer.register_channel(topic.name, "cdr", self._schemas[topic.type], metadata)

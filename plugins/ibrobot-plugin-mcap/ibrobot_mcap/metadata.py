@@ -45,6 +45,14 @@ class Topic:
     name: str
     type: str
     latched: bool
+    definition: str = ""
+    """`ros2msg` or `ros2idl` text, of a topic that is copied from a bag that has it; else ROS 2's own."""
+    hash: str = ""
+    """Of the type so defined; empty where the text cannot be read."""
+
+    def type_hash(self) -> str:
+        """As rosbag2 writes it; empty where it is not known."""
+        return self.hash if self.definition else type_hash(self.type)
 
 
 class _Text(str):
@@ -118,7 +126,7 @@ def information(
 def _topic(topic: Topic) -> dict[str, Any]:
     return {
         "name": topic.name, "type": topic.type, "serialization_format": "cdr",
-        "offered_qos_profiles": offered_qos(topic.latched), "type_description_hash": type_hash(topic.type),
+        "offered_qos_profiles": offered_qos(topic.latched), "type_description_hash": topic.type_hash(),
     }  # fmt: skip
 
 

@@ -7,13 +7,14 @@ import attrs
 from ibrobot_core.options import option
 
 MIB = 1 << 20
+COMPRESSIONS = ("none", "lz4", "zstd")
 
 
 @attrs.frozen
 class McapOptions:
     """How episodes are written."""
 
-    compression: str = option("none", choices=("none", "lz4", "zstd"), help="of chunks; JPEG pictures gain nothing")
+    compression: str = option("none", choices=COMPRESSIONS, help="of chunks; JPEG pictures gain nothing")
     chunk_size: int = option(MIB, unit="bytes", ge=1024, le=256 * MIB, help="a chunk of this size is written")
     chunk_period_s: float = option(0.5, unit="s", gt=0, le=60, help="a chunk as old as this is written")
     split_size: int | None = option(None, unit="bytes", ge=64 * 1024, help="a file of this size is followed by another")

@@ -14,7 +14,8 @@ from ibrobot_core.errors import RecorderError
 from ibrobot_core.interfaces import EpisodeReader, EpisodeSummary, Recorded, TopicSummary
 from ibrobot_core.messages import CompressedImage, Image
 from ibrobot_mcap.jpeg import from_jpeg, is_jpeg
-from ibrobot_mcap.metadata import DROPPED, INFORMATION, METADATA, OUTCOME, RECORD, RECORD_KEY
+from ibrobot_mcap.metadata import DROPPED, INFORMATION, METADATA, OUTCOME, RECORD, RECORD_KEY, Topic
+from ibrobot_mcap.options import COMPRESSIONS
 from ibrobot_mcap.sources import McapSource, Raw, RosbagsSource, Source
 
 
@@ -72,9 +73,21 @@ class Rosbag2Reader(EpisodeReader):
         """The messages as they are stored, in the order of receipt."""
         return self._source.messages(frozenset(self._source.types))
 
-    def stored_types(self) -> Mapping[str, str]:
-        """Topic -> type, as they are stored: JPEG pictures are `CompressedImage`."""
-        return self._source.types
+    def stored(self, topic: str) -> Topic:
+        """A topic as it is stored (JPEG pictures are `CompressedImage`), with what the bag has of its type."""
+        source, type_ = self._source, self._source.types[topic]
+        definition = source.definitions.get(type_, "")
+        try:
+            type_hash = self._codec.type_hash(type_)
+        except CodecError:
+            if not definition:
+                raise
+            type_hash = ""  # a definition that only others can read
+        return Topic(topic, type_, topic in source.latched, definition, type_hash)
+
+    def compression(self) -> str:
+        """Of its chunks, as the recorder's option has it; `none` where that has no such."""
+        return self._source.compression if self._source.compression in COMPRESSIONS else "none"
 
     def latched(self) -> frozenset[str]:
         """Topics whose offered QoS is transient local."""

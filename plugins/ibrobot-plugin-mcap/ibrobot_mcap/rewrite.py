@@ -12,7 +12,6 @@ import attrs
 from ibrobot_core.errors import RecorderError
 from ibrobot_core.interfaces import EpisodeStart, EpisodeSummary
 from ibrobot_mcap.bagfile import Item
-from ibrobot_mcap.metadata import Topic
 from ibrobot_mcap.options import McapOptions
 from ibrobot_mcap.reader import Rosbag2Reader
 from ibrobot_mcap.storage import Storage
@@ -51,10 +50,11 @@ def rewrite(
         stack.callback(reader.close)
         summary = reader.summary()
         latched = reader.latched()
-        topics = {name: Topic(name, type_, name in latched) for name, type_ in reader.stored_types().items()}
+        topics = {name: reader.stored(name) for name in summary.topics}
         start_ns = summary.start_ns if begin_ns is None else begin_ns
         metadata = {**summary.metadata, **(marks or {})}
-        storage = Storage(EpisodeStart(target, start_ns, summary.metadata, metadata), McapOptions(min_free=0))
+        options = McapOptions(min_free=0, compression=reader.compression())
+        storage = Storage(EpisodeStart(target, start_ns, summary.metadata, metadata), options)
         try:
             for topic in topics.values():
                 storage.announce(topic)

@@ -121,6 +121,14 @@ class McapFile:
             raise RecorderError(f"{self.path}: chunk at byte {block.offset} is damaged: its checksum is wrong")
         return content
 
+    def compression(self, block: Block) -> str:
+        """Of a block, as the file says it; empty for none."""
+        if not block.chunk:
+            return ""
+        head = os.pread(self._file.fileno(), min(block.length, _CHUNK.size + 16), block.offset)
+        name = _CHUNK.unpack_from(head)[4]
+        return head[_CHUNK.size : _CHUNK.size + name].decode("ascii", "replace")
+
     def entries(self, block: Block) -> Iterator[Entry]:
         """The messages of a block, in the order written.
 

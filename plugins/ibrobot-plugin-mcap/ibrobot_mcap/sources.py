@@ -40,6 +40,8 @@ class Source(ABC):
     """Topic -> number of messages."""
     definitions: Mapping[str, str]
     """Type -> its definition, where the bag has it."""
+    compression: str = ""
+    """Of the first chunk: `zstd`, `lz4`, or none."""
     latched: frozenset[str] = frozenset()
     """Topics that were offered as transient local."""
     start_ns: int
@@ -83,6 +85,7 @@ class McapSource(Source):
             for channel in file.channels.values()
             if "transient_local" in channel.metadata.get("offered_qos_profiles", "")
         )
+        self.compression = next((file.compression(block) for file in self._files for block in file.blocks), "")
         types: dict[str, str] = {}
         counts: dict[str, int] = {}
         self.definitions = {}

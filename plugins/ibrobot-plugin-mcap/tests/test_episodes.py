@@ -12,7 +12,12 @@ from click.testing import CliRunner
 from ibrobot_mcap import rewrite
 from ibrobot_mcap.commands import episodes
 from ibrobot_mcap.reader import Rosbag2Reader
+from mcap.reader import make_reader
 from PIL import Image as Png
+from rosbags.rosbag2 import Reader as RosbagsReader
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as RosbagsWriter
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from ibrobot_core.errors import RecorderError
 
@@ -144,6 +149,52 @@ def test_trim_copies_a_part(tmp_path):
     assert summary.metadata["trimmed"] == "0.3 s to 0.5 s of episode_000001"
     with pytest.raises(RecorderError, match=r"is 0\.99 s long; --from 0\.5 --to 0\.2 is no part of it"):
         run("trim", path, "--from", "0.5", "--to", "0.2", "-o", tmp_path / "none")
+
+
+LAMP = "builtin_interfaces/Time since\nstring[] marks\n"
+
+
+@pytest.mark.parametrize("storage", list(StoragePlugin))
+def test_a_bag_of_others_is_trimmed_with_the_definitions_that_it_brings(tmp_path, storage):
+    store = get_typestore(Stores.ROS2_JAZZY)
+    store.register(get_types_from_msg(LAMP, "lamp_msgs/msg/Lamp"))
+    # Known here, but with another field: the copy must say what its sender meant.
+    del store.fielddefs["std_msgs/msg/Bool"], store.types["std_msgs/msg/Bool"]
+    store.register(get_types_from_msg("bool data\nuint8 more\n", "std_msgs/msg/Bool"))
+    kind = store.types
+    with RosbagsWriter(tmp_path / "bag", version=9, storage_plugin=storage) as writer:
+        topics = {type_: writer.add_connection(f"/{type_[:4]}", type_, typestore=store) for type_ in (
+            "lamp_msgs/msg/Lamp", "std_msgs/msg/Bool")}  # fmt: skip
+        for index in range(20):
+            lamp = kind["lamp_msgs/msg/Lamp"](kind["builtin_interfaces/msg/Time"](index, 2), ["a"])
+            both = (lamp, kind["std_msgs/msg/Bool"](True, index))
+            for message in both:
+                type_ = message.__msgtype__
+                writer.write(topics[type_], stamp(index), store.serialize_cdr(message, type_))
+    run("trim", tmp_path / "bag", "--from", "0.05", "-o", tmp_path / "cut")
+    _, messages = contents(tmp_path / "cut")
+    assert [m.since_ns // 10**9 for topic, m, _, _ in messages if topic == "/lamp"] == list(range(5, 20))
+    assert [m.more for topic, m, _, _ in messages if topic == "/std_"] == list(range(5, 20))
+    hashes = {name: store.hash_rihs01(name) for name in topics}
+    with RosbagsReader(tmp_path / "cut") as reader:
+        assert {c.msgtype: c.digest for c in reader.connections} == hashes
+        assert all(each.msgdef.data for each in reader.connections)
+    unfinish(tmp_path / "cut", cut=10)
+    assert "repaired, 30 messages" in run("repair", tmp_path / "cut")
+    assert str(contents(tmp_path / "cut")[1]) == str(messages), "of classes of their own"
+
+
+@pytest.mark.parametrize("compression", ["none", "lz4", "zstd"])
+def test_a_copy_is_compressed_as_the_original_is(tmp_path, compression):
+    bench = Bench(tmp_path, compression=compression)
+    bench.begin()
+    bench.write(500)
+    bench.end()
+    run("trim", bench.path, "-o", tmp_path / "cut")
+    assert contents(tmp_path / "cut")[1] == contents(bench.path)[1]
+    with (tmp_path / "cut" / "cut_0.mcap").open("rb") as file:
+        chunks = make_reader(file).get_summary().chunk_indexes
+    assert {chunk.compression for chunk in chunks} == {"" if compression == "none" else compression}
 
 
 def test_export_writes_numbers_by_joint(tmp_path):

@@ -73,6 +73,15 @@ class Codec:
         message: Message = convert(ros)
         return message
 
+    def type_hash(self, type_name: str) -> str:
+        """The type's hash, `RIHS01_…`, as it is defined here.
+
+        Raises:
+            CodecError: for a type that nobody defined, or whose definition cannot be read.
+        """
+        self._define(type_name)
+        return type_hash(type_name, self._types)
+
     def _class_of(self, type_name: str) -> type[Any]:
         """Core's class where the type is as core knows it; else one made from the definition."""
         if type_name not in self._classes:

@@ -19,6 +19,11 @@ class CodecError(IbrobotError):
     """A message that cannot be encoded or decoded, e.g. of a type that nobody defined."""
 
 
+def is_idl(text: str) -> bool:
+    """Whether a definition is `ros2idl` rather than `ros2msg` text."""
+    return text.startswith(f"{_SEPARATOR}IDL: ")
+
+
 def parse_definition(type_name: str, text: str) -> dict[str, Any]:
     """The types in a `.msg` text, or in a `ros2msg` or `ros2idl` text with its dependencies.
 
@@ -26,7 +31,7 @@ def parse_definition(type_name: str, text: str) -> dict[str, Any]:
         CodecError: for a text that is no definition.
     """
     try:
-        if not text.startswith(f"{_SEPARATOR}IDL: "):
+        if not is_idl(text):
             return dict(get_types_from_msg(text, type_name))
         found: dict[str, Any] = {}
         for part in text.split(_SEPARATOR)[1:]:
