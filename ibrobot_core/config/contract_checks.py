@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 
 import attrs
@@ -21,6 +22,7 @@ PERIPHERAL_TOPICS: Mapping[str, tuple[str, type[messages.Message]]] = {
 
 _IMAGES = (messages.Image.ros_type, messages.CompressedImage.ros_type)
 _IMAGE_KEYS = "observation.images."
+_TYPE_NAME = re.compile(r"[A-Za-z]\w*/msg/[A-Za-z]\w*", re.ASCII)
 _JOINT_FIELDS = ("position", "velocity", "effort")
 
 
@@ -76,17 +78,34 @@ class ContractChecks:
             spec = attrs.evolve(spec, type=messages.JointState.ros_type)
         if not spec.type:
             self.document.add(key, f"needs a type, since that of {spec.topic} is not known by itself")
+        elif spec.foreign:
+            self._foreign(key, spec)
         elif spec.type not in message_types():
             known = sorted(message_types())
-            self.document.add((*key, "type"), f"unknown message type {spec.type!r}{hint(spec.type, known, 'known')}")
+            self.document.add(
+                (*key, "type"),
+                f"unknown message type {spec.type!r}{hint(spec.type, known, 'known')} "
+                "(`foreign: true` takes one that only bags to convert have)",
+            )
         elif spec.topic == JOINT_STATES and spec.type != messages.JointState.ros_type:
             self.document.add((*key, "type"), f"{JOINT_STATES} carries {messages.JointState.ros_type}, not {spec.type}")
         else:
             self._fits(key, spec)
         return spec
 
+    def _foreign(self, key: Key, spec: ObservationSpec) -> None:
+        """What can be known of a type whose definition only the bag to convert has."""
+        if spec.type in message_types():
+            self.document.add((*key, "foreign"), f"{spec.type} is known here; leave foreign out")
+        elif not _TYPE_NAME.fullmatch(spec.type):
+            self.document.add((*key, "type"), f"expected PACKAGE/msg/NAME, got {spec.type!r}")
+        elif not spec.select:
+            self.document.add(key, f"needs a select: paths to numbers of {spec.type}, e.g. wrench.force.x or data.0")
+        elif spec.image is not None or spec.key.startswith(_IMAGE_KEYS):
+            self.document.add(key, f"no pictures are made of {spec.type}, only numbers; take a topic with pictures")
+
     def _of_peripheral(self, key: Key, spec: ObservationSpec) -> ObservationSpec:
-        for other in ("topic", "type"):
+        for other in ("topic", "type", "foreign"):
             if getattr(spec, other):
                 self.document.add((*key, other), f"comes from peripheral {spec.peripheral!r}; give one or the other")
                 return spec

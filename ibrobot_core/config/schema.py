@@ -79,6 +79,7 @@ class ObservationSpec:
     key: str = option(help="e.g. observation.state, observation.images.top")
     topic: str = option("", help="where the messages come from; a peripheral's own topic where it names one")
     type: str = option("", help="ROS 2 message type; known by itself for /joint_states and peripherals")
+    foreign: bool = option(False, help="the type is one that only bags of others have, each with its definition")
     peripheral: str | None = option(None, help="the peripheral that publishes it")
     select: tuple[str, ...] = option((), help="dotted paths into the message, e.g. position.shoulder_pan")
     image: ImageSpec | None = option(None, help="for images")

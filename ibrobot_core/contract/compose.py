@@ -98,6 +98,8 @@ class Composer:
 
 
 def _leaves(part: ObservationPart) -> tuple[Leaf, ...]:
+    if part.type not in MESSAGE_TYPES:
+        raise ContractError(f"{part.key}: no {part.type} can be made, which only the bags it was read from define")
     leaves = Selection(part.type, part.select).leaves
     if len(leaves) > 1 and any(leaf.kind == "array" for leaf in leaves):
         raise ContractError(f"{part.key}: where {', '.join(part.select)} begin in a vector cannot be told")

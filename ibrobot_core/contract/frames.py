@@ -33,7 +33,9 @@ class _Part:
         self.part = part
         self.stream: Stream[Message] = Stream(part.align, step_ns)
         self._read: Callable[[Any], _Array] = (
-            Selection(part.type, part.select) if part.image is None else partial(decode_image, spec=part.image)
+            Selection(part.type, part.select, foreign=True)
+            if part.image is None
+            else partial(decode_image, spec=part.image)
         )
         self._sample: Sample[Message] | None = None
         self._value: _Array | None = None
@@ -42,6 +44,8 @@ class _Part:
         if message.ros_type != self.part.type:
             raise ContractError(f"{self.part.key}: {self.part.topic} is a {self.part.type}, got a {message.ros_type}")
         stamp_ns = message.header.stamp_ns if hasattr(message, "header") else None
+        if stamp_ns is None and self.part.align.stamp == "header":  # of a type that nobody knew before
+            raise ContractError(f"{self.part.key}: a {self.part.type} has no header; give `align: {{stamp: receive}}`")
         self.stream.add(stamp_ns, received_ns, message)
 
     def at(self, t_ns: int) -> _Array | None:

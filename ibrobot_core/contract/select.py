@@ -38,7 +38,7 @@ class Leaf:
 
     field: str
     kind: str
-    """`number`, `element`, `joint` or `array`."""
+    """`number`, `element`, `joint`, `array` or `foreign`."""
     part: str = ""
     """Element number or joint name."""
 
@@ -61,17 +61,25 @@ class Selection:
         type_name: the ROS 2 message type, e.g. `sensor_msgs/msg/JointState`.
         select: the paths, in the order of the vector.
         joints: the robot's joints.
+        foreign: a type that core does not know is one that bags of others define; then every path, e.g.
+            `wrench.force.x` or `tags.0.id`, is looked up in the messages, and leads to one number.
 
     Raises:
         ContractError: for an unknown type, or a path that leads to no number of it.
     """
 
-    def __init__(self, type_name: str, select: Sequence[str] = (), joints: Sequence[str] = ()) -> None:
+    def __init__(
+        self, type_name: str, select: Sequence[str] = (), joints: Sequence[str] = (), *, foreign: bool = False
+    ) -> None:
         message_type = MESSAGE_TYPES.get(type_name)
-        if message_type is None:
+        if message_type is None and foreign and select:
+            self.paths = tuple(select)
+            leaves = [Leaf(path, "foreign") for path in select]
+        elif message_type is None:
             raise ContractError(f"unknown message type {type_name!r}{_close(type_name, MESSAGE_TYPES)}")
-        self.paths = tuple(select) or _default(message_type, joints)
-        leaves = [leaf for path in self.paths for leaf in _resolve(message_type, path)]
+        else:
+            self.paths = tuple(select) or _default(message_type, joints)
+            leaves = [leaf for path in self.paths for leaf in _resolve(message_type, path)]
         self.leaves = tuple(leaves)
         """What each number of the vector is, in its order; one for a whole array."""
         unknown = any(leaf.kind == "array" for leaf in leaves)
@@ -79,7 +87,7 @@ class Selection:
         """Length of the vector; -1 where a whole array is taken, whose length only the messages know."""
         self.names: tuple[str, ...] = () if unknown else tuple(leaf.label for leaf in leaves)
         """One name per element; none where the length is unknown."""
-        runs = groupby(leaves, lambda leaf: (leaf.kind, leaf.field if leaf.kind != "number" else ""))
+        runs = groupby(leaves, lambda leaf: (leaf.kind, leaf.field if leaf.kind not in ("number", "foreign") else ""))
         self._reads = [_reader(kind, list(run)) for (kind, _), run in runs]
 
     def __call__(self, message: Message) -> NDArray[np.float32]:
@@ -137,6 +145,8 @@ def _array_leaf(message_type: type[Any], path: str, field: str, rest: str) -> Le
 def _reader(kind: str, leaves: list[Leaf]) -> _Read:
     """Reads a run of leaves of one kind, and one array where they are of arrays."""
     field = leaves[0].field
+    if kind == "foreign":
+        return _foreign_reader([leaf.field.split(".") for leaf in leaves])
     if kind == "number":
         reads = [attrgetter(leaf.field) for leaf in leaves]
         return lambda message: np.array([read(message) for read in reads], dtype=np.float64)
@@ -177,6 +187,38 @@ def _element_reader(field: str, elements: list[int]) -> _Read:
         return array[indices]
 
     return values
+
+
+def _foreign_reader(paths: list[list[str]]) -> _Read:
+    return lambda message: np.array([_number_at(message, path) for path in paths], dtype=np.float64)
+
+
+def _number_at(message: Any, path: Sequence[str]) -> float:
+    """The number that a path leads to in a message whose class nobody knew before."""
+    value: Any = message
+    for depth, token in enumerate(path):
+        before = ".".join(path[:depth]) or "the message"
+        if attrs.has(type(value)):
+            if token not in attrs.fields_dict(type(value)):
+                fields = ", ".join(attrs.fields_dict(type(value)))
+                raise ContractError(f"{'.'.join(path)!r}: {before} has no field {token!r}; there are: {fields}")
+            value = getattr(value, token)
+        elif isinstance(value, tuple | list | np.ndarray) and token.isascii() and token.isdigit():
+            if int(token) >= len(value):
+                raise ContractError(f"{before} has {len(value)} elements, element {token} is asked for")
+            value = value[int(token)]
+        else:
+            break
+    else:
+        if isinstance(value, int | float | np.number | np.bool_):
+            return float(value)
+    if isinstance(value, tuple | list | np.ndarray):
+        raise ContractError(f"{'.'.join(path)!r} leads to {len(value)} elements; they go by number, e.g. .0")
+    raise ContractError(f"{'.'.join(path)!r} leads to no number{_fields_of(value)}")
+
+
+def _fields_of(value: Any) -> str:
+    return f"; there are: {', '.join(attrs.fields_dict(type(value)))}" if attrs.has(type(value)) else ""
 
 
 def _close(name: str, known: typing.Iterable[str]) -> str:

@@ -192,10 +192,15 @@ def _observation(spec: ObservationSpec, config: RobotConfig) -> ObservationPart:
     if not topic or not type_:
         example = f"type: {_CAMERA_TYPE}" if topic else "topic: /imu"
         raise ContractError(f"{spec.key}: nothing says where it comes from, add for example {example}")
+    if type_ not in MESSAGE_TYPES and spec.foreign and spec.select:
+        return _foreign_observation(spec.key, topic, type_, spec.select, spec.align)
     if type_ not in MESSAGE_TYPES:
         raise ContractError(f"{spec.key}: unknown message type {type_!r}; known: {', '.join(MESSAGE_TYPES)}")
     if type_ == _COMPRESSED_TYPE:
-        raise ContractError(f"{spec.key}: there is no decoder for {type_}; take the topic with raw images")
+        raise ContractError(
+            f"{spec.key}: there is no decoder for {type_} of a robot, take the topic with raw images; of a bag, JPEG "
+            f"is read as {_CAMERA_TYPE}, give that type"
+        )
     has_header = "header" in attrs.fields_dict(MESSAGE_TYPES[type_])
     align = spec.align if has_header else attrs.evolve(spec.align, stamp="receive")
     if type_ == _CAMERA_TYPE:
@@ -215,9 +220,18 @@ def _observation(spec: ObservationSpec, config: RobotConfig) -> ObservationPart:
     return ObservationPart(spec.key, topic, type_, selection.paths, None, align, feature)
 
 
+def _foreign_observation(key: str, topic: str, type_: str, select: Sequence[str], align: Align) -> ObservationPart:
+    """Of a type that only bags of others define."""
+    selection = Selection(type_, select, foreign=True)
+    feature = Feature("float32", (selection.size,), selection.names)
+    return ObservationPart(key, topic, type_, selection.paths, None, align, feature)
+
+
 def _recorded_observation(key: str, part: Mapping[str, Any]) -> ObservationPart:
     """A part as `_canonical` gives it."""
     align = Align(**part["align"])
+    if part["type"] not in MESSAGE_TYPES and part["select"]:
+        return _foreign_observation(key, part["topic"], part["type"], part["select"], align)
     if part["encoding"] is None:
         selection = Selection(part["type"], part["select"])
         feature = Feature("float32", (selection.size,), selection.names)

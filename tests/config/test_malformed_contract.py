@@ -41,8 +41,39 @@ CASES = {
         "topic: /other, type: sensor_msgs/msg/Imag,",
         (
             "robot.yaml:36: contract.observations.1.type: unknown message type 'sensor_msgs/msg/Imag', did you "
-            "mean 'sensor_msgs/msg/Image'?"
+            "mean 'sensor_msgs/msg/Image'? (`foreign: true` takes one that only bags to convert have)"
         ),
+    ),
+    "contract_foreign_that_is_known": (
+        "topic: /joint_states,",
+        "topic: /imu, type: sensor_msgs/msg/Imu, foreign: true,",
+        "robot.yaml:35: contract.observations.0.foreign: sensor_msgs/msg/Imu is known here; leave foreign out",
+    ),
+    "contract_foreign_name": (
+        "topic: /joint_states,",
+        "topic: /touch, type: lamp_msgs/Touch, foreign: true,",
+        "robot.yaml:35: contract.observations.0.type: expected PACKAGE/msg/NAME, got 'lamp_msgs/Touch'",
+    ),
+    "contract_foreign_whole": (
+        "topic: /joint_states, select: [position.pan, position.lift, position.grip]",
+        "topic: /touch, type: lamp_msgs/msg/Touch, foreign: true",
+        (
+            "robot.yaml:35: contract.observations.0: needs a select: paths to numbers of lamp_msgs/msg/Touch, "
+            "e.g. wrench.force.x or data.0"
+        ),
+    ),
+    "contract_foreign_image": (
+        "key: observation.state, topic: /joint_states,",
+        "key: observation.images.x, topic: /touch, type: lamp_msgs/msg/Touch, foreign: true,",
+        (
+            "robot.yaml:35: contract.observations.0: no pictures are made of lamp_msgs/msg/Touch, only numbers; "
+            "take a topic with pictures"
+        ),
+    ),
+    "contract_foreign_peripheral": (
+        "peripheral: top,",
+        "peripheral: top, foreign: true,",
+        "robot.yaml:36: contract.observations.1.foreign: comes from peripheral 'top'; give one or the other",
     ),
     "contract_joint_states_type": (
         "topic: /joint_states,",

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, ClassVar
 
+import attrs
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -316,3 +317,23 @@ def test_history_does_not_reach_over_a_gap(make_config: Make) -> None:
         frame = sampler.sample(clock.advance(contract.step_ns))
         lengths.append(None if frame.missing else len(frame.history))
     assert lengths == [0, 1, 2, 3, None, 0, 1, 2]
+
+
+def test_a_foreign_message_without_a_header_needs_to_go_by_receipt(make_config: Make) -> None:
+    @attrs.frozen
+    class Touch(Message):
+        ros_type: ClassVar[str] = "lamp_msgs/msg/Touch"
+        hardness: float
+
+    def contract(stamp: str) -> Contract:
+        spec = ObservationSpec(
+            "observation.touch", topic="/touch", type=Touch.ros_type, foreign=True, select=("hardness",),
+            align=Align("hold", stamp),
+        )  # fmt: skip
+        return Contract.from_config(make_config((spec,)))
+
+    received = [("/touch", Touch(0.5), 7)]
+    (frame,) = frames(contract("receive"), received, [8])
+    np.testing.assert_array_equal(frame.values["observation.touch"], np.array([0.5], np.float32))
+    with pytest.raises(ContractError, match=r"a lamp_msgs/msg/Touch has no header; give `align: \{stamp: receive\}`"):
+        list(frames(contract("header"), received, [8]))

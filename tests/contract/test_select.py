@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import re
+from typing import Any, ClassVar
+
+import attrs
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -129,3 +133,62 @@ def test_paths_that_lead_nowhere_are_refused_at_once(type_name: str, select: lis
 def test_messages_that_lack_what_is_selected_are_refused(received: Message, select: list[str], message: str) -> None:
     with pytest.raises(ContractError, match=message):
         Selection(received.ros_type, select)(received)
+
+
+TOUCH = "lamp_msgs/msg/Touch"
+
+
+@attrs.frozen
+class Tag:
+    number: int
+    name: str
+
+
+@attrs.frozen
+class Touch(Message):
+    """As a codec makes it of a definition that a bag brought."""
+
+    ros_type: ClassVar[str] = TOUCH
+    header: Header
+    pressure: Any
+    tags: tuple[Tag, ...]
+    hot: bool = False
+
+
+@given(
+    pressure=st.lists(st.floats(width=32, allow_nan=False), min_size=1, max_size=5),
+    numbers=st.lists(st.integers(-1000, 1000), min_size=1, max_size=3),
+    hot=st.booleans(),
+)
+def test_paths_lead_into_messages_of_foreign_types(pressure: list[float], numbers: list[int], hot: bool) -> None:
+    paths = [f"pressure.{i}" for i in range(len(pressure))] + [f"tags.{i}.number" for i in range(len(numbers))]
+    selection = Selection(TOUCH, [*paths, "hot"], foreign=True)
+    assert (selection.size, selection.names) == (len(paths) + 1, (*paths, "hot"))
+    message = Touch(Header(), np.array(pressure, np.float32), tuple(Tag(n, "x") for n in numbers), hot)
+    vector = selection(message)
+    assert vector.dtype == np.float32
+    np.testing.assert_array_equal(vector, np.array([*pressure, *numbers, hot], np.float32))
+
+
+@pytest.mark.parametrize(
+    ("path", "message"),
+    [
+        ("presure.0", "'presure.0': the message has no field 'presure'; there are: header, pressure, tags, hot"),
+        ("pressure", "'pressure' leads to 2 elements; they go by number"),
+        ("pressure.2", "pressure has 2 elements, element 2 is asked for"),
+        ("pressure.x", "'pressure.x' leads to 2 elements; they go by number"),
+        ("pressure.0.x", "'pressure.0.x' leads to no number"),
+        ("tags.0", "'tags.0' leads to no number; there are: number, name"),
+        ("tags.0.name", "'tags.0.name' leads to no number"),
+        ("tags.0.nmae", "'tags.0.nmae': tags.0 has no field 'nmae'; there are: number, name"),
+    ],
+)
+def test_paths_that_lead_to_no_number_of_a_foreign_message(path: str, message: str) -> None:
+    touch = Touch(Header(), np.zeros(2), (Tag(1, "x"),))
+    with pytest.raises(ContractError, match=re.escape(message)):
+        Selection(TOUCH, [path], foreign=True)(touch)
+
+
+def test_a_type_that_nobody_called_foreign_is_unknown() -> None:
+    with pytest.raises(ContractError, match="unknown message type 'lamp_msgs/msg/Touch'"):
+        Selection(TOUCH, ["pressure.0"])

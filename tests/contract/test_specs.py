@@ -13,6 +13,7 @@ import yaml
 
 from ibrobot_core.config import load
 from ibrobot_core.config.schema import ActionSpec, Align, ImageSpec, ObservationSpec
+from ibrobot_core.contract.compose import Composer
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.descriptors import HardwareDescriptor
 from ibrobot_core.errors import ContractError
@@ -77,6 +78,21 @@ def test_images(make_config: Make, peripheral: str, image: ImageSpec | None, exp
 def test_a_message_without_a_header_goes_by_its_receipt(make_config: Make) -> None:
     made = contract(make_config, STATE, SCENE)
     assert [part.align.stamp for part in made.observation_parts] == ["header", "receive"]
+
+
+def test_a_foreign_type_is_read_back_as_it_was(make_config: Make) -> None:
+    spec = ObservationSpec(
+        "observation.touch", topic="/touch", type="lamp_msgs/msg/Touch", foreign=True, select=("tags.0.id", "x")
+    )
+    contract = Contract.from_config(make_config((STATE, spec)))
+    assert contract.observations["observation.touch"] == Feature("float32", (2,), ("tags.0.id", "x"))
+    again = Contract.from_canonical(json.loads(json.dumps(contract.canonical())))
+    assert again.fingerprint() == contract.fingerprint()
+    assert again.parts("observation.touch") == contract.parts("observation.touch")
+    with pytest.raises(ContractError, match="unknown message type 'lamp_msgs/msg/Touch'"):
+        Contract.from_config(make_config((attrs.evolve(spec, foreign=False),)))
+    with pytest.raises(ContractError, match=r"observation\.touch: no lamp_msgs/msg/Touch can be made"):
+        Composer(contract)
 
 
 def test_steps_joints_and_topics(make_config: Make) -> None:

@@ -228,7 +228,7 @@ def test_bags_of_others_by_the_contract_alone(
     tmp_path: Path, storage: StoragePlugin, compression: CompressionMode | None
 ) -> None:
     store = get_typestore(Stores.ROS2_JAZZY)
-    store.register(get_types_from_msg("string[] marks\n", LAMP))
+    store.register(get_types_from_msg("string[] marks\nfloat32[] hues\n", LAMP))
     writer = Writer(tmp_path / "bag", version=9, storage_plugin=storage)
     if compression is not None:
         writer.set_compression(compression, CompressionFormat.ZSTD)
@@ -242,11 +242,16 @@ def test_bags_of_others_by_the_contract_alone(
             t_ns = START_NS + i * 33_333_333
             pixels = numbered(i)
             picture = Image(Header(t_ns), *SIZE, "rgb8", 3 * SIZE[1], pixels.ravel())
-            writer.write(lamp, t_ns, store.serialize_cdr(store.types["lamp_msgs/msg/Lamp"](["a"]), LAMP))
+            shining = store.types[LAMP](["a"], np.array([0.25, i], np.float32))
+            writer.write(lamp, t_ns, store.serialize_cdr(shining, LAMP))
             writer.write(topics["/joint_states"], t_ns, bytes(encode(JointState(Header(t_ns), JOINTS, [i, 1.0, 2.0]))))
             writer.write(topics["/commands"], t_ns, bytes(encode(Float64MultiArray([i + 0.5, 1.0, 2.0]))))
             writer.write(topics["/top"], t_ns, bytes(encode(picture)))
-    (tmp_path / "robot.yaml").write_text(ROBOT)
+    lamp_too = (
+        f"- {{key: observation.hue, topic: /lamp, type: {LAMP}, foreign: true, select: [hues.1], "
+        "align: {stamp: receive}}"
+    )
+    (tmp_path / "robot.yaml").write_text(ROBOT.replace("  actions:", f"    {lamp_too}\n  actions:"))
     result = run(
         tmp_path / "bag", "--config", tmp_path / "robot.yaml", "--prompt", "blink", "--no-videos",
         "--out", tmp_path / "set",
@@ -255,6 +260,7 @@ def test_bags_of_others_by_the_contract_alone(
     found = rows(tmp_path / "set")
     np.testing.assert_array_equal(found["observation.state"][:, 0], np.arange(30))
     np.testing.assert_array_equal(found["action"][:, 0], np.arange(30) + 0.5)
+    np.testing.assert_array_equal(found["observation.hue"].ravel(), np.arange(30))
     assert json.loads((tmp_path / "set/meta/info.json").read_bytes())["robot_type"] == "bench_follower"
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import attrs
 import pytest
 
-from ibrobot_core.config.schema import TransportConfig
+from ibrobot_core.config.schema import ObservationSpec, TransportConfig
 from ibrobot_core.errors import ComponentFailed, NotSupported, PlanningError, TeleopError
 from ibrobot_core.launch.runtime import ESTOP, RESET, Runtime
 from ibrobot_core.launch.session import Session
@@ -262,6 +262,16 @@ def test_a_transport_that_a_run_does_not_use_is_refused(runs: Runs):
     with pytest.raises(NotSupported, match="transport: shared: nothing would use it"):
         Runtime(Session(attrs.evolve(session.config, transport=shared), session.registry, session.request))
     runs.make("transport={type: local}")
+
+
+def test_an_observation_that_only_bags_have_is_refused(runs: Runs):
+    session = runs.make().session
+    touch = ObservationSpec(
+        "observation.touch", topic="/touch", type="lamp_msgs/msg/Touch", foreign=True, select=("pressure.0",)
+    )
+    contract = attrs.evolve(session.config.contract, observations=(touch,))
+    with pytest.raises(NotSupported, match=r"contract: observation\.touch: lamp_msgs/msg/Touch is foreign"):
+        Runtime(Session(attrs.evolve(session.config, contract=contract), session.registry, session.request))
 
 
 def test_diagnostics_have_each_sensors_rate_and_age_and_what_the_hardware_counts(
