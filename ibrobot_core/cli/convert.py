@@ -7,6 +7,7 @@ import os
 import re
 import sys
 import time
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -235,4 +236,12 @@ def _tell(report: Report) -> None:
         f"gaps {summary['gaps']} (ticks skipped {summary['skipped_ticks']}, held {summary['held_ticks']}), "
         f"messages lost in recording {summary['lost_messages']}"
     )
+    for what, of_each in (
+        ("missing for a time", [each.gaps for each in done]), ("stamps that jumped", [each.resets for each in done]),
+        ("lost in recording", [each.lost for each in done]),
+    ):  # fmt: skip
+        if counts := sum(map(Counter, of_each), Counter[str]()):
+            click.echo(f"{what}: {', '.join(f'{name} {count}' for name, count in counts.most_common())}")
+    if summary["without_prompt"]:
+        click.echo(f"{summary['without_prompt']} without a prompt: their task is empty; --prompt TEXT gives them one")
     click.echo(f"{summary['size_bytes'] / _MIB:.1f} MiB in {report.seconds:.1f} s")

@@ -172,6 +172,11 @@ def test_a_gap_is_refused_skipped_or_held(tmp_path: Path) -> None:
     assert (found["skip"]["gaps"], found["hold"]["gaps"]) == (1, 1)
     assert found["skip"]["skipped_ticks"] == found["hold"]["held_ticks"] > 10
     assert found["skip"]["frames"] == found["hold"]["frames"] - found["hold"]["held_ticks"]
+    told = run(tmp_path / "bag", "--out", tmp_path / "told", "--missing", "hold").out
+    assert "missing for a time: observation.images.wrist 1\n" in told
+    assert "1 without a prompt: their task is empty; --prompt TEXT gives them one" in told
+    asked = run(tmp_path / "bag", "--out", tmp_path / "asked", "--missing", "hold", "--prompt", "stack").out
+    assert "without a prompt" not in asked
 
 
 def test_appending_takes_what_is_new_and_fits(bags: Path, tmp_path: Path) -> None:

@@ -111,6 +111,8 @@ class Report:
             "resumed": self.resumed, "skipped_ticks": sum(each.skipped for each in done),
             "held_ticks": sum(each.held for each in done), "gaps": sum(sum(each.gaps.values()) for each in done),
             "lost_messages": sum(sum(each.lost.values()) for each in done),
+            "resets": sum(sum(each.resets.values()) for each in done),
+            "without_prompt": sum(not each.prompt for each in done),
             "size_bytes": self.size_bytes, "seconds": round(self.seconds, 3),
             "reports": [attrs.asdict(each) for each in self.episodes],
         }  # fmt: skip

@@ -62,14 +62,20 @@ def problems_of(path: Path, longest_gap: float) -> list[str]:
     return problems
 
 
+def contract_of(metadata: Mapping[str, str]) -> Contract | None:
+    """The contract that an episode was recorded by; None for one without."""
+    if "contract" not in metadata:
+        return None
+    try:
+        return Contract.from_canonical(json.loads(metadata["contract"]))
+    except (ValueError, ContractError):
+        return None  # somebody else's key of the same name
+
+
 def _required(metadata: Mapping[str, str]) -> Collection[str]:
     """The topics of the contract that an episode was recorded by; nothing for one without."""
-    if "contract" not in metadata:
-        return ()
-    try:
-        return Contract.from_canonical(json.loads(metadata["contract"])).topics
-    except (ValueError, ContractError):
-        return ()  # somebody else's key of the same name
+    contract = contract_of(metadata)
+    return () if contract is None else contract.topics
 
 
 def _pause(topic: str, stamps: list[int], longest_gap: float, start_ns: int) -> list[str]:

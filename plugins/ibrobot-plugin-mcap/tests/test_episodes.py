@@ -11,6 +11,7 @@ import pytest
 from click.testing import CliRunner
 from ibrobot_mcap import rewrite
 from ibrobot_mcap.commands import episodes
+from ibrobot_mcap.commands.plot import Facts, actions_of
 from ibrobot_mcap.reader import Rosbag2Reader
 from mcap.reader import make_reader
 from PIL import Image as Png
@@ -20,6 +21,7 @@ from rosbags.rosbag2 import Writer as RosbagsWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from ibrobot_core.errors import RecorderError
+from ibrobot_core.messages import JointState
 
 from .conftest import CAMERA, JOINTS, Bench, joints, picture, stamp
 
@@ -75,6 +77,17 @@ def test_list_tells_every_episode_of_a_folder_of_datasets(tmp_path):
     assert rows[0]["prompt"] == "pick the cube"
 
 
+def test_names_are_whole_where_the_output_goes_to_a_file_or_a_program(tmp_path):
+    prompt = "pick the very small red cube, put it into the blue bin on the left, and go home again"
+    bench = Bench(tmp_path)
+    bench.begin(prompt=prompt)
+    topic = "/a_controller_of_a_very_long_name/and_of_a_group_in_it/of_which_the_topic_is/commands"
+    bench.write(3, topic)
+    bench.end()
+    assert f" {topic} " in run("info", bench.path)
+    assert prompt in run("list", tmp_path)
+
+
 def test_one_that_cannot_be_read_does_not_hide_the_others(tmp_path):
     made(tmp_path, 1)
     bad = made(tmp_path, 2)
@@ -91,6 +104,8 @@ def test_info_needs_no_repair(tmp_path):
     assert "unfinished; `ibrobot episodes repair` makes it whole" in output
     assert "/joint_states" in output
     assert "prompt: pick" in output
+    with pytest.raises(RecorderError, match=r"is a folder with an episode in it; name one, e\.g\. .*episode_000001"):
+        run("info", tmp_path)
     assert json.loads(run("info", path, "--json"))["metadata"]["prompt"] == "pick"
 
 
@@ -228,6 +243,32 @@ def test_plot_draws_a_png(tmp_path):
         width, height = png.size
     assert width > 1000
     assert height > 800
+
+
+def test_plot_shows_the_first_and_the_last_picture_and_bears_states_without_positions(tmp_path):
+    bench = Bench(tmp_path)
+    bench.begin((JOINTS, CAMERA))
+    bench.write(100, make=lambda index: JointState(joints(index).header, ("pan",), (), [1.0]))
+    for index in range(0, 90, 3):
+        bench.recorder.write(CAMERA, picture(index), stamp(index))
+    bench.write(100, "/leader", start=100)
+    bench.end()
+    facts = Facts(bench.path)
+    pictures = facts.pictures[CAMERA]
+    assert [place for place in pictures if place < 7] == list(range(len(pictures) - 1)), "none from its end on"
+    np.testing.assert_array_equal(pictures[0][1], picture(0).data.reshape(48, 64, 3))
+    np.testing.assert_array_equal(pictures[7][1], picture(87).data.reshape(48, 64, 3))
+    assert set(facts.joints) == {("/leader", "pan"), ("/leader", "tilt")}
+    run("plot", bench.path, "-o", tmp_path / "a.png")
+
+
+def test_plot_takes_the_actions_and_their_joints_from_the_contract(tmp_path):
+    action = {"topic": "/told", "type": "std_msgs/msg/Float64MultiArray", "joints": ["pan", "tilt"]}
+    contract = {"version": 1, "units": "SI", "rate_hz": 30.0, "observations": {}, "action": [action]}
+    topics = ["/told", "/arm/commands"]
+    assert actions_of({"contract": json.dumps(contract)}, topics) == {"/told": ("pan", "tilt")}
+    assert actions_of({"contract": "of sale"}, topics) == {"/arm/commands": ()}
+    assert actions_of({}, topics) == {"/arm/commands": ()}
 
 
 def test_plot_without_matplotlib_says_how_to_install_it(tmp_path, monkeypatch):

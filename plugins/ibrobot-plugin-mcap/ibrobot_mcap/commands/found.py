@@ -40,6 +40,10 @@ def opened(path: Path) -> Iterator[Rosbag2Reader]:
     """
     if not path.exists():
         raise RecorderError(f"{path}: there is no such episode")
+    if path.is_dir() and not is_rosbag2(path):
+        episodes = episodes_in(path)
+        count = "an episode" if len(episodes) == 1 else f"{len(episodes)} episodes"
+        raise RecorderError(f"{path}: is a folder with {count} in it; name one, e.g. {episodes[0]}")
     reader = Rosbag2Reader(path)
     try:
         yield reader

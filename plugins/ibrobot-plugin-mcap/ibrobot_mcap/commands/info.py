@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import attrs
@@ -25,13 +26,15 @@ def info(episode: Path, as_json: bool) -> None:
     if as_json:
         click.echo(json.dumps(attrs.asdict(summary), indent=2, default=str))
         return
-    console = Console()
+    console = Console(width=None if sys.stdout.isatty() else 1000)
     state = summary.outcome if summary.finished else "unfinished; `ibrobot episodes repair` makes it whole"
     console.print(f"{episode}: {state}", soft_wrap=True)
     console.print(f"{date_of(summary)} UTC, {duration_s(summary):.2f} s, {told_size(size_of(episode))}")
     table = Table(box=None, padding=(0, 1))
     for heading in ("topic", "type", "messages", "Hz", "lost"):
-        table.add_column(heading, justify="left" if heading in ("topic", "type") else "right")
+        # Names are folded rather than cut: `export` wants them whole.
+        left = heading in ("topic", "type")
+        table.add_column(heading, justify="left" if left else "right", overflow="fold", no_wrap=not left)
     span_s = duration_s(summary)
     for name, topic in summary.topics.items():
         rate = f"{(topic.count - 1) / span_s:.1f}" if span_s and topic.count > 1 else ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import click
@@ -12,7 +13,7 @@ from rich.table import Table
 from ibrobot_core.errors import RecorderError
 
 _WIDE = 100
-"""Columns of a terminal in which prompts have room."""
+"""Columns of a terminal in which prompts and years have room."""
 
 
 @click.command("list")
@@ -40,15 +41,25 @@ def list_episodes(path: Path, as_json: bool) -> None:
     if as_json:
         click.echo(json.dumps(rows, indent=2))
     else:
-        console = Console()
+        console = Console(width=None if sys.stdout.isatty() else 1000)
         table = Table(box=None, padding=(0, 1))
-        prompts = ("prompt",) if console.width >= _WIDE else ()
-        for heading in ("episode", "began", "s", "messages", "lost", "outcome", "size", *prompts):
+        wide = console.width >= _WIDE
+        prompts = ("prompt",) if wide else ()
+        for heading in (
+            "episode",
+            "began (UTC)" if wide else "began",
+            "s",
+            "messages",
+            "lost",
+            "outcome",
+            "size",
+            *prompts,
+        ):
             right = heading in ("s", "messages", "lost", "size")
             table.add_column(heading, justify="right" if right else "left", no_wrap=heading != "prompt")
         for row in rows:
             table.add_row(
-                _shown(Path(str(row["path"])), path), str(row["date"])[5:], f"{row['duration_s']:.1f}",
+                _shown(Path(str(row["path"])), path), str(row["date"])[0 if wide else 5 :], f"{row['duration_s']:.1f}",
                 str(row["messages"]), str(row["dropped"]),
                 str(row["outcome"]) if row["finished"] else "[red]unfinished[/red]", told_size(int(str(row["bytes"]))),
                 *([str(row["prompt"])] if prompts else []),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 from ibrobot_core.errors import RecorderError
 from ibrobot_core.messages import Float64MultiArray, Image, JointState
 from ibrobot_core.units import NS_PER_S
+from ibrobot_mcap.checks import contract_of
 
 _THUMBNAILS = 8
 
@@ -27,11 +29,11 @@ def plot(episode: Path, output: Path | None) -> None:
         raise RecorderError("plot needs matplotlib: pip install 'ibrobot-plugin-mcap[plot]'") from None
     mpl.use("Agg")
     output = output or Path(f"{episode.name}.png")
-    _draw(_Facts(episode), output)
+    _draw(Facts(episode), output)
     click.echo(str(output))
 
 
-class _Facts:
+class Facts:
     """All of an episode that the picture shows."""
 
     def __init__(self, episode: Path) -> None:
@@ -40,9 +42,12 @@ class _Facts:
 
         self.name = episode.name
         self.stamps: dict[str, list[int]] = defaultdict(list)
-        self.joints: dict[str, list[tuple[float, float]]] = defaultdict(list)
+        self.joints: dict[tuple[str, str], list[tuple[float, float]]] = defaultdict(list)
+        """Topic and joint -> its positions."""
         self.vectors: dict[str, list[tuple[float, list[float]]]] = defaultdict(list)
-        self.pictures: dict[str, list[tuple[float, np.ndarray[Any, Any]]]] = defaultdict(list)
+        self.pictures: dict[str, dict[int, tuple[float, np.ndarray[Any, Any]]]] = defaultdict(dict)
+        """Topic -> place along the episode, from 0 -> the picture there."""
+        newest: dict[str, tuple[float, Image]] = {}
         with opened(episode) as reader:
             self.summary = summary = reader.summary()
             start_ns, span_ns = summary.start_ns, max(1, summary.end_ns - summary.start_ns)
@@ -51,18 +56,32 @@ class _Facts:
                 self.stamps[item.topic].append(item.received_ns)
                 message = item.message
                 if isinstance(message, JointState):
-                    for joint, position in zip(message.name, message.position.tolist(), strict=True):
-                        self.joints[joint].append((at_s, position))
+                    # A sender may leave the positions out.
+                    for joint, position in zip(message.name, message.position.tolist(), strict=False):
+                        self.joints[item.topic, joint].append((at_s, position))
                 elif isinstance(message, Float64MultiArray):
                     self.vectors[item.topic].append((at_s, message.data.tolist()))
                 elif isinstance(message, Image):
-                    shown = self.pictures[item.topic]
-                    if (item.received_ns - start_ns) * _THUMBNAILS >= len(shown) * span_ns and len(shown) < _THUMBNAILS:
-                        shown.append((at_s, pixels_of(message)))
+                    shown, newest[item.topic] = self.pictures[item.topic], (at_s, message)
+                    place = (item.received_ns - start_ns) * (_THUMBNAILS - 1) // span_ns
+                    if place not in shown and place < _THUMBNAILS - 1:
+                        shown[place] = (at_s, pixels_of(message))
+        for topic, (at_s, message) in newest.items():  # the end, which shows what became of it
+            self.pictures[topic][_THUMBNAILS - 1] = (at_s, pixels_of(message))
+        self.actions = actions_of(self.summary.metadata, self.vectors)
 
 
-def _draw(facts: _Facts, output: Path) -> None:
+def actions_of(metadata: Mapping[str, str], topics: Collection[str]) -> dict[str, tuple[str, ...]]:
+    """Topic of an action -> its joints: by the recorded contract; without one by the names that controllers have."""
+    contract = contract_of(metadata)
+    if contract is not None:
+        return {part.topic: part.joints for part in contract.action_parts}
+    return {topic: () for topic in topics if topic.endswith("/commands")}
+
+
+def _draw(facts: Facts, output: Path) -> None:
     from matplotlib import pyplot as plt
+    from matplotlib.ticker import LogFormatter
 
     summary = facts.summary
     heights = [3.0, 3.0, 3.0, *[1.6] * len(facts.pictures)]
@@ -72,34 +91,44 @@ def _draw(facts: _Facts, output: Path) -> None:
     prompt = summary.metadata.get("prompt", "")
     figure.suptitle(f"{facts.name}: {state}" + (f", “{prompt}”" if prompt else ""))
     joints = figure.add_subplot(grid[0, :])
-    for joint, points in facts.joints.items():
-        joints.plot(*zip(*points, strict=True), label=joint, linewidth=1)
+    colours: dict[str, Any] = {}
+    several = len({topic for topic, _ in facts.joints}) > 1
+    for (topic, joint), points in facts.joints.items():
+        (line,) = joints.plot(*zip(*points, strict=True), label=f"{topic} {joint}" if several else joint, linewidth=1)
+        colours.setdefault(joint, line.get_color())
     joints.set(title="joints", ylabel="rad")
-    if facts.joints:
-        joints.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))
     actions = figure.add_subplot(grid[1, :], sharex=joints)
-    for topic, values in facts.vectors.items():
-        if topic.endswith("/commands"):
-            table = np.array([vector for _, vector in values])
-            actions.plot([at for at, _ in values], table, linewidth=1)
-    actions.set(title="actions", ylabel="rad")
+    for topic, names in facts.actions.items():
+        values = facts.vectors.get(topic, [])
+        for index in range(max((len(vector) for _, vector in values), default=0)):
+            points = [(at, vector[index]) for at, vector in values if index < len(vector)]
+            name = names[index] if index < len(names) else f"{topic} {index}"
+            actions.plot(*zip(*points, strict=True), label=name, color=colours.get(name), linewidth=1)
+    actions.set(title="actions: what the joints were told", ylabel="rad")
+    for axes in (joints, actions):
+        if axes.lines:
+            axes.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))
     gaps = figure.add_subplot(grid[2, :], sharex=joints)
     for topic, stamps in facts.stamps.items():
         if len(stamps) > 2:
             ms = np.diff(stamps) / 1e6
             at_s = (np.array(stamps[1:]) - summary.start_ns) / NS_PER_S
-            gaps.plot(
-                at_s, ms, ".", markersize=2, label=f"{topic}: {1e3 / ms.mean():.1f} Hz, longest {ms.max():.0f} ms"
-            )
+            known = summary.topics.get(topic)
+            lost = f", {known.dropped} lost" if known is not None and known.dropped else ""
+            label = f"{topic}: {1e3 / ms.mean():.1f} Hz, longest {ms.max():.0f} ms{lost}"
+            gaps.plot(at_s, ms, ".", markersize=2, label=label)
     gaps.set(title="time between messages", ylabel="ms", xlabel="s", yscale="log")
+    gaps.yaxis.set_major_formatter(LogFormatter())
+    gaps.yaxis.set_minor_formatter(LogFormatter())
     if facts.stamps:
         gaps.legend(fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2, markerscale=4)
     for row, (topic, pictures) in enumerate(facts.pictures.items(), 3):
-        for column, (at, pixels) in enumerate(pictures):
+        first = min(pictures)
+        for column, (at, pixels) in pictures.items():
             axes = figure.add_subplot(grid[row, column])
             axes.imshow(pixels, cmap="viridis" if pixels.ndim == 2 else None)
             axes.set_axis_off()
-            axes.set_title(f"{at:.1f} s" if column else f"{topic}\n{at:.1f} s", fontsize="small", loc="left")
+            axes.set_title(f"{topic}\n{at:.1f} s" if column == first else f"{at:.1f} s", fontsize="small", loc="left")
     try:
         figure.savefig(output, dpi=80)
     except (OSError, ValueError) as error:
