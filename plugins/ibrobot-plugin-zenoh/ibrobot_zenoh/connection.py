@@ -5,10 +5,13 @@ from __future__ import annotations
 import ctypes
 import json
 import logging
+import math
 import os
 import threading
+import time
 from collections.abc import Callable
 from functools import cache
+from pathlib import Path
 from typing import Any, Protocol
 from weakref import WeakSet
 
@@ -16,6 +19,7 @@ import zenoh
 
 from ibrobot_core.errors import TransportError
 from ibrobot_zenoh.options import ZenohOptions
+from ibrobot_zenoh.reasons import tls_context, why_not
 
 _RETRY_MS = (50, 200)
 """First and longest time between attempts to connect."""
@@ -27,6 +31,8 @@ quarter of a request's time.
 """
 _CLOSE_WAIT_S = 1.0
 """How long closing waits for an attempt to connect, which nothing can interrupt."""
+_ASK_WHY_S = 2.0
+"""How often it is looked for what stands between us and the other side."""
 _FIRST_WAIT_S = 0.3
 """How long making a client waits for somebody to answer, so that what is there can be used at once."""
 
@@ -62,7 +68,7 @@ def zenoh_config(options: ZenohOptions) -> zenoh.Config:
     """Zenoh's settings: the user's own file, and over it what the options say. No scouting of any kind.
 
     Raises:
-        TransportError: for a file that cannot be read.
+        TransportError: for a file that cannot be read, or certificates that do not belong together.
     """
     try:
         config = zenoh.Config() if options.settings is None else zenoh.Config.from_file(options.settings)
@@ -92,8 +98,7 @@ def zenoh_config(options: ZenohOptions) -> zenoh.Config:
         settings["transport/link/tx/queue/size"] = dict.fromkeys(("interactive_high", "data"), _BATCHES)
         settings["transport/link/rx/buffer_size"] = _RECEIVED_AT_ONCE
     if (tls := options.tls) is not None:
-        for path in (tls.ca, tls.certificate, tls.key):
-            _check_readable(path)
+        tls_context(tls)
         settings["transport/link/tls"] = {
             "root_ca_certificate": str(tls.ca), "enable_mtls": True, "verify_name_on_connect": True,
             "connect_certificate": str(tls.certificate), "connect_private_key": str(tls.key),
@@ -103,7 +108,7 @@ def zenoh_config(options: ZenohOptions) -> zenoh.Config:
         settings["transport/auth/usrpwd/user"] = options.user
         settings["transport/auth/usrpwd/password"] = options.password
     if options.users is not None:
-        _check_readable(options.users)
+        _check_users(options.users)
         settings["transport/auth/usrpwd/dictionary_file"] = str(options.users)
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
@@ -115,12 +120,22 @@ def first_line(error: BaseException) -> str:
     return str(error).partition(" at /")[0].strip()
 
 
-def _check_readable(path: Any) -> None:
+def _check_users(path: Path) -> None:
+    """See that somebody is named: a file without anybody would let everybody in."""
     try:
-        with open(path, "rb"):
-            pass
-    except OSError as error:
-        raise TransportError(f"{path}: cannot be read: {error.strerror}") from error
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise TransportError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    seen: set[str] = set()
+    for number, line in enumerate(lines, 1):
+        name, _, password = line.partition(":")
+        if not (name and password):
+            raise TransportError(f"{path}:{number}: is no NAME:PASSWORD")
+        if name in seen:
+            raise TransportError(f"{path}:{number}: {name!r} has a password already")
+        seen.add(name)
+    if not seen:
+        raise TransportError(f"{path}: is empty, must have a line NAME:PASSWORD for each who may connect")
 
 
 _open: WeakSet[Connection] = WeakSet()
@@ -163,6 +178,9 @@ class Connection:
         self._thread: threading.Thread | None = None
         _open.add(self)
         _close_at_the_end()
+        self._options = options
+        self.why_not = f"nobody answers at {self._endpoints}"
+        """What stands between us and the other side, before it answered."""
         self.answered = threading.Event()
         """Set when there is a session."""
         if options.mode != "client":
@@ -183,7 +201,7 @@ class Connection:
             TransportError: when closed, or not connected yet.
         """
         if (session := self.open_session) is None:
-            raise TransportError(f"not connected: nobody answers at {self._endpoints}")
+            raise TransportError(f"not connected: {self.why_not}")
         return session
 
     @property
@@ -243,14 +261,18 @@ class Connection:
 
     def _connect(self) -> None:
         """Try until somebody answers; every new reason why nobody does is logged once."""
-        told = ""
+        told, asked_s = "", -math.inf
         pause_ms, longest_ms = _RETRY_MS
         while not self._closed.is_set():
             try:
                 session = zenoh.open(self._config)
-            except zenoh.ZError as error:
-                if (reason := first_line(error)) != told:
-                    self._log.warning("not connected to %s yet: %s", self._endpoints, told := reason)
+            except zenoh.ZError:
+                if time.monotonic() - asked_s > _ASK_WHY_S:
+                    tried = {each: why_not(each, self._options.tls) for each in self._options.connect}
+                    self.why_not = "; ".join(f"{endpoint}: {reason}" for endpoint, reason in tried.items())
+                    asked_s = time.monotonic()
+                if self.why_not != told:
+                    self._log.warning("not connected yet: %s", told := self.why_not)
                 self._closed.wait(pause_ms / 1000)
                 pause_ms = min(2 * pause_ms, longest_ms)
                 continue

@@ -163,6 +163,11 @@ class ZenohTransport(TopicTransport):
         """Wait up to `timeout_s` [s] for the other side; whether it has answered."""
         return self._connection.answered.wait(timeout_s)
 
+    @property
+    def why_not_connected(self) -> str:
+        """What stands between us and the other side, before it answered."""
+        return self._connection.why_not
+
     def is_heard(self, topic: str, type_name: str, timeout_s: float) -> bool:
         """Whether anybody listens to messages of a type on a topic, waiting for it up to `timeout_s` [s]."""
         return self._topics.is_heard(topic, type_name, timeout_s)

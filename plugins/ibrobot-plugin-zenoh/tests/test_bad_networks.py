@@ -73,7 +73,7 @@ def test_a_client_may_come_before_its_router(caplog: pytest.LogCaptureFixture):
     """What it declared meanwhile is there as soon as the router is."""
     endpoint = free_endpoint()
     early = client(endpoint)
-    with pytest.raises(TransportError, match=f"not connected: nobody answers at {endpoint}"):
+    with pytest.raises(TransportError, match=f"not connected: {endpoint}: nobody listens there"):
         early.request("echo", b"", WAIT_S)
     early.publish("topic", b"nobody hears this")
     arrived: queue.SimpleQueue[object] = queue.SimpleQueue()

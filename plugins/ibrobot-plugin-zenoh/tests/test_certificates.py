@@ -16,6 +16,7 @@ from click.testing import CliRunner, Result
 from cryptography import x509
 from ibrobot_zenoh.commands.certs import certs
 from ibrobot_zenoh.options import Tls
+from ibrobot_zenoh.reasons import why_not
 
 from ibrobot_core.errors import TransportError
 from ibrobot_core.messages import Int32, String
@@ -58,11 +59,15 @@ def test_another_authority_s_certificate_gets_nothing(lab: Path, tmp_path: Path,
     server.serve("echo", lambda payload: payload)
     # One that trusts the server, so that it is the server that refuses; and one that does not.
     stranger = Tls(lab / "ca.pem", tmp_path / "other/robot1/certificate.pem", tmp_path / "other/robot1/key.pem")
-    for wrong in (stranger, tls(tmp_path / "other", "robot1")):
+    stranger_s = tls(tmp_path / "other", "robot1")
+    for wrong, said in (
+        (stranger, f"it refuses {stranger.certificate}"),
+        (stranger_s, f"not signed by {stranger_s.ca}"),
+    ):
         caplog.clear()
         robot = client(endpoint, tls=wrong)
         wait_for(lambda: "not connected" in caplog.text)
-        with pytest.raises(TransportError, match=f"not connected: nobody answers at {endpoint}"):
+        with pytest.raises(TransportError, match=rf"not connected: {endpoint}: .*{said}"):
             robot.request("echo", b"hello", 1.0)
         robot.close()
     server.close()
@@ -90,9 +95,56 @@ def test_a_server_of_another_name_is_not_believed(lab: Path, tmp_path: Path, cap
     endpoint = free_endpoint("tls")
     server = router(endpoint, tls=tls(lab, "elsewhere.lab"))
     robot = client(endpoint, tls=tls(lab, "robot1"))
-    wait_for(lambda: "not connected" in caplog.text)
+    wait_for(lambda: "certificate is not valid for '127.0.0.1'" in caplog.text)
     robot.close()
     server.close()
+
+
+def test_a_robot_s_certificate_is_not_a_server_s(lab: Path):
+    endpoint = free_endpoint("tls")
+    server = router(endpoint, tls=tls(lab, "robot2"))
+    assert "made for a --robot" in why_not(endpoint, tls(lab, "robot1"))
+    server.close()
+
+
+def test_an_end_without_tls_is_told(lab: Path):
+    secured, plain = free_endpoint("tls"), free_endpoint("tcp")
+    servers = [router(secured, tls=tls(lab, "localhost")), router(plain)]
+    assert "does not speak TLS" in why_not(plain.replace("tcp", "tls"), tls(lab, "robot1"))
+    assert "write tls/ for tcp/" in why_not(secured.replace("tls", "tcp"), None)
+    for server in servers:
+        server.close()
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "said"),
+    [
+        ("tcp/nowhere.invalid:7447", "no machine of the name 'nowhere.invalid'"),
+        ("tcp/[::1]:1", "nobody listens there"),
+        ("quic/127.0.0.1:1", "nobody answers there"),
+    ],
+)
+def test_what_is_not_there_is_told(endpoint: str, said: str):
+    assert said in why_not(endpoint, None)
+
+
+@pytest.mark.parametrize(
+    ("ca", "certificate", "key", "said"),
+    [
+        ("robot1/ca.pem", "robot1/certificate.pem", "robot2/key.pem", "robot2/key.pem: is not the key of"),
+        ("ca.key", "robot1/certificate.pem", "robot1/key.pem", "ca.key: is no certificate in PEM"),
+        ("ca.pem", "robot1/certificate.pem", "ca.pem", "are no certificate and key in PEM"),
+        ("ca.pem", "robot9/certificate.pem", "robot1/key.pem", "robot9/certificate.pem: cannot be read: No such file"),
+    ],
+)
+@pytest.mark.parametrize("mode", ["client", "router"])
+def test_files_that_do_not_belong_together_are_told(
+    lab: Path, ca: str, certificate: str, key: str, said: str, mode: str
+):
+    endpoint = free_endpoint("tls")
+    make = client if mode == "client" else router
+    with pytest.raises(TransportError, match=said):
+        make(endpoint, tls=Tls(lab / ca, lab / certificate, lab / key))
 
 
 def test_the_readme_s_access_control(lab: Path, tmp_path: Path):
@@ -161,6 +213,19 @@ def test_the_yaml_to_paste(tmp_path: Path):
         "connect": ["tls/gpu.lab:7447"],
         "tls": {key: f"arm/{file}" for key, file in files.items()},
     }
+
+
+def test_an_ipv6_address_is_put_in_brackets(tmp_path: Path):
+    output = run(tmp_path / "lab", "--server", "fe80::1,gpu.lab", "--robot", "robot1").output
+    assert yaml.safe_load(output.partition("# robot1")[2].partition("\n")[2])["transport"]["connect"] == [
+        "tls/[fe80::1]:7447"
+    ]
+
+
+def test_a_folder_that_cannot_be_written_is_told(tmp_path: Path):
+    (tmp_path / "file").touch()
+    with pytest.raises(TransportError, match=r"file/lab: cannot be written: Not a directory"):
+        certs.main([str(tmp_path / "file/lab"), "--robot", "robot1"], standalone_mode=False)
 
 
 def test_the_same_authority_signs_what_comes_later(lab: Path):

@@ -97,7 +97,8 @@ def test_hz(robot: ZenohTransport, endpoint: str):
     assert unit.startswith("Hz")
     assert 1 < float(rate) <= 210
     silent = run("hz", "/silence", "--endpoint", endpoint, "-n", "1", "--period", "0.02")
-    assert silent == "less than two messages on /silence in 0.02 s\n"
+    told = "nobody publishes /silence yet; published now: /joint_states\n"
+    assert silent == f"{told}less than two messages on /silence in 0.02 s\n"
 
 
 def test_pub(robot: ZenohTransport, endpoint: str):
@@ -144,8 +145,9 @@ def test_which_network(monkeypatch: pytest.MonkeyPatch):
         run("list")
     assert "which network? Give --config CONFIG, or --endpoint" in CliRunner().invoke(topic, ["list"]).output
     assert "is no endpoint" in CliRunner().invoke(topic, ["list", "--endpoint", "gpu"]).output
+    assert "certificates are given by --config" in CliRunner().invoke(topic, ["list", "--endpoint", "tls/a:1"]).output
     nobody = free_endpoint()
-    with pytest.raises(IbrobotError, match=f"nobody answers at {nobody}: is the robot, server or router up"):
+    with pytest.raises(IbrobotError, match=f"{nobody}: nobody listens there: is the robot, server or router up"):
         run("list", "--endpoint", nobody)
 
 

@@ -68,6 +68,23 @@ def test_files_that_are_not_there(options: dict[str, object]):
         make(mode="router", **options)
 
 
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "users.txt: is empty, must have a line NAME:PASSWORD"),
+        ("robot1:a\nrobot2\n", "users.txt:2: is no NAME:PASSWORD"),
+        (":a\n", "users.txt:1: is no NAME:PASSWORD"),
+        ("robot1:\n", "users.txt:1: is no NAME:PASSWORD"),
+        ("robot1:a\nrobot1:b\n", "users.txt:2: 'robot1' has a password already"),
+    ],
+)
+def test_a_file_of_users_that_says_something_else(text: str, said: str, tmp_path: Path):
+    """An empty one would let everybody in."""
+    (tmp_path / "users.txt").write_text(text)
+    with pytest.raises(TransportError, match=said):
+        router(free_endpoint(), users=tmp_path / "users.txt")
+
+
 def test_passwords(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     users = tmp_path / "users.txt"
     users.write_text("robot1:secret\n")
@@ -81,7 +98,7 @@ def test_passwords(tmp_path: Path, caplog: pytest.LogCaptureFixture):
         caplog.clear()
         stranger = client(endpoint, **wrong)
         wait_for(lambda: "not connected" in caplog.text)
-        with pytest.raises(TransportError, match="not connected"):
+        with pytest.raises(TransportError, match=r"not connected: .*are user and password right"):
             stranger.request("echo", b"x", WAIT_S)
         stranger.close()
     known.close()

@@ -35,13 +35,21 @@ def certs(out_dir: Path, servers: tuple[str, ...], robots: tuple[str, ...], days
     taken = [name for name in machines if (out_dir / name).exists() or machines.count(name) > 1]
     if taken:
         raise TransportError(f"{out_dir / taken[0]} is there already, or named twice; nothing is overwritten")
+    try:
+        _make(out_dir, days, hosts, robots)
+    except OSError as error:
+        raise TransportError(f"{error.filename or out_dir}: cannot be written: {error.strerror}") from error
+
+
+def _make(out_dir: Path, days: int, hosts: dict[str, list[str]], robots: tuple[str, ...]) -> None:
     authority = Authority(out_dir, days)
     click.echo(f"{'made' if authority.is_new else 'signed by'} the authority {out_dir / CA}")
     for name, names in hosts.items():
         _tell(authority.issue(name, names), "mode: router", f"listen: [tls/0.0.0.0:{_PORT}]")
     server = next(iter(hosts), "SERVER")
+    endpoint = f'"tls/[{server}]:{_PORT}"' if ":" in server else f"tls/{server}:{_PORT}"
     for name in robots:
-        _tell(authority.issue(name), f"connect: [tls/{server}:{_PORT}]")
+        _tell(authority.issue(name), f"connect: [{endpoint}]")
 
 
 def _tell(folder: Path, *lines: str) -> None:

@@ -48,7 +48,8 @@ def options_from(config: str | None, endpoints: tuple[str, ...], domain: int | N
         try:
             return ZenohOptions(connect=endpoints, **changes)
         except ValueError as error:
-            raise click.UsageError(f"--endpoint: {error}") from None
+            told = "certificates are given by --config" if "needs tls" in str(error) else error
+            raise click.UsageError(f"--endpoint: {told}") from None
     from ibrobot_core.config import find_config, load
     from ibrobot_core.plugins import installed
 
@@ -80,7 +81,7 @@ def connected(config: str | None, endpoints: tuple[str, ...], domain: int | None
     transport = ZenohTransport(options, Context("topic", RealClock(), log, Robot("command_line", ())))
     try:
         if not transport.await_connection(_CONNECT_S):
-            raise TransportError(f"nobody answers at {', '.join(options.connect)}: is the robot, server or router up?")
+            raise TransportError(f"not connected: {transport.why_not_connected}")
         yield transport
     finally:
         transport.close()

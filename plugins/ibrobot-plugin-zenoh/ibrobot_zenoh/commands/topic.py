@@ -63,6 +63,7 @@ def echo(transport: ZenohTransport, name: str, count: int | None, full: bool) ->
     """Show the messages on TOPIC, until Ctrl-C."""
     arrived: queue.SimpleQueue[Message] = queue.SimpleQueue()
     transport.subscribe_messages(name, arrived.put)
+    _tell_whether_published(transport, name)
     for _ in _counted(count):
         click.echo(f"{shown(arrived.get(), full=full)}---")
 
@@ -75,6 +76,7 @@ def hz(transport: ZenohTransport, name: str, count: int | None, period: float) -
     """Measure how often messages come on TOPIC, until Ctrl-C."""
     arrived: queue.SimpleQueue[float] = queue.SimpleQueue()
     transport.subscribe_messages(name, lambda message: arrived.put(time.monotonic()))
+    _tell_whether_published(transport, name)
     last: float | None = None
     for _ in _counted(count):
         times = [last] if last is not None else []
@@ -114,6 +116,13 @@ def pub(transport: ZenohTransport, name: str, type_name: str, text: str, rate: f
         if rate is not None:
             due += 1 / rate
             time.sleep(max(0.0, due - time.monotonic()))
+
+
+def _tell_whether_published(transport: ZenohTransport, name: str) -> None:
+    """Who waits for messages is told when nobody sends any."""
+    published = [found.name for found in transport.shared_topics(_LIST_S) if found.publishers]
+    if name not in published:
+        click.echo(f"nobody publishes {name} yet; published now: {', '.join(published) or 'nothing'}", err=True)
 
 
 def _counted(count: int | None) -> Iterator[int]:
