@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import signal
 import sys
@@ -101,10 +102,12 @@ def _from_config(what: str, registry: Registry, options: dict[str, Any]) -> tupl
     if options["listen"]:
         changes += [
             "transport.connect=[]",
-            f"transport.listen=[{', '.join(options['listen'])}]",
+            f"transport.listen={json.dumps(options['listen'])}",
             "transport.mode=router",
         ]
     changes += [f"transport.{option}" for option in options["transport_options"]]
+    if Path(what).is_dir():
+        raise click.UsageError(f"{what} is a folder: give the plugin of the model in it, e.g. --type lerobot")
     path = find_config(what, registry)
     config = load(path, overrides=changes, sim=options["sim"], registry=registry)
     model: str = options["model"] or (next(iter(config.models)) if len(config.models) == 1 else "")
@@ -138,9 +141,12 @@ def _from_folder(
     overrides = [f"path={folder.absolute()}", *options["overrides"]]
     policy: Policy = policies.make(single_options(policies.options, overrides, str(folder)), context)
     transports = registry.find("transport", "zenoh")
-    listen = ", ".join(options["listen"] or (DEFAULT_LISTEN,))
+    listen = json.dumps(options["listen"] or (DEFAULT_LISTEN,))
     settings = single_options(
-        transports.options, ["mode=router", f"listen=[{listen}]", *options["transport_options"]], "--transport"
+        transports.options,
+        ["mode=router", f"listen={listen}", *options["transport_options"]],
+        "--listen, --transport",
+        "--transport",
     )
 
     def make_transport() -> Transport:

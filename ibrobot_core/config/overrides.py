@@ -10,10 +10,10 @@ from ibrobot_core.config.yaml_nodes import Document, Key, Place, parse
 from ibrobot_core.errors import ConfigError, Problem
 
 
-def apply(document: Document, overrides: Sequence[str]) -> None:
-    """Put `overrides` into `document`, in order; faults in them are noted there."""
+def apply(document: Document, overrides: Sequence[str], flag: str = "--set") -> None:
+    """Put `overrides` into `document`, in order; faults in them are noted there, as of the command line's `flag`."""
     for rank, text in enumerate(overrides, start=1):
-        place = Place(rank, 0, 0, f"--set {text}")
+        place = Place(rank, 0, 0, f"{flag} {text}")
         path, equals, value_text = text.partition("=")
         if not equals or not path or not all(path.split(".")):
             message = "expected PATH=VALUE, e.g. control.rate_hz=50"

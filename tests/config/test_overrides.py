@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import attrs
 import pytest
 import yaml
 from hypothesis import HealthCheck, example, given, settings
@@ -13,8 +14,10 @@ from hypothesis import strategies as st
 from ibrobot_core.config import RobotConfig, from_document
 from ibrobot_core.config.overrides import apply
 from ibrobot_core.config.show import dump
+from ibrobot_core.config.single import single_options
 from ibrobot_core.config.yaml_nodes import Document, parse, scalar
 from ibrobot_core.errors import ConfigError
+from ibrobot_core.options import option
 from ibrobot_core.plugins import Registry
 
 Load = Callable[..., RobotConfig]
@@ -81,6 +84,30 @@ def test_an_override_is_checked_like_the_file(load_text: Load, base: str, overri
         load_text(base, overrides=[override])
 
     assert str(told.value).splitlines()[0] == f"--set {override}: {expected}"
+
+
+@attrs.frozen
+class _Pair:
+    low: int = option(0)
+    high: int = option(1)
+
+    def __attrs_post_init__(self) -> None:
+        if self.low > self.high:
+            raise ValueError("low is above high")
+
+
+@pytest.mark.parametrize(
+    ("texts", "said"),
+    [
+        (["lowe=1"], "--pair lowe=1: lowe: unknown key, did you mean 'low'?"),
+        (["low=2"], "pair: low is above high"),
+    ],
+)
+def test_options_alone_are_checked_like_the_file(texts: list[str], said: str) -> None:
+    with pytest.raises(ConfigError) as told:
+        single_options(_Pair, texts, "pair", "--pair")
+    assert str(told.value) == said
+    assert single_options(_Pair, ["high=5"], "pair") == _Pair(0, 5)
 
 
 @pytest.mark.parametrize("override", ["control.rate_hz", "=5", "control.=5", "a..b=5", ""])

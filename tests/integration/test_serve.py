@@ -100,6 +100,7 @@ def test_a_server_that_is_killed_in_the_middle_of_requests_harms_nothing():
         (("so101_blind", "--model", "other"), "one of scripted_pick"),
         (("nowhere", "--type", "scripted_pick"), "no such folder"),
         ((".", "--type", "nothing_of_this_name"), "nothing_of_this_name"),
+        ((".",), ". is a folder: give the plugin of the model in it"),
     ],
 )
 def test_a_wrong_command_line_is_told(ibrobot: tuple[str, ...], arguments: tuple[str, ...], said: str, tmp_path: Path):
