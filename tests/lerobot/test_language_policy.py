@@ -6,7 +6,7 @@ import logging
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import override
+from typing import Any, override
 
 import attrs
 import numpy as np
@@ -17,6 +17,7 @@ from ibrobot_lerobot.options import LeRobotPolicyOptions
 from ibrobot_lerobot.policy import SEED, LeRobotPolicy
 from lerobot.policies.rtc.configuration_rtc import RTCConfig
 
+from ibrobot_core.errors import PolicyError
 from ibrobot_core.interfaces import Frame
 from ibrobot_core.testing import PolicySuite
 from ibrobot_core.testing.contexts import START_NS, host_context
@@ -81,6 +82,24 @@ def test_the_plan_is_continued_as_lerobot_does(path: Path, policy: LeRobotPolicy
     alone = policy.postprocess(policy.infer(policy.preprocess(frame())))
     assert np.abs(ours[:2] - prefix[:2]).mean() < 0.5 * np.abs(alone[:2] - prefix[:2]).mean()
     assert len(ours) == CHUNK
+
+
+@pytest.mark.parametrize(
+    ("prefix", "delay", "said"),
+    [
+        (np.zeros((1, 5, SIZE), np.float32), None, "delay_steps is missing"),
+        (np.zeros((5, SIZE), np.float32), 2, "prefix is float32 (5, 6), must be float32 (1, -1, 6)"),
+        (np.zeros((1, 5, SIZE), np.float32), 6, "0 <= delay_steps <= 5 <= 8 must hold"),
+        (np.zeros((1, CHUNK + 1, SIZE), np.float32), 1, "0 <= delay_steps <= 9 <= 8 must hold"),
+    ],
+)
+def test_a_plan_that_is_none_is_told(policy: LeRobotPolicy, prefix: Any, delay: int | None, said: str) -> None:
+    tensors = {**policy.preprocess(frame()), "prefix": prefix}
+    if delay is not None:
+        tensors["delay_steps"] = np.array([delay])
+    with pytest.raises(PolicyError) as told:
+        policy.infer(tensors)
+    assert said in str(told.value)
 
 
 def test_steps_that_are_not_standard_are_said(path: Path, caplog: pytest.LogCaptureFixture) -> None:

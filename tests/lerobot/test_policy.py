@@ -181,6 +181,40 @@ def test_half_precision_is_near(folders: dict[str, Path]) -> None:
     assert 0 < np.abs(a - b).max() < 0.1
 
 
+def test_a_first_run_that_overflows_is_told(folders: dict[str, Path], caplog: pytest.LogCaptureFixture) -> None:
+    """One joint did not move in the dataset, so that its normalised zero is beyond float16."""
+    loaded(folders["act"], dtype="float16")
+    assert "act overflows torch.float16 in a run on zeros; bfloat16 and float32" in caplog.text
+
+
+def test_a_first_run_that_fails_is_told(folders: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ibrobot_lerobot.model.Model.predict", lambda self, batch: 1 / 0)
+    with pytest.raises(PolicyError, match=r"act: its first run failed: ZeroDivisionError: division by zero"):
+        make(folders["act"]).load()
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({SEED: None}, "seed is missing, must be int64 (1,)"),
+        ({STATE: np.zeros(6, np.float32)}, "observation.state is float32 (6,), must be float32 (1, 6)"),
+        ({STATE: np.zeros((1, 6))}, "observation.state is float64 (1, 6), must be float32 (1, 6)"),
+        ({TOP: np.zeros((480, 640, 3), np.uint8)}, f"{TOP} is uint8 (480, 640, 3), must be uint8 (96, 96, 3)"),
+        ({"prefix": np.zeros((1, 2, 6), np.float32)}, "prefix is not known"),
+        ({SEED: None, "sed": np.zeros(1)}, "seed is missing, must be int64 (1,); sed is not known"),
+    ],
+)
+def test_a_request_that_another_client_got_wrong_is_told(
+    folders: dict[str, Path], changes: dict[str, Any], said: str
+) -> None:
+    policy = loaded(folders["act"])
+    [frame] = frames(policy, 1)
+    tensors = {**policy.preprocess(frame), **changes}
+    with pytest.raises(PolicyError) as told:
+        policy.infer({name: value for name, value in tensors.items() if value is not None})
+    assert str(told.value) == f"the request's tensors: {said}"
+
+
 def test_threads_are_set(folders: dict[str, Path]) -> None:
     policy = LeRobotPolicy(LeRobotPolicyOptions(folders["act"], threads=2, device="cpu"), host_context())
     policy.load()

@@ -56,21 +56,32 @@ class Model:
         self._chunk = torch.compile(self._policy.predict_action_chunk) if options.compile else None
         self._draws = False
         """Whether it draws random numbers, so that each request needs a run with a seed of its own."""
+        self._log = log
         log.info("%s on %s, %d threads", checkpoint.type, self._device, threads)
 
     def warm_up(self, tensors: Tensors) -> None:
         """Run once, and see whether the result is a chunk of actions.
 
         Raises:
-            PolicyError: when it is not, as with a policy that plans step by step.
+            PolicyError: when it fails, or is none, as with a policy that plans step by step.
         """
-        [action] = self.predict([tensors])
+        try:
+            [action] = self.predict([tensors])
+        except Exception as error:
+            raise PolicyError(
+                f"{self._checkpoint.path}: its first run failed: {type(error).__name__}: {error}"
+            ) from error
         size, length = self._checkpoint.action_size, self._checkpoint.chunk_size
         if action.ndim != 3 or action.shape[0] != 1 or action.shape[2] != size or not 1 <= action.shape[1] <= length:
             raise PolicyError(
                 f"{self._checkpoint.path}: {self._checkpoint.type} gives actions of shape {action.shape}, "
                 f"a chunk has (1, up to {length}, {size})"
             )
+        if self._autocast is not None and not np.isfinite(action).all():
+            self._log.warning(
+                "%s: %s overflows %s in a run on zeros; bfloat16 and float32 have a larger range",
+                self._checkpoint.path, self._checkpoint.type, self._autocast,
+            )  # fmt: skip
 
     def predict(self, batch: Sequence[Tensors]) -> list[NDArray[np.float32]]:
         """Chunks, each of shape (1, N, A), of requests whose tensors have equal names and shapes."""

@@ -62,13 +62,21 @@ class LeRobotPolicy(Policy):
         self._pictures: tuple[str, ...] = () if self._pre.others else _pictures(self.spec)
         """Observations that `infer` normalises."""
         self._model: Model | None = None
+        self._taken: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {}
+        """Tensors of a request without a prefix: their dtypes and shapes; -1 stands for any size."""
         self._seed = ctx.seed
 
     @override
     def load(self) -> None:
         check_weights(self._options.path)
         model = _import("model").Model(self._checkpoint, self._options, self._pre, self._pictures, self._ctx.log)
-        model.warm_up(self.preprocess(self._zeros()))
+        tensors = self.preprocess(self._zeros())
+        model.warm_up(tensors)
+        # How long a text is, and what LeRobot's own steps make of it, is not known beforehand.
+        self._taken = {
+            name: (array.dtype, (-1,) * array.ndim if self._pre.others and name != SEED else array.shape)
+            for name, array in tensors.items()
+        }
         self._model = model
 
     @override
@@ -120,6 +128,8 @@ class LeRobotPolicy(Policy):
     def infer_batch(self, batch: Sequence[Tensors]) -> list[Tensors]:
         if self._model is None:
             raise PolicyError(f"{self._options.path} is not loaded: call load() first")
+        for tensors in batch:
+            self._check(tensors)
         return [{ACTION: action} for action in self._model.predict(batch)]
 
     @override
@@ -130,6 +140,31 @@ class LeRobotPolicy(Policy):
         else:
             action = self._post({ACTION: action})[ACTION]
         return action[0, : self.spec.chunk_size].astype(np.float64)
+
+    def _check(self, tensors: Tensors) -> None:
+        """See that a request, which may come from anywhere, has what `preprocess` makes."""
+        taken = dict(self._taken)
+        if self.spec.prompt:
+            taken[TASK] = (np.dtype(np.uint8), (1, -1))
+        if self.spec.prefix and tensors.keys() & {PREFIX, DELAY}:
+            taken[PREFIX] = (np.dtype(np.float32), (1, -1, self._checkpoint.action_size))
+            taken[DELAY] = (np.dtype(np.int64), (1,))
+        wrong = []
+        for name, (dtype, shape) in taken.items():
+            array = tensors.get(name)
+            if array is None or array.dtype != dtype or not _fits(array.shape, shape):
+                got = "is missing" if array is None else f"is {array.dtype} {array.shape}"
+                wrong.append(f"{name} {got}, must be {dtype} {shape}")
+        if not self._pre.others:
+            wrong += [f"{name} is not known" for name in tensors if name not in taken]
+        if not wrong and PREFIX in taken:
+            delay, length, most = int(tensors[DELAY][0]), tensors[PREFIX].shape[1], self._checkpoint.chunk_size
+            if not 0 <= delay <= length <= most:
+                wrong.append(
+                    f"{DELAY} {delay} and a {PREFIX} of {length}: 0 <= {DELAY} <= {length} <= {most} must hold"
+                )
+        if wrong:
+            raise PolicyError(f"the request's tensors: {'; '.join(wrong)}")
 
     def _batch(self, frame: Frame, prefix: NDArray[Any] | None = None) -> dict[str, NDArray[Any]]:
         """A batch of one, as LeRobot makes it of an observation: images (1, C, H, W) from 0 to 1."""
@@ -167,6 +202,11 @@ class LeRobotPolicy(Policy):
 
 def _pictures(spec: PolicySpec) -> tuple[str, ...]:
     return tuple(key for key, shape in spec.observations.items() if len(shape) == 3)
+
+
+def _fits(shape: tuple[int, ...], wanted: tuple[int, ...]) -> bool:
+    """Whether a shape is as wanted, where -1 stands for any size but 0."""
+    return len(shape) == len(wanted) and all(n == m or (m == -1 and n > 0) for n, m in zip(shape, wanted, strict=True))
 
 
 def _seed(episode: int, stamp_ns: int) -> NDArray[np.int64]:

@@ -108,6 +108,17 @@ def test_numbers_are_normalised_and_back(tmp_path: Path) -> None:
     np.testing.assert_allclose(actions, np.tile(2 + np.arange(6), (10, 1)))
 
 
+def test_clients_in_other_languages_are_told_of_every_tensor(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[3] / "docs/reference/wire.md").read_text(encoding="utf-8")
+    policy = make(write(tmp_path / "pi0", type="pi0"))
+    plan = np.zeros((3, 6))
+    tensors = policy.preprocess(frame(prompt="pick", prefix=plan, delay_steps=1))
+    assert tensors.keys() == {STATE, TOP, "seed", "task", "prefix", "delay_steps"}
+    for name in ("seed", "task", "prefix", "delay_steps"):
+        dtype, shape = (cell.strip() for cell in page.partition(f"| `{name}` |")[2].split("|")[:2])
+        assert (tensors[name].dtype, tensors[name].ndim) == (dtype, shape.count(",") + (shape != "(1,)"))
+
+
 def test_history_begins_with_the_oldest_frame_that_there_is(tmp_path: Path) -> None:
     policy = make(write(tmp_path / "diffusion", type="diffusion", n_obs_steps=3, horizon=16))
     past = (frame(0.1), frame(0.2), frame(0.3))
