@@ -174,6 +174,7 @@ class ContractChecks:
                 (*key, "executor"), f"unknown executor {spec.executor!r}{hint(spec.executor, known, 'known')}"
             )
             return spec
+        self._commands(key, spec)
         if any(other.executor == spec.executor for other in earlier):
             self.document.add((*key, "executor"), f"executor {spec.executor!r} has an action already")
         part = self.parts.executors.get(spec.executor)
@@ -183,6 +184,26 @@ class ContractChecks:
             message = f"executor {spec.executor!r} takes goals; an action needs one that streams, such as type position"
             self.document.add((*key, "executor"), message)
         return self._safety(key, spec, part)
+
+    def _commands(self, key: Key, spec: ActionSpec) -> None:
+        """Whether the messages are a robot's own, or said to be of others, and where their numbers are."""
+        own = messages.Float64MultiArray.ros_type
+        if not spec.foreign:
+            if spec.type != own:
+                message = (
+                    f"this robot publishes {own}, not {spec.type!r}; foreign: true takes the commands of bags of others"
+                )
+                self.document.add((*key, "type"), message)
+            elif spec.select:
+                self.document.add(
+                    (*key, "select"), "has a meaning for the commands of bags of others only, with foreign: true"
+                )
+        elif not _TYPE_NAME.fullmatch(spec.type):
+            self.document.add((*key, "type"), f"expected PACKAGE/msg/NAME, got {spec.type!r}")
+        elif not spec.select and spec.type not in (own, messages.JointState.ros_type):
+            example = "points.0.positions.0" if spec.type.endswith("JointTrajectory") else "data.0"
+            message = f"needs a select: paths to numbers of {spec.type}, one for each joint, e.g. {example}"
+            self.document.add(key, message)
 
     def _safety(self, key: Key, spec: ActionSpec, part: Part) -> ActionSpec:
         """One answer to what follows stale setpoints, in both, whether the action or the executor gives it."""

@@ -93,9 +93,9 @@ class ActionSpec:
     executor: str = option(help="the executor that takes it")
     topic: str = option(help="where what the robot was told is published")
     key: str = option("action", choices=("action",), help="the key of the action vector, as in datasets")
-    type: str = option(
-        "std_msgs/msg/Float64MultiArray", choices=("std_msgs/msg/Float64MultiArray",), help="message type"
-    )
+    type: str = option("std_msgs/msg/Float64MultiArray", help="message type; another one needs foreign")
+    foreign: bool = option(False, help="the commands are those in bags of others, not what this robot publishes")
+    select: tuple[str, ...] = option((), help="with foreign: where the numbers are, one for each joint")
     safety_behavior: str = option("hold", choices=("hold", "relax"), help="what follows when the setpoints go stale")
 
 

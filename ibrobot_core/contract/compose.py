@@ -34,6 +34,10 @@ class Composer:
 
     def __init__(self, contract: Contract) -> None:
         self._contract = contract
+        if foreign := [part for part in contract.action_parts if part.select]:
+            raise ContractError(
+                f"{_ACTION}: no {foreign[0].type} can be made, which bags of others have on {foreign[0].topic}"
+            )
         self._topics: dict[str, list[ObservationPart]] = {}
         for part in contract.observation_parts:
             self._topics.setdefault(part.topic, []).append(part)
@@ -101,6 +105,10 @@ def _leaves(part: ObservationPart) -> tuple[Leaf, ...]:
     if part.type not in MESSAGE_TYPES:
         raise ContractError(f"{part.key}: no {part.type} can be made, which only the bags it was read from define")
     leaves = Selection(part.type, part.select).leaves
+    if parts := [leaf.label for leaf in leaves if leaf.kind == "foreign"]:
+        raise ContractError(
+            f"{part.key}: no {part.type} can be made of {', '.join(parts)}: the rest of it is not known"
+        )
     if len(leaves) > 1 and any(leaf.kind == "array" for leaf in leaves):
         raise ContractError(f"{part.key}: where {', '.join(part.select)} begin in a vector cannot be told")
     return leaves

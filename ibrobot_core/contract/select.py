@@ -62,7 +62,8 @@ class Selection:
         select: the paths, in the order of the vector.
         joints: the robot's joints.
         foreign: a type that core does not know is one that bags of others define; then every path, e.g.
-            `wrench.force.x` or `tags.0.id`, is looked up in the messages, and leads to one number.
+            `wrench.force.x` or `tags.0.id`, is looked up in the messages, and leads to one number. So is one into
+            a list of parts of a known type, e.g. `points.0.positions.2`.
 
     Raises:
         ContractError: for an unknown type, or a path that leads to no number of it.
@@ -125,9 +126,24 @@ def _resolve(message_type: type[Any], path: str) -> list[Leaf]:
             return [Leaf(field, "number")]
         elif "ndarray" in str(kind).lower():
             return [_array_leaf(message_type, path, field, rest)]
+        elif typing.get_origin(kind) is tuple and attrs.has(typing.get_args(kind)[0]) and rest:
+            return _part_leaves(typing.get_args(kind)[0], path, field, rest)
         else:
             raise ContractError(f"{path!r} leads to no number of {message_type.__name__}")
     return [leaf for name in attrs.fields_dict(owner) for leaf in _resolve(message_type, f"{path}.{name}")]
+
+
+def _part_leaves(part: type[Any], path: str, field: str, rest: str) -> list[Leaf]:
+    """The leaves below an element of a list of parts; how many there are, only the messages know."""
+    number, _, inner = rest.partition(".")
+    if not (number.isascii() and number.isdigit()):
+        raise ContractError(f"{path!r}: {field} is a list, its elements go by number, e.g. {field}.0")
+    if not inner:
+        raise ContractError(f"{path!r} leads to no number, but to a {part.__name__}")
+    leaves = _resolve(part, inner)
+    if any(leaf.kind == "array" for leaf in leaves):
+        raise ContractError(f"{path!r} is an array, its elements go by number, e.g. {path}.0")
+    return [Leaf(f"{field}.{number}.{leaf.label}", "foreign") for leaf in leaves]
 
 
 def _array_leaf(message_type: type[Any], path: str, field: str, rest: str) -> Leaf:

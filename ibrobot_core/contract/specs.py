@@ -17,7 +17,8 @@ from ibrobot_core.interfaces.dataset import Feature
 from ibrobot_core.messages import MESSAGE_TYPES
 from ibrobot_core.units import NS_PER_S
 
-_KNOWN_TYPES = {"/joint_states": "sensor_msgs/msg/JointState"}
+_JOINTS_TYPE = "sensor_msgs/msg/JointState"
+_KNOWN_TYPES = {"/joint_states": _JOINTS_TYPE}
 _CAMERA_TYPE = "sensor_msgs/msg/Image"
 _COMPRESSED_TYPE = "sensor_msgs/msg/CompressedImage"
 _IMAGE_DTYPES = {"16UC1": "uint16", "32FC1": "float32"}
@@ -48,6 +49,8 @@ class ActionPart:
     type: str
     safety_behavior: str
     joints: tuple[str, ...]
+    select: tuple[str, ...] = ()
+    """Paths to the joints' numbers in messages of others; none where `data` has them, in order."""
 
 
 @attrs.frozen(slots=False)
@@ -100,7 +103,14 @@ class Contract:
                 _recorded_observation(key, part) for key, each in canonical["observations"].items() for part in each
             ]
             actions = [
-                ActionPart(part["topic"], part["topic"], part["type"], "hold", tuple(part["joints"]))
+                ActionPart(
+                    part["topic"],
+                    part["topic"],
+                    part["type"],
+                    "hold",
+                    tuple(part["joints"]),
+                    tuple(part.get("select", ())),
+                )
                 for part in canonical["action"]
             ]
             contract = cls(float(canonical["rate_hz"]), tuple(parts), tuple(actions))
@@ -152,7 +162,11 @@ class Contract:
             "units": "SI",
             "rate_hz": self.rate_hz,
             "observations": {key: [_canonical(p) for p in self.parts(key)] for key in self.observations},
-            "action": [{"topic": p.topic, "type": p.type, "joints": list(p.joints)} for p in self.action_parts],
+            "action": [
+                {"topic": p.topic, "type": p.type, "joints": list(p.joints)}
+                | ({"select": list(p.select)} if p.select else {})
+                for p in self.action_parts
+            ],
         }
 
     def fingerprint(self) -> str:
@@ -254,7 +268,21 @@ def _action(spec: ActionSpec, config: RobotConfig) -> ActionPart:
     if executor is None:
         known = ", ".join(config.executors) or "none"
         raise ContractError(f"{spec.key}: no executor {spec.executor!r}; the executors are: {known}")
-    return ActionPart(executor.name, spec.topic, spec.type, spec.safety_behavior, executor.joints)
+    select = tuple(spec.select)
+    if not select and spec.type == _JOINTS_TYPE:
+        select = tuple(f"position.{joint}" for joint in executor.joints)
+    if select:
+        try:
+            size = Selection(spec.type, select, foreign=spec.foreign).size
+        except ContractError as error:
+            raise ContractError(f"{spec.key}: {spec.topic}: {error}") from None
+        if size != len(executor.joints):
+            told = "a length that only messages know" if size < 0 else f"{size} numbers"
+            raise ContractError(
+                f"{spec.key}: {spec.topic}: select gives {told}, executor {spec.executor!r} has "
+                f"{len(executor.joints)} joints: {', '.join(executor.joints)}"
+            )
+    return ActionPart(executor.name, spec.topic, spec.type, spec.safety_behavior, executor.joints, select)
 
 
 def _joined(features: list[Feature]) -> Feature:

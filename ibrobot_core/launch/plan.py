@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import attrs
 
-from ibrobot_core.config.schema import Share
+from ibrobot_core.config.schema import ActionSpec, ObservationSpec, Share
 from ibrobot_core.errors import ComponentFailed, NotSupported
 from ibrobot_core.launch.builders.control import NAME as CONTROL
 from ibrobot_core.launch.builders.control import Control
@@ -80,7 +80,7 @@ def build_plan(session: Session) -> LaunchPlan:
     """All components of a run, in the order in which they can start.
 
     Raises:
-        NotSupported: for a transport that would not be used, or an observation that no robot can have.
+        NotSupported: for a transport that would not be used, or a contract with topics that only bags of others have.
     """
     config = session.config
     modes = config.control_modes.values()
@@ -92,11 +92,12 @@ def build_plan(session: Session) -> LaunchPlan:
             f"transport: {config.transport.type}: nothing would use it; a model does with execution_mode: distributed, "
             "and topics under share"
         )
-    foreign = next((spec for spec in config.contract.observations if spec.foreign), None)
+    specs: tuple[ObservationSpec | ActionSpec, ...] = (*config.contract.observations, *config.contract.actions)
+    foreign = next((spec for spec in specs if spec.foreign), None)
     if foreign is not None and (config.recording is not None or any(mode.inference for mode in modes)):
         raise NotSupported(
-            f"contract: {foreign.key}: {foreign.type} is foreign, and comes from bags alone: this contract is for "
-            "`ibrobot convert`; a robot's own has no such observation"
+            f"contract: {foreign.key}: {foreign.topic} is foreign, and comes from bags alone: this contract is for "
+            "`ibrobot convert`; a robot's own has nothing of the kind"
         )
     if session.request.lockstep and share.subscribe:
         raise NotSupported("transport.share.subscribe: in lockstep nothing may come from other machines, at any time")

@@ -166,6 +166,35 @@ CASES = {
             "one that streams, such as type position"
         ),
     ),
+    "contract_action_type": (
+        "executor: arm_position, topic",
+        "executor: arm_position, type: sensor_msgs/msg/JointState, topic",
+        (
+            "robot.yaml:38: contract.actions.0.type: this robot publishes std_msgs/msg/Float64MultiArray, not "
+            "'sensor_msgs/msg/JointState'; foreign: true takes the commands of bags of others"
+        ),
+    ),
+    "contract_action_select": (
+        "executor: arm_position, topic",
+        "executor: arm_position, select: [data.1, data.0], topic",
+        (
+            "robot.yaml:38: contract.actions.0.select: has a meaning for the commands of bags of others only, with "
+            "foreign: true"
+        ),
+    ),
+    "contract_foreign_action_whole": (
+        "executor: arm_position, topic",
+        "executor: arm_position, type: trajectory_msgs/msg/JointTrajectory, foreign: true, topic",
+        (
+            "robot.yaml:38: contract.actions.0: needs a select: paths to numbers of "
+            "trajectory_msgs/msg/JointTrajectory, one for each joint, e.g. points.0.positions.0"
+        ),
+    ),
+    "contract_foreign_action_name": (
+        "executor: arm_position, topic",
+        "executor: arm_position, type: JointState, foreign: true, topic",
+        "robot.yaml:38: contract.actions.0.type: expected PACKAGE/msg/NAME, got 'JointState'",
+    ),
     "contract_action_twice": (
         "executor: grip_position, topic",
         "executor: arm_position, topic",

@@ -21,6 +21,8 @@ from ibrobot_core.messages import (
     Int32,
     Int32MultiArray,
     JointState,
+    JointTrajectory,
+    JointTrajectoryPoint,
     Joy,
     Message,
     Pose,
@@ -114,6 +116,9 @@ def test_joint_states_without_a_select_are_the_robots_positions() -> None:
         ("std_msgs/msg/String", ["data"], "'data' leads to no number of String"),
         ("std_msgs/msg/String", [], "String needs a select"),
         ("tf2_msgs/msg/TFMessage", ["transforms.0"], "leads to no number"),
+        ("tf2_msgs/msg/TFMessage", ["transforms.first"], "transforms is a list, its elements go by number"),
+        ("tf2_msgs/msg/TFMessage", ["transforms.0.rotatoin.x"], "has no field 'rotatoin', did you mean 'rotation'"),
+        ("trajectory_msgs/msg/JointTrajectory", ["points.0.positions"], "is an array, its elements go by number"),
     ],
 )
 def test_paths_that_lead_nowhere_are_refused_at_once(type_name: str, select: list[str], message: str) -> None:
@@ -192,3 +197,16 @@ def test_paths_that_lead_to_no_number_of_a_foreign_message(path: str, message: s
 def test_a_type_that_nobody_called_foreign_is_unknown() -> None:
     with pytest.raises(ContractError, match="unknown message type 'lamp_msgs/msg/Touch'"):
         Selection(TOUCH, ["pressure.0"])
+
+
+def test_paths_lead_into_lists_of_parts_of_known_types() -> None:
+    points = tuple(JointTrajectoryPoint(i, positions=[i, i + 0.5]) for i in range(2))
+    selection = Selection("trajectory_msgs/msg/JointTrajectory", ["points.1.positions.1", "points.0.positions.0"])
+    assert selection.size == 2
+    np.testing.assert_array_equal(selection(JointTrajectory(Header(), ("a", "b"), points)), [1.5, 0.0])
+    whole = Selection("tf2_msgs/msg/TFMessage", ["transforms.0.translation"])
+    assert whole.names == tuple(f"transforms.0.translation.{axis}" for axis in "xyz")
+    with pytest.raises(ContractError, match="points has 0 elements, element 1 is asked for"):
+        selection(JointTrajectory(Header(), ("a", "b"), ()))
+    with pytest.raises(ContractError, match="leads to no number of JointTrajectory"):
+        Selection("trajectory_msgs/msg/JointTrajectory", ["points"])

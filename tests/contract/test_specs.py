@@ -95,6 +95,31 @@ def test_a_foreign_type_is_read_back_as_it_was(make_config: Make) -> None:
         Composer(contract)
 
 
+@pytest.mark.parametrize(
+    ("type_", "select", "expected"),
+    [
+        ("sensor_msgs/msg/JointState", (), ("position.gripper",)),
+        ("trajectory_msgs/msg/JointTrajectory", ("points.0.positions.0",), ("points.0.positions.0",)),
+        ("lamp_msgs/msg/Command", ("joints.0.target",), ("joints.0.target",)),
+    ],
+)
+def test_commands_of_others_are_read_back_as_they_were(
+    make_config: Make, type_: str, select: tuple[str, ...], expected: tuple[str, ...]
+) -> None:
+    action = ActionSpec(executor="gripper_position", topic="/told", type=type_, foreign=True, select=select)
+    contract = Contract.from_config(make_config((STATE,), (action,)))
+    assert contract.action_parts[0].select == expected
+    again = Contract.from_canonical(json.loads(json.dumps(contract.canonical())))
+    assert again.fingerprint() == contract.fingerprint()
+    assert again.action_parts[0].select == expected
+    with pytest.raises(ContractError, match=r"action: no .* can be made, which bags of others have on /told"):
+        Composer(contract)
+    with pytest.raises(
+        ContractError, match="select gives 2 numbers, executor 'gripper_position' has 1 joints: gripper"
+    ):
+        Contract.from_config(make_config((STATE,), (attrs.evolve(action, select=expected * 2),)))
+
+
 def test_steps_joints_and_topics(make_config: Make) -> None:
     made = contract(make_config, STATE)
     assert made.step_ns == 33_333_333

@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,15 @@ from recordings import CONTRACT, JOINTS, SIZE, START_NS, numbered, record
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from ibrobot_core.messages import Float64MultiArray, Header, Image, JointState
+from ibrobot_core.messages import (
+    Float64MultiArray,
+    Header,
+    Image,
+    JointState,
+    JointTrajectory,
+    JointTrajectoryPoint,
+    Message,
+)
 from ibrobot_core.recording.convert.run import STAGING
 from ibrobot_core.testing.terminal import Terminal
 
@@ -267,6 +276,40 @@ def test_bags_of_others_by_the_contract_alone(
     np.testing.assert_array_equal(found["action"][:, 0], np.arange(30) + 0.5)
     np.testing.assert_array_equal(found["observation.hue"].ravel(), np.arange(30))
     assert json.loads((tmp_path / "set/meta/info.json").read_bytes())["robot_type"] == "bench_follower"
+
+
+@pytest.mark.parametrize(
+    ("told", "more"),
+    [
+        (lambda i: JointState(Header(0), JOINTS[::-1], [2.0, 1.0, i + 0.5]), ""),
+        (
+            lambda i: JointTrajectory(Header(0), JOINTS, (JointTrajectoryPoint(0, [i + 0.5, 1.0, 2.0]),)),
+            ", select: [points.0.positions.0, points.0.positions.1, points.0.positions.2]",
+        ),
+    ],
+    ids=["leader", "trajectory"],
+)
+def test_commands_of_others_come_as_what_they_are(tmp_path: Path, told: Callable[[int], Message], more: str) -> None:
+    type_ = told(0).ros_type
+    store = get_typestore(Stores.ROS2_JAZZY)
+    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        states = writer.add_connection("/joint_states", JointState.ros_type, typestore=store)
+        commands = writer.add_connection("/commands", type_, typestore=store)
+        for i in range(30):
+            t_ns = START_NS + i * 33_333_333
+            writer.write(states, t_ns, bytes(encode(JointState(Header(t_ns), JOINTS, [i, 1.0, 2.0]))))
+            writer.write(commands, t_ns, bytes(encode(told(i))))
+    robot, _, _ = ROBOT.partition("    - key: observation.images.top")
+    action = f"{{key: action, executor: arm, topic: /commands, type: {type_}, foreign: true{more}}}"
+    (tmp_path / "robot.yaml").write_text(f"{robot}  actions:\n    - {action}\n")
+    config = ("--config", tmp_path / "robot.yaml")
+    result = run(tmp_path / "bag", *config, "--prompt", "wave", "--out", tmp_path / "set")
+    assert result.code == 0, result.err
+    np.testing.assert_array_equal(rows(tmp_path / "set")["action"], [[i + 0.5, 1.0, 2.0] for i in range(30)])
+    again = run(tmp_path / "set", "--to", "bag", "--out", tmp_path / "again")
+    assert again.code == 1
+    assert f"action: no {type_} can be made, which bags of others have on /commands" in again.err
+    assert not (tmp_path / "again").exists()
 
 
 def test_a_bar_moves_on_a_terminal(bags: Path, tmp_path: Path) -> None:

@@ -270,7 +270,7 @@ def test_an_observation_that_only_bags_have_is_refused(runs: Runs):
         "observation.touch", topic="/touch", type="lamp_msgs/msg/Touch", foreign=True, select=("pressure.0",)
     )
     contract = attrs.evolve(session.config.contract, observations=(touch,))
-    with pytest.raises(NotSupported, match=r"contract: observation\.touch: lamp_msgs/msg/Touch is foreign"):
+    with pytest.raises(NotSupported, match=r"contract: observation\.touch: /touch is foreign"):
         Runtime(Session(attrs.evolve(session.config, contract=contract), session.registry, session.request))
 
 

@@ -32,7 +32,7 @@ def with_action(contract: Contract) -> Contract:
     """
     features = {part.topic: Feature("float32", (len(part.joints),)) for part in contract.action_parts}
     parts = tuple(
-        ObservationPart(ACTION, part.topic, part.type, ("data",), None, _COMMAND, features[part.topic])
+        ObservationPart(ACTION, part.topic, part.type, part.select or ("data",), None, _COMMAND, features[part.topic])
         for part in contract.action_parts
     )
     return attrs.evolve(contract, observation_parts=(*contract.observation_parts, *parts), action_parts=())
