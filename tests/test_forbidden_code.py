@@ -9,38 +9,54 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-FOLDERS = ("ibrobot_core", "plugins", "benchmarks", "docs")
+FOLDERS = ("ibrobot_core", "plugins", "benchmarks", "docs", "tests")
 MODULES = {"pickle", "cPickle", "_pickle", "dill", "cloudpickle", "joblib", "marshal", "shelve"}
 CALLS = {"eval", "exec", "compile", "__import__"}
+METHODS = {"unsafe_load", "full_load", "unsafe_load_all", "full_load_all", "read_pickle", "to_pickle", "Unpickler"}
+UNSAFE = (("weights_only", False), ("allow_pickle", True))
+LOADERS = {"SafeLoader", "CSafeLoader"}
 
 
 def offences(source: str) -> Iterator[str]:
     """What there is in a module that could run what a stranger sent, with its line."""
     for node in ast.walk(ast.parse(source)):
-        names: list[str] = []
+        found: list[str] = []
         match node:
             case ast.Import(names=aliases):
-                names = [alias.name for alias in aliases]
+                found = _imported(*(alias.name for alias in aliases))
             case ast.ImportFrom(module=str(module)):
-                names = [module]
-            case ast.Call(func=ast.Name(id=name)) if name in CALLS:
-                yield f"line {node.lineno}: {name}()"
-            case ast.Call(func=ast.Attribute(value=ast.Name(id="torch"), attr="load"), keywords=keywords):
-                safe = [k for k in keywords if k.arg == "weights_only" and getattr(k.value, "value", None) is True]
-                if not safe:
-                    yield f"line {node.lineno}: torch.load without weights_only=True"
-            case ast.Call(keywords=keywords):
-                for keyword in keywords:
-                    value = getattr(keyword.value, "value", None)
-                    if (keyword.arg, value) in (("weights_only", False), ("allow_pickle", True)):
-                        yield f"line {node.lineno}: {keyword.arg}={value}"
-        for name in names:
-            if name.split(".")[0] in MODULES:
-                yield f"line {node.lineno}: import {name}"
+                found = _imported(module)
+            case ast.Call(func=ast.Attribute(attr="import_module"), args=[ast.Constant(value=str(module))]):
+                found = _imported(module)
+            case ast.Call():
+                found = _called(node)
+        yield from (f"line {node.lineno}: {each}" for each in found)  # type: ignore[attr-defined]
+
+
+def _imported(*modules: str) -> list[str]:
+    return [f"import {module}" for module in modules if module.split(".")[0] in MODULES]
+
+
+def _called(call: ast.Call) -> list[str]:
+    given = {keyword.arg: getattr(keyword.value, "value", None) for keyword in call.keywords}
+    found = [f"{name}={value}" for name, value in UNSAFE if (name, value) in given.items()]
+    match call.func:
+        case ast.Name(id=name) if name in CALLS:
+            found.append(f"{name}()")
+        case ast.Attribute(attr=name) if name in METHODS:
+            found.append(f"{name}()")
+        case ast.Attribute(value=ast.Name(id="torch"), attr="load") if given.get("weights_only") is not True:
+            found.append("torch.load without weights_only=True")
+        case ast.Attribute(value=ast.Name(id="yaml"), attr="load"):
+            names = {getattr(part, "attr", None) or getattr(part, "id", None) for part in ast.walk(call)}
+            if not names & LOADERS:
+                found.append("yaml.load without SafeLoader")
+    return found
 
 
 def sources() -> list[Path]:
-    return sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py") if ".venv" not in path.parts)
+    found = [path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py") if ".venv" not in path.parts]
+    return sorted([*found, *ROOT.glob("*.py")])
 
 
 def test_nothing_unpickles_or_evaluates():
@@ -61,12 +77,26 @@ def test_nothing_unpickles_or_evaluates():
         "torch.load(path, weights_only=False)",
         "load(path, weights_only=False)",
         "np.load(path, allow_pickle=True)",
+        "yaml.load(text, yaml.Loader)",
+        "yaml.load(text)",
+        "yaml.unsafe_load(text)",
+        "pandas.read_pickle(path)",
+        "importlib.import_module('pickle')",
     ],
 )
 def test_the_check_finds_it(source: str):
     assert list(offences(source))
 
 
-@pytest.mark.parametrize("source", ["torch.load(path, weights_only=True)", "re.compile(text)", "evaluate(x)"])
+@pytest.mark.parametrize(
+    "source",
+    [
+        "torch.load(path, weights_only=True)",
+        "re.compile(text)",
+        "evaluate(x)",
+        "yaml.load(text, Loader=yaml.SafeLoader)",
+        "importlib.import_module(name)",
+    ],
+)
 def test_the_check_lets_the_rest_be(source: str):
     assert not list(offences(source))

@@ -67,9 +67,6 @@ def serve(what: str, **options: Any) -> None:
     handler.setFormatter(logging.Formatter("%(levelname).1s %(message)s"))
     logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
     logging.getLogger("ibrobot").setLevel(logging.INFO)
-    stopping = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stopping.set())
     name, policy, make_transport = (
         _from_folder(Path(what), registry, options) if options["type_"] else _from_config(what, registry, options)
     )
@@ -78,6 +75,9 @@ def serve(what: str, **options: Any) -> None:
         begun_s = time.monotonic()
         policy.load()
         logging.getLogger("ibrobot").info("%s loaded in %.1f s", name, time.monotonic() - begun_s)
+        stopping = threading.Event()  # only from now on: until here either signal ends it at once
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: stopping.set())
         transport = make_transport()
         limits = ServiceOptions(options["batch"], options["queue"], options["patience"] / 1000)
         service = InferenceService(policy, transport, name, limits, policy.picture_codec())

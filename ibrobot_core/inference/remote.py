@@ -135,4 +135,8 @@ class RemoteEngine(Engine):
             if known[field] != ours.get(field):
                 lines.append(f"  {field}\n      robot: {ours.get(field)}\n     server: {known[field]}")
         lines.append(f"  fingerprint\n      robot: {self._fingerprint}\n     server: {health.get('fingerprint')}")
+        if len(lines) == 2:  # the fingerprint alone
+            lines.append(
+                "  they look alike, but files or options differ, e.g. statistics: copy the server's, without weights"
+            )
         return "\n".join(lines)

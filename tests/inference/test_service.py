@@ -294,8 +294,20 @@ def test_the_engine_tells_both_sides_where_the_policies_differ():
         with pytest.raises(ContractError, match=r"chunk_size\n +robot: 99\n +server: 10") as caught:
             remote.start()
         assert "observations" not in str(caught.value)
+        assert "look alike" not in str(caught.value)
         with pytest.raises(PolicyError, match="another policy"):
             remote.infer({"x": np.zeros(1)}, 1, deadline())
+
+
+def test_policies_that_differ_in_their_files_alone_are_told(monkeypatch: pytest.MonkeyPatch):
+    other = Net()
+    monkeypatch.setattr(other, "fingerprint", lambda: "0ther")
+    with (
+        served() as cloud,
+        engine(cloud, other) as remote,
+        pytest.raises(ContractError, match=r"robot: 0ther\n +server: \w+\n +they look alike, but files or options"),
+    ):
+        remote.start()
 
 
 def test_the_engine_says_that_nobody_serves_its_model():

@@ -9,6 +9,7 @@ import pytest
 
 from ibrobot_core.errors import ConfigError, NotSupported
 from ibrobot_core.messages import Bool, String
+from ibrobot_core.units import NS_PER_S
 
 if TYPE_CHECKING:
     from conftest import Runs, Site
@@ -82,6 +83,18 @@ def test_what_is_published_goes_out(runs: Runs, network: None):
     assert {topic for topic, *_ in sent} == {"/joint_states", "/note"}
     runtime.stop()
     assert made().closed
+
+
+def test_a_topic_that_nothing_publishes_is_told_once(runs: Runs, network: None, caplog: pytest.LogCaptureFixture):
+    runtime = runs.start("transport={type: network, share: {publish: [/joint_state, /joint_states]}}")
+    while runtime.session.clock.now_ns() < 4 * NS_PER_S:
+        runtime.step()
+    assert "is not shared" not in caplog.text
+    for _ in range(300):
+        runtime.step()
+    runtime.stop()
+    said = "/joint_state is not shared: nothing publishes it so far, did you mean '/joint_states'?"
+    assert [said] == [record.message for record in caplog.records if "is not shared" in record.message]
 
 
 def test_a_network_that_refuses_is_told_once(runs: Runs, network: None, caplog: pytest.LogCaptureFixture):

@@ -6,15 +6,20 @@ from collections.abc import Callable
 from typing import override
 
 from ibrobot_core.bus import Subscription
+from ibrobot_core.config.convert import hint
 from ibrobot_core.errors import IbrobotError, NotSupported
 from ibrobot_core.interfaces import TopicTransport
 from ibrobot_core.launch.builders.transport import NAME as TRANSPORT
 from ibrobot_core.launch.component import Component, Worker
 from ibrobot_core.launch.session import Session
 from ibrobot_core.messages import Message
+from ibrobot_core.units import NS_PER_S
 
 _DEPTH = 10
 """Messages of a topic that may wait for the network; beyond, the oldest is dropped and counted by the bus."""
+
+_SILENT_NS = 5 * NS_PER_S
+"""A topic without any message for so long after the start is told of, once [ns]."""
 
 
 def _topics(session: Session) -> TopicTransport:
@@ -36,16 +41,24 @@ class PublishedTopic(Worker):
         self._topic = topic
         self._waiting: Subscription | None = None
         self._told = False
+        self._silent_from_ns: int | None = None
 
     @override
     def setup(self) -> None:
         self._transport = _topics(self._session)
+        self._silent_from_ns = self._session.clock.now_ns()
         self._waiting = self._session.bus.subscribe(self._topic, _DEPTH)
 
     @override
     def work(self, timeout_s: float) -> None:
         assert self._waiting is not None
         received = self._waiting.get(timeout_s)
+        if received is not None:
+            self._silent_from_ns = None
+        elif self._silent_from_ns is not None and self._session.clock.now_ns() - self._silent_from_ns > _SILENT_NS:
+            self._silent_from_ns = None
+            known = hint(self._topic, list(self._session.bus.topics()), "topics here")
+            self._session.log.warning("%s is not shared: nothing publishes it so far%s", self._topic, known)
         while received is not None:
             self._send(received.message)
             received = self._waiting.get()
