@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import attrs
@@ -205,6 +206,18 @@ class Checks:
         topics: Any = self.parts.recording.keys.topics if self.parts.recording else ()
         if isinstance(topics, str) and topics not in ("contract", "all"):
             self.document.add(("recording", "topics"), f"{topics!r} is not one of: contract, all, or a list of topics")
+        elif not topics and self.parts.recording:
+            self.document.add(
+                ("recording", "topics"), "names no topic; contract takes those of the contract, all every one"
+            )
+        for i, topic in enumerate(topics if isinstance(topics, tuple) else ()):
+            if not topic.startswith("/"):
+                message = f"{topic!r} is no full name of a topic, did you mean '/{topic}'?"
+                self.document.add(("recording", "topics", i), message)
+        dataset = Path(self.parts.recording.keys.dataset) if self.parts.recording else Path("default")
+        if dataset.is_absolute() or ".." in dataset.parts or not dataset.parts:
+            message = f"{str(dataset)!r} does not lie below recording.root; give a folder's name, e.g. pick_cube"
+            self.document.add(("recording", "dataset"), message)
 
 
 def streams(part: Part) -> bool:

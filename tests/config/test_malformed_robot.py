@@ -281,6 +281,24 @@ CASES = {
         "recording: {type: log, topics: everything}",
         "robot.yaml:40: recording.topics: 'everything' is not one of: contract, all, or a list of topics",
     ),
+    "recording_no_topics": (
+        "recording: {type: log}",
+        "recording: {type: log, topics: []}",
+        "robot.yaml:40: recording.topics: names no topic; contract takes those of the contract, all every one",
+    ),
+    "recording_topic_name": (
+        "recording: {type: log}",
+        "recording: {type: log, topics: [/tf, joint_states]}",
+        ("robot.yaml:40: recording.topics.1: 'joint_states' is no full name of a topic, did you mean '/joint_states'?"),
+    ),
+    "recording_dataset_outside": (
+        "recording: {type: log}",
+        "recording: {type: log, dataset: ../pick}",
+        (
+            "robot.yaml:40: recording.dataset: '../pick' does not lie below recording.root; give a folder's name, "
+            "e.g. pick_cube"
+        ),
+    ),
 }
 
 

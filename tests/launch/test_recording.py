@@ -190,3 +190,17 @@ def test_messages_that_were_lost_on_the_way_are_told_by_topic(runs: Runs, monkey
     assert written["/few"] + lost["/few"] == 10
     assert written["/many"] + lost.get("/many", 0) == 45
     assert lost.keys() <= {"/few", "/many"}
+
+
+def test_a_listed_topic_that_nobody_publishes_is_told_once(
+    runs: Runs, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+):
+    runtime, _ = note(runs, monkeypatch, "[/joint_states, /joint_stats]")
+    for _ in range(2):
+        runtime.plan.episodes.begin()
+        ticks(runtime, 3)
+        runtime.plan.episodes.end("success")
+        ticks(runtime, 1)
+    told = "recording.topics: nothing of /joint_stats has come so far, nor was recorded; there are: "
+    assert caplog.text.count(told) == 1
+    assert "/joint_states" in caplog.text.partition(told)[2]

@@ -82,6 +82,7 @@ class Recording(Worker):
         """Topic -> size of a message of it [bytes], measured once an episode, since pictures may have to be encoded."""
         self._lost: Mapping[str, int] = {}
         """Topic -> messages lost on the way here, before the present episode."""
+        self._told_absent = False
         self._whole = 0
         self._hoped = 0
         """Episodes kept whole, and those that have ended and are not written to their ends yet."""
@@ -209,6 +210,7 @@ class Recording(Worker):
             with self._order:
                 self._hoped -= order.hoped
                 self._whole += order.hoped and whole
+            self._tell_absent()
 
     def _finish(self, recorder: Recorder, end: EpisodeEnd) -> bool:
         """End the open episode, if any; whether it is whole."""
@@ -244,6 +246,18 @@ class Recording(Worker):
         session.registry.emit(
             "ibrobot_fault_raised", robot=session.config.robot.name, fault=fault, stamp_ns=session.clock.now_ns()
         )
+
+    def _tell_absent(self) -> None:
+        """Say once, after the first episode, which listed topics never came: a misspelt one never will."""
+        listed = self._config.topics if isinstance(self._config.topics, tuple) else ()
+        absent = [topic for topic in listed if topic not in self._seen]
+        if absent and not self._told_absent:
+            self._told_absent = True
+            there = ", ".join(self._session.bus.topics())
+            self._session.log.warning(
+                "recording.topics: nothing of %s has come so far, nor was recorded; there are: %s",
+                ", ".join(absent), there,
+            )  # fmt: skip
 
     def _keeps(self, topic: str) -> bool:
         return is_kept(topic, self._config, self._contract)

@@ -35,7 +35,7 @@ def problems_of(path: Path, longest_gap: float) -> list[str]:
     last_header: dict[str, int] = {}
     back: dict[str, int] = defaultdict(int)
     try:
-        summary = reader.summary()
+        summary, repeated = reader.summary(), reader.repeated()
         if not summary.finished:
             problems.append("unfinished; `ibrobot episodes repair` makes it whole")
         for item in reader.messages():
@@ -51,8 +51,9 @@ def problems_of(path: Path, longest_gap: float) -> list[str]:
     absent = [topic for topic in _required(summary.metadata) if not stamps[topic]]
     problems += [f"no message of {topic}, which its contract has" for topic in absent]
     for topic, stated in stated_counts(path / METADATA).items():
-        if stated != len(stamps[topic]):
-            problems.append(f"{topic}: {len(stamps[topic])} messages, {METADATA} says {stated}")
+        found = len(stamps[topic]) + repeated.get(topic, 0)
+        if stated != found:
+            problems.append(f"{topic}: {found} messages, {METADATA} says {stated}")
     for topic, known in summary.topics.items():
         if known.dropped:
             problems.append(f"{topic}: {known.dropped} messages were lost while recording")

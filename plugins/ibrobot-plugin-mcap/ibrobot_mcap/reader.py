@@ -85,6 +85,10 @@ class Rosbag2Reader(EpisodeReader):
             type_hash = ""  # a definition that only others can read
         return Topic(topic, type_, topic in source.latched, definition, type_hash)
 
+    def repeated(self) -> Mapping[str, int]:
+        """Topic -> copies in the later files of a split episode, which `messages` passes over."""
+        return self._source.repeated
+
     def compression(self) -> str:
         """Of its chunks, as the recorder's option has it; `none` where that has no such."""
         return self._source.compression if self._source.compression in COMPRESSIONS else "none"

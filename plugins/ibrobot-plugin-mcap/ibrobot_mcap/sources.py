@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import heapq
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import override
@@ -42,6 +43,8 @@ class Source(ABC):
     """Type -> its definition, where the bag has it."""
     compression: str = ""
     """Of the first chunk: `zstd`, `lz4`, or none."""
+    repeated: Mapping[str, int] = {}
+    """Topic -> copies in later files, which `counts` and `messages` leave out."""
     latched: frozenset[str] = frozenset()
     """Topics that were offered as transient local."""
     start_ns: int
@@ -101,6 +104,12 @@ class McapSource(Source):
             for key, count in block.counts.items():
                 counts[self._files[number].channels[key].topic] += count
         self.types, self.counts, self.custom = types, counts, {}
+        copies: Counter[str] = Counter()
+        for number, file in enumerate(self._files):
+            for block in file.blocks if number else ():
+                if block.repeated:
+                    copies.update({file.channels[key].topic: count for key, count in block.counts.items()})
+        self.repeated = copies
 
     @override
     def messages(self, topics: Collection[str]) -> Iterator[Raw]:

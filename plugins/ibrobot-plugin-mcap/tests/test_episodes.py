@@ -21,7 +21,7 @@ from rosbags.rosbag2 import Writer as RosbagsWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from ibrobot_core.errors import RecorderError
-from ibrobot_core.messages import JointState
+from ibrobot_core.messages import JointState, String
 
 from .conftest import CAMERA, JOINTS, Bench, joints, picture, stamp
 
@@ -152,6 +152,20 @@ def test_verify_says_what_is_wrong(tmp_path):
     assert "100 messages, metadata.yaml says 101" in run("verify", good, code=1)
     unfinish(good)
     assert "unfinished" in run("verify", good, code=1)
+
+
+def test_verify_counts_the_latched_messages_that_every_file_repeats(tmp_path):
+    bench = Bench(tmp_path, split_duration=0.2)
+    bench.ctx.bus.publish("/robot_description", String("<urdf/>"), latched=True)
+    bench.begin()
+    bench.recorder.write("/robot_description", String("<urdf/>"), stamp(0))
+    bench.write(100)
+    bench.end()
+    assert len(list(bench.path.glob("*.mcap"))) == 5
+    assert run("verify", bench.path) == f"{bench.path}: good\n"
+    text = (bench.path / "metadata.yaml").read_text()
+    (bench.path / "metadata.yaml").write_text(text.replace("message_count: 5\n", "message_count: 4\n"))
+    assert "/robot_description: 5 messages, metadata.yaml says 4" in run("verify", bench.path, code=1)
 
 
 def test_trim_copies_a_part(tmp_path):

@@ -29,7 +29,8 @@ def info(episode: Path, as_json: bool) -> None:
     console = Console(width=None if sys.stdout.isatty() else 1000)
     state = summary.outcome if summary.finished else "unfinished; `ibrobot episodes repair` makes it whole"
     console.print(f"{episode}: {state}", soft_wrap=True)
-    console.print(f"{date_of(summary)} UTC, {duration_s(summary):.2f} s, {told_size(size_of(episode))}")
+    began = f"{date_of(summary)} UTC" if date_of(summary) else "no messages"
+    console.print(f"{began}, {duration_s(summary):.2f} s, {told_size(size_of(episode))}")
     table = Table(box=None, padding=(0, 1))
     for heading in ("topic", "type", "messages", "Hz", "lost"):
         # Names are folded rather than cut: `export` wants them whole.
