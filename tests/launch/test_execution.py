@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import attrs
 import numpy as np
 import pytest
 
@@ -92,6 +93,28 @@ def test_the_plan_to_be_continued_travels_with_the_request(mode: str, runs: Runs
     finally:
         service.close()
         type(network).__mro__[1].close(network)
+
+
+def test_a_prompt_is_there_where_the_policy_wants_one(
+    runs: Runs, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+):
+    prompt = "control_modes.policy.inference.prompt=pick up the cube"
+    runs.start(prompt).stop()
+    assert "control_modes.policy.inference.prompt: model 'net' takes no prompt" in caplog.text
+    make = runs.parts.Net.__init__
+
+    def wants_a_prompt(self: Any, *arguments: Any, **options: Any) -> None:
+        make(self, *arguments, **options)
+        self.spec = attrs.evolve(self.spec, prompt=True)
+
+    monkeypatch.setattr(runs.parts.Net, "__init__", wants_a_prompt)
+    with pytest.raises(
+        ComponentFailed, match=r"control_modes\.policy\.inference\.prompt: is missing; model 'net' wants"
+    ):
+        runs.start()
+    caplog.clear()
+    runs.start(prompt).stop()
+    assert "takes no prompt" not in caplog.text
 
 
 def test_the_status_and_the_diagnostics_tell_how_the_plan_is_kept_filled(runs: Runs):

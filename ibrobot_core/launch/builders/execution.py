@@ -67,10 +67,18 @@ class Model(Component):
             ) from None
         for mode in session.config.control_modes.values():
             if mode.inference is not None and mode.inference.model == model.name:
+                where = f"{session.config.source}: control_modes.{mode.name}"
                 try:
                     check_strategy(mode.dispatch, policy.spec)
                 except ContractError as error:
-                    raise ContractError(f"{session.config.source}: control_modes.{mode.name}.{error}") from None
+                    raise ContractError(f"{where}.{error}") from None
+                if policy.spec.prompt and not mode.inference.prompt:
+                    raise ContractError(
+                        f"{where}.inference.prompt: is missing; model {model.name!r} wants to be told what to do, "
+                        "e.g. prompt: put the cube into the bin"
+                    )
+                if mode.inference.prompt and not policy.spec.prompt:
+                    session.log.warning("%s.inference.prompt: model %r takes no prompt", where, model.name)
         if model.norm_mode != "radians":
             policy = PolicyInItsUnits(policy, self._units())
         self._policy = policy

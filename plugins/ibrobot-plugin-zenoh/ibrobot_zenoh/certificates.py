@@ -36,7 +36,7 @@ class Authority:
         days: how long what is made here is valid.
 
     Raises:
-        TransportError: when only one of the two is there, or they cannot be read.
+        TransportError: when only one of the two is there, they cannot be read, or the authority has expired.
     """
 
     def __init__(self, folder: Path, days: int) -> None:
@@ -59,6 +59,14 @@ class Authority:
         if not isinstance(loaded, ec.EllipticCurvePrivateKey) or loaded.public_key() != self._certificate.public_key():
             raise TransportError(f"{key}: not the key of {certificate}")
         self._key = loaded
+        end = self._certificate.not_valid_after_utc
+        if end < datetime.now(UTC):
+            raise TransportError(f"{certificate}: has expired on {end:%Y-%m-%d}; make all anew in another folder")
+
+    @property
+    def ends(self) -> datetime:
+        """When what is made now is not valid any more: no later than the authority itself."""
+        return min(self._certificate.not_valid_after_utc, datetime.now(UTC) + timedelta(days=self._days))
 
     def issue(self, name: str, hosts: Sequence[str] = ()) -> Path:
         """Make a folder `name` with `ca.pem`, `certificate.pem` and `key.pem`.
@@ -115,7 +123,7 @@ class Authority:
             .public_key(key.public_key())
             .serial_number(x509.random_serial_number())
             .not_valid_before(now - _EARLY)
-            .not_valid_after(now + timedelta(days=self._days))
+            .not_valid_after(now + timedelta(days=self._days) if key is self._key else self.ends)
         )
 
 

@@ -6,6 +6,7 @@ import json
 import queue
 import stat
 import threading
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import yaml
 import zenoh
 from click.testing import CliRunner, Result
 from cryptography import x509
+from ibrobot_zenoh.certificates import Authority
 from ibrobot_zenoh.commands.certs import certs
 from ibrobot_zenoh.options import Tls
 from ibrobot_zenoh.reasons import why_not
@@ -232,6 +234,23 @@ def test_the_same_authority_signs_what_comes_later(lab: Path):
     before = (lab / "ca.pem").read_bytes()
     assert "signed by the authority" in run(lab, "--robot", "robot9").output
     assert (lab / "ca.pem").read_bytes() == (lab / "robot9/ca.pem").read_bytes() == before
+
+
+def test_nothing_is_valid_for_longer_than_its_authority(tmp_path: Path):
+    first = run(tmp_path, "--robot", "robot1", "--days", "10")
+    later = run(tmp_path, "--robot", "robot2", "--days", "100")
+    ends = [each.output.partition("all is valid until ")[2][:10] for each in (first, later)]
+    assert ends[0] == ends[1] == f"{datetime.now(UTC) + timedelta(days=10):%Y-%m-%d}"
+    made = [
+        x509.load_pem_x509_certificate((tmp_path / name).read_bytes()) for name in ("ca.pem", "robot2/certificate.pem")
+    ]
+    assert made[0].not_valid_after_utc == made[1].not_valid_after_utc
+
+
+def test_an_authority_that_has_expired_signs_nothing(tmp_path: Path):
+    Authority(tmp_path, days=-1)
+    with pytest.raises(TransportError, match=r"ca\.pem: has expired on 20\d\d-\d\d-\d\d; make all anew"):
+        Authority(tmp_path, days=10)
 
 
 def test_nothing_is_overwritten(lab: Path):

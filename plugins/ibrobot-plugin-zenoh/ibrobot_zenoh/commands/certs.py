@@ -36,20 +36,19 @@ def certs(out_dir: Path, servers: tuple[str, ...], robots: tuple[str, ...], days
     if taken:
         raise TransportError(f"{out_dir / taken[0]} is there already, or named twice; nothing is overwritten")
     try:
-        _make(out_dir, days, hosts, robots)
+        authority = Authority(out_dir, days)
+        made = [authority.issue(name, hosts.get(name, ())) for name in machines]
     except OSError as error:
         raise TransportError(f"{error.filename or out_dir}: cannot be written: {error.strerror}") from error
-
-
-def _make(out_dir: Path, days: int, hosts: dict[str, list[str]], robots: tuple[str, ...]) -> None:
-    authority = Authority(out_dir, days)
-    click.echo(f"{'made' if authority.is_new else 'signed by'} the authority {out_dir / CA}")
-    for name, names in hosts.items():
-        _tell(authority.issue(name, names), "mode: router", f"listen: [tls/0.0.0.0:{_PORT}]")
+    told = "made" if authority.is_new else "signed by"
+    click.echo(f"{told} the authority {out_dir / CA}; all is valid until {authority.ends:%Y-%m-%d}")
     server = next(iter(hosts), "SERVER")
     endpoint = f'"tls/[{server}]:{_PORT}"' if ":" in server else f"tls/{server}:{_PORT}"
-    for name in robots:
-        _tell(authority.issue(name), f"connect: [{endpoint}]")
+    for name, folder in zip(machines, made, strict=True):
+        if name in hosts:
+            _tell(folder, "mode: router", f"listen: [tls/0.0.0.0:{_PORT}]")
+        else:
+            _tell(folder, f"connect: [{endpoint}]")
 
 
 def _tell(folder: Path, *lines: str) -> None:

@@ -50,7 +50,10 @@ def _command(function: Callable[..., None]) -> click.Command:
 @click.option("--types", is_flag=True, help="With message types, and how many publish and listen.")
 def list_(transport: ZenohTransport, types: bool) -> None:
     """List the topics that are shared now."""
-    for found in transport.shared_topics(_LIST_S):
+    shared = transport.shared_topics(_LIST_S)
+    if not shared:
+        click.echo("no topics are shared there now", err=True)
+    for found in shared:
         counts = f"  {found.type}  published by {found.publishers}, heard by {found.subscribers} ROS 2 nodes"
         click.echo(f"{found.name}{counts if types else ''}")
 
