@@ -35,14 +35,15 @@ _ACTION = {"action": PolicyFeature(FeatureType.ACTION, (SIZE,))}
 _OF_TYPE = {STATE: FeatureType.STATE, TOP: FeatureType.VISUAL, WRIST: FeatureType.VISUAL, SCENE: FeatureType.ENV}
 
 
-def _features(*keys: str) -> dict[str, Any]:
+def features(*keys: str) -> dict[str, Any]:
+    """A configuration's features, on the CPU."""
     return {"input_features": {key: _FEATURES[key] for key in keys}, "output_features": _ACTION, "device": "cpu"}
 
 
 def act(**changes: Any) -> ACTConfig:
     """Two cameras, state and scene."""
     small = {"dim_model": 32, "n_heads": 2, "dim_feedforward": 32, "n_encoder_layers": 1, "n_vae_encoder_layers": 1}
-    given = _features(STATE, TOP, WRIST, SCENE) | small | {"chunk_size": CHUNK, "n_action_steps": CHUNK} | changes
+    given = features(STATE, TOP, WRIST, SCENE) | small | {"chunk_size": CHUNK, "n_action_steps": CHUNK} | changes
     return ACTConfig(pretrained_backbone_weights=None, **given)
 
 
@@ -50,7 +51,7 @@ def diffusion(**changes: Any) -> DiffusionConfig:
     """Two cameras; three observations of history, and five of sixteen actions."""
     small = {"down_dims": (16, 32), "diffusion_step_embed_dim": 16, "spatial_softmax_num_keypoints": 4}
     steps = {"n_obs_steps": 3, "horizon": 16, "n_action_steps": 5, "num_inference_steps": 3, "n_groups": 4}
-    given = _features(STATE, TOP, WRIST) | small | steps | changes
+    given = features(STATE, TOP, WRIST) | small | steps | changes
     return DiffusionConfig(pretrained_backbone_weights=None, **given)
 
 
@@ -60,7 +61,7 @@ def vqbet(**changes: Any) -> VQBeTConfig:
         "gpt_n_layer": 1, "gpt_n_head": 2, "gpt_hidden_dim": 32, "gpt_input_dim": 32, "gpt_output_dim": 32,
         "vqvae_embedding_dim": 16, "vqvae_enc_hidden_dim": 16, "offset_loss_weight": 1.0,
     }  # fmt: skip
-    given = _features(STATE, TOP) | small | {"crop_shape": (84, 84)} | changes
+    given = features(STATE, TOP) | small | {"crop_shape": (84, 84)} | changes
     return VQBeTConfig(pretrained_backbone_weights=None, **given)
 
 
@@ -178,7 +179,5 @@ def language_model(path: Path) -> Path:
 def smolvla(language: Path, **changes: Any) -> SmolVLAConfig:
     """One camera and a prompt."""
     small = {"num_vlm_layers": 2, "num_steps": 3, "resize_imgs_with_padding": (32, 32), "max_state_dim": 8}
-    given = (
-        _features(STATE, TOP) | small | {"chunk_size": CHUNK, "n_action_steps": CHUNK, "max_action_dim": 8} | changes
-    )
+    given = features(STATE, TOP) | small | {"chunk_size": CHUNK, "n_action_steps": CHUNK, "max_action_dim": 8} | changes
     return SmolVLAConfig(vlm_model_name=str(language), **given)

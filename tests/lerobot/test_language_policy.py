@@ -15,7 +15,13 @@ import torch
 from ibrobot_lerobot.checkpoint import ACTION
 from ibrobot_lerobot.options import LeRobotPolicyOptions
 from ibrobot_lerobot.policy import SEED, LeRobotPolicy
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies import make_pre_post_processors
+from lerobot.policies.pi0.configuration_pi0 import PI0Config
+from lerobot.policies.pi05.configuration_pi05 import PI05Config
 from lerobot.policies.rtc.configuration_rtc import RTCConfig
+from lerobot.policies.utils import prepare_observation_for_inference
+from lerobot.processor import tokenizer_processor
 
 from ibrobot_core.errors import PolicyError
 from ibrobot_core.interfaces import Frame
@@ -23,7 +29,7 @@ from ibrobot_core.testing import PolicySuite
 from ibrobot_core.testing.contexts import START_NS, host_context
 
 sys.path.insert(0, str(Path(__file__).parent))
-from checkpoints import CHUNK, SIZE, STATE, TOP, Theirs, language_model, save, smolvla
+from checkpoints import CHUNK, SIZE, STATE, TOP, Theirs, features, language_model, save, smolvla, statistics
 
 pytestmark = [pytest.mark.lerobot, pytest.mark.filterwarnings("default")]  # transformers warns of its own
 
@@ -100,6 +106,32 @@ def test_a_plan_that_is_none_is_told(policy: LeRobotPolicy, prefix: Any, delay: 
     with pytest.raises(PolicyError) as told:
         policy.infer(tensors)
     assert said in str(told.value)
+
+
+@pytest.mark.parametrize("name", ["pi0", "pi05"])
+def test_the_robots_side_of_pi0(name: str, path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its network is too large to make one here; its processors are not."""
+    config = {"pi0": PI0Config, "pi05": PI05Config}[name](**features(STATE, TOP))
+    step = tokenizer_processor.TokenizerProcessorStep
+    monkeypatch.setattr(
+        f"lerobot.policies.{name}.processor_{name}.TokenizerProcessorStep",
+        lambda tokenizer_name, **options: step(tokenizer_name=str(path.parent / "vlm"), **options),
+    )
+    config.save_pretrained(tmp_path)
+    for processor in make_pre_post_processors(config, dataset_stats=statistics()):
+        processor.save_pretrained(tmp_path)
+    policy = LeRobotPolicy(LeRobotPolicyOptions(tmp_path), host_context())
+    assert (policy.spec.chunk_size, policy.spec.prompt, policy.spec.prefix) == (50, True, True)
+    tensors = policy.preprocess(frame())
+    pre, _ = make_pre_post_processors(PreTrainedConfig.from_pretrained(tmp_path), pretrained_path=str(tmp_path))
+    values = {key: np.array(value) for key, value in frame().values.items()}
+    wanted = pre(prepare_observation_for_inference(values, torch.device("cpu"), frame().prompt, "tester"))
+    arrays = {key: value.numpy() for key, value in wanted.items() if isinstance(value, torch.Tensor)}
+    assert len(arrays) == 4
+    for key, array in arrays.items():
+        np.testing.assert_array_equal(tensors[key], array)
+    with pytest.raises(PolicyError, match="has no weights"):
+        policy.load()
 
 
 def test_steps_that_are_not_standard_are_said(path: Path, caplog: pytest.LogCaptureFixture) -> None:
