@@ -67,7 +67,11 @@ def convert(context: click.Context, /, to: str, as_json: bool, **asked: Any) -> 
     if wrong := [name for name in given if name in (_ONLY_TO_BAG if to == "dataset" else _ONLY_TO_DATASET)]:
         option = next(each.opts[0] for each in context.command.params if each.name == wrong[0])
         raise click.UsageError(f"{option} has no meaning for --to {to}")
-    report = (_to_bags if to == "bag" else _to_dataset)(as_json=as_json, **asked)
+    try:
+        report = (_to_bags if to == "bag" else _to_dataset)(as_json=as_json, **asked)
+    except KeyboardInterrupt:
+        click.echo("interrupted; finished episodes are kept, and the same command goes on from there", err=True)
+        sys.exit(130)
     if as_json:
         click.echo(json.dumps(report.summary()))
     else:
@@ -218,8 +222,9 @@ def _progress(episodes: int, quiet: bool) -> Iterator[Any]:
 
 def _tell(report: Report) -> None:
     summary = report.summary()
-    for each in report.failed:
-        click.echo(f"left out {each.source}: {each.error}", err=True)
+    for error in dict.fromkeys(each.error for each in report.failed):  # many may have the same
+        sources = ", ".join(each.source for each in report.failed if each.error == error)
+        click.echo(f"left out {sources}: {error}", err=True)
     for each in report.episodes:
         if each.passed_over:
             click.echo(f"passed over {each.source}: {each.passed_over}", err=True)

@@ -148,7 +148,8 @@ class Operator(Watcher):
     def _state(self) -> str:
         desk = self._desk
         if self._typed is not None:
-            return f"prompt (Enter alone takes “{desk.last_prompt}”, Tab goes back): {self._typed}_"
+            enter = f"takes “{desk.last_prompt}”" if desk.last_prompt else "leaves it empty"
+            return f"prompt (Enter alone {enter}, Tab goes back): {self._typed}_"
         if desk.recording:
             prompt = f" “{desk.last_prompt}”" if desk.last_prompt else ""
             left = "" if self._continuous else f", {max(0.0, self._longest_s - desk.elapsed_s()):.0f} s left"

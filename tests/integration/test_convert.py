@@ -139,6 +139,36 @@ def test_killed_it_keeps_what_was_done_and_goes_on_from_there(bags: Path, tmp_pa
     assert digest(out) == digest(whole)
 
 
+def test_interrupted_by_the_keyboard_it_says_what_is_kept(bags: Path, tmp_path: Path) -> None:
+    whole, out = tmp_path / "whole", tmp_path / "stopped"
+    assert run(bags, "--out", whole).code == 0
+    arguments = [str(bags), "--jobs", "1", "--out", str(out)]
+    with subprocess.Popen(
+        [sys.executable, "-c", PROGRAM, "convert", *arguments], stderr=subprocess.PIPE, text=True,
+        start_new_session=True,
+    ) as process:  # fmt: skip
+        assert process.stderr is not None
+        first = process.stderr.readline()
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+        told = process.stderr.read()
+    assert process.returncode == 130, told
+    assert "frames (1 of 4" in first
+    assert "interrupted; finished episodes are kept, and the same command goes on from there" in told
+    assert "Traceback" not in told
+    result = run(*arguments, "--json")
+    assert result.report["resumed"] >= 1, result.err
+    assert digest(out) == digest(whole)
+
+
+def test_many_with_the_same_fault_are_told_together(tmp_path: Path) -> None:
+    for number in (1, 2, 3):
+        record(tmp_path / f"bags/episode_{number:06d}", number, 0.2, contract=None)
+    result = run(tmp_path / "bags", "--out", tmp_path / "set")
+    (told,) = [line for line in result.err.splitlines() if line.startswith("left out")]
+    assert told.count("episode_00000") == 3
+    assert told.count("brings no contract") == 1
+
+
 def test_a_bad_episode_is_told_and_left_out(bags: Path, tmp_path: Path) -> None:
     episodes = tmp_path / "mixed/episodes"
     for number in (1, 3):

@@ -46,7 +46,7 @@ def test_an_operator_records_by_keys(tmp_path: Path):
     with Terminal(*arguments, columns=120) as terminal:
         terminal.wait_for("waiting: Tab starts")
         terminal.type("\t")
-        terminal.wait_for("prompt (Enter alone takes")
+        terminal.wait_for("prompt (Enter alone leaves it empty")
         terminal.type("wave\r")
         terminal.wait_for("recording “wave”, 1 s")
         terminal.type("\t")

@@ -8,6 +8,7 @@ import multiprocessing
 import os
 import re
 import shutil
+import signal
 import sys
 import threading
 import time
@@ -15,6 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from multiprocessing import forkserver
 from pathlib import Path
 from typing import Any
 
@@ -239,7 +241,9 @@ def _run_in_processes(
     done = context.Value("q", 0)
     pool = ProcessPoolExecutor(min(limit, len(jobs)), context, _begin_process, (done,), max_tasks_per_child=1)
     try:
-        waiting: set[Future[EpisodeReport]] = {pool.submit(_convert_in_process, job) for job in jobs}
+        with _deaf():
+            forkserver.ensure_running()
+            waiting: set[Future[EpisodeReport]] = {pool.submit(_convert_in_process, job) for job in jobs}
         while waiting:
             finished, waiting = wait(waiting, _POLL_S, FIRST_COMPLETED)
             watch(done.value, None)
@@ -252,8 +256,30 @@ def _run_in_processes(
             "a converting process was killed, e.g. for want of memory; the episodes done are kept: "
             "the same command goes on from there, with fewer --jobs if need be"
         ) from None
+    except KeyboardInterrupt:
+        for process in multiprocessing.active_children():
+            process.terminate()
+        raise
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+@contextmanager
+def _deaf() -> Iterator[None]:
+    """Ctrl-C waits meanwhile, and never reaches the processes begun here: each would tell where it was just then."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # where Ctrl-C does not come
+        return
+    came: list[int] = []
+    handler = signal.signal(signal.SIGINT, lambda number, _: came.append(number))  # any thread may get it
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # what is begun inherits it
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        signal.signal(signal.SIGINT, handler)
+    if came:
+        signal.raise_signal(signal.SIGINT)
 
 
 def _refuse_misfits(units: Sequence[Unit], old: DatasetSummary | None) -> dict[str, EpisodeReport]:
