@@ -36,6 +36,10 @@ _VERSION = "v3.0"
 _PICTURE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
 _DEPTH_UNITS = {"uint16": "mm", "float32": "m"}
 
+# The first array looks for pandas, which takes a second where that is installed: here once, so that processes forked
+# from one that has this module need not.
+pa.array([])
+
 
 def chunk_file(folder: str, number: int, suffix: str) -> str:
     """Path of file `number`, from 0, of a folder below the root."""
