@@ -23,7 +23,6 @@ import socket
 import struct
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -31,6 +30,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from made_up import plugin
 
 from ibrobot_core.config import load
 from ibrobot_core.inference.client import DispatchInfer, EngineClient
@@ -328,15 +328,7 @@ def main() -> int:
     if given.serve:
         serve(given.serve, Path(given.certificates) if given.certificates else None)
         return 0
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        (folder / "null_parts.py").write_text(PLUGIN)
-        metadata = folder / "null_parts-1.0.dist-info"
-        metadata.mkdir()
-        (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: null-parts\nVersion: 1.0\n")
-        (metadata / "entry_points.txt").write_text("[ibrobot]\nnull_parts = null_parts\n")
-        sys.path.insert(0, name)
-        os.environ["PYTHONPATH"] = os.pathsep.join([name, *filter(None, [os.environ.get("PYTHONPATH")])])
+    with plugin("null_parts", PLUGIN) as folder:
         return run(given, folder)
 
 

@@ -16,7 +16,6 @@ import os
 import socket
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 from importlib.metadata import distributions
@@ -24,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from made_up import plugin
 
 from ibrobot_core.config import load
 from ibrobot_core.launch.runtime import Runtime
@@ -249,15 +249,7 @@ def main() -> int:
     parser.add_argument("--kills", type=int, default=20)
     kills = parser.parse_args().kills
     logging.disable(logging.CRITICAL)
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        (folder / "sways_parts.py").write_text(PLUGIN)
-        metadata = folder / "sways_parts-1.0.dist-info"
-        metadata.mkdir()
-        (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: sways-parts\nVersion: 1.0\n")
-        (metadata / "entry_points.txt").write_text("[ibrobot]\nsways_parts = sways_parts\n")
-        sys.path.insert(0, name)
-        os.environ["PYTHONPATH"] = os.pathsep.join([name, *filter(None, [os.environ.get("PYTHONPATH")])])
+    with plugin("sways_parts", PLUGIN) as folder:
         return run(kills, folder)
 
 

@@ -1,4 +1,4 @@
-"""Inference clients in the host: one policy call at a time, order kept, a hanging policy does not keep the host."""
+"""Inference clients in the host: who waits for whom, resets in their place, a hanging policy does not keep the host."""
 
 from __future__ import annotations
 
