@@ -62,14 +62,17 @@ class CallsInTheSendersThread(LocalTransport):
 
 class DropsFailingSubscribers(LocalTransport):
     def subscribe(self, topic, callback):
-        def once(payload):
+        failed = threading.Event()
+
+        def until_it_fails(payload):
+            if failed.is_set():
+                return
             try:
                 callback(payload)
             except ValueError:
-                threading.Thread(target=end).start()
+                failed.set()
 
-        end = super().subscribe(topic, once)
-        return end
+        return super().subscribe(topic, until_it_fails)
 
 
 class SharesAnswers(LocalTransport):
