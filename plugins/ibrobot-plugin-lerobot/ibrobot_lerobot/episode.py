@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ibrobot_core.errors import DatasetError
 from ibrobot_lerobot import layout
+from ibrobot_lerobot.arrow import table_of, to_array
 from ibrobot_lerobot.layout import Column
 from ibrobot_lerobot.pictures import PngEncoder, tiff
 from ibrobot_lerobot.stats import DepthStats, PixelStats, Stats, vector_stats
@@ -120,12 +121,10 @@ class EpisodeWriter:
 
     def _array(self, field: pa.Field) -> pa.Array:
         values = [row[field.name] for row in self._rows]
-        if field.name not in self._vectors:
-            return pa.array(values, field.type)
-        block = np.array(values)
-        self._vectors[field.name].append(block)
-        flat = pa.array(block.ravel())
-        return flat if flat.type == field.type else pa.FixedSizeListArray.from_arrays(flat, field.type.list_size)
+        if field.name in self._vectors:
+            values = np.array(values)
+            self._vectors[field.name].append(values)
+        return to_array(values, field.type)
 
     def close(self) -> None:
         """Finish the episode: a dataset that LeRobot loads.
@@ -172,7 +171,7 @@ class EpisodeWriter:
         row |= {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
         path = self._root / layout.chunk_file(layout.EPISODES, 0, "parquet")
         path.parent.mkdir(parents=True)
-        pq.write_table(pa.Table.from_pylist([row]), path)
+        pq.write_table(table_of([row]), path)
         pq.write_table(layout.task_table(list(self._tasks)), self._root / layout.TASKS)
         layout.write_json(self._root / layout.STATS, plain(stats))
         layout.write_json(self._root / layout.OWN, self._metadata)

@@ -14,6 +14,7 @@ import pyarrow.parquet as pq
 
 from ibrobot_core.errors import DatasetError
 from ibrobot_core.interfaces import Feature
+from ibrobot_lerobot.arrow import table_of
 
 INFO = "meta/info.json"
 STATS = "meta/stats.json"
@@ -35,10 +36,6 @@ COUNTERS = {
 _VERSION = "v3.0"
 _PICTURE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
 _DEPTH_UNITS = {"uint16": "mm", "float32": "m"}
-
-# The first array looks for pandas, which takes a second where that is installed: here once, so that processes forked
-# from one that has this module need not.
-pa.array([])
 
 
 def chunk_file(folder: str, number: int, suffix: str) -> str:
@@ -154,8 +151,8 @@ def task_table(tasks: list[str]) -> pa.Table:
         ],
         "attributes": {}, "creator": {"library": "pyarrow", "version": pa.__version__}, "pandas_version": "2.2.0",
     }  # fmt: skip
-    table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), "task": pa.array(tasks, pa.string())})
-    return table.replace_schema_metadata({"pandas": json.dumps(described)})
+    schema = pa.schema({"task_index": pa.int64(), "task": pa.string()}, {"pandas": json.dumps(described)})
+    return table_of([{"task_index": number, "task": task} for number, task in enumerate(tasks)], schema)
 
 
 @attrs.frozen
@@ -207,8 +204,7 @@ def open_dataset(root: Path) -> OnDisk | None:
     try:
         info = json.loads((root / INFO).read_bytes())
         stats = json.loads((root / STATS).read_bytes()) if (root / STATS).exists() else {}
-        table = pq.read_table(root / TASKS).sort_by("task_index") if (root / TASKS).exists() else None
-        tasks = table.column("task").to_pylist() if table is not None else []
+        tasks = _read_tasks(root / TASKS) if (root / TASKS).exists() else []
         metadata = json.loads((root / OWN).read_bytes()) if (root / OWN).exists() else {}
         version = info["codebase_version"]
     except (OSError, ValueError, KeyError, TypeError, pa.ArrowException) as error:
@@ -216,6 +212,13 @@ def open_dataset(root: Path) -> OnDisk | None:
     if version != _VERSION:
         raise DatasetError(f"{root}: is of version {version!r}, must be {_VERSION!r}; LeRobot converts older ones")
     return OnDisk(root, info, stats, tasks, metadata)
+
+
+def _read_tasks(path: Path) -> list[str]:
+    """By their numbers."""
+    with pq.ParquetFile(path) as file:
+        rows = file.read(["task_index", "task"]).to_pylist()
+    return [row["task"] for row in sorted(rows, key=lambda row: row["task_index"])]
 
 
 def write_json(path: Path, document: Any) -> None:

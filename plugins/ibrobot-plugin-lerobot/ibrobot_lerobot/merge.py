@@ -14,6 +14,7 @@ import pyarrow.parquet as pq
 
 from ibrobot_core.errors import DatasetError
 from ibrobot_lerobot import layout
+from ibrobot_lerobot.arrow import table_of, to_array
 from ibrobot_lerobot.episode import counter_stats, plain
 from ibrobot_lerobot.layout import OnDisk
 from ibrobot_lerobot.stats import Stats, aggregate
@@ -180,8 +181,8 @@ class _Merge:
             for group in range(file.num_row_groups):
                 table = file.read_row_group(group)
                 for name, offset in (("index", self._frame), ("episode_index", self._episode)):
-                    table = _replaced(table, name, table.column(name).to_numpy() + offset)
-                table = _replaced(table, "task_index", tasks[table.column("task_index").to_numpy()])
+                    table = _replaced(table, name, _numbers(table, name) + offset)
+                table = _replaced(table, "task_index", tasks[_numbers(table, "task_index")])
                 self._table.write_table(table)
         self._data.bytes += size
         return self._data.number
@@ -215,7 +216,7 @@ class _Merge:
     def _flush_rows(self) -> None:
         if not self._rows:
             return
-        table = pa.Table.from_pylist(self._rows, None if self._rows_table is None else self._rows_table.schema)
+        table = table_of(self._rows, None if self._rows_table is None else self._rows_table.schema)
         if self._rows_table is None:
             path = self._target / layout.chunk_file(layout.EPISODES, self._rows_number, "parquet")
             path.parent.mkdir(parents=True)
@@ -254,9 +255,14 @@ def _indices(what: str, number: int) -> dict[str, int]:
     return {f"{what}/chunk_index": chunk, f"{what}/file_index": file}
 
 
+def _numbers(table: pa.Table, name: str) -> np.ndarray[Any, np.dtype[np.int64]]:
+    return np.array(table.column(name).to_pylist(), np.int64)  # to_numpy imports pandas
+
+
 def _replaced(table: pa.Table, name: str, values: np.ndarray[Any, Any]) -> pa.Table:
     position = table.schema.get_field_index(name)
-    return table.set_column(position, table.schema.field(position), pa.array(values))
+    field = table.schema.field(position)
+    return table.set_column(position, field, to_array(values, field.type))
 
 
 def _row_stats(row: Mapping[str, Any]) -> dict[str, Stats]:

@@ -1,0 +1,65 @@
+"""Arrow arrays of Python values and NumPy arrays, without pandas.
+
+`pyarrow.array` imports pandas where that is installed, as beside LeRobot: more than a second and 130 MiB in every
+process, for types of it that are never given here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import chain
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from pyarrow import types
+
+
+def to_array(values: Any, kind: pa.DataType) -> pa.Array:
+    """The array of type `kind` that has `values`, a sequence of any kind without gaps.
+
+    Types are those of the tables: numbers, booleans, text, bytes, lists of any of them, and structs of mappings.
+    """
+    if types.is_struct(kind):
+        columns = [to_array([value[field.name] for value in values], field.type) for field in kind]
+        return pa.StructArray.from_arrays(columns, fields=list(kind))
+    if types.is_fixed_size_list(kind):
+        return pa.FixedSizeListArray.from_arrays(to_array(_flat(values), kind.value_type), kind.list_size)
+    if types.is_list(kind):
+        offsets = to_array(_offsets(values), pa.int32())
+        return pa.ListArray.from_arrays(offsets, to_array(_flat(values), kind.value_type))
+    if types.is_string(kind):
+        values = [value.encode() for value in values]
+    if types.is_string(kind) or types.is_binary(kind):
+        return _from_buffers(kind, len(values), _offsets(values), b"".join(values))
+    if types.is_boolean(kind):
+        return _from_buffers(kind, len(values), np.packbits(np.asarray(values, bool), bitorder="little"))
+    return _from_buffers(kind, len(values), np.ascontiguousarray(values, kind.to_pandas_dtype()))
+
+
+def table_of(rows: Sequence[Mapping[str, Any]], schema: pa.Schema | None = None) -> pa.Table:
+    """The table of `rows`, of this schema, else of the first row's types."""
+    schema = schema or pa.schema([(name, _type_of(value)) for name, value in rows[0].items()])
+    return pa.Table.from_arrays(
+        [to_array([row[field.name] for row in rows], field.type) for field in schema], schema=schema
+    )
+
+
+def _type_of(value: Any) -> pa.DataType:
+    if isinstance(value, list):
+        return pa.list_(_type_of(value[0]))
+    return {bool: pa.bool_(), int: pa.int64(), float: pa.float64(), str: pa.string()}[type(value)]
+
+
+def _flat(values: Any) -> Any:
+    """The elements of all lists."""
+    return values.reshape(-1) if isinstance(values, np.ndarray) else list(chain.from_iterable(values))
+
+
+def _offsets(values: Sequence[Any]) -> Any:
+    """Where each begins, and the end of the last."""
+    return np.cumsum([0, *map(len, values)], dtype=np.int32)
+
+
+def _from_buffers(kind: pa.DataType, length: int, *buffers: Any) -> pa.Array:
+    return pa.Array.from_buffers(kind, length, [None, *map(pa.py_buffer, buffers)])
