@@ -16,7 +16,7 @@ from ibrobot_core.messages import CompressedImage, Image
 from ibrobot_mcap.jpeg import from_jpeg, is_jpeg
 from ibrobot_mcap.metadata import DROPPED, INFORMATION, METADATA, OUTCOME, RECORD, RECORD_KEY, Topic
 from ibrobot_mcap.options import COMPRESSIONS
-from ibrobot_mcap.sources import McapSource, Raw, RosbagsSource, Source
+from ibrobot_mcap.sources import McapSource, Raw, Source
 
 
 def is_rosbag2(path: Path) -> bool:
@@ -132,7 +132,7 @@ def stated_counts(path: Path) -> Mapping[str, int]:
 
 def _open(path: Path, facts: Mapping[str, Any]) -> Source:
     if not path.is_dir():
-        return McapSource([path]) if path.suffix == ".mcap" else RosbagsSource(path)
+        return McapSource([path]) if path.suffix == ".mcap" else _open_by_rosbags(path)
     listed = [path / Path(name).name for name in facts.get("relative_file_paths", ())]
     for file in listed:
         if not file.is_file():
@@ -144,6 +144,12 @@ def _open(path: Path, facts: Mapping[str, Any]) -> Source:
         return McapSource(files)
     if not facts:
         raise RecorderError(f"{path}: has no {METADATA}, without which only MCAP files can be read; open one file")
+    return _open_by_rosbags(path)
+
+
+def _open_by_rosbags(path: Path) -> Source:
+    from ibrobot_mcap.rosbags_source import RosbagsSource  # takes as long to import as all other modules here
+
     return RosbagsSource(path)
 
 
