@@ -1,16 +1,18 @@
 """What `ibrobot convert` costs beside LeRobot's own writer: the same pictures, the same encoder.
 
-    python benchmarks/convert.py [--lerobot PYTHON] [--frames 300] [--only speed|memory]
+    python benchmarks/convert.py [--lerobot PYTHON] [--frames 300] [--times 3] [--only speed|memory]
 
 Two 640x480 cameras at 30 Hz, joint states and actions at 100 Hz, recorded as raw bags; synthetic pictures with texture,
 motion and sensor noise. `--lerobot` is an interpreter that has `lerobot[dataset]`; by default this one. In one run:
 
-- `ibrobot convert` of two episodes;
+- `ibrobot convert` of two episodes, its reading of the bags included;
 - LeRobot's `LeRobotDataset` as `lerobot-record` uses it by default (pictures as PNG files, encoded at the end of an
   episode) and streaming, fed with the same pictures from memory. Streaming is fed no faster than it encodes, since it
   drops pictures otherwise.
 
-Frames a second leave out the imports of both, and so does LeRobot's CPU time; all else is of the whole command.
+Three times in turn; printed are medians, and those of the paired ratios. Frames a second leave out what the two
+commands import (not what the converting processes of ours do), and so does LeRobot's CPU time; all else is of the whole
+command. Both should have the same PyAV: its releases bring encoders of very different speed.
 
 Then the memory of `ibrobot convert` for episodes of 60 and 600 frames, and for 1, 10 and 50 of them. Memory is the
 proportional share of all processes of the command together. Exits with 1 below 3x the frames a second of LeRobot's
@@ -31,6 +33,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -198,28 +201,40 @@ def _cpu() -> float:
     return sum(usage.ru_utime + usage.ru_stime for usage in each)
 
 
-def speed(python: str, folder: Path, frames: int) -> bool:
-    """Ours and LeRobot's, the same pictures."""
+def theirs(python: str, mode: str, out: Path, frames: int) -> dict[str, float]:
+    """LeRobot's writer on two episodes."""
+    shutil.rmtree(out, ignore_errors=True)
+    found = measure([python, __file__, "--child", mode, "--out", str(out), "--frames", str(frames)])
+    # What it was fed from is not its own.
+    found["peak_mib"] -= found.pop("pictures_mib")
+    return found | {"frames_s": found["frames"] / found["seconds"]}
+
+
+def speed(python: str, folder: Path, frames: int, times: int) -> bool:
+    """Ours and LeRobot's, the same pictures, one after the other."""
     source = folder / "two"
     for number in (1, 2):
         record(source / f"episode_{number:06d}", frames)
-    rows = {"ibrobot convert": ours(source, folder / "ours")}
-    rows["ibrobot convert --jobs 1"] = ours(source, folder / "ours", "--jobs", "1")
-    for mode in ("streaming", "default"):
-        command = [python, __file__, "--child", mode, "--out", str(folder / mode), "--frames", str(frames)]
-        found = measure(command)
-        found["frames_s"] = found["frames"] / found["seconds"]
-        # What it was fed from is not its own.
-        found["peak_mib"] -= found.pop("pictures_mib")
-        rows[f"LeRobot, {mode}"] = found
-    for name, row in rows.items():
-        cpu_s = row["cpu_s"] * 300 / row["frames"]
-        figures = f"{row['frames_s']:6.1f} frames/s  {cpu_s:6.1f} CPU s per 300 frames  {row['peak_mib']:6.0f} MiB"
-        print(f"{name:26} {figures}", flush=True)
-    best = rows["ibrobot convert"]["frames_s"]
-    ratios = {mode: best / rows[f"LeRobot, {mode}"]["frames_s"] for mode in ("default", "streaming")}
-    print(f"{ratios['default']:.2f} times LeRobot's default, {ratios['streaming']:.2f} times its streaming")
-    return ratios["default"] >= ENOUGH and ratios["streaming"] >= 1.0
+    runs = {
+        "ibrobot convert": lambda: ours(source, folder / "ours"),
+        "LeRobot, streaming": lambda: theirs(python, "streaming", folder / "lerobot", frames),
+        "LeRobot, default": lambda: theirs(python, "default", folder / "lerobot", frames),
+    }
+    found: dict[str, list[dict[str, float]]] = {name: [] for name in runs}
+    for _ in range(times):
+        for name, run in runs.items():
+            found[name].append(run())
+    for name, rows in found.items():
+        frames_s, cpu_s, peak_mib = (median(row[each] for row in rows) for each in ("frames_s", "cpu_s", "peak_mib"))
+        cpu_s *= 300 / rows[0]["frames"]
+        print(f"{name:18} {frames_s:6.1f} frames/s  {cpu_s:6.1f} CPU s per 300 frames  {peak_mib:6.0f} MiB", flush=True)
+    ratios = {
+        mode: [own["frames_s"] / other["frames_s"] for own, other in zip(found["ibrobot convert"], rows, strict=True)]
+        for mode, rows in found.items()
+    }
+    default, streaming = median(ratios["LeRobot, default"]), median(ratios["LeRobot, streaming"])
+    print(f"{default:.2f} times LeRobot's default, {streaming:.2f} times its streaming (medians of {times} pairs)")
+    return default >= ENOUGH and streaming >= 1.0
 
 
 def memory(folder: Path) -> bool:
@@ -245,6 +260,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--lerobot", default=sys.executable, metavar="PYTHON")
     parser.add_argument("--frames", type=int, default=300)
+    parser.add_argument("--times", type=int, default=3)
     parser.add_argument("--only", choices=("speed", "memory"))
     parser.add_argument("--child", help=argparse.SUPPRESS)
     parser.add_argument("--out", type=Path, help=argparse.SUPPRESS)
@@ -253,7 +269,7 @@ def main() -> int:
         lerobot(asked.child, asked.out, asked.frames, 2)
         return 0
     with tempfile.TemporaryDirectory() as folder:
-        good = asked.only == "memory" or speed(asked.lerobot, Path(folder), asked.frames)
+        good = asked.only == "memory" or speed(asked.lerobot, Path(folder), asked.frames, asked.times)
         good = (asked.only == "speed" or memory(Path(folder))) and good
     return 0 if good else 1
 

@@ -120,7 +120,7 @@ class EpisodeWriter:
         self._rows, self._rows_bytes = [], 0
 
     def _array(self, field: pa.Field) -> pa.Array:
-        values = [row[field.name] for row in self._rows]
+        values: Any = [row[field.name] for row in self._rows]
         if field.name in self._vectors:
             values = np.array(values)
             self._vectors[field.name].append(values)
