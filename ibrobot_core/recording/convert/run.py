@@ -25,6 +25,7 @@ import attrs
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import DatasetError, IbrobotError
 from ibrobot_core.interfaces import DatasetSummary, EpisodeAddress
+from ibrobot_core.memory import set_malloc
 from ibrobot_core.plugins import installed
 from ibrobot_core.recording.convert.episode import Job, Unit, convert_episode, make_writer, read_unit, unit_key
 from ibrobot_core.recording.convert.provenance import conversion, provenance
@@ -34,6 +35,8 @@ from ibrobot_core.units import seconds
 STAGING = ".staging"
 """Where converted episodes wait within the dataset's folder."""
 _POLL_S = 0.2
+_MAP_FROM, _KEEP = 512 << 10, 8 << 20
+"""Pictures are given back when freed [bytes]: among smaller things they would leave gaps, more with every minute."""
 
 Watch = Callable[[int, int, EpisodeReport | None], None]
 """Told frames done, frames in all by estimate, and the episode that has just been done, if any."""
@@ -209,6 +212,7 @@ _done: Any = None
 def _begin_process(done: Any) -> None:
     global _done  # noqa: PLW0603 - how a pool gives its processes what cannot be sent with each job
     _done = done
+    set_malloc(_MAP_FROM, _KEEP)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import ctypes
 import json
 import logging
 import math
-import os
 import threading
 import time
 from collections.abc import Callable
@@ -18,6 +16,7 @@ from weakref import WeakSet
 import zenoh
 
 from ibrobot_core.errors import TransportError
+from ibrobot_core.memory import set_malloc
 from ibrobot_zenoh.options import ZenohOptions
 from ibrobot_zenoh.reasons import tls_context, why_not
 
@@ -36,25 +35,8 @@ _ASK_WHY_S = 2.0
 _FIRST_WAIT_S = 0.3
 """How long making a client waits for somebody to answer, so that what is there can be used at once."""
 
-
-_KEPT_BYTES = 256 << 20
-_MMAP_THRESHOLD, _LARGEST_THRESHOLD = -3, 32 << 20
-_TRIM_THRESHOLD = -1
-
-
-@cache
-def keep_freed_memory() -> None:
-    """Have the C library keep what was freed, where it is glibc.
-
-    Mapping memory anew for each large message costs more than its copies do. An operator's own
-    `MALLOC_MMAP_THRESHOLD_` stands.
-    """
-    if "MALLOC_MMAP_THRESHOLD_" in os.environ:
-        return
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
-    if mallopt is not None:
-        mallopt(_MMAP_THRESHOLD, _LARGEST_THRESHOLD)
-        mallopt(_TRIM_THRESHOLD, _KEPT_BYTES)
+_LARGEST_KEPT, _KEPT_BYTES = 32 << 20, 256 << 20
+"""Freed memory that glibc keeps: mapping it anew for each large message costs more than its copies do [bytes]."""
 
 
 class Declared(Protocol):
@@ -167,7 +149,7 @@ class Connection:
 
     def __init__(self, options: ZenohOptions, log: logging.Logger) -> None:
         self._log = log
-        keep_freed_memory()
+        set_malloc(_LARGEST_KEPT, _KEPT_BYTES)
         self._endpoints = ", ".join(options.connect or options.listen)
         self._config = zenoh_config(options)
         self._lock = threading.Lock()
