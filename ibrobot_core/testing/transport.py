@@ -14,11 +14,14 @@ from ibrobot_core.errors import TransportError
 from ibrobot_core.interfaces import Context, Payload, Transport
 from ibrobot_core.testing.suite import Suite
 
+_HELD_S = 120.0
+"""The longest that a callback is held back [s]: longer than anything here waits, so that none goes on by itself."""
+
 
 class TransportSuite(Suite[Transport]):
     """What every `Transport` must do, between two ends."""
 
-    wait_s: ClassVar[float] = 10.0
+    wait_s: ClassVar[float] = 30.0
     """How long a check waits for what must come [s]."""
     short_s: ClassVar[float] = 0.05
     """How long a check waits for what must not come [s]."""
@@ -40,6 +43,15 @@ class TransportSuite(Suite[Transport]):
         finally:
             near.close()
             far.close()
+
+    @contextmanager
+    def held(self) -> Iterator[threading.Event]:
+        """What callbacks wait for; they go on when the block is left, however that is."""
+        go_on = threading.Event()
+        try:
+            yield go_on
+        finally:
+            go_on.set()
 
     def test_delivers_in_order(self) -> None:
         """Every payload arrives once, whole, in the order sent; empty and large ones too."""
@@ -81,12 +93,11 @@ class TransportSuite(Suite[Transport]):
 
     def test_a_slow_subscriber_blocks_nobody(self) -> None:
         """`publish` returns and others are served while one callback does not return."""
-        with self.ends() as (near, far):
-            release = threading.Event()
+        with self.ends() as (near, far), self.held() as release:
             arrived: queue.SimpleQueue[Payload] = queue.SimpleQueue()
 
             def slow(payload: Payload) -> None:
-                release.wait(self.wait_s)
+                release.wait(_HELD_S)
 
             far.subscribe("topic", slow)
             far.subscribe("topic", arrived.put)
@@ -139,17 +150,18 @@ class TransportSuite(Suite[Transport]):
 
     def test_sent_buffers_are_free_again(self) -> None:
         """A bytearray or a view of one can be sent, and written to again once the call has returned."""
-        with self.ends() as (near, far):
+        with self.ends() as (near, far), self.held() as going_on:
             arrived: queue.SimpleQueue[Payload] = queue.SimpleQueue()
-            going_on, served = threading.Event(), threading.Event()
+            served, sender = threading.Event(), threading.get_ident()
 
             def slow(payload: Payload) -> None:
-                going_on.wait(self.wait_s)
+                assert threading.get_ident() != sender, "publish calls the subscribers itself"
+                going_on.wait(_HELD_S)
                 arrived.put(bytes(payload))
 
             def answer(payload: Payload) -> Payload:
                 if payload == b"late":
-                    going_on.wait(self.wait_s)
+                    going_on.wait(_HELD_S)
                     arrived.put(bytes(payload))
                     served.set()
                 return bytearray(payload)
@@ -170,14 +182,13 @@ class TransportSuite(Suite[Transport]):
 
     def test_a_slow_answer_delays_no_other(self) -> None:
         """While one request is being answered, others are; no more at a time than there are workers."""
-        with self.ends() as (near, far):
-            release = threading.Event()
+        with self.ends() as (near, far), self.held() as release:
             begun: queue.SimpleQueue[Payload] = queue.SimpleQueue()
 
             def answer(payload: Payload) -> Payload:
                 begun.put(payload)
                 if payload != b"quick":
-                    release.wait(self.wait_s)
+                    release.wait(_HELD_S)
                 return payload
 
             far.serve("echo", answer, workers=2)
@@ -202,12 +213,12 @@ class TransportSuite(Suite[Transport]):
 
     def test_a_late_answer_is_dropped(self) -> None:
         """A request that is answered too late fails, and its answer is not given to the next one."""
-        with self.ends() as (near, far):
-            release, done = threading.Event(), threading.Event()
+        with self.ends() as (near, far), self.held() as release:
+            done = threading.Event()
 
             def answer(payload: Payload) -> Payload:
                 if payload == b"slow":
-                    release.wait(self.wait_s)
+                    release.wait(_HELD_S)
                     done.set()
                 return payload
 

@@ -45,8 +45,17 @@ class OneTopic(LocalTransport):
 
 
 class NeverEnds(LocalTransport):
+    """Calls the subscribers of a topic one after the other: the ended one before the others."""
+
+    def __init__(self):
+        super().__init__()
+        self.callbacks = {}
+
     def subscribe(self, topic, callback):
-        super().subscribe(topic, callback)
+        known = self.callbacks.setdefault(topic, [])
+        known.append(callback)
+        if len(known) == 1:
+            super().subscribe(topic, lambda payload: [call(payload) for call in known])
         return lambda: None
 
 
@@ -76,7 +85,7 @@ class DropsFailingSubscribers(LocalTransport):
 
 
 class SharesAnswers(LocalTransport):
-    """Answers come through one queue: whoever asks takes what is there."""
+    """Answers come through one queue, in the order asked: whoever asks takes what is there."""
 
     def __init__(self):
         super().__init__()
@@ -91,6 +100,9 @@ class SharesAnswers(LocalTransport):
             return self.answers.get(timeout=timeout_s)
         except queue.Empty:
             raise TransportError("late") from None
+
+    def serve(self, name, handler, *, workers=16):
+        return super().serve(name, handler, workers=1)
 
 
 class MixesAnswers(LocalTransport):
