@@ -111,11 +111,32 @@ def test_a_fault_ends_it(runs: Runs):
     assert runtime.summary()["episodes"] == 0
 
 
+def test_a_host_that_is_held_up_cuts_nothing_out(runs: Runs, monkeypatch: pytest.MonkeyPatch):
+    runtime = replay(runs, attrs.evolve(WAVE, commands=Track(TIMES * 4, WAVE.commands.positions)))
+    feeder = runtime.plan.mode.feeder
+    work, units = feeder.work, iter(range(1000))
+
+    def held_up(timeout_s: float) -> None:
+        if not 100 <= next(units) < 250:
+            work(timeout_s)
+
+    monkeypatch.setattr(feeder, "work", held_up)
+    told = commands(runtime)
+    first = next(i for i, command in enumerate(told) if np.allclose(command, WAVE.commands.positions[0], atol=1e-9))
+    assert first < 100
+    way = np.abs(np.diff(WAVE.commands.positions, axis=0)).max(axis=0) / 4
+    assert (np.abs(np.diff(told[first:], axis=0)) <= 1.5 * way).all(), "it goes on from where it stood, with no jump"
+    assert 200 + 80 < len(told) - first < 200 + 150
+    np.testing.assert_allclose(told[-1], WAVE.commands.positions[-1], atol=1e-9)
+
+
 def test_in_real_time_a_motion_longer_than_what_control_is_given_at_once_is_played_whole(runs: Runs):
-    long = attrs.evolve(WAVE, commands=Track(TIMES * 2.5, WAVE.commands.positions))
+    # It ends with seconds at rest: a process that is held up on the way has the time to catch up.
+    times, positions = np.append(TIMES * 1.5, 6.0), WAVE.commands.positions[[*range(len(TIMES)), -1]]
+    long = attrs.evolve(WAVE, commands=Track(times, positions))
     runtime = replay(runs, long, lockstep=False, sim=False)
     runtime.start()
-    assert runtime.session.finished.wait(20)
+    assert runtime.session.finished.wait(60)
     runtime.stop()
     runtime.raise_failure()
     assert runtime.session.state is not None

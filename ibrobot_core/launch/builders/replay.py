@@ -92,9 +92,15 @@ class ReplayFeeder(Feeder):
             self._begun_ns, self._sent = state.stamp_ns, 0
             self._rows = self._setpoints(state.position[self._columns])
         elapsed_ns = state.stamp_ns - self._begun_ns
+        here, ahead = elapsed_ns // self._period_ns, _AHEAD_NS // self._period_ns
+        if 0 < self._sent <= here and self._sent < len(self._rows):
+            # This side was held up until control had nothing left: go on from where that holds, and cut nothing out.
+            pause_ns = (here - self._sent + 1) * self._period_ns
+            self._begun_ns += pause_ns
+            elapsed_ns -= pause_ns
+            here = self._sent - 1
         if not state.stale and elapsed_ns >= self._approach_ns:
             self._measured.append((elapsed_ns - self._approach_ns, state.position[self._columns]))
-        here, ahead = elapsed_ns // self._period_ns, _AHEAD_NS // self._period_ns
         if self._sent < min(here + ahead // 2, len(self._rows)):
             rows = self._rows[here : here + ahead]
             if len(rows):
