@@ -18,6 +18,8 @@ from ibrobot_core.units import ns
 SET_MODE = "/set_mode"
 RESET = "/reset"
 ESTOP = "/estop"
+_GLANCE_S, _GLANCES = 0.1, 100
+"""How long the first joint state is waited for at a time [s], and how often: time passes for a stopped process too."""
 
 
 class Runtime:
@@ -248,10 +250,12 @@ class Runtime:
         session = self.session
         states = session.bus.subscribe("/joint_states", 1)
         try:
-            while session.state is None:
-                if states.get(1.0) is None and session.state is None:
-                    self.raise_failure()
-                    raise HardwareError("control is ready but gives no joint states")
+            for _ in range(_GLANCES):
+                if session.state is not None:
+                    return
+                self.raise_failure()
+                states.get(_GLANCE_S)
+            raise HardwareError("control is ready but gives no joint states")
         finally:
             states.close()
 
