@@ -112,8 +112,9 @@ class ProcessEngine(Engine):
     @override
     def close(self) -> None:
         self._closed.set()
-        if self._process is not None:
-            self._process.kill()
+        process = self._process  # a request that goes on may bury it meanwhile
+        if process is not None:
+            process.kill()
         with self._lock:
             self._bury()
 
