@@ -20,7 +20,7 @@ _BYTES_PER_PIXEL = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1, "m
 class SensorSuite(Suite[Sensor]):
     """What every `Sensor` must do. A driver runs it against a fake of its device."""
 
-    timeout_s: ClassVar[float] = 5.0
+    timeout_s: ClassVar[float] = 30.0
     """How long a check waits for a message that must come [s]."""
 
     def trigger(self, sensor: Sensor, ctx: Context) -> None:
@@ -74,8 +74,12 @@ class SensorSuite(Suite[Sensor]):
         with self.opened() as (sensor, ctx):
             self._next(sensor, ctx)
             self.silence(sensor)
-            waiting = [sensor.read(0.01) for _ in range(3)]
-            assert waiting[-1] is None, "a message came though the device captured nothing"
+            silent = 0
+            for _ in range(100):  # what was captured before may take its time
+                silent = silent + 1 if sensor.read(0.01) is None else 0
+                if silent == 3:
+                    return
+            pytest.fail("messages come though the device captures nothing")
 
     def test_messages_stay_as_they_were(self) -> None:
         """A message does not change when the next one is read."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import os
 import subprocess
 import sys
@@ -80,15 +81,16 @@ class Terminal:
         os.write(self._master, text.encode())
 
     def interrupt(self) -> None:
-        """Press Ctrl-C, and again where nothing comes of it, until the command ends.
+        """Press Ctrl-C, and Enter where nothing comes of it, and wait for the command to end.
 
-        A signal between Python's last look at it and the system call that reads a line is not seen before the next.
+        A signal between Python's last look at it and the system call that reads a line is not seen before that line. A
+        second Ctrl-C would not do: it may come while the first is obeyed.
         """
         with self._changed:
-            for _ in range(10):
-                self.type("\x03")
-                if self._changed.wait_for(lambda: self._ended, 3):
-                    return
+            self.type("\x03")
+            if not self._changed.wait_for(lambda: self._ended, 3):
+                self.type("\r")
+                self._changed.wait_for(lambda: self._ended, _TIMEOUT_S)
 
     def end(self) -> int:
         """Wait for the end and take the exit code.
@@ -104,13 +106,14 @@ class Terminal:
         return code
 
     def _read(self) -> None:
+        decoder = codecs.getincrementaldecoder("utf-8")("replace")  # a character may come in two pieces
         while True:
             try:
                 received = os.read(self._master, 65536)
             except OSError:  # nobody has the other end open any more
                 received = b""
             with self._changed:
-                self.screen += received.decode(errors="replace")
+                self.screen += decoder.decode(received)
                 self._ended = not received
                 self._changed.notify_all()
             if self._ended:
