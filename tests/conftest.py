@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
+from importlib import invalidate_caches
 from importlib.metadata import EntryPoint, distributions
 from pathlib import Path
 
@@ -30,6 +31,8 @@ class Site:
         (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {distribution}\nVersion: 1.0\n")
         (metadata / "entry_points.txt").write_text(f"[ibrobot]\n{module} = {module}\n")
         self.modules.append(module)
+        # Python lists a folder anew when its time stamp has changed, which it has not within some milliseconds.
+        invalidate_caches()
 
     def entry_points(self) -> list[EntryPoint]:
         """The entry points of what was added, and of nothing else."""
