@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from bisect import bisect_right
 
 import pytest
 from hypothesis import given
@@ -118,7 +119,7 @@ def test_get_waits_for_a_message_and_gives_up_in_time(bus: Bus) -> None:
     waiting.start()
 
     bus.publish("/a", Int32(7))
-    waiting.join(10.0)
+    waiting.join(30.0)
 
     assert [item.message for item in got] == [Int32(7)]
 
@@ -142,8 +143,9 @@ def test_what_was_received_by_the_snapshot_is_in_the_queues() -> None:
 
     stamps = [item.received_ns for item in everything.drain()]
     assert len(stamps) == 2000
+    assert stamps == sorted(stamps)
     for now_ns, queued in snapshots:
-        assert sum(stamp <= now_ns for stamp in stamps) <= queued
+        assert bisect_right(stamps, now_ns) <= queued
 
 
 def test_services_answer_and_their_absence_is_told(bus: Bus) -> None:

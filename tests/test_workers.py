@@ -9,13 +9,15 @@ import pytest
 
 from ibrobot_core.workers import Workers
 
+PATIENCE_S = 30.0
+
 
 def test_one_worker_keeps_the_order():
     done = queue.SimpleQueue()
     workers = Workers(done.put, "numbers")
     for i in range(100):
         assert workers.put(i) is None
-    assert [done.get(timeout=5) for _ in range(100)] == list(range(100))
+    assert [done.get(timeout=PATIENCE_S) for _ in range(100)] == list(range(100))
     workers.end()
 
 
@@ -24,16 +26,16 @@ def test_threads_start_when_needed_and_no_more_than_allowed():
 
     def work(item):
         begun.put(threading.current_thread())
-        release.wait(5)
+        release.wait(PATIENCE_S)
 
     workers = Workers(work, "busy", count=2)
     for i in range(3):
         workers.put(i)
-    assert begun.get(timeout=5) is not begun.get(timeout=5)
+    assert begun.get(timeout=PATIENCE_S) is not begun.get(timeout=PATIENCE_S)
     with pytest.raises(queue.Empty):
         begun.get(timeout=0.02)
     release.set()
-    begun.get(timeout=5)
+    begun.get(timeout=PATIENCE_S)
     workers.end()
 
 
@@ -42,14 +44,14 @@ def test_the_oldest_gives_way():
 
     def work(item):
         begun.put(item)
-        release.wait(5)
+        release.wait(PATIENCE_S)
 
     workers = Workers(work, "slow", depth=2)
     workers.put("a")
-    assert begun.get(timeout=5) == "a"
+    assert begun.get(timeout=PATIENCE_S) == "a"
     assert [workers.put(item) for item in "bcde"] == [None, None, "b", "c"]
     release.set()
-    assert [begun.get(timeout=5) for _ in range(2)] == ["d", "e"]
+    assert [begun.get(timeout=PATIENCE_S) for _ in range(2)] == ["d", "e"]
     workers.end()
 
 
@@ -64,7 +66,7 @@ def test_an_exception_is_logged_and_the_next_item_worked_on(caplog: pytest.LogCa
     workers = Workers(work, "the picky one")
     workers.put(1)
     workers.put(2)
-    assert done.get(timeout=5) == 2
+    assert done.get(timeout=PATIENCE_S) == 2
     workers.end()
     assert "the picky one failed" in caplog.text
     assert "one is bad" in caplog.text

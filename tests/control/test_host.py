@@ -6,6 +6,7 @@ import os
 import queue
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,7 +26,7 @@ from ibrobot_core.plugins import installed
 if TYPE_CHECKING:
     from conftest import Site
 
-PATIENCE_S = 20.0
+PATIENCE_S = 30.0
 PLUGIN = """
 import attrs
 from ibrobot_core import hookimpl
@@ -67,7 +68,7 @@ robot:
     - {name: pan, lower: -1.0, upper: 1.0, max_velocity: 3.0, max_acceleration: 40.0}
     - {name: grip, lower: 0.0, upper: 1.0, max_velocity: 3.0, max_acceleration: 40.0}
   groups: {arm: [pan, grip]}
-  description: {poses: {out: [1.0, 1.0]}}
+  description: {poses: {out: [0.4, 0.8]}}
 simulation: {type: arm}
 executors:
   position: {type: position, group: arm}
@@ -89,8 +90,9 @@ class Told:
 
     def state(self, wanted: Callable[[ControlState], bool]) -> ControlState:
         """The next state that is as `wanted`."""
+        deadline_s = time.monotonic() + PATIENCE_S
         while not wanted(found := self.states.get(timeout=PATIENCE_S)):
-            pass
+            assert time.monotonic() < deadline_s, f"the last state was {found}"
         return found
 
 
@@ -155,7 +157,7 @@ class TestBoth:
         epoch = host.call("counters")["epoch"]
         if isinstance(host, InlineControl):
             host.step()
-        np.testing.assert_allclose(told.state(lambda state: state.epoch == epoch).command, 1.0, atol=0.01)
+        np.testing.assert_allclose(told.state(lambda state: state.epoch == epoch).command, [0.4, 0.8], atol=0.01)
 
     def test_commands_are_answered_with_the_epoch_and_refused_with_the_reason(self, make, kind):
         host = make(kind)
@@ -173,14 +175,16 @@ class TestProcess:
         host = make()
         host.start()
         first = told.state(lambda state: True)
-        positions = np.linspace(first.command, [0.3, 0.9], 50)
+        end = np.array([0.3, 0.9])
+        # It ends with seconds at rest, so that it is no matter when it comes.
+        positions = np.vstack([np.linspace(first.command, end, 50), np.full((1500, 2), end)])
         host.write_plan(PlanRecord(first.epoch, first.stamp_ns, 10_000_000, np.ones(2, dtype=bool), positions))
 
         ticks = [first.tick]
-        while not np.allclose((state := told.state(lambda state: True)).command, [0.3, 0.9]):
-            ticks.append(state.tick)
-        assert ticks == list(range(first.tick, first.tick + len(ticks)))
-        assert host.lost_states == 0
+        told.state(lambda state: ticks.append(state.tick) or np.allclose(state.command, end))
+        assert ticks == sorted(set(ticks))
+        # A host that was stopped for seconds comes too late for some, and says so.
+        assert ticks[-1] - first.tick + 1 - len(ticks) <= host.lost_states
 
     def test_a_start_that_is_given_up_on_the_way_stops_the_robot(self, make, tmp_path):
         given_up = threading.Event()

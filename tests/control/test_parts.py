@@ -61,7 +61,7 @@ class Part(Hardware):
         out[:] = self.order[:2]
 
     def _act(self) -> None:
-        assert self.gate.wait(5.0)
+        assert self.gate.wait(60.0)
         if self.error is not None:
             raise self.error
 

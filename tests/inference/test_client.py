@@ -17,7 +17,7 @@ from ibrobot_core.interfaces import Frame
 from ibrobot_core.testing import host_context
 from ibrobot_core.testing.fakes import FakePolicy
 
-PATIENCE_S = 10.0
+PATIENCE_S = 30.0
 
 
 class GatedPolicy(FakePolicy):

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from ibrobot_core.errors import ContractError, PolicyError, TransportError
+from ibrobot_core.inference import service as module
 from ibrobot_core.inference.remote import RemoteEngine
 from ibrobot_core.inference.service import InferenceService, ServiceOptions, health_name, service_name
 from ibrobot_core.inference.wire import Kind, Message, decode, encode
@@ -23,7 +24,7 @@ from ibrobot_core.local_transport import LocalTransport
 from ibrobot_core.testing import host_context
 from ibrobot_core.testing.fakes import FakePolicy
 
-PATIENCE_S = 20.0
+PATIENCE_S = 30.0
 SOON_NS = round(PATIENCE_S * 1e9)
 
 
@@ -247,7 +248,8 @@ def test_draining_finishes_what_is_there_and_refuses_what_comes():
         assert [outputs(first), outputs(waiting)] == [[0], [2]]
 
 
-def test_a_policy_that_remembers_serves_one_robot_and_is_reset_for_each_episode():
+def test_a_policy_that_remembers_serves_one_robot_and_is_reset_for_each_episode(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(module, "_LEASE_NS", 100 * SOON_NS)
     with served(Net(stateful=True)) as cloud:
         cloud.policy.gate.release(10)
         for episode, seed in ((1, 7), (1, 7), (2, 8)):
@@ -263,8 +265,8 @@ def test_a_name_is_served_once():
 
 
 @contextmanager
-def engine(cloud: Cloud, policy: Net | None = None, **changes: Any) -> Iterator[RemoteEngine]:
-    made = RemoteEngine(policy or cloud.policy, cloud.transport, "net", "so101", **changes)
+def engine(cloud: Cloud, policy: Net | None = None) -> Iterator[RemoteEngine]:
+    made = RemoteEngine(policy or cloud.policy, cloud.transport, "net", "so101", start_timeout_s=PATIENCE_S)
     try:
         yield made
     finally:
@@ -319,7 +321,7 @@ def test_the_engine_says_that_nobody_serves_its_model():
         remote.infer({"x": np.zeros(1)}, 1, deadline())
     transport.serve(health_name("net"), lambda payload: b"<html>")
     with pytest.raises(PolicyError, match="is no server of ibrobot: b'<html>'"):
-        remote.start()
+        RemoteEngine(Net(), transport, "net", "so101", start_timeout_s=PATIENCE_S).start()
     transport.close()
 
 

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from conftest import Site
 
 PARTS = '''
+import time
+
 import attrs
 from ibrobot_core import hookimpl
 from ibrobot_core.descriptors import (
@@ -52,7 +54,7 @@ class Scene(FakeHardware):
         self.broken = False
 
 class Camera(FakeSensor):
-    """`TROUBLE` says which one is missing, has a bug, or is unplugged at its sixth frame."""
+    """50 Hz in real time; `TROUBLE` says which one is missing, has a bug, or is unplugged at its sixth frame."""
     frames = 0
     def open(self):
         trouble = TROUBLE.get(self._ctx.name)
@@ -66,6 +68,7 @@ class Camera(FakeSensor):
         self.frames += 1
         if self.frames > 5 and TROUBLE.get(self._ctx.name) == "unplugged":
             raise SensorError("unplugged")
+        time.sleep(min(timeout_s, 0.02))
         return super().read(timeout_s)
     def close(self):
         CALLS.append("close " + self._ctx.name)

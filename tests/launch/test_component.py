@@ -11,7 +11,7 @@ from ibrobot_core.errors import ComponentFailed, SensorError
 from ibrobot_core.launch import component as module
 from ibrobot_core.launch.component import Worker
 
-PATIENCE_S = 10.0
+PATIENCE_S = 30.0
 
 
 class Probe(Worker):

@@ -31,7 +31,7 @@ class Network(LocalTransport, TopicTransport):
         self.closed = False
 
     def publish_message(self, topic, message, *, latched=False):
-        self.goes_on.wait(10)
+        self.goes_on.wait(60)
         if self.refuses:
             raise TransportError("the network says no")
         self.sent.append((topic, message, latched))
@@ -126,7 +126,7 @@ def test_what_others_publish_comes_in(runs: Runs, network: None, caplog: pytest.
     lamp = runtime.session.bus.subscribe("/lamp")
     take = made().callbacks["/lamp"]
     take(Bool(True))
-    received = lamp.get(5.0)
+    received = lamp.get(30.0)
     assert received is not None
     assert received.message == Bool(True)
     for _ in range(2):
