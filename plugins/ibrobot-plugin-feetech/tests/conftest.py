@@ -1,4 +1,4 @@
-"""An emulated arm on a pseudo-terminal, with a calibration that fits the tests' robot."""
+"""An emulated arm on a pseudo-terminal or a line in memory, with a calibration that fits the tests' robot."""
 
 from __future__ import annotations
 
@@ -12,6 +12,10 @@ from ibrobot_feetech.emulator import Emulator
 from ibrobot_core.calibration import Calibration, JointCalibration, save_calibration
 from ibrobot_core.testing.contexts import ARM, GRIPPER
 
+from .line import lay
+
+ADAPTER_S = bus._ADAPTER_S
+PATIENCE_S = 30.0
 JOINTS = (*ARM, *GRIPPER)
 OFFSETS = (-120, 35, 0, 900, -2000, 40)
 
@@ -40,8 +44,24 @@ def prepare(emulator: Emulator, calibration: Calibration) -> None:
 
 @pytest.fixture(autouse=True)
 def patience(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A busy machine may keep the emulator, a thread of this process, from answering for a while."""
-    monkeypatch.setattr(bus, "_ADAPTER_S", 0.2)
+    """A busy machine may keep the emulator, a thread of this process, from answering for a while.
+
+    So nothing may be silent or late here but on a `line`, which no machine delays.
+    """
+    monkeypatch.setattr(bus, "_ADAPTER_S", PATIENCE_S)
+
+
+@pytest.fixture
+def lines(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Buses find the test's lines, and wait as long for replies as they always do."""
+    lay(monkeypatch)
+    monkeypatch.setattr(bus, "_ADAPTER_S", ADAPTER_S)
+
+
+@pytest.fixture
+def ports(lines: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Among tests with lines, one with a pseudo-terminal."""
+    monkeypatch.setattr(bus, "_ADAPTER_S", PATIENCE_S)
 
 
 @pytest.fixture

@@ -20,12 +20,10 @@ from ibrobot_feetech.errors import (
 )
 from ibrobot_feetech.sync import SyncReader, SyncWriter
 
+from .conftest import arm_calibration, prepare
+from .line import Line
+
 SERVOS = (1, 2, 3, 4, 5, 6)
-
-
-@pytest.fixture
-def patience() -> None:
-    """None: what is late here is late by the bus's own measure."""
 
 
 @pytest.fixture
@@ -34,6 +32,16 @@ def bus(emulator: Emulator) -> Iterator[FeetechBus]:
     bus.open()
     yield bus
     bus.close()
+
+
+class OnALine:
+    """Where replies are late or missing: in memory, by the bus's own measure of time and not by the machine's."""
+
+    @pytest.fixture
+    def emulator(self, lines: None) -> Iterator[Emulator]:
+        with Line(6) as emulator:
+            prepare(emulator, arm_calibration())
+            yield emulator
 
 
 class TestRequests:
@@ -75,15 +83,6 @@ class TestRequests:
         bus.action()
         assert bus.sync_read("goal_position", (1, 4)) == {1: 2100, 4: 2100}
 
-    def test_scan_finds_those_that_are_there(self, bus: FeetechBus, emulator: Emulator) -> None:
-        emulator.faults.silent.add(4)
-        assert bus.scan(range(1, 10)) == dict.fromkeys((1, 2, 3, 5, 6), 777)
-
-    def test_ping_says_who_is_missing(self, bus: FeetechBus) -> None:
-        assert bus.ping(3) == 777
-        with pytest.raises(NoReply, match=r"servo 9, model_number: no reply within .* ms; check its power"):
-            bus.ping(9)
-
     def test_a_value_that_does_not_fit_is_refused_before_it_is_sent(self, bus: FeetechBus) -> None:
         with pytest.raises(ValueError, match="acceleration must be 0 to 255, not 256"):
             bus.write(1, "acceleration", 256)
@@ -115,27 +114,6 @@ class TestErrors:
         assert replies.answered.all()
         assert not replies.complete
 
-    def test_a_damaged_reply_is_told_from_none(self, bus: FeetechBus, emulator: Emulator) -> None:
-        emulator.faults.corrupt = 1.0
-        with pytest.raises((PacketError, NoReply)):
-            bus.read(1, "present_position")
-
-    def test_retries_are_bounded_and_counted(self, emulator: Emulator) -> None:
-        bus = FeetechBus(emulator.port, retries=3)
-        bus.open()
-        emulator.faults.silent.add(1)
-        with pytest.raises(NoReply):
-            bus.read(1, "present_position")
-        assert (bus.counters["retries"], bus.counters["timeouts"]) == (3, 4)
-        bus.close()
-
-    def test_the_silence_of_one_does_not_hide_the_others(self, bus: FeetechBus, emulator: Emulator) -> None:
-        emulator.faults.silent.add(3)
-        replies = SyncReader(bus, SERVOS, "present_position").read()
-        assert replies.answered.tolist() == [True, True, False, True, True, True]
-        with pytest.raises(NoReply, match=r"servo 3 \(elbow_flex\), present_position: no reply"):
-            bus.sync_read("present_position", SERVOS)
-
     def test_a_port_held_by_another_is_refused(self, bus: FeetechBus, emulator: Emulator) -> None:
         with pytest.raises(PortError, match="another program holds the port"):
             FeetechBus(emulator.port).open()
@@ -160,7 +138,39 @@ class TestErrors:
             FeetechBus(str(tmp_path)).open()
 
 
-class TestLateReplies:
+class TestSilence(OnALine):
+    def test_scan_finds_those_that_are_there(self, bus: FeetechBus, emulator: Emulator) -> None:
+        emulator.faults.silent.add(4)
+        assert bus.scan(range(1, 10)) == dict.fromkeys((1, 2, 3, 5, 6), 777)
+
+    def test_ping_says_who_is_missing(self, bus: FeetechBus) -> None:
+        assert bus.ping(3) == 777
+        with pytest.raises(NoReply, match=r"servo 9, model_number: no reply within .* ms; check its power"):
+            bus.ping(9)
+
+    def test_a_damaged_reply_is_told_from_none(self, bus: FeetechBus, emulator: Emulator) -> None:
+        emulator.faults.corrupt = 1.0
+        with pytest.raises((PacketError, NoReply)):
+            bus.read(1, "present_position")
+
+    def test_retries_are_bounded_and_counted(self, emulator: Emulator) -> None:
+        bus = FeetechBus(emulator.port, retries=3)
+        bus.open()
+        emulator.faults.silent.add(1)
+        with pytest.raises(NoReply):
+            bus.read(1, "present_position")
+        assert (bus.counters["retries"], bus.counters["timeouts"]) == (3, 4)
+        bus.close()
+
+    def test_the_silence_of_one_does_not_hide_the_others(self, bus: FeetechBus, emulator: Emulator) -> None:
+        emulator.faults.silent.add(3)
+        replies = SyncReader(bus, SERVOS, "present_position").read()
+        assert replies.answered.tolist() == [True, True, False, True, True, True]
+        with pytest.raises(NoReply, match=r"servo 3 \(elbow_flex\), present_position: no reply"):
+            bus.sync_read("present_position", SERVOS)
+
+
+class TestLateReplies(OnALine):
     """The servo counts up with every request, so that an answer tells which request it is of."""
 
     @pytest.fixture
@@ -256,10 +266,10 @@ class TestLateReplies:
         assert bus.read(2, "present_position") >= before
 
 
-class TestDamage:
+class TestDamage(OnALine):
     @pytest.mark.parametrize("seed", range(3))
-    def test_garbage_and_duplicates_are_passed_over(self, seed: int) -> None:
-        with Emulator(6, seed=seed) as emulator:
+    def test_garbage_and_duplicates_are_passed_over(self, lines: None, seed: int) -> None:
+        with Line(6, seed=seed) as emulator:
             emulator.faults.corrupt, emulator.faults.drop, emulator.faults.duplicate = 0.01, 0.02, 0.05
             bus = FeetechBus(emulator.port, retries=8)
             bus.open()

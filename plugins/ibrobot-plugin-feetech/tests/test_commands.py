@@ -11,13 +11,27 @@ import pytest
 from ibrobot_feetech.emulator import EmulatedServo, Emulator
 
 from ibrobot_core.calibration import load_calibration
-from ibrobot_core.testing.terminal import Terminal
+from ibrobot_core.testing import terminal as terminal_module
 
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
 MIDDLES = {1: 2500, 2: 300, 3: 2048, 4: 3900, 5: 1000, 6: 100}
 """Servo -> where its encoder is in the middle pose."""
 ENDS = {1: (797, 3297), 2: (900, 3190), 3: (950, 3150), 4: (970, 3120), 6: (1400, 2700)}
 """Servo -> what it reports at its joint's ends, once the middle is at 2047."""
+
+
+PATIENCE = """
+from ibrobot_feetech import bus
+bus._ADAPTER_S = 0.03
+"""
+"""Python source: the emulator, a thread of this process, may be slow on a busy machine. A scan asks 250 times."""
+
+
+class Terminal(terminal_module.Terminal):
+    """The commands, with more patience than they need with an arm."""
+
+    def __init__(self, *arguments: str, before: str = "", columns: int = 80) -> None:
+        super().__init__(*arguments, before=PATIENCE + before, columns=columns)
 
 
 class Person:
@@ -194,7 +208,7 @@ def test_a_middle_that_no_offset_reaches_is_explained_and_asked_again(emulator, 
 
 def test_signs_are_learnt_from_turning_each_joint(emulator, person, home):
     with Terminal(
-        "feetech", "calibrate", emulator.port, "--middle-now", "--range-seconds", "3", "--check-signs"
+        "feetech", "calibrate", emulator.port, "--middle-now", "--range-seconds", "8", "--check-signs"
     ) as terminal:
         terminal.wait_for("to both ends")
         person.sweep(ENDS)

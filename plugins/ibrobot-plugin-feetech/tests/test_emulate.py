@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from ibrobot_feetech import bus as bus_module
 from ibrobot_feetech.bus import FeetechBus
 
 from ibrobot_core.calibration import load_calibration
@@ -17,7 +18,10 @@ IBROBOT = (sys.executable, "-c", "from ibrobot_core.cli.main import main; main()
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_it_says_its_port_serves_and_ends_cleanly(number: signal.Signals, tmp_path: Path) -> None:
+def test_it_says_its_port_serves_and_ends_cleanly(
+    number: signal.Signals, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bus_module, "_ADAPTER_S", 2.0)  # so long does a scan take, whoever answers
     link = tmp_path / "arm"
     command = (*IBROBOT, "feetech", "emulate", "--servos", "2", "--link", str(link), "--calibration", "two")
     environment = {**os.environ, "XDG_CONFIG_HOME": str(tmp_path)}

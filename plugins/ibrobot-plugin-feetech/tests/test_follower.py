@@ -24,8 +24,14 @@ from ibrobot_core.testing.contexts import START_NS, control_context
 from ibrobot_core.testing.hardware import HardwareSuite
 
 from .conftest import JOINTS, arm_calibration, prepare
+from .line import Line
 
 TICK = 2 * math.pi / 4096
+
+
+@pytest.fixture(autouse=True)
+def _in_memory(lines: None) -> None:
+    pass
 
 
 class TestFollower(HardwareSuite):
@@ -33,7 +39,7 @@ class TestFollower(HardwareSuite):
     def _arm(self, calibration_file: Path) -> Iterator[None]:
         self.clock = SteppedClock(START_NS)
         self.file = calibration_file
-        with Emulator(6, clock=self.clock) as self.emulator:
+        with Line(6, clock=self.clock) as self.emulator:
             prepare(self.emulator, arm_calibration())
             yield
 
@@ -82,8 +88,9 @@ def rig(calibration_file: Path) -> Iterator[Rig]:
 
 @contextmanager
 def rig_of(file: Path, link: Path | None = None, **options: Any) -> Iterator[Rig]:
+    """On a line; with `link` on a pseudo-terminal."""
     clock = SteppedClock(START_NS)
-    with Emulator(6, clock=clock, link=link) as emulator:
+    with Line(6, clock=clock) if link is None else Emulator(6, clock=clock, link=link) as emulator:
         prepare(emulator, arm_calibration())
         ctx = control_context("arm", clock=clock)
         port = str(link) if link is not None else emulator.port
@@ -240,7 +247,7 @@ class TestFaults:
         assert rig.register("torque_enable") == [1] * 6
 
     def test_unplugged_is_a_fault_at_once_and_replugged_it_comes_back(
-        self, tmp_path: Path, calibration_file: Path
+        self, ports: None, tmp_path: Path, calibration_file: Path
     ) -> None:
         with rig_of(calibration_file, link=tmp_path / "port") as rig:
             rig.follower.connect()

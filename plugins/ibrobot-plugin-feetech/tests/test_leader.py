@@ -22,17 +22,30 @@ from ibrobot_core.testing import TeleopSuite
 from ibrobot_core.testing.contexts import START_NS, host_context
 
 from .conftest import JOINTS, OFFSETS, arm_calibration, prepare
+from .line import Line
 
 TICK_NS = 10_000_000
 RADIAN = 4096 / (2 * math.pi)
 """Ticks."""
 
 
+@pytest.fixture(autouse=True)
+def _in_memory(lines: None) -> None:
+    pass
+
+
+@pytest.fixture
+def emulator() -> Iterator[Emulator]:
+    with Line(6) as emulator:
+        prepare(emulator, arm_calibration())
+        yield emulator
+
+
 class LeaderSuite(TeleopSuite):
     @pytest.fixture(autouse=True)
     def _arm(self, calibration_file: Path) -> Iterator[None]:
         self.file, self.typed = calibration_file, queue.SimpleQueue[str]()
-        with Emulator(6) as self.emulator:
+        with Line(6) as self.emulator:
             prepare(self.emulator, arm_calibration())
             yield
 
@@ -299,7 +312,7 @@ class TestBus:
         with pytest.raises(TeleopError, match=r"servo 1 \(shoulder_pan\): position 100 right after 3000"):
             desk.read()
 
-    def test_unplugged_it_says_so_and_replugged_it_connects(self, tmp_path: Path, calibration_file: Path):
+    def test_unplugged_it_says_so_and_replugged_it_connects(self, ports: None, tmp_path: Path, calibration_file: Path):
         link = tmp_path / "port"
         with Emulator(6, link=link) as emulator:
             prepare(emulator, arm_calibration())
