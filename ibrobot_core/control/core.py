@@ -23,6 +23,8 @@ from ibrobot_core.units import ns
 
 EMERGENCY_STOP = "emergency stop"
 """The fault that a person raises."""
+_FIRST_READINGS = 10
+"""Of so many, one must be new: a single reply may be lost."""
 _POSE_SPEED = 0.25
 """Fraction of the velocity limits at which start and stop move to a pose."""
 _POSE_TIMEOUT_S = 10.0
@@ -228,8 +230,11 @@ class ControlCore:
         self._hardware.disconnect()
 
     def _first_reading(self) -> JointReading:
-        measured = self._hardware.read()
-        if measured.stale:
+        for _ in range(_FIRST_READINGS):
+            measured = self._hardware.read()
+            if not measured.stale:
+                break
+        else:
             raise HardwareError("the joints do not answer yet")
         self._answered_ns = measured.stamp_ns
         return measured
