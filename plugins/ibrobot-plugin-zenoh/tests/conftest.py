@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from ibrobot_zenoh import reasons
 
 from ibrobot_core.testing.leaks import no_leaks  # noqa: F401
 
@@ -16,3 +17,9 @@ def _zenoh_runs() -> None:
     first, second = router(endpoint), client(endpoint)
     second.close()
     first.close()
+
+
+@pytest.fixture(autouse=True)
+def _patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a busy machine, a trial of why there is no connection may wait for long."""
+    monkeypatch.setattr(reasons, "_TIMEOUT_S", 10.0)

@@ -14,7 +14,7 @@ from ibrobot_zenoh.transport import ZenohTransport
 from ibrobot_core.interfaces import Transport
 from ibrobot_core.testing import host_context
 
-WAIT_S = 10.0
+WAIT_S = 30.0
 """How long a test waits for what must come [s]."""
 
 _numbers = itertools.count()

@@ -49,7 +49,7 @@ def test_requests_pass_with_certificates(lab: Path):
     robots = [client(endpoint, tls=tls(lab, name)) for name in ("robot1", "robot2")]
     for robot in robots:
         settle(robot, server)
-        assert robot.request("echo", b"hello", 5.0) == b"hello"
+        assert robot.request("echo", b"hello", WAIT_S) == b"hello"
     for end in (*robots, server):
         end.close()
 

@@ -30,7 +30,13 @@ from ibrobot_core.robot import Robot
 
 from .pair import WAIT_S, free_endpoint, router, wait_for
 
-IBROBOT = "from ibrobot_core.cli.main import main; main()"
+PATIENT = """
+from importlib import import_module
+import_module("ibrobot_zenoh.commands.network")._CONNECT_S = 30.0
+import_module("ibrobot_zenoh.commands.topic")._LIST_S = 30.0
+from ibrobot_core.cli.main import main
+main()
+"""
 STATE = JointState(Header(5, "base"), ("pan",), [0.5])
 
 
@@ -68,6 +74,13 @@ def _without_shared_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(network_module, "options_from", options)
 
 
+@pytest.fixture(autouse=True)
+def _patient_commands(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(network_module, "_CONNECT_S", WAIT_S)
+    for name in ("_LIST_S", "_HEARD_S"):
+        monkeypatch.setattr(f"ibrobot_zenoh.commands.topic.{name}", WAIT_S)
+
+
 def run(*arguments: str) -> str:
     result = CliRunner().invoke(topic, arguments, catch_exceptions=True)
     if result.exception is not None:
@@ -92,10 +105,10 @@ def test_echo(robot: ZenohTransport, endpoint: str):
 
 
 def test_hz(robot: ZenohTransport, endpoint: str):
-    output = run("hz", "/joint_states", "--endpoint", endpoint, "-n", "1", "--period", "0.3")
+    output = run("hz", "/joint_states", "--endpoint", endpoint, "-n", "1", "--period", "3")
     rate, unit, *_ = output.split()
     assert unit.startswith("Hz")
-    assert 1 < float(rate) <= 210
+    assert 1 < float(rate) <= 400  # 200 at most, and more where some had waited for a busy machine
     silent = run("hz", "/silence", "--endpoint", endpoint, "-n", "1", "--period", "0.02")
     told = "nobody publishes /silence yet; published now: /joint_states\n"
     assert silent == f"{told}less than two messages on /silence in 0.02 s\n"
@@ -129,7 +142,7 @@ def test_pub_of_another_type_is_refused(robot: ZenohTransport, endpoint: str):
 @pytest.mark.parametrize("command", [["echo", "/joint_states"], ["hz", "/joint_states", "--period", "0.05"]])
 def test_ctrl_c_ends_it_cleanly(command: list[str], robot: ZenohTransport, endpoint: str):
     with subprocess.Popen(
-        [sys.executable, "-c", IBROBOT, "topic", *command, "--endpoint", endpoint],
+        [sys.executable, "-c", PATIENT, "topic", *command, "--endpoint", endpoint],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     ) as process:  # fmt: skip
         assert process.stdout is not None
@@ -140,7 +153,7 @@ def test_ctrl_c_ends_it_cleanly(command: list[str], robot: ZenohTransport, endpo
 
 
 def test_which_network(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(network_module, "_CONNECT_S", 0.1)
+    monkeypatch.setattr(network_module, "_CONNECT_S", 3.0)  # for as long it tries
     with pytest.raises(SystemExit):
         run("list")
     assert "which network? Give --config CONFIG, or --endpoint" in CliRunner().invoke(topic, ["list"]).output

@@ -195,7 +195,8 @@ def test_a_ros_2_node_of_another_make_hears_and_is_heard():
             assert peer.stdout.readline().split() == ["/lab/chatter", "/reply"]
             expected = SharedTopic("/lab/chatter", "std_msgs/msg/String", 1, 1)
             wait_for(lambda: expected in far.shared_topics(WAIT_S))
-            near.publish_message("/chatter", String("hello"))
+            # That it listens may be known at the router before it is here.
+            wait_for(lambda: near.publish_message("/chatter", String("hello")) or not arrived.empty())
             assert arrived.get(timeout=WAIT_S) == String("heard hello")
         finally:
             peer.kill()
