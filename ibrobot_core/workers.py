@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import signal
 import threading
 import time
 from collections import deque
@@ -11,6 +12,16 @@ from collections.abc import Callable
 _log = logging.getLogger("ibrobot.workers")
 
 _END_S = 1.0
+
+
+def on_signals(act: Callable[[], object], *numbers: int) -> None:
+    """Have `act` called at each of these signals, in a thread of its own.
+
+    A handler comes in the middle of what the main thread does. Where that waits for an event it may hold the lock that
+    setting the event takes, and no more would ever happen.
+    """
+    for number in numbers:
+        signal.signal(number, lambda *_: threading.Thread(target=act, name="signal", daemon=True).start())
 
 
 class Workers[T]:

@@ -240,6 +240,12 @@ def _stop_on_signals(session: Session, keys: Keys | None) -> None:
             if keys is not None:
                 keys.close()
             os._exit(_INTERRUPTED_TWICE)
+        if session.request.lockstep:  # nobody waits for the end, which comes at a tick
+            finish()
+        else:  # see `on_signals`
+            threading.Thread(target=finish, name="signal", daemon=True).start()
+
+    def finish() -> None:
         session.log.info("stopping; Ctrl-C again stops at once")
         session.finish()
 

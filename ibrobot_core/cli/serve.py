@@ -22,6 +22,7 @@ from ibrobot_core.inference.service import InferenceService, ServiceOptions
 from ibrobot_core.interfaces import Context, Policy, Transport
 from ibrobot_core.plugins import Registry, installed
 from ibrobot_core.robot import Robot
+from ibrobot_core.workers import on_signals
 
 DEFAULT_LISTEN = "tcp/127.0.0.1:7447"
 _PLAIN_PERIOD_S = 10.0
@@ -76,8 +77,7 @@ def serve(what: str, **options: Any) -> None:
         policy.load()
         logging.getLogger("ibrobot").info("%s loaded in %.1f s", name, time.monotonic() - begun_s)
         stopping = threading.Event()  # only from now on: until here either signal ends it at once
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: stopping.set())
+        on_signals(stopping.set, signal.SIGINT, signal.SIGTERM)
         transport = make_transport()
         limits = ServiceOptions(options["batch"], options["queue"], options["patience"] / 1000)
         service = InferenceService(policy, transport, name, limits, policy.picture_codec())

@@ -13,6 +13,8 @@ from urllib.parse import parse_qs, urlsplit
 import click
 import cv2
 
+from ibrobot_core.workers import on_signals
+
 if TYPE_CHECKING:
     from ibrobot_camera.camera import OpenCvCamera
 
@@ -75,8 +77,7 @@ def preview(source: str, host: str, port: int, seconds: float | None) -> None:
     from ibrobot_camera.commands.sources import opened
 
     ended = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: ended.set())
+    on_signals(ended.set, signal.SIGINT, signal.SIGTERM)
     token = secrets.token_urlsafe(16)
     with opened(source) as cameras:
         views = {name: Newest(name, camera, ended) for name, camera in cameras.items()}

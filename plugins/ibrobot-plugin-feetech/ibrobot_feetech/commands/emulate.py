@@ -23,6 +23,7 @@ from ibrobot_core.calibration import (
     save_calibration,
 )
 from ibrobot_core.units import TICKS_PER_TURN
+from ibrobot_core.workers import on_signals
 from ibrobot_feetech.commands.joints import SO101
 
 if TYPE_CHECKING:
@@ -70,8 +71,7 @@ def emulate(
     if link is not None and link.exists() and not link.is_symlink():
         raise click.BadParameter(f"{link} is there already and is no link: name another path", param_hint="--link")
     ended = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: ended.set())
+    on_signals(ended.set, signal.SIGINT, signal.SIGTERM)
     config = _config(physics) if physics is not None else None
     joints = config.robot.joint_names if config is not None else _JOINTS[:servos]
     count = len(joints) if config is not None else servos
