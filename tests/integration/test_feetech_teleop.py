@@ -11,10 +11,12 @@ from typing import Any
 import attrs
 import numpy as np
 import pytest
-from ibrobot_feetech.emulator import Emulator
+from ibrobot_feetech import bus
+from ibrobot_feetech.emulator import EmulatedServo, Emulator
 
 from ibrobot_core.calibration import Calibration, JointCalibration, save_calibration
 from ibrobot_core.config import load
+from ibrobot_core.control import host
 from ibrobot_core.errors import IbrobotError
 from ibrobot_core.launch.runtime import ESTOP, RESET, Runtime
 from ibrobot_core.launch.session import Request, Session
@@ -28,14 +30,27 @@ RADIAN = 4096 / (2 * math.pi)
 """Ticks."""
 MAX_STEP = 3.0 * 0.01 * RADIAN
 """The velocity limit, for one tick of control [ticks]."""
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
+
+
+class Noting(EmulatedServo):
+    """Keeps its goals while its torque is on, each as it is written: several may come at once to a slow emulator."""
+
+    def __init__(self, servo: int) -> None:
+        self.goals: list[int] = []
+        super().__init__(servo)
+
+    def write(self, address: int, content: bytes) -> None:
+        super().write(address, content)
+        if self.torque:
+            self.goals.append(self.get("goal_position"))
 
 
 def arm(folder: Path, name: str) -> tuple[Emulator, Path]:
     """An emulated arm at zero, and its calibration."""
     joints = {joint: JointCalibration(i + 1, 0, 0, 700, 3400) for i, joint in enumerate(JOINTS[:-1])}
     joints["gripper"] = JointCalibration(6, 0, 0, 1500, 2752)
-    emulator = Emulator(6, link=folder / name)
+    emulator = Emulator({number: Noting(number) for number in range(1, 7)}, link=folder / name)
     for joint in joints.values():
         servo = emulator.servos[joint.id]
         servo.set("min_position_limit", joint.range_min)
@@ -50,26 +65,24 @@ class Station:
     leader: Emulator
     follower: Emulator
     runtime: Runtime
-    goals: list[list[int]] = attrs.field(factory=list)
-    """The follower's goals [ticks], as often as they changed."""
+    requests: int = 0
+    """To the follower."""
 
-    def watch(self) -> None:
-        """Note the follower's goals after each request, once its torque is on."""
-        goals = [servo.get("goal_position") for servo in self.follower.servos.values()]
-        torque = all(servo.torque for servo in self.follower.servos.values())
-        if torque and (not self.goals or self.goals[-1] != goals):
-            self.goals.append(goals)
+    def count(self) -> None:
+        self.requests += 1
 
-    def turn(self, joint: str, angle: float, over_s: float = 0.3) -> None:
-        """A person moves a joint of the leader to an angle [rad]."""
+    def fastest(self) -> float:
+        """The longest step between two goals of a servo of the follower [ticks]."""
+        servos = self.follower.servos.values()
+        return max(float(np.abs(np.diff(servo.goals)).max()) for servo in servos if isinstance(servo, Noting))
+
+    def turn(self, joint: str, angle: float) -> None:
+        """A person moves a joint of the leader to an angle [rad], in steps of a hand however late they come."""
         servo = self.leader.servos[JOINTS.index(joint) + 1]
-        begin, begun = servo.encoder, time.monotonic()
-        while (share := min(1.0, (time.monotonic() - begun) / over_s)) < 1.0:
+        for encoder in np.linspace(servo.encoder, 2048 + angle * RADIAN, 60):
             with self.leader.lock:
-                servo.turn(begin + share * (2048 + angle * RADIAN - begin))
+                servo.turn(float(encoder))
             self.runtime.wait(0.005)
-        with self.leader.lock:
-            servo.turn(2048 + angle * RADIAN)
 
     def angle(self, joint: str) -> float:
         """Where a joint of the follower is [rad]."""
@@ -94,23 +107,24 @@ class Station:
         self.until(lambda: len(self.faults) >= count, "a fault")
         return self.faults[-1]
 
-    def until_at_rest(self) -> float:
-        """Where the follower's pan comes to rest [rad]."""
-        since, last = time.monotonic(), self.angle("shoulder_pan")
-        while time.monotonic() - since < 0.3:
+    def until_at_rest(self, requests_at_rest: int = 30) -> float:
+        """Where the follower's pan comes to rest [rad]: an emulated joint moves when the control process asks."""
+        last, since, requests = self.angle("shoulder_pan"), time.monotonic(), self.requests
+        while time.monotonic() - since < 0.3 or self.requests < requests + requests_at_rest:
             self.runtime.wait(0.02)
             if abs(self.angle("shoulder_pan") - last) > 1e-4:
-                since, last = time.monotonic(), self.angle("shoulder_pan")
+                last, since, requests = self.angle("shoulder_pan"), time.monotonic(), self.requests
         return last
 
     def assert_no_jump(self) -> None:
-        """No goal was further from the one before it than the limits allow, a missed tick or two granted."""
-        steps = np.abs(np.diff(self.goals, axis=0))
-        assert steps.max() <= 3 * MAX_STEP + 1
+        """No goal was further from the one before it than the limits allow."""
+        assert self.fastest() <= MAX_STEP + 1
 
 
 @pytest.fixture
-def station(tmp_path: Path) -> Iterator[Callable[..., Station]]:
+def station(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Station]]:
+    monkeypatch.setattr(bus, "_ADAPTER_S", 0.5)
+    monkeypatch.setattr(host, "_REPLY_TIMEOUT_S", PATIENCE_S)
     made: list[Any] = []
 
     def start(*overrides: str) -> Station:
@@ -121,14 +135,15 @@ def station(tmp_path: Path) -> Iterator[Callable[..., Station]]:
             f"teleoperation.leader={{type: so101_leader, port: {tmp_path}/leader, calibration: {leader_file}}}",
             "control_modes.teleop.teleop=leader",
             # A busy machine may keep the emulator, a thread of this process, from answering for a while.
-            "hardware.lost_replies=25",
-            "teleoperation.leader.lost_replies=25",
-            "control.state_timeout=1.0",
+            "hardware.lost_replies=200",
+            "hardware.retries=200",
+            "teleoperation.leader.lost_replies=5",
+            "control.state_timeout=20.0",
         )
         config = load(CONFIG, overrides=(*sections, *overrides), mode="teleop")
         station = Station(leader, follower, Runtime(Session(config, installed(), Request())))
         made.append(station)
-        follower.on_request = station.watch
+        follower.on_request = station.count
         leader.start()
         follower.start()
         leader.servos[1].turn(2048 + 0.6 * RADIAN)
@@ -143,10 +158,10 @@ def station(tmp_path: Path) -> Iterator[Callable[..., Station]]:
 
 
 def test_the_follower_comes_to_the_leader_without_a_jump_and_follows(station: Callable[..., Station]):
-    arms = station()
+    arms = station("teleoperation.leader.ramp_velocity=0.15")
     arms.until_at("shoulder_pan", 0.6)
-    steps = np.abs(np.diff(arms.goals, axis=0))
-    assert steps.max() <= 3 * 1.0 * 0.01 * RADIAN + 1, "the approach is slower than the limits"
+    # A setpoint is a tenth of a second from the one before it, where the host is slow, or the tolerance at the end.
+    assert arms.fastest() <= 0.02 * RADIAN + 1 < MAX_STEP, "the approach is slower than the limits"
     for angle in (-0.5, 0.4):
         arms.turn("shoulder_pan", angle)
         arms.turn("elbow_flex", -angle)
@@ -189,7 +204,7 @@ def test_an_unplugged_follower_is_a_fault_and_replugged_a_reset_goes_on(station:
 
     arms.turn("shoulder_pan", -0.3)
     arms.follower.replug()
-    assert arms.until_at_rest() == pytest.approx(0.6, abs=0.05)
+    assert arms.until_at_rest(requests_at_rest=0) == pytest.approx(0.6, abs=0.05)
     arms.runtime.session.bus.call(RESET, None)
     arms.until_at("shoulder_pan", -0.3)
     arms.assert_no_jump()
