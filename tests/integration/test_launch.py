@@ -28,7 +28,7 @@ def test_scripted_pick_succeeds_and_the_summary_is_the_last_line(launch: Callabl
 
 
 def test_one_episode_in_real_time(launch: Callable[..., Ran]):
-    ran = launch("--episodes", "1")
+    ran = launch("--episodes", "1", "--set", "contract.max_duration_s=100")
     assert ran.code == 0, ran.err
     summary = ran.summary
     assert (summary["episodes"], summary["successes"], summary["faults"]) == (1, 1, [])
@@ -63,7 +63,7 @@ def test_a_fault_is_named_and_the_run_holds_until_its_end(recorded: Callable[...
 
 
 def test_a_fault_in_real_time(launch: Callable[..., Ran]):
-    ran = launch("--duration", "2", "--set", "simulation.faults=[{at: 0.5, kind: silent}]")
+    ran = launch("--duration", "6", "--set", "simulation.faults=[{at: 0.5, kind: silent}]")
     assert ran.code == 1, ran.err
     (fault,) = ran.summary["faults"]
     assert "the joints do not answer: no state for " in fault
