@@ -13,9 +13,10 @@ from lerobot.motors.feetech import FeetechMotorsBus
 
 from ibrobot_core.testing.terminal import Terminal
 
-pytestmark = pytest.mark.lerobot
+pytestmark = [pytest.mark.lerobot, pytest.mark.usefixtures("patient_buses")]
 
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
+PATIENCE = "from ibrobot_feetech import bus\nbus._ADAPTER_S = 0.5"
 STEPS = (*range(0, -1100, -50), *range(-1100, 1101, 50), *range(1100, -1, -50))
 
 
@@ -32,7 +33,8 @@ def test_lerobot_takes_a_calibration_made_in_the_dialogue(tmp_path: Path) -> Non
 
         for number, servo in emulator.servos.items():
             servo.turn(middles[number])
-        with Terminal("feetech", "calibrate", emulator.port, "--name", str(path), "--accept-ranges") as terminal:
+        arguments = ("feetech", "calibrate", emulator.port, "--name", str(path), "--accept-ranges")
+        with Terminal(*arguments, before=PATIENCE) as terminal:
             terminal.wait_for("Then press Enter")
             terminal.type("\r")
             terminal.wait_for("(Enter ends it)")

@@ -19,7 +19,7 @@ from ibrobot_core.calibration import Calibration, JointCalibration, load_calibra
 from ibrobot_core.clock import SteppedClock
 from ibrobot_core.units import ticks_to_lerobot
 
-pytestmark = pytest.mark.lerobot
+pytestmark = [pytest.mark.lerobot, pytest.mark.usefixtures("patient_buses")]
 
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
 CALIBRATION = {
