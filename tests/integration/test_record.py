@@ -41,6 +41,12 @@ def test_simulated_episodes_are_recorded_unattended_with_the_scenes_judgement(tm
     assert dataset["robot"] == "so101"
 
 
+def is_recording(terminal: Terminal) -> None:
+    """Wait for some of an episode; how many seconds are shown, a busy machine may skip."""
+    for _ in range(5):
+        terminal.wait_for("recording “wave”, ")
+
+
 def test_an_operator_records_by_keys(tmp_path: Path):
     arguments = ("record", "so101_blind", "--sim", "--mode", "teleop", "--root", str(tmp_path), "--dataset", "desk")
     with Terminal(*arguments, columns=120) as terminal:
@@ -48,16 +54,16 @@ def test_an_operator_records_by_keys(tmp_path: Path):
         terminal.type("\t")
         terminal.wait_for("prompt (Enter alone leaves it empty")
         terminal.type("wave\r")
-        terminal.wait_for("recording “wave”, 1 s")
+        is_recording(terminal)
         terminal.type("\t")
         terminal.wait_for("episode 1: success")
         terminal.type("\t")
         terminal.wait_for("takes “wave”")
         terminal.type("\r")
-        terminal.wait_for("recording “wave”, 1 s")
+        is_recording(terminal)
         terminal.type("\x1b[24~")  # F12
         terminal.wait_for("episode 2: discarded")
-        terminal.interrupt()
+        terminal.type("\x03")  # once: a second one ends it at once
         terminal.wait_for("recorded   1 episodes")
         assert terminal.end() == 0
     (kept,) = outcomes(tmp_path / "desk")
@@ -66,6 +72,6 @@ def test_an_operator_records_by_keys(tmp_path: Path):
 
 def test_without_a_terminal_it_says_what_to_add(tmp_path: Path, ibrobot: tuple[str, ...]):
     command = [*ibrobot, "record", "so101_blind", "--sim", "--headless", "--mode", "teleop"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 2
     assert "without a terminal nobody can begin an episode: add --auto" in done.stderr
