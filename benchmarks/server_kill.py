@@ -1,10 +1,11 @@
 """A server killed in the middle of a request, again and again: the arm holds, and goes on once there is a server again.
 
-    python benchmarks/server_kill.py [--kills 20]
+    python benchmarks/server_kill.py [--kills 20] [--slack 0]
 
 A robot in real time, its model of 60 ms in `ibrobot serve`, over Zenoh on this machine. Exits with 1 when the arm moved
 longer after a kill than its plan and one stale timeout, did not go on within a second of a restart, when the death of a
 server was not known within 50 ms, a request was answered twice or not at all, or when threads, files or memory grew.
+`--slack` grants each of these times some seconds more, on a machine that has other things to do.
 """
 
 from __future__ import annotations
@@ -78,6 +79,7 @@ STALE_S = 0.25
 PLAN_S = 12 / 30
 RESUMED_S = 1.0
 KNOWN_S = 0.05
+PATIENCE_S = 60.0
 SETTLE_S = 0.1
 """Within which the safety layer brings any motion to rest."""
 ROBOT = f"""
@@ -155,25 +157,25 @@ def until(condition: Any, timeout_s: float, what: str) -> None:
 
 
 def kill_once(
-    server: Server, folder: Path, endpoint: str, session: Session, motion: Motion
+    server: Server, folder: Path, endpoint: str, session: Session, motion: Motion, slack_s: float
 ) -> tuple[Server, float, float, float]:
     """Kill the server in the middle of a request; seconds until that is known, the arm holds, and the next goes on."""
     stats, engine = session.stats, session.engine_stats
     assert stats is not None
     assert engine is not None
     chunks = stats.chunks
-    until(lambda: stats.chunks > chunks, 10, "a chunk")
-    until(lambda: stats.requests > stats.chunks + stats.failures + stats.timeouts, 10, "a request in flight")
+    until(lambda: stats.chunks > chunks, PATIENCE_S, "a chunk")
+    until(lambda: stats.requests > stats.chunks + stats.failures + stats.timeouts, PATIENCE_S, "a request in flight")
     time.sleep(0.02)
     killed_ns = session.clock.now_ns()
     server.kill()
-    until(lambda: not engine.alive, 10, "the server is known to be dead")
+    until(lambda: not engine.alive, PATIENCE_S, "the server is known to be dead")
     known_ns = session.clock.now_ns()
-    time.sleep(PLAN_S + STALE_S + 3 * SETTLE_S)
+    time.sleep(PLAN_S + STALE_S + 3 * SETTLE_S + slack_s)
     held_ns = motion.moved_ns()[-1]
     server = Server(folder, endpoint)
     served_ns = session.clock.now_ns()
-    until(lambda: motion.moved_ns()[-1] > held_ns, 10, "the arm goes on")
+    until(lambda: motion.moved_ns()[-1] > held_ns, PATIENCE_S, "the arm goes on")
     moved_ns = motion.moved_ns()
     first_ns = moved_ns[moved_ns > held_ns][0]
     resumed_s = max(0.0, seconds(int(first_ns) - served_ns))
@@ -187,7 +189,7 @@ def resources() -> dict[str, int]:
     return {"threads": threading.active_count(), "files": files, "memory_mib": pages * os.sysconf("SC_PAGE_SIZE") >> 20}
 
 
-def run(kills: int, folder: Path) -> int:
+def run(kills: int, slack_s: float, folder: Path) -> int:
     """Print what came of it as JSON; 1 when it is not as it must be."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -203,10 +205,10 @@ def run(kills: int, folder: Path) -> int:
     known, held, resumed, grown = [], [], [], []
     try:
         runtime.start()
-        until(lambda: session.stats is not None, 10, "the mode begins")
+        until(lambda: session.stats is not None, PATIENCE_S, "the mode begins")
         motion = Motion(session)
         for number in range(kills):
-            server, known_s, held_s, resumed_s = kill_once(server, folder, endpoint, session, motion)
+            server, known_s, held_s, resumed_s = kill_once(server, folder, endpoint, session, motion, slack_s)
             known.append(known_s)
             held.append(held_s)
             resumed.append(resumed_s)
@@ -234,8 +236,8 @@ def run(kills: int, folder: Path) -> int:
     print(json.dumps(told))
     first, last = (grown[0], grown[-1]) if grown else (resources(), resources())
     good = (
-        max(held) <= PLAN_S + STALE_S + SETTLE_S and max(resumed) <= RESUMED_S
-        and max(known) <= KNOWN_S and told["answered_twice"] == 0
+        max(held) <= PLAN_S + STALE_S + SETTLE_S + slack_s and max(resumed) <= RESUMED_S + slack_s
+        and max(known) <= KNOWN_S + slack_s and told["answered_twice"] == 0
         and 0 <= stats.requests - stats.chunks - stats.failures - stats.timeouts <= 1
         and last["threads"] <= first["threads"] and last["files"] <= first["files"] + 2
         and last["memory_mib"] <= first["memory_mib"] + 20
@@ -247,10 +249,11 @@ def main() -> int:
     """As a made-up plugin, so that robot and server load the same policy."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--kills", type=int, default=20)
-    kills = parser.parse_args().kills
+    parser.add_argument("--slack", type=float, default=0.0, help="[s]")
+    arguments = parser.parse_args()
     logging.disable(logging.CRITICAL)
     with plugin("sways_parts", PLUGIN) as folder:
-        return run(kills, folder)
+        return run(arguments.kills, arguments.slack, folder)
 
 
 if __name__ == "__main__":

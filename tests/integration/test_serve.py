@@ -24,6 +24,7 @@ pytestmark = pytest.mark.integration
 
 ROOT = Path(__file__).parents[2]
 MODE = "control_modes.model_inference.inference.execution_mode={}"
+PATIENT = ("--set", "control_modes.model_inference.inference.request_timeout=60")
 
 
 @pytest.fixture
@@ -53,14 +54,14 @@ def test_all_execution_modes_pick_the_cube_by_the_same_motion(
     motions = {}
     for mode, more in {"monolithic": (), "process": (), "distributed": ("--set", network)}.items():
         ran, logs = recorded(
-            "--lockstep", "--episodes", "2", "--seed", "3", "--set", MODE.format(mode), *more, dataset=mode
+            "--lockstep", "--episodes", "2", "--seed", "3", "--set", MODE.format(mode), *PATIENT, *more, dataset=mode
         )
         assert (ran.code, ran.summary["successes"]) == (0, 2), ran.err
         motions[mode] = np.concatenate([log.positions for log in logs])
     for mode in ("process", "distributed"):
         np.testing.assert_array_equal(motions[mode], motions["monolithic"])
     server.send_signal(signal.SIGTERM)
-    out, _ = server.communicate(timeout=30)
+    out, _ = server.communicate(timeout=120)
     assert server.returncode == 0
     assert re.search(r"[1-9]\d* requests, (\d+) answered, 0 expired, 0 malformed, 0 waiting", out)
 
@@ -75,10 +76,10 @@ def test_a_model_process_ends_with_a_host_that_was_killed(ibrobot: tuple[str, ..
         children = (Path(f"/proc/{host.pid}/task/{host.pid}/children")).read_text().split()
         model = [int(pid) for pid in children if "model_process" in Path(f"/proc/{pid}/cmdline").read_text()]
         assert len(model) == 1
+        end = os.pidfd_open(model[0])  # before it can be gone
     finally:
         host.kill()
         host.communicate()
-    end = os.pidfd_open(model[0])
     try:
         assert select.select([end], [], [], 30.0)[0], "the model's process is still there"
     finally:
@@ -86,8 +87,8 @@ def test_a_model_process_ends_with_a_host_that_was_killed(ibrobot: tuple[str, ..
 
 
 def test_a_server_that_is_killed_in_the_middle_of_requests_harms_nothing():
-    command = [sys.executable, ROOT / "benchmarks/server_kill.py", "--kills", "2"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    command = [sys.executable, ROOT / "benchmarks/server_kill.py", "--kills", "2", "--slack", "5"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     told: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     assert told["answered_twice"] == 0
