@@ -14,11 +14,18 @@ import numpy as np
 import pyarrow as pa
 from pyarrow import types
 
+_NUMBERS = {
+    pa.from_numpy_dtype(np.dtype(name)): np.dtype(name)
+    for name in ("uint8", "uint16", "int32", "int64", "float32", "float64")
+}
+"""`DataType.to_pandas_dtype` needs pandas in old releases."""
+
 
 def to_array(values: Any, kind: pa.DataType) -> pa.Array:
     """The array of type `kind` that has `values`, a sequence of any kind without gaps.
 
-    Types are those of the tables: numbers, booleans, text, bytes, lists of any of them, and structs of mappings.
+    Types are those of the tables: numbers that a feature may have, booleans, text, bytes, lists of any of them, and
+    structs of mappings.
     """
     if types.is_struct(kind):
         columns = [to_array([value[field.name] for value in values], field.type) for field in kind]
@@ -34,7 +41,7 @@ def to_array(values: Any, kind: pa.DataType) -> pa.Array:
         return _from_buffers(kind, len(values), _offsets(values), b"".join(values))
     if types.is_boolean(kind):
         return _from_buffers(kind, len(values), np.packbits(np.asarray(values, bool), bitorder="little"))
-    return _from_buffers(kind, len(values), np.ascontiguousarray(values, kind.to_pandas_dtype()))
+    return _from_buffers(kind, len(values), np.ascontiguousarray(values, _NUMBERS[kind]))
 
 
 def table_of(rows: Sequence[Mapping[str, Any]], schema: pa.Schema | None = None) -> pa.Table:
