@@ -1,4 +1,4 @@
-"""Worker threads: items are worked on in the order of arrival, by a bounded number of threads."""
+"""Worker threads: items worked on in the order of arrival by a bounded number of threads; what a signal sets off."""
 
 from __future__ import annotations
 

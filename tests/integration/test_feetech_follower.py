@@ -14,7 +14,8 @@ from pathlib import Path
 
 import attrs
 import pytest
-from ibrobot_feetech.emulator import EmulatedServo, Emulator
+from ibrobot_feetech.emulator import Emulator
+from noting import Noting
 
 from ibrobot_core.calibration import Calibration, JointCalibration, save_calibration
 
@@ -92,18 +93,6 @@ class Bench:
     def torque(self) -> list[bool]:
         with self.emulator.lock:
             return [servo.torque for servo in self.emulator.servos.values()]
-
-
-class Noting(EmulatedServo):
-    """Keeps its goals, each as it is written: several may come at once where the emulator is slow."""
-
-    def __init__(self, servo: int) -> None:
-        self.goals: list[int] = []
-        super().__init__(servo)
-
-    def write(self, address: int, content: bytes) -> None:
-        super().write(address, content)
-        self.goals.append(self.get("goal_position"))
 
 
 @pytest.fixture

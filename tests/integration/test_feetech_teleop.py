@@ -12,7 +12,8 @@ import attrs
 import numpy as np
 import pytest
 from ibrobot_feetech import bus
-from ibrobot_feetech.emulator import EmulatedServo, Emulator
+from ibrobot_feetech.emulator import Emulator
+from noting import Noting
 
 from ibrobot_core.calibration import Calibration, JointCalibration, save_calibration
 from ibrobot_core.config import load
@@ -31,19 +32,6 @@ RADIAN = 4096 / (2 * math.pi)
 MAX_STEP = 3.0 * 0.01 * RADIAN
 """The velocity limit, for one tick of control [ticks]."""
 PATIENCE_S = 60.0
-
-
-class Noting(EmulatedServo):
-    """Keeps its goals while its torque is on, each as it is written: several may come at once to a slow emulator."""
-
-    def __init__(self, servo: int) -> None:
-        self.goals: list[int] = []
-        super().__init__(servo)
-
-    def write(self, address: int, content: bytes) -> None:
-        super().write(address, content)
-        if self.torque:
-            self.goals.append(self.get("goal_position"))
 
 
 def arm(folder: Path, name: str) -> tuple[Emulator, Path]:
