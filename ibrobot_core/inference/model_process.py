@@ -25,7 +25,7 @@ import attrs
 from ibrobot_core.config import from_document
 from ibrobot_core.errors import IbrobotError
 from ibrobot_core.inference.build import build_policy
-from ibrobot_core.inference.wire import LIMITS, Kind, Message, decode, encode
+from ibrobot_core.inference.wire import LIMITS, Decoder, Encoder, Kind, Message
 from ibrobot_core.interfaces import Policy
 from ibrobot_core.plugins import installed
 
@@ -78,6 +78,8 @@ class ModelLoop:
     request: memoryview
     answer: memoryview
     episode: int | None = None
+    encoder: Encoder = attrs.field(factory=Encoder)
+    decoder: Decoder = attrs.field(factory=Decoder)
 
     def run(self) -> None:
         """Answer until the host hangs up."""
@@ -94,7 +96,7 @@ class ModelLoop:
         """Answer the request in memory; returns the size of the answer's frame."""
         begun_ns = time.monotonic_ns()
         try:
-            message = decode(self.request[:size])
+            message = self.decoder.decode(self.request[:size])
             if message.episode != self.episode:
                 self.policy.reset(message.seed)
                 self.episode = message.episode
@@ -105,7 +107,7 @@ class ModelLoop:
             return self._put(Message(Kind.FAILURE, request_id, text=told(error)))
 
     def _put(self, message: Message) -> int:
-        return len(encode(message, lambda size: self.answer[:size]))
+        return len(self.encoder.encode(message, lambda size: self.answer[:size]))
 
 
 def _end_with(host: int) -> None:

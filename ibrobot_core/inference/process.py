@@ -19,7 +19,7 @@ from typing import Any, override
 from ibrobot_core.config import RobotConfig
 from ibrobot_core.errors import PolicyError
 from ibrobot_core.inference.engine import Engine
-from ibrobot_core.inference.wire import LIMITS, Kind, Message, decode, encode
+from ibrobot_core.inference.wire import LIMITS, Decoder, Encoder, Kind, Message
 from ibrobot_core.interfaces import Tensors
 from ibrobot_core.memory import create_memory
 from ibrobot_core.units import NS_PER_S
@@ -57,6 +57,7 @@ class ProcessEngine(Engine):
         self._log = logging.getLogger("ibrobot.inference")
         self._robot = config.robot.name
         self._lock = threading.Lock()
+        self._encoder, self._decoder = Encoder(), Decoder()
         self._closed = threading.Event()
         self._given_up = given_up or self._closed
         self._process: subprocess.Popen[bytes] | None = None
@@ -89,7 +90,7 @@ class ProcessEngine(Engine):
                 Kind.REQUEST, request_id, tensors, self._robot, episode=self._episode, seed=self._seed,
                 deadline_ns=max(0, deadline_ns - time.monotonic_ns()),
             )  # fmt: skip
-            frame = encode(message, lambda size: self._request[:size])
+            frame = self._encoder.encode(message, lambda size: self._request[:size])
             try:
                 self._pipe.send_bytes(json.dumps({"id": request_id, "size": len(frame)}).encode())
             except OSError:
@@ -97,7 +98,7 @@ class ProcessEngine(Engine):
             while (event := self._await("answer", deadline_s))["id"] != request_id:
                 pass  # of a request that nobody waits for any more
             # The memory belongs to the next answer; this one is kept.
-            answer = decode(bytes(self._answer[: event["size"]]))
+            answer = self._decoder.decode(bytes(self._answer[: event["size"]]))
         self._deaths = 0
         self.stats.model_ms = answer.latency_ms
         if answer.kind is Kind.FAILURE:

@@ -13,7 +13,7 @@ import attrs
 from ibrobot_core.errors import ContractError, PolicyError, TransportError, WireError
 from ibrobot_core.inference.engine import Engine
 from ibrobot_core.inference.service import health_name, service_name
-from ibrobot_core.inference.wire import LIMITS, Encoder, Kind, Limits, Message, decode
+from ibrobot_core.inference.wire import LIMITS, Buffer, Decoder, Encoder, Kind, Limits, Message
 from ibrobot_core.interfaces import PictureCodec, Policy, Tensors, Transport
 from ibrobot_core.units import NS_PER_S
 
@@ -52,9 +52,9 @@ class RemoteEngine(Engine):
         self._robot = f"{robot}-{uuid.uuid4().hex[:8]}"
         self._start_timeout_s = start_timeout_s
         self.parallel = 1 if policy.spec.stateful else _PARALLEL
-        self._encoders = [Encoder(limits, codec) for _ in range(self.parallel)]
+        self._encoder, self._decoder = Encoder(limits, codec), Decoder(limits)
+        self._buffers = [Buffer() for _ in range(self.parallel)]
         """Those that are free."""
-        self._limits = limits
         self._episode, self._seed = 0, 0
         self._end_watch: Callable[[], None] | None = None
 
@@ -82,15 +82,15 @@ class RemoteEngine(Engine):
             Kind.REQUEST, request_id, tensors, self._robot, self._fingerprint, stamp_ns=time.time_ns(),
             deadline_ns=left_ns, episode=self._episode, seed=self._seed,
         )  # fmt: skip
-        encoder = self._encoders.pop()
+        buffer = self._buffers.pop()
         try:
-            frame = encoder.encode(message)
+            frame = self._encoder.encode(message, buffer.allocate)
             reply = self._transport.request(service_name(self._model), frame, left_ns / NS_PER_S)
-            answer = decode(reply, limits=self._limits)
+            answer = self._decoder.decode(reply)
         except (TransportError, WireError) as error:
             raise PolicyError(str(error)) from None
         finally:
-            self._encoders.append(encoder)
+            self._buffers.append(buffer)
         if answer.kind is Kind.FAILURE:
             raise PolicyError(f"the server of {self._model}: {answer.text}")
         if answer.id != request_id or answer.fingerprint != self._fingerprint:

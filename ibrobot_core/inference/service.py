@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import queue
 import threading
 import time
 import traceback
@@ -16,7 +17,7 @@ import numpy as np
 
 from ibrobot_core.errors import IbrobotError, PolicyError, WireError
 from ibrobot_core.inference.fair_queue import FairQueue
-from ibrobot_core.inference.wire import LIMITS, Kind, Limits, Message, decode, encode
+from ibrobot_core.inference.wire import LIMITS, Decoder, Encoder, Kind, Limits, Message
 from ibrobot_core.interfaces import Payload, PictureCodec, Policy, Tensors, Transport
 from ibrobot_core.units import NS_PER_S
 
@@ -71,25 +72,36 @@ class RobotCounts:
         return {**counts, "latency_p50_ms": round(float(p50), 2), "latency_p99_ms": round(float(p99), 2)}
 
 
-@attrs.define(eq=False)
+@attrs.frozen(eq=False)
+class _Outcome:
+    """What came of a request: outputs, or why there are none."""
+
+    outputs: Tensors | None
+    error: str = ""
+    expired: bool = False
+
+
+@attrs.frozen(eq=False)
 class _Ticket:
-    """A request that waits for its turn, and what came of it."""
+    """A request that waits for its turn. The first outcome counts."""
 
     message: Message
     deadline_ns: int
-    alike: tuple[Any, ...]
-    outputs: Tensors | None = None
-    error: str = ""
-    expired: bool = False
-    done: threading.Event = attrs.field(factory=threading.Event)
+    outcomes: queue.SimpleQueue[_Outcome] = attrs.field(factory=queue.SimpleQueue)
 
     def answer(self, outputs: Tensors) -> None:
-        self.outputs = outputs
-        self.done.set()
+        self.outcomes.put(_Outcome(outputs))
 
     def fail(self, error: str, *, expired: bool = False) -> None:
-        self.error, self.expired = error, expired
-        self.done.set()
+        self.outcomes.put(_Outcome(None, error, expired))
+
+    def like(self, other: _Ticket) -> bool:
+        """Whether both can be in one batch."""
+        theirs = other.message.tensors
+        return self.message.tensors.keys() == theirs.keys() and all(
+            array.dtype == theirs[name].dtype and array.shape == theirs[name].shape
+            for name, array in self.message.tensors.items()
+        )
 
 
 class InferenceService:
@@ -111,7 +123,7 @@ class InferenceService:
         self._transport = transport
         self._model = model
         self._options = options or ServiceOptions()
-        self._codec = codec
+        self._decoder, self._encoder = Decoder(self._options.limits, codec), Encoder(self._options.limits)
         self._fingerprint = policy.fingerprint()
         self._queue: FairQueue[_Ticket] = FairQueue(self._options.queue)
         self._lock = threading.Lock()
@@ -177,19 +189,19 @@ class InferenceService:
         """Called by the transport, once for every request, in several threads."""
         arrived_ns = time.monotonic_ns()
         try:
-            message = decode(payload, limits=self._options.limits, codec=self._codec)
+            message = self._decoder.decode(payload)
             if message.kind is not Kind.REQUEST:
                 raise WireError(f"a frame of kind {message.kind.name}; robots send requests")
         except WireError as error:
             with self._lock:
                 self._malformed += 1
-            return encode(Message(Kind.FAILURE, 0, text=str(error)))
+            return self._encoder.encode(Message(Kind.FAILURE, 0, text=str(error)))
         with self._idle:
             refused = self._refusal(message)
             self._at_work += 1
         try:
-            ticket = self._wait_for(message, arrived_ns, refused)
-            return self._reply(ticket, arrived_ns)
+            outcome = _Outcome(None, refused) if refused else self._wait_for(message, arrived_ns)
+            return self._reply(message, outcome, arrived_ns)
         finally:
             with self._idle:
                 self._at_work -= 1
@@ -205,41 +217,40 @@ class InferenceService:
             )
         return ""
 
-    def _wait_for(self, message: Message, arrived_ns: int, refused: str) -> _Ticket:
+    def _wait_for(self, message: Message, arrived_ns: int) -> _Outcome:
         patience_ns = min(message.deadline_ns, round(_LONGEST_WAIT_S * NS_PER_S))
-        alike = tuple((name, array.dtype, array.shape) for name, array in sorted(message.tensors.items()))
-        ticket = _Ticket(message, arrived_ns + patience_ns, alike)
-        if refused:
-            ticket.fail(refused)
-        elif (gave_way := self._queue.put(message.robot, ticket)) is not None:
+        ticket = _Ticket(message, arrived_ns + patience_ns)
+        if (gave_way := self._queue.put(message.robot, ticket)) is not None:
             gave_way.fail(f"the server is full: {self._options.queue} requests wait")
-        if not ticket.done.wait(max(0.0, (ticket.deadline_ns - time.monotonic_ns()) / NS_PER_S)):
-            ticket.fail("no outputs within the deadline", expired=True)
-        return ticket
+        try:
+            return ticket.outcomes.get(timeout=max(0.0, (ticket.deadline_ns - time.monotonic_ns()) / NS_PER_S))
+        except queue.Empty:
+            return _Outcome(None, "no outputs within the deadline", expired=True)
 
-    def _reply(self, ticket: _Ticket, arrived_ns: int) -> Payload:
-        message = ticket.message
+    def _reply(self, message: Message, outcome: _Outcome, arrived_ns: int) -> Payload:
         latency_ms = (time.monotonic_ns() - arrived_ns) / 1e6
-        said = Message(
-            Kind.FAILURE, message.id, {}, message.robot, self._fingerprint, ticket.error, message.stamp_ns,
-            latency_ms=latency_ms,
-        )  # fmt: skip
-        reply = None
-        if ticket.outputs is not None and not ticket.error:
+
+        def said(kind: Kind, outputs: Tensors, text: str = "") -> Payload:
+            answer = Message(
+                kind, message.id, outputs, message.robot, self._fingerprint, text, message.stamp_ns,
+                latency_ms=latency_ms,
+            )  # fmt: skip
+            return self._encoder.encode(answer)
+
+        error, reply = outcome.error, None
+        if outcome.outputs is not None:
             try:
-                reply = encode(
-                    attrs.evolve(said, kind=Kind.ANSWER, tensors=ticket.outputs), limits=self._options.limits
-                )
-            except WireError as error:
-                said = attrs.evolve(said, text=f"the policy's outputs: {error}")
+                reply = said(Kind.ANSWER, outcome.outputs)
+            except WireError as unsaid:
+                error = f"the policy's outputs: {unsaid}"
         with self._lock:
             for counts in (self._all, self._counts(message.robot)):
                 counts.requests += 1
                 counts.answered += reply is not None
                 counts.failed += reply is None
-                counts.expired += ticket.expired
+                counts.expired += outcome.expired
                 counts.latencies_ms.append(latency_ms)
-        return reply if reply is not None else encode(said)
+        return reply if reply is not None else said(Kind.FAILURE, {}, error)
 
     def _counts(self, robot: str) -> RobotCounts:
         counts = self._robots.setdefault(robot, RobotCounts())
@@ -251,7 +262,7 @@ class InferenceService:
     def _infer_all(self) -> None:
         """The model's one thread."""
         most = 1 if self._policy.spec.stateful else self._options.batch
-        while batch := self._queue.take(most, lambda a, b: a.alike == b.alike, self._options.patience_s):
+        while batch := self._queue.take(most, _Ticket.like, self._options.patience_s):
             now_ns = time.monotonic_ns()
             live = [ticket for ticket in batch if ticket.deadline_ns > now_ns]
             for ticket in batch:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import enum
 import math
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import override
 
 import attrs
@@ -24,14 +24,21 @@ VERSION = 1
 ALIGNMENT = 64
 """Bytes; every tensor's buffer begins at a multiple of it, counted from the frame's first byte."""
 
-_HEAD = struct.Struct("<4sHBxQqqQqdQIHHH6x")
+_NUMBERS = struct.Struct("<4sHBBQqqQqd")
+_SIZES = struct.Struct("<QIHHH6s")
+_HEAD_SIZE = _NUMBERS.size + _SIZES.size
 _ENTRY = struct.Struct("<QQBBH")
+_OFFSET = struct.Struct("<Q")
+"""How an entry begins."""
+_ZEROS = bytes(6)
 _DTYPES = tuple(
     np.dtype(code) for code in ("?", "u1", "i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f2", "<f4", "<f8")
 )
 _CODES = {dtype: code for code, dtype in enumerate(_DTYPES, 1)}
 _JPEG = 128
 _BYTE = np.dtype(np.uint8)
+_LAYOUTS_KEPT = 64
+"""One for each robot, as a rule."""
 
 
 class Kind(enum.IntEnum):
@@ -43,6 +50,9 @@ class Kind(enum.IntEnum):
     """Its outputs."""
     FAILURE = 3
     """Why there are none, in `text`."""
+
+
+_KINDS = {kind.value: kind for kind in Kind}
 
 
 @attrs.frozen
@@ -99,78 +109,94 @@ class NoPictures(PictureCodec):
 
 
 @attrs.frozen(eq=False)
-class _Placed:
-    """A tensor, or its JPEG, and its entry in the table."""
+class _Place:
+    """Where a frame has a tensor, or its JPEG."""
 
-    array: NDArray[np.generic]
-    code: int
+    name: str
+    dtype: np.dtype[np.generic]
     shape: tuple[int, ...]
-    name: bytes
     offset: int
+    nbytes: int
+    jpeg: bool
+
+
+@attrs.frozen(eq=False)
+class _Layout:
+    """All of a frame but its numbers and its tensors' values: as a rule the same from one request to the next."""
+
+    robot: str
+    fingerprint: str
+    text: str
+    places: Sequence[_Place]
+    head: bytes
+    """What lies between the numbers and the tensors."""
+    size: int
+    """Of the whole frame."""
 
 
 def _aligned(offset: int) -> int:
     return -(-offset // ALIGNMENT) * ALIGNMENT
 
 
-def encode(
-    message: Message, allocate: Callable[[int], memoryview] = lambda size: memoryview(bytearray(size)), *,
-    limits: Limits = LIMITS, codec: PictureCodec | None = None,
-) -> memoryview:  # fmt: skip
-    """A frame; every tensor is copied once, to where it is sent from.
+def _jpegs(tensors: Tensors, codec: PictureCodec) -> Mapping[str, bytes]:
+    """Of those that the codec takes."""
+    jpegs = {}
+    for name, array in tensors.items():
+        if array.dtype == _BYTE and array.ndim == 3 and array.shape[2] in (1, 3):
+            jpeg = codec.encode(name, array.view(np.uint8))
+            if jpeg is not None:
+                jpegs[name] = jpeg
+    return jpegs
 
-    Args:
-        message: what to say.
-        allocate: gives writable memory of so many bytes, or more.
-        limits: those of the receiver.
-        codec: makes JPEG of camera pictures: their pixels change.
 
-    Raises:
-        WireError: for what has no place in a frame, e.g. a tensor of objects, or more than the limits allow.
-    """
-    robot, fingerprint = (_text(text, limits.name) for text in (message.robot, message.fingerprint))
-    text = _text(message.text, limits.text)
+def _lay_out(message: Message, jpegs: Mapping[str, bytes], limits: Limits) -> _Layout:
+    texts = [_text(text, limits.name) for text in (message.robot, message.fingerprint)]
+    texts.append(_text(message.text, limits.text))
     if len(message.tensors) > limits.tensors:
         raise WireError(f"{len(message.tensors)} tensors are more than {limits.tensors}")
-    stored = [(_text(name, limits.name), *_stored(name, array, codec)) for name, array in message.tensors.items()]
-    cursor = _HEAD.size + len(robot) + len(fingerprint) + len(text)
-    cursor += sum(_ENTRY.size + 4 * len(shape) + len(name) for name, _, _, shape in stored)
-    placed = []
-    for name, array, code, shape in stored:
-        if len(shape) > limits.ndim or not name:
-            raise WireError(
-                f"tensor {name.decode()!r} with {len(shape)} dimensions; it needs a name, and at most {limits.ndim}"
-            )
-        placed.append(_Placed(array, code, shape, name, offset := _aligned(cursor)))
-        cursor = offset + array.nbytes
+    rows = []
+    for name, array in message.tensors.items():
+        if array.ndim > limits.ndim or not name:
+            raise WireError(f"tensor {name!r} with {array.ndim} dimensions; it needs a name, and at most {limits.ndim}")
+        rows.append(struct.pack(f"<{array.ndim}I", *array.shape) + _text(name, limits.name))
+    cursor = _HEAD_SIZE + sum(map(len, texts)) + sum(_ENTRY.size + len(row) for row in rows)
+    places, table = list[_Place](), b""
+    for (name, array), row in zip(message.tensors.items(), rows, strict=True):
+        dtype, jpeg = array.dtype.newbyteorder("<"), jpegs.get(name)
+        code = _CODES.get(dtype) if jpeg is None else _JPEG
+        if code is None:
+            raise WireError(f"tensor {name!r} has dtype {dtype}; only numbers and booleans of 1 to 8 bytes travel")
+        offset, nbytes = _aligned(cursor), array.nbytes if jpeg is None else len(jpeg)
+        places.append(_Place(name, dtype, array.shape, offset, nbytes, jpeg is not None))
+        table += _ENTRY.pack(offset, nbytes, code, array.ndim, len(row) - 4 * array.ndim) + row
+        cursor = offset + nbytes
     if cursor > limits.size:
         raise WireError(f"a frame of {cursor} bytes is larger than {limits.size}")
-    frame = allocate(cursor)[:cursor]
+    robot, fingerprint, text = map(len, texts)
+    head = b"".join((_SIZES.pack(cursor, text, len(places), robot, fingerprint, _ZEROS), *texts, table))
+    if places:
+        head = head.ljust(places[0].offset - _NUMBERS.size, b"\0")
+    return _Layout(message.robot, message.fingerprint, message.text, places, head, cursor)
+
+
+def _fill(frame: memoryview, layout: _Layout, message: Message, jpegs: Mapping[str, bytes]) -> memoryview:
     try:
-        _HEAD.pack_into(
-            frame, 0, MAGIC, VERSION, message.kind, message.id, message.stamp_ns, message.deadline_ns, message.episode,
-            message.seed, message.latency_ms, cursor, len(text), len(placed), len(robot), len(fingerprint),
+        _NUMBERS.pack_into(
+            frame, 0, MAGIC, VERSION, message.kind, 0, message.id, message.stamp_ns, message.deadline_ns,
+            message.episode, message.seed, message.latency_ms,
         )  # fmt: skip
     except struct.error as error:
         raise WireError(f"a number of request {message.id} has no place in a frame: {error}") from None
-    _write(frame, robot + fingerprint + text, placed)
+    end = _NUMBERS.size + len(layout.head)
+    frame[_NUMBERS.size : end] = layout.head
+    for place in layout.places:
+        frame[end : place.offset] = bytes(place.offset - end)
+        end = place.offset + place.nbytes
+        if place.jpeg:
+            frame[place.offset : end] = jpegs[place.name]
+        else:
+            np.ndarray(place.shape, place.dtype, frame, place.offset)[...] = message.tensors[place.name]
     return frame
-
-
-def _write(frame: memoryview, texts: bytes, placed: list[_Placed]) -> None:
-    end = _HEAD.size + len(texts)
-    frame[_HEAD.size : end] = texts
-    for entry in placed:
-        _ENTRY.pack_into(frame, end, entry.offset, entry.array.nbytes, entry.code, len(entry.shape), len(entry.name))
-        end += _ENTRY.size
-        row = struct.pack(f"<{len(entry.shape)}I", *entry.shape) + entry.name
-        frame[end : end + len(row)] = row
-        end += len(row)
-    for entry in placed:
-        frame[end : entry.offset] = bytes(entry.offset - end)
-        array = entry.array
-        np.ndarray(array.shape, array.dtype.newbyteorder("<"), frame, entry.offset)[...] = array
-        end = entry.offset + array.nbytes
 
 
 def _text(text: str, most: int) -> bytes:
@@ -180,80 +206,171 @@ def _text(text: str, most: int) -> bytes:
     return encoded
 
 
-def _stored(
-    name: str, array: NDArray[np.generic], codec: PictureCodec | None
-) -> tuple[NDArray[np.generic], int, tuple[int, ...]]:
-    """What goes into the buffer, the code of its dtype, and the tensor's shape."""
-    code = _CODES.get(array.dtype.newbyteorder("<"))
-    if code is None:
-        raise WireError(f"tensor {name!r} has dtype {array.dtype}; only numbers and booleans of 1 to 8 bytes travel")
-    if codec is not None and array.dtype == _BYTE and array.ndim == 3 and array.shape[2] in (1, 3):
-        jpeg = codec.encode(name, array.view(np.uint8))
-        if jpeg is not None:
-            return np.frombuffer(jpeg, np.uint8), _JPEG, array.shape
-    return array, code, array.shape
+def _fresh(size: int) -> memoryview:
+    return memoryview(bytearray(size))
+
+
+class Buffer:
+    """Memory for one frame after another: fresh memory for a large one costs more than to fill it."""
+
+    def __init__(self) -> None:
+        self._memory = bytearray()
+
+    def allocate(self, size: int) -> memoryview:
+        """So many bytes; those given before are the same, unless somebody still looks at them."""
+        try:
+            if size < len(self._memory):
+                del self._memory[size:]
+            else:
+                self._memory.extend(bytes(size - len(self._memory)))
+        except BufferError:
+            self._memory = bytearray(size)
+        return memoryview(self._memory)
 
 
 class Encoder:
-    """Encodes into one buffer that it keeps: a frame is good until the next is made."""
+    """Encodes messages, the sooner those that differ from earlier ones in numbers and values alone.
+
+    Args:
+        limits: those of the receiver.
+        codec: makes JPEG of camera pictures: their pixels change.
+    """
 
     def __init__(self, limits: Limits = LIMITS, codec: PictureCodec | None = None) -> None:
         self._limits = limits
         self._codec = codec
-        self._buffer = bytearray()
+        self._layouts: dict[Hashable, _Layout] = {}
 
-    def encode(self, message: Message) -> bytearray:
-        """As the function `encode`."""
-        encode(message, self._allocate, limits=self._limits, codec=self._codec).release()
-        return self._buffer
+    def encode(self, message: Message, allocate: Callable[[int], memoryview] = _fresh) -> memoryview:
+        """A frame; every tensor is copied once, to where it is sent from. May be called by several threads at a time.
 
-    def _allocate(self, size: int) -> memoryview:
-        """The buffer at this size: fresh memory for a large frame costs more than to fill it."""
-        try:
-            if size < len(self._buffer):
-                del self._buffer[size:]
-            else:
-                self._buffer.extend(bytes(size - len(self._buffer)))
-        except BufferError:  # somebody still looks at the last frame
-            self._buffer = bytearray(size)
-        return memoryview(self._buffer)
+        Args:
+            message: what to say.
+            allocate: gives writable memory of so many bytes, or more.
+
+        Raises:
+            WireError: for what has no place in a frame, e.g. a tensor of objects, or more than the limits allow.
+        """
+        jpegs = _jpegs(message.tensors, self._codec) if self._codec is not None else {}
+        key = (
+            message.robot, message.fingerprint, message.text,
+            *[(name, array.dtype, array.shape) for name, array in message.tensors.items()],
+        )  # fmt: skip
+        layout = self._layouts.get(key) if not jpegs else None
+        if layout is None:
+            layout = _lay_out(message, jpegs, self._limits)
+            if not (jpegs or message.text):
+                _keep(self._layouts, key, layout)
+        return _fill(allocate(layout.size)[: layout.size], layout, message, jpegs)
+
+
+def _keep[K](layouts: dict[K, _Layout], key: K, layout: _Layout) -> None:
+    if len(layouts) >= _LAYOUTS_KEPT:
+        layouts.clear()
+    layouts[key] = layout
+
+
+def encode(message: Message, *, limits: Limits = LIMITS, codec: PictureCodec | None = None) -> memoryview:
+    """As `Encoder.encode`, for once."""
+    return Encoder(limits, codec).encode(message)
 
 
 def decode(payload: Payload, *, limits: Limits = LIMITS, codec: PictureCodec | None = None) -> Message:
-    """A message whose tensors are read-only views of `payload`: nothing is copied, but for JPEG.
+    """As `Decoder.decode`, for once."""
+    return Decoder(limits, codec).decode(payload)
 
-    Raises:
-        WireError: for anything but a whole frame within the limits.
+
+class Decoder:
+    """Decodes frames, the sooner those that differ from earlier ones in numbers and values alone.
+
+    Args:
+        limits: a frame beyond them is refused.
+        codec: for pictures that come as JPEG; none are taken without.
     """
-    frame = memoryview(payload).toreadonly()
-    if not _HEAD.size <= len(frame) <= limits.size:
-        raise WireError(f"{len(frame)} bytes; a frame has {_HEAD.size} to {limits.size}")
-    (
-        magic, version, kind, request, stamp_ns, deadline_ns, episode, seed, latency_ms, size, text_size, count,
-        robot_size, fingerprint_size,
-    ) = _HEAD.unpack_from(frame)  # fmt: skip
-    if magic != MAGIC:
-        raise WireError(f"no frame: it begins with {magic!r}, not {MAGIC!r}")
-    if version != VERSION:
-        raise WireError(f"a frame of version {version}; this side speaks version {VERSION}")
-    if frame[7] or any(frame[_HEAD.size - 6 : _HEAD.size]):
-        raise WireError("a frame whose reserved bytes are not 0")
-    if kind not in Kind:
-        raise WireError(f"a frame of the unknown kind {kind}")
-    if size != len(frame):
-        raise WireError(f"a frame that says {size} bytes has {len(frame)}")
-    if count > limits.tensors or max(robot_size, fingerprint_size) > limits.name or text_size > limits.text:
-        raise WireError(
-            f"{count} tensors, texts of {robot_size}, {fingerprint_size}, {text_size} bytes: over the limits"
+
+    def __init__(self, limits: Limits = LIMITS, codec: PictureCodec | None = None) -> None:
+        self._limits = limits
+        self._codec = codec or NoPictures()
+        self._layouts: dict[bytes, _Layout] = {}
+        """By their heads."""
+
+    def decode(self, payload: Payload) -> Message:
+        """A message whose tensors are read-only views of `payload`: nothing is copied, but for JPEG.
+
+        May be called by several threads at a time.
+
+        Raises:
+            WireError: for anything but a whole frame within the limits.
+        """
+        frame = memoryview(payload).toreadonly()
+        if not _HEAD_SIZE <= len(frame) <= self._limits.size:
+            raise WireError(f"{len(frame)} bytes; a frame has {_HEAD_SIZE} to {self._limits.size}")
+        magic, version, kind, reserved, request, stamp_ns, deadline_ns, episode, seed, latency_ms = (
+            _NUMBERS.unpack_from(frame)
         )
-    if deadline_ns < 0 or not 0 <= latency_ms < math.inf:
-        raise WireError(f"a deadline of {deadline_ns} ns, a latency of {latency_ms} ms")
-    reader = _Reader(frame, _HEAD.size)
-    robot, fingerprint, text = (reader.text(n) for n in (robot_size, fingerprint_size, text_size))
-    tensors = _tensors(reader, count, limits, codec or NoPictures())
-    return Message(
-        Kind(kind), request, tensors, robot, fingerprint, text, stamp_ns, deadline_ns, episode, seed, latency_ms
-    )
+        if magic != MAGIC:
+            raise WireError(f"no frame: it begins with {magic!r}, not {MAGIC!r}")
+        if version != VERSION:
+            raise WireError(f"a frame of version {version}; this side speaks version {VERSION}")
+        if kind not in _KINDS:
+            raise WireError(f"a frame of the unknown kind {kind}")
+        if deadline_ns < 0 or not 0 <= latency_ms < math.inf:
+            raise WireError(f"a deadline of {deadline_ns} ns, a latency of {latency_ms} ms")
+        layout = self._laid_out(frame, reserved)
+        tensors = {}
+        for place in layout.places:
+            if place.jpeg:
+                tensors[place.name] = self._picture(frame, place)
+                continue
+            array = tensors[place.name] = np.ndarray(place.shape, place.dtype, frame, place.offset)
+            if place.dtype.kind == "b" and np.any(array.view(np.uint8) > 1):
+                raise WireError(f"tensor {place.name!r} has booleans other than 0 and 1")
+        return Message(
+            _KINDS[kind], request, tensors, layout.robot, layout.fingerprint, layout.text, stamp_ns, deadline_ns,
+            episode, seed, latency_ms,
+        )  # fmt: skip
+
+    def _laid_out(self, frame: memoryview, reserved: int) -> _Layout:
+        limits = self._limits
+        size, text_size, count, robot_size, fingerprint_size, zeros = _SIZES.unpack_from(frame, _NUMBERS.size)
+        if reserved or zeros != _ZEROS:
+            raise WireError("a frame whose reserved bytes are not 0")
+        if size != len(frame):
+            raise WireError(f"a frame that says {size} bytes has {len(frame)}")
+        if count > limits.tensors or max(robot_size, fingerprint_size) > limits.name or text_size > limits.text:
+            raise WireError(
+                f"{count} tensors, texts of {robot_size}, {fingerprint_size}, {text_size} bytes: over the limits"
+            )
+        end = table = _HEAD_SIZE + robot_size + fingerprint_size + text_size
+        if count and table + _OFFSET.size <= size:
+            # The table ends where the first tensor begins; whether it does is seen when it is read.
+            longest = count * (_ENTRY.size + 4 * limits.ndim + limits.name) + ALIGNMENT
+            end = min(_OFFSET.unpack_from(frame, table)[0], table + longest)
+        head = bytes(frame[_NUMBERS.size : end])
+        layout = self._layouts.get(head)
+        if layout is None:
+            reader = _Reader(frame, _HEAD_SIZE)
+            robot, fingerprint, text = (reader.text(n) for n in (robot_size, fingerprint_size, text_size))
+            places = _places(reader, count, limits)
+            layout = _Layout(robot, fingerprint, text, places, head, size)
+            if not (text or any(place.jpeg for place in places)):  # those do not come again
+                _keep(self._layouts, head, layout)
+        return layout
+
+    def _picture(self, frame: memoryview, place: _Place) -> NDArray[np.uint8]:
+        height, width, channels = place.shape
+        try:
+            picture = self._codec.decode(frame[place.offset : place.offset + place.nbytes], (height, width, channels))
+        except WireError as error:
+            raise WireError(f"picture {place.name!r}: {error}") from None
+        except Exception as error:  # contained: a decoder may fail in any way over what a stranger sent
+            raise WireError(f"picture {place.name!r}: {type(error).__name__}: {error}") from error
+        if picture.shape != place.shape or picture.dtype != _BYTE:
+            raise WireError(
+                f"picture {place.name!r} is {picture.dtype} {picture.shape}, not the {place.shape} that was announced"
+            )
+        picture.flags.writeable = False
+        return picture
 
 
 @attrs.define
@@ -276,7 +393,7 @@ class _Reader:
             raise WireError("a text that is not UTF-8") from None
 
 
-def _tensors(reader: _Reader, count: int, limits: Limits, codec: PictureCodec) -> Mapping[str, NDArray[np.generic]]:
+def _places(reader: _Reader, count: int, limits: Limits) -> Sequence[_Place]:
     table = []
     for _ in range(count):
         offset, nbytes, code, ndim, name_size = _ENTRY.unpack(reader.take(_ENTRY.size))
@@ -284,52 +401,28 @@ def _tensors(reader: _Reader, count: int, limits: Limits, codec: PictureCodec) -
             raise WireError(f"a tensor of {ndim} dimensions with a name of {name_size} bytes: over the limits")
         shape = struct.unpack(f"<{ndim}I", reader.take(4 * ndim))
         table.append((reader.text(name_size), code, shape, offset, nbytes))
-    tensors: dict[str, NDArray[np.generic]] = {}
+    places: dict[str, _Place] = {}
     cursor, decoded = reader.at, 0
     for name, code, shape, offset, nbytes in table:
-        if name in tensors:
+        if name in places:
             raise WireError(f"two tensors named {name!r}")
         if offset != _aligned(cursor) or offset + nbytes > len(reader.frame):
             raise WireError(f"tensor {name!r}: {nbytes} bytes at {offset} are not where they belong")
         cursor = offset + nbytes
+        if code != _JPEG and not 0 < code <= len(_DTYPES):
+            raise WireError(f"tensor {name!r} of the unknown dtype {code}")
+        dtype = _BYTE if code == _JPEG else _DTYPES[code - 1]
         # A dimension of zero must not hide the others from the limit.
-        elements = math.prod(max(1, n) for n in shape)
+        claimed = math.prod(max(1, n) for n in shape) * dtype.itemsize
         if code == _JPEG:
-            decoded += elements
+            if len(shape) != 3 or shape[2] not in (1, 3) or 0 in shape:
+                raise WireError(f"picture {name!r} of shape {shape}, expected (height, width, 3 or 1)")
+            decoded += claimed
             if decoded > limits.size:
                 raise WireError(f"picture {name!r} of shape {shape} is larger than {limits.size} bytes")
-            tensors[name] = _picture(name, reader.frame[offset:cursor], shape, codec)
-        else:
-            tensors[name] = _view(name, reader.frame, code, shape, elements, offset, nbytes, limits)
+        elif claimed > limits.size or math.prod(shape) * dtype.itemsize != nbytes:
+            raise WireError(f"tensor {name!r} of shape {shape} and dtype {dtype} in {nbytes} bytes")
+        places[name] = _Place(name, dtype, shape, offset, nbytes, code == _JPEG)
     if cursor != len(reader.frame):
         raise WireError(f"{len(reader.frame) - cursor} bytes that belong to nothing")
-    return tensors
-
-
-def _view(
-    name: str, frame: memoryview, code: int, shape: tuple[int, ...], elements: int, offset: int, nbytes: int,
-    limits: Limits,
-) -> NDArray[np.generic]:  # fmt: skip
-    if not 0 < code <= len(_DTYPES):
-        raise WireError(f"tensor {name!r} of the unknown dtype {code}")
-    dtype = _DTYPES[code - 1]
-    if elements * dtype.itemsize > limits.size or math.prod(shape) * dtype.itemsize != nbytes:
-        raise WireError(f"tensor {name!r} of shape {shape} and dtype {dtype} in {nbytes} bytes")
-    if dtype.kind == "b" and any(np.frombuffer(frame[offset : offset + nbytes], np.uint8) > 1):
-        raise WireError(f"tensor {name!r} has booleans other than 0 and 1")
-    return np.ndarray(shape, dtype, frame, offset)
-
-
-def _picture(name: str, jpeg: memoryview, shape: tuple[int, ...], codec: PictureCodec) -> NDArray[np.uint8]:
-    if len(shape) != 3 or shape[2] not in (1, 3) or 0 in shape:
-        raise WireError(f"picture {name!r} of shape {shape}, expected (height, width, 3 or 1)")
-    try:
-        picture = codec.decode(jpeg, (shape[0], shape[1], shape[2]))
-    except WireError as error:
-        raise WireError(f"picture {name!r}: {error}") from None
-    except Exception as error:  # contained: a decoder may fail in any way over what a stranger sent
-        raise WireError(f"picture {name!r}: {type(error).__name__}: {error}") from error
-    if picture.shape != shape or picture.dtype != _BYTE:
-        raise WireError(f"picture {name!r} is {picture.dtype} {picture.shape}, not the {shape} that was announced")
-    picture.flags.writeable = False
-    return picture
+    return list(places.values())

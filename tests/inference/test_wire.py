@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 import tracemalloc
 from pathlib import Path
@@ -15,7 +16,18 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from ibrobot_core.errors import WireError
-from ibrobot_core.inference.wire import ALIGNMENT, Encoder, Kind, Limits, Message, PictureCodec, decode, encode
+from ibrobot_core.inference.wire import (
+    ALIGNMENT,
+    Buffer,
+    Decoder,
+    Encoder,
+    Kind,
+    Limits,
+    Message,
+    PictureCodec,
+    decode,
+    encode,
+)
 
 PAGE = Path(__file__).parents[2] / "docs/reference/wire.md"
 DTYPES = st.sampled_from(["?", "u1", "i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f2", "<f4", "<f8", ">f4", ">i2"])
@@ -23,7 +35,8 @@ ARRAYS = DTYPES.flatmap(lambda code: hnp.arrays(code, hnp.array_shapes(min_dims=
 TEXTS = st.text(st.characters(codec="utf-8"), max_size=20)
 I64 = st.integers(-(2**63), 2**63 - 1)
 MESSAGES = st.builds(
-    Message, kind=st.sampled_from(Kind), id=st.integers(0, 2**64 - 1), robot=TEXTS, fingerprint=TEXTS, text=TEXTS,
+    Message, kind=st.sampled_from(Kind), id=st.integers(0, 2**64 - 1), robot=TEXTS, fingerprint=TEXTS,
+    text=st.just("") | TEXTS,
     tensors=st.dictionaries(TEXTS.filter(bool), ARRAYS, max_size=4), stamp_ns=I64,
     deadline_ns=st.integers(0, 2**63 - 1), episode=st.integers(0, 2**64 - 1), seed=I64,
     latency_ms=st.floats(0, 1e9),
@@ -51,12 +64,28 @@ def test_what_is_encoded_is_decoded(message: Message):
 
 @given(st.lists(MESSAGES, min_size=1, max_size=4))
 def test_one_buffer_serves_one_frame_after_another(messages: list[Message]):
-    encoder = Encoder()
-    for message in messages:
-        frame = encoder.encode(message)
+    encoder, decoder, buffer = Encoder(), Decoder(), Buffer()
+    for message in [*messages, *messages]:
+        frame = encoder.encode(message, buffer.allocate)
         assert bytes(frame) == bytes(encode(message))
-        decoded = decode(frame)
+        decoded = decoder.decode(frame)
         same(message, decoded)  # its views are there still when the next frame is made
+
+
+def test_robots_that_come_and_go_cost_no_memory():
+    encoder, decoder = Encoder(), Decoder()
+
+    def meet(robots: range) -> int:
+        for number in robots:
+            decoder.decode(encoder.encode(attrs.evolve(EXAMPLE, robot=f"robot {number}", text="x" * (number % 2))))
+        return tracemalloc.get_traced_memory()[0]
+
+    tracemalloc.start()
+    try:
+        few = meet(range(200))
+        assert meet(range(200, 2000)) < few + 200_000
+    finally:
+        tracemalloc.stop()
 
 
 def test_tensors_are_aligned_read_only_views():
@@ -77,10 +106,15 @@ def test_damage_is_a_wire_error_or_another_message(message: Message, changes: li
     for at, value in changes:
         frame[at % len(frame)] = value
     frame = frame + bytes(longer) if longer > 0 else frame[: len(frame) + longer]
+    knowing = Decoder()
+    knowing.decode(encode(message))
     try:
         decoded = decode(frame)
-    except WireError:
+    except WireError as error:
+        with pytest.raises(WireError, match=re.escape(str(error))):
+            knowing.decode(frame)
         return
+    assert bytes(encode(decoded)) == bytes(encode(knowing.decode(frame))), "what came before changes nothing"
     assert bytes(encode(decoded))[:8] == bytes(frame)[:8], "what is accepted can be said again"
 
 

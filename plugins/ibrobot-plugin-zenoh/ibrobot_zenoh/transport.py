@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import uuid
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any, override
 
 import zenoh
@@ -27,6 +28,7 @@ _FAILED = zenoh.Encoding.TEXT_PLAIN
 """Marks a server's own words, which Zenoh's about a timeout are not."""
 
 
+@lru_cache
 def _key(prefix: str, name: str) -> zenoh.KeyExpr:
     try:
         key = zenoh.KeyExpr(f"ibrobot/{prefix}/{name.removeprefix('/')}")
@@ -38,7 +40,13 @@ def _key(prefix: str, name: str) -> zenoh.KeyExpr:
 
 
 def _sendable(payload: Payload) -> bytes | bytearray:
-    return payload.tobytes() if isinstance(payload, memoryview) else payload
+    """What Zenoh takes, which are no views."""
+    if not isinstance(payload, memoryview):
+        return payload
+    whole = payload.obj
+    if isinstance(whole, bytes | bytearray) and len(whole) == payload.nbytes and payload.c_contiguous:
+        return whole
+    return payload.tobytes()
 
 
 class ZenohTransport(TopicTransport):
