@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import queue
 import threading
 import time
 from abc import ABC, abstractmethod
-from contextlib import AbstractContextManager, nullcontext
 from typing import override
 
 import attrs
@@ -20,7 +20,7 @@ from ibrobot_core.robot import Vector
 from ibrobot_core.units import ns
 
 _CLOSE_TIMEOUT_S = 1.0
-_ALONE = nullcontext()
+_ALONE = contextlib.nullcontext()
 _PATIENCE_S = 600.0
 """How long a request is waited for where nothing else says so."""
 
@@ -79,7 +79,7 @@ class InferenceClient(ABC):
 
 def run_policy(
     policy: Policy, engine: Engine, request: DispatchInfer, deadline_ns: int,
-    turn: AbstractContextManager[object] = _ALONE,
+    turn: contextlib.AbstractContextManager[object] = _ALONE,
 ) -> Chunk:  # fmt: skip
     """The three steps, one after the other. A policy that raises gives a chunk with its error: the arm holds.
 
@@ -139,7 +139,7 @@ class LockstepClient(InferenceClient):
 
 
 class EngineClient(InferenceClient):
-    """Runs the policy in threads of the host process, so many as its engine takes requests; `infer` where that is.
+    """Runs the policy in threads of this process, up to as many as its engine takes requests; `infer` where that is.
 
     A request that waits behind slow ones is not run at all when a newer one, or a reset, waits behind it: nobody
     waits for its answer any more. The policy itself is called by one thread at a time.
@@ -156,18 +156,15 @@ class EngineClient(InferenceClient):
         self._timeout_ns = ns(timeout_s)
         self._work: queue.SimpleQueue[tuple[DispatchInfer, int] | int | None] = queue.SimpleQueue()
         self._chunks: queue.SimpleQueue[Chunk | PolicyError] = queue.SimpleQueue()
-        self._taking, self._turn = threading.Lock(), threading.Lock()
-        self._threads = [
-            threading.Thread(target=self._run, name="inference", daemon=True) for _ in range(self._engine.parallel)
-        ]
-        for thread in self._threads:
-            thread.start()
+        self._taking, self._turn, self._idle = threading.Lock(), threading.Lock(), threading.Lock()
+        self._idle.acquire()  # free while a thread waits for work
+        self._threads: list[threading.Thread] = []
 
     @property
     @override
     def parallel(self) -> int:
         # A model that takes most of the time itself would only let them wait, and look at older observations.
-        stats, most = self._engine.stats, len(self._threads)
+        stats, most = self._engine.stats, self._engine.parallel
         return min(most, max(1, round(stats.infer_ms / stats.model_ms))) if stats.model_ms else most
 
     @property
@@ -177,7 +174,7 @@ class EngineClient(InferenceClient):
 
     @override
     def submit(self, request: DispatchInfer) -> None:
-        self._work.put((request, time.monotonic_ns() + self._timeout_ns))
+        self._put((request, time.monotonic_ns() + self._timeout_ns))
 
     @override
     def poll(self, timeout_s: float = 0.0) -> Chunk | None:
@@ -191,7 +188,7 @@ class EngineClient(InferenceClient):
 
     @override
     def reset(self, seed: int) -> None:
-        self._work.put(seed)
+        self._put(seed)
 
     @override
     def close(self) -> None:
@@ -202,10 +199,18 @@ class EngineClient(InferenceClient):
         for thread in self._threads:
             thread.join(max(0.0, deadline_s - time.monotonic()))
 
+    def _put(self, work: tuple[DispatchInfer, int] | int) -> None:
+        self._work.put(work)
+        # One thread for as long as one will do: each has memory of its own for large messages, which grows cold.
+        if not self._idle.acquire(blocking=False) and len(self._threads) < self._engine.parallel:
+            thread = threading.Thread(target=self._run, name="inference", daemon=True)
+            self._threads.append(thread)
+            thread.start()
+
     def _run(self) -> None:
         while True:
             with self._taking:  # what was submitted before a reset begins before it, and what follows after it
-                work = self._work.get()
+                work = self._next()
                 if work is None:
                     return
                 if isinstance(work, int):
@@ -214,6 +219,13 @@ class EngineClient(InferenceClient):
                 if not self._work.empty():
                     continue
             self._chunks.put(run_policy(self._policy, self._engine, *work, self._turn))
+
+    def _next(self) -> tuple[DispatchInfer, int] | int | None:
+        with contextlib.suppress(queue.Empty):
+            return self._work.get_nowait()
+        if self._idle.locked():
+            self._idle.release()
+        return self._work.get()
 
     def _reset(self, seed: int) -> None:
         try:

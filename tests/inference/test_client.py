@@ -141,6 +141,16 @@ def test_a_far_model_is_asked_several_times_at_once_and_reset_in_between(policy:
         client.close()
 
 
+def test_one_request_takes_one_thread(policy: GatedPolicy):
+    before = set(threading.enumerate())
+    client = EngineClient(policy, FarEngine(policy, 0.0))
+    policy.gate.release()
+    client.submit(request(1))
+    assert client.poll(PATIENCE_S) is not None
+    assert len(set(threading.enumerate()) - before) == 1
+    client.close()
+
+
 def test_nothing_overtakes_a_reset_that_takes_long(policy: GatedPolicy, monkeypatch: pytest.MonkeyPatch):
     begun, go_on = threading.Event(), threading.Event()
 
