@@ -153,7 +153,7 @@ def main() -> None:
     """Print one JSON line for each payload."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--count", type=int, default=200)
-    parser.add_argument("--pause", type=float, default=0.02)
+    parser.add_argument("--pause", type=float, default=0.0)
     parser.add_argument("--port", type=int, default=50171)
     parser.add_argument("--serve", type=int)
     parser.add_argument("--payload", default="")
