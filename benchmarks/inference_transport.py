@@ -9,7 +9,7 @@ floor of mTLS. `process` is execution mode process; `zenoh` and `zenoh mTLS` are
 distributed as between machines, `zenoh shm` as within one. `lerobot` is its RobotClient and PolicyServer, in the
 interpreter PYTHON, which has `lerobot[async]==0.6.1`: it has no JPEG there and sends raw pictures of as many bytes.
 
-All ways are measured in turn, four times, since a machine may be slower for a while. Times are in ms: request to chunk
+All ways are measured in turn, eight times, since a machine may be slower for a while. Times are in ms: request to chunk
 p50 and p99, how long the control loop is blocked in asking, and processor time of both sides together for a request.
 One request follows the other; with a pause between them [s], all ways find their memory and code out of the caches.
 Exits with 1 where ours is less than 5 times as fast as LeRobot when given, raw cameras over Zenoh take more than 5
@@ -91,7 +91,7 @@ PAYLOADS = {
     "2 JPEGs": CHANCE.integers(0, 255, (2, 38_400), dtype=np.uint8),
 }
 WARM_UP = 20
-ROUNDS = 4
+ROUNDS = 8
 LEROBOT_RATIO, BLOCKED_MS = 5.0, 1.0
 LIMITS = {"process": ("tcp", 3.0), "zenoh": ("tcp", 5.0), "zenoh shm": ("tcp", 5.0), "zenoh mTLS": ("tls", 5.0)}
 """How often a floor's time raw cameras may take."""
