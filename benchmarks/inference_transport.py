@@ -5,13 +5,14 @@
 Every way carries the same observations: two raw pictures of 640x480, two of 224x224 in float32, two JPEGs of 38 kB,
 each with six joint positions; a chunk of 50x6 comes back. `tcp` sends a frame of the same bytes over a plain socket
 between two processes and gets a chunk's back: the floor. `tls` is the same with TLS and certificates of both sides, the
-floor of mTLS. `process` is execution mode process; `zenoh` and `zenoh mTLS` are execution mode
-distributed as between machines, `zenoh shm` as within one. `lerobot` is its RobotClient and PolicyServer, in the
-interpreter PYTHON, which has `lerobot[async]==0.6.1`: it has no JPEG there and sends raw pictures of as many bytes.
+floor of mTLS. `process` is execution mode process; `zenoh` and `zenoh mTLS` are execution mode distributed as between
+machines, `zenoh shm` as within one. `lerobot` is its RobotClient and PolicyServer, in the interpreter PYTHON, which has
+`lerobot[async]==0.6.1`: it has no JPEG there and sends raw pictures of as many bytes.
 
-All ways are measured in turn, eight times, since a machine may be slower for a while. Times are in ms: request to chunk
-p50 and p99, how long the control loop is blocked in asking, and processor time of both sides together for a request.
-One request follows the other; with a pause between them [s], all ways find their memory and code out of the caches.
+All ways are measured in turn, eight times, since a machine may be slower for a while; LeRobot, which is slow to start,
+every other time. Times are in ms: request to chunk p50 and p99, how long the control loop is blocked in asking, and
+processor time of both sides together for a request. One request follows the other; with a pause between them [s], all
+ways find their memory and code out of the caches.
 Exits with 1 where ours is less than 5 times as fast as LeRobot when given, raw cameras over Zenoh take more than 5
 times their floor, `process` more than 3 times, or asking blocks for over 1 ms.
 """
@@ -298,7 +299,9 @@ def summary(payload: str, way: str, rounds: list[dict[str, Any]]) -> dict[str, A
     return {**row, "cpu_ms": float(np.mean([each["cpu_ms"] for each in rounds]))}
 
 
-def measured(given: argparse.Namespace, folder: Path, certificates: Path) -> Iterator[tuple[str, str, dict[str, Any]]]:
+def measured(
+    given: argparse.Namespace, number: int, folder: Path, certificates: Path
+) -> Iterator[tuple[str, str, dict[str, Any]]]:
     """A round of every way: payload, way, and what came of it."""
     count = -(-given.count // ROUNDS)
     for payload, pictures in PAYLOADS.items():
@@ -309,7 +312,7 @@ def measured(given: argparse.Namespace, folder: Path, certificates: Path) -> Ite
         yield payload, "zenoh", over_zenoh(*how)
         yield payload, "zenoh shm", over_zenoh(*how, shared=True)
         yield payload, "zenoh mTLS", over_zenoh(*how, certificates)
-    if given.lerobot:
+    if given.lerobot and number % 2 == 0:
         script = Path(__file__).absolute().with_name("lerobot_async.py")
         command = [given.lerobot, script, "--count", str(count), "--pause", str(given.pause)]
         # Its logger makes a folder where it runs.
@@ -325,8 +328,8 @@ def run(given: argparse.Namespace, folder: Path) -> int:
     made = ("certs", certificates, "--server", "localhost", "--robot", "robot")
     subprocess.run([*ibrobot, *made], check=True, stdout=subprocess.DEVNULL)
     found: dict[tuple[str, str], list[dict[str, Any]]] = {}
-    for _ in range(ROUNDS):
-        for payload, way, row in measured(given, folder, certificates):
+    for number in range(ROUNDS):
+        for payload, way, row in measured(given, number, folder, certificates):
             found.setdefault((payload, way), []).append(row)
     rows = [summary(payload, way, rounds) for (payload, way), rounds in found.items()]
     print(
