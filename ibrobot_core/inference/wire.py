@@ -217,13 +217,13 @@ class Buffer:
         self._memory = bytearray()
 
     def allocate(self, size: int) -> memoryview:
-        """So many bytes; those given before are the same, unless somebody still looks at them."""
+        """So many bytes, as a rule those given before: a frame is good until the next is made."""
         try:
             if size < len(self._memory):
                 del self._memory[size:]
             else:
                 self._memory.extend(bytes(size - len(self._memory)))
-        except BufferError:
+        except BufferError:  # somebody still looks at the last frame
             self._memory = bytearray(size)
         return memoryview(self._memory)
 
