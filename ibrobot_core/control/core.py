@@ -17,7 +17,7 @@ from ibrobot_core.control.link import ControlState, PlanRecord
 from ibrobot_core.control.parts import HardwareParts
 from ibrobot_core.control.safety import SafetyLayer
 from ibrobot_core.errors import GoalRejected, HardwareError, IbrobotError, NotSupported
-from ibrobot_core.interfaces import Episode, Executor, JointReading, Plan, Signal
+from ibrobot_core.interfaces import Episode, Executor, JointReading, Plan, Signal, Torque
 from ibrobot_core.robot import Vector
 from ibrobot_core.units import ns
 
@@ -324,13 +324,18 @@ class ControlCore:
             )  # fmt: skip
 
     def _relax(self, why: str) -> None:
-        try:
-            self._hardware.relax()
-        except (HardwareError, NotSupported) as error:
-            self._raise_fault(f"torque cannot be taken off: {error}")
-            return
-        self._relaxed = True
-        self._log.warning("torque off (%s): the arm may fall", why)
+        """Take torque off, and say for each part whether that is so, whatever fault is set already."""
+        outcomes = self._hardware.relax()
+        self._relaxed = not self._hardware.holds
+        off = [name for name, outcome in outcomes.items() if outcome is Torque.OFF]
+        if off:
+            parts = f" of {', '.join(off)}" if len(off) < len(outcomes) else ""
+            self._log.warning("torque%s off (%s): the arm may fall", parts, why)
+        for name, outcome in outcomes.items():
+            if outcome is Torque.UNKNOWN:
+                self._announce(f"torque of {name} may still be on: nothing confirmed that it is off", "may hold")
+            elif outcome is not Torque.OFF:
+                self._announce(f"torque of {name} cannot be taken off: {outcome}", "holds")
 
     def _retake(self) -> bool:
         """Torque comes back: start from where the joints lie. False where that is not known: a fault."""
@@ -341,18 +346,28 @@ class ControlCore:
         except HardwareError as error:
             self._raise_fault(f"torque stays off: {error}")
             return False
-        self._relaxed = False
+        self._take_back()
         return True
+
+    def _take_back(self) -> None:
+        self._relaxed = False
+        self._hardware.retake()
 
     def _raise_fault(self, fault: str) -> None:
         if self.fault:
             return
-        self.fault = fault
-        self.events.append({"event": "fault", "fault": fault, "stamp_ns": self._clock.now_ns()})
-        self._leave()
-        self._target = None
-        if self._config.control.stop == "relax" and not self._relaxed:
+        relaxes = self._config.control.stop == "relax"
+        self._announce(fault, "relaxes" if relaxes else "holds")
+        if relaxes and not self._relaxed:
             self._relax("fault")
+
+    def _announce(self, fault: str, then: str) -> None:
+        """Tell the host of a fault, also beside one that is set; `then` is what the robot does."""
+        self.events.append({"event": "fault", "fault": fault, "then": then, "stamp_ns": self._clock.now_ns()})
+        if not self.fault:
+            self.fault = fault
+            self._leave()
+            self._target = None
 
     def _leave(self) -> None:
         """Deactivate all executors; without one, every joint brakes and holds."""
@@ -401,7 +416,7 @@ class ControlCore:
         self._hardware.reset_faults()
         self._measured = self._first_reading()
         self._leave()
-        self._relaxed = False
+        self._take_back()
         self._safety.reset(self._measured.position)
         self.fault = ""
         self._enter()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from functools import partial
 from typing import Any
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ibrobot_core.errors import HardwareError, IbrobotError, NotSupported
-from ibrobot_core.interfaces import Episode, Hardware, JointReading, Signal, SimulatedHardware
+from ibrobot_core.interfaces import Episode, Hardware, JointReading, Signal, SimulatedHardware, Torque
 from ibrobot_core.robot import Robot, Vector
 
 
@@ -26,6 +26,7 @@ class HardwareParts:
         self._parts = parts
         self._indices = {name: robot.indices(part.joints) for name, part in parts.items()}
         self._size = len(robot.joints)
+        self._off: set[str] = set()
         self._pool = ThreadPoolExecutor(len(parts)) if len(parts) > 1 else None
         self.signals: tuple[Signal, ...] = tuple(s for part in parts.values() for s in part.signals)
         self._signal_values: Vector = np.full(sum(s.size for s in self.signals), np.nan)
@@ -70,19 +71,29 @@ class HardwareParts:
         Raises:
             HardwareError: with the name of the part that failed.
         """
-        if self._single is not None:
+        if self._single is not None and not self._off:
             self._single.write(command)
             return
         commands = {id(part): command[self._indices[name]] for name, part in self._parts.items()}
-        self._each(lambda part: part.write(commands[id(part)]))
+        self._each(lambda part: part.write(commands[id(part)]), but=self._off)
 
-    def relax(self) -> None:
-        """Take torque off.
+    def relax(self) -> dict[str, Torque | IbrobotError]:
+        """Take torque off; for each part what became of it, or why its torque stays on.
 
-        Raises:
-            NotSupported: where a part cannot.
+        From then on only parts whose torque stays on are written, until `retake`.
         """
-        self._each(lambda part: part.relax())
+        outcomes: dict[str, Torque | IbrobotError] = dict(zip(self._parts, self._each(_relaxed), strict=True))
+        self._off = {name for name, outcome in outcomes.items() if isinstance(outcome, Torque)}
+        return outcomes
+
+    def retake(self) -> None:
+        """Write all parts again: the next `write` puts torque back on."""
+        self._off.clear()
+
+    @property
+    def holds(self) -> bool:
+        """Whether any part is still written, so that its joints hold."""
+        return len(self._off) < len(self._parts)
 
     def require_relax(self) -> None:
         """Raise where a part cannot take torque off.
@@ -136,12 +147,20 @@ class HardwareParts:
                 return part.success()
         return None
 
-    def _each(self, act: Callable[[Hardware], Any]) -> Sequence[Any]:
+    def _each(self, act: Callable[[Hardware], Any], but: Collection[str] = ()) -> Sequence[Any]:
+        parts = [(name, part) for name, part in self._parts.items() if name not in but]
         if self._pool is None:
-            return [_named(name, partial(act, part)) for name, part in self._parts.items()]
-        futures = [(name, self._pool.submit(act, part)) for name, part in self._parts.items()]
+            return [_named(name, partial(act, part)) for name, part in parts]
+        futures = [(name, self._pool.submit(act, part)) for name, part in parts]
         wait([future for _, future in futures])  # also where one fails: no part is called twice at once
         return [_named(name, future.result) for name, future in futures]
+
+
+def _relaxed(part: Hardware) -> Torque | IbrobotError:
+    try:
+        return part.relax()
+    except (HardwareError, NotSupported) as error:
+        return error
 
 
 def _named(name: str, act: Callable[[], Any]) -> Any:

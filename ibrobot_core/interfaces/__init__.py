@@ -3,7 +3,18 @@
 from ibrobot_core.interfaces.context import Context
 from ibrobot_core.interfaces.dataset import DatasetSummary, DatasetWriter, Feature
 from ibrobot_core.interfaces.executor import Executor, GoalState, GoalStatus, Plan
-from ibrobot_core.interfaces.hardware import Episode, Hardware, JointReading, Signal, SimulatedHardware, nan_vector
+from ibrobot_core.interfaces.hardware import (
+    Condition,
+    Episode,
+    Hardware,
+    Holding,
+    JointReading,
+    Severity,
+    Signal,
+    SimulatedHardware,
+    Torque,
+    nan_vector,
+)
 from ibrobot_core.interfaces.planner import JointGoal, Planner, PlanRequest, PoseGoal
 from ibrobot_core.interfaces.policy import Frame, PictureCodec, Policy, PolicySpec, Tensors
 from ibrobot_core.interfaces.reader import EpisodeAddress, EpisodeReader, EpisodeSummary, Recorded, TopicSummary
@@ -14,6 +25,7 @@ from ibrobot_core.interfaces.transport import Payload, SharedTopic, TopicTranspo
 from ibrobot_core.interfaces.viewer import Viewer
 
 __all__ = [
+    "Condition",
     "Context",
     "DatasetSummary",
     "DatasetWriter",
@@ -29,6 +41,7 @@ __all__ = [
     "GoalState",
     "GoalStatus",
     "Hardware",
+    "Holding",
     "JointGoal",
     "JointReading",
     "Payload",
@@ -42,6 +55,7 @@ __all__ = [
     "Recorded",
     "Recorder",
     "Sensor",
+    "Severity",
     "SharedTopic",
     "Signal",
     "SimulatedHardware",
@@ -50,6 +64,7 @@ __all__ = [
     "Tensors",
     "TopicSummary",
     "TopicTransport",
+    "Torque",
     "Transport",
     "Viewer",
     "nan_vector",

@@ -18,7 +18,7 @@ from ibrobot_core.control.core import ControlCore
 from ibrobot_core.control.link import ControlState, PlanRecord
 from ibrobot_core.descriptors import HardwareDescriptor
 from ibrobot_core.errors import HardwareError
-from ibrobot_core.interfaces import Context, JointReading
+from ibrobot_core.interfaces import Context, JointReading, Torque
 from ibrobot_core.plugins import Entry, Registry, discover
 from ibrobot_core.robot import Vector
 from ibrobot_core.testing.contexts import START_NS
@@ -60,6 +60,7 @@ class ScriptedHardware(FakeHardware):
         self.stale = False
         self.write_error = ""
         self.signal_error = ""
+        self.relax_outcome: Torque | HardwareError = Torque.OFF
         self._last: JointReading | None = None
 
     @override
@@ -77,6 +78,13 @@ class ScriptedHardware(FakeHardware):
             raise HardwareError(self.write_error)
         super().write(position)
         self.written.append(position.copy())
+
+    @override
+    def relax(self) -> Torque:
+        if isinstance(self.relax_outcome, HardwareError):
+            raise self.relax_outcome
+        super().relax()
+        return self.relax_outcome
 
     @override
     def read_signal(self, index: int, out: Vector) -> None:

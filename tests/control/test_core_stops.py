@@ -5,6 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ibrobot_core.errors import HardwareError
+from ibrobot_core.interfaces import Torque
+
 
 class TestFailures:
     def test_a_lost_reply_is_ridden_out_without_a_jerk(self, make_rig):
@@ -193,6 +196,59 @@ class TestStop:
 
         assert rig.hardware.relaxed
         assert len(rig.hardware.written) == count
+
+    @pytest.mark.parametrize(
+        ("outcome", "told"),
+        [
+            (Torque.UNKNOWN, "torque of hardware may still be on: nothing confirmed that it is off"),
+            (HardwareError("servo 3 keeps it"), "torque of hardware cannot be taken off: servo 3 keeps it"),
+        ],
+        ids=["unknown", "failed"],
+    )
+    def test_relax_that_is_not_confirmed_is_reported_beside_the_fault(self, make_rig, caplog, outcome, told):
+        rig = make_rig({"control": {"stop": "relax"}}).start()
+        rig.hardware.relax_outcome = outcome
+        rig.hardware.silent = True
+        rig.tick(3)
+
+        assert rig.core.fault == "the bus is silent"
+        assert [event["fault"] for event in rig.events("fault")] == ["the bus is silent", told]
+        assert "torque off" not in caplog.text
+
+    def test_a_failed_relax_goes_on_braking_and_an_unconfirmed_one_writes_no_more(self, make_rig):
+        for outcome, writes in ((HardwareError("servo 3 keeps it"), True), (Torque.UNKNOWN, False)):
+            rig = make_rig({"control": {"stop": "relax"}}).start()
+            rig.plan([0.9, 1.0, 0.9], 0.5)
+            rig.tick(20)
+            rig.hardware.relax_outcome = outcome
+            rig.call("estop")
+            count = len(rig.hardware.written)
+            rig.tick(20)
+
+            assert (len(rig.hardware.written) > count) == writes
+            rig.assert_within_limits()
+
+    def test_of_two_parts_the_relaxed_one_is_not_written_while_the_other_brakes(self, make_rig):
+        hardware = {
+            "hand": {"type": "scripted", "joints": ["grip", "lift"]}, "base": {"type": "scripted", "joints": ["pan"]},
+        }  # fmt: skip
+        rig = make_rig({"hardware": hardware, "control": {"stop": "relax"}}).start()
+        rig.plan([0.3, -0.2, 0.9])
+        rig.tick(20)
+        hand, base = rig.parts["hand"], rig.parts["base"]
+        base.relax_outcome = HardwareError("servo 1 keeps it")
+        rig.call("estop")
+        counts = len(hand.written), len(base.written)
+        rig.tick(20)
+        assert hand.relaxed
+        assert len(hand.written) == counts[0]
+        assert len(base.written) == counts[1] + 20
+        assert rig.core.counters()["loop"]["write_errors"] == 0
+
+        assert "error" not in rig.call("reset")
+        rig.tick()
+        rig.core.close()
+        assert not hand.relaxed
 
     @pytest.mark.parametrize("stop", ["hold", "pose rest"])
     def test_nothing_moves_the_robot_any_more(self, make_rig, stop):

@@ -33,7 +33,7 @@ import attrs
 from ibrobot_core import hookimpl
 from ibrobot_core.descriptors import HardwareDescriptor, PolicyDescriptor, SensorDescriptor, TeleopDescriptor
 from ibrobot_core.errors import PolicyError, SensorError
-from ibrobot_core.interfaces import TeleopCommand
+from ibrobot_core.interfaces import TeleopCommand, Torque
 from ibrobot_core.options import option
 from ibrobot_core.testing.fakes import FakePolicy, FakeRealHardware, FakeSensor, FakeTeleop
 from ibrobot_core.control import core, host
@@ -58,6 +58,7 @@ class Arm(FakeRealHardware):
         self._note("write", *map(repr, position.tolist()))
     def relax(self):
         self._note("relax")
+        return Torque.OFF
     def _note(self, *words):
         os.write(self._log, (" ".join([words[0], str(time.monotonic_ns()), *words[1:]]) + "\\n").encode())
 

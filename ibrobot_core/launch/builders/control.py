@@ -91,7 +91,7 @@ class Control(Component):
         elif event["event"] == "fault":
             fault = str(event["fault"])
             session.outcome.faults.append(fault)
-            session.log.error("fault: %s; the robot %s", fault, _stopped_by(session))
+            session.log.error("fault: %s; the robot %s", fault, event["then"])
             session.registry.emit(
                 "ibrobot_fault_raised", robot=session.config.robot.name, fault=fault, stamp_ns=int(event["stamp_ns"])
             )
@@ -108,7 +108,3 @@ def _aftermath(session: Session) -> str:
         if descriptor.torque_off:
             commands[f"`{descriptor.torque_off}`"] = None
     return f"; if joints still hold, {' and '.join(commands)} takes their torque off" if commands else ""
-
-
-def _stopped_by(session: Session) -> str:
-    return "relaxes" if session.config.control.stop == "relax" else "holds"

@@ -19,6 +19,7 @@ from ibrobot_core.interfaces import (
     Plan,
     Signal,
     SimulatedHardware,
+    Torque,
     nan_vector,
 )
 from ibrobot_core.robot import Vector
@@ -68,9 +69,10 @@ class FakeHardware(SimulatedHardware):
         self._open = False
 
     @override
-    def relax(self) -> None:
+    def relax(self) -> Torque:
         self._check_open()
         self.relaxed = True
+        return Torque.OFF
 
     @override
     def read_signal(self, index: int, out: Vector) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ibrobot_core.calibration import load_calibration
 from ibrobot_core.errors import HardwareError
-from ibrobot_core.interfaces import Context, Hardware, JointReading, Signal, nan_vector
+from ibrobot_core.interfaces import Context, Hardware, JointReading, Signal, Torque, nan_vector
 from ibrobot_core.robot import Vector
 from ibrobot_core.units import ns, seconds
 from ibrobot_feetech import arm as servos
@@ -135,9 +135,10 @@ class FeetechFollower(Hardware):
         self._writer.write(self._arm.ticks(position))
 
     @override
-    def relax(self) -> None:
+    def relax(self) -> Torque:
         servos.relax(self._bus, self._arm.servos)
         self._relaxed = True
+        return Torque.OFF
 
     @override
     def reset_faults(self) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ibrobot_core.errors import HardwareError
-from ibrobot_core.interfaces import Context, Episode, JointReading, Signal, SimulatedHardware
+from ibrobot_core.interfaces import Context, Episode, JointReading, Signal, SimulatedHardware, Torque
 from ibrobot_core.robot import Vector
 from ibrobot_core.units import ns
 from ibrobot_mujoco.faults import Faults
@@ -116,15 +116,17 @@ class MujocoHardware(SimulatedHardware):
         self._send(position.copy())
 
     @override
-    def relax(self) -> None:
+    def relax(self) -> Torque:
         """Take torque off every servo of the model."""
         self._connected()
-        self._send(None)
+        return Torque.OFF if self._send(None) else Torque.UNKNOWN
 
-    def _send(self, command: Vector | None) -> None:
-        """Put a command (None: torque off) on its way."""
-        if not self._faults.active("silent", self._now_ns):
-            self._commands.append((self._now_ns + self._latency_ns, command))
+    def _send(self, command: Vector | None) -> bool:
+        """Put a command (None: torque off) on its way; False where a silent bus swallows it."""
+        if self._faults.active("silent", self._now_ns):
+            return False
+        self._commands.append((self._now_ns + self._latency_ns, command))
+        return True
 
     @override
     def reset_faults(self) -> None:
