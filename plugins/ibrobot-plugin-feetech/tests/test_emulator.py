@@ -12,14 +12,16 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
+import serial
 from ibrobot_feetech.emulator import EmulatedServo, Emulator
 from ibrobot_feetech.protocol import BROADCAST, Instruction, Packet, Scanner, pack
-from ibrobot_feetech.registers import register
+from ibrobot_feetech.registers import BAUD_RATES, register
 
 from ibrobot_core.clock import SteppedClock
 from ibrobot_core.units import ns
 
 SERVOS = 3
+OVERLOAD = 0x20
 PING_1 = bytes.fromhex("FF FF 01 02 01 FB")
 PONG_1 = bytes.fromhex("FF FF 01 02 00 FC")
 
@@ -297,8 +299,76 @@ class TestFaults:
         emulator.faults.errors[1] = 0x20
         assert host.ask(1, Instruction.PING)[0].code == 0x20
 
+    def test_a_blocked_joint_stays_and_is_in_overload_after_its_protection_time(
+        self, host: Host, emulator: Emulator, clock: SteppedClock
+    ) -> None:
+        host.write(1, "torque_enable", 1)
+        emulator.faults.blocked.add(1)
+        host.write(1, "goal_position", 3000)
+        clock.advance(ns(1.9))
+        assert host.read(1, "present_position") == 2048
+        assert host.read(1, "present_load") == 1000
+        assert host.read(1, "status") == 0
+        clock.advance(ns(0.2))
+        assert host.read(1, "status") == OVERLOAD
+        assert host.read(1, "present_load") == 200, "the protective torque"
+        emulator.faults.blocked.clear()
+        clock.advance(ns(1.0))
+        assert host.read(1, "present_position") == 3000
+        assert host.read(1, "status") == OVERLOAD, "it lasts until the torque was off"
+
+    def test_the_acknowledgement_of_torque_off_still_carries_the_overload(
+        self, host: Host, emulator: Emulator, clock: SteppedClock
+    ) -> None:
+        host.write(1, "torque_enable", 1)
+        emulator.faults.overloaded.add(1)
+        host.read(1, "status")
+        clock.advance(ns(2.1))
+        assert host.read(1, "status") == OVERLOAD
+        emulator.faults.overloaded.clear()
+        assert host.write(1, "torque_enable", 0).code == OVERLOAD
+        assert host.write(1, "torque_enable", 1).code == 0
+
+    def test_a_light_load_never_overloads(self, host: Host, emulator: Emulator, clock: SteppedClock) -> None:
+        host.write(1, "torque_enable", 1)
+        emulator.faults.blocked.add(1)
+        host.write(1, "goal_position", 2048 + 50)
+        clock.advance(ns(60.0))
+        assert 0 < host.read(1, "present_load") < 800
+        assert host.read(1, "status") == 0
+
+    def test_a_brown_out_happens_once(self, host: Host, emulator: Emulator) -> None:
+        host.write(2, "torque_enable", 1)
+        host.write(2, "acceleration", 7)
+        emulator.faults.brown_out.add(2)
+        assert host.read(2, "torque_enable") == 0
+        assert host.read(2, "acceleration") == 0
+        assert emulator.faults.brown_out == set()
+        host.write(2, "torque_enable", 1)
+        assert host.read(2, "torque_enable") == 1
+
+    def test_a_disconnected_servo_is_silent_and_comes_back_without_torque(self, host: Host, emulator: Emulator) -> None:
+        host.write(2, "torque_enable", 1)
+        emulator.faults.disconnected.add(2)
+        host.send(pack(Packet(2, Instruction.PING)))
+        host.quiet()
+        with emulator.lock:
+            emulator.servos[2].turn(1000)
+        emulator.faults.disconnected.clear()
+        assert host.read(2, "torque_enable") == 0
+        assert host.read(2, "present_position") == 1000
+
 
 class TestPort:
+    @pytest.mark.parametrize("rate", BAUD_RATES)
+    def test_servos_answer_at_their_own_rate_and_no_other_ends_the_service(self, rate: int) -> None:
+        with Emulator(1, baud_rate=rate, throttle=True) as emulator:
+            emulator.servos[1].set("baud_rate", BAUD_RATES[rate])
+            for asked in (*BAUD_RATES, 300):
+                with serial.Serial(emulator.port, asked, timeout=5.0 if asked == rate else 0.02) as port:
+                    port.write(PING_1)
+                    assert port.read(6) == (PONG_1 if asked == rate else b"")
+
     def test_throttled_bytes_take_at_least_their_time_on_the_wire(self) -> None:
         with Emulator(1, throttle=True) as emulator:
             emulator.servos[1].set("return_delay", 0)

@@ -56,10 +56,14 @@ _SWITCH_S = 2e-4
 @click.option("--late-s", type=click.FloatRange(min=0), default=0.05, show_default=True, help="How late [s].")
 @click.option("--delay-s", type=click.FloatRange(min=0), default=0.0, help="Further delay of every reply [s].")
 @click.option("--silent", type=int, multiple=True, metavar="ID", help="A servo that neither hears nor answers.")
+@click.option("--blocked", type=int, multiple=True, metavar="ID", help="A servo whose joint does not move.")
+@click.option("--overloaded", type=int, multiple=True, metavar="ID", help="A servo that carries all that it can.")
+@click.option("--disconnected", type=int, multiple=True, metavar="ID", help="A servo without its cable.")
 @click.option("--error", "errors", type=(int, int), multiple=True, metavar="ID BITS", help="Error bits of a servo.")
 def emulate(
     servos: int, baud: int, throttle: bool, link: Path | None, calibration: str | None, physics: str | None, seed: int,
-    silent: tuple[int, ...], errors: tuple[tuple[int, int], ...], **chances: float,
+    silent: tuple[int, ...], blocked: tuple[int, ...], overloaded: tuple[int, ...], disconnected: tuple[int, ...],
+    errors: tuple[tuple[int, int], ...], **chances: float,
 ) -> None:  # fmt: skip
     """Emulate a bus of STS3215 servos on a pseudo-terminal.
 
@@ -79,8 +83,10 @@ def emulate(
         emulator = stack.enter_context(Emulator(count, baud_rate=baud, throttle=throttle, seed=seed, link=link))
         for name, value in chances.items():
             setattr(emulator.faults, name, value)
-        emulator.faults.silent |= set(silent)
-        emulator.faults.errors |= dict(errors)
+        faults = emulator.faults
+        faults.silent, faults.blocked = set(silent), set(blocked)
+        faults.overloaded, faults.disconnected = set(overloaded), set(disconnected)
+        faults.errors = dict(errors)
         found = _calibrate(emulator, calibration, joints, config.robot if config is not None else None)
         click.echo(str(link) if link is not None else emulator.port)
         arm = None

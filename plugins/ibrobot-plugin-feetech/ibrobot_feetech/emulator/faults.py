@@ -1,4 +1,4 @@
-"""What goes wrong on an emulated bus, by chance or on command."""
+"""What goes wrong on an emulated bus and in its servos, by chance or on command."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import numpy as np
 
 @attrs.define
 class Faults:
-    """Faults of the replies; any may be changed while the bus is served.
+    """Faults of replies and servos; any may be changed while the bus is served, and takes effect at the next request.
 
-    Probabilities are of each reply, but `corrupt` is of each byte.
+    Probabilities are of each reply, but `corrupt` is of each byte. Servos are named by their ids.
     """
 
     drop: float = 0.0
@@ -25,6 +25,14 @@ class Faults:
     """Servos that neither hear nor answer."""
     errors: dict[int, int] = attrs.field(factory=dict)
     """Servo id -> error bits that its replies carry."""
+    blocked: set[int] = attrs.field(factory=set)
+    """Servos whose joints do not move; far from its goal, such a servo goes into overload."""
+    overloaded: set[int] = attrs.field(factory=set)
+    """Servos that carry all that they can where they stand; they go into overload."""
+    disconnected: set[int] = attrs.field(factory=set)
+    """Servos without their cable: silent, without torque, and without their RAM when they come back."""
+    brown_out: set[int] = attrs.field(factory=set)
+    """Servos that lose their supply for a moment: their RAM and torque are gone. Emptied once that has happened."""
     counts: dict[str, int] = attrs.field(
         factory=lambda: dict.fromkeys(("replies", "dropped", "corrupted", "duplicated", "late"), 0)
     )

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import fcntl
 import heapq
 import os
 import select
+import struct
+import sys
 import termios
 import threading
 import time
@@ -23,11 +26,11 @@ from ibrobot_feetech.emulator.wire import Wire
 
 _SPEED = 5
 """Index of the output speed in a terminal's attributes."""
-_RATES = {
-    getattr(termios, f"B{rate}"): rate
-    for rate in (4800, 9600, 19200, 38400, 57600, 115200, 500000, 1000000)
-    if hasattr(termios, f"B{rate}")
-}
+_UNASKED = 50
+"""A rate that no host asks for, to tell whether one has asked [baud]."""
+_TCGETS2 = 0x802C542A
+_TERMIOS2 = struct.Struct("4I20B2I")
+"""A terminal's attributes on Linux, the speeds last: in baud, where `termios` has codes and none for 250,000."""
 
 
 class Emulator:
@@ -116,7 +119,6 @@ class Emulator:
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
         self.port = os.ttyname(self._slave)
-        # A rate that no host asks for, to tell whether one has asked.
         attributes = termios.tcgetattr(self._slave)
         attributes[_SPEED - 1] = attributes[_SPEED] = termios.B50
         termios.tcsetattr(self._slave, termios.TCSANOW, attributes)
@@ -178,5 +180,12 @@ class Emulator:
 
     def _host_rate(self) -> int:
         """The rate that the host has set on its side; the servos' own until then."""
-        speed = termios.tcgetattr(self._slave)[_SPEED]
-        return self._default_rate if speed == termios.B50 else _RATES.get(speed, 0)
+        rate = _baud_rate(self._slave)
+        return self._default_rate if rate == _UNASKED else rate
+
+
+def _baud_rate(terminal: int) -> int:
+    """A terminal's output speed [baud]."""
+    if sys.platform == "linux":
+        return int(_TERMIOS2.unpack(fcntl.ioctl(terminal, _TCGETS2, bytes(_TERMIOS2.size)))[-1])
+    return int(termios.tcgetattr(terminal)[_SPEED])  # elsewhere the codes are the rates

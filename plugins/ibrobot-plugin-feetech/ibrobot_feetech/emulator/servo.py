@@ -15,7 +15,10 @@ _MIDDLE = 128
 """Written to `torque_enable`, it makes the present position the middle of the turn."""
 _MAX_VELOCITY = 3073
 """What the motor can do at 12 V without load [ticks/s]: 0.222 s for 60 degrees."""
-_FORWARD, _BACKWARD = 1, -1
+_DUTY_PER_TICK = 8.0
+"""Of the motor, for each tick between goal and joint, with a P coefficient of 32 [0.1 %]."""
+_UNDERVOLTAGE, _OVERHEATING, _OVERLOAD = 0x01, 0x04, 0x20
+_MEASURED = ("present_voltage", "present_temperature")
 
 _DEFAULTS = {
     "firmware_major": 3,
@@ -72,7 +75,13 @@ class EmulatedServo:
         """Where the joint is [ticks], before the homing offset."""
         self.velocity = 0.0
         """[ticks/s]"""
+        self.blocked = False
+        """Whether something holds the joint where it is."""
+        self.burdened = False
+        """Whether the joint carries all that the motor can, wherever its goal is."""
         self._driven = False
+        self._heavy_s = 0.0
+        self._overload = False
         self.errors = 0
         """Error bits forced upon it."""
         self._prepared: tuple[int, bytes] | None = None
@@ -148,21 +157,24 @@ class EmulatedServo:
 
     def brown_out(self) -> None:
         """Lose power for a moment: RAM and torque are gone, EPROM stays."""
-        servo = EmulatedServo(self.id, self.encoder)
-        self.table[:] = servo.table
+        measured = {name: self.get(name) for name in _MEASURED}
+        self.table[:] = EmulatedServo(self.id, self.encoder).table
         self.table[:_EPROM_END] = self._eprom
+        for name, value in measured.items():
+            self.set(name, value)
+        self.set("torque_limit", self.get("max_torque"))
         self.velocity, self._prepared = 0.0, None
-        self._publish()
+        self.advance(0.0)
         self.set("goal_position", self.get("present_position"))
 
     def advance(self, elapsed_s: float) -> None:
-        """Let time pass [s]: the joint moves towards its goal."""
-        if self._driven:
-            return
-        if self.torque and self.get("operating_mode") == 0:
-            self._follow(elapsed_s)
-        else:
-            self.velocity = 0.0
+        """Let time pass [s]: the joint moves towards its goal, and too much load for too long is an overload."""
+        if not self._driven:
+            if self.torque and not self.blocked and self.get("operating_mode") == 0:
+                self._follow(elapsed_s)
+            else:
+                self.velocity = 0.0
+        self._protect(elapsed_s)
         self._publish()
 
     @property
@@ -200,6 +212,25 @@ class EmulatedServo:
     def _way(self) -> float:
         return self.goal - self.encoder
 
+    def _protect(self, elapsed_s: float) -> None:
+        """Go into overload as the table says; only torque off ends it, and an instant later the error bit."""
+        if not self.torque:
+            self._heavy_s, self._overload = 0.0, False
+            return
+        heavy = abs(self._duty()) >= 10 * self.get("overload_torque")
+        self._heavy_s = self._heavy_s + elapsed_s if heavy else 0.0
+        self._overload = self._overload or self._heavy_s >= 0.01 * self.get("protection_time")
+
+    def _duty(self) -> float:
+        """What the motor is driven with [0.1 %], signed."""
+        if not self.torque:
+            return 0.0
+        most = min(self.get("max_torque"), self.get("torque_limit"))
+        if self._overload:
+            most = min(most, 10 * self.get("protective_torque"))
+        wanted = most if self.burdened else self._way() * _DUTY_PER_TICK * self.get("p_coefficient") / 32
+        return max(-most, min(most, wanted))
+
     def _make_middle(self) -> None:
         self.table[_TORQUE] = 0
         offset = round(self.encoder) - TURN // 2
@@ -220,14 +251,13 @@ class EmulatedServo:
             reported %= TURN
         self.set("present_position", reported)
         self.set("present_velocity", max(-32767, min(32767, round(self.velocity))))
-        way = self._way() if self.torque else 0.0
-        self.set("present_load", max(-1000, min(1000, round(way * self.get("p_coefficient") / 32))))
+        self.set("present_load", round(self._duty()))
         self.set("moving", int(abs(self.velocity) > 0))
-        status = 0
+        status = _OVERLOAD if self._overload else 0
         if not self.get("min_voltage_limit") <= self.get("present_voltage") <= self.get("max_voltage_limit"):
-            status |= 0x01
+            status |= _UNDERVOLTAGE
         if self.get("present_temperature") > self.get("max_temperature_limit"):
-            status |= 0x04
+            status |= _OVERHEATING
         self.set("status", status)
 
 

@@ -34,12 +34,20 @@ class Wire:
         self._chance = np.random.default_rng(seed)
         self._scanner = protocol.Scanner()
         self._now_s: float | None = None
+        self._disconnected: set[int] = set()
 
     def advance(self, now_s: float) -> None:
-        """Let the joints move until `now_s` [s]."""
+        """Let the joints move until `now_s` [s], under the faults that there are."""
         elapsed_s = now_s - self._now_s if self._now_s is not None else 0.0
         self._now_s = now_s
+        faults = self._faults
+        unpowered = faults.brown_out | (faults.disconnected - self._disconnected)
+        self._disconnected = set(faults.disconnected)
+        faults.brown_out.clear()
         for servo in self._servos:
+            servo.blocked, servo.burdened = servo.id in faults.blocked, servo.id in faults.overloaded
+            if servo.id in unpowered:
+                servo.brown_out()
             servo.advance(max(0.0, elapsed_s))
 
     def receive(self, received: bytes, baud_rate: int) -> list[tuple[float, bytes]]:
@@ -50,8 +58,10 @@ class Wire:
         """
         replies: list[tuple[float, bytes]] = []
         for packet in self._scanner.feed(received):
-            sent_s = self._wire_s(protocol.OVERHEAD + len(packet.parameters), baud_rate)
             hearing = self._hearing(baud_rate)
+            if not hearing:
+                continue
+            sent_s = self._wire_s(protocol.OVERHEAD + len(packet.parameters), baud_rate)
             for asked, content in self._carry_out(packet, hearing):
                 servo = hearing[asked]
                 reply = protocol.pack(Packet(asked, servo.error | self._faults.errors.get(asked, 0), content))
@@ -63,7 +73,7 @@ class Wire:
 
     def _hearing(self, baud_rate: int) -> dict[int, EmulatedServo]:
         """Those that hear the host, by the ids in their tables."""
-        silent = self._faults.silent
+        silent = self._faults.silent | self._faults.disconnected
         return {
             servo.id: servo
             for servo in self._servos
