@@ -23,6 +23,8 @@ PLUGINS = sorted(FOLDERS)
 SHARED = "ros2"
 EXTRAS = {"camera": "[realsense]", "mcap": "[plot]", "zenoh": "[interop]"}
 """Name -> extras that its tests use."""
+PLATFORMS = ("x86_64-unknown-linux-gnu", "aarch64-unknown-linux-gnu", "aarch64-apple-darwin")
+"""Where everything must install without a compiler: PCs, robots' own computers (e.g. Raspberry Pi, Jetson), and Macs."""
 # A fixed seed: the same checks give the same result; `nox -s core -- --hypothesis-seed=random` explores.
 PYTEST = ("pytest", "--config-file=pyproject.toml", "--rootdir=.", "--hypothesis-seed=0")
 
@@ -80,6 +82,15 @@ def layers(session: nox.Session) -> None:
     """Which module may import which: the contracts in pyproject.toml."""
     install(session, *PLUGINS, groups=("lint",))
     session.run("lint-imports")
+
+
+@nox.session
+def wheels(session: nox.Session) -> None:
+    """Whether core and every plugin, with all extras, install from wheels alone on each platform; only resolves."""
+    projects = ("pyproject.toml", *(str(folder / "pyproject.toml") for folder in FOLDERS.values()))
+    options = ("--quiet", "--all-extras", "-c", "constraints.txt", "--only-binary", ":all:", "--python-version", "3.12")
+    for platform in PLATFORMS:
+        session.run("uv", "pip", "compile", *options, "--python-platform", platform, "-o", os.devnull, *projects)
 
 
 @nox.session

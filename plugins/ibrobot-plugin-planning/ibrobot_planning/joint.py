@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import override
 
 import numpy as np
-from numpy.typing import NDArray
-from ruckig import InputParameter, Result, Ruckig, Trajectory  # type: ignore[import-not-found]  # ships no types
 
 from ibrobot_core.errors import PlanningError
 from ibrobot_core.interfaces import Context, JointGoal, Planner, PlanRequest, PoseGoal
 from ibrobot_core.messages import Header, JointTrajectory, JointTrajectoryPoint
 from ibrobot_core.robot import Joint, Vector
-from ibrobot_core.units import NS_PER_S, ns
+from ibrobot_core.units import ns, seconds
 from ibrobot_planning.options import JointPlannerOptions
+from ibrobot_planning.profile import RestToRest
 
 _SHORTEST_PHASE_S = 1e-5
 """Shorter phases of the profile get no point of their own: interpolation would divide by their time."""
@@ -57,15 +57,16 @@ class JointPlanner(Planner):
         def along(values: list[float]) -> float:
             return float(np.min(np.array(values)[moving] / share[moving]))
 
-        limits = [
+        profile = RestToRest(
+            distance,
             along([joint.max_velocity * velocity for joint in joints]),
             along([joint.max_acceleration * acceleration for joint in joints]),
             self._options.max_jerk,
-        ]
+        )
         direction = delta / distance
         points = tuple(
             JointTrajectoryPoint(stamp, request.start + way * direction, speed * direction, rate * direction)
-            for stamp, way, speed, rate in _profile(distance, limits, self._options.step)
+            for stamp, way, speed, rate in _points(profile, self._options.step)
         )
         return JointTrajectory(header, request.joints, points)
 
@@ -121,32 +122,21 @@ def _fraction(name: str, value: float) -> float:
     return value
 
 
-def _profile(distance: float, limits: list[float], step: float) -> list[tuple[int, float, float, float]]:
-    """The fastest way from rest to rest over `distance` under `limits` on velocity, acceleration and jerk.
+def _points(profile: RestToRest, step: float) -> list[tuple[int, float, float, float]]:
+    """Points on a profile, at most `step` [s] apart.
 
-    Jerk is constant in each phase of the profile, and every phase begins and ends on a point: an executor that
-    interpolates with positions, velocities and accelerations follows the profile exactly.
+    Every phase begins and ends on a point: an executor that interpolates with positions, velocities and accelerations
+    follows the profile exactly.
 
     Returns:
         Per point: time [ns], way, speed and its rate of change.
     """
-    limit = InputParameter(1)
-    limit.target_position = [distance]
-    limit.max_velocity, limit.max_acceleration, limit.max_jerk = ([value] for value in limits)
-    trajectory = Trajectory(1)
-    result = Ruckig(1).calculate(limit, trajectory)
-    if result is not Result.Working:
-        raise PlanningError(f"no profile over {distance} rad within velocity, acceleration, jerk {limits}: {result}")
-    points = [(0, 0.0, 0.0, 0.0)]
-    for stamp in _stamps(np.cumsum(trajectory.profiles[0][0].t), step):
-        position, velocity, acceleration = trajectory.at_time(stamp / NS_PER_S)
-        points.append((stamp, position[0], velocity[0], acceleration[0]))
-    end = max(points[-1][0], 1)
-    points[-1] = (end, distance, 0.0, 0.0)
-    return points
+    stamps = _stamps(profile.ends, step)
+    between = [(stamp, *profile.at(seconds(stamp))) for stamp in stamps[:-1]]
+    return [(0, 0.0, 0.0, 0.0), *between, (max(stamps[-1], 1), profile.distance, 0.0, 0.0)]
 
 
-def _stamps(ends: NDArray[np.float64], step: float) -> list[int]:
+def _stamps(ends: Sequence[float], step: float) -> list[int]:
     """Times [ns] that cut each phase, ending at `ends` [s], into equal parts of at most `step` [s]; zero left out."""
     stamps: list[int] = []
     begin = 0.0
@@ -155,5 +145,5 @@ def _stamps(ends: NDArray[np.float64], step: float) -> list[int]:
             continue
         parts = math.ceil((end - begin) / step)
         stamps += [ns(time) for time in np.linspace(begin, end, parts + 1)[1:]]
-        begin = float(end)
-    return stamps or [ns(float(ends[-1]))]
+        begin = end
+    return stamps or [ns(ends[-1])]
