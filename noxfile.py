@@ -24,7 +24,7 @@ SHARED = "ros2"
 EXTRAS = {"camera": "[realsense]", "mcap": "[plot]", "zenoh": "[interop]"}
 """Name -> extras that its tests use."""
 PLATFORMS = ("x86_64-unknown-linux-gnu", "aarch64-unknown-linux-gnu", "aarch64-apple-darwin")
-"""Where everything must install without a compiler: PCs, robots' own computers (e.g. Raspberry Pi, Jetson), and Macs."""
+"""Where everything must install without a compiler: PCs, robots' own computers (e.g. Jetson), and Macs."""
 # A fixed seed: the same checks give the same result; `nox -s core -- --hypothesis-seed=random` explores.
 PYTEST = ("pytest", "--config-file=pyproject.toml", "--rootdir=.", "--hypothesis-seed=0")
 

@@ -26,7 +26,7 @@ def test_arrives_at_rest_within_the_limits_and_no_phase_is_slower_than_they_dema
     np.testing.assert_allclose(profile.at(ends[-1]), (distance, 0.0, 0.0), atol=1e-9 * distance)
     assert np.all(lengths >= 0)
     states = np.array([profile.at(time) for time in ends])
-    # Integrated phase by phase with a jerk of the limit, or none: the jerk always is at its limit but in phases 2, 4, 6.
+    # Integrated phase by phase: the jerk is at its limit but for phases 2, 4 and 6, where it is 0.
     jerks = jerk * np.array([1, 0, -1, 0, -1, 0, 1])
     way = speed = rate = 0.0
     for t, j, state in zip(lengths, jerks, states, strict=True):
