@@ -85,7 +85,8 @@ def main() -> None:
         follower, follower_file = arm(folder, "follower", throttle=arguments.throttle)
         sections = (
             f"hardware={{type: feetech_so101, port: {folder}/follower, calibration: {follower_file}}}",
-            f"teleoperation.leader={{type: so101_leader, port: {folder}/leader, calibration: {leader_file}}}",
+            f"teleoperation.leader={{type: so101_leader, port: {folder}/leader, calibration: {leader_file}, "
+            "deadman: none}",
             "control_modes.teleop.teleop=leader", f"control.rate_hz={arguments.rate}",
         )  # fmt: skip
         command = [*LAUNCH, "--mode", "teleop", "--headless", "--json", "--duration", str(arguments.duration)]

@@ -20,11 +20,13 @@ class TeleopSuite(Suite[Teleop]):
 
     has_deadman: ClassVar[bool] = True
     """Whether the device has a deadman that `release` lets go."""
+    has_operator: ClassVar[bool] = True
+    """Whether a person starts every motion. False for a device that moves the robot by itself, e.g. a demonstration."""
     tolerance_rad: ClassVar[float] = 1e-6
     """How far the first positions may be from the measured ones [rad]."""
 
     def engage(self, teleop: Teleop) -> None:
-        """The operator presses the deadman; leave it as it is for a device without one."""
+        """The operator presses the deadman, or does what starts motion; nothing for a device that moves by itself."""
 
     def release(self, teleop: Teleop) -> None:
         """The operator lets the deadman go."""
@@ -108,6 +110,22 @@ class TeleopSuite(Suite[Teleop]):
             self.release(teleop)
             commands = [teleop.read(self._measure(ctx, pose)) for _ in range(2)]
             assert commands[-1].positions is None
+
+    def test_waits_for_the_operator(self) -> None:
+        """After each `activate` (a launch, a mode switch, a reset) nothing moves before the operator acts again."""
+        if not self.has_operator:
+            pytest.skip("moves by itself")
+        with self.connected() as (teleop, ctx):
+            pose = self.poses(ctx)[0]
+            for _ in range(2):
+                teleop.activate(self._measure(ctx, pose))
+                for _ in range(100):
+                    positions = teleop.read(self._measure(ctx, pose)).positions
+                    assert positions is None, "it commands positions before the operator has acted"
+                self.engage(teleop)
+                teleop.read(self._measure(ctx, pose))
+                self.operate(teleop)
+                assert teleop.read(self._measure(ctx, pose)).positions, "no positions once the operator acted"
 
     def test_leaves_the_measurement_alone(self) -> None:
         """`activate` and `read` change nothing in `measured`, nor does a later change of it reach the device."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import queue
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -53,6 +54,8 @@ class Station:
     leader: Emulator
     follower: Emulator
     runtime: Runtime
+    typed: queue.SimpleQueue[str]
+    """Keys of the person at the terminal."""
     requests: int = 0
     """To the follower."""
 
@@ -83,6 +86,10 @@ class Station:
             self.runtime.raise_failure()
             assert time.monotonic() < deadline, f"{what}: not within {PATIENCE_S:.0f} s"
             self.runtime.wait(0.01)
+
+    def press_space(self) -> None:
+        """Follow the leader, or pause."""
+        self.typed.put("space")
 
     def until_at(self, joint: str, angle: float) -> None:
         self.until(lambda: abs(self.angle(joint) - angle) < 0.01, f"{joint} comes to {angle} rad")
@@ -129,7 +136,9 @@ def station(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callabl
             "control.state_timeout=20.0",
         )
         config = load(CONFIG, overrides=(*sections, *overrides), mode="teleop")
-        station = Station(leader, follower, Runtime(Session(config, installed(), Request())))
+        typed = queue.SimpleQueue[str]()
+        session = Session(config, installed(), Request(keys=lambda: typed))
+        station = Station(leader, follower, Runtime(session), typed)
         made.append(station)
         follower.on_request = station.count
         leader.start()
@@ -147,6 +156,8 @@ def station(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callabl
 
 def test_the_follower_comes_to_the_leader_without_a_jump_and_follows(station: Callable[..., Station]):
     arms = station("teleoperation.leader.ramp_velocity=0.15")
+    assert arms.until_at_rest() == pytest.approx(0.0, abs=0.01), "a launch alone moves nothing"
+    arms.press_space()
     arms.until_at("shoulder_pan", 0.6)
     # A setpoint is a tenth of a second from the one before it, where the host is slow, or the tolerance at the end.
     assert arms.fastest() <= 0.02 * RADIAN + 1 < MAX_STEP, "the approach is slower than the limits"
@@ -162,6 +173,7 @@ def test_the_follower_comes_to_the_leader_without_a_jump_and_follows(station: Ca
 
 def test_an_unplugged_leader_is_a_fault_and_replugged_a_reset_goes_on(station: Callable[..., Station]):
     arms = station()
+    arms.press_space()
     arms.until_at("shoulder_pan", 0.6)
     arms.leader.unplug()
     fault = arms.until_fault()
@@ -176,6 +188,8 @@ def test_an_unplugged_leader_is_a_fault_and_replugged_a_reset_goes_on(station: C
     arms.leader.replug()
     assert arms.until_at_rest() == stopped, "nothing moves before the reset"
     arms.runtime.session.bus.call(RESET, None)
+    assert arms.until_at_rest() == pytest.approx(stopped, abs=0.01), "a reset alone moves nothing"
+    arms.press_space()
     arms.until_at("shoulder_pan", -0.3)
     arms.assert_no_jump()
     assert arms.faults == [fault]
@@ -183,6 +197,7 @@ def test_an_unplugged_leader_is_a_fault_and_replugged_a_reset_goes_on(station: C
 
 def test_an_unplugged_follower_is_a_fault_and_replugged_a_reset_goes_on(station: Callable[..., Station]):
     arms = station()
+    arms.press_space()
     arms.until_at("shoulder_pan", 0.6)
     arms.follower.unplug()
     fault = arms.until_fault()
@@ -192,8 +207,11 @@ def test_an_unplugged_follower_is_a_fault_and_replugged_a_reset_goes_on(station:
 
     arms.turn("shoulder_pan", -0.3)
     arms.follower.replug()
-    assert arms.until_at_rest(requests_at_rest=0) == pytest.approx(0.6, abs=0.05)
+    stopped = arms.until_at_rest(requests_at_rest=0)
+    assert stopped == pytest.approx(0.6, abs=0.05)
     arms.runtime.session.bus.call(RESET, None)
+    assert arms.until_at_rest() == pytest.approx(stopped, abs=0.01), "a reset alone moves nothing"
+    arms.press_space()
     arms.until_at("shoulder_pan", -0.3)
     arms.assert_no_jump()
     assert not arms.runtime.session.finished.is_set()
@@ -201,6 +219,7 @@ def test_an_unplugged_follower_is_a_fault_and_replugged_a_reset_goes_on(station:
 
 def test_a_servo_of_the_leader_that_dies_is_named(station: Callable[..., Station]):
     arms = station("control.stop=relax")
+    arms.press_space()
     arms.until_at("shoulder_pan", 0.6)
     arms.leader.faults.silent.add(3)
     assert "servo 3 (elbow_flex)" in arms.until_fault()
@@ -209,10 +228,14 @@ def test_a_servo_of_the_leader_that_dies_is_named(station: Callable[..., Station
 
 def test_the_emergency_stop_holds_until_the_reset(station: Callable[..., Station]):
     arms = station()
+    arms.press_space()
     arms.until_at("shoulder_pan", 0.6)
     arms.runtime.session.bus.call(ESTOP, None)
     arms.turn("shoulder_pan", -0.3)
-    assert arms.until_at_rest() == pytest.approx(0.6, abs=0.05)
+    stopped = arms.until_at_rest()
+    assert stopped == pytest.approx(0.6, abs=0.05)
     arms.runtime.session.bus.call(RESET, None)
+    assert arms.until_at_rest() == pytest.approx(stopped, abs=0.01), "a reset alone moves nothing"
+    arms.press_space()
     arms.until_at("shoulder_pan", -0.3)
     arms.assert_no_jump()

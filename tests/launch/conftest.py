@@ -78,7 +78,10 @@ class Stick(FakeTeleop):
     """Pushed forward, all the time."""
     def __init__(self, ctx):
         super().__init__(ctx)
-        self.deadman, self.velocity = True, 0.2
+        self.velocity = 0.2
+    def activate(self, measured):
+        super().activate(measured)
+        self.deadman = True
     def connect(self):
         CALLS.append("connect stick")
         super().connect()

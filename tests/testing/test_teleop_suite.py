@@ -71,6 +71,13 @@ class IgnoresTheDeadman(FakeTeleop):
         return super().read(measured)
 
 
+class StaysPressedOverAReset(FakeTeleop):
+    def activate(self, measured):
+        pressed = self.deadman
+        super().activate(measured)
+        self.deadman = pressed
+
+
 class KeepsTheMeasurement(FakeTeleop):
     def activate(self, measured):
         super().activate(measured)
@@ -104,6 +111,7 @@ WRONG = {
     NotANumber: "positions_are_of_known_joints",
     NeverMoves: "operating_moves",
     IgnoresTheDeadman: "released_deadman_gives_none",
+    StaysPressedOverAReset: "waits_for_the_operator",
     KeepsTheMeasurement: "leaves_the_measurement_alone",
     ChangesTheMeasurement: "leaves_the_measurement_alone",
     DisconnectsOnce: "disconnect_is_safe_at_any_time",

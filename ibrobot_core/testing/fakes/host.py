@@ -86,6 +86,7 @@ class FakeTeleop(Teleop):
     def activate(self, measured: JointReading) -> None:
         self._positions = measured.position.copy()
         self._last_ns = measured.stamp_ns
+        self.deadman = False
 
     @override
     def read(self, measured: JointReading) -> TeleopCommand:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import override
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ibrobot_core.calibration import load_calibration
 from ibrobot_core.errors import HardwareError, TeleopError
@@ -25,6 +26,8 @@ _FASTEST_HAND = 13_000
 """Faster than a person turns a joint [ticks/s]: three turns a second."""
 _SLACK = 64
 """What a position may differ from the last one at any rate [ticks]."""
+_TAKEN_UP = 40
+"""A leader whose joint turned by more is in somebody's hand [ticks]: 3.5 degrees."""
 
 
 class LeaderTeleop(Teleop):
@@ -74,13 +77,17 @@ class LeaderTeleop(Teleop):
         self._toggled = False
         self._pressed_ns: int | None = None
         self._held_until_ns = 0
+        self._resting: NDArray[np.int32] | None = None
+        """Where the leader stood when the mode began [ticks]; None until that was read."""
+        self._taken_up = False
+        """Whether it was moved since then."""
 
     @override
     def connect(self) -> None:
         if self._options.deadman != "none" and self._ctx.keys is None:
             raise TeleopError(
                 f"{self._ctx.name}: deadman: {self._options.deadman} needs a terminal: start ibrobot in one, its input "
-                "not redirected, or set deadman: none"
+                "not redirected, or set deadman: none, with which the robot follows once the leader arm is moved"
             )
         bus = FeetechBus(self._options.port, baud_rate=self._options.baud_rate, joints=self._arm.names)
         try:
@@ -121,12 +128,15 @@ class LeaderTeleop(Teleop):
 
     @override
     def help(self) -> str:
-        words = {
-            "none": "the robot follows the leader arm",
-            "toggle": "space  follow the leader arm, and pause",
-            "hold": "space held  follow the leader arm",
+        start = {
+            "none": "move the leader arm to start",
+            "toggle": "press space to follow the leader arm",
+            "hold": "hold space to follow the leader arm",
         }
-        return f"{words[self._options.deadman]}   {self._options.estop_key}  emergency stop"
+        pause = {"none": "", "toggle": ": space pauses", "hold": ": release space to pause"}
+        deadman = self._options.deadman
+        state = f"PAUSED: {start[deadman]}" if self._setpoint is None else f"following the leader arm{pause[deadman]}"
+        return f"{state}   {self._options.estop_key}  emergency stop"
 
     def _check_names(self, option: str, names: Sequence[str], known: Sequence[str]) -> None:
         for name in names:
@@ -215,9 +225,9 @@ class LeaderTeleop(Teleop):
         return before + way * min(1.0, share)
 
     def _release(self) -> None:
-        """As if nobody had touched a key: paused where there is a deadman, and a ramp to begin with."""
-        self._setpoint = self._pressed_ns = None
-        self._toggled = False
+        """As if nobody had touched a key or the leader: paused, and a ramp to begin with."""
+        self._setpoint = self._pressed_ns = self._resting = None
+        self._toggled = self._taken_up = False
         self._held_until_ns = 0
 
     def _typed(self) -> list[str]:
@@ -244,4 +254,12 @@ class LeaderTeleop(Teleop):
                 return self._toggled
             case "hold":
                 return now_ns < self._held_until_ns
-        return True
+        return self._is_taken_up()
+
+    def _is_taken_up(self) -> bool:
+        """Whether the leader was moved since the mode began; nobody knows before every servo has answered once."""
+        if self._resting is None:
+            self._resting = None if self._lost.any() else self._ticks.copy()
+        elif not self._taken_up:
+            self._taken_up = bool(np.abs(self._ticks - self._resting).max() > _TAKEN_UP)
+        return self._taken_up

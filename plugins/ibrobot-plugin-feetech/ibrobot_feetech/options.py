@@ -57,9 +57,10 @@ class LeaderOptions:
         0.02, unit="rad", gt=0, help="distance from the leader's pose at which the approach ends"
     )
     deadman: str = option(
-        "none",
-        choices=("none", "toggle", "hold"),
-        help="none: always follows; toggle: space follows and pauses; hold: follows while space is held",
+        "toggle",
+        choices=("toggle", "hold", "none"),
+        help="toggle: space follows and pauses; hold: follows while space is held; none: follows once the leader arm "
+        "is moved, for runs without a terminal",
     )
     release: float = option(
         0.2, unit="s", gt=0, le=1, help="deadman hold: without a repeat of the key for so long, it counts as released"

@@ -63,12 +63,24 @@ class LeaderSuite(TeleopSuite):
                 servo.turn(servo.encoder + 100)
 
 
-class TestAlwaysFollowing(LeaderSuite):
+class TestWithoutADeadman(LeaderSuite):
     has_deadman = False
+
+    @override
+    def context(self) -> Context:
+        self.clock = SteppedClock(START_NS)
+        return host_context(clock=self.clock)
 
     @override
     def make(self, ctx: Context) -> Teleop:
         return self.leader(ctx, "none")
+
+    @override
+    def engage(self, teleop: Teleop) -> None:
+        """Somebody takes the leader up."""
+        still = np.zeros(6)
+        teleop.read(JointReading(self.clock.now_ns(), still, still, still))
+        self.operate(teleop)
 
 
 class TestToggle(LeaderSuite):
@@ -145,9 +157,12 @@ class Desk:
 
 @pytest.fixture
 def desk(emulator: Emulator, calibration_file: Path, request: pytest.FixtureRequest) -> Iterator[Desk]:
-    desk = Desk(emulator, calibration_file, **getattr(request, "param", {}))
+    given = getattr(request, "param", {})
+    desk = Desk(emulator, calibration_file, **given)
     desk.leader.connect()
     desk.leader.activate(desk.measured())
+    if "deadman" not in given:
+        desk.typed.put("space")
     yield desk
     desk.leader.disconnect()
 
@@ -229,6 +244,37 @@ class TestApproach:
 
 
 class TestDeadman:
+    def test_without_a_word_in_the_yaml_it_waits_for_space(self, emulator: Emulator, calibration_file: Path):
+        desk = Desk(emulator, calibration_file)
+        desk.leader.connect()
+        desk.leader.activate(desk.measured())
+        desk.turn("shoulder_pan", 2500)
+        assert [desk.read().positions for _ in range(50)] == [None] * 50
+        assert desk.leader.help().startswith("PAUSED: press space to follow")
+        assert desk.read("space").positions is not None
+        assert desk.leader.help().startswith("following the leader arm: space pauses")
+        desk.leader.disconnect()
+
+    @options(deadman="none")
+    def test_none_follows_once_the_leader_is_taken_up(self, desk: Desk):
+        desk.turn("shoulder_pan", 2500)  # while nobody read
+        assert [desk.read().positions for _ in range(50)] == [None] * 50
+        assert desk.leader.help().startswith("PAUSED: move the leader arm")
+        desk.turn("shoulder_pan", 2510)
+        assert desk.read().positions is None, "it trembles"
+        desk.turn("shoulder_pan", 2600)
+        assert desk.follow()[0] == pytest.approx(552 / RADIAN, abs=1e-3)
+        desk.leader.activate(desk.measured())
+        assert desk.read().positions is None, "a reset waits again"
+
+    @options(deadman="none")
+    def test_a_lost_reply_at_the_start_is_no_motion(self, desk: Desk):
+        desk.turn("shoulder_pan", 2500)
+        desk.emulator.faults.silent.add(1)
+        assert desk.read().positions is None
+        desk.emulator.faults.silent.clear()
+        assert [desk.read().positions for _ in range(50)] == [None] * 50
+
     @options(deadman="toggle", ramp_velocity=1.0)
     def test_a_pause_ends_in_the_same_approach(self, desk: Desk):
         assert desk.read().positions is None
@@ -318,7 +364,7 @@ class TestBus:
             prepare(emulator, arm_calibration())
             desk = Desk(emulator, calibration_file, link)
             desk.leader.connect()
-            desk.read()
+            desk.read("space")
             emulator.unplug()
             with pytest.raises(TeleopError, match=r"leader: .*port: the port is"):
                 desk.read()
@@ -327,5 +373,7 @@ class TestBus:
                 desk.leader.connect()
             emulator.replug()
             desk.leader.connect()
-            assert desk.read().positions is not None
+            desk.leader.activate(desk.measured())
+            assert desk.read().positions is None, "it waits to be started again"
+            assert desk.read("space").positions is not None
             desk.leader.disconnect()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import queue
 from typing import override
 
 import numpy as np
@@ -15,18 +16,22 @@ from ibrobot_jointlog.options import ReplayOptions
 
 
 class ReplayTeleop(Teleop):
-    """Plays a joint log from wherever the robot is; it needs no operator, so it has no deadman.
+    """Plays a joint log from wherever the robot is, once the operator presses space.
 
-    A run has two parts: the approach, from the position measured at the first read to the log's first sample, and the
+    Where there is no terminal, nobody can press it: it plays as soon as its mode begins.
+
+    A run has two parts: the approach, from the position measured when it starts to the log's first sample, and the
     log itself. A looping replay approaches its first sample again from the last.
     """
 
     def __init__(self, options: ReplayOptions, ctx: Context) -> None:
         self._options = options
+        self._ctx = ctx
         self._robot = ctx.robot
+        self._keys: queue.SimpleQueue[str] | None = None
         self._log: JointLog | None = None
         self._begun_ns: int | None = None
-        """When the present run began [ns]; None until the first read."""
+        """When the present run began [ns]; None until it is started."""
         self._from: Vector = np.empty(0)
         """Where it began [rad], shape (J,)."""
 
@@ -34,10 +39,12 @@ class ReplayTeleop(Teleop):
     def connect(self) -> None:
         self._log = read_log(self._options.path, self._robot.joint_names)
         self._begun_ns = None
+        self._keys = self._ctx.keys() if self._ctx.keys is not None else None
 
     @override
     def activate(self, measured: JointReading) -> None:
         self._begun_ns = None
+        self._typed()  # what was typed for something else
 
     @override
     def read(self, measured: JointReading) -> TeleopCommand:
@@ -45,6 +52,8 @@ class ReplayTeleop(Teleop):
         if log is None:
             raise TeleopError("replay is not connected: connect comes before read")
         if self._begun_ns is None:
+            if self._keys is not None and _START_KEY not in self._typed():
+                return TeleopCommand(None)
             self._begun_ns, self._from = measured.stamp_ns, measured.position.copy()
         elapsed = seconds(measured.stamp_ns - self._begun_ns)
         approach = self._approach_time(log.positions[0] - self._from)
@@ -60,12 +69,19 @@ class ReplayTeleop(Teleop):
 
     @override
     def disconnect(self) -> None:
-        self._log = None
+        self._log = self._keys = None
 
     @override
     def help(self) -> str:
         again = ", again and again" if self._options.loop else ""
-        return f"replays {self._options.path}{again}; no keys"
+        waits = self._keys is not None and self._begun_ns is None
+        return f"press {_START_KEY} to replay {self._options.path}" if waits else f"replays {self._options.path}{again}"
+
+    def _typed(self) -> list[str]:
+        typed: list[str] = []
+        while self._keys is not None and not self._keys.empty():
+            typed.append(self._keys.get_nowait())
+        return typed
 
     def _command(self, positions: Vector, finished: bool = False) -> TeleopCommand:
         named = dict(zip(self._robot.joint_names, positions.tolist(), strict=True))
@@ -80,6 +96,7 @@ class ReplayTeleop(Teleop):
         return float(np.max(np.maximum(by_speed, by_acceleration)))
 
 
+_START_KEY = "space"
 _PEAK_SPEED, _PEAK_ACCELERATION = 1.5, 6.0
 """Greatest first and second derivative of `_ease`."""
 

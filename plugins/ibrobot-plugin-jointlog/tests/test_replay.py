@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import queue
 from pathlib import Path
 from typing import override
 
@@ -52,10 +53,19 @@ class TestReplay(TeleopSuite):
     @pytest.fixture(autouse=True)
     def _log(self, tmp_path_factory):
         self.path = write_log(tmp_path_factory.mktemp("log") / "joints.csv", WAVE)
+        self.typed = queue.SimpleQueue[str]()
+
+    @override
+    def context(self) -> Context:
+        return host_context(keys=lambda: self.typed)
 
     @override
     def make(self, ctx: Context) -> Teleop:
         return ReplayTeleop(ReplayOptions(self.path), ctx)
+
+    @override
+    def engage(self, teleop: Teleop) -> None:
+        self.typed.put("space")
 
     @override
     def operate(self, teleop: Teleop) -> None:
@@ -85,6 +95,24 @@ def test_it_finishes_at_the_last_sample_and_stays_there(tmp_path):
         command = teleop.read(reading(time, WAVE[0]))
         assert command.finished
         assert vector(command) == WAVE[-1]
+
+
+def test_without_a_terminal_it_plays_as_soon_as_its_mode_begins(tmp_path):
+    teleop = ReplayTeleop(ReplayOptions(write_log(tmp_path / "log.csv", WAVE)), host_context())
+    teleop.connect()
+    teleop.activate(reading(0, WAVE[0]))
+    assert vector(teleop.read(reading(0, WAVE[0]))) == WAVE[0]
+
+
+def test_the_panel_says_what_to_press(tmp_path):
+    typed = queue.SimpleQueue[str]()
+    teleop = ReplayTeleop(ReplayOptions(write_log(tmp_path / "log.csv", WAVE)), host_context(keys=lambda: typed))
+    teleop.connect()
+    teleop.activate(reading(0, WAVE[0]))
+    assert teleop.help().startswith("press space to replay")
+    typed.put("space")
+    teleop.read(reading(0, WAVE[0]))
+    assert teleop.help().startswith("replays")
 
 
 def test_a_loop_goes_back_to_the_first_sample_without_a_jump_and_never_finishes(tmp_path):

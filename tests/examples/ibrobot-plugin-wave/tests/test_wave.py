@@ -12,6 +12,7 @@ class TestWave(TeleopSuite):
     """Runs every check of the suite on the wave."""
 
     has_deadman = False
+    has_operator = False  # it waves by itself
 
     @override
     def make(self, ctx: Context) -> Teleop:
