@@ -70,7 +70,7 @@ class FeetechFollower(Hardware):
         )
         self._health = [nan_vector(size) for _ in self.signals]
         self._lost = np.zeros(size, dtype=np.intp)
-        self._health_due_ns = self._stamp_ns = 0
+        self._health_due_ns = 0
         self._speed: Vector = np.zeros(size)
         self._velocity: Vector = np.zeros(size)
         self._complaints = np.zeros(size, dtype=np.uint8)
@@ -113,12 +113,11 @@ class FeetechFollower(Hardware):
         except FeetechError as error:
             self._fault = error
             raise
-        self._take(values, good)
+        self._take(values, good, stamp_ns)
         if healthy and good.all():
             self._health_due_ns = begun_ns + ns(self._options.health_period)
             self._take_health(values)
         stale = bool(self._lost.any())
-        self._stamp_ns = stamp_ns
         position = self._arm.radians(self._ticks.astype(np.float64))
         return JointReading(stamp_ns, position, self._velocity.copy(), self._effort(), stale)
 
@@ -181,27 +180,26 @@ class FeetechFollower(Hardware):
         self._writer = SyncWriter(bus, ids)
         self._ticks = np.array(list(bus.sync_read("present_position", ids).values()), dtype=np.intp)
         self._doubtful = self._ticks
+        self._ticks_ns = self._doubtful_ns = np.full(len(ids), self._ctx.clock.now_ns())
         self._speed = np.zeros(len(ids))
         self._velocity = np.zeros(len(ids))
         self._lost[:] = 0
-        self._stamp_ns = self._ctx.clock.now_ns()
-        self._health_due_ns = self._stamp_ns
+        self._health_due_ns = 0
         self._fault = None
 
     def _plausible(self, ticks: NDArray[np.intp], answered: NDArray[np.bool_], stamp_ns: int) -> NDArray[np.bool_]:
         """Whether a joint can be where its reply says. The checksum has 8 bits: some damage passes it.
 
-        What a joint's speed does not explain is believed when the next reply says it again.
+        What its speed does not explain, since its own last good reply, is believed when the next reply says it again.
         """
-        elapsed_s = seconds(stamp_ns - self._stamp_ns)
-        expected = self._ticks + self._speed * elapsed_s
-        band = _SLACK_TICKS + min(_MAX_ACCELERATION * elapsed_s, _MAX_SPEED) * elapsed_s
-        near = np.abs(ticks - expected) <= band
-        again = np.abs(ticks - self._doubtful) <= band
+        elapsed_s = (stamp_ns - self._ticks_ns) * 1e-9
+        near = np.abs(ticks - self._ticks - self._speed * elapsed_s) <= _reach(elapsed_s)
+        again = np.abs(ticks - self._doubtful) <= _reach((stamp_ns - self._doubtful_ns) * 1e-9)
         inside = (ticks >= 0) & (ticks < 4096)
         good: NDArray[np.bool_] = inside & (near | again)
         self._counts["implausible_positions"] += int((answered & ~good).sum())
         self._doubtful = np.where(answered & inside, ticks, self._doubtful)
+        self._doubtful_ns = np.where(answered & inside, stamp_ns, self._doubtful_ns)
         return good
 
     def _check(self, replies: Replies, good: NDArray[np.bool_]) -> None:
@@ -219,9 +217,10 @@ class FeetechFollower(Hardware):
             others = f", nor from {', '.join(self._arm.names[servo] for servo in gone[1:])}" if len(gone) > 1 else ""
             raise NoReply(self._bus.place(gone[0], "present_position"), f"no good reply for {ticks} ticks{others}")
 
-    def _take(self, values: NDArray[np.intp], good: NDArray[np.bool_]) -> None:
+    def _take(self, values: NDArray[np.intp], good: NDArray[np.bool_], stamp_ns: int) -> None:
         position, velocity, load = values[:, 0], values[:, 1], values[:, 2]
         self._ticks = np.where(good, position, self._ticks)
+        self._ticks_ns = np.where(good, stamp_ns, self._ticks_ns)
         self._speed = np.where(good, velocity, self._speed)
         self._velocity = self._speed * self._arm.sign * _RADIANS_PER_TICK
         self._health[3] = np.where(good, load * self._arm.sign * 1e-3, self._health[3])
@@ -282,6 +281,12 @@ class FeetechFollower(Hardware):
                     "%s: its calibrated range is %.2f to %.2f rad, its limits are %.2f to %.2f: it stops at the range",
                     joint, low, high, lower, upper,
                 )  # fmt: skip
+
+
+def _reach(elapsed_s: Vector) -> Vector:
+    """How far from the expected position a joint can get in that time [ticks]."""
+    reach: Vector = _SLACK_TICKS + np.minimum(_MAX_ACCELERATION * elapsed_s, _MAX_SPEED) * elapsed_s
+    return reach
 
 
 def _servo(fault: HardwareError) -> int | None:

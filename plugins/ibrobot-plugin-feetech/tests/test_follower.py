@@ -11,7 +11,9 @@ from typing import Any, override
 import attrs
 import numpy as np
 import pytest
-from ibrobot_feetech.emulator import Emulator
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from ibrobot_feetech.emulator import EmulatedServo, Emulator
 from ibrobot_feetech.errors import FeetechError, NoReply, PortError, ServoFault
 from ibrobot_feetech.follower import FeetechFollower
 from ibrobot_feetech.options import FollowerOptions
@@ -99,6 +101,20 @@ def rig_of(file: Path, link: Path | None = None, **options: Any) -> Iterator[Rig
             yield Rig(emulator, clock, follower)
         finally:
             follower.disconnect()
+
+
+class Joint:
+    """Moves the joint of a servo, tick by tick, no faster than the motor can."""
+
+    STEP_S = 0.01
+
+    def __init__(self, servo: EmulatedServo) -> None:
+        self._servo, self.speed = servo, 0.0
+
+    def step(self, change: float) -> None:
+        """Change the speed [ticks/s] evenly over a tick, and move."""
+        before, self.speed = self.speed, min(max(self.speed + change, -3073.0), 3073.0)
+        self._servo.drive(self._servo.encoder + (before + self.speed) / 2 * self.STEP_S, self.speed)
 
 
 class TestSetUp:
@@ -262,6 +278,34 @@ class TestFaults:
             rig.emulator.replug()
             rig.follower.reset_faults()
             assert not rig.tick().stale
+
+    @given(
+        speed=st.floats(-3000.0, 3000.0),
+        lost=st.lists(st.integers(0, 3), min_size=1, max_size=3),
+        acceleration=st.floats(-25_000.0, 25_000.0),
+    )
+    @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+    def test_lost_replies_are_ridden_out_at_any_speed(
+        self, calibration_file: Path, speed: float, lost: list[int], acceleration: float
+    ) -> None:
+        """The joint reaches `speed` [ticks/s]; in each gap of lost replies it speeds up or brakes [ticks/s^2]."""
+        with rig_of(calibration_file) as rig:
+            rig.follower.connect()
+            joint = Joint(rig.emulator.servos[2])
+            while joint.speed != speed:
+                joint.step(float(np.clip(speed - joint.speed, -250.0, 250.0)))
+                assert not rig.tick().stale
+            for gap in lost:
+                rig.emulator.faults.silent.add(2)
+                for _ in range(gap):
+                    joint.step(acceleration * Joint.STEP_S)
+                    assert rig.tick().stale
+                rig.emulator.faults.silent.clear()
+                joint.step(acceleration * Joint.STEP_S)
+                assert not rig.tick().stale
+                joint.step(0.0)
+                rig.tick()
+            assert rig.follower.counters()["implausible_positions"] == 0
 
     def test_a_position_that_no_speed_explains_is_not_believed_until_it_is_said_again(self, rig: Rig) -> None:
         before = rig.run(2)[-1].position[1]
