@@ -40,10 +40,16 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return save(smolvla(language_model(root / "vlm")), root / "smolvla")
 
 
+def options(path: Path, language: Path | None = None) -> LeRobotPolicyOptions:
+    """With leave to load the language model, which lies elsewhere."""
+    language = language or path.parent / "vlm"
+    return LeRobotPolicyOptions(path, threads=1, device="cpu", base_models=(str(language),))
+
+
 @pytest.fixture(scope="module")
 def policy(path: Path) -> Iterator[LeRobotPolicy]:
     torch.set_num_threads(1)
-    policy = LeRobotPolicy(LeRobotPolicyOptions(path, threads=1, device="cpu"), host_context())
+    policy = LeRobotPolicy(options(path), host_context())
     policy.load()
     yield policy
     policy.close()
@@ -120,7 +126,7 @@ def test_the_robots_side_of_pi0(name: str, path: Path, tmp_path: Path, monkeypat
     config.save_pretrained(tmp_path)
     for processor in make_pre_post_processors(config, dataset_stats=statistics()):
         processor.save_pretrained(tmp_path)
-    policy = LeRobotPolicy(LeRobotPolicyOptions(tmp_path), host_context())
+    policy = LeRobotPolicy(options(tmp_path, path.parent / "vlm"), host_context())
     assert (policy.spec.chunk_size, policy.spec.prompt, policy.spec.prefix) == (50, True, True)
     tensors = policy.preprocess(frame())
     pre, _ = make_pre_post_processors(PreTrainedConfig.from_pretrained(tmp_path), pretrained_path=str(tmp_path))
@@ -136,7 +142,7 @@ def test_the_robots_side_of_pi0(name: str, path: Path, tmp_path: Path, monkeypat
 
 def test_steps_that_are_not_standard_are_said(path: Path, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.INFO):
-        LeRobotPolicy(LeRobotPolicyOptions(path), host_context())
+        LeRobotPolicy(options(path), host_context())
     assert "steps that only LeRobot runs, so this process loads torch" in caplog.text
     assert "smolvla_new_line_processor, tokenizer_processor" in caplog.text
 
@@ -148,4 +154,4 @@ class TestSmolVla(PolicySuite):
 
     @override
     def make(self, ctx):
-        return LeRobotPolicy(LeRobotPolicyOptions(self.path, threads=1, device="cpu"), ctx)
+        return LeRobotPolicy(options(self.path), ctx)

@@ -3,17 +3,29 @@
 from __future__ import annotations
 
 import hashlib
-import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
 import attrs
+from safetensors import SafetensorError, safe_open
 
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import ContractError, PolicyError
 from ibrobot_core.interfaces import PolicySpec
 from ibrobot_lerobot import layout
+from ibrobot_lerobot.untrusted import (
+    MAX_ACTIONS,
+    MAX_HISTORY,
+    check_steps,
+    check_type,
+    check_values,
+    own_file,
+    read_json,
+    shape,
+    statistics_file,
+    whole,
+)
 
 PREPROCESSOR = "policy_preprocessor.json"
 POSTPROCESSOR = "policy_postprocessor.json"
@@ -21,6 +33,7 @@ WEIGHTS = "model.safetensors"
 ACTION = "action"
 NOTE = "ibrobot.json"
 """A copy of the dataset's `meta/ibrobot.json`, beside the checkpoint."""
+TRAINING = "train_config.json"
 RENAME = "rename_observations_processor"
 
 _WITHOUT_PROMPT = frozenset({"act", "diffusion", "vqbet", "tdmpc", "gaussian_actor"})
@@ -44,6 +57,8 @@ class Checkpoint:
     """Names within the policy -> kind (STATE, ENV, VISUAL), and shape of the observation: images (H, W, C)."""
     action_size: int
     chunk_size: int
+    n_obs_steps: int
+    """Ticks of observations that it sees at once."""
     processors: Mapping[str, Mapping[str, Any]]
     """File -> its JSON."""
     trained_on: Mapping[str, Any]
@@ -51,17 +66,12 @@ class Checkpoint:
     trained_on_path: Path | None
 
     @property
-    def n_obs_steps(self) -> int:
-        """Ticks of observations that it sees at once."""
-        return int(self.config.get("n_obs_steps", 1))
-
-    @property
     def names(self) -> dict[str, str]:
         """The contract's keys -> names within the policy."""
         renamed: dict[str, str] = {}
         for step in self.processors[PREPROCESSOR]["steps"]:
             if step.get("registry_name") == RENAME:
-                renamed |= step["config"].get("rename_map", {})
+                renamed |= rename_map(self.path / PREPROCESSOR, step)
         back = {inside: outside for outside, inside in renamed.items()}
         return {back.get(name, name): name for name in self.inputs}
 
@@ -87,49 +97,74 @@ class Checkpoint:
         try:
             contract = Contract.from_canonical(self.trained_on["contract"])
             return contract, str(self.trained_on["conversion"]["norm_mode"])
-        except (KeyError, TypeError, ContractError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError, ContractError) as error:
             raise PolicyError(f"{self.trained_on_path}: is no meta/{NOTE} of `ibrobot convert`'s: {error!r}") from None
 
     def fingerprint(self) -> str:
         """SHA-256, the first 32 hexadecimal digits, of configuration, processors and statistics."""
         digest = hashlib.sha256()
-        states = [
-            step["state_file"] for each in self.processors.values() for step in each["steps"] if "state_file" in step
-        ]
-        for name in ("config.json", PREPROCESSOR, POSTPROCESSOR, *states):
+        for name in ("config.json", *self.processors):
             digest.update(f"{name}\0".encode() + (self.path / name).read_bytes())
+        for each in self.processors.values():
+            for step in each["steps"]:
+                if "state_file" in step:
+                    file = statistics_file(self.path, step["state_file"])
+                    digest.update(f"{file.name}\0".encode() + file.read_bytes())
         return digest.hexdigest()[:32]
 
 
-def read_checkpoint(path: Path) -> Checkpoint:
+def read_checkpoint(path: Path, base_models: Collection[str] = ()) -> Checkpoint:
     """Read the folder at `path`.
 
+    Args:
+        path: the folder.
+        base_models: what it may have LeRobot load besides, in addition to what LeRobot's own configurations name.
+
     Raises:
-        PolicyError: when it is no checkpoint of LeRobot 0.6's, or one that needs something beside it.
+        PolicyError: when it is no checkpoint of LeRobot 0.6's, one that needs something beside it, or one that would
+            run or read what it must not.
     """
-    if not (path / "config.json").is_file():
+    if not (path / "config.json").exists():
         inner = [each for each in ("pretrained_model", "checkpoints/last/pretrained_model") if (path / each).is_dir()]
         hint = f"did you mean {path / inner[0]}?" if inner else "lerobot-train writes it to …/pretrained_model"
         raise PolicyError(f"{path} is no folder with a checkpoint: it has no config.json; {hint}")
-    config = _json(path / "config.json")
+    file = path / "config.json"
+    config = read_json(path, file.name)
+    check_values(file, config, base_models)
     if config.get("use_peft"):
         raise PolicyError(f"{path} has an adapter only (use_peft); merge it into the model that it adapts")
-    processors = {name: _processor(path / name) for name in (PREPROCESSOR, POSTPROCESSOR)}
+    processors = {name: _processor(path, name, base_models) for name in (PREPROCESSOR, POSTPROCESSOR)}
     try:
+        kind = check_type(file, config["type"])
         inputs = {
-            name: (feature["type"], _shape(feature))
+            name: (feature["type"], _shape(file, name, feature))
             for name, feature in config["input_features"].items()
             if feature["type"] in ("STATE", "ENV", "VISUAL") and not name.startswith(_EMPTY_CAMERA)
         }
-        [action_size] = config["output_features"][ACTION]["shape"]
-        sizes = ("n_action_steps",) if config["type"] in _SHORTER_CHUNKS else _CHUNK_SIZES
-        chunk_size = next(int(config[size]) for size in sizes if config.get(size) is not None)
-        kind = str(config["type"])
+        [action_size] = shape(file, ACTION, config["output_features"][ACTION]["shape"])
+        sizes = ("n_action_steps",) if kind in _SHORTER_CHUNKS else _CHUNK_SIZES
+        size = next(size for size in sizes if config.get(size) is not None)
     except (KeyError, TypeError, ValueError, AttributeError, StopIteration) as error:
-        raise PolicyError(f"{path / 'config.json'}: is no policy's configuration of LeRobot 0.6: {error!r}") from None
+        raise PolicyError(f"{file}: is no policy's configuration of LeRobot 0.6: {error!r}") from None
+    chunk_size = whole(file, size, config[size], MAX_ACTIONS)
+    n_obs_steps = whole(file, "n_obs_steps", config.get("n_obs_steps", 1), MAX_HISTORY)
     note = _note_path(path)
-    trained_on = _json(note) if note is not None else {}
-    return Checkpoint(path, kind, config, inputs, int(action_size), chunk_size, processors, trained_on, note)
+    trained_on = read_json(note.parent, note.name) if note is not None else {}
+    return Checkpoint(
+        path, kind, config, inputs, action_size, chunk_size, n_obs_steps, processors, trained_on, note
+    )  # fmt: skip
+
+
+def rename_map(path: Path, step: Mapping[str, Any]) -> dict[str, str]:
+    """The robot's names of observations -> the policy's, of a step `RENAME` in the processor at `path`.
+
+    Raises:
+        PolicyError: when it is none.
+    """
+    names = step.get("config", {}).get("rename_map", {})
+    if not isinstance(names, dict) or not all(isinstance(name, str) for name in names.values()):
+        raise PolicyError(f"{path}: rename_map is {names!r}, must give names to names")
+    return names
 
 
 def check_weights(path: Path) -> None:
@@ -138,8 +173,13 @@ def check_weights(path: Path) -> None:
     Raises:
         PolicyError: when there are none, or in a format that carries code.
     """
-    if (path / WEIGHTS).is_file():
-        return
+    if (path / WEIGHTS).exists():
+        file = own_file(path, WEIGHTS)
+        try:
+            with safe_open(file, framework="numpy"):
+                return  # the header was read, and fits the file
+        except (OSError, SafetensorError) as error:
+            raise PolicyError(f"{file}: cannot be read: {error}") from None
     others = sorted(each.name for each in path.iterdir() if each.suffix in (".bin", ".pt", ".pth", ".ckpt", ".pkl"))
     if others:
         raise PolicyError(
@@ -155,34 +195,26 @@ def _note_path(path: Path) -> Path | None:
     """What tells of the training set: the note beside the checkpoint, else the dataset, where it still lies here."""
     if (path / NOTE).is_file():
         return path / NOTE
-    train = path / "train_config.json"
-    root = (_json(train).get("dataset") or {}).get("root") if train.is_file() else None
-    own = Path(root) / layout.OWN if root else None
+    if not (path / TRAINING).is_file():
+        return None
+    dataset = read_json(path, TRAINING).get("dataset")
+    root = dataset.get("root") if isinstance(dataset, dict) else None
+    own = Path(root) / layout.OWN if isinstance(root, str) and "\0" not in root else None
     return own if own is not None and own.is_file() else None
 
 
-def _shape(feature: Mapping[str, Any]) -> tuple[int, ...]:
-    shape = tuple(int(n) for n in feature["shape"])
-    return (*shape[1:], shape[0]) if feature["type"] == "VISUAL" else shape
+def _shape(file: Path, name: str, feature: Mapping[str, Any]) -> tuple[int, ...]:
+    sizes = shape(file, name, feature["shape"])
+    return (*sizes[1:], sizes[0]) if feature["type"] == "VISUAL" else sizes
 
 
-def _processor(path: Path) -> dict[str, Any]:
-    if not path.is_file():
+def _processor(folder: Path, name: str, base_models: Collection[str]) -> dict[str, Any]:
+    if not (folder / name).exists():
         raise PolicyError(
-            f"{path.parent} has no {path.name}: a checkpoint from before LeRobot 0.4, which "
+            f"{folder} has no {name}: a checkpoint from before LeRobot 0.4, which "
             "`python -m lerobot.processor.migrate_policy_normalization` brings up to date"
         )
-    document = _json(path)
-    if not isinstance(document.get("steps"), list):
-        raise PolicyError(f"{path}: has no list of steps")
-    return document
-
-
-def _json(path: Path) -> dict[str, Any]:
-    try:
-        document = json.loads(path.read_bytes())
-    except (OSError, ValueError) as error:
-        raise PolicyError(f"{path}: cannot be read: {error}") from None
-    if not isinstance(document, dict):
-        raise PolicyError(f"{path}: must be a JSON object, not {type(document).__name__}")
+    document = read_json(folder, name)
+    check_steps(folder / name, document)
+    check_values(folder / name, document, base_models)
     return document

@@ -147,6 +147,7 @@ class Model:
         path = self._checkpoint.path
         try:
             config = PreTrainedConfig.from_pretrained(path)
+            config.pretrained_path = path  # the file may name another
             config.device = str(self._device)
             if hasattr(config, "pretrained_backbone_weights"):
                 config.pretrained_backbone_weights = None  # they are in the checkpoint, and would be downloaded

@@ -47,3 +47,7 @@ class LeRobotPolicyOptions:
         None, ge=1, help="CPU threads of torch; by default one less than the cores, at least 1"
     )
     n_action_steps: int | None = option(None, ge=1, help="actions of a chunk that are used; by default all")
+    base_models: tuple[str, ...] = option(
+        (),
+        help="models or folders that the checkpoint may load besides itself; not needed for LeRobot's own",
+    )

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import make_pre_post_processors
+from lerobot.processor import ProcessorStep
 from numpy.typing import NDArray
 
 from ibrobot_core.errors import PolicyError
 from ibrobot_lerobot.checkpoint import POSTPROCESSOR, PREPROCESSOR, Checkpoint
+from ibrobot_lerobot.untrusted import check_step_name
 
 _DEVICE = {"device_processor": {"device": "cpu"}}
 
@@ -21,16 +25,21 @@ class LeRobotSteps:
     """The saved processors, run by LeRobot on the CPU.
 
     Raises:
-        PolicyError: when LeRobot cannot make them, e.g. for want of a tokeniser's files.
+        PolicyError: when LeRobot cannot make them, e.g. for want of a tokeniser's files, or when a step is none.
     """
 
     def __init__(self, checkpoint: Checkpoint) -> None:
+        for file, each in checkpoint.processors.items():
+            for step in each["steps"]:
+                if "registry_name" not in step:
+                    _check_class(checkpoint.path / file, step["class"])
         overrides = {
             file: _DEVICE if any(step.get("registry_name") == "device_processor" for step in each["steps"]) else {}
             for file, each in checkpoint.processors.items()
         }
         try:
             config = PreTrainedConfig.from_pretrained(checkpoint.path)
+            config.pretrained_path = checkpoint.path  # the file may name another
             self._pre, self._post = make_pre_post_processors(
                 config, pretrained_path=str(checkpoint.path), preprocessor_overrides=overrides[PREPROCESSOR],
                 postprocessor_overrides=overrides[POSTPROCESSOR],
@@ -59,3 +68,15 @@ class LeRobotSteps:
         """Actions, shape (1, N, A), through the postprocessor."""
         found = self._post(torch.from_numpy(np.array(action)))
         return np.array(found.numpy(force=True))
+
+
+def _check_class(path: Path, name: str) -> None:
+    """Refuse a class below `lerobot` that is no processor step, before LeRobot calls it."""
+    module, _, attribute = name.rpartition(".")
+    try:
+        found = vars(import_module(module)).get(attribute)
+    except ImportError as error:
+        raise PolicyError(f"{path}: step {name!r} cannot be imported: {error}") from None
+    if not (isinstance(found, type) and issubclass(found, ProcessorStep) and found.__module__.startswith("lerobot.")):
+        raise PolicyError(f"{path}: step {name!r} is no processor step of LeRobot's")
+    check_step_name(path, str(vars(found).get("_registry_name", "")))

@@ -47,7 +47,7 @@ class LeRobotPolicy(Policy):
     def __init__(self, options: LeRobotPolicyOptions, ctx: Context) -> None:
         self._options = options
         self._ctx = ctx
-        self._checkpoint = checkpoint = read_checkpoint(options.path)
+        self._checkpoint = checkpoint = read_checkpoint(options.path, options.base_models)
         self.spec = checkpoint.spec(options.n_action_steps)
         self._pre = read_steps(checkpoint, PREPROCESSOR)
         self._post = read_steps(checkpoint, POSTPROCESSOR)

@@ -13,7 +13,8 @@ from safetensors import SafetensorError
 from safetensors.numpy import load_file
 
 from ibrobot_core.errors import PolicyError
-from ibrobot_lerobot.checkpoint import ACTION, RENAME, Checkpoint
+from ibrobot_lerobot.checkpoint import ACTION, RENAME, Checkpoint, rename_map
+from ibrobot_lerobot.untrusted import statistics_file
 
 type Array = NDArray[Any]
 
@@ -101,11 +102,14 @@ def read_steps(checkpoint: Checkpoint, file: str) -> Steps:
     steps: list[Step] = []
     others = []
     for entry in checkpoint.processors[file]["steps"]:
-        name, config = str(entry.get("registry_name") or entry.get("class")), entry.get("config", {})
+        name, config = str(entry.get("registry_name") or entry["class"]), entry.get("config", {})
         if name == RENAME:
-            steps.append(Rename(config.get("rename_map", {})))
+            steps.append(Rename(rename_map(checkpoint.path / file, entry)))
         elif name in ("normalizer_processor", "unnormalizer_processor"):
-            steps.append(_normalise(checkpoint.path / file, entry, inverse=name.startswith("un")))
+            try:
+                steps.append(_normalise(checkpoint.path / file, entry, inverse=name.startswith("un")))
+            except (KeyError, TypeError, ValueError, AttributeError) as error:
+                raise PolicyError(f"{checkpoint.path / file}: step {name!r} cannot be read: {error!r}") from None
         elif not _does_nothing(name, config):
             others.append(name)
     return Steps(steps, others)
@@ -121,10 +125,11 @@ def _does_nothing(name: str, config: Mapping[str, Any]) -> bool:
 def _normalise(path: Path, entry: Mapping[str, Any], *, inverse: bool) -> Normalise:
     config, flat = entry["config"], {}
     if "state_file" in entry:
+        state = statistics_file(path.parent, entry["state_file"])
         try:
-            flat = load_file(path.parent / entry["state_file"])
+            flat = load_file(state)
         except (OSError, SafetensorError) as error:
-            raise PolicyError(f"{path.parent / entry['state_file']}: cannot be read: {error}") from None
+            raise PolicyError(f"{state}: cannot be read: {error}") from None
     only, eps = config.get("normalize_observation_keys"), np.float32(config.get("eps", 1e-8))
     modes, statistics = {}, {}
     for name, feature in config["features"].items():

@@ -292,7 +292,7 @@ except Exception as error:
 
 def test_without_lerobot_it_is_said_how_to_install_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write(tmp_path / "act")
-    (path / "model.safetensors").touch()
+    save_file(STATISTICS, path / "model.safetensors")
     odd = write(tmp_path / "odd", (step("tokenizer_processor"),), type="smolvla")
     for name in ("ibrobot_lerobot.model", "ibrobot_lerobot.pipeline"):
         monkeypatch.setitem(sys.modules, name, None)

@@ -1,0 +1,243 @@
+"""A checkpoint is input from outside: what of it is read, and which of its steps and references are allowed."""
+
+from __future__ import annotations
+
+import json
+import re
+import stat
+from collections.abc import Collection, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from ibrobot_core.errors import PolicyError
+
+MAX_ACTIONS = 10_000
+"""Of a chunk."""
+MAX_HISTORY = 1_000
+"""Ticks of observations that a policy sees at once."""
+_MAX_JSON = 8 << 20
+_MAX_STATISTICS = 64 << 20
+_MAX_DEPTH = 32
+_MAX_NUMBER = 10_000_000
+"""Larger than any dimension of a network that LeRobot has."""
+_MAX_ELEMENTS = 1 << 26
+"""Of one observation."""
+
+_STATE_FILE = re.compile(r"\w[\w.-]*\.safetensors", re.ASCII)
+_LEROBOTS_CLASS = re.compile(r"lerobot(\.[A-Za-z_]\w*)+", re.ASCII)
+_TRAINING = ("optimizer_", "scheduler_")
+"""Beginnings of keys whose numbers are no sizes."""
+_REMOTE_CODE_TYPES = frozenset({"gaussian_actor", "groot", "pi0_fast", "wall_x"})
+_REMOTE_CODE_STEPS = re.compile(r"action_tokenizer_processor|groot_.*|reward_classifier_processor|.*_encoder")
+"""LeRobot sets `trust_remote_code` for what these load."""
+_NAMES_A_MODEL = re.compile(
+    r"(.*_)?(tokenizer|vlm_base|vlm_model|base_model|(model|tokenizer|encoder|processor|vlm|base|backbone)_name"
+    r"|(name_or|checkpoint|model|pretrained|tokenizer)_path|(model|encoder|assets|hub|tokenizer)_(id|repo)|\w*_dir)"
+)
+"""Keys whose text says what is loaded besides the checkpoint."""
+_LOOKS_LIKE_A_PATH = re.compile(r"[~.]|.*[/\\]", re.DOTALL)
+_NOT_LOADED = frozenset({"pretrained_path", "repo_id", "license", "tags"})
+"""Notes of `lerobot-train`."""
+_PROSE = re.compile(r".*(prompt|template|instruction).*")
+BASE_MODELS = frozenset(
+    {
+        "HuggingFaceTB/SmolVLM2-500M-Video-Instruct",
+        "OpenGVLab/InternVL3-1B-hf",
+        "Qwen/Qwen2.5-VL-3B-Instruct",
+        "Qwen/Qwen3-VL-2B-Instruct",
+        "Wan-AI/Wan2.2-TI2V-5B",
+        "Wan-AI/Wan2.2-TI2V-5B-Diffusers",
+        "allenai/MolmoAct2",
+        "allenai/MolmoAct2-FAST-Tokenizer",
+        "facebook/bart-large",
+        "facebook/vjepa2-vitl-fpc64-256",
+        "google/paligemma-3b-pt-224",
+        "google/umt5-xxl",
+        "lerobot/fastwam_base",
+        "openai/clip-vit-base-patch16",
+        "robbyant/lingbot-va-base",
+    }
+)
+"""What LeRobot's own configurations name; none of it runs code of its own."""
+
+
+def read_json(folder: Path, name: str) -> dict[str, Any]:
+    """A JSON object in a checkpoint's folder.
+
+    Raises:
+        PolicyError: for a file that is missing, a link out of the folder, no regular file, too large, nested too deep,
+            or no JSON object.
+    """
+    path = own_file(folder, name, _MAX_JSON)
+    try:
+        document = json.loads(path.read_bytes())
+        too_deep = any(len(place) > _MAX_DEPTH for place, _ in _leaves(document))
+    except (OSError, ValueError) as error:
+        raise PolicyError(f"{path}: cannot be read: {error}") from None
+    except RecursionError:
+        too_deep = True
+    if too_deep:
+        raise PolicyError(f"{path}: is nested more than {_MAX_DEPTH} deep")
+    if not isinstance(document, dict):
+        raise PolicyError(f"{path}: must be a JSON object, not {type(document).__name__}")
+    return document
+
+
+def own_file(folder: Path, name: str, max_size: int | None = None) -> Path:
+    """The path of a file in a checkpoint's folder, which may be a link within the Hugging Face cache.
+
+    Args:
+        folder: the checkpoint.
+        name: of the file.
+        max_size: the most bytes that it may have; None: any number.
+
+    Raises:
+        PolicyError: when it is no regular file, a link out of the folder, or too large.
+    """
+    path, root = folder / name, folder.resolve()
+    try:
+        real = path.resolve(strict=True)
+        status = real.stat()
+    except (OSError, RuntimeError) as error:
+        raise PolicyError(f"{path}: cannot be read: {error}") from None
+    # The cache of Hugging Face has MODEL/snapshots/REVISION/config.json -> ../../blobs/HASH.
+    blobs = [root.parents[1] / "blobs"] if root.parent.name == "snapshots" else []
+    if not any(real.is_relative_to(allowed) for allowed in (root, *blobs)):
+        raise PolicyError(f"{path}: links to {real}, outside of the checkpoint; put the file itself there")
+    if not stat.S_ISREG(status.st_mode):
+        raise PolicyError(f"{path}: is not a regular file")
+    if max_size is not None and status.st_size > max_size:
+        raise PolicyError(f"{path}: has {status.st_size} bytes, at most {max_size} are read")
+    return path
+
+
+def statistics_file(folder: Path, name: str) -> Path:
+    """The path of the statistics that a processor step names, as `own_file` checks it."""
+    return own_file(folder, name, _MAX_STATISTICS)
+
+
+def check_steps(path: Path, document: Mapping[str, Any]) -> None:
+    """Check that each step of a processor is LeRobot's, runs no code from elsewhere, and reads its own files alone.
+
+    Args:
+        path: the processor's file.
+        document: what is in it.
+
+    Raises:
+        PolicyError: for any other step.
+    """
+    steps = document.get("steps")
+    if not isinstance(steps, list):
+        raise PolicyError(f"{path}: has no list of steps")
+    for entry in steps:
+        if not isinstance(entry, dict):
+            raise PolicyError(f"{path}: a step is a {type(entry).__name__}, must be an object")
+        key = "registry_name" if "registry_name" in entry else "class"
+        name = entry.get(key)
+        if not isinstance(name, str) or not name:
+            raise PolicyError(f"{path}: the {key} of a step is {name!r}, must be the name of a step of LeRobot's")
+        if key == "class" and not _LEROBOTS_CLASS.fullmatch(name):
+            raise PolicyError(
+                f"{path}: step {name!r} is no processor step of LeRobot's; nothing else is run from a checkpoint"
+            )
+        check_step_name(path, name)
+        if not isinstance(entry.get("config", {}), dict):
+            raise PolicyError(f"{path}: the config of step {name!r} is a {type(entry['config']).__name__}")
+        state = entry.get("state_file", "none.safetensors")
+        if not isinstance(state, str) or not _STATE_FILE.fullmatch(state):
+            raise PolicyError(f"{path}: state_file {state!r} is not the plain name of a safetensors file beside it")
+
+
+def check_step_name(path: Path, name: str) -> None:
+    """Refuse a registered step that has LeRobot run code from elsewhere.
+
+    Raises:
+        PolicyError: for such a step.
+    """
+    if _REMOTE_CODE_STEPS.fullmatch(name):
+        raise PolicyError(f"{path}: step {name!r} runs code that it loads from elsewhere; such policies are not run")
+
+
+def check_values(path: Path, document: Mapping[str, Any], base_models: Collection[str]) -> None:
+    """Check every value of a checkpoint's JSON file.
+
+    Args:
+        path: the file.
+        document: what is in it.
+        base_models: what the user trusts besides `BASE_MODELS`.
+
+    Raises:
+        PolicyError: for a number that is larger than any network, a wish to run code from elsewhere, and a file or
+            model outside of the checkpoint that is not trusted.
+    """
+    for place, value in _leaves(document):
+        where = f"{path}: {'.'.join(map(str, place))}"
+        key = next((str(each) for each in reversed(place) if isinstance(each, str)), "")
+        if key == "trust_remote_code" and value:
+            raise PolicyError(f"{where}: would run code that comes with a model; such policies are not run")
+        if isinstance(value, int | float) and not key.startswith(_TRAINING) and not abs(value) <= _MAX_NUMBER:
+            raise PolicyError(f"{where} is {value}, must be at most {_MAX_NUMBER}")
+        if isinstance(value, str) and names_a_model(key, value) and value not in {*BASE_MODELS, *base_models}:
+            raise PolicyError(
+                f"{where} names {value!r} to load besides the checkpoint; if you trust it, allow it in the robot YAML "
+                f"with the model's base_models: [{value}]"
+            )
+
+
+def names_a_model(key: str, value: str) -> bool:
+    """Whether LeRobot may take the value of a key for a folder or a model of a hub, and load it."""
+    if not value or key in _NOT_LOADED or _PROSE.fullmatch(key):
+        return False
+    return bool(_NAMES_A_MODEL.fullmatch(key) or _LOOKS_LIKE_A_PATH.match(value))
+
+
+def check_type(path: Path, kind: Any) -> str:
+    """The type of a policy.
+
+    Raises:
+        PolicyError: when LeRobot would run code from elsewhere for it.
+    """
+    if not isinstance(kind, str):
+        raise PolicyError(f"{path}: type is {kind!r}, must be the name of a policy of LeRobot's")
+    if kind in _REMOTE_CODE_TYPES:
+        raise PolicyError(f"{path}: policies of type {kind!r} run code that they load from elsewhere; none is run")
+    return kind
+
+
+def whole(path: Path, name: str, value: Any, most: int) -> int:
+    """A whole number from 1 to `most`.
+
+    Raises:
+        PolicyError: for anything else.
+    """
+    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:
+        raise PolicyError(f"{path}: {name} is {value!r}, must be a whole number from 1 to {most}")
+    return value
+
+
+def shape(path: Path, name: str, value: Any) -> tuple[int, ...]:
+    """The shape of a feature.
+
+    Raises:
+        PolicyError: when it is none, or of more numbers than an observation has.
+    """
+    elements = 1
+    for n in value if isinstance(value, list) and value else [0]:
+        elements *= n if isinstance(n, int) and not isinstance(n, bool) and n > 0 else _MAX_ELEMENTS + 1
+    if elements > _MAX_ELEMENTS:
+        raise PolicyError(
+            f"{path}: the shape of {name} is {value!r}, must be a list of at most {_MAX_ELEMENTS} numbers"
+        )
+    return tuple(value)
+
+
+def _leaves(document: Any) -> Iterator[tuple[tuple[str | int, ...], Any]]:
+    """Places and values that are neither object nor list; not recursive, since the file chooses the depth."""
+    waiting: list[tuple[tuple[str | int, ...], Any]] = [((), document)]
+    while waiting:
+        place, value = waiting.pop()
+        if len(place) <= _MAX_DEPTH and isinstance(value, dict | list):
+            items = value.items() if isinstance(value, dict) else enumerate(value)
+            waiting += [((*place, key), inner) for key, inner in items]
+        else:
+            yield place, value
