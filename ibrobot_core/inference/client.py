@@ -96,7 +96,7 @@ def run_policy(
             tensors = policy.preprocess(request.frame)
         outputs = engine.infer(tensors, request.id, deadline_ns)
         with turn:
-            actions = np.asarray(policy.postprocess(outputs), dtype=np.float64)
+            actions = np.array(policy.postprocess(outputs), dtype=np.float64)  # a policy may reuse its own
     except PolicyError as error:
         return Chunk(request.id, stamp_ns, None, str(error))
     except Exception as error:

@@ -19,6 +19,7 @@ from ibrobot_core.errors import IbrobotError, PolicyError, WireError
 from ibrobot_core.inference.fair_queue import FairQueue
 from ibrobot_core.inference.wire import LIMITS, Decoder, Encoder, Kind, Limits, Message
 from ibrobot_core.interfaces import Payload, PictureCodec, Policy, Tensors, Transport
+from ibrobot_core.interfaces.policy import copied
 from ibrobot_core.units import NS_PER_S
 
 _ROBOTS_KEPT = 256
@@ -275,7 +276,8 @@ class InferenceService:
         with self._lock:
             self._batches[len(live)] += 1
         try:
-            outputs = self._policy.infer_batch([ticket.message.tensors for ticket in live])
+            # Other threads encode the answers, while the model may overwrite its outputs in the next batch.
+            outputs = [copied(each) for each in self._policy.infer_batch([ticket.message.tensors for ticket in live])]
             if len(outputs) != len(live):
                 raise PolicyError(f"{len(outputs)} outputs for a batch of {len(live)}")
         except Exception as error:  # noqa: BLE001 - contained: a request that the policy cannot take is told so

@@ -70,6 +70,11 @@ class PolicySpec:
     """Unit of joint positions that it was trained in, as under `models`; None when the checkpoint does not say."""
 
 
+def copied(tensors: Tensors) -> dict[str, NDArray[np.generic]]:
+    """The same arrays in memory of their own, e.g. outputs that the next `infer` would overwrite."""
+    return {name: np.array(array) for name, array in tensors.items()}
+
+
 class PictureCodec(ABC):
     """JPEG for tensors that are camera pictures: `uint8`, shape (H, W, 3) or (H, W, 1)."""
 
@@ -108,6 +113,7 @@ class Policy(ABC):
         """Inputs -> raw outputs. The heavy step.
 
         Tensors are plain arrays of booleans, integers or floats; those that came from elsewhere cannot be written to.
+        Outputs may be overwritten by the next call: whoever keeps them copies them.
         """
 
     @abstractmethod
@@ -115,11 +121,11 @@ class Policy(ABC):
         """Raw outputs -> actions, shape (N, A) with 1 <= N <= `chunk_size`, in the contract's units and order."""
 
     def infer_batch(self, batch: Sequence[Tensors]) -> list[Tensors]:
-        """Outputs of several inputs, in their order. All have the same names, dtypes and shapes.
+        """Outputs of several inputs, in their order. All inputs have the same names, dtypes and shapes.
 
-        One after the other, where a policy does not know better.
+        One after the other by default. The outputs of a batch share no memory; the next call may overwrite them.
         """
-        return [self.infer(tensors) for tensors in batch]
+        return [copied(self.infer(tensors)) for tensors in batch]
 
     def fingerprint(self) -> str:
         """What both sides of `infer` must agree on; of the spec, where a policy does not add e.g. its weights' hash.

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ibrobot_core.errors import PolicyError
 from ibrobot_core.interfaces import Context, Frame, Policy, PolicySpec, Tensors
+from ibrobot_core.interfaces.policy import copied
 from ibrobot_core.testing.suite import Suite
 
 _STEP_NS = 33_333_333
@@ -120,13 +121,13 @@ class PolicySuite(Suite[Policy]):
         """No step changes what it is given."""
         with self.loaded() as (policy, ctx):
             frame = self.frame(policy, ctx, 1)
-            before = _copy(frame.values)
+            before = copied(frame.values)
             inputs = policy.preprocess(frame)
             assert _equal(frame.values, before), "preprocess changed the frame"
-            before = _copy(inputs)
+            before = copied(inputs)
             outputs = policy.infer(inputs)
             assert _equal(inputs, before), "infer changed its input"
-            before = _copy(outputs)
+            before = copied(outputs)
             policy.postprocess(outputs)
             assert _equal(outputs, before), "postprocess changed its input"
 
@@ -158,12 +159,12 @@ class PolicySuite(Suite[Policy]):
             np.testing.assert_array_equal(here, there)
 
     def test_a_batch_is_as_good_as_one_by_one(self) -> None:
-        """`infer_batch` gives as many outputs as inputs, in their order, as `infer` would."""
+        """`infer_batch` gives as many outputs as inputs, in their order, as `infer` would, none in another's memory."""
         with self.loaded() as (policy, ctx):
             if policy.spec.stateful:
                 pytest.skip("each request changes what it remembers")
             batch = [policy.preprocess(self.frame(policy, ctx, i)) for i in range(3)]
-            together = policy.infer_batch(batch)
+            together = [copied(outputs) for outputs in policy.infer_batch(batch)]
             assert len(together) == len(batch)
             for inputs, outputs in zip(batch, together, strict=True):
                 alone = policy.postprocess(policy.infer(inputs)).copy()
@@ -192,7 +193,7 @@ class PolicySuite(Suite[Policy]):
             if policy.spec.stateful:
                 pytest.skip("says that it remembers")
             inputs = policy.preprocess(self.frame(policy, ctx, 1))
-            first = _copy(policy.infer(inputs))
+            first = copied(policy.infer(inputs))
             policy.infer(policy.preprocess(self.frame(policy, ctx, 2)))
             assert _equal(first, policy.infer(inputs))
 
@@ -211,10 +212,6 @@ def _check_chunk(chunk: NDArray[np.float64], spec: PolicySpec) -> None:
     assert chunk.shape[1] == spec.action_size
     assert chunk.dtype == np.float64
     assert np.isfinite(chunk).all()
-
-
-def _copy(tensors: Tensors) -> dict[str, NDArray[np.generic]]:
-    return {key: np.array(value) for key, value in tensors.items()}
 
 
 def _equal(a: Tensors, b: Tensors) -> bool:

@@ -66,6 +66,25 @@ def monolithic(policy: GatedPolicy) -> Iterator[EngineClient]:
     client.close()
 
 
+class ReusesItsChunk(FakePolicy):
+    def __init__(self) -> None:
+        super().__init__(host_context())
+        self._chunk = np.zeros((10, 6))
+
+    def postprocess(self, tensors):
+        self._chunk[:] = super().postprocess(tensors)
+        return self._chunk
+
+
+def test_chunk_is_not_overwritten_by_the_next():
+    client = LockstepClient(ReusesItsChunk())
+    chunks = []
+    for number in (1, 2):
+        client.submit(request(number))
+        chunks.append(client.poll())
+    assert not np.array_equal(chunks[0].actions, chunks[1].actions)
+
+
 def test_the_answer_carries_the_id_and_the_observations_time(policy: GatedPolicy, monolithic: EngineClient):
     monolithic.submit(request(3))
     assert monolithic.poll() is None, "submit does not wait for the policy"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -57,6 +58,33 @@ class Net(FakePolicy):
         if any((tensors["x"] == 13).any() for tensors in batch):
             raise ValueError("thirteen")
         return super().infer_batch(batch)
+
+
+class OneOutput(Net):
+    """Writes every answer into the same array, as a network does whose outputs are allocated once."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._output = np.zeros(1)
+
+    @override
+    def infer(self, tensors: Tensors) -> Tensors:
+        np.multiply(tensors["x"], 2, out=self._output)
+        return {"twice": self._output}
+
+
+class OneBatchOfOutputs(Net):
+    """As `OneOutput`, with a row for each request of a batch."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._outputs = np.zeros((8, 1))
+
+    @override
+    def infer_batch(self, batch: Any) -> list[Tensors]:
+        for row, each in zip(self._outputs, super().infer_batch(batch), strict=False):
+            row[:] = each["twice"]
+        return [{"twice": row} for row in self._outputs[: len(batch)]]
 
 
 class Cloud:
@@ -145,6 +173,26 @@ def test_what_waits_goes_together_up_to_the_limit_and_each_gets_its_own():
         assert outputs(first) == [0]
         assert cloud.policy.batches == [[0], [1, 2, 3], [4]]
         assert cloud.health()["batches"] == {"1": 2, "3": 1}
+
+
+@pytest.fixture
+def model_runs_on() -> Iterator[None]:
+    """The model's thread begins the next batch before any other thread can encode the answers of the last."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(10.0)
+    yield
+    sys.setswitchinterval(before)
+
+
+@pytest.mark.parametrize("policy", [OneOutput, OneBatchOfOutputs])
+def test_fleet_gets_its_own_answers_of_a_policy_that_reuses_its_outputs(policy: type[Net], model_runs_on: None):
+    with served(policy(), batch=4) as cloud:
+        first = cloud.busy()
+        futures = [cloud.asked(f"robot {i}", i) for i in range(1, 9)]
+        cloud.policy.gate.release(3)
+        assert [outputs(future) for future in futures] == [[2 * i] for i in range(1, 9)]
+        assert outputs(first) == [0]
+        assert cloud.policy.batches == [[0], [1, 2, 3, 4], [5, 6, 7, 8]]
 
 
 def test_a_robot_that_asks_often_waits_for_itself_only():

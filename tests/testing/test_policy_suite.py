@@ -145,6 +145,25 @@ class ReversesBatches(FakePolicy):
         return super().infer_batch(batch)[::-1]
 
 
+class AnswersABatchFromOneArray(FakePolicy):
+    """Every robot of a batch gets the actions of the last one."""
+
+    output = np.zeros(6)
+
+    def infer(self, tensors):
+        outputs = super().infer(tensors)
+        self.output[:] = outputs["delta"]
+        return {**outputs, "delta": self.output}
+
+    def infer_batch(self, batch):
+        return [self.infer(tensors) for tensors in batch]
+
+
+class ReusesItsOutputs(AnswersABatchFromOneArray):
+    def infer_batch(self, batch):
+        return FakePolicy.infer_batch(self, batch)
+
+
 class NeedsWeightsAtTheEdge(FakePolicy):
     scale = None
 
@@ -156,6 +175,7 @@ class NeedsWeightsAtTheEdge(FakePolicy):
 
 
 WRONG = {
+    AnswersABatchFromOneArray: "a_batch_is_as_good_as_one_by_one",
     CountsRequests: "infer_remembers_nothing",
     ReversesBatches: "a_batch_is_as_good_as_one_by_one",
     NeedsWeightsAtTheEdge: "the_edge_needs_no_weights",
@@ -185,6 +205,24 @@ def test_catches(wrong, caught_by, tmp_path):
             return wrong(ctx)
 
     assert caught_by in failed_checks(Suite, tmp_path)
+
+
+def test_only_the_batch_check_catches_answers_that_share_an_array(tmp_path):
+    class Suite(TestPolicy):
+        @override
+        def make(self, ctx):
+            return AnswersABatchFromOneArray(ctx)
+
+    assert failed_checks(Suite, tmp_path) == {"a_batch_is_as_good_as_one_by_one"}
+
+
+def test_infer_may_reuse_its_outputs(tmp_path):
+    class Suite(TestPolicy):
+        @override
+        def make(self, ctx):
+            return ReusesItsOutputs(ctx)
+
+    assert failed_checks(Suite, tmp_path) == set()
 
 
 def test_every_check_catches_something():
