@@ -46,8 +46,12 @@ class DispatchStats:
     latency_ms: float = 0.0
     """From the observation to its chunk, of the last one."""
     latency_p50_ms: float = 0.0
-    """Of the newest hundred."""
+    """Of the newest."""
     latency_p99_ms: float = 0.0
+    queue_ms: float = 0.0
+    """As much of the last latency as the request waited for those of other robots."""
+    pace_ms: float = 0.0
+    """Time to leave from one request to the next, as the model's server asks; 0: any."""
     requests: int = 0
     retries: int = 0
     """Requests sent because the one before was overdue."""
@@ -57,7 +61,7 @@ class DispatchStats:
     dropped_answers: int = 0
     """Answers to requests that had timed out, were overtaken by a newer answer, or were from before a reset."""
     failures: int = 0
-    """Requests that gave no chunk, those that timed out among them."""
+    """Requests that gave no chunk, those that timed out among them; all that were in flight in an outage are one."""
     timeouts: int = 0
     holds: int = 0
     """Times the plan ran dry."""
@@ -81,6 +85,7 @@ class Dispatcher:
 
     One request is in flight; another is sent for newer observations when that is overdue, and the answer that comes
     first is used. Several are, where the way to the model takes so long that one at a time would let the plan end.
+    Where other robots use the model too, it keeps to the pace that the server asks for, as long as the plan lasts.
     After failures it asks with growing pauses. Without an answer the plan ends and the arm holds; what comes then leads
     over from there.
 
@@ -123,6 +128,9 @@ class Dispatcher:
             lead_in=lead_in if holds else None, continues=options.joins_by == "rtc",
         )  # fmt: skip
         self._latency = LatencyEstimate()
+        """All of it."""
+        self._unqueued = LatencyEstimate()
+        """Without waiting for other robots: who asks earlier because others ask makes all wait longer."""
         self._chunk_length = spec.chunk_size
         self.stats = DispatchStats(options.joins_by, blends)
         self._log = logging.getLogger("ibrobot.dispatch")
@@ -130,7 +138,9 @@ class Dispatcher:
         self._sampler: FrameSampler | None = None
         self._open: dict[int, int] = {}
         """Requests that may still be answered, oldest first: id -> time of the observation [ns]."""
-        self._pause_ns = self._overdue_ns = 0
+        self._pause_ns = self._overdue_ns = self._pace_ns = self._queued_ns = 0
+        self._asked_ns = self._failed_ns = 0
+        """When a request was last sent, and when one failed."""
         self._returns = client.returns
 
     def begin(self, seed: int) -> None:
@@ -176,6 +186,8 @@ class Dispatcher:
             self._returns = self._client.returns
             self._settle()
             self._ask_after_ns = t_ns
+        if self._too_soon(t_ns, remaining):
+            return
         if self._open:
             if self._overlaps(t_ns):
                 self._ask(t_ns)
@@ -192,7 +204,10 @@ class Dispatcher:
             self.stats.dropped_answers += 1
             return
         if chunk.actions is None:
-            self._fail(chunk.id, now_ns, chunk.error)
+            if chunk.id == max(self._open):
+                self._fail(chunk.id, now_ns, chunk.error)
+            else:  # the newer one that follows it may be answered all the same
+                del self._open[chunk.id]
             return
         self._smoother.trim(now_ns)
         try:
@@ -202,7 +217,7 @@ class Dispatcher:
             return
         # A chunk for older observations is of no use any more.
         self._open = {number: stamp_ns for number, stamp_ns in self._open.items() if number > chunk.id}
-        self._count(now_ns - asked_ns, len(chunk.actions))
+        self._count(chunk, now_ns, now_ns - asked_ns)
         self._settle()
         if not joined:
             self.stats.late_chunks += 1
@@ -220,6 +235,7 @@ class Dispatcher:
             self._wait_for(frame)
             return False
         self._waiting_since_ns = None
+        self._asked_ns = t_ns
         self._request_id += 1
         self.stats.requests += 1
         self._open[self._request_id] = t_ns
@@ -244,8 +260,22 @@ class Dispatcher:
         """The plan length at which to ask."""
         if self._options.watermark != "auto":
             return int(self._options.watermark)
+        # Who had to wait for others asks later by as much: so the requests of a fleet spread over time.
+        spread = self._chunk_length // 2 - round(self._queued_ns / self._smoother.step_ns)
         # Time for an answer, and, should that be lost, for another once the first is overdue.
-        return max(self._chunk_length // 2, self._steps(self._usual_ns() + self._latency.upper_ns))
+        return max(spread, self._steps(2 * self._unqueued.upper_ns + self._slack_ns))
+
+    def _too_soon(self, t_ns: int, remaining: int) -> bool:
+        """Whether the server's pace says to wait, and the plan lasts meanwhile.
+
+        Where it would not last, the robot asks just in time, unless answers take more than half of a chunk: then the
+        model cannot keep up with its robots, and who does not wait only makes it worse for all.
+        """
+        if self._options.watermark != "auto" or t_ns - self._asked_ns >= self._pace_ns + self._queued_ns:
+            return False
+        usual_ns = self._latency.quantile_ns(0.5)
+        in_time = 2 * usual_ns <= self._chunk_length * self._smoother.step_ns
+        return not in_time or remaining > self._steps(usual_ns + self._slack_ns)
 
     def _overlaps(self, t_ns: int) -> bool:
         """Whether it is time for a further request although some are on their way.
@@ -267,13 +297,16 @@ class Dispatcher:
         """A time in actions, rounded up."""
         return -(-time_ns // self._smoother.step_ns)
 
-    def _count(self, latency_ns: int, length: int) -> None:
+    def _count(self, chunk: Chunk, now_ns: int, latency_ns: int) -> None:
         """An answer came."""
-        self._latency.add(latency_ns)
-        self._chunk_length = length
+        assert chunk.actions is not None
+        self._latency.add(now_ns, latency_ns)
+        self._unqueued.add(now_ns, max(0, latency_ns - chunk.queued_ns))
+        self._chunk_length = len(chunk.actions)
+        self._pace_ns, self._queued_ns = chunk.pace_ns, chunk.queued_ns
         stats = self.stats
         stats.chunks += 1
-        stats.latency_ms = latency_ns / 1e6
+        stats.latency_ms, stats.queue_ms, stats.pace_ms = latency_ns / 1e6, chunk.queued_ns / 1e6, chunk.pace_ns / 1e6
         stats.latency_p50_ms = self._latency.quantile_ns(0.5) / 1e6
         stats.latency_p99_ms = self._latency.quantile_ns(0.99) / 1e6
 
@@ -283,8 +316,13 @@ class Dispatcher:
         self._overdue_ns = self._usual_ns() if self.stats.chunks else 0
 
     def _usual_ns(self) -> int:
-        """Within what time an answer comes [ns]; a tick is for the asking, and one for the rounding."""
-        return self._latency.upper_ns + 2 * self._contract.step_ns
+        """Within what time an answer comes [ns]."""
+        return self._latency.upper_ns + self._slack_ns
+
+    @property
+    def _slack_ns(self) -> int:
+        """A tick for the asking, and one for the rounding [ns]."""
+        return 2 * self._contract.step_ns
 
     def _wait_for(self, frame: Frame) -> None:
         """Nothing is asked, and the arm holds, while an observation is missing."""
@@ -296,8 +334,11 @@ class Dispatcher:
             self._waiting_since_ns = frame.stamp_ns
 
     def _fail(self, number: int, now_ns: int, why: str) -> None:
+        asked_ns = self._open.pop(number)
+        if asked_ns < self._failed_ns:  # it was on its way already when this outage was noticed
+            return
+        self._failed_ns = now_ns
         self.stats.failures += 1
-        del self._open[number]
         self._ask_after_ns = now_ns + self._pause_ns
         self._pause_ns = min(2 * self._pause_ns, _LONGEST_PAUSE_NS)
         self._log.warning("inference failed, the arm holds when its plan ends: %s", why)

@@ -41,6 +41,10 @@ class Chunk:
     start_ns: int
     actions: Vector | None
     error: str = ""
+    queued_ns: int = 0
+    """For how long the request waited for those of other robots [ns]."""
+    pace_ns: int = 0
+    """Time to leave from one request to the next, as the server asks [ns]; 0: any."""
 
 
 class InferenceClient(ABC):
@@ -102,7 +106,10 @@ def run_policy(
     except Exception as error:
         logging.getLogger("ibrobot.inference").exception("the policy failed")
         return Chunk(request.id, stamp_ns, None, f"{type(error).__name__}: {error}")
-    return Chunk(request.id, stamp_ns, actions)
+    stats = engine.stats
+    return Chunk(
+        request.id, stamp_ns, actions, queued_ns=round(stats.queue_ms * 1e6), pace_ns=round(stats.pace_ms * 1e6)
+    )
 
 
 class LockstepClient(InferenceClient):
@@ -165,7 +172,8 @@ class EngineClient(InferenceClient):
     def parallel(self) -> int:
         # A model that takes most of the time itself would only let them wait, and look at older observations.
         stats, most = self._engine.stats, self._engine.parallel
-        return min(most, max(1, round(stats.infer_ms / stats.model_ms))) if stats.model_ms else most
+        there_ms = stats.model_ms + stats.queue_ms
+        return min(most, max(1, round(stats.infer_ms / there_ms))) if there_ms else most
 
     @property
     @override

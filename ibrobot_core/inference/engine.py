@@ -21,12 +21,17 @@ class EngineStats:
     """Whether there is a model that answers."""
     requests: int = 0
     failures: int = 0
+    """Requests without outputs; those that were on their way when one failed count as one with it."""
     restarts: int = 0
     """Times that the model's process was started again, or its server came back."""
     infer_ms: float = 0.0
     """From the tensors to the outputs, of the last request."""
     model_ms: float = 0.0
-    """As much of it as the other side says that it took."""
+    """As much of it as the model took, where it runs elsewhere."""
+    queue_ms: float = 0.0
+    """As much of it as the request waited for other robots' requests."""
+    pace_ms: float = 0.0
+    """Time to leave from one request to the next, as the server asks; 0: any."""
 
 
 class Engine(ABC):
@@ -37,6 +42,7 @@ class Engine(ABC):
     def __init__(self, mode: str) -> None:
         self.stats = EngineStats(mode)
         self._counting = threading.Lock()
+        self._failed_ns = 0
 
     def start(self) -> None:
         """Return when the model is ready.
@@ -64,7 +70,9 @@ class Engine(ABC):
             outputs = self.run(tensors, request_id, deadline_ns)
         except Exception:
             with self._counting:
-                self.stats.failures += 1
+                if begun_ns >= self._failed_ns:  # else it was on its way when the outage was noticed
+                    self.stats.failures += 1
+                    self._failed_ns = time.monotonic_ns()
             raise
         self.stats.infer_ms = (time.monotonic_ns() - begun_ns) / 1e6
         return outputs

@@ -3,38 +3,42 @@
 from __future__ import annotations
 
 import threading
-from collections import OrderedDict, deque
 from collections.abc import Callable
 
 
 class FairQueue[T]:
-    """Items by robot, taken round robin: a robot that asks often waits for itself, not the others for it.
+    """The newest item of each robot, taken in turn: a robot that asks often does not keep the others waiting.
 
     Args:
-        depth: how many items may wait. Beyond, the oldest of the robot with the most waiting gives way.
+        depth: how many robots may wait.
     """
 
     def __init__(self, depth: int) -> None:
         self._depth = depth
-        self._waiting: OrderedDict[str, deque[T]] = OrderedDict()
-        self._count = 0
+        self._waiting: dict[str, T] = {}
+        """In the order of their turns."""
         self._changed = threading.Condition()
         self._ended = False
 
     def __len__(self) -> int:
-        return self._count
+        return len(self._waiting)
 
     def put(self, robot: str, item: T) -> T | None:
-        """Append an item; returns the one that had to give way."""
+        """Have an item wait: in the place of the robot's earlier one, where that waits still, or as the last.
+
+        Returns:
+            The item that does not wait any more: the earlier one; or this one, where the queue is full.
+        """
         with self._changed:
-            self._waiting.setdefault(robot, deque()).append(item)
-            self._count += 1
-            gave_way = self._pop(max(self._waiting, key=self._length)) if self._count > self._depth else None
+            earlier = self._waiting.get(robot)
+            if earlier is None and len(self._waiting) >= self._depth:
+                return item
+            self._waiting[robot] = item
             self._changed.notify()
-            return gave_way
+            return earlier
 
     def take(self, most: int, alike: Callable[[T, T], bool], patience_s: float = 0.0) -> list[T]:
-        """The next items, at most one of each robot, in turn; waits for the first.
+        """The next items, in turn; waits for the first.
 
         Args:
             most: how many items.
@@ -45,14 +49,13 @@ class FairQueue[T]:
             Nothing after `end`, once the queue is empty.
         """
         with self._changed:
-            self._changed.wait_for(lambda: self._count or self._ended)
+            self._changed.wait_for(lambda: self._waiting or self._ended)
             if patience_s > 0:
                 self._changed.wait_for(lambda: len(self._waiting) >= most or self._ended, patience_s)
             taken: list[T] = []
-            for robot in list(self._waiting):
-                if len(taken) < most and (not taken or alike(taken[0], self._waiting[robot][0])):
-                    self._waiting.move_to_end(robot)
-                    taken.append(self._pop(robot))
+            for robot, item in list(self._waiting.items()):
+                if len(taken) < most and (not taken or alike(taken[0], item)):
+                    taken.append(self._waiting.pop(robot))
             return taken
 
     def end(self) -> None:
@@ -60,14 +63,3 @@ class FairQueue[T]:
         with self._changed:
             self._ended = True
             self._changed.notify_all()
-
-    def _length(self, robot: str) -> int:
-        return len(self._waiting[robot])
-
-    def _pop(self, robot: str) -> T:
-        items = self._waiting[robot]
-        item = items.popleft()
-        self._count -= 1
-        if not items:
-            del self._waiting[robot]
-        return item

@@ -91,6 +91,7 @@ class RemoteEngine(Engine):
             raise PolicyError(str(error)) from None
         finally:
             self._buffers.append(buffer)
+        self.stats.pace_ms = answer.pace_ns / 1e6
         if answer.kind is Kind.FAILURE:
             raise PolicyError(f"the server of {self._model}: {answer.text}")
         if answer.id != request_id or answer.fingerprint != self._fingerprint:
@@ -98,7 +99,8 @@ class RemoteEngine(Engine):
                 f"the server of {self._model} answered request {answer.id} by policy {answer.fingerprint!r}, "
                 f"asked was {request_id} by {self._fingerprint!r}"
             )
-        self.stats.model_ms = answer.latency_ms
+        self.stats.queue_ms = min(answer.queued_ns / 1e6, answer.latency_ms)
+        self.stats.model_ms = answer.latency_ms - self.stats.queue_ms
         return answer.tensors
 
     @override

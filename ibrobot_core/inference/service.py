@@ -17,6 +17,7 @@ import numpy as np
 
 from ibrobot_core.errors import IbrobotError, PolicyError, WireError
 from ibrobot_core.inference.fair_queue import FairQueue
+from ibrobot_core.inference.pacing import Pacing
 from ibrobot_core.inference.wire import LIMITS, Decoder, Encoder, Kind, Limits, Message
 from ibrobot_core.interfaces import Payload, PictureCodec, Policy, Tensors, Transport
 from ibrobot_core.interfaces.policy import copied
@@ -47,7 +48,7 @@ class ServiceOptions:
     batch: int = 8
     """The most requests for one `infer_batch`."""
     queue: int = 64
-    """The most requests that wait."""
+    """The most requests that wait, one of each robot."""
     patience_s: float = 0.0
     """How long a batch that is not full waits for more requests [s]; 0: only what waits already goes together."""
     limits: Limits = LIMITS
@@ -80,6 +81,7 @@ class _Outcome:
     outputs: Tensors | None
     error: str = ""
     expired: bool = False
+    queued_ns: int = 0
 
 
 @attrs.frozen(eq=False)
@@ -87,11 +89,12 @@ class _Ticket:
     """A request that waits for its turn. The first outcome counts."""
 
     message: Message
+    arrived_ns: int
     deadline_ns: int
     outcomes: queue.SimpleQueue[_Outcome] = attrs.field(factory=queue.SimpleQueue)
 
-    def answer(self, outputs: Tensors) -> None:
-        self.outcomes.put(_Outcome(outputs))
+    def answer(self, outputs: Tensors, begun_ns: int) -> None:
+        self.outcomes.put(_Outcome(outputs, queued_ns=begun_ns - self.arrived_ns))
 
     def fail(self, error: str, *, expired: bool = False) -> None:
         self.outcomes.put(_Outcome(None, error, expired))
@@ -127,6 +130,7 @@ class InferenceService:
         self._decoder, self._encoder = Decoder(self._options.limits, codec), Encoder(self._options.limits)
         self._fingerprint = policy.fingerprint()
         self._queue: FairQueue[_Ticket] = FairQueue(self._options.queue)
+        self._pacing = Pacing()
         self._lock = threading.Lock()
         self._all = RobotCounts()
         self._robots: OrderedDict[str, RobotCounts] = OrderedDict()
@@ -220,21 +224,26 @@ class InferenceService:
 
     def _wait_for(self, message: Message, arrived_ns: int) -> _Outcome:
         patience_ns = min(message.deadline_ns, round(_LONGEST_WAIT_S * NS_PER_S))
-        ticket = _Ticket(message, arrived_ns + patience_ns)
-        if (gave_way := self._queue.put(message.robot, ticket)) is not None:
-            gave_way.fail(f"the server is full: {self._options.queue} requests wait")
+        ticket = _Ticket(message, arrived_ns, arrived_ns + patience_ns)
+        self._pacing.ask(message.robot, arrived_ns)
+        gave_way = self._queue.put(message.robot, ticket)
+        if gave_way is ticket:
+            ticket.fail(f"the server is full: {self._options.queue} requests wait")
+        elif gave_way is not None:
+            gave_way.fail(f"not begun: the newer request {message.id} of this robot took its place")
         try:
             return ticket.outcomes.get(timeout=max(0.0, (ticket.deadline_ns - time.monotonic_ns()) / NS_PER_S))
         except queue.Empty:
             return _Outcome(None, "no outputs within the deadline", expired=True)
 
     def _reply(self, message: Message, outcome: _Outcome, arrived_ns: int) -> Payload:
-        latency_ms = (time.monotonic_ns() - arrived_ns) / 1e6
+        now_ns = time.monotonic_ns()
+        latency_ms = (now_ns - arrived_ns) / 1e6
 
         def said(kind: Kind, outputs: Tensors, text: str = "") -> Payload:
             answer = Message(
                 kind, message.id, outputs, message.robot, self._fingerprint, text, message.stamp_ns,
-                latency_ms=latency_ms,
+                latency_ms=latency_ms, queued_ns=outcome.queued_ns, pace_ns=self._pacing.pace_ns(now_ns),
             )  # fmt: skip
             return self._encoder.encode(answer)
 
@@ -273,6 +282,7 @@ class InferenceService:
                 self._infer(live)
 
     def _infer(self, live: list[_Ticket]) -> None:
+        begun_ns = time.monotonic_ns()
         with self._lock:
             self._batches[len(live)] += 1
         try:
@@ -287,8 +297,9 @@ class InferenceService:
                 for ticket in live:
                     self._infer([ticket])
             return
+        self._pacing.work(len(live), time.monotonic_ns() - begun_ns)
         for ticket, output in zip(live, outputs, strict=True):
-            ticket.answer(output)
+            ticket.answer(output, begun_ns)
 
     def _enter(self, ticket: _Ticket, now_ns: int) -> bool:
         """Give a model that remembers to the robot that asks, reset where its episode is a new one."""

@@ -88,12 +88,17 @@ class Message:
     stamp_ns: int = 0
     """When the robot sent the request, by its own clock; the answer repeats it."""
     deadline_ns: int = 0
-    """For how long from its arrival on anybody waits for the answer [ns]; no clock needs to agree with another."""
+    """In a request: for how long from its arrival on anybody waits for the answer [ns]; no clock needs to agree with
+    another."""
     episode: int = 0
-    """Counts the robot's episodes; a policy that remembers is reset with `seed` where it changes."""
+    """In a request: counts the robot's episodes; a policy that remembers is reset with `seed` where it changes."""
     seed: int = 0
     latency_ms: float = 0.0
     """In an answer: from the request's arrival at the server to its answer."""
+    queued_ns: int = 0
+    """In an answer: for how much of it the request waited for its turn [ns]."""
+    pace_ns: int = 0
+    """In an answer or a failure: the time that the robot should leave from one request to the next [ns]; 0: any."""
 
 
 class NoPictures(PictureCodec):
@@ -180,10 +185,12 @@ def _lay_out(message: Message, jpegs: Mapping[str, bytes], limits: Limits) -> _L
 
 
 def _fill(frame: memoryview, layout: _Layout, message: Message, jpegs: Mapping[str, bytes]) -> memoryview:
+    asks = message.kind is Kind.REQUEST
+    times = (message.deadline_ns, message.episode) if asks else (message.queued_ns, message.pace_ns)
     try:
         _NUMBERS.pack_into(
-            frame, 0, MAGIC, VERSION, message.kind, 0, message.id, message.stamp_ns, message.deadline_ns,
-            message.episode, message.seed, message.latency_ms,
+            frame, 0, MAGIC, VERSION, message.kind, 0, message.id, message.stamp_ns, *times, message.seed,
+            message.latency_ms,
         )  # fmt: skip
     except struct.error as error:
         raise WireError(f"a number of request {message.id} has no place in a frame: {error}") from None
@@ -305,17 +312,15 @@ class Decoder:
         frame = memoryview(payload).toreadonly()
         if not _HEAD_SIZE <= len(frame) <= self._limits.size:
             raise WireError(f"{len(frame)} bytes; a frame has {_HEAD_SIZE} to {self._limits.size}")
-        magic, version, kind, reserved, request, stamp_ns, deadline_ns, episode, seed, latency_ms = (
-            _NUMBERS.unpack_from(frame)
-        )
+        magic, version, kind, reserved, request, stamp_ns, *times, seed, latency_ms = _NUMBERS.unpack_from(frame)
         if magic != MAGIC:
             raise WireError(f"no frame: it begins with {magic!r}, not {MAGIC!r}")
         if version != VERSION:
             raise WireError(f"a frame of version {version}; this side speaks version {VERSION}")
         if kind not in _KINDS:
             raise WireError(f"a frame of the unknown kind {kind}")
-        if deadline_ns < 0 or not 0 <= latency_ms < math.inf:
-            raise WireError(f"a deadline of {deadline_ns} ns, a latency of {latency_ms} ms")
+        if times[0] < 0 or not 0 <= latency_ms < math.inf:
+            raise WireError(f"a deadline or wait of {times[0]} ns, a latency of {latency_ms} ms")
         layout = self._laid_out(frame, reserved)
         tensors = {}
         for place in layout.places:
@@ -325,9 +330,10 @@ class Decoder:
             array = tensors[place.name] = np.ndarray(place.shape, place.dtype, frame, place.offset)
             if place.dtype.kind == "b" and np.any(array.view(np.uint8) > 1):
                 raise WireError(f"tensor {place.name!r} has booleans other than 0 and 1")
+        (deadline_ns, episode), (queued_ns, pace_ns) = (times, (0, 0)) if kind == Kind.REQUEST else ((0, 0), times)
         return Message(
             _KINDS[kind], request, tensors, layout.robot, layout.fingerprint, layout.text, stamp_ns, deadline_ns,
-            episode, seed, latency_ms,
+            episode, seed, latency_ms, queued_ns, pace_ns,
         )  # fmt: skip
 
     def _laid_out(self, frame: memoryview, reserved: int) -> _Layout:

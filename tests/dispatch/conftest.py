@@ -116,10 +116,12 @@ class Rig:
             self.dispatcher.tick(now_ns)
         return self.clock.now_ns()
 
-    def answer(self, actions, request: DispatchInfer | None = None, *, start_ns: int | None = None) -> None:
+    def answer(
+        self, actions, request: DispatchInfer | None = None, *, start_ns: int | None = None, **fields: Any
+    ) -> None:
         asked = request or self.requests[-1]
         start = asked.frame.stamp_ns if start_ns is None else start_ns
-        self.dispatcher.accept(Chunk(asked.id, start, actions), self.clock.now_ns())
+        self.dispatcher.accept(Chunk(asked.id, start, actions, **fields), self.clock.now_ns())
 
     def tick_of(self, request: DispatchInfer) -> int:
         """At which tick it was sent."""

@@ -12,10 +12,11 @@ from ibrobot_core.dispatch.latency import LatencyEstimate
 MS = 1_000_000
 
 
-def estimate(latencies: list[int]) -> LatencyEstimate:
+def estimate(latencies: list[int], spacing_ns: int = 0) -> LatencyEstimate:
+    """Answers with these latencies, one every `spacing_ns` [ns]."""
     result = LatencyEstimate()
-    for latency_ns in latencies:
-        result.add(latency_ns)
+    for number, latency_ns in enumerate(latencies):
+        result.add(number * spacing_ns, latency_ns)
     return result
 
 
@@ -44,3 +45,10 @@ def test_one_answer_that_was_held_up_does_not_count() -> None:
     usual = [50 * MS] * 99
     assert estimate([*usual, 3000 * MS]).upper_ns < 60 * MS
     assert estimate([*usual[:80], *[900 * MS] * 5]).upper_ns > 900 * MS, "several do"
+
+
+def test_answers_expire_by_time() -> None:
+    hiccup, usual = [2000 * MS] * 3, [50 * MS] * 12
+    assert estimate([*hiccup, *usual], 800 * MS).quantile_ns(1.0) == 2000 * MS, "it was 9.6 s ago"
+    assert estimate([*hiccup, *usual, 50 * MS], 800 * MS).quantile_ns(1.0) == 50 * MS, "10.4 s"
+    assert estimate([70 * MS, 90 * MS], 60_000 * MS).quantile_ns(0.0) == 90 * MS, "the newest always counts"

@@ -205,3 +205,86 @@ def test_only_where_the_arm_is_held_it_goes_on_from_there(
     rig.answer(chunk_at(101.0, 10), dry)
     past = (rig.clock.now_ns() - dry.frame.stamp_ns) // STEP
     assert rig.plans[-1][2][0, 0] == (2.0 if safety_behavior == "hold" else 101.0 + past)
+
+
+def test_waiting_for_other_robots_does_not_raise_the_demand(make_rig: type[Rig]) -> None:
+    """Who asks earlier because the server is busy makes it busier."""
+    rig = make_rig(watermark="auto", timeout_s=60.0, chunk_size=20)
+    for _ in range(5):
+        while len(rig.requests) <= rig.stats.chunks:
+            rig.tick()
+        asked_ns = rig.tick(7) - 7 * STEP
+        rig.answer(chunk_at((asked_ns - START_NS) // STEP, 20), queued_ns=6 * STEP)
+        assert rig.stats.latency_ms == 700.0
+        assert rig.stats.queue_ms == 600.0
+    rig.tick()
+    assert rig.stats.watermark <= 20 // 2
+
+
+def test_one_that_had_to_wait_for_others_asks_later_by_as_much(make_rig: type[Rig]) -> None:
+    rig = make_rig(watermark="auto", timeout_s=60.0, chunk_size=20)
+    asked, queued = [], (0, 2, 0)
+    for ticks in queued:
+        while len(rig.requests) == len(asked):
+            rig.tick()
+        asked.append(rig.tick_of(rig.requests[-1]))
+        rig.tick(ticks)
+        rig.answer(chunk_at(asked[-1], 20), queued_ns=ticks * STEP)
+    assert np.diff(asked).tolist() == [9, 11]
+
+
+def test_the_servers_pace_is_kept_as_long_as_the_plan_lasts(make_rig: type[Rig]) -> None:
+    rig = make_rig(watermark="auto", timeout_s=60.0, chunk_size=20)
+    for pace, expected in ((0, 9), (14, 14), (40, 17)):
+        rig.tick()
+        while rig.stats.requests == rig.stats.chunks:
+            rig.tick()
+        asked = rig.tick_of(rig.requests[-1])
+        rig.answer(chunk_at(asked, 20), pace_ns=pace * STEP)
+        while rig.stats.requests == rig.stats.chunks:
+            rig.tick()
+        assert rig.tick_of(rig.requests[-1]) - asked == expected
+        assert rig.stats.pace_ms == 100 * pace
+        rig.answer(chunk_at(rig.tick_of(rig.requests[-1]), 20))
+    assert rig.stats.holds == 0
+
+
+def test_who_gives_a_watermark_is_not_paced(make_rig: type[Rig]) -> None:
+    rig = make_rig(watermark=15, timeout_s=60.0, chunk_size=20)
+    rig.tick()
+    rig.answer(chunk_at(0, 20), pace_ns=40 * STEP)
+    rig.tick(4)
+    assert len(rig.requests) == 2
+
+
+def test_all_requests_in_flight_in_an_outage_are_one_failure(make_rig: type[Rig]) -> None:
+    rig = make_rig(watermark="auto", timeout_s=3.0, chunk_size=20)
+    rig.client.parallel = 8
+    rig.tick(20)
+    assert len(rig.requests) == 4
+    for request in reversed(rig.requests):
+        rig.dispatcher.accept(Chunk(request.id, 0, None, "no server"), rig.clock.now_ns())
+    assert (rig.stats.failures, rig.stats.dropped_answers) == (1, 0)
+    rig.tick(2)
+    rig.dispatcher.accept(Chunk(rig.requests[-1].id, 0, None, "no server"), rig.clock.now_ns())
+    assert rig.stats.failures == 2, "one that was sent after the first was known"
+
+
+def test_requests_that_time_out_one_after_the_other_are_one_failure(make_rig: type[Rig]) -> None:
+    rig = make_rig(watermark="auto", timeout_s=3.0, chunk_size=20)
+    rig.client.parallel = 8
+    rig.tick(47)
+    assert rig.stats.timeouts == 4
+    assert rig.stats.failures == 1
+
+
+def test_a_request_that_a_newer_one_follows_is_no_failure(make_rig: type[Rig]) -> None:
+    """As a server turns it away when the newer one comes."""
+    rig = make_rig(watermark="auto", timeout_s=60.0, chunk_size=20)
+    rig.client.parallel = 8
+    rig.tick(6)
+    older, newer = rig.requests
+    rig.dispatcher.accept(Chunk(older.id, 0, None, "a newer one took its place"), rig.clock.now_ns())
+    assert rig.stats.failures == 0
+    rig.answer(chunk_at(rig.tick_of(newer), 20), newer)
+    assert (rig.stats.chunks, rig.stats.failures) == (1, 0)

@@ -128,13 +128,14 @@ class FarEngine(LocalEngine):
 
     parallel = 3
 
-    def __init__(self, policy: FakePolicy, model_ms: float) -> None:
+    def __init__(self, policy: FakePolicy, model_ms: float, queue_ms: float = 0.0) -> None:
         super().__init__(policy)
-        self._model_ms = model_ms
+        self._times_ms = model_ms, queue_ms
 
     def run(self, tensors, request_id, deadline_ns):
         outputs = super().run(tensors, request_id, deadline_ns)
-        self.stats.model_ms = self._model_ms
+        self.stats.model_ms, self.stats.queue_ms = self._times_ms
+        self.stats.pace_ms = 750.0
         return outputs
 
 
@@ -191,13 +192,17 @@ def test_nothing_overtakes_a_reset_that_takes_long(policy: GatedPolicy, monkeypa
     client.close()
 
 
-@pytest.mark.parametrize(("model_ms", "parallel"), [(1e-6, 3), (1e9, 1)])
-def test_what_waits_for_the_model_itself_gains_nothing_by_company(policy: GatedPolicy, model_ms: float, parallel: int):
-    client = EngineClient(policy, FarEngine(policy, model_ms))
+@pytest.mark.parametrize(("model_ms", "queue_ms", "parallel"), [(1e-6, 0.0, 3), (1e9, 0.0, 1), (1e-6, 1e9, 1)])
+def test_what_waits_at_the_model_gains_nothing_by_company(
+    policy: GatedPolicy, model_ms: float, queue_ms: float, parallel: int
+):
+    client = EngineClient(policy, FarEngine(policy, model_ms, queue_ms))
     assert client.parallel == 3, "as long as nothing is known"
     policy.gate.release(100)
     client.submit(request(1))
-    assert client.poll(PATIENCE_S) is not None
+    chunk = client.poll(PATIENCE_S)
+    assert chunk is not None
+    assert (chunk.queued_ns, chunk.pace_ns) == (queue_ms * 1e6, 750_000_000)
     assert client.parallel == parallel
     client.close()
 

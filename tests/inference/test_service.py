@@ -195,15 +195,16 @@ def test_fleet_gets_its_own_answers_of_a_policy_that_reuses_its_outputs(policy: 
         assert cloud.policy.batches == [[0], [1, 2, 3, 4], [5, 6, 7, 8]]
 
 
-def test_a_robot_that_asks_often_waits_for_itself_only():
+def test_the_newest_request_of_a_robot_takes_the_place_of_one_that_waits():
     with served(batch=1) as cloud:
         cloud.busy()
-        greedy = [cloud.asked("greedy", 20 + i) for i in range(3)]
+        older = cloud.asked("greedy", 20)
         others = [cloud.asked(f"robot {i}", i) for i in (1, 2)]
+        newer = cloud.ask("greedy", 21, id=6)
+        assert failure(older) == "not begun: the newer request 6 of this robot took its place"
         cloud.policy.gate.release(10)
-        for future in (*greedy, *others):
-            outputs(future)
-        assert cloud.policy.batches == [[0], [20], [1], [2], [21], [22]]
+        assert [outputs(future) for future in (newer, *others)] == [[42], [2], [4]]
+        assert cloud.policy.batches == [[0], [21], [1], [2]]
 
 
 def test_a_patient_batch_waits_for_more_until_it_is_full():
@@ -245,15 +246,42 @@ def test_expired_work_is_not_begun():
         assert cloud.health()["robots"]["late"]["expired"] == 1
 
 
-def test_a_full_queue_turns_the_oldest_of_the_greediest_away():
-    with served(queue=3, batch=1) as cloud:
+def test_a_full_queue_turns_away_what_comes():
+    with served(queue=2, batch=1) as cloud:
         cloud.busy()
-        greedy = [cloud.asked("greedy", 10), cloud.asked("greedy", 11)]
-        modest = cloud.asked("modest", 1)
-        newest = cloud.ask("newest", 2)
-        assert failure(greedy[0]) == "the server is full: 3 requests wait"
+        waiting = [cloud.asked(f"robot {i}", i) for i in (1, 2)]
+        assert failure(cloud.ask("robot 3", 3)) == "the server is full: 2 requests wait"
+        newer = cloud.ask("robot 2", 4)
+        assert "took its place" in failure(waiting[1]), "it needs no further place"
         cloud.policy.gate.release(10)
-        assert [outputs(future) for future in (greedy[1], modest, newest)] == [[22], [2], [4]]
+        assert [outputs(future) for future in (waiting[0], newer)] == [[2], [8]]
+
+
+def test_an_answer_says_how_long_it_waited_for_others_and_how_often_to_ask(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(module.Pacing, "pace_ns", lambda pacing, now_ns: 750_000_000)
+    with served(batch=1, queue=1) as cloud:
+        first = cloud.busy()
+        second = cloud.asked("robot", 1)
+        turned_away = cloud.ask("other", 2)
+        waited_ns = -time.monotonic_ns()
+        assert turned_away.result(PATIENCE_S).pace_ns == 750_000_000
+        waited_ns += time.monotonic_ns()
+        cloud.policy.gate.release(10)
+        answer = second.result(PATIENCE_S)
+        assert waited_ns <= answer.queued_ns <= answer.latency_ms * 1e6
+        assert answer.pace_ns == 750_000_000
+        assert first.result(PATIENCE_S).queued_ns < answer.queued_ns
+
+
+def test_the_service_measures_who_asks_and_what_it_costs(monkeypatch: pytest.MonkeyPatch):
+    noted = []
+    monkeypatch.setattr(module.Pacing, "ask", lambda pacing, robot, now_ns: noted.append(robot))
+    monkeypatch.setattr(module.Pacing, "work", lambda pacing, size, took_ns: noted.append((size, took_ns > 0)))
+    with served() as cloud:
+        cloud.policy.gate.release(10)
+        outputs(cloud.ask("robot", 1))
+        cloud.ask("robot", 2, fingerprint="other").result(PATIENCE_S)
+        assert noted == ["robot", (1, True)]
 
 
 def test_garbage_is_counted_told_and_harmless():
@@ -332,7 +360,7 @@ def test_the_engine_gets_the_servers_outputs_and_its_latency():
         assert remote.infer({"x": np.arange(3.0)}, 1, deadline())["twice"].tolist() == [0, 2, 4]
         stats = remote.stats
         assert (stats.mode, stats.alive, stats.requests, stats.failures) == ("distributed", True, 1, 0)
-        assert 0 < stats.model_ms <= stats.infer_ms
+        assert 0 < stats.model_ms <= stats.model_ms + stats.queue_ms <= stats.infer_ms
         (robot,) = cloud.health()["robots"]
         assert robot.startswith("so101-")
 
@@ -410,6 +438,43 @@ def test_the_engine_believes_no_answer_but_its_own(answer: bytes, said: str):
     with pytest.raises(PolicyError, match=said):
         remote.infer({"x": np.zeros(1)}, 1, deadline())
     assert remote.stats.failures == 1
+    transport.close()
+
+
+def test_the_engine_knows_waiting_from_work_and_the_pace():
+    transport = LocalTransport()
+    replies = [
+        Message(Kind.ANSWER, 1, {}, fingerprint=Net().fingerprint(), latency_ms=50.0, queued_ns=30_000_000),
+        Message(Kind.FAILURE, 2, text="full", pace_ns=750_000_000),
+    ]
+    transport.serve(service_name("net"), lambda payload: encode(replies[decode(payload).id - 1]))
+    remote = RemoteEngine(Net(), transport, "net", "so101")
+    remote.infer({"x": np.zeros(1)}, 1, deadline())
+    assert (remote.stats.model_ms, remote.stats.queue_ms, remote.stats.pace_ms) == (20.0, 30.0, 0.0)
+    with pytest.raises(PolicyError, match="full"):
+        remote.infer({"x": np.zeros(1)}, 2, deadline())
+    assert remote.stats.pace_ms == 750.0
+    transport.close()
+
+
+def test_all_requests_on_their_way_in_an_outage_are_one_failure():
+    transport = LocalTransport()
+    together = threading.Barrier(5)
+
+    def fail(payload: Any) -> bytes:
+        together.wait(PATIENCE_S)
+        raise RuntimeError("the power is out")
+
+    end = transport.serve(service_name("net"), fail)
+    remote = RemoteEngine(Net(), transport, "net", "so101")
+    with ThreadPoolExecutor(5) as pool:
+        asked = [pool.submit(remote.infer, {"x": np.zeros(1)}, number, deadline()) for number in range(5)]
+        assert all(isinstance(future.exception(PATIENCE_S), PolicyError) for future in asked)
+    assert (remote.stats.requests, remote.stats.failures) == (5, 1)
+    end()
+    with pytest.raises(PolicyError, match="nobody serves"):
+        remote.infer({"x": np.zeros(1)}, 6, deadline())
+    assert remote.stats.failures == 2, "one that was sent later"
     transport.close()
 
 

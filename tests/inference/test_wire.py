@@ -34,13 +34,15 @@ DTYPES = st.sampled_from(["?", "u1", "i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<
 ARRAYS = DTYPES.flatmap(lambda code: hnp.arrays(code, hnp.array_shapes(min_dims=0, max_dims=4, min_side=0, max_side=5)))
 TEXTS = st.text(st.characters(codec="utf-8"), max_size=20)
 I64 = st.integers(-(2**63), 2**63 - 1)
-MESSAGES = st.builds(
-    Message, kind=st.sampled_from(Kind), id=st.integers(0, 2**64 - 1), robot=TEXTS, fingerprint=TEXTS,
-    text=st.just("") | TEXTS,
-    tensors=st.dictionaries(TEXTS.filter(bool), ARRAYS, max_size=4), stamp_ns=I64,
-    deadline_ns=st.integers(0, 2**63 - 1), episode=st.integers(0, 2**64 - 1), seed=I64,
-    latency_ms=st.floats(0, 1e9),
-)  # fmt: skip
+ANY = {
+    "id": st.integers(0, 2**64 - 1), "robot": TEXTS, "fingerprint": TEXTS, "text": st.just("") | TEXTS,
+    "tensors": st.dictionaries(TEXTS.filter(bool), ARRAYS, max_size=4), "stamp_ns": I64, "seed": I64,
+    "latency_ms": st.floats(0, 1e9),
+}  # fmt: skip
+WAITS, COUNTS = st.integers(0, 2**63 - 1), st.integers(0, 2**64 - 1)
+MESSAGES = st.builds(Message, kind=st.just(Kind.REQUEST), deadline_ns=WAITS, episode=COUNTS, **ANY) | st.builds(
+    Message, kind=st.sampled_from((Kind.ANSWER, Kind.FAILURE)), queued_ns=WAITS, pace_ns=COUNTS, **ANY
+)
 EXAMPLE = Message(
     Kind.REQUEST, 7, {"state": np.array([0.5, -1.5], np.float32), "on": np.array([[True], [False]])}, "so101", "3f2a",
     stamp_ns=1_700_000_000_000_000_000, deadline_ns=5_000_000_000, episode=2, seed=42,
@@ -274,6 +276,21 @@ def test_a_small_jpeg_that_claims_a_large_picture_is_not_decoded():
     codec.answer = AssertionError("it was decoded")
     with pytest.raises(WireError, match="larger than"):
         decode(frame, codec=codec)
+
+
+def test_answers_of_older_servers_say_nothing_of_waiting_and_pace():
+    """As version 1 was before: the two fields were 0 in answers."""
+    old = bytearray(encode(Message(Kind.ANSWER, 7, {"action": np.zeros(2)}, "so101", "3f2a", latency_ms=20.0)))
+    assert old[24:40] == bytes(16)
+    answer = decode(old)
+    assert (answer.queued_ns, answer.pace_ns, answer.deadline_ns, answer.episode) == (0, 0, 0, 0)
+
+
+@pytest.mark.parametrize("kind", [Kind.ANSWER, Kind.FAILURE])
+def test_waiting_and_pace_lie_where_a_request_has_deadline_and_episode(kind: Kind):
+    frame = encode(Message(kind, 7, queued_ns=30_000_000, pace_ns=750_000_000))
+    assert struct.unpack_from("<qQ", frame, 24) == (30_000_000, 750_000_000)
+    assert bytes(frame[:24]) == bytes(encode(Message(kind, 7)))[:24], "the rest is as it was"
 
 
 def test_the_documented_example_is_what_is_sent():

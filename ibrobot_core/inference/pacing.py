@@ -1,0 +1,90 @@
+"""Pacing: how often each robot of a server may ask, so that its model keeps up and nobody waits long."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict, deque
+from collections.abc import Iterable
+from statistics import median
+
+from ibrobot_core.units import NS_PER_S
+
+_TARGET = 0.8
+"""Share of the model's time that requests may take. At 0.8, random arrivals wait for two requests' time on average."""
+_GROWTH = 1.25
+"""How much more often than now a robot might ask: one that keeps to its pace may want more."""
+_WINDOW_NS = 5 * NS_PER_S
+_RENEWED_NS = NS_PER_S // 5
+_BATCHES_KEPT = 64
+
+
+class Pacing:
+    """The time that each robot of a server should leave between its requests.
+
+    The model's time is shared by max-min fairness: a robot that asks seldom gets what it wants, and what it leaves is
+    shared by the others. As long as all together want less than the model can do, nobody is held back. Demand is
+    measured over 5 s, and the cost of a request by the median batch of the cheapest size, so that neither grows
+    because the model stood still for a while. May be used by several threads.
+    """
+
+    def __init__(self) -> None:
+        self._asked: OrderedDict[str, deque[int]] = OrderedDict()
+        """When each robot asked within the window, by when it asked last."""
+        self._batches: deque[tuple[int, int]] = deque(maxlen=_BATCHES_KEPT)
+        self._pace_ns = 0
+        self._renew_ns = 0
+        self._lock = threading.Lock()
+
+    def ask(self, robot: str, now_ns: int) -> None:
+        """Note that a robot asks."""
+        with self._lock:
+            self._asked.setdefault(robot, deque()).append(now_ns)
+            self._asked.move_to_end(robot)
+
+    def work(self, requests: int, took_ns: int) -> None:
+        """Note that a batch of so many requests took so long [ns]."""
+        with self._lock:
+            self._batches.append((requests, took_ns))
+
+    def pace_ns(self, now_ns: int) -> int:
+        """Time to leave from one request to the next [ns]; 0: no limit."""
+        with self._lock:
+            if now_ns >= self._renew_ns:
+                self._renew_ns = now_ns + _RENEWED_NS
+                self._forget(now_ns - _WINDOW_NS)
+                self._pace_ns = fair_pace_ns((len(asked) for asked in self._asked.values()), self._cost_ns())
+            return self._pace_ns
+
+    def _forget(self, before_ns: int) -> None:
+        for robot, asked in list(self._asked.items()):
+            while asked and asked[0] < before_ns:
+                asked.popleft()
+            if not asked:
+                del self._asked[robot]
+
+    def _cost_ns(self) -> float:
+        """What a request takes of the model's time [ns], in batches of the size that does most."""
+        sizes = {size for size, _ in self._batches}
+        return min((median(ns for n, ns in self._batches if n == size) / size for size in sizes), default=0.0)
+
+
+def fair_pace_ns(counts: Iterable[int], cost_ns: float) -> int:
+    """The pace of the robots that ask most, so that all together take no more than the target of the model's time.
+
+    Args:
+        counts: of each robot, how often it asked within the window.
+        cost_ns: what a request takes [ns].
+
+    Returns:
+        The pace [ns]; 0 where nobody needs to be held back, as where there is one robot only.
+    """
+    wanted = sorted(_GROWTH * count for count in counts)
+    if len(wanted) < 2 or not cost_ns:
+        return 0
+    left = _TARGET * _WINDOW_NS / cost_ns
+    for index, requests in enumerate(wanted):
+        share = left / (len(wanted) - index)
+        if requests > share:
+            return round(_WINDOW_NS / share)
+        left -= requests
+    return 0
