@@ -9,6 +9,8 @@ from __future__ import annotations
 import enum
 import math
 import struct
+import threading
+from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import override
 
@@ -37,8 +39,8 @@ _DTYPES = tuple(
 _CODES = {dtype: code for code, dtype in enumerate(_DTYPES, 1)}
 _JPEG = 128
 _BYTE = np.dtype(np.uint8)
-_LAYOUTS_KEPT = 64
-"""One for each robot, as a rule."""
+_LAYOUTS_KEPT = 512
+"""One for each robot, as a rule: more than a server has. They take about 2 kB each."""
 
 
 class Kind(enum.IntEnum):
@@ -137,6 +139,27 @@ class _Layout:
     """What lies between the numbers and the tensors."""
     size: int
     """Of the whole frame."""
+
+
+class _Layouts[K: Hashable]:
+    """The layouts that were used last. May be used by several threads."""
+
+    def __init__(self) -> None:
+        self._kept: OrderedDict[K, _Layout] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def get(self, key: K) -> _Layout | None:
+        with self._lock:
+            layout = self._kept.get(key)
+            if layout is not None:
+                self._kept.move_to_end(key)
+            return layout
+
+    def keep(self, key: K, layout: _Layout) -> None:
+        with self._lock:
+            self._kept[key] = layout
+            if len(self._kept) > _LAYOUTS_KEPT:
+                self._kept.popitem(last=False)
 
 
 def _aligned(offset: int) -> int:
@@ -246,7 +269,7 @@ class Encoder:
     def __init__(self, limits: Limits = LIMITS, codec: PictureCodec | None = None) -> None:
         self._limits = limits
         self._codec = codec
-        self._layouts: dict[Hashable, _Layout] = {}
+        self._layouts: _Layouts[Hashable] = _Layouts()
 
     def encode(self, message: Message, allocate: Callable[[int], memoryview] = _fresh) -> memoryview:
         """A frame; every tensor is copied once, to where it is sent from. May be called by several threads at a time.
@@ -267,14 +290,8 @@ class Encoder:
         if layout is None:
             layout = _lay_out(message, jpegs, self._limits)
             if not (jpegs or message.text):
-                _keep(self._layouts, key, layout)
+                self._layouts.keep(key, layout)
         return _fill(allocate(layout.size)[: layout.size], layout, message, jpegs)
-
-
-def _keep[K](layouts: dict[K, _Layout], key: K, layout: _Layout) -> None:
-    if len(layouts) >= _LAYOUTS_KEPT:
-        layouts.clear()
-    layouts[key] = layout
 
 
 def encode(message: Message, *, limits: Limits = LIMITS, codec: PictureCodec | None = None) -> memoryview:
@@ -298,7 +315,7 @@ class Decoder:
     def __init__(self, limits: Limits = LIMITS, codec: PictureCodec | None = None) -> None:
         self._limits = limits
         self._codec = codec or NoPictures()
-        self._layouts: dict[bytes, _Layout] = {}
+        self._layouts: _Layouts[bytes] = _Layouts()
         """By their heads."""
 
     def decode(self, payload: Payload) -> Message:
@@ -360,7 +377,7 @@ class Decoder:
             places = _places(reader, count, limits)
             layout = _Layout(robot, fingerprint, text, places, head, size)
             if not (text or any(place.jpeg for place in places)):  # those do not come again
-                _keep(self._layouts, head, layout)
+                self._layouts.keep(head, layout)
         return layout
 
     def _picture(self, frame: memoryview, place: _Place) -> NDArray[np.uint8]:

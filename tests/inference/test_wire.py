@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from ibrobot_core.errors import WireError
+from ibrobot_core.inference import wire
 from ibrobot_core.inference.wire import (
     ALIGNMENT,
     Buffer,
@@ -84,10 +85,23 @@ def test_robots_that_come_and_go_cost_no_memory():
 
     tracemalloc.start()
     try:
-        few = meet(range(200))
-        assert meet(range(200, 2000)) < few + 200_000
+        few = meet(range(1100))
+        assert meet(range(1100, 2500)) < few + 200_000
     finally:
         tracemalloc.stop()
+
+
+@pytest.mark.parametrize("robots", [64, 65, 300])
+def test_robots_that_take_turns_are_laid_out_once(robots: int, monkeypatch: pytest.MonkeyPatch):
+    laid_out: list[str] = []
+    for name in ("_lay_out", "_places"):
+        work = getattr(wire, name)
+        monkeypatch.setattr(wire, name, lambda *args, work=work, name=name: laid_out.append(name) or work(*args))
+    encoder, decoder = Encoder(), Decoder()
+    for _ in range(3):
+        for number in range(robots):
+            decoder.decode(encoder.encode(attrs.evolve(EXAMPLE, robot=f"robot {number}")))
+    assert len(laid_out) == 2 * robots, "by the encoder and the decoder"
 
 
 def test_tensors_are_aligned_read_only_views():
