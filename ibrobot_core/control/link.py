@@ -2,6 +2,10 @@
 
 The memory is an unnamed file passed by descriptor, so that nothing is left behind however the two end, and there is no
 lock that a dead peer could hold: each record carries its sequence number and a checksum, and a torn one is passed over.
+
+Nothing here relies on the order in which one processor sees another's stores (weak on ARM): a reader copies
+a record, and believes the copy if its checksum covers just this sequence number and these bytes. Any mixture of two
+records, in whatever order its parts became visible, fails that but for 1 in 2^32, and is read again a tick later.
 """
 
 from __future__ import annotations
@@ -29,6 +33,8 @@ STATE_SLOTS = 256
 PLAN_ROWS = 2048
 """The longest plan, in setpoints."""
 _SEQUENCE_BYTES = 8
+_PLAN_HEAD_BYTES = 48
+"""Of a plan's integers, before its mask; its checksum covers what follows the first two, `seq` and `crc`."""
 
 
 @attrs.frozen(eq=False)
@@ -85,9 +91,9 @@ class Layout:
     @property
     def plan(self) -> np.dtype[Any]:
         """One of the two plan slots."""
-        integers = [(name, "i8") for name in ("epoch", "start", "step", "rows")]
+        integers = [(name, "i8") for name in ("seq", "crc", "epoch", "start", "step", "rows")]
         arrays = [("mask", "i8", (self.joints,)), ("positions", "f8", (PLAN_ROWS, self.joints))]
-        return np.dtype([("seq", "i8"), *integers, ("crc", "i8"), *arrays])
+        return np.dtype([*integers, *arrays])
 
     @property
     def size(self) -> int:
@@ -115,8 +121,7 @@ class SharedMemory:
         self._plan_size = layout.plan.itemsize
         self._split = split
         self._body = np.zeros(1, layout.state)
-        self._plan_head = layout.plan.fields["positions"][1] if layout.plan.fields else 0
-        self._row = 8 * layout.joints
+        self._row_bytes = 8 * layout.joints
         self._written = 0
         self._read = 0
         self._plan_seq = 0
@@ -179,7 +184,7 @@ class SharedMemory:
         slot["epoch"], slot["start"], slot["step"], slot["rows"] = plan.epoch, plan.start_ns, plan.step_ns, rows
         slot["mask"] = plan.mask
         slot["positions"][:rows] = plan.positions
-        slot["crc"] = self._plan_checksum(self._plan_seq % 2, rows)
+        slot["crc"] = _plan_checksum(self._plan_bytes(self._plan_seq % 2, rows), self._plan_seq)
         slot["seq"] = self._plan_seq
 
     def read_plan(self) -> PlanRecord | None:
@@ -189,24 +194,23 @@ class SharedMemory:
         seq = int(sequences[index])
         if seq <= self._seen_plan:
             return None
-        slot = self._plans[index]
-        rows = int(slot["rows"])
-        plan = PlanRecord(
-            int(slot["epoch"]), int(slot["start"]), int(slot["step"]), slot["mask"].astype(bool),
-            slot["positions"][:rows].copy(),
-        )  # fmt: skip
-        if self._plan_checksum(index, rows) != int(slot["crc"]) or int(self._plans["seq"][index]) != seq:
+        copy = bytes(self._plan_bytes(index, int(self._plans["rows"][index])))
+        head = np.frombuffer(copy[:_PLAN_HEAD_BYTES], np.int64).tolist()
+        if head[0] != seq or head[1] != _plan_checksum(copy, seq):
             self.torn += 1
             return None
         self._seen_plan = seq
-        return plan
+        _, _, epoch, start_ns, step_ns, rows = head
+        body = copy[_PLAN_HEAD_BYTES:]
+        mask = np.frombuffer(body[: self._row_bytes], np.int64).astype(bool)
+        positions = np.frombuffer(body[self._row_bytes :]).reshape(rows, -1)
+        return PlanRecord(epoch, start_ns, step_ns, mask, positions)
 
-    def _plan_checksum(self, index: int, rows: int) -> int:
-        # From the first integer after `seq` up to `crc`, and the positions in use.
+    def _plan_bytes(self, index: int, rows: int) -> memoryview:
+        """A plan's slot, as far as `rows` setpoints use it."""
         begin = self._split + index * self._plan_size
-        head = crc32(self._bytes[begin + 8 : begin + 40])
-        body = begin + self._plan_head - self._row
-        return crc32(self._bytes[body : body + self._row * (1 + max(0, min(rows, PLAN_ROWS)))], head)
+        used = _PLAN_HEAD_BYTES + self._row_bytes * (1 + max(0, min(rows, PLAN_ROWS)))
+        return self._bytes[begin : begin + used]
 
     def close(self) -> None:
         """Unmap; the memory is gone when both sides have."""
@@ -214,6 +218,11 @@ class SharedMemory:
         self._bytes.release()
         self._map.close()
         os.close(self._descriptor)
+
+
+def _plan_checksum(plan: memoryview | bytes, seq: int) -> int:
+    """Of a plan's bytes under a sequence number."""
+    return crc32(plan[2 * _SEQUENCE_BYTES :], seq)
 
 
 def _state(record: Any) -> ControlState:

@@ -6,13 +6,16 @@ import json
 import os
 import socket
 from collections.abc import Iterator
+from zlib import crc32
 
+import attrs
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from ibrobot_core.control import link
 from ibrobot_core.control.link import (
     PLAN_ROWS,
     STATE_SLOTS,
@@ -126,6 +129,47 @@ class TestStates:
 
 
 class TestPlans:
+    @pytest.mark.parametrize("reached", [0, 1, 8, 60, 119, 120])
+    def test_one_torn_between_its_copy_and_its_check_is_refused(self, sides, monkeypatch, reached):
+        """The writer had reached this byte of the rows when they were copied, and ends before they are checked."""
+        host, control = sides
+        for epoch in (1, 2, 3):
+            host.write_plan(attrs.evolve(plan(epoch, rows=5), positions=np.full((5, 3), float(epoch))))
+        slot = control._plans[1]  # of the first and the third
+        complete = slot.copy()
+        rows = slot["positions"][:5].reshape(-1).view(np.uint8)
+        rows[reached:] = np.full(15, 1.0).view(np.uint8)[reached:]
+
+        def end_the_write(data: bytes, start: int = 0) -> int:
+            control._plans[1] = complete
+            return crc32(data, start)
+
+        monkeypatch.setattr(link, "crc32", end_the_write)
+        received = control.read_plan()
+        again = control.read_plan()
+
+        assert (received is None) == (reached < 120)
+        assert control.torn == (reached < 120)
+        (read,) = (each for each in (received, again) if each is not None)
+        assert (read.positions == 3.0).all()
+
+    def test_an_older_one_is_not_taken_for_the_newest(self, sides):
+        """A processor may show the sequence number of a write before the rest of it."""
+        host, control = sides
+        host.write_plan(plan(1))
+        old = host._plans[1].copy()
+        host.write_plan(plan(2))
+        host.write_plan(plan(3))
+        new = host._plans[1].copy()
+        old["seq"] = 3
+        host._plans[1] = old
+
+        assert control.read_plan() is None
+        host._plans[1] = new
+        received = control.read_plan()
+        assert received is not None
+        assert received.epoch == 3
+
     def test_the_newest_comes_once(self, sides):
         host, control = sides
         assert control.read_plan() is None
