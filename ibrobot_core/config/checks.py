@@ -114,6 +114,8 @@ class Checks:
         control: Control | None = self.parts.plain.get("control", Control())
         if control is None:
             return
+        if pose := control.load_shedding.pose:
+            self._refer(("control", "load_shedding", "pose"), pose, list(robot.description.poses), "pose")
         for key, value, words in (
             ("startup", control.startup, ("hold",)),
             ("stop", control.stop, ("hold", "relax")),

@@ -237,6 +237,24 @@ class TransportConfig(Component):
 
 
 @attrs.frozen
+class Following:
+    """When a joint does not follow its setpoint, which is a fault."""
+
+    distance: float = option(
+        0.25, unit="rad", gt=0, help="from its setpoint, beside what its lag explains; at most half of its max_lead"
+    )
+    timeout: float = option(2.0, unit="s", gt=0, help="time that it may be so far away")
+
+
+@attrs.frozen
+class Shedding:
+    """What relieves joints that stay hot or overloaded: the arm goes to a pose, if one is given, and relaxes."""
+
+    after: float = option(60.0, unit="s", gt=0, help="time for which such a condition lasts before")
+    pose: str = option("", help="named pose in which the arm can lie without torque; empty: it relaxes where it is")
+
+
+@attrs.frozen
 class Control:
     """The `control:` section."""
 
@@ -245,6 +263,8 @@ class Control:
     stop: str = option("hold", help="what stopping does: hold, relax, or pose NAME")
     priority: int = option(60, ge=1, le=99, help="SCHED_FIFO priority, where the machine permits it")
     state_timeout: float = option(0.1, unit="s", gt=0, help="time without a state from the hardware before a fault")
+    following_error: Following = option(factory=Following, help="when a joint does not follow its setpoint")
+    load_shedding: Shedding = option(factory=Shedding, help="what relieves joints that stay hot or overloaded")
 
 
 @attrs.frozen(slots=False)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ibrobot_core.clock import Clock
 from ibrobot_core.config import RobotConfig
+from ibrobot_core.control.following import FollowingError
 from ibrobot_core.control.link import ControlState, PlanRecord
 from ibrobot_core.control.parts import HardwareParts
 from ibrobot_core.control.safety import SafetyLayer
@@ -71,8 +72,12 @@ class ControlCore:
         self._active: list[_Owned] = []
         self._state_timeout_ns = ns(config.control.state_timeout)
         self._counts = {"read_errors": 0, "write_errors": 0, "signal_errors": 0, "stale_states": 0, "old_plans": 0}
+        self._counts["following_errors"] = 0
         self._relaxed = False
         self._stopping = False
+        self._following = FollowingError(config.control.following_error, config.robot, self.period_ns)
+        self._yielded: Vector | None = None
+        """Where joints that did not follow rest while the fault lasts [rad], NaN for the others; shape (J,)."""
         self._target: Vector | None = None
         self._arriving = False
         self._tick = 0
@@ -148,6 +153,7 @@ class ControlCore:
         self._read()
         signals = self._read_signals()
         success = self._hardware.success()
+        self._check_following()
         command = self._safety.apply(self._desired(), self._measured.position)
         self._write(command)
         self._hardware.advance(periods * self.period_ns)
@@ -282,6 +288,22 @@ class ControlCore:
         if age_ns >= self._state_timeout_ns:
             self._raise_fault(f"the joints do not answer: no state for {age_ns / 1e6:.0f} ms")
 
+    def _check_following(self) -> None:
+        """Stop where a joint does not follow, and press no longer against what blocks it."""
+        if self.fault or self._relaxed or self._measured.stale:
+            return
+        told, measured = self._safety.current, self._measured.position
+        fault = self._following.check(told, self._safety.velocity, measured)
+        if fault:
+            self._counts["following_errors"] += 1
+            self._raise_fault(fault)
+            self._yielded = np.where(self._following.lost, measured, np.nan)
+
+    def _yield(self) -> Vector | None:
+        if self._yielded is None:
+            return None
+        return np.where(np.isnan(self._yielded), self._safety.current, self._yielded)
+
     def _write(self, command: Vector) -> None:
         if self._relaxed:
             return
@@ -296,7 +318,7 @@ class ControlCore:
         if self._target is not None:
             return None if self._late_to_pose else self._safety.towards(self._target, _POSE_SPEED)
         if not self._active:
-            return None
+            return self._yield()
         # A plan goes on by time where a single reply was lost.
         now_ns = self._clock.now_ns() if self._measured.stale else None
         setpoints = []
@@ -352,6 +374,7 @@ class ControlCore:
     def _take_back(self) -> None:
         self._relaxed = False
         self._hardware.retake()
+        self._following.restart()
 
     def _raise_fault(self, fault: str) -> None:
         if self.fault:
@@ -418,6 +441,7 @@ class ControlCore:
         self._leave()
         self._take_back()
         self._safety.reset(self._measured.position)
+        self._yielded = None
         self.fault = ""
         self._enter()
 

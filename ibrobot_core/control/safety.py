@@ -11,7 +11,7 @@ from ibrobot_core.errors import HardwareError
 from ibrobot_core.robot import Robot, Vector
 from ibrobot_core.units import seconds
 
-KINDS = ("estop", "nonfinite", "unmeasured", "first_command", "position", "velocity", "acceleration")
+KINDS = ("estop", "nonfinite", "unmeasured", "first_command", "position", "lead", "velocity", "acceleration")
 """Why a joint was not given what was asked for. A joint counts once a tick, under the first of these that applies."""
 
 
@@ -19,9 +19,14 @@ class SafetyLayer:
     """Turns what is asked for into what the hardware is told, one tick at a time.
 
     From `activate` on, at every tick and for every joint, whatever is asked for:
-    `lower <= p <= upper`, `|p - p'| <= max_velocity * dt` and `|(p - p') - (p' - p'')| <= max_acceleration * dt^2`,
-    where p, p', p'' are the last three commands and dt is the period. So that braking never ends beyond a position
-    limit, a step is taken only if braking from it at max_acceleration stops in time.
+    `lower <= p <= upper`, `|p - m| <= max_lead`, `|p - p'| <= max_velocity * dt` and
+    `|(p - p') - (p' - p'')| <= max_acceleration * dt^2`, where p, p', p'' are the last three commands, m is the
+    measured position and dt is the period. So that braking never ends beyond a position limit, nor beyond max_lead
+    from where the joint is now, a step is taken only if braking from it at max_acceleration stops in time.
+
+    The order is that of precedence. The first two always hold, the first before the second. The last two yield where a
+    joint's measured position moves away from the command so that no braking stops in time, e.g. because somebody pushes
+    it; where p' itself is too far from m, p starts at rest at max_lead from it.
 
     What can be had within these limits passes unchanged, bit by bit. After something that could not, the command
     catches up as fast as the limits allow and brakes so as not to overshoot.
@@ -40,6 +45,7 @@ class SafetyLayer:
         self._period_s = seconds(period_ns)
         self._lower = robot.lower.astype(np.float64)
         self._upper = robot.upper.astype(np.float64)
+        self._max_lead = robot.max_lead
         # Velocities are kept as steps [rad per tick], accelerations as changes of step: no rounding by dt comes in.
         max_step = robot.max_velocity * self._period_s
         self._change = robot.max_acceleration * self._period_s**2
@@ -83,7 +89,8 @@ class SafetyLayer:
         Args:
             desired: positions [rad], shape (J,), a numpy array; None for silence. A joint brakes and holds where
                 its value is missing, not finite, or where the joint is not measured; all do on a wrong length or type.
-            measured: positions [rad], shape (J,); NaN where a joint is not measured.
+            measured: positions [rad], shape (J,); NaN where a joint is not measured. While they repeat an older
+                reading the command goes no further than `max_lead` from that.
 
         Raises:
             RuntimeError: before the first `activate`.
@@ -91,18 +98,20 @@ class SafetyLayer:
         if not self._active:
             raise RuntimeError("the safety layer must be activated at the measured positions first")
         wanted = _vector(desired, len(self._names))
+        seen = _vector(measured, len(self._names))
+        seen = self._nothing if seen is None else seen
+        known = np.isfinite(seen)
+        lower, upper = self._bounds(seen, known)
         if wanted is None:
             self._events["missing" if desired is None else "wrong_length"] += 1
-            command = self._next(self._nothing, np.zeros(len(self._names), dtype=bool))
+            command = self._next(self._nothing, np.zeros(len(self._names), dtype=bool), lower, upper)
         else:
-            seen = _vector(measured, len(self._names))
-            known = np.isfinite(self._nothing if seen is None else seen)
             follow = np.isfinite(wanted) & known & (not self._estopped)
             before = self._position
-            command = self._next(wanted, follow)
+            command = self._next(wanted, follow, lower, upper)
             differs = command != wanted
             if differs.any():
-                self._count(differs, wanted, known, before)
+                self._count(differs, wanted, known, before, (wanted < lower) | (wanted > upper))
             self._fresh &= ~follow
         return command.copy()
 
@@ -158,11 +167,22 @@ class SafetyLayer:
         totals = self._counts.sum(axis=0) + self._events["wrong_length"]
         return dict(zip(self._names, totals.tolist(), strict=True))
 
-    def _next(self, wanted: Vector, follow: NDArray[np.bool_]) -> Vector:
-        """Advance by a tick towards `wanted` [rad] where `follow`, to a stop elsewhere; shapes (J,)."""
-        position, slack = self._position, self._half_slack
+    def _bounds(self, seen: Vector, known: NDArray[np.bool_]) -> tuple[Vector, Vector]:
+        """Lowest and highest command of this tick [rad], by position limits and lead; shapes (J,)."""
         # A joint that started outside may come in, and then not go back out.
-        lower, upper = np.minimum(self._lower, position), np.maximum(self._upper, position)
+        lower, upper = np.minimum(self._lower, self._position), np.maximum(self._upper, self._position)
+        lead = self._max_lead
+        if not known.all():
+            seen, lead = np.where(known, seen, 0.0), np.where(known, lead, np.inf)
+        return _limited(seen - lead, lower, upper), _limited(seen + lead, lower, upper)
+
+    def _next(self, wanted: Vector, follow: NDArray[np.bool_], lower: Vector, upper: Vector) -> Vector:
+        """Advance by a tick towards `wanted` [rad] where `follow`, to a stop elsewhere; all shapes (J,)."""
+        slack = self._half_slack
+        position = _limited(self._position, lower, upper)
+        left = position != self._position
+        if left.any():
+            self._step, self._target = np.where(left, 0.0, self._step), np.where(left, np.nan, self._target)
         target = _limited(np.where(follow, wanted, position), lower, upper)
         ahead = target - position
         # Where the target moves smoothly it is expected to go on; otherwise to be a place to stop at.
@@ -196,8 +216,19 @@ class SafetyLayer:
         self._target_step = target_step
         return command
 
-    def _count(self, differs: NDArray[np.bool_], wanted: Vector, known: NDArray[np.bool_], before: Vector) -> None:
-        """Count the joints that `differs` marks, each under the first of `KINDS` that applies."""
+    def _count(
+        self, differs: NDArray[np.bool_], wanted: Vector, known: NDArray[np.bool_], before: Vector,
+        beyond: NDArray[np.bool_],
+    ) -> None:  # fmt: skip
+        """Count the joints that `differs` marks, each under the first of `KINDS` that applies.
+
+        Args:
+            differs: shape (J,).
+            wanted: shape (J,).
+            known: which joints are measured, shape (J,).
+            before: the last commands, shape (J,).
+            beyond: which joints were wanted beyond their bounds, shape (J,).
+        """
         lower, upper = np.minimum(self._lower, before), np.maximum(self._upper, before)
         step = _limited(wanted, lower, upper) - before
         reasons = np.array(
@@ -207,6 +238,7 @@ class SafetyLayer:
                 ~known,
                 self._fresh,
                 (wanted < lower) | (wanted > upper),
+                beyond,
                 np.abs(step) > self._max_step + self._half_slack,
                 differs,
             )

@@ -236,7 +236,8 @@ CASES = {
         "control: &a {rate_hz: 100, stop: hold, more: *a}",
         (
             "robot.yaml:41: control.more: an alias to the block that contains it\n"
-            "robot.yaml:41: control.more: unknown key; known keys: rate_hz, startup, stop, priority, state_timeout"
+            "robot.yaml:41: control.more: unknown key; known keys: rate_hz, startup, stop, priority, state_timeout, "
+            "following_error, load_shedding"
         ),
     ),
     "merge_of_list": (

@@ -60,6 +60,7 @@ class ScriptedHardware(FakeHardware):
         self.stale = False
         self.write_error = ""
         self.signal_error = ""
+        self.blocked = np.zeros(len(ctx.joints), dtype=bool)
         self.relax_outcome: Torque | HardwareError = Torque.OFF
         self._last: JointReading | None = None
 
@@ -91,6 +92,13 @@ class ScriptedHardware(FakeHardware):
         if self.signal_error:
             raise HardwareError(self.signal_error)
         super().read_signal(index, out)
+
+    @override
+    def advance(self, step_ns: int) -> None:
+        before = self._position
+        super().advance(step_ns)
+        self._position = np.where(self.blocked, before, self._position)
+        self._velocity = np.where(self.blocked, 0.0, self._velocity)
 
     @override
     def reset_faults(self) -> None:

@@ -62,10 +62,26 @@ def test_a_joint_that_is_blocked_is_named(rig):
 
     rig.hardware.read = read
     with pytest.raises(
-        HardwareError, match=r"control.startup: pose rest: not reached within 10 s: lift is \d\.\d\d rad away; check"
+        HardwareError, match=r"control.startup: pose rest: joint lift does not follow: it is \d\.\d\d rad"
     ):
         arrive(rig)
     assert "not active; active: none" in rig.call("goal", executor="arm_position", goal_id="1", goal={})["error"]
+
+
+def test_a_joint_that_hangs_too_far_from_the_pose_is_named(rig):
+    rig.tick()
+    follow = type(rig.hardware).read
+
+    def read():
+        reading = follow(rig.hardware)
+        reading.position[1] -= 0.22
+        return reading
+
+    rig.hardware.read = read
+    with pytest.raises(
+        HardwareError, match=r"control.startup: pose rest: not reached within 10 s: lift is 0\.22 rad away; check"
+    ):
+        arrive(rig)
 
 
 def test_a_fault_on_the_way_is_told(rig):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import attrs
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -14,9 +15,9 @@ from ibrobot_core.errors import HardwareError
 from ibrobot_core.robot import Joint, Robot, Vector
 
 
-def make_robot(*limits: tuple[float, float, float, float]) -> Robot:
+def make_robot(*limits: tuple[float, float, float, float], max_lead: float | None = None) -> Robot:
     joints = (
-        Joint(name=f"j{i}", lower=a, upper=b, max_velocity=v, max_acceleration=c)
+        Joint(name=f"j{i}", lower=a, upper=b, max_velocity=v, max_acceleration=c, max_lead=max_lead)
         for i, (a, b, v, c) in enumerate(limits)
     )
     return Robot(name="robot", joints=tuple(joints))
@@ -31,7 +32,10 @@ ZERO = np.zeros(1)
 
 
 class Watched:
-    """A real layer, whose every output is checked against the limits."""
+    """A real layer, whose every output is checked against the limits. The joints are where they were sent, if not told.
+
+    Velocity and acceleration limits may yield only where the measured position leaves no room to brake within the lead.
+    """
 
     def __init__(self, robot: Robot, period_ns: int) -> None:
         self.robot, self.dt = robot, period_ns / 1e9
@@ -39,25 +43,47 @@ class Watched:
 
     def start(self, measured: Vector, reset: bool = False) -> None:
         (self.layer.reset if reset else self.layer.activate)(measured)
-        self.measured = measured
+        self.start_at = measured
         self.before = [measured, measured]
         np.testing.assert_array_equal(self.layer.current, measured)
 
     def tick(self, desired: Any, measured: Vector | None = None) -> Vector:
-        command = self.layer.apply(desired, self.measured if measured is None else measured)
         robot, (older, old) = self.robot, self.before
+        measured = old if measured is None else measured
+        command = self.layer.apply(desired, measured)
         assert command.shape == old.shape
         assert command.dtype == np.float64
         assert np.isfinite(command).all()
         # Inside the limits; a joint that began outside them never moves further out.
         assert (command >= np.minimum(robot.lower, old)).all()
         assert (command <= np.maximum(robot.upper, old)).all()
-        rounding = 40 * np.spacing(np.max(np.abs([robot.lower, robot.upper, self.measured])))
-        assert (np.abs(command - old) <= robot.max_velocity * self.dt * (1 + 1e-9) + rounding).all()
-        change = (command - old) - (old - older)
-        assert (np.abs(change) <= robot.max_acceleration * self.dt**2 * (1 + 1e-9) + rounding).all()
-        self.before = [old, command]
+        # Within reach of where the joint is.
+        band = np.where(np.isfinite(measured), robot.max_lead, np.inf), np.nan_to_num(measured)
+        lowest, highest = (
+            np.clip(band[1] + side * band[0], np.minimum(robot.lower, old), np.maximum(robot.upper, old))
+            for side in (-1, 1)
+        )
+        assert (lowest <= command).all()
+        assert (command <= highest).all()
+
+        rounding = 40 * np.spacing(np.max(np.abs([robot.lower, robot.upper, self.start_at])))
+        most = robot.max_acceleration * self.dt**2
+        within = np.clip(old, lowest, highest)
+        step = np.where(within == old, old - older, 0.0)
+        gentlest = np.maximum(np.abs(step) - most, 0.0)
+        room = np.where(step > 0, highest - within, within - lowest)
+        free = braking(gentlest, most) <= room
+        assert (np.abs(command - within)[free] <= (robot.max_velocity * self.dt * (1 + 1e-9) + rounding)[free]).all()
+        change = command - within - step
+        assert (np.abs(change)[free] <= (most * (1 + 1e-9) + rounding)[free]).all()
+        self.before = [within, command]
         return command
+
+
+def braking(step: Vector, change: Vector) -> Vector:
+    """The way of a joint [rad] that goes `step` in this tick and `change` less in each that follows; shape (J,)."""
+    n = np.floor(step / change)
+    return np.asarray((n + 1) * step - change * n * (n + 1) / 2)
 
 
 limits = st.tuples(
@@ -154,6 +180,72 @@ def test_whatever_is_asked_for_the_limits_hold_and_every_intervention_is_counted
     assert list(watched.layer.interventions.values()) == (expected + wrong).tolist()
 
 
+@settings(max_examples=60, deadline=None)
+@given(streams(), st.data())
+def test_wherever_the_joints_are_the_command_is_within_reach_of_them(
+    stream: tuple[Robot, int, Vector, list[tuple[str, Any, int]]], data: st.DataObject
+) -> None:
+    """Joints follow at once, lag, are blocked, or are pushed away; the checks are those of `Watched`."""
+    robot, period_ns, start, events = stream
+    lead = data.draw(st.one_of(st.none(), st.floats(0.01, 2.0)))
+    robot = attrs.evolve(robot, joints=tuple(attrs.evolve(joint, max_lead=lead) for joint in robot.joints))
+    watched = Watched(robot, period_ns)
+    watched.start(start)
+    measured = start
+    for kind, value, repeats in events:
+        share = data.draw(st.sampled_from([0.0, 0.05, 0.3, 1.0]))
+        measured = measured + data.draw(st.sampled_from([0.0, 0.0, -1.0, 0.003, 0.7]))
+        for _ in range(repeats if kind in {"command", "step", "push"} else 0):
+            measured = measured + share * (watched.layer.current - measured)
+            watched.tick(wish(kind, value, watched.layer, robot, period_ns), measured)
+
+
+def test_a_blocked_joint_does_not_wind_up_and_its_release_makes_no_jump() -> None:
+    watched = Watched(one_joint(), PERIOD_NS)  # checks velocity and acceleration: here they never yield
+    watched.start(ZERO)
+    lead = watched.robot.max_lead[0]
+    position, leads = 0.0, []
+    for index in range(400):
+        wanted = min(2.0 * index * 0.01, 1.9)
+        free = index < 20 or index >= 200
+        position += 0.15 * (watched.before[-1][0] - position) if free else 0.0
+        command = watched.tick(np.array([wanted]), np.array([position]))
+        leads.append(abs(command[0] - position))
+    assert max(leads[:20]) < lead
+    assert leads[100:200] == [pytest.approx(lead)] * 100
+    assert command[0] == 1.9
+    assert watched.layer.counters()["lead"] > 100
+
+
+def test_an_ordinary_fast_motion_does_not_meet_the_lead_limit() -> None:
+    """A servo that lags by 0.1 s, and whose readings are 20 ms old, at the limits of an SO-101."""
+    watched = Watched(make_robot((-2, 2, 3, 40)), PERIOD_NS)
+    watched.start(ZERO)
+    plan = np.concatenate([rest_to_rest(a, b, 3.0, 40.0, 0.01) for a, b in ((0, 2), (2, -2), (-2, 1))])
+    positions = [0.0, 0.0, 0.0]
+    for wanted in plan:
+        positions.append(positions[-1] + (1 - np.exp(-0.1)) * (watched.before[-1][0] - positions[-1]))
+        assert watched.tick(np.array([wanted]), np.array([positions[-3]]))[0] == wanted
+    assert set(watched.layer.counters().values()) == {0}
+
+
+def test_a_joint_that_is_pushed_away_takes_its_command_along() -> None:
+    watched = Watched(one_joint(), PERIOD_NS)
+    watched.start(ZERO)
+    watched.tick(None)
+    assert watched.tick(None, np.array([1.5]))[0] == pytest.approx(1.5 - watched.robot.max_lead[0])
+    assert watched.layer.at_rest
+    assert watched.tick(ZERO, np.array([-2.0]))[0] == pytest.approx(-2.0 + watched.robot.max_lead[0])
+
+
+def test_readings_that_repeat_do_not_let_the_command_run_away() -> None:
+    watched = Watched(one_joint(), PERIOD_NS)
+    watched.start(ZERO)
+    for _ in range(200):
+        command = watched.tick(np.array([2.0]), ZERO)
+    assert command[0] == watched.robot.max_lead[0]
+
+
 @settings(max_examples=40, deadline=None)
 @given(limits, periods, st.floats(0, 1), st.floats(0, 1))
 def test_a_stationary_target_is_reached_exactly_and_never_overshot(
@@ -232,8 +324,8 @@ def test_any_motion_within_the_limits_passes_bit_by_bit_and_counts_nothing(
     for kind, value, repeats in events:
         for _ in range(repeats if kind in {"command", "step", "push"} else 0):
             # What one layer gives out is a motion within the limits, often right at them.
-            motion = limiting.apply(wish(kind, value, limiting, robot, period_ns), start)
-            np.testing.assert_array_equal(passing.apply(motion, start), motion)
+            motion = limiting.apply(wish(kind, value, limiting, robot, period_ns), limiting.current)
+            np.testing.assert_array_equal(passing.apply(motion, passing.current), motion)
     assert set(passing.counters().values()) == {0}
 
 
@@ -317,7 +409,7 @@ def test_a_smooth_stream_is_caught_up_with_after_a_gap() -> None:
 
 
 def test_the_kinds_of_intervention_are_told_apart() -> None:
-    def counted(desired: Any, *, ticks: int = 1, settle: bool = True, measured: Vector = ZERO) -> dict[str, int]:
+    def counted(desired: Any, *, ticks: int = 1, settle: bool = True, measured: Vector | None = None) -> dict[str, int]:
         watched = Watched(one_joint(), PERIOD_NS)
         watched.start(ZERO)
         if settle:
@@ -331,6 +423,7 @@ def test_the_kinds_of_intervention_are_told_apart() -> None:
     assert counted(np.array([np.nan])) == {"nonfinite": 1}
     assert counted(np.array([-np.inf])) == {"nonfinite": 1}
     assert counted(np.array([2.5])) == {"position": 1}
+    assert counted(np.array([1.5]), measured=ZERO) == {"lead": 1}
     assert counted(np.array([0.5])) == {"velocity": 1}
     assert counted(np.array([0.03])) == {"acceleration": 1}
     assert counted(np.array([0.001]), measured=np.array([np.nan])) == {"unmeasured": 1}

@@ -6,7 +6,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import attrs
 import pytest
 import yaml
 from ibrobot_mujoco import gl
@@ -17,6 +16,7 @@ from ibrobot_mujoco.so101 import MJCF, so101
 
 from ibrobot_core.errors import SensorError
 from ibrobot_core.plugins import installed
+from ibrobot_core.robot import Joint
 from ibrobot_core.testing import control_context
 
 
@@ -42,7 +42,7 @@ def test_stands_for_the_robot_and_its_cameras() -> None:
 def test_the_so101_of_scripts_is_that_of_the_robot_yaml() -> None:
     document = yaml.safe_load((Path(__file__).parents[3] / "configs" / "so101.yaml").read_text())["robot"]
     robot = so101()
-    assert [attrs.asdict(joint) for joint in robot.joints] == document["joints"]
+    assert robot.joints == tuple(Joint(**joint) for joint in document["joints"])
     assert {name: list(joints) for name, joints in robot.groups.items()} == document["groups"]
     assert {name: list(pose) for name, pose in robot.description.poses.items()} == document["description"]["poses"]
     assert document["description"]["mjcf"] == MJCF

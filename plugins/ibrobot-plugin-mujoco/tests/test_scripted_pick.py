@@ -106,7 +106,7 @@ def test_tries_again_when_the_gripper_did_not_close() -> None:
     assert outcome.success
     assert outcome.success_s is not None
     assert outcome.success_s > 7.0, "the first attempt succeeded: the fault came to nothing"
-    assert outcome.interventions == {}
+    assert outcome.interventions["lead"] > 0, "the setpoint ran away from the gripper that did not move"
     assert outcome.bumps == set()
     assert_chunks_agree(outcome)
 

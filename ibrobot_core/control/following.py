@@ -1,0 +1,63 @@
+"""Following error: joints that stay away from their setpoints, because something blocks them or they have no torque."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ibrobot_core.config.schema import Following
+from ibrobot_core.robot import LAG_S, Robot, Vector
+from ibrobot_core.units import ns
+
+
+class FollowingError:
+    """Watches how far each joint's setpoint is from its measured position.
+
+    A joint is away when that is more than `distance` (or half of its `max_lead`, where that is less) plus what a servo
+    lags behind at the setpoint's speed. Away for `timeout` without a break, it does not follow. Joints that grip may
+    stay away for ever: that is how they hold an object.
+
+    Args:
+        options: distance and timeout.
+        robot: the joints; J is their number.
+        period_ns: the control period [ns]; `check` is called at most once in each.
+    """
+
+    def __init__(self, options: Following, robot: Robot, period_ns: int) -> None:
+        self._robot = robot
+        self._timeout = options.timeout
+        distance = np.minimum(options.distance, robot.max_lead / 2)
+        self._distance: Vector = np.where(robot.grips, np.inf, distance)
+        self._longest = max(1, round(ns(options.timeout) / period_ns))
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin to watch: no joint has been away yet."""
+        self._ticks = np.zeros(len(self._distance), dtype=np.int64)
+
+    @property
+    def lost(self) -> NDArray[np.bool_]:
+        """Which joints do not follow, shape (J,)."""
+        return self._ticks >= self._longest
+
+    def check(self, setpoint: Vector, velocity: Vector, measured: Vector) -> str:
+        """Take one tick's figures, all of shape (J,).
+
+        Args:
+            setpoint: what the joints were told [rad].
+            velocity: how fast that moves [rad/s].
+            measured: where they are [rad].
+
+        Returns:
+            What is wrong and what to do about it, for the joint that is furthest away; empty where all follow.
+        """
+        away = np.abs(setpoint - measured)
+        self._ticks = np.where(away > self._distance + LAG_S * np.abs(velocity), self._ticks + 1, 0)
+        if not self.lost.any():
+            return ""
+        joint = int(np.where(self.lost, away, -1.0).argmax())
+        return (
+            f"joint {self._robot.joint_names[joint]} does not follow: it is {away[joint]:.2f} rad from its setpoint, "
+            f"and has been away for {self._timeout:g} s; check what is in its way, its load, and that its motor has "
+            "power and torque; a joint that is meant to squeeze needs `grips: true`"
+        )
