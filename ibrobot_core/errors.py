@@ -7,6 +7,9 @@ from pathlib import Path
 
 import attrs
 
+_LISTED = 50
+"""How many problems a message lists; a screen holds no more."""
+
 
 class IbrobotError(Exception):
     """Base of every error that ibrobot raises on purpose.
@@ -39,7 +42,9 @@ class ConfigError(IbrobotError):
 
     def __init__(self, problems: Iterable[Problem]) -> None:
         self.problems = tuple(problems)
-        super().__init__("\n".join(str(p) for p in self.problems))
+        lines = [str(problem) for problem in self.problems[:_LISTED]]
+        more = len(self.problems) - _LISTED
+        super().__init__("\n".join([*lines, f"and {more} more"] if more > 0 else lines))
 
 
 class PluginError(IbrobotError):

@@ -16,6 +16,8 @@ from cattrs import Converter
 from ibrobot_core.config.expand import resolve_path
 from ibrobot_core.config.yaml_nodes import Key
 
+_SHOWN = 200
+"""Characters of a value that a message shows."""
 _YAML_1_1_BOOLS = {"on", "off", "yes", "no", "y", "n", "true", "false"}
 
 
@@ -69,7 +71,10 @@ def shown(value: Any) -> str:
         return "true" if value else "false"
     if isinstance(value, Mapping):
         return "a mapping"
-    return "a list" if isinstance(value, list | tuple) else repr(value)
+    if isinstance(value, list | tuple):
+        return "a list"
+    text = repr(value)
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}… ({len(text)} characters)"
 
 
 def _wrong(expected: str, value: Any, remark: str = "") -> ValueError:

@@ -27,7 +27,7 @@ from ibrobot_core.config.schema import (
     TransportConfig,
 )
 from ibrobot_core.config.structure import Part, Parts, Structurer
-from ibrobot_core.config.yaml_nodes import Document, Place, parse
+from ibrobot_core.config.yaml_nodes import MAX_BYTES, Document, Place, parse
 from ibrobot_core.errors import ConfigError, Problem
 from ibrobot_core.plugins import Registry, installed
 
@@ -55,7 +55,8 @@ def load(
         ConfigError: with everything that is wrong, in file order.
     """
     try:
-        text = Path(path).read_text(encoding="utf-8")
+        with Path(path).open(encoding="utf-8") as file:
+            text = file.read(MAX_BYTES + 1)
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
         raise ConfigError([Problem(str(path), 0, "", f"cannot be read: {reason}")]) from None

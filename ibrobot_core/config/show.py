@@ -12,7 +12,7 @@ import attrs
 import yaml
 
 from ibrobot_core.config.schema import Component, ContractConfig, ControlMode, ObservationSpec, RobotConfig
-from ibrobot_core.config.yaml_nodes import scalar
+from ibrobot_core.config.yaml_nodes import is_text
 
 
 @singledispatch
@@ -106,7 +106,7 @@ class _Dumper(yaml.SafeDumper):
 
 
 def _text(dumper: yaml.SafeDumper, value: str) -> yaml.ScalarNode:
-    style = None if isinstance(scalar(value), str) else "'"
+    style = None if is_text(value) else "'"
     if not value.isprintable():
         style = '"'  # the only one with escapes: the others fold line breaks such as U+0085
     return dumper.represent_scalar("tag:yaml.org,2002:str", value, style=style)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -33,6 +34,14 @@ _BASED = re.compile(r"0o[0-7]+|0x[0-9a-fA-F]+")
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
 _SPECIAL = re.compile(r"([-+]?)\.(inf|Inf|INF)|\.(nan|NaN|NAN)")
 
+# Far above any robot's YAML (so101.yaml: 4 kB, 365 values), and read within a second.
+MAX_BYTES = 256 * 1024
+_MAX_VALUES = 10_000
+_MAX_DEPTH = 50
+_MAX_DIGITS = 40
+_TOO_MANY = f"more than {_MAX_VALUES} values, those that aliases repeat included"
+_TOO_DEEP = f"nested more than {_MAX_DEPTH} levels deep"
+
 
 @attrs.frozen(order=True)
 class Place:
@@ -52,6 +61,8 @@ class Document:
     places: dict[Key, Place]
     problems: list[tuple[Place, Problem]]
     file: str
+    unread: set[Key] = attrs.field(factory=set)
+    """Keys whose values could not be read; what stands there is no value."""
 
     def place(self, key: Key) -> Place:
         """The place of `key`, or of what encloses it where it was not written."""
@@ -60,7 +71,9 @@ class Document:
         return self.places.get(key, Place(0, 0, 0, self.file))
 
     def add(self, key: Key, message: str) -> None:
-        """Note a fault at `key`."""
+        """Note a fault at `key`, unless its value could not even be read."""
+        if key in self.unread:
+            return
         place = self.place(key)
         self.problems.append((place, Problem(place.file, place.line, self.dotted(key), message)))
 
@@ -109,22 +122,56 @@ class _Composer(Reader, Scanner, Parser, Composer, BaseResolver):
         Parser.__init__(self)
         Composer.__init__(self)
         BaseResolver.__init__(self)
+        self._values = 0
+
+    def compose_node(self, parent: Node | None, index: Any) -> Node | None:
+        self._values += 1
+        if self._values > _MAX_VALUES:
+            raise _Excess(_TOO_MANY, self.peek_event().start_mark)  # type: ignore[no-untyped-call]
+        return super().compose_node(parent, index)
+
+    def fetch_flow_collection_start(self, token: Any) -> None:
+        if self.flow_level > _MAX_DEPTH:
+            raise _Excess(_TOO_DEEP, self.get_mark())
+        super().fetch_flow_collection_start(token)
+
+
+class _Excess(yaml.MarkedYAMLError):
+    """More of something than a robot YAML has, found before it takes time and memory."""
+
+    def __init__(self, problem: str, mark: yaml.Mark) -> None:
+        super().__init__(problem=problem, problem_mark=mark)
 
 
 def scalar(text: str) -> str | int | float | bool | None:
-    """The value of a plain scalar by the core schema of YAML 1.2: `1e-3` is a number, `on` is text."""
+    """The value of a plain scalar by the core schema of YAML 1.2: `1e-3` is a number, `on` is text.
+
+    Raises:
+        ValueError: for a number that is too long or too large.
+    """
     if text in _NULLS:
         return None
     if text in _BOOLS:
         return _BOOLS[text]
-    if _INT.fullmatch(text):
-        return int(text)
-    if _BASED.fullmatch(text):
-        return int(text, 0)
+    if _INT.fullmatch(text) or _BASED.fullmatch(text):
+        if len(text) > _MAX_DIGITS:
+            raise ValueError(f"a number of {len(text)} characters; at most {_MAX_DIGITS} are read")
+        return int(text, 0) if _BASED.fullmatch(text) else int(text)
     if _FLOAT.fullmatch(text):
-        return float(text)
+        number = float(text)
+        if math.isinf(number):
+            raise ValueError(f"{text[:_MAX_DIGITS]} is larger than any number that is read")
+        return number
     special = _SPECIAL.fullmatch(text)
     return float(text.replace(".", "")) if special else text
+
+
+def is_text(text: str) -> bool:
+    """Whether a plain scalar `text` is read as text."""
+    try:
+        return isinstance(scalar(text), str)
+    except ValueError:
+        return False
 
 
 def parse(text: str, file: str) -> Document:
@@ -134,18 +181,27 @@ def parse(text: str, file: str) -> Document:
         ConfigError: e.g. an unclosed bracket.
     """
     document = Document(None, {}, [], file)
+    if len(text) > MAX_BYTES:
+        raise ConfigError([Problem(file, 0, "", f"too long: a robot YAML has at most {MAX_BYTES // 1024} kB")])
     try:
         node = _Composer(text).get_single_node()
         document.root = None if node is None else _Constructor(document).value(node, ())
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = mark.line + 1 if mark else 0
-        raise ConfigError([Problem(file, line, "", f"not valid YAML: {error.problem}")]) from None
+        raise ConfigError([Problem(file, line, "", _reason(error))]) from None
     except RecursionError:
-        raise ConfigError([Problem(file, 0, "", "nested too deeply")]) from None
+        raise ConfigError([Problem(file, 0, "", _TOO_DEEP)]) from None
     except yaml.YAMLError as error:
         raise ConfigError([Problem(file, 0, "", f"not valid YAML: {str(error).splitlines()[0]}")]) from None
     return document
+
+
+def _reason(error: yaml.MarkedYAMLError) -> str:
+    if isinstance(error, _Excess):
+        return str(error.problem)
+    expected = f"{error.context}, " if error.context and error.context.startswith("expected") else ""
+    return f"not valid YAML: {expected}{error.problem}"
 
 
 @attrs.define
@@ -153,15 +209,23 @@ class _Constructor:
     document: Document
     _open: set[int] = attrs.field(factory=set)
     """Nodes under construction: one met again is an alias to what encloses it."""
+    _values: int = 0
 
     def place(self, node: Node) -> Place:
         return Place(0, node.start_mark.line + 1, node.start_mark.column + 1, self.document.file)
+
+    def count(self, node: Node) -> None:
+        """Refuse what aliases unfold to before memory and time are gone."""
+        self._values += 1
+        if self._values > _MAX_VALUES:
+            raise _Excess(_TOO_MANY, node.start_mark)
 
     def fault(self, node: Node, key: Key, message: str) -> None:
         place = self.place(node)
         self.document.problems.append((place, Problem(place.file, place.line, self.document.dotted(key), message)))
 
     def value(self, node: Node, key: Key) -> Any:
+        self.count(node)
         if id(node) in self._open:
             self.fault(node, key, "an alias to the block that contains it")
             return None
@@ -187,10 +251,11 @@ class _Constructor:
         self.refuse_tag(node, key)
         try:
             text = expand(node.value)
+            return scalar(text) if node.style is None else text
         except ValueError as error:
             self.fault(node, key, str(error))
+            self.document.unread.add(key)
             return node.value
-        return scalar(text) if node.style is None else text
 
     def mapping(self, node: MappingNode, key: Key) -> dict[str, Any]:
         result: dict[str, Any] = {}
@@ -220,6 +285,7 @@ class _Constructor:
                 self.fault(node, key, "<< takes an alias to a mapping, or a list of them")
                 continue
             for key_node, value_node in node.value:
+                self.count(key_node)
                 if isinstance(key_node, ScalarNode) and key_node.value == "<<":
                     self.fault(key_node, key, "<< inside a merged mapping; merge both where they are used")
                 elif isinstance(key_node, ScalarNode):

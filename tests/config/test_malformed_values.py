@@ -196,7 +196,7 @@ CASES = {
     "two_documents": (
         "control: {rate_hz: 100, stop: hold}",
         "control: {rate_hz: 100, stop: hold}\n---\na: 1",
-        "robot.yaml:42: not valid YAML: but found another document",
+        "robot.yaml:42: not valid YAML: expected a single document in the stream, but found another document",
     ),
     "env_unset": (
         "port: /dev/null}",
