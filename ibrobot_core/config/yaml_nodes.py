@@ -226,6 +226,8 @@ class _Constructor:
 
     def value(self, node: Node, key: Key) -> Any:
         self.count(node)
+        if len(key) > _MAX_DEPTH:
+            raise _Excess(_TOO_DEEP, node.start_mark)
         if id(node) in self._open:
             self.fault(node, key, "an alias to the block that contains it")
             return None

@@ -38,7 +38,8 @@ CASES = {
     "unknown_keys": ("".join(f"key{i}: 1\n" for i in range(400_000)), f"robot.yaml: {TOO_LONG}"),
     "lists": ("x: " + "[" * 50_000, f"robot.yaml:1: {TOO_DEEP}"),
     "mappings": ("x: " + "{a: " * 10_000, f"robot.yaml:1: {TOO_DEEP}"),
-    "indented": ("".join(" " * i + "a:\n" for i in range(500)), f"robot.yaml: {TOO_DEEP}"),
+    "items": ("- " * 3_000, f"robot.yaml: {TOO_DEEP}"),
+    "keys": ("".join(" " * i + "a:\n" for i in range(60)), f"robot.yaml:52: {TOO_DEEP}"),
 }
 
 

@@ -214,12 +214,6 @@ def test_nothing_but_true_and_false_is_a_truth_value(text: str) -> None:
         assert text.lower() in ("true", "false")
 
 
-@pytest.mark.parametrize("opening", ["[", "{a: ", "- "])
-def test_what_nests_too_deeply_is_told(opening: str) -> None:
-    with pytest.raises(ConfigError, match=r"^robot\.yaml: nested too deeply$"):
-        parse(opening * 3000, "robot.yaml")
-
-
 def test_quoted_scalars_are_text() -> None:
     assert parse("a: '5'\nb: \"true\"\nc: |\n  7\n", "x").root == {"a": "5", "b": "true", "c": "7\n"}
 
