@@ -18,8 +18,14 @@ import attrs
 from ibrobot_core.errors import CalibrationError
 from ibrobot_core.units import TICKS_PER_TURN
 
-VERSION = 1
-"""Of the file that stands beside the numbers."""
+VERSION = 2
+"""Of the companion file. Version 1 did not say where 0 rad is: it was the pose."""
+POSE, RANGE = "pose", "range"
+ZERO_AT: Mapping[str, str] = {
+    POSE: "the pose that was set by hand at calibration (tick 2048)",
+    RANGE: "the middle of each joint's calibrated range, as in LeRobot",
+}
+"""Where a joint is at 0 rad, and what that means."""
 MAX_OFFSET = 2047
 """Greatest homing offset that a servo can keep: sign and 11 bits."""
 MIDDLE = TICKS_PER_TURN // 2
@@ -40,12 +46,15 @@ class JointCalibration:
     """Least reported position [ticks], 0 to 4094."""
     range_max: int
     """Greatest reported position [ticks], above `range_min`, at most 4095."""
+    zero_at: str = POSE
+    """Where it is at 0 rad: one of `ZERO_AT`. LeRobot's files do not have it."""
 
     def __attrs_post_init__(self) -> None:
-        for field in attrs.fields(JointCalibration):
-            value = getattr(self, field.name)
+        for name, value in self.numbers().items():
             if type(value) is not int:
-                raise ValueError(f"{field.name}: must be a whole number, not {value!r}")
+                raise ValueError(f"{name}: must be a whole number, not {value!r}")
+        if self.zero_at not in ZERO_AT:
+            raise ValueError(f"zero_at: must be one of {', '.join(ZERO_AT)}, not {self.zero_at!r}")
         if not 0 <= self.id <= 253:
             raise ValueError(f"id: must be 0 to 253, not {self.id}")
         if self.drive_mode not in (0, 1):
@@ -70,17 +79,30 @@ class JointCalibration:
         """Whether radians fall while ticks grow."""
         return self.drive_mode == 1
 
+    @property
+    def range_middle(self) -> float:
+        """The middle of the calibrated range [ticks]: 0 degrees in LeRobot."""
+        return (self.range_min + self.range_max) / 2
+
+    def numbers(self) -> dict[str, int]:
+        """The numbers alone, as LeRobot's file has them."""
+        return {name: getattr(self, name) for name in _NUMBERS}
+
     def zero(self, lower: float | None = None) -> float:
-        """The tick at which the joint is at 0 rad: the encoder's middle, where calibration puts the joint's.
+        """The tick at which the joint is at 0 rad: the encoder's middle or the range's, as `zero_at` says.
 
         Args:
             lower: for a joint that is anchored at its closed end instead, as a gripper is: its lower limit [rad]. The
                 closed end is at `range_min`, or at `range_max` where inverted.
         """
         if lower is None:
-            return float(MIDDLE)
+            return float(MIDDLE) if self.zero_at == POSE else self.range_middle
         ticks = lower * TICKS_PER_TURN / (2 * math.pi)
         return self.range_max + ticks if self.inverted else self.range_min - ticks
+
+
+_NUMBERS = tuple(field.name for field in attrs.fields(JointCalibration) if field.name != "zero_at")
+_KEYS = ", ".join(_NUMBERS)
 
 
 @attrs.frozen
@@ -104,9 +126,26 @@ class Calibration:
             if joint.id in owners:
                 raise ValueError(f"{name}: id: servo {joint.id} belongs to {owners[joint.id]} already")
             owners[joint.id] = name
+        if len(different := {joint.zero_at for joint in self.joints.values()}) > 1:
+            raise ValueError(f"zero_at: must be the same for all joints, not {' and '.join(sorted(different))}")
+
+    @property
+    def zero_at(self) -> str:
+        """Where its joints are at 0 rad: one of `ZERO_AT`."""
+        return next((joint.zero_at for joint in self.joints.values()), POSE)
+
+    def with_zero_at(self, zero_at: str) -> Calibration:
+        """The same calibration with 0 rad elsewhere."""
+        return attrs.evolve(
+            self, joints={name: attrs.evolve(joint, zero_at=zero_at) for name, joint in self.joints.items()}
+        )
 
     def numbers(self) -> dict[str, dict[str, int]]:
         """The numbers alone, as LeRobot's file has them."""
+        return {name: joint.numbers() for name, joint in self.joints.items()}
+
+    def snapshot(self) -> dict[str, dict[str, Any]]:
+        """Joint -> fields of `JointCalibration`, as a recording keeps them."""
         return {name: attrs.asdict(joint) for name, joint in self.joints.items()}
 
     def fingerprint(self) -> str:
@@ -127,12 +166,18 @@ def calibration_path(name: str | Path) -> Path:
     return home / "ibrobot" / "calibration" / f"{name}.json"
 
 
-def load_calibration(name: str | Path, joints: Sequence[str] | None = None) -> Calibration:
+def load_calibration(
+    name: str | Path, joints: Sequence[str] | None = None, *, zero_at: str | None = None
+) -> Calibration:
     """Load a calibration: LeRobot's JSON (motor -> numbers) or IB-Robot's (servo id -> numbers).
+
+    Its companion says where 0 rad is. A file without one is another program's: in LeRobot 0 is the middle of the range,
+    in IB-Robot the pose that was set by hand.
 
     Args:
         name: a name or a path, see `calibration_path`.
         joints: names of the joints that it must have; for IB-Robot's file, in the order of their ids from 1.
+        zero_at: take the numbers alone, with 0 rad there: one of `ZERO_AT`.
 
     Raises:
         CalibrationError: when it is missing or cannot be true; names file, joint, key, value and what would be right.
@@ -141,7 +186,8 @@ def load_calibration(name: str | Path, joints: Sequence[str] | None = None) -> C
     text, document = _document(path)
     if not isinstance(document, dict) or not document:
         raise CalibrationError(f"{path}: must be an object of joints, each with {_KEYS}")
-    if all(key.isdigit() for key in document):
+    numbered = all(key.isdigit() for key in document)
+    if numbered:
         document = _by_name(document, path, joints)
     found = {}
     for joint, numbers in document.items():
@@ -156,13 +202,15 @@ def load_calibration(name: str | Path, joints: Sequence[str] | None = None) -> C
         calibration = Calibration(found, path=path)
     except ValueError as error:
         raise CalibrationError(f"{path}: {error}") from None
-    return _with_meta(calibration, path)
+    if zero_at is not None:
+        return calibration.with_zero_at(zero_at)
+    return _with_meta(calibration.with_zero_at(POSE if numbered else RANGE), path)
 
 
 def save_calibration(
     calibration: Calibration, name: str | Path, *, overwrite: bool = False, by_id: bool = False
 ) -> Path:
-    """Save a calibration as LeRobot's JSON, and beside it `NAME.meta.json` with version, arm, date and a hash.
+    """Save a calibration as LeRobot's JSON, and beside it `NAME.meta.json`: version, arm, date, place of 0 rad, hash.
 
     Two files, since LeRobot's loader refuses keys that it does not know.
 
@@ -182,22 +230,18 @@ def save_calibration(
         "version": calibration.version,
         "robot": calibration.robot,
         "date": calibration.date,
+        "zero_at": calibration.zero_at,
         "sha256": calibration.fingerprint(),
     }
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        # The numbers come first: without its companion the file is LeRobot's own, and is taken as such.
-        _meta_path(path).unlink(missing_ok=True)
         numbers = calibration.numbers()
-        _write(path, {str(joint["id"]): joint for joint in numbers.values()} if by_id else numbers)
-        _write(_meta_path(path), meta)
+        by_key = {str(joint["id"]): joint for joint in numbers.values()} if by_id else numbers
+        # The companion comes first: numbers without it would be taken for LeRobot's, with 0 rad elsewhere.
+        _write_all({_meta_path(path): meta, path: by_key})
     except OSError as error:
         raise CalibrationError(f"{path}: cannot be written: {error.strerror}") from None
     return path
-
-
-_NAMES = tuple(field.name for field in attrs.fields(JointCalibration))
-_KEYS = ", ".join(_NAMES)
 
 
 def _document(path: Path) -> tuple[str, Any]:
@@ -233,9 +277,9 @@ def _line(text: str, *keys: str) -> int:
 def _joint(numbers: Any) -> JointCalibration:
     if not isinstance(numbers, dict):
         raise ValueError(f"must be an object with {_KEYS}, not {numbers!r}")
-    if unknown := [key for key in numbers if key not in _NAMES]:
+    if unknown := [key for key in numbers if key not in _NUMBERS]:
         raise ValueError(f"{unknown[0]}: unknown key; known: {_KEYS}")
-    if missing := [key for key in _NAMES if key not in numbers]:
+    if missing := [key for key in _NUMBERS if key not in numbers]:
         raise ValueError(f"{missing[0]}: is missing")
     return JointCalibration(**numbers)
 
@@ -260,24 +304,43 @@ def _with_meta(calibration: Calibration, path: Path) -> Calibration:
     if not companion.exists():
         return calibration
     _, meta = _document(companion)
-    if not isinstance(meta, dict) or meta.get("version") != VERSION:
+    if not isinstance(meta, dict) or meta.get("version") not in (1, VERSION):
         found = meta.get("version") if isinstance(meta, dict) else meta
-        raise CalibrationError(f"{companion}: version: must be {VERSION}, not {found!r}")
+        raise CalibrationError(f"{companion}: version: must be 1 or {VERSION}, not {found!r}")
+    zero_at = POSE if meta["version"] == 1 else str(meta.get("zero_at"))
+    if zero_at not in ZERO_AT:
+        raise CalibrationError(f"{companion}: zero_at: must be one of {', '.join(ZERO_AT)}, not {zero_at!r}")
     if meta.get("sha256") != calibration.fingerprint():
         changed = datetime.fromtimestamp(path.stat().st_mtime, UTC).isoformat(timespec="seconds")
         raise CalibrationError(
             f"{path}: the numbers, changed {changed}, are not those calibrated {meta.get('date')} that "
-            f"{companion.name} tells of: calibrate again, or if they are right, delete {companion.name}"
+            f"{companion.name} tells of: calibrate again, or if they are right, take them with "
+            f"`ibrobot feetech import {path} --zero-at {zero_at} --yes`"
         )
-    return attrs.evolve(calibration, robot=str(meta.get("robot", "")), date=str(meta.get("date", "")))
+    return attrs.evolve(
+        calibration.with_zero_at(zero_at), robot=str(meta.get("robot", "")), date=str(meta.get("date", ""))
+    )
 
 
 def _meta_path(path: Path) -> Path:
     return path.with_suffix(".meta.json")
 
 
-def _write(path: Path, document: Mapping[str, Any]) -> None:
-    """All of the file or none of it."""
+def _write_all(documents: Mapping[Path, Mapping[str, Any]]) -> None:
+    """Replace files in their order, once all of them are on the disk."""
+    prepared: dict[Path, Path] = {}
+    try:
+        for path, document in documents.items():
+            prepared[path] = _prepare(path, document)
+        for path, temporary in prepared.items():
+            temporary.replace(path)
+    finally:
+        for temporary in prepared.values():
+            temporary.unlink(missing_ok=True)
+
+
+def _prepare(path: Path, document: Mapping[str, Any]) -> Path:
+    """A file beside `path` with its new content."""
     descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
         with os.fdopen(descriptor, "w") as file:
@@ -286,7 +349,7 @@ def _write(path: Path, document: Mapping[str, Any]) -> None:
             file.flush()
             os.fsync(file.fileno())
         Path(name).chmod(0o644)
-        Path(name).replace(path)
     except BaseException:
         Path(name).unlink()
         raise
+    return Path(name)

@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ibrobot_core.calibration import (
+    ZERO_AT,
     Calibration,
     JointCalibration,
     calibration_path,
@@ -20,7 +21,7 @@ from ibrobot_core.calibration import (
     save_calibration,
 )
 from ibrobot_core.errors import CalibrationError
-from ibrobot_core.units import ticks_to_radians
+from ibrobot_core.units import ticks_to_lerobot, ticks_to_radians
 
 GOOD: dict[str, Any] = {"id": 1, "drive_mode": 0, "homing_offset": -12, "range_min": 700, "range_max": 3400}
 
@@ -29,10 +30,12 @@ GOOD: dict[str, Any] = {"id": 1, "drive_mode": 0, "homing_offset": -12, "range_m
 def calibrations(draw: st.DrawFn) -> Calibration:
     names = draw(st.lists(st.sampled_from(["pan", "lift", "elbow", "wrist", "gripper"]), min_size=1, unique=True))
     joints = {}
+    zero_at = draw(st.sampled_from(sorted(ZERO_AT)))
     for number, name in enumerate(names, 1):
         low = draw(st.integers(0, 4094))
         high = draw(st.integers(low + 1, 4095))
-        joints[name] = JointCalibration(number, draw(st.integers(0, 1)), draw(st.integers(-2047, 2047)), low, high)
+        drive_mode, offset = draw(st.integers(0, 1)), draw(st.integers(-2047, 2047))
+        joints[name] = JointCalibration(number, drive_mode, offset, low, high, zero_at)
     return Calibration(joints, robot="left", date="2026-01-02T03:04:05+00:00")
 
 
@@ -129,6 +132,24 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.
     assert not list(tmp_path.glob(".*"))
 
 
+def test_a_second_file_that_cannot_be_written_leaves_both_old_ones(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = Calibration({"pan": JointCalibration(**GOOD)})
+    path = save_calibration(made, tmp_path / "arm.json")
+    left = iter([None, OSError(28, "No space left on device")])
+
+    def full(descriptor: int) -> None:
+        if (error := next(left)) is not None:
+            raise error
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(CalibrationError, match="No space left on device"):
+        save_calibration(made.with_zero_at("range"), path, overwrite=True)
+    assert load_calibration(path).zero_at == "pose"
+    assert not list(tmp_path.glob(".*"))
+
+
 def test_a_missing_file_says_how_to_make_one(tmp_path: Path) -> None:
     with pytest.raises(CalibrationError, match=r"no such calibration; `ibrobot feetech calibrate` makes one"):
         load_calibration(tmp_path / "arm.json")
@@ -144,10 +165,52 @@ def test_numbers_changed_behind_the_companions_back_are_refused(tmp_path: Path) 
     made = Calibration({"pan": JointCalibration(**GOOD)}, date="2026-01-02")
     path = save_calibration(made, tmp_path / "arm.json")
     path.write_text(json.dumps({"pan": {**GOOD, "range_min": 701}}))
-    with pytest.raises(
-        CalibrationError, match=r"changed 20.*, are not those calibrated 2026-01-02 .* delete arm\.meta\.json"
-    ):
+    remedy = r"`ibrobot feetech import .*arm\.json --zero-at pose --yes`"
+    with pytest.raises(CalibrationError, match=f"changed 20.*, are not those calibrated 2026-01-02 .* {remedy}"):
         load_calibration(path)
+    assert load_calibration(path, zero_at="range").joints["pan"].range_min == 701, "the numbers alone"
+
+
+@given(calibrations(), st.integers(0, 4095))
+def test_angles_of_lerobots_file_are_lerobots_degrees(
+    tmp_path_factory: pytest.TempPathFactory, made: Calibration, ticks: int
+) -> None:
+    path = tmp_path_factory.mktemp("c") / "arm.json"
+    path.write_text(json.dumps(made.numbers()))
+    loaded = load_calibration(path)
+    assert loaded.zero_at == "range"
+    for joint in loaded.joints.values():
+        ends = {"range_min": joint.range_min, "range_max": joint.range_max}
+        # LeRobot divides a turn by 4095, not 4096, and does not turn inverted joints round.
+        degrees = ticks_to_lerobot(float(ticks), "degrees", **ends) * 4095 / 4096
+        angle = ticks_to_radians(float(ticks), zero=joint.zero(), inverted=joint.inverted)
+        assert math.degrees(angle) == pytest.approx(-degrees if joint.inverted else degrees, abs=1e-9)
+
+
+def test_ib_robots_file_has_zero_at_the_pose(tmp_path: Path) -> None:
+    (tmp_path / "arm.json").write_text(json.dumps({"1": GOOD}))
+    assert load_calibration(tmp_path / "arm.json", ["pan"]).joints["pan"].zero() == 2048
+
+
+def test_a_companion_that_does_not_say_it_means_the_pose(tmp_path: Path) -> None:
+    made = Calibration({"pan": JointCalibration(**GOOD)})
+    path = save_calibration(made, tmp_path / "arm.json")
+    companion = tmp_path / "arm.meta.json"
+    meta = json.loads(companion.read_text())
+    assert (meta["version"], meta.pop("zero_at")) == (2, "pose")
+    companion.write_text(json.dumps({**meta, "version": 1}))
+    assert load_calibration(path).zero_at == "pose"
+    companion.write_text(json.dumps(meta))
+    with pytest.raises(CalibrationError, match=r"arm\.meta\.json: zero_at: must be one of pose, range, not 'None'"):
+        load_calibration(path)
+
+
+def test_all_joints_have_zero_at_the_same_place() -> None:
+    pan = JointCalibration(**GOOD)
+    with pytest.raises(ValueError, match="zero_at: must be the same for all joints, not pose and range"):
+        Calibration({"pan": pan, "lift": attrs.evolve(pan, id=2, zero_at="range")})
+    with pytest.raises(ValueError, match="zero_at: must be one of pose, range, not 'home'"):
+        attrs.evolve(pan, zero_at="home")
 
 
 @pytest.mark.parametrize("drive_mode", [0, 1])

@@ -174,12 +174,12 @@ def _contract(config: str | None) -> dict[str, Any]:
     return {"contract": Contract.from_config(robot), "document": json.loads(json.dumps(robot.document, default=str))}
 
 
-def _calibration(name: str | None) -> Mapping[str, Mapping[str, int]] | None:
+def _calibration(name: str | None) -> Mapping[str, Mapping[str, Any]] | None:
     if name is None:
         return None
     from ibrobot_core.calibration import load_calibration
 
-    return load_calibration(name).numbers()
+    return load_calibration(name).snapshot()
 
 
 @contextmanager

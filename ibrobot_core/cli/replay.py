@@ -79,7 +79,7 @@ def replay(
     """
     changes, sim = overrides_of(options), options["sim"]
     robot = _named(config, changes, sim=sim) if config is not None else None
-    numbers = load_calibration(calibration).numbers() if calibration is not None else None
+    numbers = load_calibration(calibration).snapshot() if calibration is not None else None
     reader = installed().open_episode(episode, told_by(robot, norm_mode, numbers) if robot is not None else None)
     try:
         summary = reader.summary()

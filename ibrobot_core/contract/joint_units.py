@@ -43,7 +43,8 @@ class JointUnits:
     Args:
         norm_mode: one of `units.NORM_MODES`.
         contract: which elements are joints' positions.
-        calibration: joint -> LeRobot's numbers.
+        calibration: joint -> fields of `JointCalibration`. Numbers of LeRobot alone have 0 rad at the pose, as
+            recordings had that do not say where it is.
         document: the robot YAML as plain values: which joints are anchored, and their lower limits.
 
     Raises:
@@ -54,7 +55,7 @@ class JointUnits:
         self,
         norm_mode: str,
         contract: Contract,
-        calibration: Mapping[str, Mapping[str, int]],
+        calibration: Mapping[str, Mapping[str, Any]],
         document: Mapping[str, Any],
     ) -> None:
         self._elements: dict[str, list[_Elements]] = {}
@@ -87,15 +88,15 @@ class JointUnits:
         return vector.astype(value.dtype)
 
 
-def calibrations(config: RobotConfig) -> dict[str, dict[str, dict[str, int]]]:
-    """The calibrations of the hardware in use, by its name; nothing for a simulation.
+def calibrations(config: RobotConfig) -> dict[str, dict[str, dict[str, Any]]]:
+    """The calibrations of the hardware in use, by its name, as recordings keep them; nothing for a simulation.
 
     Raises:
         CalibrationError: when one cannot be read.
     """
     options = {name: component.options for name, component in config.hardware.items()}
     names = {name: getattr(each, "calibration", None) for name, each in options.items()}
-    return {name: load_calibration(found).numbers() for name, found in names.items() if found is not None}
+    return {name: load_calibration(found).snapshot() for name, found in names.items() if found is not None}
 
 
 def _position_joints(contract: Contract) -> dict[str, dict[int, str]]:
@@ -113,7 +114,7 @@ def _position_joints(contract: Contract) -> dict[str, dict[int, str]]:
 
 
 def _elements(
-    mode: str, named: Mapping[int, str], calibration: Mapping[str, Mapping[str, int]], closed: Mapping[str, float]
+    mode: str, named: Mapping[int, str], calibration: Mapping[str, Mapping[str, Any]], closed: Mapping[str, float]
 ) -> _Elements:
     for joint in named.values():
         if joint not in calibration:

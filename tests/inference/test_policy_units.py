@@ -8,8 +8,11 @@ from typing import Any, override
 import attrs
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from ibrobot_core.calibration import ZERO_AT, Calibration, JointCalibration
 from ibrobot_core.config.schema import Align
 from ibrobot_core.contract.joint_units import JointUnits
 from ibrobot_core.contract.specs import ActionPart, Contract, ObservationPart
@@ -19,7 +22,7 @@ from ibrobot_core.interfaces import Feature, Frame, Policy, PolicySpec, Tensors
 from ibrobot_core.testing import PolicySuite
 from ibrobot_core.testing.contexts import host_context
 from ibrobot_core.testing.fakes import FakePolicy
-from ibrobot_core.units import radians_to_lerobot
+from ibrobot_core.units import radians_to_lerobot, ticks_to_lerobot, ticks_to_radians
 
 JOINTS = host_context().robot.joint_names
 CALIBRATION = {
@@ -39,7 +42,7 @@ CONTRACT = Contract(
 )  # fmt: skip
 
 
-def units(norm_mode: str, calibration: Mapping[str, Mapping[str, int]] = CALIBRATION) -> JointUnits:
+def units(norm_mode: str, calibration: Mapping[str, Mapping[str, Any]] = CALIBRATION) -> JointUnits:
     return JointUnits(norm_mode, CONTRACT, calibration, DOCUMENT)
 
 
@@ -98,6 +101,26 @@ def test_radians_are_passed_through() -> None:
     values = {"action": np.ones((1, len(JOINTS)))}
     assert units("radians")(values)["action"] is values["action"]
     assert units("radians").radians("action", values["action"]) is values["action"]
+
+
+@given(
+    st.tuples(st.integers(0, 1000), st.integers(3000, 4095), st.integers(0, 1), st.sampled_from(sorted(ZERO_AT))),
+    st.integers(0, 4095),
+)
+def test_what_a_dataset_gets_is_lerobots_value_of_the_tick_wherever_0_rad_is(
+    numbers: tuple[int, int, int, str], ticks: int
+) -> None:
+    low, high, drive_mode, zero_at = numbers
+    arm = Calibration(
+        {joint: JointCalibration(i, drive_mode, 0, low, high, zero_at) for i, joint in enumerate(JOINTS, 1)}
+    )
+    pan = arm.joints[JOINTS[0]]
+    measured = ticks_to_radians(np.full(len(JOINTS), float(ticks)), zero=pan.zero(), inverted=pan.inverted)
+    for mode in ("degrees", "range_m100_100"):
+        # The state in float64, as the recorded calibration says: the same for either place of 0 rad.
+        (value, *_) = units(mode, arm.snapshot())({"action": measured})["action"]
+        wanted = ticks_to_lerobot(float(ticks), mode, range_min=low, range_max=high, inverted=bool(drive_mode))
+        assert value == pytest.approx(wanted, abs=1e-9)
 
 
 def test_no_unit_without_a_calibration() -> None:

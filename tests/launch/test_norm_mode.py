@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 
+from ibrobot_core.calibration import Calibration, JointCalibration, save_calibration
 from ibrobot_core.errors import ComponentFailed
 from ibrobot_core.interfaces import Frame
 from ibrobot_core.units import radians_to_lerobot
@@ -21,12 +21,8 @@ RANGE = {"range_min": 1000, "range_max": 3000}
 
 @pytest.fixture
 def calibration(tmp_path: Path) -> str:
-    numbers = {
-        joint: {"id": i + 1, "drive_mode": 0, "homing_offset": 0, **RANGE} for i, joint in enumerate(("pan", "grip"))
-    }
-    path = tmp_path / "arm.json"
-    path.write_text(json.dumps(numbers))
-    return str(path)
+    joints = {joint: JointCalibration(i, 0, 0, **RANGE) for i, joint in enumerate(("pan", "grip"), 1)}
+    return str(save_calibration(Calibration(joints), tmp_path / "arm.json"))
 
 
 def degrees(positions: Any) -> list[float]:

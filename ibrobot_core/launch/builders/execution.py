@@ -116,7 +116,7 @@ class Model(Component):
 
     def _units(self) -> JointUnits:
         config, name = self._session.config, self._model.calibration
-        each = {"model": load_calibration(name).numbers()} if name is not None else calibrations(config)
+        each = {"model": load_calibration(name).snapshot()} if name is not None else calibrations(config)
         joined = {joint: numbers for joints in each.values() for joint, numbers in joints.items()}
         return JointUnits(self._model.norm_mode, self.contract, joined, config.document)
 

@@ -56,7 +56,7 @@ class Unit:
     features: Mapping[str, Feature]
     contract: Mapping[str, Any]
     robot_type: str
-    calibration: Mapping[str, Mapping[str, int]]
+    calibration: Mapping[str, Mapping[str, Any]]
     document: Mapping[str, Any]
     """The robot YAML as plain values; empty where it is not known."""
     recorded: Mapping[str, str]
@@ -233,7 +233,7 @@ def _recorded(summary: EpisodeSummary, name: str) -> Mapping[str, Any]:
     return document if isinstance(document, dict) else {}
 
 
-def _joined(calibrations: Mapping[str, Any]) -> dict[str, dict[str, int]]:
+def _joined(calibrations: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """The calibrations of all hardware as one."""
     joined = {joint: numbers for each in calibrations.values() for joint, numbers in each.items()}
     for joint, numbers in joined.items():

@@ -59,14 +59,14 @@ def _file(kept: dict[str, Any], document: Mapping[str, Any]) -> str:
 
 
 def told_by(
-    config: RobotConfig, norm_mode: str | None = None, calibration: Mapping[str, Mapping[str, int]] | None = None
+    config: RobotConfig, norm_mode: str | None = None, calibration: Mapping[str, Mapping[str, Any]] | None = None
 ) -> dict[str, str]:
     """What a robot YAML tells of a dataset that keeps nothing itself; see `EpisodeAddress.told`.
 
     Args:
         config: the robot YAML.
         norm_mode: the unit of the dataset's joint positions.
-        calibration: joint -> LeRobot's numbers, for a unit that needs them.
+        calibration: joint -> fields of `JointCalibration`, for a unit that needs them.
     """
     document = json.loads(json.dumps(config.document, default=str))
     told = _described(Contract.from_config(config), document, {"told": calibration} if calibration else {})
@@ -82,8 +82,8 @@ class Origin:
     contract: Contract
     document: Mapping[str, Any]
     """The robot YAML as plain values; empty where it is not known."""
-    calibration: Mapping[str, Mapping[str, int]]
-    """Joint -> LeRobot's numbers; empty where it is not known."""
+    calibration: Mapping[str, Mapping[str, Any]]
+    """Joint -> fields of `JointCalibration`; empty where it is not known."""
     norm_mode: str
     """The unit of the dataset's joint positions."""
     outcome: str = "unknown"

@@ -32,8 +32,8 @@ class Request:
     """The robot YAML that `contract` is of, as plain values."""
     force_contract: bool = False
     """Whether `contract` may differ from the recorded ones."""
-    calibration: Mapping[str, Mapping[str, int]] | None = None
-    """Joint -> LeRobot's numbers, in place of the recorded ones."""
+    calibration: Mapping[str, Mapping[str, Any]] | None = None
+    """Joint -> fields of `JointCalibration`, in place of the recorded ones."""
     norm_mode: str = option("radians", choices=NORM_MODES)
     missing: str = option("refuse", choices=MISSING)
     """What a tick is worth at which something is missing: the episode is refused, the tick left out, or the last
