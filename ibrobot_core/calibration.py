@@ -115,6 +115,8 @@ class Calibration:
     """Which arm it is."""
     date: str = ""
     """When it was made: ISO 8601, UTC."""
+    adapter: str = ""
+    """USB serial number of the adapter that it was calibrated at; empty where that has none."""
     version: int = VERSION
     """Of the layout of the file beside the numbers."""
     path: Path | None = None
@@ -210,7 +212,7 @@ def load_calibration(
 def save_calibration(
     calibration: Calibration, name: str | Path, *, overwrite: bool = False, by_id: bool = False
 ) -> Path:
-    """Save a calibration as LeRobot's JSON, and beside it `NAME.meta.json`: version, arm, date, place of 0 rad, hash.
+    """Save a calibration as LeRobot's JSON, and beside it `NAME.meta.json`: arm, date, adapter, place of 0 rad, hash.
 
     Two files, since LeRobot's loader refuses keys that it does not know.
 
@@ -231,6 +233,7 @@ def save_calibration(
         "robot": calibration.robot,
         "date": calibration.date,
         "zero_at": calibration.zero_at,
+        "adapter": calibration.adapter,
         "sha256": calibration.fingerprint(),
     }
     try:
@@ -317,9 +320,8 @@ def _with_meta(calibration: Calibration, path: Path) -> Calibration:
             f"{companion.name} tells of: calibrate again, or if they are right, take them with "
             f"`ibrobot feetech import {path} --zero-at {zero_at} --yes`"
         )
-    return attrs.evolve(
-        calibration.with_zero_at(zero_at), robot=str(meta.get("robot", "")), date=str(meta.get("date", ""))
-    )
+    told = {name: str(meta.get(name, "")) for name in ("robot", "date", "adapter")}
+    return attrs.evolve(calibration.with_zero_at(zero_at), **told)
 
 
 def _meta_path(path: Path) -> Path:

@@ -48,7 +48,7 @@ def test_lerobot_takes_a_calibration_made_in_the_dialogue(tmp_path: Path) -> Non
         with path.open() as file, draccus.config_type("json"):
             loaded = draccus.load(dict[str, MotorCalibration], file)
         assert list(loaded) == list(JOINTS)
-        assert loaded["elbow_flex"] == MotorCalibration(3, 0, 1500 - 2047, 947, 3147)
+        assert loaded["elbow_flex"] == MotorCalibration(3, 0, 1500 - 2048, 948, 3148)
         motors = {name: Motor(i, "sts3215", MotorNormMode.RANGE_M100_100) for i, name in enumerate(JOINTS, 1)}
         bus = FeetechMotorsBus(emulator.port, motors, loaded)
         bus.connect()
@@ -57,6 +57,6 @@ def test_lerobot_takes_a_calibration_made_in_the_dialogue(tmp_path: Path) -> Non
             assert bus.is_calibrated
             for number, servo in emulator.servos.items():
                 servo.turn(middles[number])
-            assert bus.sync_read("Present_Position", normalize=False) == dict.fromkeys(JOINTS, 2047)
+            assert bus.sync_read("Present_Position", normalize=False) == dict.fromkeys(JOINTS, 2048)
         finally:
             bus.disconnect(disable_torque=False)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import attrs
 import draccus
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from lerobot.motors import Motor, MotorCalibration, MotorNormMode
 from lerobot.motors.feetech import FeetechMotorsBus
 
 from ibrobot_core.calibration import Calibration, JointCalibration, load_calibration, save_calibration
-from ibrobot_core.units import LEROBOT_MODES, lerobot_to_ticks, ticks_to_lerobot
+from ibrobot_core.units import LEROBOT_MODES, lerobot_to_ticks, ticks_to_lerobot, ticks_to_radians
 
 pytestmark = pytest.mark.lerobot
 
@@ -71,4 +72,18 @@ def test_we_load_what_lerobot_saves(tmp_path_factory: pytest.TempPathFactory, jo
     path: Path = tmp_path_factory.mktemp("c") / "arm.json"
     with path.open("w") as file, draccus.config_type("json"):
         draccus.dump(bus_of("degrees", joint).calibration, file, indent=4)
-    assert load_calibration(path).joints == {"pan": joint}
+    assert load_calibration(path).joints == {"pan": attrs.evolve(joint, zero_at="range")}
+
+
+@given(joints, st.integers(0, 4095))
+def test_angles_of_lerobots_file_are_its_degrees(
+    tmp_path_factory: pytest.TempPathFactory, joint: JointCalibration, ticks: int
+) -> None:
+    path: Path = tmp_path_factory.mktemp("c") / "arm.json"
+    with path.open("w") as file, draccus.config_type("json"):
+        draccus.dump(bus_of("degrees", joint).calibration, file, indent=4)
+    loaded = load_calibration(path).joints["pan"]
+    # LeRobot divides a turn by 4095, not 4096, and does not turn inverted joints round.
+    degrees = bus_of("degrees", joint)._normalize({joint.id: ticks})[joint.id] * 4095 / 4096
+    angle = ticks_to_radians(float(ticks), zero=loaded.zero(), inverted=loaded.inverted)
+    assert np.degrees(angle) == pytest.approx(-degrees if joint.inverted else degrees, abs=1e-9)

@@ -16,6 +16,7 @@ from ibrobot_core.units import radians_to_ticks, ticks_to_radians
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.errors import FeetechError, NoReply
 from ibrobot_feetech.registers import MODEL_STS3215
+from ibrobot_feetech.supply import check_supply
 
 _LAST_TICK = 4095
 _ANGLE_BEYOND_A_TURN = 0x10
@@ -102,7 +103,7 @@ def find_servos(bus: FeetechBus, arm: Arm) -> None:
 
     Raises:
         FeetechError: names all servos that are missing, or the one that is another model.
-        HardwareError: for firmwares that differ.
+        HardwareError: for firmwares that differ, and a supply that a servo is not made for.
     """
     missing, firmware = [], {}
     for servo in arm.servos:
@@ -117,6 +118,7 @@ def find_servos(bus: FeetechBus, arm: Arm) -> None:
             raise HardwareError(f"{bus.place(servo, 'model_number')}: {found}; check that it is the right arm")
         major, minor = (bus.read_faulty(servo, f"firmware_{part}") for part in ("major", "minor"))
         firmware[servo] = f"{major}.{minor}"
+        check_supply(bus, servo)
     if len(missing) > 1:
         names = ", ".join(f"{servo} ({arm.names[servo]})" for servo in missing)
         raise NoReply(bus.place(), f"no reply from servos {names}")

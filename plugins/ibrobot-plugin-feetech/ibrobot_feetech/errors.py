@@ -49,6 +49,18 @@ class PortError(FeetechError):
     check = "check the USB cable; `ibrobot feetech find-port` lists the ports that are there"
 
 
+class PortForbidden(PortError):
+    """A port that this user may not open."""
+
+    check = "add yourself to the group that owns it, e.g. `sudo usermod -aG dialout $USER`, and log in again"
+
+
+class PortHeld(PortError):
+    """A port that another program has open."""
+
+    check = "end that program (another `ibrobot`, LeRobot, a serial monitor); `fuser -v PORT` names it"
+
+
 class NoReply(FeetechError):
     """A servo that did not answer in time, after all retries."""
 

@@ -21,6 +21,7 @@ from ibrobot_feetech.errors import FeetechError, NoReply, Place, PortError, Serv
 from ibrobot_feetech.options import FollowerOptions
 from ibrobot_feetech.protocol import faults
 from ibrobot_feetech.sync import Replies, SyncReader, SyncWriter
+from ibrobot_feetech.usb import check_adapter
 
 _RADIANS_PER_TICK = 2 * np.pi / 4096
 _SLACK_TICKS = 16
@@ -87,6 +88,7 @@ class FeetechFollower(Hardware):
         bus.open()
         bus.return_delay_s = RETURN_DELAY_S
         try:
+            check_adapter(arm.calibration, self._options.port)
             servos.find_servos(bus, arm)
             self._check_calibration()
             for servo in arm.servos:
@@ -148,6 +150,7 @@ class FeetechFollower(Hardware):
         if isinstance(fault, PortError) or not bus.is_open:
             bus.close()
             bus.open()
+            check_adapter(arm.calibration, self._options.port)
         bus.return_delay_s = RETURN_DELAY_S
         bus.resynchronise()
         servos.find_servos(bus, arm)

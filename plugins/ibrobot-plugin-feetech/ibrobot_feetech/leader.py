@@ -19,6 +19,7 @@ from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.errors import FeetechError
 from ibrobot_feetech.options import LeaderOptions
 from ibrobot_feetech.sync import SyncReader
+from ibrobot_feetech.usb import check_adapter
 
 _LONGEST_STEP_S = 0.1
 """What a ramp makes up for at most, after a host that stood still [s]."""
@@ -92,6 +93,7 @@ class LeaderTeleop(Teleop):
         bus = FeetechBus(self._options.port, baud_rate=self._options.baud_rate, joints=self._arm.names)
         try:
             bus.open()
+            check_adapter(self._arm.calibration, self._options.port)
             self._prepare(bus)
         except HardwareError as error:
             bus.close()

@@ -12,7 +12,7 @@ from contextlib import suppress
 
 import serial
 
-from ibrobot_feetech.errors import Place, PortError
+from ibrobot_feetech.errors import Place, PortError, PortForbidden, PortHeld
 
 _GONE = (errno.EIO, errno.ENODEV, errno.ENXIO, errno.EBADF)
 _VMIN = 6
@@ -57,7 +57,7 @@ class SerialPort:
         try:
             self._serial = serial.Serial(self.path, self.baud_rate, timeout=0, write_timeout=None, exclusive=True)
         except (OSError, ValueError, termios.error) as error:
-            raise PortError(Place(self.path), _why_closed(error)) from None
+            raise _why_closed(Place(self.path), error) from None
         # Drivers without such a flag are fast already, or cannot be made so.
         with suppress(OSError, ValueError, NotImplementedError, AttributeError):
             self._serial.set_low_latency_mode(True)
@@ -180,14 +180,12 @@ class SerialPort:
         return PortError(Place(self.path), getattr(error, "strerror", None) or str(error))
 
 
-def _why_closed(error: Exception) -> str:
+def _why_closed(place: Place, error: Exception) -> PortError:
     number = getattr(error, "errno", None)
     if number == errno.ENOENT:
-        return "there is no such port"
+        return PortError(place, "there is no such port")
     if number in (errno.EACCES, errno.EPERM):
-        return (
-            "no permission: add yourself to the group that owns it, e.g. `sudo usermod -aG dialout $USER`, log in anew"
-        )
+        return PortForbidden(place, "no permission")
     if number in (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK) or "exclusively lock" in str(error):
-        return "another program holds the port"
-    return f"cannot be opened: {getattr(error, 'strerror', None) or error}"
+        return PortHeld(place, "another program holds the port")
+    return PortError(place, f"cannot be opened: {getattr(error, 'strerror', None) or error}")

@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
+from ibrobot_feetech.commands import feetech
 from ibrobot_feetech.emulator import EmulatedServo, Emulator
 
 from ibrobot_core.calibration import load_calibration
@@ -17,7 +19,7 @@ JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_ro
 MIDDLES = {1: 2500, 2: 300, 3: 2048, 4: 3900, 5: 1000, 6: 100}
 """Servo -> where its encoder is in the middle pose."""
 ENDS = {1: (797, 3297), 2: (900, 3190), 3: (950, 3150), 4: (970, 3120), 6: (1400, 2700)}
-"""Servo -> what it reports at its joint's ends, once the middle is at 2047."""
+"""Servo -> what it reports at its joint's ends, once the middle is at 2048."""
 
 
 PATIENCE = """
@@ -53,7 +55,7 @@ class Person:
             [
                 {servo: start + (stop - start) * step // 8 for servo, (start, stop) in legs.items()}
                 for legs in (
-                    {servo: (2047, low) for servo, (low, _) in ends.items()},
+                    {servo: (2048, low) for servo, (low, _) in ends.items()},
                     dict(ends),
                 )
                 for step in range(9)
@@ -71,7 +73,7 @@ class Person:
         pose = next(self._path, None)
         if pose is not None:
             for servo, reported in pose.items():
-                self.emulator.servos[servo].turn((reported + MIDDLES[servo] - 2047) % 4096)
+                self.emulator.servos[servo].turn((reported + MIDDLES[servo] - 2048) % 4096)
         elif self._left > 0:
             self._left -= 1
             if self._left == 0:
@@ -119,13 +121,14 @@ def test_an_arm_is_calibrated_in_the_dialogue_and_the_former_file_is_kept(emulat
         terminal.wait_for("to both ends (Enter ends it)")
         person.sweep(ENDS)
         terminal.type("\r")
+        terminal.wait_for("0 rad is the pose that was set by hand")
         terminal.wait_for("written to servos 1, 2, 3, 4, 5, 6")
         assert terminal.end() == 0
     found = load_calibration("so101_follower", JOINTS)
     assert found.robot == "left"
     assert found.date
     for joint in found.joints.values():
-        assert joint.homing_offset == MIDDLES[joint.id] - 2047
+        assert joint.homing_offset == MIDDLES[joint.id] - 2048
         assert (joint.range_min, joint.range_max) == ENDS.get(joint.id, (0, 4095))
         servo = emulator.servos[joint.id]
         written = [servo.get(name) for name in ("homing_offset", "min_position_limit", "max_position_limit")]
@@ -133,7 +136,9 @@ def test_an_arm_is_calibrated_in_the_dialogue_and_the_former_file_is_kept(emulat
         assert servo.get("lock") == 1
     (kept,) = (path for path in home.glob("so101_follower.2*.json") if "meta" not in path.name)
     assert kept.read_text() == before
-    assert "are as the calibration says" in ran("check", emulator.port)[1]
+    _, screen = ran("check", emulator.port)
+    assert "are as the calibration says" in screen
+    assert "0 rad is the pose that was set by hand" in screen
 
 
 QUESTIONS = ("Calibrate anew?", "Go on?", "Then press Enter", "(Enter ends it)")
@@ -175,7 +180,7 @@ def test_an_existing_file_is_not_overwritten_against_the_answer(emulator, home):
 @pytest.mark.parametrize(
     ("ends", "told"),
     [
-        (ENDS | {3: (2047, 4400)}, "elbow_flex: its range 2047 to 4400 crosses the encoder's end (0/4095)"),
+        (ENDS | {3: (2048, 4400)}, "elbow_flex: its range 2048 to 4400 crosses the encoder's end (0/4095)"),
         ({servo: both for servo, both in ENDS.items() if servo != 4}, "wrist_flex: it moved by 0 ticks"),
         (ENDS | {2: (1747, 2347)}, "shoulder_lift: it moved by 53 deg, its limits are 200 deg apart"),
         (ENDS | {1: (1247, 3747)}, "shoulder_pan: the middle of its range is 39 deg off the middle pose"),
@@ -195,12 +200,12 @@ def test_ranges_that_cannot_be_true_are_explained_and_not_kept(emulator, person,
 
 
 def test_a_middle_that_no_offset_reaches_is_explained_and_asked_again(emulator, person, home):
-    emulator.servos[2].turn(4095)
+    emulator.servos[2].turn(0)
     with Terminal("feetech", "calibrate", emulator.port) as terminal:
         terminal.wait_for("Then press Enter")
         terminal.type("\r")
-        terminal.wait_for("which needs an offset of 2048")
-        person.turn(2, -1)
+        terminal.wait_for("which needs an offset of -2048")
+        person.turn(2, 1)
         terminal.wait_for("Then press Enter")
         terminal.type("\r")
         terminal.wait_for("(Enter ends it)")
@@ -208,7 +213,15 @@ def test_a_middle_that_no_offset_reaches_is_explained_and_asked_again(emulator, 
 
 def test_signs_are_learnt_from_turning_each_joint(emulator, person, home):
     with Terminal(
-        "feetech", "calibrate", emulator.port, "--middle-now", "--range-seconds", "8", "--check-signs"
+        "feetech",
+        "calibrate",
+        emulator.port,
+        "--middle-now",
+        "--range-seconds",
+        "8",
+        "--check-signs",
+        "--zero-at",
+        "range",
     ) as terminal:
         terminal.wait_for("to both ends")
         person.sweep(ENDS)
@@ -219,6 +232,7 @@ def test_signs_are_learnt_from_turning_each_joint(emulator, person, home):
         terminal.wait_for("written to servos")
         assert terminal.end() == 0
     found = load_calibration("so101_follower", JOINTS).joints
+    assert {joint.zero_at for joint in found.values()} == {"range"}
     assert [name for name, joint in found.items() if joint.inverted] == ["elbow_flex"]
 
 
@@ -254,6 +268,29 @@ def test_a_servo_that_dies_while_being_written_leaves_a_state_that_check_repairs
     for joint in load_calibration("so101_follower", JOINTS).joints.values():
         assert emulator.servos[joint.id].get("homing_offset") == joint.homing_offset
         assert emulator.servos[joint.id].get("lock") == 1
+
+
+def test_an_arm_of_lerobot_is_imported_with_its_0_or_with_the_pose(home, tmp_path):
+    file = tmp_path / "theirs.json"
+    numbers = {
+        joint: {"id": i, "drive_mode": 0, "homing_offset": 0, "range_min": 1000, "range_max": 3000 + 20 * i}
+        for i, joint in enumerate(JOINTS, 1)
+    }
+    file.write_text(json.dumps(numbers))
+    run = CliRunner().invoke
+    taken = run(feetech, ["import", str(file), "--name", "theirs"])
+    assert taken.exit_code == 0, taken.output
+    assert "0 rad is the middle of each joint's calibrated range, as in LeRobot" in taken.output
+    assert "the pose that was set by hand is up to 3.3 deg from it (shoulder_pan)" in taken.output
+    assert load_calibration("theirs").joints["gripper"].zero() == 2060
+    again = run(feetech, ["import", str(file), "--name", "theirs", "--zero-at", "pose"])
+    assert again.exit_code != 0, "it asks before it overwrites"
+    again = run(feetech, ["import", str(file), "--name", "theirs", "--zero-at", "pose", "--yes", "--arm", "left"])
+    assert again.exit_code == 0, again.output
+    assert "the former one is kept" in again.output
+    found = load_calibration("theirs")
+    assert (found.zero_at, found.robot, found.joints["gripper"].zero()) == ("pose", "left", 2048)
+    assert found.numbers() == numbers
 
 
 def test_drift_is_reported_and_written_back(emulator, calibration_file):
@@ -357,7 +394,7 @@ def test_a_port_that_is_missing_forbidden_or_not_said_is_told(tmp_path):
     assert "there is no such port" in screen
     code, screen = ran("scan", "/dev/ttyACM9", before=FORBIDDEN)
     assert code == 1
-    assert "no permission: add yourself to the group" in screen.replace("\r\n", "")
+    assert "no permission; add yourself to the group" in screen.replace("\r\n", "")
 
 
 # Root may open anything: the refusal is made up.

@@ -8,6 +8,7 @@ from ibrobot_feetech.commands.calibrate import calibrate
 from ibrobot_feetech.commands.check import check
 from ibrobot_feetech.commands.emulate import emulate
 from ibrobot_feetech.commands.find_port import find_port
+from ibrobot_feetech.commands.import_ import import_calibration
 from ibrobot_feetech.commands.monitor import monitor
 from ibrobot_feetech.commands.scan import scan
 from ibrobot_feetech.commands.setup_motors import setup_motors
@@ -22,5 +23,5 @@ def feetech() -> None:
     """
 
 
-for command in (find_port, scan, setup_motors, calibrate, check, monitor, torque, emulate):
+for command in (find_port, scan, setup_motors, calibrate, import_calibration, check, monitor, torque, emulate):
     feetech.add_command(command)

@@ -8,14 +8,23 @@ from pathlib import Path
 
 import click
 
-from ibrobot_core.calibration import Calibration, JointCalibration, calibration_path, save_calibration
+from ibrobot_core.calibration import (
+    POSE,
+    ZERO_AT,
+    Calibration,
+    JointCalibration,
+    calibration_path,
+    save_calibration,
+)
 from ibrobot_core.errors import HardwareError, IbrobotError
 from ibrobot_feetech.arm import relax, write_eprom
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.commands.dialogue import agree
 from ibrobot_feetech.commands.joints import by_servo, joints_of
 from ibrobot_feetech.commands.measure import Answers, Measurement
-from ibrobot_feetech.commands.ports import adapter_serial_number, opened, port_argument
+from ibrobot_feetech.commands.ports import opened, port_argument
+from ibrobot_feetech.commands.zero import zero_text
+from ibrobot_feetech.usb import usb_port
 
 
 @click.command()
@@ -27,6 +36,13 @@ from ibrobot_feetech.commands.ports import adapter_serial_number, opened, port_a
 @click.option(
     "--full-turn", multiple=True, default=("wrist_roll",), show_default=True, help="Joint that turns all round."
 )
+@click.option(
+    "--zero-at",
+    type=click.Choice(list(ZERO_AT)),
+    default=POSE,
+    show_default=True,
+    help="0 rad: the middle pose, set by hand, or the middle of each range, as in LeRobot.",
+)
 @click.option("--check-signs", is_flag=True, help="Ask to turn each joint in its positive direction.")
 @click.option("--middle-now", is_flag=True, help="The arm stands in its middle pose: do not ask.")
 @click.option("--range-seconds", type=click.FloatRange(0.1), help="Watch the ranges for so long, not until Enter.")
@@ -34,7 +50,7 @@ from ibrobot_feetech.commands.ports import adapter_serial_number, opened, port_a
 @click.option("--yes", is_flag=True, help="Torque off, and overwrite, without asking; the former file is kept.")
 def calibrate(
     port: str | None, name: str | None, leader: bool, robot: str | None, arm: str | None, full_turn: tuple[str, ...],
-    check_signs: bool, middle_now: bool, range_seconds: float | None, accept_ranges: bool, yes: bool,
+    zero_at: str, check_signs: bool, middle_now: bool, range_seconds: float | None, accept_ranges: bool, yes: bool,
 ) -> None:  # fmt: skip
     """Calibrate an arm: its middle pose, then the range of each joint, moved by hand.
 
@@ -50,16 +66,21 @@ def calibrate(
     with opened(port, joints=by_servo(joints)) as bus:
         _prepare(bus, yes)
         try:
-            measurement = Measurement(bus, joints, full_turn=full_turn, compared=compared, answers=answers)
+            measurement = Measurement(
+                bus, joints, full_turn=full_turn, compared=compared, zero_at=zero_at, answers=answers
+            )
             found = measurement.run()
         except BaseException:
             click.echo("Nothing was written; the torque is off, and the servos are calibrated as before.", err=True)
             raise
-        which = arm or adapter_serial_number(bus.port.path) or Path(name).stem
+        usb = usb_port(bus.port.path)
+        adapter = usb.serial_number if usb is not None else ""
         date = datetime.now(UTC).isoformat(timespec="seconds")
         backup(path)
-        save_calibration(Calibration(found, robot=which, date=date), path, overwrite=True)
+        made = Calibration(found, robot=arm or adapter or Path(name).stem, date=date, adapter=adapter)
+        save_calibration(made, path, overwrite=True)
         click.echo(f"saved: {path}")
+        click.echo(zero_text(made))
         _write(bus, found, name)
     click.echo(f"written to servos {', '.join(str(joint.servo) for joint in joints)}")
 

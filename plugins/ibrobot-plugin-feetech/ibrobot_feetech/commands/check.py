@@ -14,9 +14,12 @@ from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.commands.dialogue import agree, show, table
 from ibrobot_feetech.commands.joints import joints_of
 from ibrobot_feetech.commands.ports import opened, port_argument
+from ibrobot_feetech.commands.zero import zero_text
 from ibrobot_feetech.errors import NoReply
 from ibrobot_feetech.options import FollowerOptions
 from ibrobot_feetech.registers import MODEL_STS3215
+from ibrobot_feetech.supply import supply
+from ibrobot_feetech.usb import check_adapter
 
 _TUNING = ("p_coefficient", "i_coefficient", "d_coefficient")
 
@@ -47,7 +50,9 @@ def check(port: str | None, name: str, robot: str | None, write: bool, yes: bool
     click.echo(
         f"{calibration.path}: arm {calibration.robot or 'unnamed'}, made {calibration.date or 'at an unknown time'}"
     )
+    click.echo(zero_text(calibration))
     with opened(port, joints={joint.id: each for each, joint in calibration.joints.items()}) as bus:
+        check_adapter(calibration, bus.port.path)
         found = list(differences(bus, calibration))
         if write and (wrong := [each for each in found if not each.remedy]):
             _print(found)
@@ -82,6 +87,10 @@ def differences(bus: FeetechBus, calibration: Calibration) -> Iterator[Differenc
             continue
         if model != MODEL_STS3215:
             yield Difference(joint, servo, "model_number", str(model), str(MODEL_STS3215), "is it the right arm?")
+        power = supply(bus, servo)
+        if not power.fits:
+            measured = f"{power.measured:.1f} V"
+            yield Difference(joint, servo, "present_voltage", measured, power.limits, power.remedy)
         versions[joint] = ".".join(str(bus.read_faulty(servo, f"firmware_{part}")) for part in ("major", "minor"))
         wanted = {
             "homing_offset": numbers.homing_offset,

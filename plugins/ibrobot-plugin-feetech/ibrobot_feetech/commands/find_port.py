@@ -6,7 +6,7 @@ import click
 
 from ibrobot_core.errors import HardwareError
 from ibrobot_feetech.commands.dialogue import wait_for_enter
-from ibrobot_feetech.commands.ports import UsbPort, usb_ports
+from ibrobot_feetech.usb import UsbPort, usb_ports
 
 
 @click.command()

@@ -43,6 +43,7 @@ class Measurement:
     Args:
         bus: an open bus.
         joints: the arm's.
+        zero_at: where they are at 0 rad, one of `calibration.ZERO_AT`.
         full_turn: joints that turn all round: their range is all of it.
         compared: joints whose range is compared with their limits.
         answers: what the flags answer.
@@ -50,13 +51,14 @@ class Measurement:
 
     def __init__(
         self, bus: FeetechBus, joints: Sequence[Joint], *, full_turn: Sequence[str], compared: Sequence[str],
-        answers: Answers,
+        zero_at: str, answers: Answers,
     ) -> None:  # fmt: skip
         self._bus = bus
         self._joints = joints
         self._ids = [joint.servo for joint in joints]
         self._measured = [joint for joint in joints if joint.name not in full_turn]
         self._compared = compared
+        self._zero_at = zero_at
         self._answers = answers
         self._kept = {servo: bus.read(servo, "homing_offset") for servo in self._ids}
 
@@ -76,7 +78,7 @@ class Measurement:
             measured = ranges.get(joint.name, whole)
             found[joint.name] = JointCalibration(
                 id=joint.servo, drive_mode=int(inverted.get(joint.name, False)), homing_offset=offsets[joint.servo],
-                range_min=measured.least, range_max=measured.greatest,
+                range_min=measured.least, range_max=measured.greatest, zero_at=self._zero_at,
             )  # fmt: skip
         return found
 
@@ -117,7 +119,7 @@ class Measurement:
 
     def _accepted(self, ranges: Mapping[str, Range]) -> bool:
         compared = [joint for joint in self._measured if joint.name in self._compared]
-        doubts = [text for joint in compared if (text := doubtful(joint, ranges[joint.name]))]
+        doubts = [text for joint in compared if (text := doubtful(joint, ranges[joint.name], self._zero_at))]
         for text in doubts:
             click.echo(f"warning: {text}", err=True)
         if not doubts or self._answers.accept_ranges:

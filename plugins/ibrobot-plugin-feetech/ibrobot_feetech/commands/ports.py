@@ -1,62 +1,19 @@
-"""Serial ports of this machine, and which of them an arm is on."""
+"""The argument PORT, and the port where it is left out."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
-import attrs
 import click
-from serial.tools import list_ports
 
 from ibrobot_core.errors import HardwareError
 from ibrobot_feetech.bus import FeetechBus
+from ibrobot_feetech.usb import ADAPTER_VENDOR, usb_ports
 
-ADAPTER_VENDOR = 0x1A86
-"""USB vendor of the CH340 and CH343 on the SO-101's boards."""
 _RETRIES = 5
 """Nothing here is in a hurry."""
-_BY_ID = Path("/dev/serial/by-id")
-
-
-@attrs.frozen
-class UsbPort:
-    """A serial port behind USB."""
-
-    path: str
-    description: str
-    usb_id: str
-    """Vendor and product, e.g. `1a86:55d3`."""
-    serial_number: str
-    """Of the adapter; empty where it has none."""
-    stable: str
-    """A path that stays the same over replugging; empty where there is none."""
-
-    @property
-    def is_arm(self) -> bool:
-        """Whether the adapter is of the kind on the SO-101's boards."""
-        return self.usb_id.startswith(f"{ADAPTER_VENDOR:04x}:")
-
-    @property
-    def permitted(self) -> bool:
-        """Whether this user may open it."""
-        return os.access(self.path, os.R_OK | os.W_OK)
-
-
-def usb_ports() -> list[UsbPort]:
-    """All of them, by path."""
-    links = {str(link.resolve()): str(link) for link in _BY_ID.iterdir()} if _BY_ID.is_dir() else {}
-    return [
-        UsbPort(
-            port.device, port.description, f"{port.vid:04x}:{port.pid:04x}", port.serial_number or "",
-            links.get(port.device, ""),
-        )
-        for port in sorted(list_ports.comports())
-        if port.vid is not None
-    ]  # fmt: skip
 
 
 def the_port(port: str | None) -> str:
@@ -77,12 +34,6 @@ def the_port(port: str | None) -> str:
         raise HardwareError(f"no port given, and there are several arms: {', '.join(arms)}; give PORT")
     click.echo(f"port: {arms[0]}", err=True)
     return arms[0]
-
-
-def adapter_serial_number(port: str) -> str:
-    """Of the adapter at that port; empty where there is none."""
-    path = str(Path(port).resolve())
-    return next((found.serial_number for found in usb_ports() if found.path == path), "")
 
 
 def port_argument[F: Callable[..., Any]](command: F) -> F:

@@ -10,13 +10,11 @@ import math
 
 import attrs
 
-from ibrobot_core.calibration import MAX_OFFSET
+from ibrobot_core.calibration import MAX_OFFSET, MIDDLE, POSE
 from ibrobot_core.errors import CalibrationError
 from ibrobot_core.units import TICKS_PER_TURN, degrees
 from ibrobot_feetech.commands.joints import Joint
 
-MIDDLE = 2047
-"""What a servo reports in the middle pose, as LeRobot homes it."""
 _LEAST_SPAN = 150
 """A joint that moved by less was not moved [ticks]: 13 degrees."""
 _TOLERANCE = 0.25
@@ -83,7 +81,7 @@ def impossible(joint: str, measured: Range) -> str | None:
     return None
 
 
-def doubtful(joint: Joint, measured: Range) -> str | None:
+def doubtful(joint: Joint, measured: Range, zero_at: str = POSE) -> str | None:
     """Why a range does not look like the joint's limits; None where it does."""
     ticks = TICKS_PER_TURN / (2 * math.pi)
     expected = (joint.upper - joint.lower) * ticks
@@ -92,9 +90,16 @@ def doubtful(joint: Joint, measured: Range) -> str | None:
             f"{joint.name}: it moved by {_deg(measured.span):.0f} deg, its limits are {_deg(expected):.0f} deg apart; "
             "was it moved to both ends, and is it the right joint?"
         )
-    off = (measured.least + measured.greatest) / 2 - TICKS_PER_TURN / 2
+    middle = abs((joint.lower + joint.upper) / 2) * ticks
+    if zero_at != POSE:
+        if joint.anchored or middle <= _OFF_CENTRE:
+            return None
+        return (
+            f"{joint.name}: the middle of its limits is {_deg(middle):.0f} deg off 0, so 0 deg is not in the middle of "
+            "its range: take --zero-at pose"
+        )
     # The sign of the ticks is not known here: limits about 0 have their middle near 0 either way.
-    off = abs(off) - abs((joint.lower + joint.upper) / 2) * ticks
+    off = abs((measured.least + measured.greatest) / 2 - MIDDLE) - middle
     if not joint.anchored and off > _OFF_CENTRE:
         return f"{joint.name}: the middle of its range is {_deg(off):.0f} deg off the middle pose, which is its 0 deg"
     return None

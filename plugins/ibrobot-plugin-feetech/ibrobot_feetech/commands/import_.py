@@ -1,0 +1,45 @@
+"""`ibrobot feetech import`: a calibration of another program, or one whose adapter was replaced."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import attrs
+import click
+
+from ibrobot_core.calibration import ZERO_AT, calibration_path, load_calibration, save_calibration
+from ibrobot_feetech.commands.calibrate import backup
+from ibrobot_feetech.commands.dialogue import agree
+from ibrobot_feetech.commands.joints import joints_of
+from ibrobot_feetech.commands.zero import zero_text
+from ibrobot_feetech.usb import usb_port
+
+
+@click.command("import")
+@click.argument("file", type=click.Path(path_type=Path))
+@click.option("--name", help="Of the calibration that is made, or a path.  [default: FILE itself]")
+@click.option(
+    "--zero-at",
+    type=click.Choice(list(ZERO_AT)),
+    help="0 rad: the pose set by hand, or the middle of each range.  [default: what FILE says; range for LeRobot's]",
+)
+@click.option("--port", help="Where the arm is plugged in: its adapter is remembered.")
+@click.option("--arm", help="Which arm it is, for the records.")
+@click.option("--robot", metavar="CONFIG", help="Robot YAML with the joints; an SO-101's by default.")
+@click.option("--yes", is_flag=True, help="Overwrite without asking; the former file is kept.")
+def import_calibration(
+    file: Path, name: str | None, zero_at: str | None, port: str | None, arm: str | None, robot: str | None, yes: bool
+) -> None:
+    """Take the calibration FILE of LeRobot or IB-Robot, and say where its 0 rad is. No servo is touched."""
+    path = calibration_path(name or file)
+    found = load_calibration(file, [joint.name for joint in joints_of(robot, name)], zero_at=zero_at)
+    if path.exists() and not yes and not agree(f"{path} is there already. Overwrite it?", flag="--yes"):
+        raise click.Abort
+    adapter = usb_port(port) if port is not None else None
+    made = attrs.evolve(
+        found, robot=arm or found.robot, adapter=adapter.serial_number if adapter is not None else found.adapter
+    )
+    backup(path)
+    save_calibration(made, path, overwrite=True)
+    click.echo(f"saved: {path}")
+    click.echo(zero_text(made))

@@ -1,0 +1,79 @@
+"""USB serial adapters: which ports there are, and whether an arm is on the one that it was calibrated at."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import attrs
+from serial.tools import list_ports
+
+from ibrobot_core.calibration import Calibration
+from ibrobot_core.errors import HardwareError
+
+ADAPTER_VENDOR = 0x1A86
+"""USB vendor of the CH340 and CH343 on the SO-101's boards."""
+_BY_ID = Path("/dev/serial/by-id")
+
+
+@attrs.frozen
+class UsbPort:
+    """A serial port behind USB."""
+
+    path: str
+    description: str
+    usb_id: str
+    """Vendor and product, e.g. `1a86:55d3`."""
+    serial_number: str
+    """Of the adapter; empty where it has none."""
+    stable: str
+    """A path that stays the same over replugging; empty where there is none."""
+
+    @property
+    def is_arm(self) -> bool:
+        """Whether the adapter is of the kind on the SO-101's boards."""
+        return self.usb_id.startswith(f"{ADAPTER_VENDOR:04x}:")
+
+    @property
+    def permitted(self) -> bool:
+        """Whether this user may open it."""
+        return os.access(self.path, os.R_OK | os.W_OK)
+
+
+def usb_ports() -> list[UsbPort]:
+    """All of them, by path."""
+    links = {str(link.resolve()): str(link) for link in _BY_ID.iterdir()} if _BY_ID.is_dir() else {}
+    return [
+        UsbPort(
+            port.device, port.description, f"{port.vid:04x}:{port.pid:04x}", port.serial_number or "",
+            links.get(port.device, ""),
+        )
+        for port in sorted(list_ports.comports())
+        if port.vid is not None
+    ]  # fmt: skip
+
+
+def usb_port(path: str) -> UsbPort | None:
+    """The USB port at a path, or at what a link there points to; None for a port that is not behind USB."""
+    real = str(Path(path).resolve())
+    return next((found for found in usb_ports() if found.path == real), None)
+
+
+def check_adapter(calibration: Calibration, port: str) -> None:
+    """See that the adapter at a port is the one that the calibration was made at, where both are known.
+
+    Raises:
+        HardwareError: for another one, e.g. when the ports of leader and follower are swapped.
+    """
+    found = usb_port(port)
+    if not calibration.adapter or found is None or found.serial_number == calibration.adapter:
+        return
+    there = f"has the USB serial number {found.serial_number}" if found.serial_number else "has no USB serial number"
+    elsewhere = next((each for each in usb_ports() if each.serial_number == calibration.adapter), None)
+    where = f", which is at {elsewhere.stable or elsewhere.path}: give that port" if elsewhere else ""
+    name = f"`ibrobot feetech import {calibration.path} --port {port} --yes`"
+    raise HardwareError(
+        f"{port}: this is another arm: its adapter {there}, and {calibration.path} was made at "
+        f"{calibration.adapter}{where}; are the ports of leader and follower swapped? "
+        f"If the adapter was replaced, {name} remembers the new one"
+    )

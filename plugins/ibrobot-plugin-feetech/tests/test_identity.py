@@ -1,0 +1,135 @@
+"""Whether an arm is the one that its calibration is of, and stands the supply that it is given."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import attrs
+import pytest
+from ibrobot_feetech.bus import FeetechBus
+from ibrobot_feetech.commands.check import differences
+from ibrobot_feetech.emulator import Emulator
+from ibrobot_feetech.errors import PortError, PortForbidden, PortHeld
+from ibrobot_feetech.follower import FeetechFollower
+from ibrobot_feetech.leader import LeaderTeleop
+from ibrobot_feetech.options import FollowerOptions, LeaderOptions
+from ibrobot_feetech.port import SerialPort
+from serial.tools import list_ports
+from serial.tools.list_ports_common import ListPortInfo
+
+from ibrobot_core.calibration import save_calibration
+from ibrobot_core.errors import HardwareError, TeleopError
+from ibrobot_core.testing.contexts import control_context, host_context
+
+from .conftest import arm_calibration, prepare
+from .line import Line
+
+
+@pytest.fixture(autouse=True)
+def _in_memory(lines: None) -> None:
+    pass
+
+
+@pytest.fixture
+def emulator() -> Iterator[Emulator]:
+    with Line(6) as emulator:
+        prepare(emulator, arm_calibration())
+        yield emulator
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    """The calibration of an arm whose adapter has the serial number FOLLOWER."""
+    return save_calibration(attrs.evolve(arm_calibration(), adapter="FOLLOWER"), tmp_path / "follower.json")
+
+
+def plug_in(monkeypatch: pytest.MonkeyPatch, adapters: Mapping[str, str | None]) -> None:
+    """Make up USB adapters: port -> serial number."""
+    found = []
+    for path, serial_number in adapters.items():
+        port = ListPortInfo(str(Path(path).resolve()))
+        port.vid, port.pid, port.serial_number = 0x1A86, 0x55D3, serial_number
+        found.append(port)
+    monkeypatch.setattr(list_ports, "comports", lambda: found)
+
+
+def follower(port: str, file: Path) -> FeetechFollower:
+    return FeetechFollower(FollowerOptions(port, str(file)), control_context("arm"))
+
+
+class TestAdapter:
+    def test_the_right_one_connects(self, emulator: Emulator, file: Path, monkeypatch: pytest.MonkeyPatch):
+        plug_in(monkeypatch, {emulator.port: "FOLLOWER"})
+        arm = follower(emulator.port, file)
+        arm.connect()
+        arm.disconnect()
+
+    def test_a_swapped_follower_is_refused_before_its_torque_is_on(
+        self, emulator: Emulator, file: Path, monkeypatch: pytest.MonkeyPatch
+    ):
+        plug_in(monkeypatch, {emulator.port: "LEADER", "/dev/ttyACM7": "FOLLOWER"})
+        with pytest.raises(HardwareError) as refused:
+            follower(emulator.port, file).connect()
+        for words in (emulator.port, "LEADER", "follower.json was made at FOLLOWER", "is at /dev/ttyACM7", "swapped?"):
+            assert words in str(refused.value)
+        assert not any(servo.torque for servo in emulator.servos.values())
+
+    @pytest.mark.parametrize("serial_number", ["LEADER", None])
+    def test_a_swapped_leader_is_refused(
+        self, emulator: Emulator, file: Path, monkeypatch: pytest.MonkeyPatch, serial_number: str | None
+    ):
+        plug_in(monkeypatch, {emulator.port: serial_number})
+        leader = LeaderTeleop(LeaderOptions(emulator.port, str(file), deadman="none"), host_context("leader"))
+        with pytest.raises(TeleopError, match=r"leader: .*another arm: its adapter has .* made at FOLLOWER"):
+            leader.connect()
+
+    def test_a_port_that_is_not_behind_usb_has_nothing_to_compare(self, emulator: Emulator, file: Path):
+        arm = follower(emulator.port, file)
+        arm.connect()
+        arm.disconnect()
+
+
+class TestSupply:
+    def test_servos_for_less_than_they_are_given_are_named(self, emulator: Emulator, file: Path):
+        emulator.servos[3].set("max_voltage_limit", 80)
+        with pytest.raises(HardwareError) as refused:
+            follower(emulator.port, file).connect()
+        for words in ("servo 3 (elbow_flex)", "measures 12.1 V", "made for 4.0 to 8.0 V", "unplug it now"):
+            assert words in str(refused.value)
+        assert not any(servo.torque for servo in emulator.servos.values())
+
+    def test_a_supply_that_is_too_weak_is_another_matter(self, emulator: Emulator, file: Path):
+        emulator.servos[2].set("present_voltage", 31)
+        with pytest.raises(HardwareError, match=r"servo 2 .* measures 3\.1 V, and is made for 4\.0 .*check the supply"):
+            follower(emulator.port, file).connect()
+
+    def test_check_shows_what_a_servo_measures_and_its_limits(self, emulator: Emulator):
+        emulator.servos[3].set("max_voltage_limit", 80)
+        bus = FeetechBus(emulator.port)
+        bus.open()
+        (found,) = (each for each in differences(bus, arm_calibration()) if each.register == "present_voltage")
+        bus.close()
+        assert (found.joint, found.found, found.wanted, found.matters) == ("elbow_flex", "12.1 V", "4.0 to 8.0 V", True)
+        assert "unplug it now" in found.remedy
+
+
+class TestPort:
+    @pytest.mark.parametrize(
+        ("number", "kind", "told"),
+        [
+            (2, PortError, "there is no such port; check the USB cable"),
+            (13, PortForbidden, "no permission; add yourself to the group"),
+            (16, PortHeld, "another program holds the port; end that program"),
+        ],
+    )
+    def test_the_remedy_is_that_of_what_happened(
+        self, monkeypatch: pytest.MonkeyPatch, number: int, kind: type[PortError], told: str
+    ):
+        def refuse(*arguments: object, **options: object) -> None:
+            raise OSError(number, "refused")
+
+        monkeypatch.setattr("serial.Serial", refuse)
+        with pytest.raises(kind, match=told) as refused:
+            SerialPort("/dev/ttyACM0", 1_000_000).open()
+        assert ("cable" in str(refused.value)) == (kind is PortError)
