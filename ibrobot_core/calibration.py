@@ -320,8 +320,8 @@ def _with_meta(calibration: Calibration, path: Path) -> Calibration:
             f"{companion.name} tells of: calibrate again, or if they are right, take them with "
             f"`ibrobot feetech import {path} --zero-at {zero_at} --yes`"
         )
-    told = {name: str(meta.get(name, "")) for name in ("robot", "date", "adapter")}
-    return attrs.evolve(calibration.with_zero_at(zero_at), **told)
+    robot, date, adapter = (str(meta.get(name, "")) for name in ("robot", "date", "adapter"))
+    return attrs.evolve(calibration.with_zero_at(zero_at), robot=robot, date=date, adapter=adapter)
 
 
 def _meta_path(path: Path) -> Path:

@@ -41,6 +41,7 @@ class Joint:
         help="whether it holds objects, so that it may stay away from its setpoint without a fault; None: whether it "
         "is in a group named gripper",
     )
+    beyond_model: bool = option(False, help="whether its limits may be wider than those of the URDF and MJCF")
 
     def __attrs_post_init__(self) -> None:
         if not self.lower < self.upper:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,11 +11,16 @@ import attrs
 
 from ibrobot_core.config.convert import hint
 from ibrobot_core.config.keys import ModeKeys
+from ibrobot_core.config.models import READERS, Limits, ModelError
 from ibrobot_core.config.schema import Control, Inference, Share
 from ibrobot_core.config.structure import Part, Parts
 from ibrobot_core.config.yaml_nodes import Document, Key
 from ibrobot_core.descriptors import ExecutorDescriptor, TransportDescriptor
-from ibrobot_core.robot import Robot
+from ibrobot_core.robot import Joint, Robot
+from ibrobot_core.units import radians
+
+_SLACK = 0.01
+"""How much wider than a model's a limit may be [rad]: models and people round."""
 
 
 @attrs.frozen
@@ -73,11 +79,40 @@ class Checks:
                 self.document.add((*at, "joints", i), message)
         for pose, positions in robot.description.poses.items():
             self._pose((*at, "description", "poses", pose), robot, positions)
-        for model in ("mjcf", "urdf"):
-            path = getattr(robot.description, model)
-            if path is not None and not path.is_file():
-                message = f"no such file: {path}; a relative path starts at the folder of the YAML file"
-                self.document.add((*at, "description", model), message)
+        self._models(robot)
+
+    def _models(self, robot: Robot) -> None:
+        """The models can be read, and no joint may go where none of them lets it."""
+        known = []
+        for model, path in (("mjcf", robot.description.mjcf), ("urdf", robot.description.urdf)):
+            key: Key = ("robot", "description", model)
+            if path is None:
+                continue
+            if not path.is_file():
+                self.document.add(key, f"no such file: {path}; a relative path starts at the folder of the YAML file")
+                continue
+            try:
+                known.append(READERS[model](path))
+            except ModelError as error:
+                self.document.add(key, str(error))
+        for i, joint in enumerate(robot.joints):
+            limits = [each[joint.name] for each in known if joint.name in each]
+            if limits and not joint.beyond_model:
+                self._within(("robot", "joints", i), joint, limits)
+
+    def _within(self, key: Key, joint: Joint, limits: list[Limits]) -> None:
+        lowest, highest = min(limits, key=lambda each: each.lower), max(limits, key=lambda each: each.upper)
+        for end, value, widest, excess in (
+            ("lower", joint.lower, lowest, lowest.lower - joint.lower),
+            ("upper", joint.upper, highest, joint.upper - highest.upper),
+        ):
+            if excess <= _SLACK:
+                continue
+            remedy = f"narrow it, or set beyond_model: true where {joint.name} can go there"
+            if abs(value) > 2 * math.pi:
+                remedy = f"were degrees meant? {value:g} degrees are {radians(value):.5g} rad"
+            model = f"{widest.lower:g} to {widest.upper:g} rad ({widest.place})"
+            self.document.add((*key, end), f"{value:g} rad is beyond the model's limits, {model}; {remedy}")
 
     def _pose(self, key: Key, robot: Robot, positions: tuple[float, ...]) -> None:
         if len(positions) != len(robot.joints):

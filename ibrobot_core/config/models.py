@@ -1,0 +1,202 @@
+"""The limits of joints in URDF and MJCF models, read as plain XML: no program that uses them needs to be installed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from xml.parsers import expat
+
+import attrs
+
+_MAX_BYTES = 16 << 20
+_PLACES = ("body", "frame", "replicate")
+"""Elements of an MJCF that joints are in."""
+
+
+class ModelError(ValueError):
+    """A model that cannot be read, e.g. a file that is not XML; names file and line."""
+
+
+@attrs.frozen
+class Limits:
+    """Position limits of a joint in a model [rad, or m for one that slides]."""
+
+    lower: float
+    upper: float
+    place: str
+    """File and line."""
+
+
+@attrs.frozen
+class Element:
+    """An XML element."""
+
+    tag: str
+    attributes: Mapping[str, str]
+    file: Path
+    line: int
+    children: list[Element] = attrs.field(factory=list)
+
+    def error(self, message: str) -> ModelError:
+        """An error that names this place."""
+        return ModelError(f"{self.file}:{self.line}: {message}")
+
+    def below(self) -> Iterator[Element]:
+        """All elements within this one, in file order."""
+        waiting = self.children[::-1]
+        while waiting:
+            element = waiting.pop()
+            yield element
+            waiting += element.children[::-1]
+
+
+def read_xml(path: Path) -> Element:
+    """The root element of an XML file. Document types, and with them entities, are refused.
+
+    Raises:
+        ModelError: when it cannot be read, or is no such XML.
+    """
+    parser = expat.ParserCreate()
+    top = Element("", {}, path, 0)
+    opened = [top]
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        element = Element(tag, attributes, path, parser.CurrentLineNumber)
+        opened[-1].children.append(element)
+        opened.append(element)
+
+    def refuse(*_: object) -> None:
+        raise ModelError(f"{path}:{parser.CurrentLineNumber}: has a document type (<!DOCTYPE …>): remove it")
+
+    parser.StartElementHandler, parser.EndElementHandler = start, lambda _: opened.pop()
+    parser.StartDoctypeDeclHandler = refuse
+    try:
+        with path.open("rb") as file:
+            content = file.read(_MAX_BYTES + 1)
+        if len(content) > _MAX_BYTES:
+            raise ModelError(f"{path}: is larger than {_MAX_BYTES >> 20} MiB, which no robot model needs")
+        parser.Parse(content, True)
+    except OSError as error:
+        raise ModelError(f"{path}: cannot be read: {error.strerror}") from None
+    except expat.ExpatError as error:
+        raise ModelError(f"{path}:{error.lineno}: not valid XML: {expat.ErrorString(error.code)}") from None
+    return top.children[0]
+
+
+def urdf_limits(path: Path) -> dict[str, Limits]:
+    """Joint -> limits, of the joints of a URDF that have some.
+
+    Raises:
+        ModelError: when it is no URDF.
+    """
+    found = {}
+    for joint in _root(path, "robot").children:
+        if joint.tag == "joint" and joint.attributes.get("type") in ("revolute", "prismatic"):
+            for limit in joint.children:
+                if limit.tag == "limit":
+                    lower, upper = (_numbers(limit, name, "0", 1)[0] for name in ("lower", "upper"))
+                    found[joint.attributes.get("name", "")] = Limits(lower, upper, f"{path.name}:{limit.line}")
+    return found
+
+
+def mjcf_limits(path: Path) -> dict[str, Limits]:
+    """Joint -> limits, of the hinges and slides of an MJCF that have some: its own, or those of its default class.
+
+    Raises:
+        ModelError: when it is no MJCF.
+    """
+    root = _root(path, "mujoco")
+    _include(root, path.parent)
+    compiler: dict[str, str] = {}
+    for element in root.children:
+        if element.tag == "compiler":
+            compiler.update(element.attributes)
+    classes = _default_classes(root)
+    found: dict[str, Limits] = {}
+    for joint, class_ in _mjcf_joints(root):
+        name = joint.attributes.get("name")
+        if class_ not in classes:
+            raise joint.error(f"joint {name!r}: no default class {class_!r}; the classes are: {', '.join(classes)}")
+        given = {**classes[class_], **joint.attributes}
+        kind = given.get("type", "hinge")
+        limited = given.get("limited", "auto")
+        if limited == "auto":
+            limited = compiler.get("autolimits", "true") if "range" in given else "false"
+        if name is not None and kind in ("hinge", "slide") and limited == "true":
+            lower, upper = _numbers(attrs.evolve(joint, attributes=given), "range", "0 0", 2)
+            turn = math.pi / 180 if kind == "hinge" and compiler.get("angle", "degree") == "degree" else 1.0
+            found[name] = Limits(lower * turn, upper * turn, f"{joint.file.name}:{joint.line}")
+    return found
+
+
+READERS: Mapping[str, Callable[[Path], dict[str, Limits]]] = {"mjcf": mjcf_limits, "urdf": urdf_limits}
+"""Key under `robot.description` -> what reads the joint limits of that model."""
+
+
+def _root(path: Path, tag: str) -> Element:
+    root = read_xml(path)
+    if root.tag != tag:
+        raise root.error(f"begins with <{root.tag}>, must be <{tag}>")
+    return root
+
+
+def _numbers(element: Element, name: str, default: str, count: int) -> list[float]:
+    text = element.attributes.get(name, default)
+    try:
+        numbers = [float(word) for word in text.split()]
+    except ValueError:
+        numbers = []
+    if len(numbers) != count or not all(map(math.isfinite, numbers)):
+        raise element.error(f"{name} is {text!r}, must be {count} finite number{'s' if count > 1 else ''}")
+    return numbers
+
+
+def _include(root: Element, folder: Path) -> None:
+    """Put the content of included files, whose names are relative to the model's folder, in the place of includes."""
+    seen: set[Path] = set()
+    waiting = [root]
+    while waiting:
+        element = waiting.pop()
+        children: list[Element] = []
+        todo = element.children[::-1]
+        while todo:
+            child = todo.pop()
+            if child.tag != "include":
+                children.append(child)
+                continue
+            file = folder / child.attributes.get("file", "")
+            if file in seen:
+                raise child.error(f"includes {file.name} a second time, which MuJoCo refuses")
+            seen.add(file)
+            todo += read_xml(file).children[::-1]
+        element.children[:] = children
+        waiting += children
+
+
+def _default_classes(root: Element) -> dict[str, dict[str, str]]:
+    """Default class -> attributes of its joints; `main` is that of joints without a class."""
+    classes: dict[str, dict[str, str]] = {"main": {}}
+    waiting = [(element, "main") for element in reversed(root.children) if element.tag == "default"]
+    while waiting:
+        element, parent = waiting.pop()
+        name = element.attributes.get("class", parent)
+        own = dict(classes[parent])
+        for child in element.children:
+            own.update(child.attributes if child.tag == "joint" else {})
+        classes[name] = own
+        waiting += [(child, name) for child in reversed(element.children) if child.tag == "default"]
+    return classes
+
+
+def _mjcf_joints(root: Element) -> Iterator[tuple[Element, str]]:
+    """The joints below the world, each with its default class."""
+    worlds = [element for element in root.children if element.tag == "worldbody"]
+    waiting = [(world, world.attributes.get("childclass", "main")) for world in reversed(worlds)]
+    while waiting:
+        element, class_ = waiting.pop()
+        for child in element.children:
+            if child.tag == "joint":
+                yield child, child.attributes.get("class", class_)
+        inner = [child for child in element.children if child.tag in _PLACES]
+        waiting += [(child, child.attributes.get("childclass", class_)) for child in reversed(inner)]
