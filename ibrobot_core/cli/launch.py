@@ -195,7 +195,11 @@ def run_loaded(robot: RobotConfig, request: Request, options: dict[str, Any], wa
             return
         watcher.attach(runtime)
         _stop_on_signals(runtime.session, keys)
-        status = _run(runtime, watcher, live=not options["headless"] and sys.stdout.isatty())
+        try:
+            status = _run(runtime, watcher, live=not options["headless"] and sys.stdout.isatty())
+        finally:
+            for line in runtime.session.outcome.holding:
+                click.echo(line, err=True)
     _tell(runtime, watcher, options["as_json"])
     runtime.raise_failure()
     sys.exit(status)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Callable, Mapping
+from enum import Enum
 from typing import Any
 
 import attrs
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from ibrobot_core.clock import Clock
 from ibrobot_core.config import RobotConfig
 from ibrobot_core.control.following import FollowingError
+from ibrobot_core.control.health import Health
 from ibrobot_core.control.link import ControlState, PlanRecord
 from ibrobot_core.control.parts import HardwareParts
 from ibrobot_core.control.safety import SafetyLayer
@@ -62,6 +64,7 @@ class ControlCore:
     def __init__(
         self, config: RobotConfig, hardware: HardwareParts, executors: Mapping[str, Executor], clock: Clock
     ) -> None:
+        self._log = logging.getLogger("ibrobot.control")
         self._config = config
         self._robot = config.robot
         self._hardware = hardware
@@ -79,6 +82,10 @@ class ControlCore:
         self._yielded: Vector | None = None
         """Where joints that did not follow rest while the fault lasts [rad], NaN for the others; shape (J,)."""
         self._target: Vector | None = None
+        self._health = Health(config.control.load_shedding, self._log)
+        self._shedding = False
+        self._unwell = ""
+        """The fault, where it is a condition of a joint."""
         self._arriving = False
         self._tick = 0
         self._commands: dict[str, Callable[..., Mapping[str, Any] | None]] = {
@@ -98,10 +105,11 @@ class ControlCore:
         """What the host is to be told: `goal` and `fault` events."""
         self.state: ControlState | None = None
         """After a tick, what it found and did."""
-        self._log = logging.getLogger("ibrobot.control")
 
     def start(self, mode: str) -> None:
         """Connect, take the joints over where they are, and enter `mode` once `arrived`.
+
+        Where that fails, the torque that it put on is off again.
 
         Raises:
             HardwareError: when the hardware does not connect or its first reading is no position.
@@ -110,8 +118,12 @@ class ControlCore:
         if self._config.control.stop == "relax":
             self._hardware.require_relax()
         self._hardware.connect()
-        self._measured = self._first_reading()
-        self._safety.activate(self._measured.position)
+        try:
+            self._measured = self._first_reading()
+            self._safety.activate(self._measured.position)
+        except HardwareError:
+            self._hardware.undo_connect()
+            raise
         self.mode = mode
         behaviour, _, pose = self._config.control.startup.partition(" ")
         if behaviour == "pose":
@@ -154,6 +166,7 @@ class ControlCore:
         signals = self._read_signals()
         success = self._hardware.success()
         self._check_following()
+        self._check_health()
         command = self._safety.apply(self._desired(), self._measured.position)
         self._write(command)
         self._hardware.advance(periods * self.period_ns)
@@ -194,18 +207,32 @@ class ControlCore:
             "executors": {name: dict(owned.executor.counters()) for name, owned in self._owned.items()},
             "hardware": self._hardware.counters(),
             "loop": dict(self._counts),
+            "conditions": [attrs.asdict(each, value_serializer=_plain) for each in self._health.conditions],
         }
 
-    def begin_stop(self) -> None:
-        """Start the configured stop behaviour; tick until `stopped`."""
+    def begin_stop(self, *, unmoved: bool = False) -> None:
+        """Start the configured stop behaviour; tick until `stopped`.
+
+        Args:
+            unmoved: the start failed elsewhere before anything moved the robot: the torque it put on goes off again.
+        """
         self._stopping = True
         self._leave()
         self._target = None
+        self._shedding = False
+        if unmoved and self._config.control.startup == "hold":
+            self._hardware.undo_connect()
+            self._relaxed = True
+            return
         behaviour, _, pose = self._config.control.stop.partition(" ")
         if behaviour == "relax":
             self._relax("stop")
         elif behaviour == "pose" and not self.fault and not self._safety.estopped:
             self._move_to(pose)
+
+    def holding(self) -> list[str]:
+        """What holds torque, and how to take it off; a line each. Also after `close`."""
+        return [f"{each.where} holds torque; to take it off: {each.command}" for each in self._hardware.holding()]
 
     @property
     def signals(self) -> tuple[Signal, ...]:
@@ -299,6 +326,31 @@ class ControlCore:
             self._raise_fault(fault)
             self._yielded = np.where(self._following.lost, measured, np.nan)
 
+    def _check_health(self) -> None:
+        """Stop where a condition is a fault; shed load where it has lasted for too long."""
+        conditions = self._hardware.health()
+        if conditions or self._health.conditions:
+            now_ns = self._clock.now_ns()
+            self._health.update(conditions, now_ns)
+            if not (self._shedding or self._stopping or self._relaxed) and (why := self._health.overdue(now_ns)):
+                self._shed(why)
+            if (fault := self._health.fault) and not self.fault:
+                self._unwell = fault
+                self._raise_fault(fault)
+        if self._shedding and (self._target is None or self._at_target or self._late_to_pose):
+            self._shedding, self._target = False, None
+            self._relax("load shedding")
+
+    def _shed(self, why: str) -> None:
+        """Move to the pose for it, where nothing but the joints' health forbids motion, and then relax."""
+        options = self._config.control.load_shedding
+        moves = options.pose and self.fault in ("", self._unwell)
+        then = f"goes to pose {options.pose} and relaxes" if moves else "relaxes"
+        self._announce(f"{why}; this has lasted for {options.after:g} s", then)
+        self._shedding = True
+        if moves:
+            self._move_to(options.pose)
+
     def _yield(self) -> Vector | None:
         if self._yielded is None:
             return None
@@ -375,6 +427,8 @@ class ControlCore:
         self._relaxed = False
         self._hardware.retake()
         self._following.restart()
+        self._health.restart()
+        self._shedding = False
 
     def _raise_fault(self, fault: str) -> None:
         if self.fault:
@@ -442,7 +496,7 @@ class ControlCore:
         self._take_back()
         self._safety.reset(self._measured.position)
         self._yielded = None
-        self.fault = ""
+        self.fault = self._unwell = ""
         self._enter()
 
     def _goal(self, executor: str, goal_id: str, goal: Mapping[str, Any]) -> None:
@@ -454,3 +508,8 @@ class ControlCore:
     def _cancel(self) -> None:
         for owned in self._active:
             owned.executor.cancel(owned.reading(self._measured))
+
+
+def _plain(_: object, __: object, value: Any) -> Any:
+    """For JSON."""
+    return value.value if isinstance(value, Enum) else value

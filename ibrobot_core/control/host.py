@@ -50,6 +50,7 @@ class ControlHost(ABC):
         signals: topic and size of each of the hardware's signals; known once `start` returned.
         report: the last `loop` and `counters` that control gave.
         refused: real-time settings that the machine refused, a line each.
+        holding: what held torque when control ended, and how to take it off, a line each.
     """
 
     def __init__(self, on_state: OnState, on_event: OnEvent) -> None:
@@ -58,6 +59,7 @@ class ControlHost(ABC):
         self.signals: list[tuple[str, int]] = []
         self.report: dict[str, Any] = {"loop": Punctuality().summary(), "counters": {}}
         self.refused: list[str] = []
+        self.holding: list[str] = []
 
     @abstractmethod
     def start(self) -> None:
@@ -81,8 +83,12 @@ class ControlHost(ABC):
         """Replace the plan."""
 
     @abstractmethod
-    def stop(self) -> None:
-        """Stop the robot by the configured behaviour, and end control. Safe to call twice."""
+    def stop(self, *, unmoved: bool = False) -> None:
+        """Stop the robot by the configured behaviour, and end control. Safe to call twice.
+
+        Args:
+            unmoved: the run failed before anything moved the robot: the torque that its start put on goes off again.
+        """
 
 
 class InlineControl(ControlHost):
@@ -112,7 +118,7 @@ class InlineControl(ControlHost):
                 self._clock.advance(self._core.period_ns)
                 self._core.tick()
         except BaseException:
-            self._core.close()
+            self._close()
             raise
         self.signals = [(signal.topic, signal.size) for signal in self._core.signals]
         self._started = True
@@ -136,16 +142,20 @@ class InlineControl(ControlHost):
         self._core.set_plan(plan)
 
     @override
-    def stop(self) -> None:
+    def stop(self, *, unmoved: bool = False) -> None:
         if not self._started:
             return
         self._started = False
-        self._core.begin_stop()
+        self._core.begin_stop(unmoved=unmoved)
         while not self._core.stopped:
             self._clock.advance(self._core.period_ns)
             self._on_state(self._core.tick())
         self._report()
+        self._close()
+
+    def _close(self) -> None:
         self._core.close()
+        self.holding = self._core.holding()
 
     def _report(self) -> None:
         self.report = {"loop": self._punctuality.summary(), "counters": self._core.counters()}
@@ -230,6 +240,7 @@ class ControlClient(ControlHost):
                 raise ComponentFailed(f"the control process was not ready after {_START_TIMEOUT_S:.0f} s")
             for message in messages:
                 if message["event"] == "failed":
+                    self.holding = message["holding"]
                     failure = HardwareError(message["error"])
                     failure.exit_code = message["exit_code"]
                     raise failure
@@ -265,11 +276,11 @@ class ControlClient(ControlHost):
             self._memory.write_plan(plan)
 
     @override
-    def stop(self) -> None:
+    def stop(self, *, unmoved: bool = False) -> None:
         if self._process is None:
             return
         self._stopping = True
-        self._channel.send({"do": "stop", "id": 0})
+        self._channel.send({"do": "stop", "id": 0, "unmoved": unmoved})
         self._end()
 
     def _end(self) -> None:
@@ -334,8 +345,10 @@ class ControlClient(ControlHost):
             logging.getLogger(message["logger"]).log(message["level"], message["message"])
         elif message["event"] in ("report", "stopped"):
             self.report = {"loop": message["loop"], "counters": message["counters"]}
+            self.holding = message.get("holding", [])
         elif message["event"] == "failed":
             self._failure = message["error"]
+            self.holding = message["holding"]
         else:
             self._on_event(message)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from functools import partial
@@ -10,8 +11,19 @@ from typing import Any
 import numpy as np
 
 from ibrobot_core.errors import HardwareError, IbrobotError, NotSupported
-from ibrobot_core.interfaces import Episode, Hardware, JointReading, Signal, SimulatedHardware, Torque
+from ibrobot_core.interfaces import (
+    Condition,
+    Episode,
+    Hardware,
+    Holding,
+    JointReading,
+    Signal,
+    SimulatedHardware,
+    Torque,
+)
 from ibrobot_core.robot import Robot, Vector
+
+_LOG = logging.getLogger("ibrobot.control")
 
 
 class HardwareParts:
@@ -35,13 +47,35 @@ class HardwareParts:
         self._single = only if len(parts) == 1 and only.joints == robot.joint_names else None
 
     def connect(self) -> None:
-        """Connect all; where one fails, those before it are disconnected again."""
+        """Connect all; where one fails, those before it are as they were."""
+        connected: list[str] = []
         try:
             for name, part in self._parts.items():
                 _named(name, part.connect)
+                connected.append(name)
         except IbrobotError:
+            self.undo_connect(connected)
             self.disconnect()
             raise
+
+    def undo_connect(self, names: Collection[str] | None = None) -> None:
+        """Take off the torque that `connect` put on, of all parts or those of `names`; what stays on is logged."""
+        for name, part in self._parts.items():
+            if names is None or name in names:
+                try:
+                    part.undo_connect()
+                except HardwareError as error:
+                    _LOG.error("torque of %s cannot be taken off: %s", name, error)
+
+    def holding(self) -> list[Holding]:
+        """What holds torque, as far as is known."""
+        return [holding for part in self._parts.values() if (holding := part.holding()) is not None]
+
+    def health(self) -> Sequence[Condition]:
+        """What is wrong with the joints of all parts."""
+        if self._single is not None:
+            return self._single.health()
+        return [condition for part in self._parts.values() for condition in part.health()]
 
     def disconnect(self) -> None:
         """Release all."""

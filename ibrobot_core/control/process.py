@@ -84,7 +84,7 @@ class ControlProcess:
             behind = (self._clock.now_ns() - deadline) // period
             periods = 1 + max(0, behind)
             deadline += max(0, behind) * period
-        self._report("stopped")
+        self._report("stopped", holding=self._core.holding())
 
     def _cycle(self, deadline: int, late: int, periods: int) -> None:
         plan = self._memory.read_plan()
@@ -107,7 +107,7 @@ class ControlProcess:
         begun_ns = self._clock.now_ns()
         for command in self._channel.receive():
             if command["do"] == "stop":
-                self._begin_stop(_TOLD)
+                self._begin_stop(_TOLD, unmoved=command["unmoved"])
             else:
                 self._channel.send(self._core.handle(command))
         return self._clock.now_ns() - begun_ns > self._core.period_ns
@@ -121,16 +121,17 @@ class ControlProcess:
         if self._core.state is not None and self._core.state.tick % REPORT_TICKS == 0 and not self._channel.backlog:
             self._report("report")
 
-    def _report(self, event: str) -> None:
-        self._channel.send({"event": event, "loop": self._punctuality.summary(), "counters": self._core.counters()})
+    def _report(self, event: str, **more: Any) -> None:
+        loop, counters = self._punctuality.summary(), self._core.counters()
+        self._channel.send({"event": event, "loop": loop, "counters": counters, **more})
 
-    def _begin_stop(self, why: str) -> None:
+    def _begin_stop(self, why: str, *, unmoved: bool = False) -> None:
         if not self._stopping:
             self._stopping = True
             logging.getLogger("ibrobot.control").log(
                 logging.DEBUG if why == _TOLD else logging.WARNING, "stopping: %s", why
             )
-            self._core.begin_stop()
+            self._core.begin_stop(unmoved=unmoved)
 
     def _terminate(self, number: int, frame: Any) -> None:
         self._terminated = True
@@ -158,22 +159,27 @@ def main(descriptors: list[int]) -> int:
         ready = {"event": "ready", "signals": signals, "refused": refused}
         ControlProcess(core, clock, channel, memory, descriptors[2], order["host"], ready).run()
     except IbrobotError as error:
-        if core is not None:
-            core.abandon()
-        channel.send({"event": "failed", "error": str(error), "exit_code": error.exit_code})
+        channel.send({**_failed(core, str(error)), "exit_code": error.exit_code})
         return 1
     except Exception as error:  # noqa: BLE001 - a bug here must still stop the robot
         # The host tells it in one line; the traceback goes where a bug's belongs.
         traceback.print_exc()
-        if core is not None:
-            core.abandon()
-        channel.send({"event": "failed", "error": f"{type(error).__name__}: {error}", "exit_code": 1})
+        channel.send({**_failed(core, f"{type(error).__name__}: {error}"), "exit_code": 1})
         return 1
     finally:
         if core is not None:
             core.close()
+            if channel.closed:  # nobody else can say it
+                print(*core.holding(), sep="\n", end="\n" if core.holding() else "", file=sys.stderr)
         channel.flush(_FAREWELL_S)
     return 0
+
+
+def _failed(core: ControlCore | None, error: str) -> dict[str, Any]:
+    """The last words of a core that can go on no more."""
+    if core is not None:
+        core.abandon()
+    return {"event": "failed", "error": error, "holding": core.holding() if core is not None else []}
 
 
 if __name__ == "__main__":

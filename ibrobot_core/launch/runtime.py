@@ -70,6 +70,7 @@ class Runtime:
                 self._begin_mode()
         except BaseException as error:
             ended = session.finished.is_set()
+            session.start_failed = True
             self.stop()
             self.raise_failure()  # e.g. control, which died while a camera started
             if ended and isinstance(error, ComponentFailed):
@@ -195,6 +196,7 @@ class Runtime:
             "successes": outcome.successes,
             "goals_failed": outcome.goals_failed,
             "faults": outcome.faults,
+            "holding": outcome.holding,
             "loop": report["loop"],
             "counters": report["counters"],
             "rates_hz": {name: round(rate, 2) for name, rate in session.rates.items()},

@@ -54,6 +54,8 @@ class Outcome:
     successes: int = 0
     faults: list[str] = attrs.field(factory=list)
     goals_failed: int = 0
+    holding: list[str] = attrs.field(factory=list)
+    """What holds torque after the run, and how to take it off, a line each."""
 
 
 class Feed(ABC):
@@ -100,6 +102,8 @@ class Session:
         self.mode = config.default_control_mode
         self.epoch = 0
         self.feeder: Feed | None = None
+        self.start_failed = False
+        """Whether the run ended before all of it was there: nothing has moved the robot."""
         self.state: ControlState | None = None
         self.stats: DispatchStats | None = None
         self.engine_stats: EngineStats | None = None

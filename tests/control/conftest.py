@@ -18,7 +18,7 @@ from ibrobot_core.control.core import ControlCore
 from ibrobot_core.control.link import ControlState, PlanRecord
 from ibrobot_core.descriptors import HardwareDescriptor
 from ibrobot_core.errors import HardwareError
-from ibrobot_core.interfaces import Context, JointReading, Torque
+from ibrobot_core.interfaces import Condition, Context, Holding, JointReading, Torque
 from ibrobot_core.plugins import Entry, Registry, discover
 from ibrobot_core.robot import Vector
 from ibrobot_core.testing.contexts import START_NS
@@ -61,6 +61,9 @@ class ScriptedHardware(FakeHardware):
         self.write_error = ""
         self.signal_error = ""
         self.blocked = np.zeros(len(ctx.joints), dtype=bool)
+        self.conditions: tuple[Condition, ...] = ()
+        self.connect_error = ""
+        self.torque = False
         self.relax_outcome: Torque | HardwareError = Torque.OFF
         self._last: JointReading | None = None
 
@@ -78,6 +81,7 @@ class ScriptedHardware(FakeHardware):
         if self.write_error:
             raise HardwareError(self.write_error)
         super().write(position)
+        self.torque = True
         self.written.append(position.copy())
 
     @override
@@ -85,7 +89,23 @@ class ScriptedHardware(FakeHardware):
         if isinstance(self.relax_outcome, HardwareError):
             raise self.relax_outcome
         super().relax()
+        self.torque = self.relax_outcome is not Torque.OFF
         return self.relax_outcome
+
+    @override
+    def connect(self) -> None:
+        if self.connect_error:
+            raise HardwareError(self.connect_error)
+        super().connect()
+        self.torque = True
+
+    @override
+    def holding(self) -> Holding | None:
+        return Holding(self._ctx.name, f"scripted off {self._ctx.name}") if self.torque else None
+
+    @override
+    def health(self) -> tuple[Condition, ...]:
+        return self.conditions
 
     @override
     def read_signal(self, index: int, out: Vector) -> None:

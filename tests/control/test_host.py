@@ -32,6 +32,7 @@ import attrs
 from ibrobot_core import hookimpl
 from ibrobot_core.descriptors import HardwareDescriptor
 from ibrobot_core.errors import HardwareError
+from ibrobot_core.interfaces import Holding
 from ibrobot_core.options import option
 from ibrobot_core.testing.fakes import FakeHardware
 
@@ -47,6 +48,8 @@ class Arm(FakeHardware):
         if self.options.trouble == "read":
             raise HardwareError("servo 3 does not answer: check its cable")
         return super().read()
+    def holding(self):
+        return Holding("/dev/ttyARM", "arm torque off") if self.options.holds and not self.relaxed else None
     def disconnect(self):
         super().disconnect()
         if self.options.closed:
@@ -56,6 +59,7 @@ class Arm(FakeHardware):
 class Options:
     trouble: str = option("", help="when it fails")
     closed: str = option("", help="file made when it is released")
+    holds: bool = option(False, help="whether it has torque")
 
 @hookimpl
 def ibrobot_hardware():
@@ -142,6 +146,21 @@ class TestBoth:
 
         assert (tmp_path / "closed").exists()
         host.stop()
+
+    @pytest.mark.parametrize(("unmoved", "lines"), [(False, 1), (True, 0)])
+    def test_what_holds_torque_after_a_stop_is_told(self, make, kind, unmoved, lines):
+        host = make(kind, holds=True)
+        host.start()
+        host.stop(unmoved=unmoved)
+
+        assert host.holding == ["/dev/ttyARM holds torque; to take it off: arm torque off"] * lines
+
+    def test_what_holds_torque_after_a_failed_start_is_told(self, make, kind):
+        host = make(kind, holds=True, trouble="connect")
+        with pytest.raises(HardwareError):
+            host.start()
+
+        assert host.holding == ["/dev/ttyARM holds torque; to take it off: arm torque off"]
 
     @pytest.mark.parametrize("trouble", ["connect", "read"])
     def test_hardware_that_does_not_answer_is_told_and_released(self, make, kind, tmp_path, trouble):

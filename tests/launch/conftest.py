@@ -28,7 +28,7 @@ from ibrobot_core.descriptors import (
     HardwareDescriptor, PlannerDescriptor, PolicyDescriptor, RecorderDescriptor, SensorDescriptor, TeleopDescriptor,
 )
 from ibrobot_core.errors import HardwareError, PolicyError, SensorError
-from ibrobot_core.interfaces import Hardware
+from ibrobot_core.interfaces import Hardware, Holding
 from ibrobot_core.testing.fakes import (
     FakeHardware, FakePlanner, FakePolicy, FakeRealHardware, FakeRecorder, FakeSensor, FakeTeleop,
 )
@@ -52,6 +52,8 @@ class Scene(FakeHardware):
         return super().read()
     def reset_faults(self):
         self.broken = False
+    def holding(self):
+        return None if self.relaxed else Holding("the scene", "scene torque off")
 
 class Camera(FakeSensor):
     """50 Hz in real time; `TROUBLE` says which one is missing, has a bug, or is unplugged at its sixth frame."""

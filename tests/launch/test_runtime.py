@@ -114,6 +114,23 @@ def test_one_that_cannot_start_is_named_and_those_before_it_stop(
     assert runs.parts.CALLS == ["open top", "close side", "close top"]
 
 
+def test_a_start_that_fails_after_control_leaves_no_torque_on(runs: Runs):
+    runtime = runs.make()
+    runs.parts.TROUBLE["side"] = "missing"
+    with pytest.raises(ComponentFailed, match="no such device"):
+        runtime.start()
+
+    assert runs.parts.MADE["simulation"].relaxed
+    assert runtime.summary()["holding"] == []
+
+
+def test_what_holds_torque_after_a_run_is_in_its_summary(runs: Runs):
+    runtime = runs.start()
+    runtime.stop()
+
+    assert runtime.summary()["holding"] == ["the scene holds torque; to take it off: scene torque off"]
+
+
 def test_a_missing_model_is_told_before_anything_is_powered(runs: Runs, monkeypatch: pytest.MonkeyPatch):
     runtime = runs.make(mode="lost")
     happened = watch(runtime, monkeypatch)

@@ -64,8 +64,10 @@ class Control(Component):
 
     @override
     def stop(self) -> None:
-        if self._session.has_control:
-            self._session.control.stop()
+        session = self._session
+        if session.has_control:
+            session.control.stop(unmoved=session.start_failed)
+            session.outcome.holding = session.control.holding
 
     def _publish(self, state: ControlState) -> None:
         session = self._session

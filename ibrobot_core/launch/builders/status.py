@@ -7,6 +7,7 @@ from typing import Any, override
 
 import attrs
 
+from ibrobot_core.interfaces import Severity
 from ibrobot_core.launch.component import Worker
 from ibrobot_core.launch.session import Session
 from ibrobot_core.messages import DiagnosticArray, DiagnosticStatus, Header, KeyValue, RobotStatus
@@ -64,6 +65,7 @@ class Status(Worker):
         report = session.control.report
         counters: Mapping[str, Any] = report["counters"]
         groups = {"loop": {**report["loop"], **counters.get("loop", {})}, "safety": counters.get("safety", {})}
+        groups["interventions"] = counters.get("joints", {})
         groups |= {f"executor {name}": counts for name, counts in counters.get("executors", {}).items()}
         groups |= {f"hardware {name}": counts for name, counts in counters.get("hardware", {}).items()}
         if session.stats is not None:
@@ -75,13 +77,21 @@ class Status(Worker):
             groups[f"sensor {name}"] = {"rate_hz": round(rate, 2), **age}
         groups["bus drops"] = session.bus.dropped()
         level = DiagnosticStatus.ERROR if session.outcome.faults else DiagnosticStatus.OK
-        return DiagnosticArray(
-            Header(now_ns),
-            tuple(
-                DiagnosticStatus(
-                    level if name == "loop" else DiagnosticStatus.OK, name, "", session.config.robot.name,
-                    tuple(KeyValue(key, str(value)) for key, value in counts.items()),
-                )
-                for name, counts in groups.items()
-            ),
-        )  # fmt: skip
+        robot = session.config.robot.name
+        statuses = [
+            DiagnosticStatus(level if name == "loop" else DiagnosticStatus.OK, name, "", robot, _values(counts))
+            for name, counts in groups.items()
+        ]
+        statuses += [_of_joint(condition, robot) for condition in counters.get("conditions", ())]
+        return DiagnosticArray(Header(now_ns), tuple(statuses))
+
+
+def _of_joint(condition: Mapping[str, Any], robot: str) -> DiagnosticStatus:
+    """A condition of a joint, as control reports it."""
+    level = DiagnosticStatus.ERROR if condition["severity"] == Severity.FAULT.value else DiagnosticStatus.WARN
+    values = {condition["quantity"]: f"{condition['value']:.4g} {condition['unit']}".rstrip()}
+    return DiagnosticStatus(level, f"joint {condition['joint']}", condition["message"], robot, _values(values))
+
+
+def _values(counts: Mapping[str, Any]) -> tuple[KeyValue, ...]:
+    return tuple(KeyValue(key, str(value)) for key, value in counts.items())

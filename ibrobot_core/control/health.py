@@ -1,0 +1,59 @@
+"""Conditions of joints over time: what begins, what is a fault, what has lasted so long that load must be shed."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+
+from ibrobot_core.config.schema import Shedding
+from ibrobot_core.interfaces import Condition, Severity
+from ibrobot_core.units import ns
+
+_Key = tuple[str, str]
+"""Joint and quantity."""
+
+
+class Health:
+    """Remembers since when each condition has lasted; a warning is logged when it begins.
+
+    Args:
+        options: how long conditions that shedding load helps against may last.
+        log: for warnings.
+    """
+
+    def __init__(self, options: Shedding, log: logging.Logger) -> None:
+        self._after_ns = ns(options.after)
+        self._log = log
+        self._since_ns: dict[_Key, int] = {}
+        self._severity: dict[_Key, Severity] = {}
+        self.conditions: Sequence[Condition] = ()
+        """The present ones."""
+
+    def restart(self) -> None:
+        """Begin to count the time again."""
+        self._since_ns.clear()
+
+    def update(self, conditions: Sequence[Condition], now_ns: int) -> None:
+        """Take the present conditions at `now_ns` [ns]."""
+        found = {(condition.joint, condition.quantity): condition for condition in conditions}
+        for key, condition in found.items():
+            if condition.severity is Severity.WARNING and key not in self._severity:
+                self._log.warning("%s", condition.message)
+        self._severity = {key: condition.severity for key, condition in found.items()}
+        self._since_ns = {
+            key: self._since_ns.get(key, now_ns) for key, condition in found.items() if condition.sheds_load
+        }
+        self.conditions = conditions
+
+    @property
+    def fault(self) -> str:
+        """The message of a condition that is a fault; empty where none is."""
+        return next((each.message for each in self.conditions if each.severity is Severity.FAULT), "")
+
+    def overdue(self, now_ns: int) -> str:
+        """The message of a condition that has lasted for so long that load must be shed; empty where none has."""
+        for condition in self.conditions:
+            since_ns = self._since_ns.get((condition.joint, condition.quantity), now_ns)
+            if now_ns - since_ns >= self._after_ns:
+                return condition.message
+        return ""
