@@ -154,17 +154,68 @@ def test_inference_leaves_the_processs_random_numbers_alone(folders: dict[str, P
     assert torch.equal(torch.rand(3), wanted)
 
 
-def test_a_batch_of_act_is_one_run(folders: dict[str, Path]) -> None:
-    policy = loaded(folders["act"])
-    batch = [policy.preprocess(frame) for frame in frames(policy, 4)]
+TOLERANCE = 1e-5
+"""Of actions of a batch beside those of single runs: kernels for other sizes sum in another order."""
+
+
+def network(policy: LeRobotPolicy) -> torch.nn.Module:
+    """What a run of the policy calls once, or once for each step of denoising."""
     model = policy._model._policy  # type: ignore[union-attr]
-    sizes: list[int] = []
-    model.register_forward_pre_hook(lambda *_: sizes.append(0))
-    model.model.register_forward_pre_hook(lambda _, inputs: sizes.append(len(inputs[0][STATE])))
+    return {"act": lambda: model.model, "diffusion": lambda: model.diffusion.unet, "vqbet": lambda: model.vqbet.policy}[
+        model.config.type
+    ]()
+
+
+@pytest.mark.parametrize(("name", "runs"), [("act", 1), ("diffusion", 3), ("vqbet", 1)])
+def test_a_batch_is_one_run(folders: dict[str, Path], name: str, runs: int) -> None:
+    policy = loaded(folders[name])
+    batch = [policy.preprocess(frame) for frame in frames(policy, 8)]
+    calls: list[int] = []
+    hook = network(policy).register_forward_hook(lambda *_: calls.append(1))
     together = [policy.postprocess(each) for each in policy.infer_batch(batch)]
-    assert sizes == [4]
-    for chunk, tensors in zip(together, batch, strict=True):
-        np.testing.assert_allclose(chunk, policy.postprocess(policy.infer(tensors)), atol=1e-5)
+    hook.remove()
+    assert len(calls) == runs
+    alone = [policy.postprocess(policy.infer(tensors)) for tensors in batch]
+    assert np.abs(np.stack(together) - np.stack(alone)).max() < TOLERANCE
+    assert len({chunk.tobytes() for chunk in together}) == 8, "each request has its own actions"
+    backwards = [policy.postprocess(each) for each in policy.infer_batch(batch[::-1])][::-1]
+    assert np.abs(np.stack(backwards) - np.stack(alone)).max() < TOLERANCE
+
+
+@pytest.mark.parametrize("name", ["diffusion", "vqbet"])
+def test_noise_of_a_batch_is_that_of_each_request_alone(folders: dict[str, Path], name: str) -> None:
+    """Equal observations with equal seeds act alike, with other seeds not, whatever else is in the batch."""
+    policy = loaded(folders[name])
+    one = dict(policy.preprocess(frames(policy, 1)[0]))
+    other = {**one, SEED: one[SEED] + 1}
+    first, second, third = (each["action"] for each in policy.infer_batch([one, other, one]))
+    np.testing.assert_allclose(first, third, atol=TOLERANCE)
+    assert np.abs(first - second).max() > 0.01
+
+
+def test_a_batch_that_draws_in_unknown_ways_is_run_one_by_one(
+    folders: dict[str, Path], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    policy = loaded(folders["act"])
+    model = policy._model._policy  # type: ignore[union-attr]
+    predict = model.predict_action_chunk
+    monkeypatch.setattr(model, "predict_action_chunk", lambda inputs: predict(inputs) + torch.empty(1).log_normal_())
+    batch = [policy.preprocess(frame) for frame in frames(policy, 3)]
+    with caplog.at_level("INFO"):
+        for _ in range(2):
+            for tensors, outputs in zip(batch, policy.infer_batch(batch), strict=True):
+                np.testing.assert_array_equal(outputs["action"], policy.infer(tensors)["action"])
+    assert caplog.text.count("requests are run one by one") == 1
+
+
+def test_inference_of_a_batch_leaves_the_processs_random_numbers_alone(folders: dict[str, Path]) -> None:
+    policy = loaded(folders["diffusion"])
+    batch = [policy.preprocess(frame) for frame in frames(policy, 3)]
+    torch.manual_seed(1)
+    wanted = torch.rand(3)
+    torch.manual_seed(1)
+    policy.infer_batch(batch)
+    assert torch.equal(torch.rand(3), wanted)
 
 
 def test_fewer_actions_on_demand(folders: dict[str, Path]) -> None:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from ibrobot_core.errors import PolicyError
 from ibrobot_core.interfaces import Tensors
 from ibrobot_lerobot.checkpoint import ACTION, Checkpoint
+from ibrobot_lerobot.draws import Draw, Draws, NotByRequest
 from ibrobot_lerobot.options import LeRobotPolicyOptions
 from ibrobot_lerobot.steps import Steps
 
@@ -54,8 +55,10 @@ class Model:
         self._policy = self._load(options)
         self._autocast = getattr(torch, options.dtype) if options.dtype in ("bfloat16", "float16") else None
         self._chunk = torch.compile(self._policy.predict_action_chunk) if options.compile else None
-        self._draws = False
-        """Whether it draws random numbers, so that each request needs a run with a seed of its own."""
+        self._draws: Sequence[Draw] = ()
+        """What a request draws by itself."""
+        self._one_by_one = False
+        """Whether it draws in a way that cannot be told apart by request."""
         self._log = log
         log.info("%s on %s, %d threads", checkpoint.type, self._device, threads)
 
@@ -84,17 +87,32 @@ class Model:
             )  # fmt: skip
 
     def predict(self, batch: Sequence[Tensors]) -> list[NDArray[np.float32]]:
-        """Chunks, each of shape (1, N, A), of requests whose tensors have equal names and shapes."""
-        if len(batch) > 1 and (self._draws or "prefix" in batch[0]):
+        """Chunks, each of shape (1, N, A), of requests whose tensors have equal names and shapes.
+
+        They are one run of the network: noise is drawn for each request by its own seed. Requests with a prefix, which
+        may have different delays, are run one by one.
+        """
+        if len(batch) > 1 and (self._one_by_one or "prefix" in batch[0]):
             return [self.predict([tensors])[0] for tensors in batch]
         inputs = self.inputs(batch)
         devices = [self._device] if self._device.type == "cuda" else []
         with torch.random.fork_rng(devices), torch.no_grad(), self._arithmetic():
-            torch.manual_seed(int(batch[0]["seed"][0]))
-            before = self._random_states()
-            actions = self._run(inputs, batch)
-            after = self._random_states()
-        self._draws |= any(not torch.equal(a, b) for a, b in zip(before, after, strict=True))
+            draws = Draws([int(tensors["seed"][0]) for tensors in batch], self._device, self._draws)
+            try:
+                with draws if self._chunk is None else nullcontext():  # a compiled network draws where we cannot see it
+                    actions = self._run(inputs, batch)
+                escaped = draws.escaped and len(batch) > 1
+            except NotByRequest:
+                escaped = True
+        if escaped:
+            self._one_by_one = True
+            self._log.info(
+                "%s draws random numbers that belong to no one request: requests are run one by one",
+                self._checkpoint.type,
+            )  # fmt: skip
+            return self.predict(batch)
+        if len(batch) == 1 and "prefix" not in batch[0]:
+            self._draws = draws.made
         result = actions.float().numpy(force=True)
         return [np.array(result[i : i + 1]) for i in range(len(batch))]
 
@@ -165,10 +183,6 @@ class Model:
 
     def _arithmetic(self) -> Any:
         return torch.autocast(self._device.type, self._autocast) if self._autocast is not None else nullcontext()
-
-    def _random_states(self) -> list[torch.Tensor]:
-        cuda = [torch.cuda.get_rng_state(self._device)] if self._device.type == "cuda" else []
-        return [torch.get_rng_state(), *cuda]
 
 
 def _cores() -> int:
