@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import signal
 import sys
 import threading
@@ -54,6 +55,10 @@ _PANEL_PERIOD_S = 0.5
     help="How long a batch that is not full waits for more requests.",
 )  # fmt: skip
 @click.option(
+    "--hang-timeout", type=click.FloatRange(min=0, min_open=True), default=30.0, show_default=True, metavar="S",
+    help="A model that is at work on one batch for longer hangs: requests fail, and the server starts again.",
+)  # fmt: skip
+@click.option(
     "--drain", type=click.FloatRange(min=0), default=10.0, show_default=True, metavar="S",
     help="At the end, how long to wait for requests that are there.",
 )  # fmt: skip
@@ -72,6 +77,7 @@ def serve(what: str, **options: Any) -> None:
         _from_folder(Path(what), registry, options) if options["type_"] else _from_config(what, registry, options)
     )
     transport: Transport | None = None
+    hung = threading.Event()
     try:
         begun_s = time.monotonic()
         policy.load()
@@ -79,13 +85,18 @@ def serve(what: str, **options: Any) -> None:
         stopping = threading.Event()  # only from now on: until here either signal ends it at once
         on_signals(stopping.set, signal.SIGINT, signal.SIGTERM)
         transport = make_transport()
-        limits = ServiceOptions(options["batch"], options["queue"], options["patience"] / 1000)
-        service = InferenceService(policy, transport, name, limits, policy.picture_codec())
+        limits = ServiceOptions(options["batch"], options["queue"], options["patience"] / 1000, options["hang_timeout"])
+
+        def replace() -> None:
+            hung.set()
+            stopping.set()
+
+        service = InferenceService(policy, transport, name, limits, policy.picture_codec(), replace)
         try:
             service.start()
             click.echo(f"serving {name} (policy {policy.fingerprint()}); Ctrl-C ends")
             _show(service, stopping)
-            if not service.drain(options["drain"]):
+            if not hung.is_set() and not service.drain(options["drain"]):
                 logging.getLogger("ibrobot").warning("requests that were there were not answered in time")
         finally:
             service.close()
@@ -93,7 +104,17 @@ def serve(what: str, **options: Any) -> None:
     finally:
         if transport is not None:
             transport.close()
+        if hung.is_set():  # closing the policy could hang as well
+            _start_again()
         policy.close()
+
+
+def _start_again() -> None:
+    """Replace this process by one with the same command line: nothing else ends a thread that hangs."""
+    logging.getLogger("ibrobot").error("the server starts again, with the same command line")
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
 
 
 def _from_config(what: str, registry: Registry, options: dict[str, Any]) -> tuple[str, Policy, Callable[[], Transport]]:

@@ -174,6 +174,9 @@ class Inference:
     )
     server_model: str = option("", help="what the server calls the model, where that is not its name here")
     request_timeout: float = option(5.0, unit="s", gt=0, help="after it a request has failed and the arm holds")
+    hang_timeout: float = option(
+        30.0, unit="s", gt=0, help="for process: a model at work on one request for longer hangs, and is replaced"
+    )
     prompt: str = option("", help="task for language-conditioned policies")
     jpeg_quality: int | None = option(
         None, ge=1, le=100, help="send pictures to the server as JPEG: far fewer bytes, other pixels; null: as they are"

@@ -58,6 +58,13 @@ class FairQueue[T]:
                     taken.append(self._waiting.pop(robot))
             return taken
 
+    def clear(self) -> list[T]:
+        """Take all that wait, in turn."""
+        with self._changed:
+            taken = list(self._waiting.values())
+            self._waiting.clear()
+            return taken
+
     def end(self) -> None:
         """Wait no longer for what may come."""
         with self._changed:

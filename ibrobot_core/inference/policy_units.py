@@ -53,6 +53,10 @@ class PolicyInItsUnits(Policy):
         return self._policy.preprocess(attrs.evolve(self._converted(frame), prefix=prefix, history=history))
 
     @override
+    def check(self, tensors: Tensors) -> None:
+        self._policy.check(tensors)
+
+    @override
     def infer(self, tensors: Tensors) -> Tensors:
         return self._policy.infer(tensors)
 

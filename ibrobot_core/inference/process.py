@@ -35,7 +35,7 @@ class ProcessEngine(Engine):
     """The model in a process of its own, which loads the weights; tensors go through shared memory.
 
     One that dies is started again: at once the first time, then after pauses that double until it answers. Requests
-    meanwhile fail, and the arm holds.
+    meanwhile fail, and the arm holds. One that hangs is killed, and so dies.
 
     Args:
         config: the robot YAML.
@@ -43,11 +43,13 @@ class ProcessEngine(Engine):
         fingerprint: of the policy on this side.
         seed: the run's.
         given_up: set when nobody waits for it any more, e.g. while it loads.
+        hang_timeout_s: how long it may be at work on one request before it is taken to hang [s].
     """
 
     def __init__(
-        self, config: RobotConfig, model: str, fingerprint: str, seed: int = 0, given_up: threading.Event | None = None
-    ) -> None:
+        self, config: RobotConfig, model: str, fingerprint: str, seed: int = 0,
+        given_up: threading.Event | None = None, hang_timeout_s: float = 30.0,
+    ) -> None:  # fmt: skip
         super().__init__("process")
         self._order = {
             "document": config.document, "source": str(config.source), "sim": config.simulated, "model": model,
@@ -62,6 +64,11 @@ class ProcessEngine(Engine):
         self._given_up = given_up or self._closed
         self._process: subprocess.Popen[bytes] | None = None
         self._failure = ""
+        self._hang_timeout_s = hang_timeout_s
+        self._sent = 0
+        """The id of the newest request."""
+        self._at_work_s: float | None = None
+        """Since when the process is at work on one request [s]; None while it has none."""
         self._deaths = 0
         self._start_again_s = 0.0
         self._episode, self._seed = 0, seed
@@ -95,6 +102,8 @@ class ProcessEngine(Engine):
                 self._pipe.send_bytes(json.dumps({"id": request_id, "size": len(frame)}).encode())
             except OSError:
                 raise self._died() from None
+            self._sent = request_id
+            self._at_work_s = self._at_work_s or time.monotonic()
             while (event := self._await("answer", deadline_s))["id"] != request_id:
                 pass  # of a request that nobody waits for any more
             # The memory belongs to the next answer; this one is kept.
@@ -155,6 +164,8 @@ class ProcessEngine(Engine):
                         self._failure = event["error"]
                     elif event["event"] == "ready":
                         self._check(event["fingerprint"])
+                    elif event["event"] == "answer":
+                        self._at_work_s = None if event["id"] == self._sent else time.monotonic()
                     if event["event"] == wanted:
                         return dict(event)
                     continue
@@ -162,6 +173,8 @@ class ProcessEngine(Engine):
                 raise self._died() from None
             if self._closed.is_set() or self._given_up.is_set():
                 raise PolicyError("the model was closed")
+            if self._at_work_s is not None and time.monotonic() - self._at_work_s > self._hang_timeout_s:
+                raise self._hung()
             if time.monotonic() >= deadline_s:
                 state = "did not answer" if self.stats.alive else "is still loading"
                 raise PolicyError(f"the model's process {self.pid} {state} in time")
@@ -186,6 +199,12 @@ class ProcessEngine(Engine):
         if not self.stats.alive:
             self._await("ready", deadline_s)
 
+    def _hung(self) -> PolicyError:
+        assert self._process is not None
+        self._failure = f"it hung, at work on one request for more than {self._hang_timeout_s:g} s"
+        self._process.kill()
+        return self._died()
+
     def _died(self) -> PolicyError:
         """What is known of the death of the process, which is set to start again."""
         assert self._process is not None
@@ -202,6 +221,7 @@ class ProcessEngine(Engine):
     def _bury(self) -> int:
         """End and forget the process; returns its exit status."""
         self.stats.alive = False
+        self._at_work_s = None
         if self._process is None:
             return 0
         process, self._process = self._process, None

@@ -29,6 +29,8 @@ _LATENCIES_KEPT = 1000
 _LEASE_NS = 5 * NS_PER_S
 """How long a model that remembers stays with a silent robot, where another asks."""
 _LONGEST_WAIT_S = 600.0
+_GLANCE_S = 1.0
+"""The longest that the watchdog sleeps."""
 
 
 def service_name(model: str) -> str:
@@ -51,6 +53,8 @@ class ServiceOptions:
     """The most requests that wait, one of each robot."""
     patience_s: float = 0.0
     """How long a batch that is not full waits for more requests [s]; 0: only what waits already goes together."""
+    hang_timeout_s: float = 30.0
+    """After which a model that is at work on one batch is taken to hang [s]."""
     limits: Limits = LIMITS
 
 
@@ -117,11 +121,12 @@ class InferenceService:
         model: what robots call it.
         options: how requests are queued.
         codec: for pictures that come as JPEG.
+        on_hang: called once when the model hangs. Nothing can stop its thread: replace the process.
     """
 
     def __init__(
         self, policy: Policy, transport: Transport, model: str, options: ServiceOptions | None = None,
-        codec: PictureCodec | None = None,
+        codec: PictureCodec | None = None, on_hang: Callable[[], object] = lambda: None,
     ) -> None:  # fmt: skip
         self._policy = policy
         self._transport = transport
@@ -139,12 +144,17 @@ class InferenceService:
         self._at_work = 0
         self._idle = threading.Condition(self._lock)
         self._draining = False
+        self._work: tuple[int, list[_Ticket]] | None = None
+        """What the model is at work on, and since when [ns]."""
+        self._on_hang = on_hang
+        self._closed = threading.Event()
         self._owner: tuple[str, int] | None = None
         self._owner_heard_ns = 0
         self._begun_ns = time.monotonic_ns()
         self._log = logging.getLogger("ibrobot.inference")
         self._ends: list[Callable[[], None]] = []
         self._thread = threading.Thread(target=self._infer_all, name=f"model {model}", daemon=True)
+        self._watchdog = threading.Thread(target=self._watch, name=f"watchdog of {model}", daemon=True)
 
     def start(self) -> None:
         """Begin to answer.
@@ -158,6 +168,7 @@ class InferenceService:
         self._ends.append(self._transport.serve(health_name(self._model), self._health, workers=1))
         self._ends.append(self._transport.serve(service_name(self._model), self._answer, workers=workers))
         self._thread.start()
+        self._watchdog.start()
 
     def drain(self, timeout_s: float) -> bool:
         """Refuse what comes from now on, and wait for what is there to be answered; whether all was, in time [s]."""
@@ -168,12 +179,22 @@ class InferenceService:
     def close(self) -> None:
         """End; what still waits is answered with an error. Safe to call twice."""
         self._draining = True
+        self._closed.set()
         self._queue.end()
         ends, self._ends = self._ends, []
         for end in ends:
             end()
-        if self._thread.is_alive():
-            self._thread.join(1.0)
+        for thread in (self._thread, self._watchdog):
+            if thread.is_alive() and thread is not threading.current_thread():
+                thread.join(1.0)
+
+    @property
+    def state(self) -> str:
+        """What `…/health` says: `ready`, `draining`, or `hangs`."""
+        work = self._work
+        if work is not None and time.monotonic_ns() - work[0] > self._options.hang_timeout_s * NS_PER_S:
+            return "hangs"
+        return "draining" if self._draining else "ready"
 
     def statistics(self) -> dict[str, Any]:
         """What `…/health` answers."""
@@ -181,7 +202,7 @@ class InferenceService:
             robots = {name: counts.summary() for name, counts in self._robots.items()}
             batches = {str(size): count for size, count in sorted(self._batches.items())}
             return {
-                "model": self._model, "state": "draining" if self._draining else "ready",
+                "model": self._model, "state": self.state,
                 "fingerprint": self._fingerprint, "spec": attrs.asdict(self._policy.spec),
                 "uptime_s": round((time.monotonic_ns() - self._begun_ns) / NS_PER_S, 1), "waiting": len(self._queue),
                 "malformed": self._malformed, **self._all.summary(), "batches": batches, "robots": robots,
@@ -213,7 +234,10 @@ class InferenceService:
                 self._idle.notify_all()
 
     def _refusal(self, message: Message) -> str:
-        if self._draining:
+        state = self.state
+        if state == "hangs":
+            return self._hang()
+        if state == "draining":
             return "the server is stopping"
         if message.fingerprint != self._fingerprint:
             return (
@@ -278,10 +302,35 @@ class InferenceService:
             for ticket in batch:
                 if ticket not in live:
                     ticket.fail("expired before its turn came; it was not begun", expired=True)
-            if live and (not self._policy.spec.stateful or self._enter(live[0], now_ns)):
-                self._infer(live)
+            if live:
+                self._work = (now_ns, live)
+                self._run(live, now_ns)
+                self._work = None
 
-    def _infer(self, live: list[_Ticket]) -> None:
+    def _run(self, live: list[_Ticket], now_ns: int) -> None:
+        if not self._policy.spec.stateful:
+            self._infer(live)
+        elif self._enter(live[0], now_ns) and self._infer(live):
+            self._owner = (live[0].message.robot, live[0].message.episode)
+            self._owner_heard_ns = now_ns
+
+    def _watch(self) -> None:
+        """Tell all who wait that the model hangs, once it does."""
+        while not self._closed.wait(min(_GLANCE_S, self._options.hang_timeout_s / 4)):
+            work = self._work
+            if work is None or self.state != "hangs":
+                continue
+            self._log.error("%s", self._hang())
+            for ticket in (*work[1], *self._queue.clear()):
+                ticket.fail(self._hang())
+            self._on_hang()
+            return
+
+    def _hang(self) -> str:
+        return f"the model hangs: it has been at work on one batch for more than {self._options.hang_timeout_s:g} s"
+
+    def _infer(self, live: list[_Ticket]) -> bool:
+        """Answer the tickets; whether there were outputs for all together."""
         begun_ns = time.monotonic_ns()
         with self._lock:
             self._batches[len(live)] += 1
@@ -296,25 +345,34 @@ class InferenceService:
             else:  # one of them must not spoil the others
                 for ticket in live:
                     self._infer([ticket])
-            return
+            return False
         self._pacing.work(len(live), time.monotonic_ns() - begun_ns)
         for ticket, output in zip(live, outputs, strict=True):
             ticket.answer(output, begun_ns)
+        return True
 
     def _enter(self, ticket: _Ticket, now_ns: int) -> bool:
-        """Give a model that remembers to the robot that asks, reset where its episode is a new one."""
-        robot, episode = ticket.message.robot, ticket.message.episode
-        if self._owner is not None and self._owner[0] != robot and now_ns - self._owner_heard_ns < _LEASE_NS:
+        """Whether a model that remembers may answer this robot; reset where its episode is a new one.
+
+        The model becomes the robot's once it has answered: a request that it cannot take is no reason to keep others
+        away, or to forget what another robot's episode was.
+        """
+        message = ticket.message
+        if self._owner is not None and self._owner[0] != message.robot and now_ns - self._owner_heard_ns < _LEASE_NS:
             ticket.fail(f"this policy remembers its requests, so it serves one robot, now {self._owner[0]!r}")
             return False
-        self._owner_heard_ns = now_ns
-        if self._owner != (robot, episode):
+        try:
+            self._policy.check(message.tensors)
+        except Exception as error:  # noqa: BLE001 - contained: the robot is told
+            ticket.fail(self._told(error))
+            return False
+        if self._owner != (message.robot, message.episode):
+            self._owner = None
             try:
-                self._policy.reset(ticket.message.seed)
+                self._policy.reset(message.seed)
             except Exception as error:  # noqa: BLE001 - contained: the robot is told
                 ticket.fail(f"the policy's reset failed: {self._told(error)}")
                 return False
-            self._owner = (robot, episode)
         return True
 
     def _told(self, error: Exception) -> str:

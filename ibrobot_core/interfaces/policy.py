@@ -108,6 +108,15 @@ class Policy(ABC):
             PolicyError: when the frame lacks a key that the policy needs.
         """
 
+    def check(self, tensors: Tensors) -> None:
+        """See that a request, which may come from anywhere, has what `preprocess` makes; does nothing by default.
+
+        A server asks before it resets a policy that remembers for another robot.
+
+        Raises:
+            PolicyError: with what is missing or of another dtype or shape.
+        """
+
     @abstractmethod
     def infer(self, tensors: Tensors) -> Tensors:
         """Inputs -> raw outputs. The heavy step.

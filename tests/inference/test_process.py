@@ -204,6 +204,27 @@ def test_a_process_with_another_policy_than_the_host_is_refused(config: RobotCon
     engine.close()
 
 
+def test_a_process_that_hangs_is_replaced(
+    engine: ProcessEngine, ask: Callable[..., Any], caplog: pytest.LogCaptureFixture
+):
+    engine.reset(5)
+    engine._hang_timeout_s = 0.2
+    hung = engine.pid
+    said = [""]
+    while "it hung" not in said[-1]:  # the first of them, or one that comes later
+        with pytest.raises(PolicyError, match=r"did not answer in time|it hung") as caught:
+            ask("hang", patience_ns=60_000_000)
+        said.append(str(caught.value))
+    assert said[-1] == f"the model's process {hung} died: it hung, at work on one request for more than 0.2 s"
+    assert len(said) > 2
+    assert not engine.stats.alive
+    assert "it hung, at work on one request for more than 0.2 s; it starts again in 0 s" in caplog.text
+    engine._hang_timeout_s = PATIENCE_NS / 1e9  # this machine may be busy
+    outputs = ask()
+    assert outputs["pid"] == engine.pid != hung
+    assert outputs["seeds"].tolist() == [5]
+
+
 def test_closing_ends_a_model_that_hangs(engine: ProcessEngine, ask: Callable[..., Any]):
     with pytest.raises(PolicyError, match="did not answer in time"):
         ask("hang", patience_ns=50_000_000)

@@ -93,7 +93,8 @@ class Cloud:
     def __init__(self, policy: Net, options: ServiceOptions | None = None) -> None:
         self.policy = policy
         self.transport = LocalTransport()
-        self.service = InferenceService(policy, self.transport, "net", options)
+        self.hung = threading.Event()
+        self.service = InferenceService(policy, self.transport, "net", options, on_hang=self.hung.set)
         self.service.start()
         self.pool = ThreadPoolExecutor(80)
 
@@ -333,6 +334,69 @@ def test_a_policy_that_remembers_serves_one_robot_and_is_reset_for_each_episode(
         assert cloud.policy.seeds == [7, 8]
         assert "serves one robot, now 'first'" in failure(cloud.ask("second", 1))
         assert "reset failed: ValueError: a negative seed" in failure(cloud.ask("first", 1, episode=3, seed=-1))
+
+
+class Choosy(Net):
+    """Remembers; refuses what is 7, and fails at what is 13."""
+
+    def __init__(self) -> None:
+        super().__init__(stateful=True)
+        self.gate.release(100)
+
+    @override
+    def check(self, tensors: Tensors) -> None:
+        if (tensors["x"] == 7).any():
+            raise PolicyError("seven is not for me")
+
+
+@pytest.mark.parametrize(("x", "said"), [(7, "seven is not for me"), (13, "ValueError: thirteen")])
+def test_a_request_that_a_policy_cannot_take_keeps_nobody_else_away(
+    x: int, said: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+):
+    monkeypatch.setattr(module, "_LEASE_NS", 100 * SOON_NS)
+    with served(Choosy()) as cloud:
+        assert failure(cloud.ask("stranger", x)) == said
+        assert outputs(cloud.ask("robot", 1, seed=3)) == [2]
+        assert (
+            failure(cloud.ask("stranger", x))
+            == "this policy remembers its requests, so it serves one robot, now 'robot'"
+        )
+        assert cloud.policy.seeds[-1] == 3
+
+
+def test_a_request_that_is_refused_does_not_make_a_policy_forget(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(module, "_LEASE_NS", 0)
+    with served(Choosy()) as cloud:
+        outputs(cloud.ask("robot", 1, episode=4, seed=3))
+        assert failure(cloud.ask("stranger", 7, seed=9)) == "seven is not for me"
+        outputs(cloud.ask("robot", 1, episode=4, seed=3))
+        assert cloud.policy.seeds == [3]
+
+
+def test_a_model_that_hangs_fails_all_requests_at_once_and_says_so(caplog: pytest.LogCaptureFixture):
+    with served(hang_timeout_s=0.02) as cloud:
+        stuck = cloud.busy()
+        said = "the model hangs: it has been at work on one batch for more than 0.02 s"
+        assert failure(stuck) == said
+        assert cloud.hung.wait(PATIENCE_S)
+        assert failure(cloud.ask("robot", 1)) == said
+        assert cloud.health()["state"] == "hangs"
+        assert caplog.messages == [said]
+
+
+def test_what_waits_behind_a_model_that_hangs_fails_with_it():
+    with served(hang_timeout_s=1.5) as cloud:
+        stuck, waiting = cloud.busy(), cloud.asked("robot", 1)
+        assert "the model hangs" in failure(waiting)
+        assert "the model hangs" in failure(stuck)
+
+
+def test_a_model_that_has_nothing_to_do_does_not_hang():
+    with served(hang_timeout_s=0.02) as cloud:
+        cloud.policy.gate.release(10)
+        outputs(cloud.ask("robot", 1))
+        assert not cloud.hung.wait(0.1)
+        assert cloud.health()["state"] == "ready"
 
 
 def test_a_name_is_served_once():

@@ -10,6 +10,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,8 +18,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
+from ibrobot_core.errors import PolicyError
+from ibrobot_core.inference.remote import RemoteEngine
+from ibrobot_core.interfaces import Transport
+from ibrobot_core.plugins import installed
+from ibrobot_core.testing import host_context
+from ibrobot_core.testing.fakes import FakePolicy
+
 if TYPE_CHECKING:
-    from conftest import Log, Ran
+    from conftest import Log, Ran, Site
 
 pytestmark = pytest.mark.integration
 
@@ -27,12 +35,33 @@ MODE = "control_modes.model_inference.inference.execution_mode={}"
 PATIENT = ("--set", "control_modes.model_inference.inference.request_timeout=60")
 
 
-@pytest.fixture
-def endpoint() -> str:
+def free_endpoint() -> str:
     """An address of this machine that nobody listens on."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{free.getsockname()[1]}"
+
+
+@pytest.fixture
+def endpoint() -> str:
+    """An address of this machine that nobody listens on."""
+    return free_endpoint()
+
+
+@pytest.fixture(scope="module")
+def connect() -> Callable[..., Transport]:
+    """Makes a transport to a router. Zenoh's own threads run already, with the files that they keep."""
+    zenoh = installed().find("transport", "zenoh")
+
+    def made(**options: Any) -> Transport:
+        transport: Transport = zenoh.make(zenoh.options(**options), host_context())
+        return transport
+
+    first = free_endpoint()
+    router = made(mode="router", listen=(first,))
+    made(connect=(first,)).close()
+    router.close()
+    return made
 
 
 @pytest.fixture
@@ -92,6 +121,72 @@ def test_a_server_that_is_killed_in_the_middle_of_requests_harms_nothing():
     assert done.returncode == 0, done.stdout + done.stderr
     told: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     assert told["answered_twice"] == 0
+
+
+HANGS_ONCE = """
+import os
+import threading
+from pathlib import Path
+import attrs
+import numpy as np
+from ibrobot_core import hookimpl
+from ibrobot_core.descriptors import PolicyDescriptor
+from ibrobot_core.testing import host_context
+from ibrobot_core.testing.fakes import FakePolicy
+
+@attrs.frozen
+class Options:
+    path: Path
+
+class HangsOnce(FakePolicy):
+    def __init__(self, options, ctx):
+        super().__init__(host_context())
+        self.mark = options.path / "hung"
+    def infer(self, tensors):
+        if not self.mark.exists():
+            self.mark.touch()
+            threading.Event().wait()
+        return {"pid": np.array([os.getpid()])}
+
+@hookimpl
+def ibrobot_policies():
+    yield PolicyDescriptor("hangs_once", HangsOnce, "hangs at its first request", Options)
+"""
+
+
+def test_a_server_whose_model_hangs_starts_again(
+    ibrobot: tuple[str, ...], endpoint: str, connect: Callable[..., Transport], site: Site, tmp_path: Path
+):
+    site.add("hangs-once", HANGS_ONCE)
+    command = [*ibrobot, "serve", tmp_path, "--type", "hangs_once", "--name", "net", "--listen", endpoint]
+    process = subprocess.Popen(
+        [*command, "--hang-timeout", "0.5"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    network = connect(connect=(endpoint,))
+    remote = RemoteEngine(FakePolicy(host_context()), network, "net", "so101", start_timeout_s=60.0)
+    tensors = {"x": np.zeros(1)}
+    try:
+        remote.start()
+        with pytest.raises(PolicyError, match=r"the model hangs: it has been at work on .* more than 0\.5 s"):
+            remote.infer(tensors, 1, time.monotonic_ns() + 60_000_000_000)
+        assert process.stdout is not None
+        served = process.stdout.readline()
+        assert served.startswith("serving net")
+        while process.stdout.readline() != served:
+            assert process.poll() is None
+        remote.start()
+        answer = remote.infer(tensors, 2, time.monotonic_ns() + 60_000_000_000)
+        assert answer["pid"].tolist() == [process.pid], "in the same process, with a new program"
+        process.send_signal(signal.SIGTERM)
+        out, err = process.communicate(timeout=60)
+        assert process.returncode == 0
+        assert "1 requests, 1 answered" in out
+        assert "E the server starts again, with the same command line" in err
+    finally:
+        remote.close()
+        network.close()
+        process.kill()
+        process.communicate()
 
 
 @pytest.mark.parametrize(

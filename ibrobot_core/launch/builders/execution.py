@@ -90,8 +90,9 @@ class Model(Component):
         match inference.execution_mode:
             case "process":
                 return ProcessEngine(
-                    session.config, inference.model, policy.fingerprint(), session.request.seed, session.finished
-                )
+                    session.config, inference.model, policy.fingerprint(), session.request.seed, session.finished,
+                    inference.hang_timeout,
+                )  # fmt: skip
             case "distributed":
                 return RemoteEngine(
                     policy, session.transport, inference.server_model or inference.model, session.config.robot.name,

@@ -117,9 +117,18 @@ class ScriptedPick(Policy):
         return tensors
 
     @override
+    def check(self, tensors: Tensors) -> None:
+        for name, shape in {STAMP: (1,), **self.spec.observations}.items():
+            array = tensors.get(name)
+            if array is None or array.shape != shape or not np.isfinite(array).all():
+                got = "nothing" if array is None else f"{array.dtype} {array.shape}"
+                raise PolicyError(f"scripted_pick needs {name} with {shape[0]} finite numbers, got {got}")
+
+    @override
     def infer(self, tensors: Tensors) -> Tensors:
         if self._planner is None:
             raise PolicyError("scripted_pick is not loaded: call load() first")
+        self.check(tensors)
         now_ns = int(tensors[STAMP][0])
         state, scene = tensors[STATE].astype(np.float64), Scene.parse(tensors[SCENE].astype(np.float64))
         if self._episode is None:

@@ -208,6 +208,22 @@ def test_a_vector_of_another_length_is_refused(policy: ScriptedPick) -> None:
         policy.preprocess(frame(0.0, state=np.zeros(2)))
 
 
+@pytest.mark.parametrize("wrong", [None, np.zeros(3), np.full(6, np.nan)], ids=["none", "shape", "nan"])
+def test_a_request_with_other_tensors_is_refused_and_nothing_forgotten(
+    policy: ScriptedPick, wrong: Vector | None
+) -> None:
+    first = chunk(policy, 0.0)
+    tensors = dict(policy.preprocess(frame(1.0)))
+    policy.check(tensors)
+    tensors.pop(STATE)
+    if wrong is not None:
+        tensors[STATE] = wrong
+    for refuse in (policy.check, policy.infer):
+        with pytest.raises(PolicyError, match=r"needs observation\.state with 6 finite numbers, got"):
+            refuse(tensors)
+    np.testing.assert_allclose(chunk(policy, 0.0), first)
+
+
 def test_infer_before_load_is_refused() -> None:
     policy = ScriptedPick(ScriptedPickOptions(), host_context(robot=ROBOT))
     with pytest.raises(PolicyError, match="is not loaded"):
