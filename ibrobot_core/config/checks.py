@@ -11,7 +11,7 @@ import attrs
 
 from ibrobot_core.config.convert import hint
 from ibrobot_core.config.keys import ModeKeys
-from ibrobot_core.config.models import READERS, Limits, ModelError
+from ibrobot_core.config.models import READERS, Limits, Model, ModelError
 from ibrobot_core.config.schema import Control, Inference, Share
 from ibrobot_core.config.structure import Part, Parts
 from ibrobot_core.config.yaml_nodes import Document, Key
@@ -82,8 +82,8 @@ class Checks:
         self._models(robot)
 
     def _models(self, robot: Robot) -> None:
-        """The models can be read, and no joint may go where none of them lets it."""
-        known = []
+        """The models can be read, the tip is in them, and no joint may go where none of them lets it."""
+        known: list[Model] = []
         for model, path in (("mjcf", robot.description.mjcf), ("urdf", robot.description.urdf)):
             key: Key = ("robot", "description", model)
             if path is None:
@@ -96,9 +96,13 @@ class Checks:
             except ModelError as error:
                 self.document.add(key, str(error))
         for i, joint in enumerate(robot.joints):
-            limits = [each[joint.name] for each in known if joint.name in each]
+            limits = [each.limits[joint.name] for each in known if joint.name in each.limits]
             if limits and not joint.beyond_model:
                 self._within(("robot", "joints", i), joint, limits)
+        at: Key = ("robot", "description", "tip")
+        if known and self.document.get(*at) is not None:
+            frames = [name for each in known for name in each.frames]
+            self._refer(at, robot.description.tip, frames, " or ".join(each.frame for each in known))
 
     def _within(self, key: Key, joint: Joint, limits: list[Limits]) -> None:
         lowest, highest = min(limits, key=lambda each: each.lower), max(limits, key=lambda each: each.upper)

@@ -1,9 +1,9 @@
-"""The limits of joints in URDF and MJCF models, read as plain XML: no program that uses them needs to be installed."""
+"""What URDF and MJCF models say of joints and frames, read as plain XML: what uses them need not be installed."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from xml.parsers import expat
 
@@ -26,6 +26,18 @@ class Limits:
     upper: float
     place: str
     """File and line."""
+
+
+@attrs.frozen
+class Model:
+    """What a robot YAML refers to in a model."""
+
+    limits: Mapping[str, Limits]
+    """Joint -> limits, of the joints that have some."""
+    frames: tuple[str, ...]
+    """What can be the tip: sites of an MJCF, links of a URDF."""
+    frame: str
+    """What such a frame is called."""
 
 
 @attrs.frozen
@@ -84,24 +96,25 @@ def read_xml(path: Path) -> Element:
     return top.children[0]
 
 
-def urdf_limits(path: Path) -> dict[str, Limits]:
-    """Joint -> limits, of the joints of a URDF that have some.
+def read_urdf(path: Path) -> Model:
+    """What a URDF says.
 
     Raises:
         ModelError: when it is no URDF.
     """
+    root = _root(path, "robot")
     found = {}
-    for joint in _root(path, "robot").children:
+    for joint in root.children:
         if joint.tag == "joint" and joint.attributes.get("type") in ("revolute", "prismatic"):
             for limit in joint.children:
                 if limit.tag == "limit":
                     lower, upper = (_numbers(limit, name, "0", 1)[0] for name in ("lower", "upper"))
                     found[joint.attributes.get("name", "")] = Limits(lower, upper, f"{path.name}:{limit.line}")
-    return found
+    return Model(found, _names(root.children, "link"), "link")
 
 
-def mjcf_limits(path: Path) -> dict[str, Limits]:
-    """Joint -> limits, of the hinges and slides of an MJCF that have some: its own, or those of its default class.
+def read_mjcf(path: Path) -> Model:
+    """What an MJCF says, with what it includes; a joint's limits are its own, or those of its default class.
 
     Raises:
         ModelError: when it is no MJCF.
@@ -127,11 +140,15 @@ def mjcf_limits(path: Path) -> dict[str, Limits]:
             lower, upper = _numbers(attrs.evolve(joint, attributes=given), "range", "0 0", 2)
             turn = math.pi / 180 if kind == "hinge" and compiler.get("angle", "degree") == "degree" else 1.0
             found[name] = Limits(lower * turn, upper * turn, f"{joint.file.name}:{joint.line}")
-    return found
+    return Model(found, _names(root.below(), "site"), "site")
 
 
-READERS: Mapping[str, Callable[[Path], dict[str, Limits]]] = {"mjcf": mjcf_limits, "urdf": urdf_limits}
-"""Key under `robot.description` -> what reads the joint limits of that model."""
+READERS: Mapping[str, Callable[[Path], Model]] = {"mjcf": read_mjcf, "urdf": read_urdf}
+"""Key under `robot.description` -> what reads that model."""
+
+
+def _names(elements: Iterable[Element], tag: str) -> tuple[str, ...]:
+    return tuple(each.attributes["name"] for each in elements if each.tag == tag and "name" in each.attributes)
 
 
 def _root(path: Path, tag: str) -> Element:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ibrobot_core.config.models import ModelError, mjcf_limits, urdf_limits
+from ibrobot_core.config.models import Model, ModelError, read_mjcf, read_urdf
 from ibrobot_core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -41,9 +41,8 @@ MJCF = """<mujoco>
 """
 
 
-def limits_of(found: object) -> dict[str, tuple[float, float]]:
-    assert isinstance(found, dict)
-    return {name: (limits.lower, limits.upper) for name, limits in found.items()}
+def limits_of(model: Model) -> dict[str, tuple[float, float]]:
+    return {name: (limits.lower, limits.upper) for name, limits in model.limits.items()}
 
 
 def write(folder: Path, text: str, name: str = "arm.xml") -> Path:
@@ -53,13 +52,13 @@ def write(folder: Path, text: str, name: str = "arm.xml") -> Path:
 
 
 def test_a_urdf_gives_the_limits_of_joints_that_have_some(tmp_path: Path) -> None:
-    found = urdf_limits(write(tmp_path, URDF))
+    found = read_urdf(write(tmp_path, URDF))
     assert limits_of(found) == {"pan": (-1.0, 1.0), "lift": (-1.5, 1.5)}
-    assert found["lift"].place == "arm.xml:5"
+    assert found.limits["lift"].place == "arm.xml:5"
 
 
 def test_an_mjcf_gives_them_by_default_classes_in_degrees(tmp_path: Path) -> None:
-    found = limits_of(mjcf_limits(write(tmp_path, MJCF)))
+    found = limits_of(read_mjcf(write(tmp_path, MJCF)))
     quarter, turn, little = math.radians(90), math.radians(180), math.radians(10)
     wanted = {"pan": (-quarter, quarter), "roll": (-turn, turn), "rail": (0.0, 0.3), "plain": (-little, little)}
     assert found.keys() == wanted.keys()
@@ -71,10 +70,10 @@ def test_an_included_file_is_read_in_its_place(tmp_path: Path) -> None:
     world = MJCF[MJCF.index("  <worldbody") : MJCF.index("</mujoco>")]
     write(tmp_path, f"<mujocoinclude>{world}</mujocoinclude>", "world.xml")
     whole = write(tmp_path, MJCF.replace(world, '<include file="world.xml"/>'))
-    assert mjcf_limits(whole).keys() == {"pan", "roll", "rail", "plain"}
+    assert read_mjcf(whole).limits.keys() == {"pan", "roll", "rail", "plain"}
     write(tmp_path, '<mujocoinclude><include file="world.xml"/></mujocoinclude>', "world.xml")
     with pytest.raises(ModelError, match=r"world\.xml:1: includes world\.xml a second time"):
-        mjcf_limits(whole)
+        read_mjcf(whole)
 
 
 @pytest.mark.parametrize(
@@ -104,13 +103,13 @@ def test_an_included_file_is_read_in_its_place(tmp_path: Path) -> None:
 )
 def test_what_is_no_model_is_refused_with_its_line(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(ModelError, match=message):
-        mjcf_limits(write(tmp_path, text))
+        read_mjcf(write(tmp_path, text))
 
 
 def test_depth_is_no_trouble(tmp_path: Path) -> None:
     deep = "<body>" * 20_000 + '<joint name="a" range="0 1"/>' + "</body>" * 20_000
     path = write(tmp_path, f'<mujoco><compiler angle="radian"/><worldbody>{deep}</worldbody></mujoco>')
-    assert limits_of(mjcf_limits(path)) == {"a": (0.0, 1.0)}
+    assert limits_of(read_mjcf(path)) == {"a": (0.0, 1.0)}
 
 
 def problems(load_text: Load, text: str) -> list[tuple[int, str, str]]:
@@ -163,3 +162,14 @@ def test_a_model_that_cannot_be_read_is_a_fault_of_its_key(load_text: Load, mode
     ((_, path, message),) = problems(load_text, modelled)
     assert path == "robot.description.urdf"
     assert "arm.urdf:9: not valid XML: no element found" in message
+
+
+def test_a_tip_that_no_model_has_is_refused(load_text: Load, modelled: str, tmp_path: Path) -> None:
+    write(tmp_path, URDF.replace("</robot>", '<link name="gripper_tip"/></robot>'), "arm.urdf")
+    text = modelled.replace("    urdf:", "    tip: griper_tip\n    urdf:")
+    ((_, path, message),) = problems(load_text, text)
+    assert path == "robot.description.tip"
+    assert message == "unknown link 'griper_tip', did you mean 'gripper_tip'?"
+    assert load_text(text.replace("griper", "gripper")).robot.description.tip == "gripper_tip"
+    write(tmp_path, MJCF.replace("</body>\n  </worldbody>", '<site name="griper_tip"/></body>\n  </worldbody>'))
+    assert load_text(text.replace("    urdf:", "    mjcf: arm.xml\n    urdf:")).robot.description.tip == "griper_tip"

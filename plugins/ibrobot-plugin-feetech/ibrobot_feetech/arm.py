@@ -9,7 +9,7 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.calibration import Calibration, JointCalibration
+from ibrobot_core.calibration import ZERO_AT, Calibration, JointCalibration
 from ibrobot_core.errors import HardwareError
 from ibrobot_core.robot import Vector
 from ibrobot_core.units import radians_to_ticks, ticks_to_radians
@@ -46,6 +46,11 @@ class Arm:
     def names(self) -> dict[int, str]:
         """Servo id -> joint."""
         return dict(zip(self.servos, self.joints, strict=True))
+
+    @property
+    def zero_text(self) -> str:
+        """Where 0 rad is, in words."""
+        return f"by {self.calibration.path}, 0 rad is {ZERO_AT[self.calibration.zero_at]}"
 
     @cached_property
     def _zero(self) -> Vector:

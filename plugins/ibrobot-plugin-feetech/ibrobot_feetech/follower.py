@@ -97,6 +97,7 @@ class FeetechFollower(Hardware):
         except BaseException:
             bus.close()
             raise
+        self._ctx.log.info("%s: %s", self._ctx.name, arm.zero_text)
         self._warn_of_reach()
 
     @override

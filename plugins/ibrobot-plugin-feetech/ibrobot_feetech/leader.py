@@ -98,6 +98,7 @@ class LeaderTeleop(Teleop):
         except HardwareError as error:
             bus.close()
             raise TeleopError(f"{self._ctx.name}: {error}") from None
+        self._ctx.log.info("%s: %s", self._ctx.name, self._arm.zero_text)
         self._bus, self._reader = bus, SyncReader(bus, self._arm.servos, "present_position")
         self._keys = self._ctx.keys() if self._ctx.keys is not None else None
 

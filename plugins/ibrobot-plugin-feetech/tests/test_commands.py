@@ -113,7 +113,8 @@ def test_an_arm_is_calibrated_in_the_dialogue_and_the_former_file_is_kept(emulat
     former = home / "so101_follower.json"
     former.write_text('{"pan": {"id": 1, "drive_mode": 0, "homing_offset": 5, "range_min": 1, "range_max": 9}}')
     before = former.read_text()
-    with Terminal("feetech", "calibrate", emulator.port, "--arm", "left") as terminal:
+    adapter = ADAPTER.format(port=emulator.port)
+    with Terminal("feetech", "calibrate", emulator.port, "--arm", "left", before=adapter) as terminal:
         terminal.wait_for("Calibrate anew? [y/N]")
         terminal.type("y\r")
         terminal.wait_for("middle of its range. Then press Enter")
@@ -125,7 +126,7 @@ def test_an_arm_is_calibrated_in_the_dialogue_and_the_former_file_is_kept(emulat
         terminal.wait_for("written to servos 1, 2, 3, 4, 5, 6")
         assert terminal.end() == 0
     found = load_calibration("so101_follower", JOINTS)
-    assert found.robot == "left"
+    assert (found.robot, found.adapter) == ("left", "5A12")
     assert found.date
     for joint in found.joints.values():
         assert joint.homing_offset == MIDDLES[joint.id] - 2048
@@ -139,6 +140,9 @@ def test_an_arm_is_calibrated_in_the_dialogue_and_the_former_file_is_kept(emulat
     _, screen = ran("check", emulator.port)
     assert "are as the calibration says" in screen
     assert "0 rad is the pose that was set by hand" in screen
+    code, screen = ran("check", emulator.port, "--write", "--yes", before=adapter.replace("5A12", "5A99"))
+    assert code == 1
+    assert "this is another arm: its adapter has the USB serial number 5A99" in screen.replace("\r\n", " ")
 
 
 QUESTIONS = ("Calibrate anew?", "Go on?", "Then press Enter", "(Enter ends it)")
@@ -404,6 +408,14 @@ def refuse(*arguments, **options):
     raise serial.SerialException(errno.EACCES, 'Permission denied')
 serial.Serial = refuse
 """
+ADAPTER = """
+from serial.tools import list_ports
+from serial.tools.list_ports_common import ListPortInfo
+port = ListPortInfo({port!r})
+port.vid, port.pid, port.serial_number = 0x1A86, 0x55D3, "5A12"
+list_ports.comports = lambda: [port]
+"""
+"""Python source: the emulator's port is behind USB."""
 PORTS = """
 from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from ibrobot_mujoco.so101 import MJCF
 
 from ibrobot_core.config.expand import resolve_path
-from ibrobot_core.config.models import mjcf_limits
+from ibrobot_core.config.models import read_mjcf
 
 CLASSES = ("main", "servo", "small")
 RANGES = st.sampled_from(["", 'range="-1 2"', 'range="-0.5 0.25"', 'range="0 3"'])
@@ -43,7 +43,7 @@ def compiled(model: mujoco.MjModel) -> dict[str, tuple[float, float]]:
 
 
 def read(path: Path) -> dict[str, tuple[float, float]]:
-    return {name: (limits.lower, limits.upper) for name, limits in mjcf_limits(path).items()}
+    return {name: (limits.lower, limits.upper) for name, limits in read_mjcf(path).limits.items()}
 
 
 @settings(max_examples=200, deadline=None)
