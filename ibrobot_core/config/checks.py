@@ -60,11 +60,24 @@ class Checks:
             if name in names[:i]:
                 self.document.add((*key, i), f"{what} {name!r} is given twice")
 
+    def _name(self, key: Key, name: str) -> None:
+        """Names become parts of topics, files and lines of a terminal."""
+        if not name or not name.isprintable() or "/" in name or name != name.strip():
+            message = f"a name is not empty and has no slash, control character or space at its ends, got {name!r}"
+            self.document.add(key, message)
+
     def _robot(self, robot: Robot) -> None:
         at: Key = ("robot",)
         names = list(robot.joint_names)
         if not names:
             self.document.add((*at, "joints"), "a robot needs at least one joint")
+        self._name((*at, "name"), robot.name)
+        for i, name in enumerate(names):
+            self._name((*at, "joints", i, "name"), name)
+        for group in robot.groups:
+            self._name((*at, "groups", group), group)
+        for pose in robot.description.poses:
+            self._name((*at, "description", "poses", pose), pose)
         for i, name in enumerate(names):
             if name in names[:i]:
                 self.document.add((*at, "joints", i, "name"), f"a second joint named {name!r}")

@@ -78,14 +78,14 @@ class Document:
         self.problems.append((place, Problem(place.file, place.line, self.dotted(key), message)))
 
     def dotted(self, key: Key) -> str:
-        """`key` as `--set` takes it: list items by their name where they have one."""
+        """`key` as `--set` takes it: list items by their name where they have one; fit for a terminal."""
         words: list[str] = []
         value = self.root
         for part in key:
             value = _child(value, part)
             name = value.get("name") if isinstance(part, int) and isinstance(value, Mapping) else None
             words.append(name if isinstance(name, str) else str(part))
-        return ".".join(words)
+        return "".join(each if each.isprintable() else ascii(each)[1:-1] for each in ".".join(words))
 
     def get(self, *key: str | int) -> Any:
         """The value at `key`, or None."""

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
+NAME = "a name is not empty and has no slash, control character or space at its ends"
 # What is wrong, the text of the base YAML that is replaced, what stands there instead, and all that is told.
 CASES = {
     "package_missing": (
@@ -46,6 +47,17 @@ CASES = {
         "pan, lower: -1.0, upper: 1.0, max_velocity: 2.0",
         "pan, lower: -1.0, upper: 1.0, max_velocity: 0",
         "robot.yaml:4: robot.joints.pan.max_velocity: 0.0 is too small, must be above 0 rad/s",
+    ),
+    "robot_name_slash": ("name: mini", "name: ../mini", f"robot.yaml:2: robot.name: {NAME}, got '../mini'"),
+    "group_name_control_character": (
+        "    gripper: [grip]",
+        '    gripper: [grip]\n    "a\\e[2J": [grip]',
+        f"robot.yaml:10: robot.groups.a\\x1b[2J: {NAME}, got 'a\\x1b[2J'",
+    ),
+    "pose_name_empty": (
+        "poses: {home: [0, 0, 0]}",
+        'poses: {home: [0, 0, 0], "": [0, 0, 0]}',
+        f"robot.yaml:11: robot.description.poses.: {NAME}, got ''",
     ),
     "joint_twice": (
         "name: lift",
