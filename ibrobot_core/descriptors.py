@@ -31,6 +31,10 @@ if TYPE_CHECKING:
     )
 
 
+def nothing_is_missing() -> None:
+    """The check of a type that needs nothing but Python packages that come with its plugin."""
+
+
 @attrs.frozen
 class Descriptor[T]:
     """One implementation of one kind.
@@ -45,6 +49,12 @@ class Descriptor[T]:
     summary: str
     options: builtins.type[Any] = NoOptions
     """A frozen attrs class made with `ibrobot_core.options.option`."""
+    check: Callable[[], None] = attrs.field(default=nothing_is_missing, kw_only=True)
+    """Whether this machine has what the type needs beyond the plugin's own packages; imports nothing heavy.
+
+    Raises:
+        MissingDependency: e.g. for a system library. A run goes on without a sensor that nothing in it needs.
+    """
 
 
 @attrs.frozen

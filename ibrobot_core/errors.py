@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import attrs
@@ -51,6 +51,24 @@ class PluginError(IbrobotError):
     """A plugin that is asked for but is missing or broken, e.g. `type: feetech_so101` without its package."""
 
     exit_code = 2
+
+
+class MissingDependency(IbrobotError):
+    """A library that a type needs and this machine lacks, e.g. no OpenGL for simulated cameras.
+
+    Args:
+        missing: what is missing, and what for.
+        apt: the Debian packages that bring it; `remedy` then is the command that installs them.
+        remedy: what to do about it, where that is not a matter of Debian packages.
+    """
+
+    exit_code = 2
+
+    def __init__(self, missing: str, *, apt: Sequence[str] = (), remedy: str = "") -> None:
+        self.missing = missing
+        self.apt = tuple(apt)
+        self.remedy = remedy or f"sudo apt-get install {' '.join(apt)}"
+        super().__init__(f"{missing}; {self.remedy}")
 
 
 class ContractError(IbrobotError):

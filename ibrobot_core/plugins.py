@@ -16,7 +16,7 @@ import pluggy
 
 from ibrobot_core import hookspecs
 from ibrobot_core.descriptors import Check, Command, ConfigFile, Descriptor, ReaderDescriptor
-from ibrobot_core.errors import PluginError, RecorderError
+from ibrobot_core.errors import MissingDependency, PluginError, RecorderError
 
 if TYPE_CHECKING:
     from ibrobot_core.interfaces import EpisodeReader
@@ -116,6 +116,22 @@ class Registry:
         if entry is None:
             raise PluginError(self._why_missing(kind, type_))
         return entry.descriptor
+
+    def missing(self, kind: str, type_: str) -> MissingDependency | None:
+        """What this machine lacks for `type_`; None where it lacks nothing. A check that fails otherwise is told so.
+
+        Raises:
+            PluginError: as `find`.
+        """
+        descriptor = self.find(kind, type_)
+        try:
+            descriptor.check()
+        except MissingDependency as missing:
+            return missing
+        except Exception as error:  # noqa: BLE001 - contained: a plugin's fault must not hide the other checks
+            package = self.entries[kind, type_].package
+            return MissingDependency(f"its check failed: {_reason(error)}", remedy=f"report it to {package}")
+        return None
 
     def open_episode(self, path: Path, told: Mapping[str, str] | None = None) -> EpisodeReader:
         """A reader of an episode.

@@ -48,11 +48,12 @@ def doctor(as_json: bool) -> None:
 
 
 def examine(registry: Registry) -> list[Finding]:
-    """All checks: Python, plugins, those that plugins bring, serial ports, real-time permissions, disk."""
+    """All checks: Python, plugins, their own checks, what types lack, serial ports, real-time permissions, disk."""
     return [
         Finding(python_version(), True),
         *(Finding(check, True) for check in plugin_checks(registry)),
         *(Finding(check, True) for check in registry.doctor()),
+        *(Finding(check, False) for check in types(registry)),
         *(Finding(check, True) for check in serial_ports()),
         Finding(realtime(), False),
         Finding(memory_lock(), False),
@@ -75,6 +76,17 @@ def plugin_checks(registry: Registry) -> list[Check]:
         for failure in registry.failures
     ]
     return [Check("plugins", True, ", ".join(working)), *broken]
+
+
+def types(registry: Registry) -> list[Check]:
+    """One check for each installed type that lacks something on this machine, or one for all."""
+    lacking = [
+        Check(f"{kind} {type_}", False, missing.missing, missing.remedy)
+        for kind, type_ in sorted(registry.entries)
+        for missing in (registry.missing(kind, type_),)
+        if missing is not None
+    ]
+    return lacking or [Check("libraries", True, "every installed type has what it needs")]
 
 
 def serial_ports(patterns: tuple[str, ...] = ("/dev/ttyACM*", "/dev/ttyUSB*")) -> list[Check]:

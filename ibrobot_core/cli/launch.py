@@ -363,4 +363,6 @@ def _tell(runtime: Runtime, watcher: Watcher, as_json: bool) -> None:
         )
     for heading, text in watcher.told():
         click.echo(f"{heading:10} {text}")
+    if runtime.plan.without:
+        click.echo(f"without    {runtime.plan.without}")
     click.echo(f"faults     {'; '.join(summary['faults']) or 'none'}")

@@ -17,17 +17,21 @@ from ibrobot_core.plugins import Entry, Registry, installed
 @click.option("--json", "as_json", is_flag=True, help="Print {plugins: […], broken: […]}.")
 @click.pass_context
 def plugins(ctx: click.Context, as_json: bool) -> None:
-    """List what the installed plugins offer, and the plugins that are broken."""
+    """List what the installed plugins offer, what this machine lacks for it, and the plugins that are broken."""
     if ctx.invoked_subcommand is not None:
         return
     registry = installed()
     entries = [registry.entries[key] for key in sorted(registry.entries)]
     if as_json:
         broken = [attrs.asdict(failure) for failure in registry.failures]
-        click.echo(json.dumps({"plugins": [_row(entry) for entry in entries], "broken": broken}, indent=2))
+        click.echo(json.dumps({"plugins": [_row(registry, entry) for entry in entries], "broken": broken}, indent=2))
         return
     columns = ("kind", "type", "package", "version", "summary")
-    _print_table(columns, [[str(_row(entry)[column]) for column in columns] for entry in entries])
+    rows = [_row(registry, entry) for entry in entries]
+    _print_table(columns, [[str(row[column]) for column in columns] for row in rows])
+    for row in rows:
+        if row["missing"] is not None:
+            click.echo(f"lacking: {row['kind']} {row['type']}: {_lacking(row)}")
     for failure in registry.failures:
         click.echo(f"broken: {failure}")
 
@@ -41,27 +45,37 @@ def show(type_: str, as_json: bool) -> None:
     entries = [registry.entries[key] for key in sorted(registry.entries) if key[1] == type_]
     if not entries:
         raise PluginError(_unknown(registry, type_))
-    described = [{**_row(entry), "options": _options(entry)} for entry in entries]
+    described = [{**_row(registry, entry), "options": _options(entry)} for entry in entries]
     if as_json:
         click.echo(json.dumps(described, indent=2))
         return
     columns = ("name", "type", "unit", "default", "allowed", "help")
     for one in described:
         click.echo(f"{one['kind']} type {one['type']} ({one['package']} {one['version']}): {one['summary']}")
+        if one["missing"] is not None:
+            click.echo(f"lacking: {_lacking(one)}")
         if one["options"]:
             _print_table(columns, [[_text(option[column]) for column in columns] for option in one["options"]])
         else:
             click.echo("no options")
 
 
-def _row(entry: Entry) -> dict[str, Any]:
+def _row(registry: Registry, entry: Entry) -> dict[str, Any]:
+    missing = registry.missing(entry.kind, entry.descriptor.type)
     return {
         "kind": entry.kind,
         "type": entry.descriptor.type,
         "package": entry.package,
         "version": entry.version,
         "summary": entry.descriptor.summary,
+        "missing": None
+        if missing is None
+        else {"what": missing.missing, "apt": list(missing.apt), "remedy": missing.remedy},
     }
+
+
+def _lacking(row: dict[str, Any]) -> str:
+    return f"{row['missing']['what']}; {row['missing']['remedy']}"
 
 
 def _unknown(registry: Registry, type_: str) -> str:

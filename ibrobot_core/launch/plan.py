@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import attrs
 
-from ibrobot_core.config.schema import ActionSpec, ObservationSpec, Share
+from ibrobot_core.config.schema import ActionSpec, ObservationSpec, Peripheral, Share
+from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import ComponentFailed, NotSupported
+from ibrobot_core.launch.absence import describe, refuse
 from ibrobot_core.launch.builders.control import NAME as CONTROL
 from ibrobot_core.launch.builders.control import Control
 from ibrobot_core.launch.builders.execution import InferenceFeeder, Model
@@ -25,6 +27,7 @@ from ibrobot_core.launch.component import Component
 from ibrobot_core.launch.episodes import Episodes
 from ibrobot_core.launch.feeder import Feeder
 from ibrobot_core.launch.session import Session
+from ibrobot_core.recording.episode import is_kept
 
 
 @attrs.frozen
@@ -49,6 +52,8 @@ class LaunchPlan:
     episodes: Episodes
     recording: Recording | None
     episodes_worker: SimulatedEpisodes | None
+    without: str
+    """The sensors that this machine cannot run, and why; empty where there are none."""
 
     def lines(self) -> list[str]:
         """The plan as `--dry-run` prints it."""
@@ -57,13 +62,14 @@ class LaunchPlan:
             f"{number:2}. {c.name:{width}}  {c.summary}" + (f"  (needs {', '.join(c.needs)})" if c.needs else "")
             for number, c in enumerate(self.components, 1)
         ]
-        return [*lines, "stops in reverse order"]
+        without = [f"without {self.without}"] if self.without else []
+        return [*lines, *without, "stops in reverse order"]
 
 
-def mode_parts(session: Session, name: str, sensors: tuple[str, ...]) -> ModeParts:
+def mode_parts(session: Session, name: str) -> ModeParts:
     """The components of a mode; nothing is loaded yet."""
     mode = session.config.control_modes[name]
-    needs = (CONTROL, *sensors)
+    needs = (CONTROL, *(f"sensor:{sensor.name}" for sensor in _sensors(session)))
     if session.request.replay is not None and name == REPLAY:
         return ModeParts((), ReplayFeeder(session, mode, session.request.replay, (CONTROL,)))
     if mode.inference is not None:
@@ -76,10 +82,25 @@ def mode_parts(session: Session, name: str, sensors: tuple[str, ...]) -> ModePar
     return ModeParts((), None)
 
 
+def _sensors(session: Session) -> list[Peripheral]:
+    """The peripherals that can run here."""
+    absent = {sensor.name for sensor in session.absent}
+    return [peripheral for name, peripheral in session.config.peripherals.items() if name not in absent]
+
+
+def _refuse_absent(session: Session, share: Share) -> None:
+    """Refuse a run that would record or publish the messages of a sensor that cannot run here."""
+    refuse(session.absent, "transport.share.publish", share.publish.__contains__)
+    if (recording := session.config.recording) is not None:
+        contract = Contract.from_config(session.config)
+        refuse(session.absent, "the recording", lambda topic: is_kept(topic, recording, contract))
+
+
 def build_plan(session: Session) -> LaunchPlan:
     """All components of a run, in the order in which they can start.
 
     Raises:
+        MissingDependency: when something needs a sensor that cannot run on this machine.
         NotSupported: for a transport that would not be used, or a contract with topics that only bags of others have.
     """
     config = session.config
@@ -101,14 +122,14 @@ def build_plan(session: Session) -> LaunchPlan:
         )
     if session.request.lockstep and share.subscribe:
         raise NotSupported("transport.share.subscribe: in lockstep nothing may come from other machines, at any time")
-    names = tuple(f"sensor:{name}" for name in config.peripherals)
-    parts = mode_parts(session, session.mode, names)
+    _refuse_absent(session, share)
+    parts = mode_parts(session, session.mode)
     components: list[Component] = []
     if config.transport is not None and used:
         components.append(TransportLink(session, config.transport))
     components += parts.models
     components.append(Control(session, tuple(model.name for model in parts.models)))
-    components += [SensorWorker(session, p, (CONTROL,)) for p in config.peripherals.values()]
+    components += [SensorWorker(session, peripheral, (CONTROL,)) for peripheral in _sensors(session)]
     recording = Recording(session, config.recording) if config.recording is not None else None
     if recording is not None:
         components.append(recording)
@@ -127,7 +148,7 @@ def build_plan(session: Session) -> LaunchPlan:
     if config.simulated and isinstance(parts.feeder, InferenceFeeder):
         worker = SimulatedEpisodes(session, episodes, (parts.feeder.name,))
         components.append(worker)
-    return LaunchPlan(tuple(_ordered(components)), parts, episodes, recording, worker)
+    return LaunchPlan(tuple(_ordered(components)), parts, episodes, recording, worker, describe(session.absent))
 
 
 def _ordered(components: list[Component]) -> list[Component]:

@@ -60,6 +60,8 @@ class Runtime:
             IbrobotError: the cause, with the component's name.
         """
         session = self.session
+        if self.plan.without:
+            session.log.warning("running without %s", self.plan.without)
         try:
             for component in self.plan.components:
                 on_start(component.name)
@@ -113,7 +115,7 @@ class Runtime:
             raise NotSupported(f"no mode {name!r}; the modes are: {', '.join(session.config.control_modes)}")
         if name == session.mode:
             return
-        parts = mode_parts(session, name, tuple(f"sensor:{sensor}" for sensor in session.config.peripherals))
+        parts = mode_parts(session, name)
         new = parts.components()
         try:
             for component in new:
@@ -201,6 +203,7 @@ class Runtime:
             "counters": report["counters"],
             "rates_hz": {name: round(rate, 2) for name, rate in session.rates.items()},
             "drops": session.bus.dropped(),
+            "absent": {sensor.name: str(sensor.missing) for sensor in session.absent},
         }
 
     def _start(self, component: Component) -> None:

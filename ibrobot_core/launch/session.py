@@ -6,6 +6,7 @@ import logging
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import attrs
@@ -17,6 +18,7 @@ from ibrobot_core.config import RobotConfig
 from ibrobot_core.control.link import ControlState, PlanRecord
 from ibrobot_core.errors import ComponentFailed
 from ibrobot_core.interfaces import Context, JointReading, Transport
+from ibrobot_core.launch.absence import AbsentSensor, absent_sensors
 from ibrobot_core.plugins import Registry
 from ibrobot_core.robot import Vector
 from ibrobot_core.units import ns
@@ -118,6 +120,15 @@ class Session:
         self._control: ControlHost | None = None
         self._transport: Transport | None = None
         self._commanding = threading.Lock()
+
+    @cached_property
+    def absent(self) -> tuple[AbsentSensor, ...]:
+        """The sensors that this machine cannot run, looked for once.
+
+        Raises:
+            MissingDependency: as `absent_sensors`.
+        """
+        return absent_sensors(self.config, self.registry)
 
     @property
     def control(self) -> ControlHost:

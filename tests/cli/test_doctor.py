@@ -42,6 +42,55 @@ def test_a_failing_check_of_a_plugin_is_told_with_its_remedy(ibrobot: Ibrobot, s
     assert "ok    python: " in ran.out
 
 
+LACKING_SENSORS = """
+from ibrobot_core import hookimpl
+from ibrobot_core.descriptors import SensorDescriptor
+from ibrobot_core.errors import MissingDependency
+
+def no_library():
+    raise MissingDependency("libdepth.so.1 is not there", apt=["libdepth1", "libusb-1.0-0"])
+
+def bug():
+    raise ZeroDivisionError("one over nothing")
+
+@hookimpl
+def ibrobot_sensors():
+    yield SensorDescriptor("depth", None, "a depth camera", check=no_library)
+    yield SensorDescriptor("odd", None, "an odd one", check=bug)
+    yield SensorDescriptor("sound", None, "needs nothing")
+"""
+
+
+def test_what_an_installed_type_lacks_is_noted_with_its_remedy(ibrobot: Ibrobot, site: Site) -> None:
+    site.add("fake-depth", LACKING_SENSORS)
+
+    ran = ibrobot("doctor")
+
+    assert (
+        "note  sensor depth: libdepth.so.1 is not there\n      sudo apt-get install libdepth1 libusb-1.0-0\n" in ran.out
+    )
+    assert (
+        "note  sensor odd: its check failed: ZeroDivisionError: one over nothing\n      report it to fake-depth"
+        in ran.out
+    )
+    assert "sensor sound" not in ran.out
+
+
+def test_plugins_names_what_a_type_lacks(ibrobot: Ibrobot, site: Site) -> None:
+    site.add("fake-depth", LACKING_SENSORS)
+    lacking = "lacking: sensor depth: libdepth.so.1 is not there; sudo apt-get install libdepth1 libusb-1.0-0"
+
+    assert lacking in ibrobot("plugins").out.splitlines()
+    assert lacking.replace("sensor depth: ", "") in ibrobot("plugins", "show", "depth").out.splitlines()
+    rows = {row["type"]: row["missing"] for row in json.loads(ibrobot("plugins", "--json").out)["plugins"]}
+    assert rows["depth"] == {
+        "what": "libdepth.so.1 is not there",
+        "apt": ["libdepth1", "libusb-1.0-0"],
+        "remedy": "sudo apt-get install libdepth1 libusb-1.0-0",
+    }
+    assert rows["sound"] is None
+
+
 def test_as_json(ibrobot: Ibrobot, site: Site) -> None:
     site.add("fake-broken", "raise ImportError('no library')")
 

@@ -34,7 +34,7 @@ def test_as_json_with_what_is_broken(ibrobot: Ibrobot, robot: Path, site: Site) 
 
     assert {
         "kind": "sensor", "type": "fake_arm", "package": "fake-arm", "version": "1.0",
-        "summary": "the camera in its hand",
+        "summary": "the camera in its hand", "missing": None,
     } in listed["plugins"]  # fmt: skip
     assert {
         "plugin": "fake_broken", "package": "fake-broken", "stage": "import", "reason": "ImportError: no library",

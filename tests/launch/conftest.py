@@ -27,7 +27,7 @@ from ibrobot_core import hookimpl
 from ibrobot_core.descriptors import (
     HardwareDescriptor, PlannerDescriptor, PolicyDescriptor, RecorderDescriptor, SensorDescriptor, TeleopDescriptor,
 )
-from ibrobot_core.errors import HardwareError, PolicyError, SensorError
+from ibrobot_core.errors import HardwareError, MissingDependency, PolicyError, SensorError
 from ibrobot_core.interfaces import Hardware, Holding
 from ibrobot_core.testing.fakes import (
     FakeHardware, FakePlanner, FakePolicy, FakeRealHardware, FakeRecorder, FakeSensor, FakeTeleop,
@@ -116,9 +116,20 @@ class Continuing(Net):
         chunk[:len(tensors["prefix"])] = tensors["prefix"]
         return chunk
 
+class Seeing(Net):
+    """Looks through the camera on top."""
+    def __init__(self, ctx):
+        super().__init__(ctx)
+        seen = {**self.spec.observations, "observation.images.top": (-1, -1, 3)}
+        self.spec = attrs.evolve(self.spec, observations=seen)
+
 class Lost(Net):
     def load(self):
         raise PolicyError("no such checkpoint")
+
+def can_draw():
+    if "no OpenGL" in TROUBLE:
+        raise MissingDependency("no OpenGL", apt=["libegl1", "libopengl0"])
 
 def make(kind):
     def make_it(options, ctx):
@@ -134,12 +145,14 @@ def ibrobot_hardware():
 @hookimpl
 def ibrobot_sensors():
     yield SensorDescriptor("webcam", make(Camera), "a camera")
-    yield SensorDescriptor("drawn", make(Camera), "a camera in the scene")
+    yield SensorDescriptor("drawn", make(Camera), "a camera in the scene", check=can_draw)
+    yield SensorDescriptor("imu", make(Camera), "a sensor of a kind of its own", kind="imu", check=can_draw)
 
 @hookimpl
 def ibrobot_policies():
     yield PolicyDescriptor("net", make(Net), "a network")
     yield PolicyDescriptor("continuing", make(Continuing), "a network that continues the plan")
+    yield PolicyDescriptor("seeing", make(Seeing), "a network with eyes")
     yield PolicyDescriptor("lost", make(Lost), "a network that is not there")
 
 @hookimpl

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from ibrobot_core.errors import ConfigError, NotSupported
+from ibrobot_core.errors import ConfigError, MissingDependency, NotSupported
 from ibrobot_core.messages import Bool, String
 from ibrobot_core.units import NS_PER_S
 
@@ -83,6 +83,13 @@ def test_what_is_published_goes_out(runs: Runs, network: None):
     assert {topic for topic, *_ in sent} == {"/joint_states", "/note"}
     runtime.stop()
     assert made().closed
+
+
+def test_pictures_of_a_camera_that_cannot_run_here_are_refused(runs: Runs, network: None):
+    runs.make()  # imports the parts
+    runs.parts.TROUBLE["no OpenGL"] = True
+    with pytest.raises(MissingDependency, match=r"transport.share.publish needs camera side: no OpenGL; sudo apt-get"):
+        runs.make("transport={type: network, share: {publish: [/camera/side/image_raw]}}", mode="teleop")
 
 
 def test_a_topic_that_nothing_publishes_is_told_once(runs: Runs, network: None, caplog: pytest.LogCaptureFixture):

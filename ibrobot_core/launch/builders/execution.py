@@ -17,6 +17,7 @@ from ibrobot_core.inference.policy_units import PolicyInItsUnits
 from ibrobot_core.inference.process import ProcessEngine
 from ibrobot_core.inference.remote import RemoteEngine
 from ibrobot_core.interfaces import PictureCodec, Policy
+from ibrobot_core.launch.absence import refuse
 from ibrobot_core.launch.builders.transport import NAME as TRANSPORT
 from ibrobot_core.launch.component import Component
 from ibrobot_core.launch.feeder import Feeder
@@ -65,6 +66,8 @@ class Model(Component):
             raise ContractError(
                 f"model {model.name!r} does not fit the contract of {session.config.source}\n{error}"
             ) from None
+        topics = {part.topic for key in policy.spec.observations for part in self.contract.parts(key)}
+        refuse(session.absent, f"model {model.name!r}", topics.__contains__)
         for mode in session.config.control_modes.values():
             if mode.inference is not None and mode.inference.model == model.name:
                 where = f"{session.config.source}: control_modes.{mode.name}"

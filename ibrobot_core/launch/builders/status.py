@@ -75,6 +75,7 @@ class Status(Worker):
         for name, rate in session.rates.items():
             age = {"age_ms": round(session.ages[name] * 1e3, 1)} if name in session.ages else {}
             groups[f"sensor {name}"] = {"rate_hz": round(rate, 2), **age}
+        groups |= {f"sensor {sensor.name}": {"missing": str(sensor.missing)} for sensor in session.absent}
         groups["bus drops"] = session.bus.dropped()
         level = DiagnosticStatus.ERROR if session.outcome.faults else DiagnosticStatus.OK
         robot = session.config.robot.name

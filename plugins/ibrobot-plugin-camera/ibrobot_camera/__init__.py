@@ -27,6 +27,12 @@ def _realsense(options: Any, ctx: Context) -> Sensor:
     return RealSenseCamera(options, ctx)
 
 
+def _find_librealsense() -> None:
+    from ibrobot_camera.librealsense import load_library
+
+    load_library()
+
+
 @hookimpl
 def ibrobot_sensors() -> Iterable[SensorDescriptor]:
     """Cameras."""
@@ -34,8 +40,9 @@ def ibrobot_sensors() -> Iterable[SensorDescriptor]:
         type="opencv", options=OpenCvOptions, make=_opencv, summary="V4L2 device, RTSP or HTTP stream, or video file"
     )
     yield SensorDescriptor(
-        type="realsense", options=RealSenseOptions, make=_realsense, summary="Intel RealSense: colour, or aligned depth"
-    )
+        type="realsense", options=RealSenseOptions, make=_realsense, check=_find_librealsense,
+        summary="Intel RealSense: colour, or aligned depth",
+    )  # fmt: skip
 
 
 def _commands() -> click.Command:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ibrobot_camera.camera import to_image
 from ibrobot_camera.capture import Pixels
+from ibrobot_camera.librealsense import load_library
 from ibrobot_camera.options import RealSenseOptions
 from ibrobot_core.errors import SensorError
 from ibrobot_core.interfaces import Context, Sensor
@@ -25,24 +26,11 @@ _SAME = 1e-6
 _NS_PER_MS = 1e6
 
 
-def load_library() -> Any:
-    """The module `pyrealsense2`.
-
-    Raises:
-        SensorError: when it is not installed; says how to install it.
-    """
-    try:
-        import pyrealsense2
-    except ImportError:
-        remedy = "pip install 'ibrobot-plugin-camera[realsense]'"
-        raise SensorError(f"type realsense needs the library pyrealsense2: {remedy}") from None
-    return pyrealsense2
-
-
 def find_device(serial: str) -> Any:
     """The RealSense of that serial number, or the only one that is there.
 
     Raises:
+        MissingDependency: as `load_library`.
         SensorError: when there is none, or several and no serial number.
     """
     rs = load_library()
@@ -194,7 +182,7 @@ class RealSenseCamera(Sensor):
         ctx: name, clock and logger.
 
     Raises:
-        SensorError: when the library is not installed.
+        MissingDependency: as `load_library`.
     """
 
     message_type = Image

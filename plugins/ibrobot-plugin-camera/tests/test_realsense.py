@@ -5,18 +5,21 @@ from __future__ import annotations
 import sys
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any, override
 
 import numpy as np
 import pytest
 from ibrobot_camera import realsense
+from ibrobot_camera.librealsense import load_library
 from ibrobot_camera.options import RealSenseOptions
 from ibrobot_camera.realsense import RealSenseCamera
 
 from ibrobot_core.clock import RealClock
-from ibrobot_core.errors import SensorError
+from ibrobot_core.errors import MissingDependency, SensorError
 from ibrobot_core.interfaces import Context, Sensor
 from ibrobot_core.messages import CameraInfo
+from ibrobot_core.plugins import installed
 from ibrobot_core.testing import SensorSuite, host_context
 
 WIDTH, HEIGHT = 64, 48
@@ -24,10 +27,35 @@ PATIENCE_S = 30.0
 SMALL = RealSenseOptions(width=WIDTH, height=HEIGHT)
 
 
-def test_without_the_library_it_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "pyrealsense2", None)
-    with pytest.raises(SensorError, match=r"pip install 'ibrobot-plugin-camera\[realsense\]'"):
+@pytest.mark.parametrize(
+    ("reason", "told"),
+    [
+        (
+            "ModuleNotFoundError(\"No module named 'pyrealsense2'\")",
+            "the Python package pyrealsense2 is not installed; pip install 'ibrobot-plugin-camera[realsense]'",
+        ),
+        (
+            "ImportError('libusb-1.0.so.0: cannot open shared object file')",
+            "pyrealsense2 cannot be loaded: libusb-1.0.so.0: cannot open shared object file; "
+            "sudo apt-get install libusb-1.0-0",
+        ),
+        (
+            "ImportError('libother.so.1: cannot open shared object file')",
+            "pyrealsense2 cannot be loaded: libother.so.1: cannot open shared object file; "
+            "install the system package that brings libother.so.1",
+        ),
+    ],
+)
+def test_what_the_library_lacks_is_named_with_its_remedy(
+    reason: str, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "pyrealsense2.py").write_text(f"raise {reason}")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "pyrealsense2", raising=False)
+    with pytest.raises(MissingDependency) as missing:
         RealSenseCamera(SMALL, host_context("top"))
+    assert str(missing.value) == told
+    assert str(installed().missing("sensor", "realsense")) == told
 
 
 class SoftwareCamera:
@@ -84,10 +112,18 @@ def patience(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(realsense, "_LOST_S", PATIENCE_S)
 
 
+@pytest.fixture
+def library() -> Any:
+    """Intel's library; tests with it are skipped where it, or a system library that it needs, is missing."""
+    try:
+        return load_library()
+    except MissingDependency as missing:
+        pytest.skip(str(missing))
+
+
 @pytest.fixture(params=[0.001])
-def soft(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[SoftwareCamera]:
-    rs = pytest.importorskip("pyrealsense2", reason="needs the extra `realsense`")
-    camera = SoftwareCamera(rs, request.param)
+def soft(library: Any, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[SoftwareCamera]:
+    camera = SoftwareCamera(library, request.param)
     monkeypatch.setattr(realsense, "find_device", lambda serial: camera.device)
     camera.running.set()
     camera.thread.start()
@@ -169,8 +205,7 @@ def test_sizes_that_it_does_not_give_or_that_differ_are_refused(soft: SoftwareCa
     first.close()
 
 
-def test_no_device_says_which_there_are() -> None:
-    pytest.importorskip("pyrealsense2", reason="needs the extra `realsense`")
+def test_no_device_says_which_there_are(library: Any) -> None:
     with pytest.raises(SensorError, match=r"no RealSense with serial number 42; there are: none"):
         realsense.find_device("42")
     with pytest.raises(SensorError, match=r"serial must say which RealSense is meant; there are: none"):

@@ -6,8 +6,8 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 from ibrobot_core import hookimpl
-from ibrobot_core.descriptors import Check, HardwareDescriptor, PolicyDescriptor, SensorDescriptor, ViewerDescriptor
-from ibrobot_mujoco.gl import check, check_asked
+from ibrobot_core.descriptors import HardwareDescriptor, PolicyDescriptor, SensorDescriptor, ViewerDescriptor
+from ibrobot_mujoco.gl import check_asked, choose
 from ibrobot_mujoco.options import CameraOptions, MujocoOptions
 from ibrobot_mujoco.policy_options import ScriptedPickOptions
 
@@ -27,6 +27,10 @@ def _camera(options: Any, ctx: Context) -> Sensor:
     from ibrobot_mujoco.camera import MujocoCamera
 
     return MujocoCamera(options, ctx)
+
+
+def _can_render() -> None:
+    choose()
 
 
 def _scripted_pick(options: Any, ctx: Context) -> Policy:
@@ -56,8 +60,9 @@ def ibrobot_hardware() -> Iterable[HardwareDescriptor]:
 def ibrobot_sensors() -> Iterable[SensorDescriptor]:
     """Cameras in the simulated scene."""
     yield SensorDescriptor(
-        type="mujoco", kind="camera", options=CameraOptions, make=_camera, summary="a camera in the simulated scene"
-    )
+        type="mujoco", kind="camera", options=CameraOptions, make=_camera, check=_can_render,
+        summary="a camera in the simulated scene",
+    )  # fmt: skip
 
 
 @hookimpl
@@ -73,9 +78,3 @@ def ibrobot_policies() -> Iterable[PolicyDescriptor]:
 def ibrobot_viewers() -> Iterable[ViewerDescriptor]:
     """A window on a desktop."""
     yield ViewerDescriptor(type="mujoco", make=_viewer, summary="a desktop window on the simulated scene")
-
-
-@hookimpl
-def ibrobot_doctor() -> Iterable[Check]:
-    """Whether cameras can render here."""
-    yield check()

@@ -1,20 +1,23 @@
-"""Which OpenGL backend renders off-screen here; looks at libraries only, and imports no MuJoCo."""
+"""Which OpenGL backend renders off-screen here; loads system libraries only, and imports no MuJoCo."""
 
 from __future__ import annotations
 
 import ctypes
 import os
 import sys
+from functools import cache
 
-from ibrobot_core.descriptors import Check
-from ibrobot_core.errors import SensorError
+from ibrobot_core.errors import MissingDependency
 
 # What each backend loads, any name of a group; as MuJoCo's own context classes need it.
 _LIBRARIES = {
-    "egl": (("libEGL.so.1", "libEGL.so"), ("libOpenGL.so.0", "libGL.so.1", "libGL.so")),
+    "egl": (("libEGL.so.1",), ("libOpenGL.so.0", "libGL.so.1", "libGL.so")),
     "osmesa": (("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so"),),
 }
-REMEDY = "apt install libegl1 libgl1-mesa-dri (or: apt install libosmesa6)"
+PACKAGES = ("libegl1", "libopengl0", "libgl1-mesa-dri")
+"""Debian packages that bring EGL with a renderer in software, for a machine without a display."""
+_EGL_PLATFORM_DEVICE_EXT = 0x313F
+_MOST_DEVICES = 16
 
 
 def _loads(name: str) -> bool:
@@ -25,14 +28,33 @@ def _loads(name: str) -> bool:
     return True
 
 
+@cache
+def _egl_has_a_driver() -> bool:
+    """Whether EGL can render on any device: its library alone, without drivers, cannot."""
+    egl = ctypes.CDLL("libEGL.so.1")
+    egl.eglGetProcAddress.restype = ctypes.c_void_p
+    find_devices = egl.eglGetProcAddress(b"eglQueryDevicesEXT")
+    find_display = egl.eglGetProcAddress(b"eglGetPlatformDisplayEXT")
+    if not find_devices or not find_display:
+        return False
+    pointer = ctypes.c_void_p
+    query = ctypes.CFUNCTYPE(ctypes.c_uint, ctypes.c_int, ctypes.POINTER(pointer), ctypes.POINTER(ctypes.c_int))
+    display_of = ctypes.CFUNCTYPE(pointer, ctypes.c_uint, pointer, pointer)(find_display)
+    devices, count = (pointer * _MOST_DEVICES)(), ctypes.c_int()
+    query(find_devices)(_MOST_DEVICES, devices, ctypes.byref(count))
+    displays = [display_of(_EGL_PLATFORM_DEVICE_EXT, device, None) for device in devices[: count.value]]
+    # Never terminated: renderers in this process may share the display.
+    return any(display and egl.eglInitialize(pointer(display), None, None) for display in displays)
+
+
 def usable() -> tuple[str, ...]:
-    """The backends whose libraries are there, best first."""
+    """The backends that work here, best first."""
     if sys.platform == "darwin":
         return ("cgl",)
     found = [
         backend
         for backend, groups in _LIBRARIES.items()
-        if all(any(_loads(name) for name in group) for group in groups)
+        if all(any(_loads(name) for name in group) for group in groups) and (backend != "egl" or _egl_has_a_driver())
     ]
     if os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
         found.append("glfw")
@@ -45,14 +67,16 @@ def check_asked() -> str:
     To be called ahead of importing MuJoCo, whose import fails obscurely on one that does not load.
 
     Raises:
-        SensorError: when there is no such backend, or its libraries do not load.
+        MissingDependency: when there is no such backend, or it does not work here.
     """
     asked = os.environ.get("MUJOCO_GL", "").strip().lower()
     known = ("cgl",) if sys.platform == "darwin" else ("egl", "osmesa", "glfw")
     if asked and asked not in known:
-        raise SensorError(f"MUJOCO_GL is {asked!r}, must be one of: {', '.join(known)}")
+        remedy = f"set it to one of {', '.join(known)}, or unset it"
+        raise MissingDependency(f"MUJOCO_GL is {asked!r}, which is no OpenGL backend", remedy=remedy)
     if asked in _LIBRARIES and asked not in usable():
-        raise SensorError(f"MUJOCO_GL={asked}, whose libraries do not load here; {REMEDY}, or unset MUJOCO_GL")
+        packages = PACKAGES if asked == "egl" else ("libosmesa6",)
+        raise MissingDependency(f"MUJOCO_GL={asked}, which does not work here (or unset it)", apt=packages)
     return asked
 
 
@@ -60,21 +84,13 @@ def choose() -> str:
     """The backend to render with: what `MUJOCO_GL` says, or else the best that is usable.
 
     Raises:
-        SensorError: when there is none.
+        MissingDependency: when there is none, or not the one of `MUJOCO_GL`.
     """
     asked = check_asked()
     if asked:
         return asked
     found = usable()
     if not found:
-        raise SensorError(f"no OpenGL backend for simulated cameras: neither EGL nor OSMesa nor a display; {REMEDY}")
+        missing = "no OpenGL that renders without a display, neither EGL with a driver nor OSMesa"
+        raise MissingDependency(missing, apt=PACKAGES)
     return found[0]
-
-
-def check() -> Check:
-    """The line of `ibrobot doctor`."""
-    try:
-        chosen = choose()
-    except SensorError as error:
-        return Check("simulated cameras", False, str(error), REMEDY)
-    return Check("simulated cameras", True, f"renders with {chosen} (usable: {', '.join(usable())})")

@@ -23,6 +23,7 @@ class Renderer:
     MuJoCo's own renderer settles on a backend when `mujoco` is first imported; this one when it is made.
 
     Raises:
+        MissingDependency: when no backend works here.
         SensorError: when the backend cannot make a context.
     """
 
@@ -67,5 +68,5 @@ def _make_context(backend: str, width: int, height: int) -> Any:
             context = importlib.import_module(f"mujoco.{backend}").GLContext(width, height)
             context.make_current()
         except Exception as error:
-            raise SensorError(f"OpenGL backend {backend} does not work here ({error}); {gl.REMEDY}") from error
+            raise SensorError(f"OpenGL backend {backend} makes no context here: {error}") from error
     return context

@@ -8,7 +8,6 @@ from typing import override
 
 import numpy as np
 import pytest
-from ibrobot_mujoco import gl
 from ibrobot_mujoco.camera import MujocoCamera
 from ibrobot_mujoco.hardware import MujocoHardware
 from ibrobot_mujoco.model import build_spec
@@ -20,10 +19,12 @@ from ibrobot_mujoco.state import PHYSICS_TOPIC, pose_scene
 from ibrobot_core.errors import SensorError
 from ibrobot_core.interfaces import Context, Episode, Sensor
 from ibrobot_core.messages import CameraInfo, Float64MultiArray, Image
+from ibrobot_core.plugins import installed
 from ibrobot_core.robot import Vector
 from ibrobot_core.testing import SensorSuite, control_context, host_context
 
-pytestmark = pytest.mark.skipif(not gl.usable(), reason=f"no OpenGL backend; {gl.REMEDY}")
+MISSING = installed().missing("sensor", "mujoco")
+pytestmark = pytest.mark.skipif(MISSING is not None, reason=str(MISSING))
 
 ROBOT = so101()
 OPTIONS = MujocoOptions()

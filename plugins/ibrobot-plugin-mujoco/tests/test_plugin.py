@@ -1,4 +1,4 @@
-"""What the plugin registers, its options, and its line in `ibrobot doctor`."""
+"""What the plugin registers, its options, and which OpenGL backend it takes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ibrobot_mujoco.options import Fault, MujocoOptions, SceneCamera
 from ibrobot_mujoco.policy_options import ScriptedPickOptions
 from ibrobot_mujoco.so101 import MJCF, so101
 
-from ibrobot_core.errors import SensorError
+from ibrobot_core.errors import MissingDependency
 from ibrobot_core.plugins import installed
 from ibrobot_core.robot import Joint
 from ibrobot_core.testing import control_context
@@ -76,22 +76,30 @@ class TestOpenGl:
         self.have(monkeypatch)
 
     @staticmethod
-    def have(monkeypatch: pytest.MonkeyPatch, *libraries: str) -> None:
+    def have(monkeypatch: pytest.MonkeyPatch, *libraries: str, driver: bool = True) -> None:
         monkeypatch.setattr(gl, "_loads", lambda name: name in libraries)
+        monkeypatch.setattr(gl, "_egl_has_a_driver", lambda: driver)
 
-    def test_nothing_there_is_an_error_with_the_remedy(self) -> None:
-        with pytest.raises(SensorError, match="apt install libegl1 libgl1-mesa-dri"):
+    def test_without_opengl_the_camera_names_the_packages_and_all_else_works(self) -> None:
+        missing = installed().missing("sensor", "mujoco")
+        assert missing is not None
+        assert missing.remedy == "sudo apt-get install libegl1 libopengl0 libgl1-mesa-dri"
+        with pytest.raises(MissingDependency, match=missing.remedy):
             gl.choose()
-        check = gl.check()
-        assert not check.ok
-        assert check.remedy == "apt install libegl1 libgl1-mesa-dri (or: apt install libosmesa6)"
+        assert installed().missing("hardware", "mujoco") is None
+        assert installed().missing("policy", "scripted_pick") is None
+
+    def test_egl_without_a_driver_cannot_render(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.have(monkeypatch, "libEGL.so.1", "libOpenGL.so.0", driver=False)
+        assert gl.usable() == ()
+        assert installed().missing("sensor", "mujoco") is not None
 
     def test_egl_comes_first(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.have(monkeypatch, "libEGL.so.1", "libGL.so.1", "libOSMesa.so.8")
         monkeypatch.setenv("DISPLAY", ":0")
         assert gl.usable() == ("egl", "osmesa", "glfw")
         assert gl.choose() == "egl"
-        assert gl.check().ok
+        assert installed().missing("sensor", "mujoco") is None
 
     def test_egl_needs_opengl_too(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.have(monkeypatch, "libEGL.so.1", "libOSMesa.so.8")
@@ -111,13 +119,12 @@ class TestOpenGl:
     ) -> None:
         self.have(monkeypatch, "libEGL.so.1", "libGL.so.1")
         monkeypatch.setenv("MUJOCO_GL", "osmesa")
-        told = "MUJOCO_GL=osmesa, whose libraries do not load here; apt install libegl1"
+        told = r"MUJOCO_GL=osmesa, which does not work here \(or unset it\); sudo apt-get install libosmesa6"
         policy = installed().find("policy", "scripted_pick")
-        with pytest.raises(SensorError, match=told):
+        with pytest.raises(MissingDependency, match=told):
             policy.make(ScriptedPickOptions(), control_context("pick"))
-        assert gl.check().found.startswith(told)
 
     def test_an_unknown_backend_is_refused(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setenv("MUJOCO_GL", "vulkan")
-        with pytest.raises(SensorError, match="MUJOCO_GL is 'vulkan', must be one of: egl, osmesa, glfw"):
+        with pytest.raises(MissingDependency, match=r"MUJOCO_GL is 'vulkan'.*; set it to one of egl, osmesa, glfw, or"):
             gl.choose()

@@ -1,0 +1,70 @@
+"""Sensors that this machine cannot run: a run goes on without them, but refuses what needs their messages."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+import attrs
+
+from ibrobot_core.config import RobotConfig
+from ibrobot_core.config.contract_checks import PERIPHERAL_TOPICS
+from ibrobot_core.errors import MissingDependency
+from ibrobot_core.plugins import Registry
+
+
+@attrs.frozen
+class AbsentSensor:
+    """A peripheral that cannot run here."""
+
+    name: str
+    label: str
+    """Kind and name, e.g. `camera top`."""
+    topic: str
+    """Where its messages would go."""
+    missing: MissingDependency
+
+
+def absent_sensors(config: RobotConfig, registry: Registry) -> tuple[AbsentSensor, ...]:
+    """The peripherals whose types lack something on this machine.
+
+    Raises:
+        MissingDependency: for one whose topic is not known before it runs, so that nobody can say what needs it.
+    """
+    absent = []
+    for name, peripheral in config.peripherals.items():
+        missing = registry.missing("sensor", peripheral.type)
+        if missing is None:
+            continue
+        if peripheral.kind not in PERIPHERAL_TOPICS:
+            raise missing
+        topic, _ = PERIPHERAL_TOPICS[peripheral.kind]
+        absent.append(AbsentSensor(name, f"{peripheral.kind} {name}", topic.format(name=name), missing))
+    return tuple(absent)
+
+
+def refuse(absent: Iterable[AbsentSensor], user: str, needs: Callable[[str], bool]) -> None:
+    """Refuse a part of a run that needs the messages of an absent sensor.
+
+    Args:
+        absent: the absent sensors.
+        user: what it is, for the error.
+        needs: whether it needs the messages on a topic.
+
+    Raises:
+        MissingDependency: with the remedy.
+    """
+    for missing, labels in _by_cause(sensor for sensor in absent if needs(sensor.topic)):
+        raise MissingDependency(f"{user} needs {labels}: {missing.missing}", apt=missing.apt, remedy=missing.remedy)
+
+
+def describe(absent: Iterable[AbsentSensor]) -> str:
+    """The absent sensors with what is missing and the remedy, on one line; empty where there are none."""
+    return "; and ".join(f"{labels}: {missing}" for missing, labels in _by_cause(absent))
+
+
+def _by_cause(absent: Iterable[AbsentSensor]) -> list[tuple[MissingDependency, str]]:
+    """What is missing, each once, and the sensors that lack it."""
+    causes: dict[str, list[AbsentSensor]] = {}
+    for sensor in absent:
+        causes.setdefault(str(sensor.missing), []).append(sensor)
+    return [(group[0].missing, ", ".join(sensor.label for sensor in group)) for group in causes.values()]

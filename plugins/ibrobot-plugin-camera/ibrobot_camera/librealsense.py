@@ -1,0 +1,34 @@
+"""Intel's library for RealSense cameras, which is an extra of this plugin and needs a system library."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+from ibrobot_core.errors import MissingDependency
+
+_PACKAGES = {"libusb-1.0.so.0": "libusb-1.0-0", "libudev.so.1": "libudev1"}
+"""System library -> the Debian package that brings it."""
+
+
+def load_library() -> Any:
+    """The module `pyrealsense2`.
+
+    Raises:
+        MissingDependency: when it is not installed, or a system library that it loads is not there; says which.
+    """
+    try:
+        import pyrealsense2
+    except ModuleNotFoundError:
+        if sys.platform == "darwin":
+            remedy = "pyrealsense2 has no wheels for macOS, use Linux"
+        else:
+            remedy = "pip install 'ibrobot-plugin-camera[realsense]'"
+        raise MissingDependency("the Python package pyrealsense2 is not installed", remedy=remedy) from None
+    except ImportError as error:
+        library = str(error).partition(":")[0]
+        missing = f"pyrealsense2 cannot be loaded: {error}"
+        if library in _PACKAGES:
+            raise MissingDependency(missing, apt=[_PACKAGES[library]]) from None
+        raise MissingDependency(missing, remedy=f"install the system package that brings {library}") from None
+    return pyrealsense2
