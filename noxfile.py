@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-import ctypes.util
+import atexit
+import json
 import os
+import shutil
 import sys
 from pathlib import Path
+from typing import Any
 
 import nox
 
@@ -26,7 +29,9 @@ EXTRAS = {"camera": "[realsense]", "mcap": "[plot]", "zenoh": "[interop]"}
 PLATFORMS = ("x86_64-unknown-linux-gnu", "aarch64-unknown-linux-gnu", "aarch64-apple-darwin")
 """Where everything must install without a compiler: PCs, robots' own computers (e.g. Jetson), and Macs."""
 # A fixed seed: the same checks give the same result; `nox -s core -- --hypothesis-seed=random` explores.
-PYTEST = ("pytest", "--config-file=pyproject.toml", "--rootdir=.", "--hypothesis-seed=0")
+PYTEST = ("pytest", "--config-file=pyproject.toml", "--rootdir=.", "--hypothesis-seed=0", "-rs")
+NOT_TESTED: list[str] = []
+"""What no session could test on this machine, and what to do about it."""
 
 
 def packages(*plugins: str) -> list[str]:
@@ -47,17 +52,34 @@ def install(
     session.install("-c", "constraints.txt", *options, *packages(*plugins), *requirements)
 
 
-def render_off_screen(session: nox.Session) -> None:
-    """See to the libraries that MuJoCo renders with where there is no display."""
-    if not sys.platform.startswith("linux"):
-        return
-    session.env.setdefault("MUJOCO_GL", "egl")
-    if ctypes.util.find_library("EGL"):
-        return
-    if os.geteuid() != 0:
-        session.error("off-screen rendering needs: sudo apt-get install libegl1 libgl1-mesa-dri")
-    session.run("apt-get", "update", "-qq", external=True)
-    session.run("apt-get", "install", "-qq", "-y", "libegl1", "libgl1-mesa-dri", external=True)
+def lacking(session: nox.Session) -> list[dict[str, Any]]:
+    """The installed types that lack something on this machine, as `ibrobot plugins --json` lists them."""
+    listed = session.run("ibrobot", "plugins", "--json", silent=True)
+    return [row for row in json.loads(str(listed))["plugins"] if row["missing"] is not None]
+
+
+def system_libraries(session: nox.Session) -> None:
+    """See to the system libraries that installed types lack: root installs them, anybody else is told how.
+
+    Tests that need what stays missing are skipped.
+    """
+    found = lacking(session)
+    packages = sorted({package for row in found for package in row["missing"]["apt"]})
+    if packages and os.geteuid() == 0 and shutil.which("apt-get"):
+        session.run("apt-get", "update", "-qq", external=True)
+        session.run("apt-get", "install", "-qq", "-y", *packages, external=True)
+        found = lacking(session)
+    for row in found:
+        line = f"{row['kind']} {row['type']} is not tested: {row['missing']['what']}; {row['missing']['remedy']}"
+        session.warn(line)
+        NOT_TESTED.append(f"{session.name}: {line}")
+
+
+@atexit.register
+def list_what_was_not_tested() -> None:
+    """After all sessions."""
+    for line in NOT_TESTED:
+        print(f"nox > {line}", file=sys.stderr)
 
 
 @nox.session
@@ -105,8 +127,7 @@ def core(session: nox.Session) -> None:
 def plugin(session: nox.Session, name: str) -> None:
     """A plugin's tests with that plugin and core alone."""
     install(session, name)
-    if name == "mujoco":
-        render_off_screen(session)
+    system_libraries(session)
     session.run(*PYTEST, str(FOLDERS[name] / "tests"), *session.posargs)
 
 
@@ -114,7 +135,7 @@ def plugin(session: nox.Session, name: str) -> None:
 def integration(session: nox.Session) -> None:
     """What needs every plugin, or starts processes."""
     install(session, *PLUGINS)
-    render_off_screen(session)
+    system_libraries(session)
     session.run(*PYTEST, "-m", "integration", "tests", *session.posargs)
 
 
@@ -122,6 +143,7 @@ def integration(session: nox.Session) -> None:
 def lerobot(session: nox.Session) -> None:
     """LeRobot itself, unmodified, against what the plugins offer; the one session with torch."""
     install(session, *PLUGINS, options=("lerobot[dataset,diffusion,feetech,smolvla,training]>=0.6.1,<0.7",))
+    system_libraries(session)
     session.run(*PYTEST, "-m", "lerobot", "tests", *session.posargs)
 
 
@@ -137,5 +159,13 @@ def docs(session: nox.Session) -> None:
 def minimums(session: nox.Session) -> None:
     """Core's and the plugins' tests with the oldest versions that they allow."""
     install(session, *PLUGINS, options=("--resolution=lowest-direct",))
-    render_off_screen(session)
+    system_libraries(session)
     session.run(*PYTEST, "-m", "not integration and not lerobot", "tests", "plugins", *session.posargs)
+
+
+@nox.session(default=False, venv_backend="none")
+def fresh(session: nox.Session) -> None:
+    """README's first two commands on a minimal Debian with nothing installed; or others: `-- [-u] COMMAND…`."""
+    lines = Path("README.md").read_text(encoding="utf-8").splitlines()
+    commands = [line.removeprefix("$ ") for line in lines if line.startswith("$ ")][:2]
+    session.run("tests/fresh/fresh.sh", *(session.posargs or commands), external=True)

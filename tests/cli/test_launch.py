@@ -17,8 +17,11 @@ if TYPE_CHECKING:
 PARTS = '''
 import signal
 from ibrobot_core import hookimpl
-from ibrobot_core.descriptors import HardwareDescriptor, PlannerDescriptor, PolicyDescriptor, TeleopDescriptor
-from ibrobot_core.errors import HardwareError, TeleopError
+from ibrobot_core.descriptors import (
+    HardwareDescriptor, PlannerDescriptor, PolicyDescriptor, RecorderDescriptor, SensorDescriptor,
+    TeleopDescriptor,
+)
+from ibrobot_core.errors import HardwareError, MissingDependency, TeleopError
 from ibrobot_core.testing.fakes import FakeHardware, FakePlanner, FakePolicy, FakeRealHardware, FakeTeleop
 
 class Scene(FakeHardware):
@@ -58,6 +61,17 @@ class Person(FakeTeleop):
         if self.reads == 50:
             signal.raise_signal(signal.SIGINT)
         return super().read(measured)
+
+def no_library():
+    raise MissingDependency("no OpenGL", apt=["libegl1"])
+
+@hookimpl
+def ibrobot_sensors():
+    yield SensorDescriptor("camera", None, "a camera that cannot run here", check=no_library)
+
+@hookimpl
+def ibrobot_recorders():
+    yield RecorderDescriptor("unused", None, "a recorder")
 
 @hookimpl
 def ibrobot_hardware():
@@ -146,6 +160,25 @@ def test_the_summary_in_words(launch: Callable[..., Ran]):
         "loop       55 ticks in lockstep",
         "faults     none",
     ]
+
+
+CAMERA = ("--set", "peripherals=[{name: top, kind: camera, type: camera}]")
+
+
+def test_the_summary_names_the_cameras_that_could_not_run(launch: Callable[..., Ran]):
+    ran = launch(*LOCKSTEP, *CAMERA, "--episodes", "1")
+    assert ran.code == 0, ran.err
+    absent = "camera top: no OpenGL; sudo apt-get install libegl1"
+    assert ran.err.count(absent) == 1
+    assert f"W running without {absent}" in ran.err.splitlines()
+    assert f"without    {absent}" in ran.out.splitlines()
+
+
+def test_a_missing_library_is_an_error_with_the_remedy_where_it_is_needed(launch: Callable[..., Ran]):
+    wanted = ("--set", "recording={type: unused, topics: all}")
+    ran = launch(*LOCKSTEP, *CAMERA, *wanted)
+    assert (ran.code, ran.out) == (2, "")
+    assert ran.err.endswith("error: the recording needs camera top: no OpenGL; sudo apt-get install libegl1\n")
 
 
 def test_the_summary_as_json_is_the_last_line(launch: Callable[..., Ran]):
