@@ -15,6 +15,8 @@ import attrs
 import numpy as np
 import pytest
 
+from ibrobot_core.plugins import installed
+
 collect_ignore_glob = [] if find_spec("ibrobot_feetech") else ["test_*.py"]  # without plugins nothing runs here
 IBROBOT = (sys.executable, "-c", "from ibrobot_core.cli.main import main; main()")
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
@@ -64,6 +66,13 @@ def prompt_threads() -> Iterator[None]:
     sys.setswitchinterval(5e-4)
     yield
     sys.setswitchinterval(before)
+
+
+@pytest.fixture(scope="session")
+def rendering() -> None:
+    """Simulated cameras; what asks for this is skipped on a machine that cannot render."""
+    if (missing := installed().missing("sensor", "mujoco")) is not None:
+        pytest.skip(str(missing))
 
 
 @pytest.fixture(scope="session")

@@ -37,7 +37,7 @@ def test_one_episode_in_real_time(launch: Callable[..., Ran]):
     assert "mode model_inference | loop " in ran.out, "plain lines while it runs"
 
 
-def test_the_whole_robot_with_its_cameras_in_lockstep(launch: Callable[..., Ran]):
+def test_the_whole_robot_with_its_cameras_in_lockstep(launch: Callable[..., Ran], rendering: None):
     ran = launch("--lockstep", "--episodes", "1", robot="so101")
     assert ran.code == 0, ran.err
     summary = ran.summary
@@ -98,7 +98,7 @@ def test_a_component_that_cannot_start_is_exit_code_1(launch: Callable[..., Ran]
     assert "Traceback" not in ran.err
 
 
-def test_dry_run_prints_the_plan_and_starts_nothing(launch: Callable[..., Ran]):
+def test_dry_run_prints_the_plan_and_starts_nothing(launch: Callable[..., Ran], rendering: None):
     ran = launch("--dry-run", "--mode", "moveit_planning", robot="so101")
     assert (ran.code, ran.err) == (0, "")
     lines = ran.out.splitlines()

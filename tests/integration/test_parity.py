@@ -220,7 +220,7 @@ def ibrobot_policies():
 '''
 
 
-def test_a_whole_run_in_simulation(site: Any, tmp_path: Path) -> None:
+def test_a_whole_run_in_simulation(site: Any, tmp_path: Path, rendering: None) -> None:
     site.add("frame-keeper", KEEPER)
     registry = installed()
     robot = find_config("so101", registry)
