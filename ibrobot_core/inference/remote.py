@@ -55,7 +55,8 @@ class RemoteEngine(Engine):
         self._encoder, self._decoder = Encoder(limits, codec), Decoder(limits)
         self._buffers = [Buffer() for _ in range(self.parallel)]
         """Those that are free."""
-        self._episode, self._seed = 0, 0
+        self._episode, self._seed = time.time_ns(), 0
+        """An episode's number does not come again after a restart under the same certificate."""
         self._end_watch: Callable[[], None] | None = None
 
     @override

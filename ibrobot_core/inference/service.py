@@ -208,10 +208,10 @@ class InferenceService:
                 "malformed": self._malformed, **self._all.summary(), "batches": batches, "robots": robots,
             }  # fmt: skip
 
-    def _health(self, payload: Payload) -> Payload:
+    def _health(self, payload: Payload, sender: str | None) -> Payload:
         return json.dumps(self.statistics()).encode()
 
-    def _answer(self, payload: Payload) -> Payload:
+    def _answer(self, payload: Payload, sender: str | None) -> Payload:
         """Called by the transport, once for every request, in several threads."""
         arrived_ns = time.monotonic_ns()
         try:
@@ -222,6 +222,8 @@ class InferenceService:
             with self._lock:
                 self._malformed += 1
             return self._encoder.encode(Message(Kind.FAILURE, 0, text=str(error)))
+        if sender is not None:  # whatever name the request claims
+            message = attrs.evolve(message, robot=sender)
         with self._idle:
             refused = self._refusal(message)
             self._at_work += 1

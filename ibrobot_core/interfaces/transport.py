@@ -12,6 +12,10 @@ from ibrobot_core.messages import Message
 type Payload = bytes | bytearray | memoryview
 """Bytes, flat. What was received is not to be written to, and lives as long as somebody holds it."""
 
+type Handler = Callable[[Payload, str | None], Payload]
+"""Makes the answer to a request. It is called with the request and the sender's name, as a certificate or password has
+proved it to the transport; None where nothing proves it. What a request says of itself is no proof."""
+
 WORKERS = 16
 """How many calls of a handler go on at the same time, where `serve` is not told otherwise."""
 
@@ -38,12 +42,12 @@ class Transport(ABC):
         """
 
     @abstractmethod
-    def serve(self, name: str, handler: Callable[[Payload], Payload], *, workers: int = WORKERS) -> Callable[[], None]:
+    def serve(self, name: str, handler: Handler, *, workers: int = WORKERS) -> Callable[[], None]:
         """Answer requests for `name`; returns a function that ends it. An exception of `handler` reaches the requester.
 
         Args:
             name: what requests ask for.
-            handler: makes the answer of a request. It is called from several threads at the same time, so that a slow
+            handler: makes the answer to a request. It is called from several threads at the same time, so that a slow
                 answer does not delay the next.
             workers: how many calls go on at the same time; further requests wait.
 

@@ -134,7 +134,7 @@ class TransportSuite(Suite[Transport]):
     def test_each_request_gets_its_own_answer(self) -> None:
         """Requests made at the same time are each answered with their own."""
         with self.ends() as (near, far):
-            far.serve("echo", lambda payload: bytes(payload) + b"!")
+            far.serve("echo", lambda payload, _: bytes(payload) + b"!")
             self.settle(near, far)
             answers: dict[int, Payload] = {}
 
@@ -159,7 +159,7 @@ class TransportSuite(Suite[Transport]):
                 going_on.wait(_HELD_S)
                 arrived.put(bytes(payload))
 
-            def answer(payload: Payload) -> Payload:
+            def answer(payload: Payload, _: str | None) -> Payload:
                 if payload == b"late":
                     going_on.wait(_HELD_S)
                     arrived.put(bytes(payload))
@@ -185,7 +185,7 @@ class TransportSuite(Suite[Transport]):
         with self.ends() as (near, far), self.held() as release:
             begun: queue.SimpleQueue[Payload] = queue.SimpleQueue()
 
-            def answer(payload: Payload) -> Payload:
+            def answer(payload: Payload, _: str | None) -> Payload:
                 begun.put(payload)
                 if payload != b"quick":
                     release.wait(_HELD_S)
@@ -216,7 +216,7 @@ class TransportSuite(Suite[Transport]):
         with self.ends() as (near, far), self.held() as release:
             done = threading.Event()
 
-            def answer(payload: Payload) -> Payload:
+            def answer(payload: Payload, _: str | None) -> Payload:
                 if payload == b"slow":
                     release.wait(_HELD_S)
                     done.set()
@@ -235,7 +235,7 @@ class TransportSuite(Suite[Transport]):
         """An exception of the server is a TransportError with its text at the requester; the service goes on."""
         with self.ends() as (near, far):
 
-            def answer(payload: Payload) -> Payload:
+            def answer(payload: Payload, _: str | None) -> Payload:
                 if payload == b"bad":
                     raise ValueError("no such thing as bad")
                 return payload
@@ -251,7 +251,7 @@ class TransportSuite(Suite[Transport]):
         with self.ends() as (near, far):
             with pytest.raises(TransportError):
                 near.request("nobody", b"", self.short_s)
-            end = far.serve("echo", lambda payload: payload)
+            end = far.serve("echo", lambda payload, _: payload)
             self.settle(near, far)
             assert near.request("echo", b"x", self.wait_s) == b"x"
             end()
@@ -261,13 +261,13 @@ class TransportSuite(Suite[Transport]):
     def test_a_name_is_served_once(self) -> None:
         """A second server of a name is refused until the first has ended."""
         with self.ends() as (near, far):
-            end = far.serve("echo", lambda payload: b"first")
+            end = far.serve("echo", lambda payload, _: b"first")
             with pytest.raises(TransportError, match="echo"):
-                far.serve("echo", lambda payload: b"second")
+                far.serve("echo", lambda payload, _: b"second")
             self.settle(near, far)
             assert near.request("echo", b"", self.wait_s) == b"first"
             end()
-            far.serve("echo", lambda payload: b"third")
+            far.serve("echo", lambda payload, _: b"third")
             self.settle(near, far)
             assert near.request("echo", b"", self.wait_s) == b"third"
 
@@ -280,7 +280,7 @@ class TransportSuite(Suite[Transport]):
             assert early.get_nowait() is False
             near.watch("other", lambda served: early.put(served) if served else None)
             for _ in range(2):
-                end = far.serve("echo", lambda payload: payload)
+                end = far.serve("echo", lambda payload, _: payload)
                 assert early.get(timeout=self.wait_s) is True
                 end_late = near.watch("echo", late.put)
                 assert late.get_nowait() is True
@@ -292,7 +292,7 @@ class TransportSuite(Suite[Transport]):
             end_early()
             last = near.watch("echo", late.put)
             assert late.get_nowait() is False
-            far.serve("echo", lambda payload: payload)
+            far.serve("echo", lambda payload, _: payload)
             assert late.get(timeout=self.wait_s) is True
             with pytest.raises(queue.Empty):
                 early.get(timeout=self.short_s)
@@ -303,7 +303,7 @@ class TransportSuite(Suite[Transport]):
         with self.ends() as (near, far):
             arrived: queue.SimpleQueue[Payload] = queue.SimpleQueue()
 
-            def answer(payload: Payload) -> Payload:
+            def answer(payload: Payload, _: str | None) -> Payload:
                 far.publish("asked", payload)
                 return payload
 
@@ -323,7 +323,7 @@ class TransportSuite(Suite[Transport]):
             with pytest.raises(TransportError):
                 near.subscribe("topic", lambda payload: None)
             with pytest.raises(TransportError):
-                near.serve("name", lambda payload: payload)
+                near.serve("name", lambda payload, _: payload)
             with pytest.raises(TransportError):
                 near.request("name", b"", self.short_s)
             with pytest.raises(TransportError):

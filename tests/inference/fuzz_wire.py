@@ -30,7 +30,7 @@ import numpy as np
 from ibrobot_core.inference.remote import RemoteEngine
 from ibrobot_core.inference.service import InferenceService, service_name
 from ibrobot_core.inference.wire import Kind, Message, decode, encode
-from ibrobot_core.interfaces import Payload, Tensors, Transport
+from ibrobot_core.interfaces import Handler, Tensors, Transport
 from ibrobot_core.local_transport import LocalTransport
 from ibrobot_core.plugins import installed
 from ibrobot_core.testing import host_context
@@ -58,10 +58,10 @@ class Tapped(LocalTransport):
 
     def __init__(self) -> None:
         super().__init__()
-        self.handlers: dict[str, Callable[[Payload], Payload]] = {}
+        self.handlers: dict[str, Handler] = {}
 
     @override
-    def serve(self, name: str, handler: Callable[[Payload], Payload], *, workers: int = 16) -> Callable[[], None]:
+    def serve(self, name: str, handler: Handler, *, workers: int = 16) -> Callable[[], None]:
         self.handlers[name] = handler
         return super().serve(name, handler, workers=workers)
 

@@ -459,7 +459,7 @@ def test_the_engine_says_that_nobody_serves_its_model():
         remote.start()
     with pytest.raises(PolicyError, match="nobody serves infer/net"):
         remote.infer({"x": np.zeros(1)}, 1, deadline())
-    transport.serve(health_name("net"), lambda payload: b"<html>")
+    transport.serve(health_name("net"), lambda payload, sender: b"<html>")
     with pytest.raises(PolicyError, match="is no server of ibrobot: b'<html>'"):
         RemoteEngine(Net(), transport, "net", "so101", start_timeout_s=PATIENCE_S).start()
     transport.close()
@@ -497,7 +497,7 @@ def test_the_engine_goes_on_with_a_server_that_was_started_again():
 )
 def test_the_engine_believes_no_answer_but_its_own(answer: bytes, said: str):
     transport = LocalTransport()
-    transport.serve(service_name("net"), lambda payload: answer)
+    transport.serve(service_name("net"), lambda payload, sender: answer)
     remote = RemoteEngine(Net(), transport, "net", "so101")
     with pytest.raises(PolicyError, match=said):
         remote.infer({"x": np.zeros(1)}, 1, deadline())

@@ -20,9 +20,13 @@ from cryptography.hazmat.primitives.serialization import (
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from ibrobot_core.errors import TransportError
+from ibrobot_zenoh.access import read_lines
+from ibrobot_zenoh.identity import Identity, Role, identity_in, subject
 
 CA, CA_KEY = "ca.pem", "ca.key"
 CERTIFICATE, KEY = "certificate.pem", "key.pem"
+ROBOTS = "robots.txt"
+"""The robots that a server lets in: the authority's own list, and a copy in each server's folder."""
 
 _EARLY = timedelta(days=2)
 """Certificates are valid from before they are made, for machines whose clock is behind."""
@@ -73,7 +77,7 @@ class Authority:
 
         Args:
             name: the certificate's common name, by which access control knows the machine.
-            hosts: names and addresses under which it is connected to; none for one that only connects.
+            hosts: names and addresses under which a server is connected to; none for a robot, which only connects.
 
         Raises:
             TransportError: when the folder is there already.
@@ -87,7 +91,7 @@ class Authority:
         names = x509.SubjectAlternativeName([_general_name(host) for host in hosts or (name,)])
         usages = [ExtendedKeyUsageOID.CLIENT_AUTH, *([ExtendedKeyUsageOID.SERVER_AUTH] if hosts else [])]
         certificate = (
-            self._builder(name, key)
+            self._builder(subject(Identity(name, Role.SERVER if hosts else Role.ROBOT)), key)
             .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
             .add_extension(x509.ExtendedKeyUsage(usages), critical=False)
             .add_extension(names, critical=False)
@@ -98,6 +102,23 @@ class Authority:
         _write(folder / CA, self._certificate)
         return folder
 
+    def admit(self, robots: Sequence[str]) -> list[Path]:
+        """Add names to the list of robots, and copy it to all servers' folders; returns those copies.
+
+        Raises:
+            TransportError: when the list cannot be read.
+        """
+        own = self._folder / ROBOTS
+        names = [*(read_lines(own) if own.exists() else ()), *robots]
+        copies = sorted(
+            folder / ROBOTS
+            for folder in self._folder.iterdir()
+            if (folder / CERTIFICATE).exists() and _is_server(folder / CERTIFICATE)
+        )
+        for path in (own, *copies):
+            path.write_text("".join(f"{name}\n" for name in names), encoding="utf-8")
+        return copies
+
     def _make(self) -> x509.Certificate:
         usage = {
             name: name in ("key_cert_sign", "crl_sign")
@@ -107,24 +128,27 @@ class Authority:
             )
         }  # fmt: skip
         return (
-            self._builder("ibrobot authority", self._key)
+            self._builder(x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "ibrobot authority")]), self._key)
             .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
             .add_extension(x509.KeyUsage(**usage), critical=True)
             .sign(self._key, hashes.SHA256())
         )
 
-    def _builder(self, name: str, key: ec.EllipticCurvePrivateKey) -> x509.CertificateBuilder:
+    def _builder(self, name: x509.Name, key: ec.EllipticCurvePrivateKey) -> x509.CertificateBuilder:
         now = datetime.now(UTC)
-        subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
         return (
             x509.CertificateBuilder()
-            .subject_name(subject)
-            .issuer_name(subject if key is self._key else self._certificate.subject)
+            .subject_name(name)
+            .issuer_name(name if key is self._key else self._certificate.subject)
             .public_key(key.public_key())
             .serial_number(x509.random_serial_number())
             .not_valid_before(now - _EARLY)
             .not_valid_after(now + timedelta(days=self._days) if key is self._key else self.ends)
         )
+
+
+def _is_server(certificate: Path) -> bool:
+    return identity_in(certificate).role is Role.SERVER
 
 
 def _general_name(host: str) -> x509.GeneralName:

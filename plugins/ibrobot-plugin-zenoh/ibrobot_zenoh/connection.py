@@ -9,7 +9,6 @@ import threading
 import time
 from collections.abc import Callable
 from functools import cache
-from pathlib import Path
 from typing import Any, Protocol
 from weakref import WeakSet
 
@@ -17,6 +16,7 @@ import zenoh
 
 from ibrobot_core.errors import TransportError
 from ibrobot_core.memory import set_malloc
+from ibrobot_zenoh.access import restrict
 from ibrobot_zenoh.options import ZenohOptions
 from ibrobot_zenoh.reasons import tls_context, why_not
 
@@ -90,7 +90,6 @@ def zenoh_config(options: ZenohOptions) -> zenoh.Config:
         settings["transport/auth/usrpwd/user"] = options.user
         settings["transport/auth/usrpwd/password"] = options.password
     if options.users is not None:
-        _check_users(options.users)
         settings["transport/auth/usrpwd/dictionary_file"] = str(options.users)
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
@@ -100,24 +99,6 @@ def zenoh_config(options: ZenohOptions) -> zenoh.Config:
 def first_line(error: BaseException) -> str:
     """What Zenoh says, without where in its source."""
     return str(error).partition(" at /")[0].strip()
-
-
-def _check_users(path: Path) -> None:
-    """See that somebody is named: a file without anybody would let everybody in."""
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise TransportError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
-    seen: set[str] = set()
-    for number, line in enumerate(lines, 1):
-        name, _, password = line.partition(":")
-        if not (name and password):
-            raise TransportError(f"{path}:{number}: is no NAME:PASSWORD")
-        if name in seen:
-            raise TransportError(f"{path}:{number}: {name!r} has a password already")
-        seen.add(name)
-    if not seen:
-        raise TransportError(f"{path}: is empty, must have a line NAME:PASSWORD for each who may connect")
 
 
 _open: WeakSet[Connection] = WeakSet()
@@ -152,6 +133,8 @@ class Connection:
         set_malloc(_LARGEST_KEPT, _KEPT_BYTES)
         self._endpoints = ", ".join(options.connect or options.listen)
         self._config = zenoh_config(options)
+        self.knows_who_asks = restrict(self._config, options)
+        """Whether the name in a request's key is proved."""
         self._lock = threading.Lock()
         self._session: zenoh.Session | None = None
         self._pending: dict[object, Callable[[zenoh.Session], Declared]] = {}

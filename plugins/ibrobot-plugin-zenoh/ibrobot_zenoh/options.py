@@ -16,6 +16,22 @@ _ENDPOINT = re.compile(r"(?P<protocol>tcp|tls|quic|unixsock-stream)/(?P<address>
 _ENCRYPTED = ("tls", "quic")
 
 
+_ROBOT = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+
+
+def check_robot_name(name: str) -> None:
+    """Nothing.
+
+    Raises:
+        ValueError: for a name that cannot be the namespace of a robot's topics.
+    """
+    if not _ROBOT.fullmatch(name):
+        raise ValueError(
+            f"{name!r} cannot be a robot's name: it is also the namespace of its topics, so use letters, digits and _ "
+            "only, e.g. robot1"
+        )
+
+
 def is_local(endpoint: str) -> bool:
     """Whether only this machine can reach an endpoint to listen on."""
     protocol, _, address = endpoint.partition("/")
@@ -45,6 +61,7 @@ class Tls:
     ca: Path = option(help="certificate of the authority that signed everybody's")
     certificate: Path = option(help="this machine's certificate")
     key: Path = option(help="its private key")
+    robots: Path | None = option(None, help="where to listen: the robots that are let in, a file with one name a line")
 
 
 @attrs.frozen
@@ -69,12 +86,16 @@ class ZenohOptions:
     trusted_network: bool = option(
         False, help="allows to listen beyond this machine without tls or users: everybody there may do everything"
     )
-    settings: Path | None = option(None, help="a JSON5 file of Zenoh's own settings, e.g. access_control")
+    settings: Path | None = option(None, help="a JSON5 file of Zenoh's own settings; its access_control replaces ours")
     max_message_size: int = option(64 * MIB, unit="bytes", ge=1024, help="larger messages are neither sent nor taken")
     lease: float = option(2.0, unit="s", ge=0.2, le=60, help="silence after which a connection counts as lost")
     shared_memory: bool = option(True, help="large messages to processes of this machine go through shared memory")
     domain: int = option(0, ge=0, le=232, help="ROS 2 domain of shared topics")
-    namespace: str = option("", help="put before the names of shared topics, e.g. robot1 makes /robot1/joint_states")
+    namespace: str | None = option(
+        None,
+        help="put before the names of shared topics, e.g. robot1 makes /robot1/joint_states; by default a robot's name "
+        "in its certificate, or its user name",
+    )
     type_hashes: bool = option(True, help="false: as ROS 2 Humble names topics, without the hash of their type")
 
     def __attrs_post_init__(self) -> None:
@@ -90,6 +111,8 @@ class ZenohOptions:
                 raise ValueError(f"{endpoint} would not use tls; write tls/{endpoint.partition('/')[2]}")
         if (self.user is None) != (self.password is None):
             raise ValueError("user and password belong together, one of them is missing")
+        if self.user is not None:
+            check_robot_name(self.user)
         if not (self.trusted_network or self.tls or self.users):
             for endpoint in self.listen:
                 if not is_local(endpoint):
@@ -97,5 +120,5 @@ class ZenohOptions:
                         f"listen: {endpoint} can be reached by other machines: give tls or users, or "
                         "trusted_network: true where everybody may do everything"
                     )
-        if not re.fullmatch(r"(/?[A-Za-z_][A-Za-z0-9_]*)*", self.namespace):
+        if not re.fullmatch(r"(/?[A-Za-z_][A-Za-z0-9_]*)*", self.namespace or ""):
             raise ValueError(f"namespace {self.namespace!r} is no ROS 2 name, e.g. robot1 or lab/robot1")

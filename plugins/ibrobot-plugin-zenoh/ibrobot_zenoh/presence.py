@@ -8,9 +8,10 @@ from collections.abc import Callable
 import zenoh
 
 from ibrobot_core.workers import Workers
+from ibrobot_zenoh.access import SERVED
 from ibrobot_zenoh.connection import Connection
 
-PREFIX = "ibrobot/served/"
+PREFIX = f"{SERVED}/"
 """Tokens are PREFIX NAME / ID."""
 
 

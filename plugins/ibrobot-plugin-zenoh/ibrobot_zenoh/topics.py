@@ -20,6 +20,7 @@ from ibrobot_core.interfaces.transport import SharedTopic
 from ibrobot_core.messages import Message
 from ibrobot_core.workers import Workers
 from ibrobot_zenoh.connection import Connection, Declared, first_line
+from ibrobot_zenoh.identity import Identity, Role
 from ibrobot_zenoh.options import ZenohOptions
 from ibrobot_zenoh.ros2 import ADMIN, Node, absolute, attachment, topic_key, topics_of_tokens, type_of_key
 
@@ -109,12 +110,16 @@ class Topics:
     Args:
         connection: the session.
         options: domain, namespace, and whether types have hashes.
+        own: who this machine is to others.
         ctx: whose robot's name the node has.
     """
 
-    def __init__(self, connection: Connection, options: ZenohOptions, ctx: Context) -> None:
+    def __init__(self, connection: Connection, options: ZenohOptions, own: Identity | None, ctx: Context) -> None:
         self.connection = connection
         self.options = options
+        self._own = own
+        default = own.name if own is not None and own.role is Role.ROBOT else ""
+        self._namespace = default if options.namespace is None else options.namespace
         self._log = ctx.log
         self._name = "ibrobot_" + re.sub(r"\W", "_", ctx.robot.name)
         self._lock = threading.Lock()
@@ -124,7 +129,9 @@ class Topics:
     def publish(self, topic: str, message: Message, *, latched: bool) -> None:
         """See `TopicTransport.publish_message`."""
         self.connection.check_open()
-        name = absolute(topic, self.options.namespace)
+        name = absolute(topic, self._namespace)
+        if self._own is not None:
+            self._own.check_may_publish(name)
         payload = encode(message).tobytes()
         if len(payload) > self.options.max_message_size:
             limit = self.options.max_message_size
@@ -136,7 +143,7 @@ class Topics:
 
     def is_heard(self, topic: str, type_name: str, timeout_s: float) -> bool:
         """See `ZenohTransport.is_heard`."""
-        publisher = self._publisher(absolute(topic, self.options.namespace), type_name, latched=False)
+        publisher = self._publisher(absolute(topic, self._namespace), type_name, latched=False)
         deadline = time.monotonic() + timeout_s
         while not publisher.is_heard and time.monotonic() + _AGAIN_S < deadline:
             time.sleep(_AGAIN_S)
@@ -155,7 +162,7 @@ class Topics:
 
     def subscribe(self, topic: str, callback: Callable[[Message], object]) -> tuple[Callable[[], None], Workers[Any]]:
         """What ends it, and the thread that calls `callback`; see `TopicTransport.subscribe_messages`."""
-        name = absolute(topic, self.options.namespace)
+        name = absolute(topic, self._namespace)
         told = _Once(self._log)
 
         def deliver(sample: zenoh.Sample) -> None:

@@ -11,11 +11,13 @@ from typing import Any, override
 import zenoh
 
 from ibrobot_core.errors import TransportError
-from ibrobot_core.interfaces import Context, Payload, SharedTopic, TopicTransport
+from ibrobot_core.interfaces import Context, Handler, Payload, SharedTopic, TopicTransport
 from ibrobot_core.interfaces.transport import WORKERS
 from ibrobot_core.messages import Message
 from ibrobot_core.workers import Workers
+from ibrobot_zenoh.access import ANYBODY, SERVED, SERVICES, TOPICS
 from ibrobot_zenoh.connection import Connection, first_line
+from ibrobot_zenoh.identity import own_identity
 from ibrobot_zenoh.options import ZenohOptions
 from ibrobot_zenoh.presence import Presence
 from ibrobot_zenoh.topics import Topics
@@ -31,7 +33,7 @@ _FAILED = zenoh.Encoding.TEXT_PLAIN
 @lru_cache
 def _key(prefix: str, name: str) -> zenoh.KeyExpr:
     try:
-        key = zenoh.KeyExpr(f"ibrobot/{prefix}/{name.removeprefix('/')}")
+        key = zenoh.KeyExpr(f"{prefix}/{name.removeprefix('/')}")
     except zenoh.ZError as error:
         raise TransportError(f"{name!r} cannot be a name here: {first_line(error)}") from error
     if "*" in name:
@@ -50,7 +52,7 @@ def _sendable(payload: Payload) -> bytes | bytearray:
 
 
 class ZenohTransport(TopicTransport):
-    """Payloads over Zenoh, under `ibrobot/topic/TOPIC` and `ibrobot/service/NAME`; messages as ROS 2 nodes send them.
+    """Payloads over Zenoh, under the keys of `ibrobot_zenoh.access`; messages as ROS 2 nodes send them.
 
     Raises:
         TransportError: see `Connection`.
@@ -59,8 +61,11 @@ class ZenohTransport(TopicTransport):
     def __init__(self, options: ZenohOptions, ctx: Context) -> None:
         self._log = ctx.log
         self._largest = options.max_message_size
+        own = own_identity(options)
+        self._name = ANYBODY if own is None else own.name
+        self._own = own
         self._connection = Connection(options, ctx.log)
-        self._topics = Topics(self._connection, options, ctx)
+        self._topics = Topics(self._connection, options, own, ctx)
         self._presence = Presence(self._connection)
         self._lock = threading.Lock()
         self._served: set[str] = set()
@@ -69,7 +74,9 @@ class ZenohTransport(TopicTransport):
     @override
     def publish(self, topic: str, payload: Payload) -> None:
         self._check_size(len(payload), topic)
-        key = _key("topic", topic)
+        if self._own is not None:
+            self._own.check_may_publish(topic)
+        key = _key(TOPICS, topic)
         session = self._connection.open_session
         if session is not None:  # else there is nobody who could have subscribed
             # What waits here is the link, never a subscriber: those have queues of their own.
@@ -89,23 +96,23 @@ class ZenohTransport(TopicTransport):
             if subscriber.put(sample) is not None:
                 self._log.warning("%s is too slow: a payload was dropped", name)
 
-        key = _key("topic", topic)
+        key = _key(TOPICS, topic)
         return self._keep(self._connection.declare(lambda session: session.declare_subscriber(key, take)), subscriber)
 
     @override
-    def serve(self, name: str, handler: Callable[[Payload], Payload], *, workers: int = WORKERS) -> Callable[[], None]:
-        key, token = _key("service", name), _key("served", name).join(uuid.uuid4().hex)
+    def serve(self, name: str, handler: Handler, *, workers: int = WORKERS) -> Callable[[], None]:
+        key, token = _key(f"{SERVICES}/*", name), _key(SERVED, name).join(uuid.uuid4().hex)
 
         def answer(query: zenoh.Query) -> None:
             with query:  # dropping it is what tells the requester that nothing more comes
                 try:
                     request = query.payload
-                    reply = handler(request.to_bytes() if request is not None else b"")
+                    reply = handler(request.to_bytes() if request is not None else b"", self._sender(query))
                     self._check_size(len(reply), name)
                 except Exception as error:  # noqa: BLE001 - it is the requester's to see
                     query.reply_err(f"{type(error).__name__}: {error}", encoding=_FAILED)
                 else:
-                    query.reply(key, _sendable(reply), express=True)
+                    query.reply(query.key_expr, _sendable(reply), express=True)
 
         server = Workers(answer, f"the server of {name}", workers, REQUESTS_WAITING)
 
@@ -132,7 +139,7 @@ class ZenohTransport(TopicTransport):
 
     @override
     def request(self, name: str, payload: Payload, timeout_s: float) -> Payload:
-        key = _key("service", name)
+        key = _key(f"{SERVICES}/{self._name}", name)
         self._check_size(len(payload), name)
         session = self._connection.session()
         try:
@@ -151,11 +158,12 @@ class ZenohTransport(TopicTransport):
             if failure is not None and failure.encoding == _FAILED:
                 raise TransportError(f"{name} failed: {failure.payload.to_bytes().decode(errors='replace')}")
             raise TransportError(f"no answer from {name} within {timeout_s} s")
-        raise TransportError(f"nobody serves {name}, or not any more")
+        hint = f"; or its list of robots lacks {self._name!r}" if self._own is not None else ""
+        raise TransportError(f"nobody serves {name}, or not any more{hint}")
 
     @override
     def watch(self, name: str, changed: Callable[[bool], object]) -> Callable[[], None]:
-        _key("served", name)  # refuses what cannot be a name
+        _key(SERVED, name)  # refuses what cannot be a name
         self._connection.check_open()
         return self._keep(*self._presence.watch(name.removeprefix("/"), changed))
 
@@ -204,6 +212,14 @@ class ZenohTransport(TopicTransport):
                     self._workers.remove(workers)
 
         return end
+
+    def _sender(self, query: zenoh.Query) -> str | None:
+        """Who asks: the access list lets nobody ask under a key of another name."""
+        return (
+            str(query.key_expr).removeprefix(f"{SERVICES}/").partition("/")[0]
+            if self._connection.knows_who_asks
+            else None
+        )
 
     def _check_size(self, size: int, name: str) -> None:
         if size > self._largest:

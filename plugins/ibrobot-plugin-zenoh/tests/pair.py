@@ -42,9 +42,12 @@ def make(**options: Any) -> ZenohTransport:
     return ZenohTransport(ZenohOptions(**{"shared_memory": False, **options}), host_context())
 
 
-def settle(near: Transport, far: Transport) -> None:
-    """Wait until all that `far` declared is known to `near`: what is declared later becomes known later."""
-    topic, known = f"settle/{next(_numbers)}", threading.Event()
+def settle(near: Transport, far: Transport, robot: str = "") -> None:
+    """Wait until all that `far` declared is known to `near`: what is declared later becomes known later.
+
+    A robot that is known by name publishes below its name only.
+    """
+    topic, known = f"{robot}/settle/{next(_numbers)}".strip("/"), threading.Event()
     end = far.subscribe(topic, lambda payload: known.set())
     wait_for(lambda: near.publish(topic, b"") or known.is_set())
     end()

@@ -12,7 +12,7 @@ from ibrobot_core.interfaces import Payload
 from ibrobot_core.testing import host_context
 
 
-def answer(payload: Payload) -> Payload:
+def answer(payload: Payload, _: str | None) -> Payload:
     if payload == b"hang":
         print("asked", flush=True)
         threading.Event().wait()

@@ -79,7 +79,7 @@ def test_a_client_may_come_before_its_router(caplog: pytest.LogCaptureFixture):
     arrived: queue.SimpleQueue[object] = queue.SimpleQueue()
     early.subscribe("topic", arrived.put)
     end_ended = early.subscribe("topic", lambda payload: arrived.put("ended"))
-    early.serve("echo", lambda payload: payload)
+    early.serve("echo", lambda payload, _: payload)
     end_ended()
     far = router(endpoint)
     known = threading.Event()
@@ -140,7 +140,7 @@ def test_an_address_that_is_taken():
 def test_large_messages_are_refused_both_ways():
     endpoint = free_endpoint()
     server = router(endpoint, max_message_size=100_000)
-    server.serve("twice", lambda payload: bytes(payload) * 2)
+    server.serve("twice", lambda payload, _: bytes(payload) * 2)
     strict, lax = client(endpoint, max_message_size=100_000), client(endpoint)
     settle(lax, server)
     with pytest.raises(TransportError, match="a message of 100001 bytes is larger than max_message_size, 100000"):
@@ -163,7 +163,7 @@ def test_a_flood_is_turned_away(monkeypatch: pytest.MonkeyPatch):
     server, robot = router(endpoint), client(endpoint)
     release, begun = threading.Event(), threading.Event()
 
-    def slow(payload: object) -> bytes:
+    def slow(payload: object, _: object) -> bytes:
         begun.set()
         release.wait(WAIT_S)
         return b"done"

@@ -4,17 +4,26 @@ from __future__ import annotations
 
 import json
 import queue
+import socket
+import ssl
 import stat
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
+import attrs
 import pytest
 import yaml
 import zenoh
 from click.testing import CliRunner, Result
 from cryptography import x509
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
+from cryptography.x509.oid import NameOID
 from ibrobot_zenoh.certificates import Authority
 from ibrobot_zenoh.commands.certs import certs
 from ibrobot_zenoh.options import Tls
@@ -39,16 +48,18 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def tls(folder: Path, name: str) -> Tls:
-    return Tls(folder / name / "ca.pem", folder / name / "certificate.pem", folder / name / "key.pem")
+    robots = folder / name / "robots.txt"
+    files = (folder / name / file for file in ("ca.pem", "certificate.pem", "key.pem"))
+    return Tls(*files, robots if robots.exists() else None)
 
 
 def test_requests_pass_with_certificates(lab: Path):
     endpoint = free_endpoint("tls")
     server = router(endpoint, tls=tls(lab, "localhost"))
-    server.serve("echo", lambda payload: payload)
+    server.serve("echo", lambda payload, _: payload)
     robots = [client(endpoint, tls=tls(lab, name)) for name in ("robot1", "robot2")]
-    for robot in robots:
-        settle(robot, server)
+    for robot, name in zip(robots, ("robot1", "robot2"), strict=True):
+        settle(robot, server, name)
         assert robot.request("echo", b"hello", WAIT_S) == b"hello"
     for end in (*robots, server):
         end.close()
@@ -58,7 +69,7 @@ def test_another_authority_s_certificate_gets_nothing(lab: Path, tmp_path: Path,
     assert run(tmp_path / "other", "--server", "localhost,127.0.0.1", "--robot", "robot1").exit_code == 0
     endpoint = free_endpoint("tls")
     server = router(endpoint, tls=tls(lab, "localhost"))
-    server.serve("echo", lambda payload: payload)
+    server.serve("echo", lambda payload, _: payload)
     # One that trusts the server, so that it is the server that refuses; and one that does not.
     stranger = Tls(lab / "ca.pem", tmp_path / "other/robot1/certificate.pem", tmp_path / "other/robot1/key.pem")
     stranger_s = tls(tmp_path / "other", "robot1")
@@ -103,10 +114,106 @@ def test_a_server_of_another_name_is_not_believed(lab: Path, tmp_path: Path, cap
 
 
 def test_a_robot_s_certificate_is_not_a_server_s(lab: Path):
+    """A machine does not listen with it; and one that does so by other means is not believed."""
+    with pytest.raises(TransportError, match="is the certificate of robot robot2, which may only connect"):
+        router(free_endpoint("tls"), tls=tls(lab, "robot2"))
+    with _pretends_to_be_a_server(tls(lab, "robot2")) as endpoint:
+        assert "made for a --robot" in why_not(endpoint, tls(lab, "robot1"))
+
+
+@contextmanager
+def _pretends_to_be_a_server(files: Tls) -> Iterator[str]:
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(files.certificate, files.key)
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+
+        def greet() -> None:
+            with suppress(OSError), listening.accept()[0] as stream:
+                context.wrap_socket(stream, server_side=True).close()
+
+        thread = threading.Thread(target=greet)
+        thread.start()
+        yield f"tls/127.0.0.1:{listening.getsockname()[1]}"
+        thread.join()
+
+
+def test_a_server_needs_a_list_of_robots(lab: Path, tmp_path: Path):
+    files = tls(lab, "localhost")
+    with pytest.raises(TransportError, match=r"nobody is let in: give tls\.robots"):
+        router(free_endpoint("tls"), tls=attrs.evolve(files, robots=None))
+    robots = tmp_path / "robots.txt"
+    for text, said in (("robot1\n\n../up\n", "3: '../up' cannot be"), ("robot1\nrobot1 # again\n", "2: 'robot1' is")):
+        robots.write_text(text)
+        with pytest.raises(TransportError, match=f"robots.txt:{said}"):
+            router(free_endpoint("tls"), tls=attrs.evolve(files, robots=robots))
+    with pytest.raises(TransportError, match=r"none.txt: cannot be read"):
+        router(free_endpoint("tls"), tls=attrs.evolve(files, robots=tmp_path / "none.txt"))
+
+
+def test_a_robot_that_is_not_listed_gets_nothing(lab: Path, tmp_path: Path):
+    """Its certificate is good; striking its name is how it is locked out. It is told what may be wrong."""
+    robots = tmp_path / "robots.txt"
+    robots.write_text("# robot1 is in repair\nrobot2\n")
     endpoint = free_endpoint("tls")
-    server = router(endpoint, tls=tls(lab, "robot2"))
-    assert "made for a --robot" in why_not(endpoint, tls(lab, "robot1"))
-    server.close()
+    server = router(endpoint, tls=attrs.evolve(tls(lab, "localhost"), robots=robots))
+    server.serve("echo", lambda payload, _: payload)
+    listed, struck = (client(endpoint, tls=tls(lab, name)) for name in ("robot2", "robot1"))
+    settle(listed, server, "robot2")
+    assert listed.request("echo", b"x", WAIT_S) == b"x"
+    with pytest.raises(TransportError, match=r"nobody serves echo, .*its list of robots lacks 'robot1'"):
+        struck.request("echo", b"x", WAIT_S)
+    for end in (listed, struck, server):
+        end.close()
+
+
+def test_a_certificate_without_a_role_is_refused(lab: Path, tmp_path: Path):
+    """As `ibrobot certs` made them before: the remedy is in the error."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "robot1")])
+    now = datetime.now(UTC)
+    old = (
+        x509.CertificateBuilder().subject_name(name).issuer_name(name).public_key(key.public_key())
+        .serial_number(1).not_valid_before(now).not_valid_after(now + timedelta(days=1)).sign(key, hashes.SHA256())
+    )  # fmt: skip
+    (tmp_path / "certificate.pem").write_bytes(old.public_bytes(Encoding.PEM))
+    private = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+    (tmp_path / "key.pem").write_bytes(private)
+    without_role = Tls(lab / "ca.pem", tmp_path / "certificate.pem", tmp_path / "key.pem")
+    for make in (client, router):
+        with pytest.raises(TransportError, match=r"certificate\.pem: has no role .*ibrobot certs NEW_FOLDER"):
+            make(free_endpoint("tls"), tls=without_role)
+
+
+def test_topics_go_under_the_name_in_the_certificate(lab: Path):
+    """Without a namespace; under another one it is an error here, since the server would drop it in silence."""
+    endpoint = free_endpoint("tls")
+    server = router(endpoint, tls=tls(lab, "localhost"))
+    robot, other = client(endpoint, tls=tls(lab, "robot1")), client(endpoint, tls=tls(lab, "robot2"), namespace="")
+    robot.publish_message("/name", String("robot1"), latched=True)
+    for hears in (server, other):
+        arrived: queue.SimpleQueue[object] = queue.SimpleQueue()
+        hears.subscribe_messages("/robot1/name", arrived.put)
+        assert arrived.get(timeout=WAIT_S) == String("robot1")
+    for topic in ("/robot1/name", "/name"):
+        with pytest.raises(TransportError, match=f"{topic}: robot2 may publish below /robot2 only"):
+            other.publish_message(topic, String("robot2"))
+    with pytest.raises(TransportError, match="robot2 may publish below /robot2 only"):
+        other.publish("robot1/state", b"")
+    for end in (robot, other, server):
+        end.close()
+
+
+def test_the_server_s_own_certificate_may_do_everything(lab: Path):
+    """For `ibrobot topic` beside the server."""
+    endpoint = free_endpoint("tls")
+    server, beside = router(endpoint, tls=tls(lab, "localhost")), client(endpoint, tls=tls(lab, "localhost"))
+    robot = client(endpoint, tls=tls(lab, "robot1"))
+    arrived: queue.SimpleQueue[object] = queue.SimpleQueue()
+    robot.subscribe_messages("/lamp", arrived.put)
+    wait_for(lambda: beside.publish_message("/robot1/lamp", Int32(1)) or not arrived.empty())
+    assert arrived.get(timeout=WAIT_S) == Int32(1)
+    for end in (beside, robot, server):
+        end.close()
 
 
 def test_an_end_without_tls_is_told(lab: Path):
@@ -150,36 +257,22 @@ def test_files_that_do_not_belong_together_are_told(
 
 
 def test_the_readme_s_access_control(lab: Path, tmp_path: Path):
-    """By the names in certificates: every robot asks for inference, and robot1 alone shares under its name."""
+    """The user's own list takes the place of ours, and needs no list of robots."""
     readme = Path(__file__).parents[1].joinpath("README.md").read_text(encoding="utf-8")
     settings = tmp_path / "access.json5"
     settings.write_text(readme.partition("```json5\n")[2].partition("```")[0])
     endpoint = free_endpoint("tls")
-    server = router(endpoint, tls=tls(lab, "localhost"), settings=settings)
-    server.serve("infer/net", lambda payload: payload)
-    server.serve("secret", lambda payload: payload)
-    arrived: queue.SimpleQueue[object] = queue.SimpleQueue()
-    server.subscribe_messages("/robot1/count", arrived.put)
-    server.subscribe_messages("/robot1/name", arrived.put)
-    first, second = (client(endpoint, tls=tls(lab, name), namespace="robot1") for name in ("robot1", "robot2"))
+    server = router(endpoint, tls=attrs.evolve(tls(lab, "localhost"), robots=None), settings=settings)
+    server.serve("infer/net", lambda payload, sender: f"{sender}".encode())
+    server.serve("secret", lambda payload, _: payload)
+    first, second = (client(endpoint, tls=tls(lab, name)) for name in ("robot1", "robot2"))
     for robot in (first, second):
         served = threading.Event()
         robot.watch("infer/net", lambda state, served=served: state and served.set())
         assert served.wait(WAIT_S)
-        assert robot.request("infer/net", b"x", WAIT_S) == b"x"
         with pytest.raises(TransportError, match="nobody serves secret"):
             robot.request("secret", b"x", WAIT_S)
-    for _ in range(3):
-        second.publish_message("/count", Int32(-1))
-        second.publish_message("/name", String("a lie"), latched=True)
-    assert second.request("infer/net", b"after it", WAIT_S) == b"after it"
-    first.publish_message("/name", String("robot1"), latched=True)
-    assert arrived.get(timeout=WAIT_S) == String("robot1")
-    first.publish_message("/count", Int32(1))
-    assert arrived.get(timeout=WAIT_S) == Int32(1)
-    late: queue.SimpleQueue[object] = queue.SimpleQueue()
-    server.subscribe_messages("/robot1/name", late.put)
-    assert late.get(timeout=WAIT_S) == String("robot1")
+    assert first.request("infer/net", b"x", WAIT_S) == b"None"  # who asks is not proved by a list of somebody else's
     for end in (first, second, server):
         end.close()
 
@@ -192,7 +285,9 @@ def test_what_is_made(lab: Path):
     assert names.get_values_for_type(x509.DNSName) == ["localhost"]
     assert [str(address) for address in names.get_values_for_type(x509.IPAddress)] == ["127.0.0.1"]
     robot = x509.load_pem_x509_certificate((lab / "robot1/certificate.pem").read_bytes())
-    assert robot.subject.rfc4514_string() == "CN=robot1"
+    assert robot.subject.rfc4514_string() == "OU=robot,CN=robot1"
+    assert server.subject.rfc4514_string() == "OU=server,CN=localhost"
+    assert (lab / "localhost/robots.txt").read_text().splitlines()[:2] == ["robot1", "robot2"]
     usages = robot.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
     assert [usage._name for usage in usages] == ["clientAuth"]  # it cannot pretend to be the server
     authority = x509.load_pem_x509_certificate((lab / "ca.pem").read_bytes())
@@ -208,7 +303,7 @@ def test_the_yaml_to_paste(tmp_path: Path):
         "type": "zenoh",
         "mode": "router",
         "listen": ["tls/0.0.0.0:7447"],
-        "tls": {key: f"gpu.lab/{file}" for key, file in files.items()},
+        "tls": {key: f"gpu.lab/{file}" for key, file in {**files, "robots": "robots.txt"}.items()},
     }
     assert robot["transport"] == {
         "type": "zenoh",
@@ -232,7 +327,10 @@ def test_a_folder_that_cannot_be_written_is_told(tmp_path: Path):
 
 def test_the_same_authority_signs_what_comes_later(lab: Path):
     before = (lab / "ca.pem").read_bytes()
-    assert "signed by the authority" in run(lab, "--robot", "robot9").output
+    output = run(lab, "--robot", "robot9").output
+    assert "signed by the authority" in output
+    assert f"# localhost: copy {lab}/localhost/robots.txt there again" in output
+    assert "robot9" in (lab / "localhost/robots.txt").read_text().splitlines()
     assert (lab / "ca.pem").read_bytes() == (lab / "robot9/ca.pem").read_bytes() == before
 
 
@@ -278,7 +376,8 @@ def test_an_authority_that_cannot_sign_is_refused(damage: str, tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    "arguments", [(), ("--robot", "../up"), ("--server", "a b"), ("--robot", ""), ("--server", ",")]
+    "arguments",
+    [(), ("--robot", "../up"), ("--robot", "robot-1"), ("--server", "a b"), ("--robot", ""), ("--server", ",")],
 )
 def test_wrong_arguments(arguments: tuple[str, ...], tmp_path: Path):
     result = run(tmp_path / "lab", *arguments)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import queue
 from pathlib import Path
 
@@ -32,6 +31,7 @@ TLS = Tls(Path("ca.pem"), Path("certificate.pem"), Path("key.pem"))
         ({"mode": "router", "listen": ("tcp/[::]:1",)}, "can be reached by other machines"),
         ({"mode": "peer", "listen": ("tcp/gpu.lab:1",)}, "can be reached by other machines"),
         ({"connect": ("tcp/a:1",), "namespace": "a b"}, "is no ROS 2 name"),
+        ({"connect": ("tcp/a:1",), "user": "a/b", "password": "x"}, "'a/b' cannot be a robot's name"),
     ],
 )
 def test_refused(options: dict[str, object], message: str):
@@ -75,7 +75,8 @@ def test_files_that_are_not_there(options: dict[str, object]):
         ("robot1:a\nrobot2\n", "users.txt:2: is no NAME:PASSWORD"),
         (":a\n", "users.txt:1: is no NAME:PASSWORD"),
         ("robot1:\n", "users.txt:1: is no NAME:PASSWORD"),
-        ("robot1:a\nrobot1:b\n", "users.txt:2: 'robot1' has a password already"),
+        ("robot1:a\nrobot1:b\n", "users.txt:2: 'robot1' is listed already"),
+        ("robot-1:a\n", "users.txt:1: 'robot-1' cannot be a robot's name"),
     ],
 )
 def test_a_file_of_users_that_says_something_else(text: str, said: str, tmp_path: Path):
@@ -90,9 +91,9 @@ def test_passwords(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     users.write_text("robot1:secret\n")
     endpoint = free_endpoint()
     server = router(endpoint, users=users)
-    server.serve("echo", lambda payload: payload)
+    server.serve("echo", lambda payload, _: payload)
     known = client(endpoint, user="robot1", password="secret")
-    settle(known, server)
+    settle(known, server, "robot1")
     assert known.request("echo", b"x", WAIT_S) == b"x"
     for wrong in ({"user": "robot1", "password": "guess"}, {}):
         caplog.clear()
@@ -105,59 +106,25 @@ def test_passwords(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     server.close()
 
 
-def test_access_control(tmp_path: Path):
-    """As in the README: robots ask for inference and share under their own name, and no more."""
-    settings, users = tmp_path / "access.json5", tmp_path / "users.txt"
+def test_users_are_told_apart_by_their_passwords(tmp_path: Path):
+    """The list is made from the file of users: each asks and publishes under its own name, and serves nothing."""
+    users = tmp_path / "users.txt"
     users.write_text("robot1:a\nrobot2:b\n")
-    rules = [
-        {"id": name, "permission": "allow", "flows": ["ingress", "egress"], "messages": MESSAGES, "key_exprs": keys}
-        for name, keys in (
-            ("everybody", ["ibrobot/service/inference", "ibrobot/served/**"]),
-            ("robot1", ["ibrobot/topic/robot1/**"]),
-        )
-    ]
-    settings.write_text(
-        json.dumps(
-            {
-                "access_control": {
-                    "enabled": True,
-                    "default_permission": "deny",
-                    "rules": rules,
-                    "subjects": [{"id": "all"}, {"id": "robot1", "usernames": ["robot1"]}],
-                    "policies": [
-                        {"rules": ["everybody"], "subjects": ["all"]},
-                        {"rules": ["robot1"], "subjects": ["robot1"]},
-                    ],
-                }
-            }
-        )
-    )
     endpoint = free_endpoint()
-    server = router(endpoint, users=users, settings=settings)
-    server.serve("inference", lambda payload: payload)
-    server.serve("stop_the_lab", lambda payload: payload)
+    server = router(endpoint, users=users)
+    server.serve("who", lambda payload, sender: f"{sender}".encode())
     arrived: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     server.subscribe("robot1/state", lambda payload: arrived.put(bytes(payload)))
-    robot1 = client(endpoint, user="robot1", password="a")
-    robot2 = client(endpoint, user="robot2", password="b")
-    for robot in (robot1, robot2):
-        served: queue.SimpleQueue[bool] = queue.SimpleQueue()
-        robot.watch("inference", served.put)
-        while not served.get(timeout=WAIT_S):
-            pass
-        assert robot.request("inference", b"x", WAIT_S) == b"x"
-        with pytest.raises(TransportError, match="nobody serves stop_the_lab"):
-            robot.request("stop_the_lab", b"x", WAIT_S)
-    robot2.publish("robot1/state", b"false")
-    robot2.request("inference", b"after it", WAIT_S)
-    robot1.publish("robot1/state", b"true")
-    assert arrived.get(timeout=WAIT_S) == b"true"
-    for end in (robot1, robot2, server):
+    server.subscribe("robot2/state", lambda payload: arrived.put(bytes(payload)))
+    robots = {name: client(endpoint, user=name, password=word) for name, word in (("robot1", "a"), ("robot2", "b"))}
+    for name, robot in robots.items():
+        robot.serve("who", lambda payload, sender: b"a lie")
+        settle(robot, server, name)
+    for name, robot in robots.items():
+        assert [robot.request("who", b"", WAIT_S) for _ in range(5)] == [name.encode()] * 5
+        with pytest.raises(TransportError, match="may publish below"):
+            robot.publish("state", b"")
+        robot.publish(f"{name}/state", name.encode())
+        assert arrived.get(timeout=WAIT_S) == name.encode()
+    for end in (*robots.values(), server):
         end.close()
-
-
-MESSAGES = [
-    "put", "delete", "declare_subscriber", "query", "reply", "declare_queryable",
-    "liveliness_token", "liveliness_query", "declare_liveliness_subscriber",
-]  # fmt: skip
-"""Everything that can be said under a key."""

@@ -8,22 +8,27 @@ from pathlib import Path
 import click
 
 from ibrobot_core.errors import TransportError
-from ibrobot_zenoh.certificates import CA, CERTIFICATE, KEY, Authority
+from ibrobot_zenoh.certificates import CA, CERTIFICATE, KEY, ROBOTS, Authority
+from ibrobot_zenoh.options import check_robot_name
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 _PORT = 7447
+_FILES = {"ca": CA, "certificate": CERTIFICATE, "key": KEY}
 
 
 @click.command()
 @click.argument("out_dir", type=click.Path(path_type=Path, file_okay=False))
-@click.option("--server", "servers", multiple=True, metavar="HOST[,IP…]", help="What others connect to; repeat it.")
-@click.option("--robot", "robots", multiple=True, metavar="NAME", help="What only connects; repeat it.")
+@click.option("--server", "servers", multiple=True, metavar="HOST[,IP…]", help="A server: what robots connect to.")
+@click.option("--robot", "robots", multiple=True, metavar="NAME", help="A robot, which only connects.")
 @click.option("--days", default=1825, show_default=True, type=click.IntRange(1, 7300), help="How long they are valid.")
 def certs(out_dir: Path, servers: tuple[str, ...], robots: tuple[str, ...], days: int) -> None:
     """Make certificates for a lab in OUT_DIR: an authority of its own, and a folder to copy to each machine.
 
-    With the authority in OUT_DIR already, it signs the new ones. Nothing is overwritten. Whoever has OUT_DIR/ca.key
-    can make more: it belongs on none of the machines.
+    A certificate holds its machine's name and role. Servers answer requests; robots ask, and publish under their own
+    name. Repeat --server and --robot. A server lets in the robots that the robots.txt in its folder names.
+
+    With the authority in OUT_DIR already, it signs the new certificates, and adds the new robots to every robots.txt.
+    No certificate or key is overwritten. Whoever has OUT_DIR/ca.key can make more: it belongs on none of the machines.
     """
     if not servers and not robots:
         raise click.UsageError("name a --server or a --robot, e.g. --server gpu.lab,192.168.1.5 --robot robot1")
@@ -32,12 +37,18 @@ def certs(out_dir: Path, servers: tuple[str, ...], robots: tuple[str, ...], days
     for name in (*(host for names in hosts.values() for host in names), *robots):
         if not _NAME.fullmatch(name.replace(":", "")):
             raise click.UsageError(f"{name!r} is no name: letters, digits, '.', '_' and '-' only")
+    for robot in robots:
+        try:
+            check_robot_name(robot)
+        except ValueError as error:
+            raise click.UsageError(f"--robot: {error}") from None
     taken = [name for name in machines if (out_dir / name).exists() or machines.count(name) > 1]
     if taken:
         raise TransportError(f"{out_dir / taken[0]} is there already, or named twice; nothing is overwritten")
     try:
         authority = Authority(out_dir, days)
         made = [authority.issue(name, hosts.get(name, ())) for name in machines]
+        lists = authority.admit(robots)
     except OSError as error:
         raise TransportError(f"{error.filename or out_dir}: cannot be written: {error.strerror}") from error
     told = "made" if authority.is_new else "signed by"
@@ -46,16 +57,19 @@ def certs(out_dir: Path, servers: tuple[str, ...], robots: tuple[str, ...], days
     endpoint = f'"tls/[{server}]:{_PORT}"' if ":" in server else f"tls/{server}:{_PORT}"
     for name, folder in zip(machines, made, strict=True):
         if name in hosts:
-            _tell(folder, "mode: router", f"listen: [tls/0.0.0.0:{_PORT}]")
+            _tell(folder, "mode: router", f"listen: [tls/0.0.0.0:{_PORT}]", files={**_FILES, "robots": ROBOTS})
         else:
-            _tell(folder, f"connect: [{endpoint}]")
+            _tell(folder, f"connect: [{endpoint}]", files=_FILES)
+    for path in lists:
+        if robots and path.parent.name not in hosts:
+            click.echo(f"\n# {path.parent.name}: copy {path} there again and restart it, so that it lets the robot in")
 
 
-def _tell(folder: Path, *lines: str) -> None:
+def _tell(folder: Path, *lines: str, files: dict[str, str]) -> None:
     """What a machine's YAML says."""
     click.echo(f"\n# {folder.name}: copy {folder}/ there, beside its YAML, which says:\ntransport:\n  type: zenoh")
     for line in lines:
         click.echo(f"  {line}")
     click.echo("  tls:")
-    for key, file in (("ca", CA), ("certificate", CERTIFICATE), ("key", KEY)):
+    for key, file in files.items():
         click.echo(f"    {key}: {folder.name}/{file}")

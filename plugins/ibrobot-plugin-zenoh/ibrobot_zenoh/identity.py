@@ -1,0 +1,91 @@
+"""Who a machine is: the name and role in its certificate."""
+
+from __future__ import annotations
+
+from enum import Enum
+from pathlib import Path
+
+import attrs
+from cryptography import x509
+from cryptography.x509.oid import NameOID
+
+from ibrobot_core.errors import TransportError
+from ibrobot_zenoh.options import Tls, ZenohOptions
+from ibrobot_zenoh.reasons import tls_context
+
+
+class Role(Enum):
+    """What a certificate allows its machine to be."""
+
+    SERVER = "server"
+    """Others may connect to it; it answers requests."""
+    ROBOT = "robot"
+    """It only connects: it asks servers, and publishes under its own name."""
+
+
+@attrs.frozen
+class Identity:
+    """The name and role in a certificate."""
+
+    name: str
+    role: Role
+
+    def check_may_publish(self, topic: str) -> None:
+        """Nothing: a server would drop in silence what a robot publishes under another name than its own.
+
+        Raises:
+            TransportError: for such a topic, e.g. `/robot2/joint_states` of robot1.
+        """
+        if self.role is Role.ROBOT and not topic.strip("/").startswith(f"{self.name}/"):
+            raise TransportError(
+                f"{topic}: {self.name} may publish below /{self.name} only; remove transport.namespace, or begin it "
+                f"with {self.name}"
+            )
+
+
+def subject(identity: Identity) -> x509.Name:
+    """A certificate's subject: the name is its common name, the role its organizational unit."""
+    return x509.Name(
+        [
+            x509.NameAttribute(NameOID.COMMON_NAME, identity.name),
+            x509.NameAttribute(NameOID.ORGANIZATIONAL_UNIT_NAME, identity.role.value),
+        ]
+    )
+
+
+def read_identity(tls: Tls) -> Identity:
+    """The name and role in a machine's certificate.
+
+    Raises:
+        TransportError: for a certificate without a role, and see `tls_context`.
+    """
+    tls_context(tls)
+    return identity_in(tls.certificate)
+
+
+def identity_in(certificate: Path) -> Identity:
+    """The name and role in a certificate's file, which must hold a certificate.
+
+    Raises:
+        TransportError: for a certificate without a role.
+    """
+    found = x509.load_pem_x509_certificate(certificate.read_bytes()).subject
+    names = found.get_attributes_for_oid(NameOID.COMMON_NAME)
+    roles = found.get_attributes_for_oid(NameOID.ORGANIZATIONAL_UNIT_NAME)
+    if len(names) != 1 or len(roles) != 1 or roles[0].value not in {role.value for role in Role}:
+        raise TransportError(
+            f"{certificate}: has no role (server or robot), so nobody can tell what its machine may do; replace the "
+            "certificates of all machines by new ones: ibrobot certs NEW_FOLDER --server HOST --robot NAME"
+        )
+    return Identity(str(names[0].value), Role(roles[0].value))
+
+
+def own_identity(options: ZenohOptions) -> Identity | None:
+    """What others know this machine by: its certificate, else its user name; None where it proves nothing.
+
+    Raises:
+        TransportError: see `read_identity`.
+    """
+    if options.tls is not None:
+        return read_identity(options.tls)
+    return None if options.user is None else Identity(options.user, Role.ROBOT)
