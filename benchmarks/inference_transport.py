@@ -241,7 +241,9 @@ def tls(folder: Path | None, machine: str) -> dict[str, Any]:
     from ibrobot_zenoh.options import Tls
 
     place = folder / machine
-    return {"tls": Tls(place / "ca.pem", place / "certificate.pem", place / "key.pem")}
+    robots = place / "robots.txt"
+    listed = robots if robots.exists() else None
+    return {"tls": Tls(place / "ca.pem", place / "certificate.pem", place / "key.pem", listed)}
 
 
 def serve(endpoint: str, certificates: Path | None) -> None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import pytest
 from ibrobot_zenoh import reasons
 
 from ibrobot_core.testing.leaks import no_leaks  # noqa: F401
 
-from .pair import client, free_endpoint, router
+from .pair import client, free_endpoint, made, router
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -23,3 +25,11 @@ def _zenoh_runs() -> None:
 def _patience(monkeypatch: pytest.MonkeyPatch) -> None:
     """On a busy machine, a trial of why there is no connection may wait for long."""
     monkeypatch.setattr(reasons, "_TIMEOUT_S", 10.0)
+
+
+@pytest.fixture(autouse=True)
+def _closed(no_leaks: None) -> Iterator[None]:  # noqa: F811
+    """A test that failed leaves no session open."""
+    yield
+    while made:
+        made.pop().close()

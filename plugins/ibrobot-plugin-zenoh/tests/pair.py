@@ -18,6 +18,8 @@ WAIT_S = 30.0
 """How long a test waits for what must come [s]."""
 
 _numbers = itertools.count()
+made: list[ZenohTransport] = []
+"""All that a test made: closed after it, however it ended, since open sessions would delay every later test."""
 
 
 def free_endpoint(protocol: str = "tcp") -> str:
@@ -39,7 +41,13 @@ def client(endpoint: str, **options: Any) -> ZenohTransport:
 
 def make(**options: Any) -> ZenohTransport:
     """A transport; without shared memory, whose files Zenoh keeps open after it was closed."""
-    return ZenohTransport(ZenohOptions(**{"shared_memory": False, **options}), host_context())
+    return keep(ZenohOptions(**{"shared_memory": False, **options}))
+
+
+def keep(options: ZenohOptions) -> ZenohTransport:
+    """A transport that is closed after the test."""
+    made.append(ZenohTransport(options, host_context()))
+    return made[-1]
 
 
 def settle(near: Transport, far: Transport, robot: str = "") -> None:
