@@ -511,7 +511,7 @@ def test_the_engine_knows_waiting_from_work_and_the_pace():
         Message(Kind.ANSWER, 1, {}, fingerprint=Net().fingerprint(), latency_ms=50.0, queued_ns=30_000_000),
         Message(Kind.FAILURE, 2, text="full", pace_ns=750_000_000),
     ]
-    transport.serve(service_name("net"), lambda payload: encode(replies[decode(payload).id - 1]))
+    transport.serve(service_name("net"), lambda payload, sender: encode(replies[decode(payload).id - 1]))
     remote = RemoteEngine(Net(), transport, "net", "so101")
     remote.infer({"x": np.zeros(1)}, 1, deadline())
     assert (remote.stats.model_ms, remote.stats.queue_ms, remote.stats.pace_ms) == (20.0, 30.0, 0.0)
