@@ -154,7 +154,7 @@ def fuzz_frames(count: int, seed: int) -> tuple[Counter[str], Robot, float]:
     for number in range(count):
         if number == min(count // 10, 100_000):
             before_mib = memory_mib()
-        answer = decode(handler(mutant(chance, frames)))
+        answer = decode(handler(mutant(chance, frames), None))
         ended["answered" if answer.kind is Kind.ANSWER else "malformed" if answer.id == 0 else "failed"] += 1
     grown = memory_mib() - before_mib
     robot.stopped.set()

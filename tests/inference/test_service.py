@@ -525,7 +525,7 @@ def test_all_requests_on_their_way_in_an_outage_are_one_failure():
     transport = LocalTransport()
     together = threading.Barrier(5)
 
-    def fail(payload: Any) -> bytes:
+    def fail(payload: Any, sender: str | None) -> bytes:
         together.wait(PATIENCE_S)
         raise RuntimeError("the power is out")
 

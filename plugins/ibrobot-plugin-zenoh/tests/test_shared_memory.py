@@ -19,7 +19,7 @@ def test_whole_messages_both_ways(size: int):
     payload = os.urandom(1000) * (size // 1000 or 1)
     endpoint = free_endpoint()
     server, robot = router(endpoint, shared_memory=True), client(endpoint, shared_memory=True)
-    server.serve("echo", lambda asked: asked)
+    server.serve("echo", lambda asked, _: asked)
     settle(robot, server)
     assert robot.request("echo", payload, WAIT_S) == payload
     robot.close()
