@@ -11,7 +11,7 @@ import pytest
 
 from ibrobot_core.clock import SteppedClock
 from ibrobot_core.errors import HardwareError, NotSupported
-from ibrobot_core.interfaces import Context, Episode, Hardware, JointReading, SimulatedHardware
+from ibrobot_core.interfaces import Context, Episode, Hardware, JointReading, SimulatedHardware, Torque
 from ibrobot_core.robot import Vector
 from ibrobot_core.testing.contexts import control_context
 from ibrobot_core.testing.suite import Suite
@@ -175,6 +175,56 @@ class HardwareSuite(Suite[Hardware]):
             hardware.read()
         with pytest.raises(HardwareError):
             hardware.write(position)
+
+    def test_relax_reports_torque_and_what_holds_it(self) -> None:
+        """`relax` is not supported, or says what became of torque; `holding` agrees, with a place and a command."""
+        with self.connected() as (hardware, ctx):
+            before = hardware.holding()
+            try:
+                outcome = hardware.relax()
+            except NotSupported:
+                pytest.skip("has no torque control")
+            assert isinstance(outcome, Torque), f"relax returned {outcome!r}, not a Torque"
+            after = hardware.holding()
+            assert after is None or outcome is not Torque.OFF, f"torque is off, and holding says {after}"
+            hardware.write(hardware.read().position)
+            self.elapse(hardware, ctx, 0.0)
+            for holding in (before, hardware.holding()):
+                if holding is not None:
+                    assert holding.where, "holding names no place"
+                    assert holding.command, "holding names no command that takes torque off"
+            assert (hardware.holding() is None) == (before is None), "after a write it holds as it did before relax"
+
+    def test_holding_is_known_while_disconnected(self) -> None:
+        """`holding` answers before `connect`, when nothing holds, and as before after `disconnect`."""
+        assert self.make(self.context()).holding() is None
+        with self.connected() as (hardware, _):
+            held = hardware.holding()
+        assert hardware.holding() == held
+
+    def test_undone_connect_leaves_no_torque_of_its_own(self) -> None:
+        """After `undo_connect` nothing holds, and the hardware can be connected again."""
+        with self.connected() as (hardware, _):
+            hardware.undo_connect()
+            assert hardware.holding() is None
+            hardware.disconnect()
+            hardware.connect()
+            assert np.isfinite(hardware.read().position).all()
+
+    def test_conditions_are_of_its_joints(self) -> None:
+        """Every condition of `health` is of a joint of this hardware, finite, with a message; none comes twice."""
+        with self.connected() as (hardware, ctx):
+            for _ in range(3):
+                self.elapse(hardware, ctx, 0.5)
+                hardware.read()
+                found = hardware.health()
+                for condition in found:
+                    assert condition.joint in hardware.joints, f"{condition.joint!r} is no joint of this hardware"
+                    assert condition.quantity
+                    assert np.isfinite(condition.value), f"{condition.quantity} of {condition.joint} is not finite"
+                    assert condition.joint in condition.message, f"{condition.message!r} does not name its joint"
+                keys = [(condition.joint, condition.quantity) for condition in found]
+                assert len(set(keys)) == len(keys), f"two conditions of one quantity: {keys}"
 
     def test_relax_ends_with_the_next_write(self) -> None:
         """`relax` is not supported, or the next `write` puts torque back on."""

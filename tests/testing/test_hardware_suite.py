@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ibrobot_core.errors import HardwareError
-from ibrobot_core.interfaces import Episode, JointReading, Signal
+from ibrobot_core.interfaces import Condition, Episode, Holding, JointReading, Severity, Signal
 from ibrobot_core.testing import HardwareSuite, SimulatedHardwareSuite, checks, failed_checks
 from ibrobot_core.testing.fakes import FakeHardware, FakeRealHardware
 
@@ -122,6 +122,59 @@ class StaysRelaxed(FakeHardware):
         self.relaxed = relaxed
 
 
+class RelaxReportsNothing(FakeHardware):
+    def relax(self):
+        super().relax()
+
+
+class HoldsOnAfterRelax(FakeHardware):
+    def holding(self):
+        return Holding("somewhere", "torque off") if self._open else None
+
+
+class NamesNoCommand(FakeHardware):
+    def holding(self):
+        return Holding("somewhere", "") if self._open and not self.relaxed else None
+
+
+class ForgetsWhatHolds(FakeHardware):
+    """Holds while it is connected only: but torque stays on when the port is released."""
+
+    def holding(self):
+        return Holding("somewhere", "torque off") if self._open and not self.relaxed else None
+
+
+class LeavesTorqueOn(FakeHardware):
+    on = False
+
+    def connect(self):
+        super().connect()
+        self.on = True
+
+    def holding(self):
+        return Holding("somewhere", "torque off") if self.on and not self.relaxed else None
+
+    def undo_connect(self):
+        pass
+
+
+class ConditionOfAnUnknownJoint(FakeHardware):
+    def health(self):
+        return (Condition("nose", "temperature", 70.0, "deg C", Severity.FAULT, "nose is hot: let it cool"),)
+
+
+class ConditionWithoutAValue(FakeHardware):
+    def health(self):
+        joint = self.joints[0]
+        return (Condition(joint, "voltage", np.nan, "V", Severity.WARNING, f"{joint} has no voltage: see its cable"),)
+
+
+class ConditionTwice(FakeHardware):
+    def health(self):
+        hot = Condition(self.joints[0], "temperature", 70.0, "deg C", Severity.FAULT, f"{self.joints[0]} is hot")
+        return (hot, hot)
+
+
 class ResetFaultsHomes(FakeHardware):
     def reset_faults(self):
         self._command = np.zeros_like(self._command)
@@ -193,6 +246,14 @@ WRONG = {
     DisconnectsOnce: "disconnect_is_safe_at_any_time",
     ReadsWhileDisconnected: "refuses_use_while_disconnected",
     StaysRelaxed: "relax_ends_with_the_next_write",
+    RelaxReportsNothing: "relax_reports_torque_and_what_holds_it",
+    HoldsOnAfterRelax: "relax_reports_torque_and_what_holds_it",
+    NamesNoCommand: "relax_reports_torque_and_what_holds_it",
+    ForgetsWhatHolds: "holding_is_known_while_disconnected",
+    LeavesTorqueOn: "undone_connect_leaves_no_torque_of_its_own",
+    ConditionOfAnUnknownJoint: "conditions_are_of_its_joints",
+    ConditionWithoutAValue: "conditions_are_of_its_joints",
+    ConditionTwice: "conditions_are_of_its_joints",
     ResetFaultsHomes: "reset_faults_moves_nothing",
     ShortSignal: "signals_fill_their_vectors",
     MovesWithoutAdvance: "time_passes_only_by_advance",
