@@ -15,7 +15,7 @@ from ibrobot_core.options import option
 Vector = NDArray[np.float64]
 
 LAG_S = 0.1
-"""How long after its setpoint a servo may be at a place [s]; measured: 0.04 s in simulation. See ADR 0016."""
+"""How long after its setpoint a servo may be at a place [s]; ADR 0016 has what was measured."""
 _LEAD_AT_REST = 0.2
 """How far a joint at rest may hang from its setpoint under load [rad]."""
 

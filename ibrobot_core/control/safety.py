@@ -111,7 +111,7 @@ class SafetyLayer:
             command = self._next(wanted, follow, lower, upper)
             differs = command != wanted
             if differs.any():
-                self._count(differs, wanted, known, before, (wanted < lower) | (wanted > upper))
+                self._count(differs, wanted, known, before, np.where(wanted > before, upper, lower))
             self._fresh &= ~follow
         return command.copy()
 
@@ -217,9 +217,8 @@ class SafetyLayer:
         return command
 
     def _count(
-        self, differs: NDArray[np.bool_], wanted: Vector, known: NDArray[np.bool_], before: Vector,
-        beyond: NDArray[np.bool_],
-    ) -> None:  # fmt: skip
+        self, differs: NDArray[np.bool_], wanted: Vector, known: NDArray[np.bool_], before: Vector, bound: Vector
+    ) -> None:
         """Count the joints that `differs` marks, each under the first of `KINDS` that applies.
 
         Args:
@@ -227,10 +226,13 @@ class SafetyLayer:
             wanted: shape (J,).
             known: which joints are measured, shape (J,).
             before: the last commands, shape (J,).
-            beyond: which joints were wanted beyond their bounds, shape (J,).
+            bound: the furthest command of this tick in the direction of `wanted`, shape (J,).
         """
         lower, upper = np.minimum(self._lower, before), np.maximum(self._upper, before)
         step = _limited(wanted, lower, upper) - before
+        room = np.abs(bound - before)
+        # A lead limits the joint from where braking for it begins.
+        leads = (np.abs(wanted - before) > room) & (_reach(room, self._change) < self._max_step)
         reasons = np.array(
             (
                 differs & self._estopped,
@@ -238,7 +240,7 @@ class SafetyLayer:
                 ~known,
                 self._fresh,
                 (wanted < lower) | (wanted > upper),
-                beyond,
+                leads,
                 np.abs(step) > self._max_step + self._half_slack,
                 differs,
             )

@@ -49,7 +49,10 @@ class Teleop(ABC):
         """Release the device. Safe to call twice."""
 
     def activate(self, measured: JointReading) -> None:
-        """Called when the mode begins and after every reset: start from the measured position."""
+        """Called when the mode begins and after every reset: start from the measured position.
+
+        Nothing moves until the operator acts again: a deadman that was pressed before counts as released.
+        """
 
     def help(self) -> str:
         """What an operator must know, in a line or a few: keys, buttons."""

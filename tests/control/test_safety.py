@@ -423,7 +423,7 @@ def test_the_kinds_of_intervention_are_told_apart() -> None:
     assert counted(np.array([np.nan])) == {"nonfinite": 1}
     assert counted(np.array([-np.inf])) == {"nonfinite": 1}
     assert counted(np.array([2.5])) == {"position": 1}
-    assert counted(np.array([1.5]), measured=ZERO) == {"lead": 1}
+    assert counted(np.array([1.5]), measured=np.array([-1.0])) == {"lead": 1}
     assert counted(np.array([0.5])) == {"velocity": 1}
     assert counted(np.array([0.03])) == {"acceleration": 1}
     assert counted(np.array([0.001]), measured=np.array([np.nan])) == {"unmeasured": 1}

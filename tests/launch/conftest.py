@@ -158,6 +158,7 @@ def ibrobot_policies():
 @hookimpl
 def ibrobot_teleop():
     yield TeleopDescriptor("stick", make(Stick), "a stick")
+    yield TeleopDescriptor("lever", make(FakeTeleop), "a lever with a deadman")
 
 @hookimpl
 def ibrobot_planners():
@@ -217,6 +218,7 @@ ROBOT = textwrap.dedent("""\
     default_control_mode: policy
     teleoperation:
       stick: {type: stick}
+      lever: {type: lever}
     contract:
       rate_hz: 25
       max_duration_s: 1

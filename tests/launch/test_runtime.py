@@ -11,8 +11,10 @@ import pytest
 
 from ibrobot_core.config.schema import ObservationSpec, TransportConfig
 from ibrobot_core.errors import ComponentFailed, NotSupported, PlanningError, TeleopError
+from ibrobot_core.interfaces import Condition, Severity
 from ibrobot_core.launch.runtime import ESTOP, RESET, Runtime
 from ibrobot_core.launch.session import Session
+from ibrobot_core.messages import DiagnosticStatus, KeyValue
 from ibrobot_core.options import NoOptions
 
 if TYPE_CHECKING:
@@ -304,3 +306,24 @@ def test_diagnostics_have_each_sensors_rate_and_age_and_what_the_hardware_counts
     assert float(found["sensor top"]["rate_hz"]) > 1
     assert 0 <= float(found["sensor top"]["age_ms"]) < 1000
     assert found["hardware simulation"] == {"retries": "3"}
+
+
+def test_diagnostics_have_the_conditions_of_joints_the_leads_and_the_following_errors(
+    runs: Runs, monkeypatch: pytest.MonkeyPatch
+):
+    runtime = runs.start(mode="teleop")
+    hot = Condition("pan", "temperature", 58.04, "deg C", Severity.WARNING, "pan is at 58 deg C: let it rest")
+    weak = Condition("grip", "voltage", 4.0, "V", Severity.FAULT, "grip has 4 V: check the supply")
+    monkeypatch.setattr(runs.parts.MADE["simulation"], "health", lambda: (hot, weak))
+    diagnostics = runtime.session.bus.subscribe("/diagnostics", 1)
+    seconds(runtime, 3.0)
+    received = diagnostics.get()
+    assert received is not None
+    status = {each.name: each for each in received.message.status}
+    assert (status["joint pan"].level, status["joint grip"].level) == (DiagnosticStatus.WARN, DiagnosticStatus.ERROR)
+    assert status["joint pan"].message == hot.message
+    assert status["joint pan"].values == (KeyValue("temperature", "58.04 deg C"),)
+    assert {"lead"} <= {pair.key for pair in status["safety"].values}
+    assert {"following_errors"} <= {pair.key for pair in status["loop"].values}
+    assert {"pan", "grip"} == {pair.key for pair in status["interventions"].values}
+    assert runtime.session.outcome.faults == [weak.message]
