@@ -243,7 +243,7 @@ def _tell(report: Report) -> None:
     )
     for what, of_each in (
         ("missing for a time", [each.gaps for each in done]), ("stamps that jumped", [each.resets for each in done]),
-        ("lost in recording", [each.lost for each in done]),
+        ("lost in recording", [each.lost for each in done]), ("missing since", [each.missing for each in done]),
     ):  # fmt: skip
         if counts := sum(map(Counter, of_each), Counter[str]()):
             click.echo(f"{what}: {', '.join(f'{name} {count}' for name, count in counts.most_common())}")

@@ -35,6 +35,8 @@ class TopicSummary:
     """Messages that can be read."""
     dropped: int = 0
     """Messages that the recorder says it lost."""
+    missing: int = 0
+    """Messages that the recorder wrote and that cannot be read any more."""
 
 
 @attrs.frozen
@@ -51,6 +53,9 @@ class EpisodeSummary:
     metadata: Mapping[str, str]
     """What the recorder was told: prompt, contract, fingerprint, calibration, versions; empty in foreign bags."""
     outcome: str = "unknown"
+    """`unknown` where the episode is unfinished or lacks messages, whatever was stated: its end may be missing."""
+    stated_outcome: str = "unknown"
+    """What the recorder stated at the end."""
 
 
 @attrs.frozen

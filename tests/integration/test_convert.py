@@ -194,13 +194,36 @@ def test_a_bad_episode_is_told_and_left_out(bags: Path, tmp_path: Path) -> None:
     record(episodes / "episode_000004", 4, 0.5, contract=attrs.evolve(CONTRACT, rate_hz=20.0))
     (episodes / "episode_000005").mkdir()
     (episodes / "episode_000005/metadata.yaml").write_text("rosbag2_bagfile_information: [")
+    record(episodes / "episode_000006", 6, 0.5)
+    (file,) = (episodes / "episode_000006").glob("*.mcap")
+    content = bytearray(file.read_bytes())
+    at = content.index(b"observation.state")  # in a record that a scan looks into
+    content[at : at + 4] = b"\xff\xff\xff\xff"
+    file.write_bytes(content.replace(b"sensor_msgs/msg/JointState", b"sensor_msgs/msg/Joint\xff\xff\xff\xff\xff"))
     result = run(episodes, "--out", tmp_path / "set")
     assert result.code == 1
     assert "left out mixed/episode_000002: no message of /wrist, which the contract has; there are: " in result.err
     assert "left out mixed/episode_000004: its contract differs from that of mixed/episode_000001:" in result.err
     assert "left out mixed/episode_000005: " in result.err
+    assert "left out mixed/episode_000006: " in result.err
+    assert "is damaged: " in result.err
+    assert "Traceback" not in result.err
     assert "2 episodes, " in result.out
     assert set(rows(tmp_path / "set")["episode_index"]) == {0, 1}
+
+
+def test_a_cut_episode_is_converted_as_unknown_and_never_as_a_success(tmp_path: Path) -> None:
+    record(tmp_path / "bags/episode_000001", 1, 0.9, "sort the blocks", chunk_size=4096)
+    (file,) = (tmp_path / "bags/episode_000001").glob("*.mcap")
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    result = run(tmp_path / "bags", "--out", tmp_path / "set", "--json")
+    assert result.code == 0, result.err
+    (report,) = result.report["reports"]
+    assert (report["outcome"], report["finished"]) == ("unknown", False)
+    assert report["missing"]["/joint_states"] > 20
+    result = run(tmp_path / "bags", "--out", tmp_path / "judged", "--success")
+    assert result.code == 1
+    assert "next.success cannot be told: the episode's outcome is unknown" in result.err
 
 
 def test_a_contract_that_differs_from_the_recorded_one_is_refused(bags: Path, tmp_path: Path) -> None:

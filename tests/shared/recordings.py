@@ -60,6 +60,7 @@ def record(
     outcome: str = "success",
     contract: Contract | None = CONTRACT,
     gap: Mapping[str, tuple[float, float]] | None = None,
+    chunk_size: int = 1 << 20,
     **metadata: str,
 ) -> None:
     """Record streams of their own rates, stamped ahead of their receipt by a few jittered milliseconds.
@@ -72,10 +73,11 @@ def record(
         outcome: how it ends.
         contract: what its metadata says; None for no contract there.
         gap: topic -> from when to when [s] it is silent.
+        chunk_size: of the file [bytes].
         metadata: more of it.
     """
     rng = np.random.default_rng(seed)
-    recorder = McapRecorder(McapOptions(), host_context(clock=SteppedClock(START_NS)))
+    recorder = McapRecorder(McapOptions(chunk_size=chunk_size), host_context(clock=SteppedClock(START_NS)))
     metadata |= {"prompt": prompt, "robot_type": "so101_follower"}
     if contract is not None:
         metadata["contract"] = json.dumps(contract.canonical())

@@ -7,6 +7,7 @@ import json
 import logging
 import os
 import shutil
+import traceback
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -132,10 +133,20 @@ def convert_episode(job: Job, progress: Callable[[int], None]) -> EpisodeReport:
     except (IbrobotError, OSError) as error:
         shutil.rmtree(making, ignore_errors=True)
         return attrs.evolve(report, error=str(error))
+    except Exception as error:  # noqa: BLE001 - a fault in a plugin must not cost the other episodes
+        shutil.rmtree(making, ignore_errors=True)
+        return attrs.evolve(report, error=unexpected(error))
     finally:
         if reader is not None:
             reader.close()
     return unit.report
+
+
+def unexpected(error: Exception) -> str:
+    """An error that no interface allows, in words, with the place where it was raised."""
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    where = f"{Path(place.filename).name}:{place.lineno}"
+    return f"{type(error).__name__}: {error} (at {where}): a fault in ibrobot or a plugin; please report it"
 
 
 def _described(report: EpisodeReport, summary: EpisodeSummary, request: Request) -> EpisodeReport:
@@ -143,6 +154,7 @@ def _described(report: EpisodeReport, summary: EpisodeSummary, request: Request)
         report, finished=summary.finished, outcome=summary.outcome,
         prompt=summary.metadata.get("prompt") or request.prompt, start_ns=summary.start_ns,
         lost={topic: each.dropped for topic, each in summary.topics.items() if each.dropped},
+        missing={topic: each.missing for topic, each in summary.topics.items() if each.missing},
     )  # fmt: skip
 
 
@@ -206,18 +218,31 @@ def _features(contract: Contract, values: Mapping[str, NDArray[Any]], success: b
     return features | ({SUCCESS: Feature("bool", (1,))} if success else {})
 
 
-def _contract(request: Request, summary: EpisodeSummary) -> Contract:
-    text = summary.metadata.get("contract")
-    if text is None:
-        if request.contract is None:
-            raise ContractError("the episode brings no contract; name the robot YAML that has it by --config")
-        return request.contract
+def recorded_contract(metadata: Mapping[str, str]) -> Contract | None:
+    """The contract that an episode was recorded by; None for one without.
+
+    Raises:
+        ContractError: when it cannot be read, or is not the one that its fingerprint is of.
+    """
+    if "contract" not in metadata:
+        return None
     try:
-        recorded = Contract.from_canonical(json.loads(text))
-    except ValueError as error:
+        contract = Contract.from_canonical(json.loads(metadata["contract"]))
+    except (ValueError, RecursionError) as error:
         raise ContractError(f"the recorded contract cannot be read: {error}") from None
+    if metadata.get("fingerprint", contract.fingerprint()) != contract.fingerprint():
+        raise ContractError("the recorded contract is damaged: it is not the one that the recorded fingerprint is of")
+    return contract
+
+
+def _contract(request: Request, summary: EpisodeSummary) -> Contract:
+    recorded = recorded_contract(summary.metadata)
     if request.contract is None:
+        if recorded is None:
+            raise ContractError("the episode brings no contract; name the robot YAML that has it by --config")
         return recorded
+    if recorded is None:
+        return request.contract
     if request.contract.fingerprint() != recorded.fingerprint() and not request.force_contract:
         difference = request.contract.difference(recorded, names=("--config", "recorded"))
         raise ContractError(f"recorded with another contract; --force-contract takes --config's:\n{difference}")

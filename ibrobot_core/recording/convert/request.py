@@ -67,6 +67,8 @@ class EpisodeReport:
     """Topic -> how often its stamps jumped."""
     lost: Mapping[str, int] = attrs.field(factory=dict)
     """Topic -> messages that the recorder says it lost."""
+    missing: Mapping[str, int] = attrs.field(factory=dict)
+    """Topic -> messages that were recorded and that cannot be read any more."""
     finished: bool = True
     """False where its recorder was killed, or the file was cut: it has what could be read."""
     outcome: str = "unknown"

@@ -27,7 +27,15 @@ from ibrobot_core.errors import DatasetError, IbrobotError
 from ibrobot_core.interfaces import DatasetSummary, EpisodeAddress
 from ibrobot_core.memory import set_malloc
 from ibrobot_core.plugins import installed
-from ibrobot_core.recording.convert.episode import Job, Unit, convert_episode, make_writer, read_unit, unit_key
+from ibrobot_core.recording.convert.episode import (
+    Job,
+    Unit,
+    convert_episode,
+    make_writer,
+    read_unit,
+    unexpected,
+    unit_key,
+)
 from ibrobot_core.recording.convert.provenance import conversion, provenance
 from ibrobot_core.recording.convert.request import EpisodeReport, Report, Request
 from ibrobot_core.units import seconds
@@ -168,8 +176,11 @@ class _Plan:
                 summary = reader.summary()
             finally:
                 reader.close()
-        except IbrobotError as error:
+        except (IbrobotError, OSError) as error:
             self._reports[source] = attrs.evolve(report, error=str(error))
+            return
+        except Exception as error:  # noqa: BLE001 - a fault in a plugin must not cost the other episodes
+            self._reports[source] = attrs.evolve(report, error=unexpected(error))
             return
         report = attrs.evolve(report, outcome=summary.outcome, start_ns=summary.start_ns)
         if (source, summary.start_ns) in known:

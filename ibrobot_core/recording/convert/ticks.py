@@ -19,6 +19,8 @@ from ibrobot_core.messages import Message
 from ibrobot_core.units import seconds
 
 ACTION = "action"
+_LONGEST_SILENCE_S = 60
+"""Without a message of any topic [s]; a damaged stamp would otherwise make rows for years."""
 _COMMAND = Align("hold", "receive")
 """The command in effect at a tick is the newest that was sent by then, however old."""
 
@@ -69,6 +71,12 @@ class _Source:
         recorded = next(self._messages, None)
         if recorded is None:
             return False
+        if (silent_s := seconds(recorded.received_ns - self._newest_ns)) > _LONGEST_SILENCE_S:
+            raise RecorderError(
+                f"no message of the contract comes for {silent_s:.0f} s, from "
+                f"{seconds(self._newest_ns - self.first_ns):.3f} s after the beginning on; at most "
+                f"{_LONGEST_SILENCE_S} s may pass: `ibrobot episodes trim` takes the parts before and after"
+            )
         self._read.append(recorded)
         self._newest_ns = recorded.received_ns
         return True

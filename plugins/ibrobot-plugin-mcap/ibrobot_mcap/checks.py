@@ -13,7 +13,7 @@ from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import ContractError, RecorderError
 from ibrobot_core.units import NS_PER_S
 from ibrobot_mcap.metadata import METADATA
-from ibrobot_mcap.reader import Rosbag2Reader, stated_counts
+from ibrobot_mcap.reader import Rosbag2Reader
 
 _FEW = 8
 """Messages that a topic must have before its period means something."""
@@ -35,7 +35,7 @@ def problems_of(path: Path, longest_gap: float) -> list[str]:
     last_header: dict[str, int] = {}
     back: dict[str, int] = defaultdict(int)
     try:
-        summary, repeated = reader.summary(), reader.repeated()
+        summary, repeated, short = reader.summary(), reader.repeated(), reader.short()
         if not summary.finished:
             problems.append("unfinished; `ibrobot episodes repair` makes it whole")
         for item in reader.messages():
@@ -50,11 +50,14 @@ def problems_of(path: Path, longest_gap: float) -> list[str]:
         reader.close()
     absent = [topic for topic in _required(summary.metadata) if not stamps[topic]]
     problems += [f"no message of {topic}, which its contract has" for topic in absent]
-    for topic, stated in stated_counts(path / METADATA).items():
-        found = len(stamps[topic]) + repeated.get(topic, 0)
+    for topic, stated in reader.stated.items():
+        known = summary.topics.get(topic)
+        found = (known.count if known is not None else 0) + repeated.get(topic, 0)
         if stated != found:
             problems.append(f"{topic}: {found} messages, {METADATA} says {stated}")
     for topic, known in summary.topics.items():
+        if known.missing and topic not in short:
+            problems.append(f"{topic}: {known.missing} messages that the recorder wrote are missing since a repair")
         if known.dropped:
             problems.append(f"{topic}: {known.dropped} messages were lost while recording")
         if back[topic]:

@@ -19,8 +19,13 @@ RECORD_KEY = "serialized_metadata"
 OUTCOME = "outcome"
 DROPPED = "dropped"
 """Keys that the recorder adds to `custom_data`: a word, and JSON topic -> number of messages."""
+MISSING = "missing"
+"""Key that a repair adds: JSON topic -> messages that the recorder wrote and that could not be read any more."""
 
 _FOR_EVER = {"sec": 9223372036, "nsec": 854775807}
+
+MARKED = "marked"
+"""Key that says that a person set the outcome afterwards."""
 
 
 @attrs.define
@@ -118,7 +123,7 @@ def information(
             }
             for name, counted in files.items()
         ],
-        "custom_data": {_Text(key): _Text(value) for key, value in custom.items()},
+        "custom_data": quoted(custom),
         "ros_distro": "jazzy",
     }
 
@@ -128,6 +133,11 @@ def _topic(topic: Topic) -> dict[str, Any]:
         "name": topic.name, "type": topic.type, "serialization_format": "cdr",
         "offered_qos_profiles": offered_qos(topic.latched), "type_description_hash": topic.type_hash(),
     }  # fmt: skip
+
+
+def quoted(custom: Mapping[str, str]) -> dict[str, str]:
+    """`custom_data` as texts, whatever they look like."""
+    return {_Text(key): _Text(value) for key, value in custom.items()}
 
 
 def dump(document: dict[str, Any] | Sequence[Any]) -> str:

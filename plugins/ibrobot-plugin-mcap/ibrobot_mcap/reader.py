@@ -3,27 +3,35 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Iterator, Mapping
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, override
+from typing import override
 
-import yaml
 from ibrobot_ros2 import Codec, CodecError
 
 from ibrobot_core.errors import RecorderError
 from ibrobot_core.interfaces import EpisodeReader, EpisodeSummary, Recorded, TopicSummary
 from ibrobot_core.messages import CompressedImage, Image
+from ibrobot_mcap.compressed import Expanded, MessageCompressed
+from ibrobot_mcap.damage import reading
+from ibrobot_mcap.facts import Facts, parse_facts, read_facts
 from ibrobot_mcap.jpeg import from_jpeg, is_jpeg
-from ibrobot_mcap.metadata import DROPPED, INFORMATION, METADATA, OUTCOME, RECORD, RECORD_KEY, Topic
+from ibrobot_mcap.metadata import DROPPED, METADATA, MISSING, OUTCOME, RECORD, RECORD_KEY, Topic
 from ibrobot_mcap.options import COMPRESSIONS
 from ibrobot_mcap.sources import McapSource, Raw, Source
+from ibrobot_mcap.sqlite_source import SqliteSource
+
+_SOURCES: Mapping[str, Callable[[Sequence[Path]], Source]] = {".mcap": McapSource, ".db3": SqliteSource}
+"""Suffix -> what reads such files."""
 
 
 def is_rosbag2(path: Path) -> bool:
     """Whether a bag lies at `path`: its folder, or one of its files."""
     if path.is_dir():
         return (path / METADATA).is_file() or any(_storage_files(path))
-    return path.suffix in (".mcap", ".db3")
+    return path.suffix in _SOURCES
 
 
 class Rosbag2Reader(EpisodeReader):
@@ -35,31 +43,61 @@ class Rosbag2Reader(EpisodeReader):
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        facts = _read_metadata(path / METADATA) if path.is_dir() else {}
-        self._finished = bool(facts) or not path.is_dir()
-        self._source = _open(path, facts)
-        custom = facts.get("custom_data") or self._source.custom or self._recorded_custom()
-        self._custom = {str(key): str(value) for key, value in custom.items()}
-        self._codec = Codec(self._source.definitions)
-        self._types = {topic: self._delivered(topic, type_) for topic, type_ in self._source.types.items()}
+        facts = read_facts(path / METADATA) if path.is_dir() else None
+        self._finished = facts is not None or not path.is_dir()
+        self._closing = ExitStack()
+        try:
+            with reading(path):
+                self._source = self._open(facts or Facts())
+            facts = facts or self._recorded() or Facts()
+            self._codec = Codec(self._source.definitions)
+            self._types = {topic: self._delivered(topic, type_) for topic, type_ in self._source.types.items()}
+        except BaseException:
+            self.close()
+            raise
+        self._is_part = not path.is_dir() and len(facts.files) > 1
+        self.stated: Mapping[str, int] = facts.counts if path.is_dir() else self._source.stated
+        """Topic -> number of messages that the bag says it has, with the copies in later files."""
+        self._stated_types = facts.types
+        self._custom = dict(facts.custom or self._source.custom)
+
+    @property
+    def finished(self) -> bool:
+        """Whether its writer ended it, and no file was cut since."""
+        return self._finished and self._source.finished
+
+    def short(self) -> dict[str, int]:
+        """Topic -> messages that the bag says it has and that cannot be found."""
+        found = Counter(self._source.counts) + Counter(self._source.repeated)
+        return {topic: stated - found[topic] for topic, stated in self.stated.items() if stated > found[topic]}
 
     @override
     def summary(self) -> EpisodeSummary:
         source = self._source
         custom = dict(self._custom)
-        dropped = _read_dropped(custom.pop(DROPPED, "{}"))
-        outcome = custom.pop(OUTCOME, "unknown")
+        dropped = _read_counts(custom.pop(DROPPED, "{}"))
+        short = self.short()
+        missing = Counter(_read_counts(custom.pop(MISSING, "{}"))) + Counter(short)
+        stated = custom.pop(OUTCOME, "unknown")
+        whole = self.finished and not short and not self._is_part
         topics = {
-            topic: TopicSummary(type_, source.counts[topic], dropped.get(topic, 0))
-            for topic, type_ in sorted(self._types.items())
+            topic: TopicSummary(type_, source.counts.get(topic, 0), dropped.get(topic, 0), missing[topic])
+            for topic, type_ in sorted({**dict.fromkeys(missing, "?"), **self._stated_types, **self._types}.items())
         }
         return EpisodeSummary(
-            self._path, self._finished and source.finished, source.start_ns, source.end_ns, topics, custom, outcome
-        )
+            self._path, self.finished, source.start_ns, source.end_ns, topics, custom,
+            stated if whole else "unknown", stated,
+        )  # fmt: skip
 
     @override
     def messages(self, topics: Collection[str] | None = None) -> Iterator[Recorded]:
-        source = self._source
+        source, short = self._source, self.short()
+        if short and source.finished:  # not at its end, so what is left would not be what was recorded
+            told = ", ".join(f"{count} of {self.stated[topic]} of {topic}" for topic, count in short.items())
+            raise RecorderError(
+                f"{self._path}: is damaged: messages are missing from within it: {told}; "
+                "`ibrobot episodes repair` keeps what can be read"
+            )
         for raw in source.messages(frozenset(source.types if topics is None else topics)):
             try:
                 message = self._codec.decode(raw.type, raw.data)
@@ -72,6 +110,11 @@ class Rosbag2Reader(EpisodeReader):
     def raw(self) -> Iterator[Raw]:
         """The messages as they are stored, in the order of receipt."""
         return self._source.messages(frozenset(self._source.types))
+
+    @property
+    def topics(self) -> Collection[str]:
+        """The topics that its files know, with or without messages."""
+        return self._source.types.keys()
 
     def stored(self, topic: str) -> Topic:
         """A topic as it is stored (JPEG pictures are `CompressedImage`), with what the bag has of its type."""
@@ -99,7 +142,7 @@ class Rosbag2Reader(EpisodeReader):
 
     @override
     def close(self) -> None:
-        self._source.close()
+        self._closing.close()
 
     def _delivered(self, topic: str, type_: str) -> str:
         """The type of the messages that `messages` gives of a topic: its first one tells JPEG from other pictures."""
@@ -108,81 +151,62 @@ class Rosbag2Reader(EpisodeReader):
         first = next(self._source.messages({topic}), None)
         if first is None:
             return type_
-        message = self._codec.decode(type_, first.data)
+        try:
+            message = self._codec.decode(type_, first.data)
+        except CodecError:
+            return type_  # reading it tells what is wrong
         return Image.ros_type if isinstance(message, CompressedImage) and is_jpeg(message) else type_
 
-    def _recorded_custom(self) -> Mapping[str, str]:
+    def _recorded(self) -> Facts | None:
         """What the newest metadata record says, for an episode without `metadata.yaml`."""
-        found: Mapping[str, str] = {}
-        for record in self._source.metadata if isinstance(self._source, McapSource) else ():
-            if record.name == RECORD and RECORD_KEY in record.metadata:
-                found = _parse(record.metadata[RECORD_KEY], self._path).get("custom_data") or {}
-        return found
+        source = self._source
+        texts = [
+            record.metadata[RECORD_KEY]
+            for record in (source.metadata if isinstance(source, McapSource) else ())
+            if record.name == RECORD and RECORD_KEY in record.metadata
+        ]
+        return parse_facts(texts[-1], self._path) if texts else None
+
+    def _open(self, facts: Facts) -> Source:
+        files = self._files(facts)
+        if facts.compressed == "file":
+            expanded = Expanded(files)
+            self._closing.callback(expanded.close)
+            files = expanded.paths
+        suffixes = {file.suffix for file in files}
+        if len(suffixes) > 1 or not suffixes <= _SOURCES.keys():
+            raise RecorderError(f"{self._path}: its files must all be .mcap, or all .db3; there are: {_names(files)}")
+        source: Source = _SOURCES[suffixes.pop()](files)
+        self._closing.callback(source.close)
+        return MessageCompressed(self._path, source) if facts.compressed == "message" else source
+
+    def _files(self, facts: Facts) -> list[Path]:
+        path = self._path
+        if not path.is_dir():
+            return [path]
+        listed = [path / name for name in facts.files]
+        for file in listed:
+            if not file.is_file():
+                raise RecorderError(f"{path}: {file.name} is missing, which {METADATA} lists")
+        files = [*listed, *sorted(file for file in _storage_files(path) if file not in listed)]
+        if not files:
+            raise RecorderError(f"{path}: has no .mcap or .db3 file")
+        return files
 
 
-def stated_counts(path: Path) -> Mapping[str, int]:
-    """Topic -> number of messages, as a `metadata.yaml` states them; nothing where there is none.
-
-    Raises:
-        RecorderError: when it cannot be read.
-    """
-    topics = _read_metadata(path).get("topics_with_message_count") or []
-    return {entry["topic_metadata"]["name"]: entry["message_count"] for entry in topics}
-
-
-def _open(path: Path, facts: Mapping[str, Any]) -> Source:
-    if not path.is_dir():
-        return McapSource([path]) if path.suffix == ".mcap" else _open_by_rosbags(path)
-    listed = [path / Path(name).name for name in facts.get("relative_file_paths", ())]
-    for file in listed:
-        if not file.is_file():
-            raise RecorderError(f"{path}: {file.name} is missing, which {METADATA} lists")
-    files = [*listed, *sorted(file for file in _storage_files(path) if file not in listed)]
-    if not files:
-        raise RecorderError(f"{path}: has no .mcap or .db3 file")
-    if all(file.suffix == ".mcap" for file in files) and not facts.get("compression_format"):
-        return McapSource(files)
-    if not facts:
-        raise RecorderError(f"{path}: has no {METADATA}, without which only MCAP files can be read; open one file")
-    return _open_by_rosbags(path)
-
-
-def _open_by_rosbags(path: Path) -> Source:
-    from ibrobot_mcap.rosbags_source import RosbagsSource  # takes as long to import as all other modules here
-
-    return RosbagsSource(path)
+def _names(files: Sequence[Path]) -> str:
+    return ", ".join(file.name for file in files)
 
 
 def _storage_files(path: Path) -> Iterator[Path]:
-    return (file for file in path.iterdir() if file.suffix in (".mcap", ".db3") and file.is_file())
+    return (file for file in path.iterdir() if file.suffix in _SOURCES and file.is_file())
 
 
-def _read_metadata(path: Path) -> dict[str, Any]:
+def _read_counts(text: str) -> Mapping[str, int]:
     try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        return {}
-    except (OSError, UnicodeDecodeError) as error:
-        raise RecorderError(f"{path}: cannot be read: {error}") from error
-    return _parse(text, path)
-
-
-def _parse(text: str, path: Path) -> dict[str, Any]:
-    try:
-        document = yaml.load(text, getattr(yaml, "CSafeLoader", yaml.SafeLoader))
-        facts: dict[str, Any] = dict(document.get(INFORMATION, document))
-    except (yaml.YAMLError, AttributeError, TypeError, ValueError) as error:
-        raise RecorderError(f"{path}: its metadata is not that of a rosbag2: {error}") from error
-    return facts
-
-
-def _read_dropped(text: str) -> Mapping[str, int]:
-    try:
-        dropped = json.loads(text)
+        counts = json.loads(text)
     except ValueError:
         return {}  # somebody else's key of the same name
-    return (
-        {topic: count for topic, count in dropped.items() if isinstance(count, int)}
-        if isinstance(dropped, dict)
-        else {}
-    )
+    if not isinstance(counts, dict):
+        return {}
+    return {topic: count for topic, count in counts.items() if isinstance(count, int)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Mapping
 from contextlib import ExitStack
@@ -12,12 +13,15 @@ import attrs
 from ibrobot_core.errors import RecorderError
 from ibrobot_core.interfaces import EpisodeStart, EpisodeSummary
 from ibrobot_mcap.bagfile import Item
+from ibrobot_mcap.metadata import MISSING
 from ibrobot_mcap.options import McapOptions
 from ibrobot_mcap.reader import Rosbag2Reader
 from ibrobot_mcap.storage import Storage
 
 REPAIRED = "repaired"
 """Key of `custom_data` that says that an episode was made whole afterwards."""
+STATED = "stated_outcome"
+"""Key of what was its outcome before."""
 
 
 @attrs.frozen
@@ -50,9 +54,11 @@ def rewrite(
         stack.callback(reader.close)
         summary = reader.summary()
         latched = reader.latched()
-        topics = {name: reader.stored(name) for name in summary.topics}
+        topics = {name: reader.stored(name) for name in reader.topics}
         start_ns = summary.start_ns if begin_ns is None else begin_ns
         metadata = {**summary.metadata, **(marks or {})}
+        if missing := {name: topic.missing for name, topic in summary.topics.items() if topic.missing}:
+            metadata[MISSING] = json.dumps(missing)
         options = McapOptions(min_free=0, compression=reader.compression())
         storage = Storage(EpisodeStart(target, start_ns, summary.metadata, metadata), options)
         try:
@@ -78,8 +84,9 @@ def rewrite(
 
 
 def repair(path: Path) -> Rewritten | None:
-    """Make an unfinished episode whole, in its place; None when it is whole already.
+    """Make an episode whole that is unfinished or lacks messages, in its place; None when it is whole already.
 
+    What is missing stays written in its metadata, with the outcome that its recorder stated; its outcome is unknown.
     The original is moved aside as `.NAME.unfinished` until the new one has been read back and has every message.
 
     Raises:
@@ -87,10 +94,10 @@ def repair(path: Path) -> Rewritten | None:
     """
     reader = Rosbag2Reader(path)
     try:
-        before = reader.summary()
+        before, short = reader.summary(), reader.short()
     finally:
         reader.close()
-    if before.finished:
+    if before.finished and not short:
         return None
     if not path.is_dir():
         raise RecorderError(f"{path}: repair takes the episode's folder, not a file of it")
@@ -101,8 +108,9 @@ def repair(path: Path) -> Rewritten | None:
     try:
         shutil.rmtree(staging, ignore_errors=True)
         staging.mkdir()
-        made = rewrite(path, staging / path.name, marks={REPAIRED: "true"})
-        counts = [{n: t.count for n, t in s.topics.items()} for s in (before, made.summary)]
+        marks = {REPAIRED: "true"} | ({STATED: before.stated_outcome} if before.stated_outcome != "unknown" else {})
+        made = rewrite(path, staging / path.name, marks=marks)
+        counts = [{n: t.count for n, t in s.topics.items() if t.count} for s in (before, made.summary)]
         if counts[0] != counts[1] or not made.summary.finished:
             raise RecorderError(f"{path}: the repaired episode has {counts[1]}, the original {counts[0]}")
         path.rename(aside)

@@ -15,10 +15,11 @@ import lz4.frame  # type: ignore[import-untyped]
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Channel, Header, Metadata, Schema
+from mcap.records import Channel, Header, McapRecord, Metadata, Schema, Statistics
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
 from ibrobot_core.errors import RecorderError
+from ibrobot_mcap.damage import reading
 
 REPEATED = "ibrobot.repeated"
 """Name of the metadata record ahead of a chunk with copies of latched messages from the file before."""
@@ -30,6 +31,9 @@ _LOOSE_SIZE = 4 << 20
 """Messages outside of chunks are taken in blocks of this size [bytes]."""
 _LARGEST = 4 << 30
 """No chunk is larger than this [bytes], by the format's own libraries."""
+_KNOWN = range(1, Opcode.DATA_END + 1)
+_PRIVATE = range(0x80, 0x100)
+"""Opcodes that a file can have."""
 
 
 @attrs.frozen
@@ -83,6 +87,8 @@ class McapFile:
         self.blocks: list[Block] = []
         self.metadata: list[Metadata] = []
         self.library = ""
+        self.stated: dict[int, int] = {}
+        """Channel -> number of messages, as the file's own statistics say; nothing where it has none."""
         self.finished = False
         self.size = 0
         """Bytes up to the end of the last whole record."""
@@ -91,8 +97,9 @@ class McapFile:
         except OSError as error:
             raise RecorderError(f"{path}: cannot be read: {error.strerror}") from error
         try:
-            self._scan(os.fstat(self._file.fileno()).st_size)
-            self._look_inside()
+            with reading(path):
+                self._scan(os.fstat(self._file.fileno()).st_size)
+                self._look_inside()
         except BaseException:
             self.close()
             raise
@@ -115,10 +122,10 @@ class McapFile:
             start = _CHUNK.size + name
             compression = bytes(content[_CHUNK.size : start]).decode()
             content = _expand(compression, content[start + 8 :], size)
-        except (struct.error, ValueError, RuntimeError, zstandard.ZstdError) as error:
-            raise RecorderError(f"{self.path}: chunk at byte {block.offset} is damaged: {error}") from error
+        except (struct.error, ValueError, RuntimeError, MemoryError, zstandard.ZstdError) as error:
+            raise self._damaged(block, str(error)) from error
         if crc and zlib.crc32(content) != crc:
-            raise RecorderError(f"{self.path}: chunk at byte {block.offset} is damaged: its checksum is wrong")
+            raise self._damaged(block, "its checksum is wrong")
         return content
 
     def compression(self, block: Block) -> str:
@@ -135,10 +142,19 @@ class McapFile:
         Raises:
             RecorderError: when it is damaged.
         """
-        for opcode, content in records(self.read(block)):
-            if opcode == Opcode.MESSAGE:
-                channel, _, received_ns, published_ns = _MESSAGE.unpack_from(content)
-                yield Entry(channel, received_ns, published_ns, content[_MESSAGE.size :])
+        counts: dict[int, int] = {}
+        with reading(self.path):
+            for opcode, content in records(self.read(block)):
+                if opcode == Opcode.MESSAGE:
+                    channel, _, received_ns, published_ns = _MESSAGE.unpack_from(content)
+                    if not block.start_ns <= received_ns <= block.end_ns:
+                        raise self._damaged(block, f"a message of {received_ns} ns is not within its span")
+                    counts[channel] = counts.get(channel, 0) + 1
+                    yield Entry(channel, received_ns, published_ns, content[_MESSAGE.size :])
+                elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                    self._note(opcode, content)
+        if counts != {channel: count for channel, count in block.counts.items() if count}:
+            raise self._damaged(block, "it has other messages than its index says")
 
     def _scan(self, end: int) -> None:
         """Walk over the records, looking into small ones only."""
@@ -152,7 +168,7 @@ class McapFile:
             file.seek(position)
             opcode, length = _RECORD.unpack(file.read(_RECORD.size))
             content, position = position + _RECORD.size, position + _RECORD.size + length
-            if opcode == 0 or position > end:
+            if position > end or not (opcode in _KNOWN or opcode in _PRIVATE):
                 return  # what comes was never written whole
             if opcode == Opcode.CHUNK:
                 start_ns, end_ns = struct.unpack("<QQ", file.read(16))
@@ -163,7 +179,7 @@ class McapFile:
             elif opcode == Opcode.MESSAGE_INDEX and self.blocks:
                 channel, size = struct.unpack("<HI", file.read(6))
                 self.blocks[-1].counts[channel] = size // 16
-            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.HEADER):
+            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.HEADER, Opcode.STATISTICS):
                 repeated = self._note(opcode, memoryview(file.read(length))) or repeated
             self.size = position
             if opcode == Opcode.FOOTER:
@@ -188,10 +204,12 @@ class McapFile:
         stream = ReadDataStream(BytesIO(content))
         if opcode == Opcode.SCHEMA:
             schema = Schema.read(stream)
-            self.schemas[schema.id] = schema
+            self._define(self.schemas, schema.id, schema)
         elif opcode == Opcode.CHANNEL:
             channel = Channel.read(stream)
-            self.channels[channel.id] = channel
+            self._define(self.channels, channel.id, channel)
+        elif opcode == Opcode.STATISTICS:
+            self.stated = dict(Statistics.read(stream).channel_message_counts)
         elif opcode == Opcode.HEADER:
             self.library = Header.read(stream).library
         else:
@@ -199,6 +217,18 @@ class McapFile:
             self.metadata.append(metadata)
             return bool(metadata.name == REPEATED)
         return False
+
+    def _define[T: McapRecord](self, known: dict[int, T], number: int, record: T) -> None:
+        """Keep a schema or a channel; files repeat them, and always alike."""
+        if known.setdefault(number, record) != record:
+            raise RecorderError(
+                f"{self.path}: is damaged: {type(record).__name__.lower()} {number} is {record!r:.200} and "
+                f"{known[number]!r:.200}"
+            )
+
+    def _damaged(self, block: Block, why: str) -> RecorderError:
+        what = "chunk" if block.chunk else "block of messages"
+        return RecorderError(f"{self.path}: {what} at byte {block.offset} is damaged: {why}")
 
     def _look_inside(self) -> None:
         """Read the chunks whose channels or counts are not known from outside; unfinished files have some."""
@@ -218,8 +248,11 @@ class McapFile:
                 if not last_of_unfinished:
                     raise
                 self.blocks.remove(block)  # it was being written when its writer ended
-                return
+                break
             block.counts = counts
+        for block in self.blocks:
+            if unknown := sorted(block.counts.keys() - self.channels.keys()):
+                raise self._damaged(block, f"it has messages of channel {unknown[0]}, which the file does not describe")
 
 
 def _expand(compression: str, data: memoryview, size: int) -> memoryview:
@@ -228,7 +261,11 @@ def _expand(compression: str, data: memoryview, size: int) -> memoryview:
     if size > _LARGEST:
         raise ValueError(f"{size} bytes are said to be in it, at most {_LARGEST} can be")
     if compression == "zstd":
-        return memoryview(zstandard.ZstdDecompressor().decompress(data, max_output_size=size))
-    if compression == "lz4":
-        return memoryview(lz4.frame.decompress(data))
-    raise ValueError(f"compression {compression!r} is not known; zstd and lz4 are")
+        content = memoryview(zstandard.ZstdDecompressor().decompress(data, max_output_size=size))
+    elif compression == "lz4":
+        content = memoryview(lz4.frame.decompress(data))
+    else:
+        raise ValueError(f"compression {compression!r} is not known; zstd and lz4 are")
+    if len(content) != size:
+        raise ValueError(f"{size} bytes are said to be in it, {len(content)} are")
+    return content

@@ -36,6 +36,8 @@ class Source(ABC):
     """Topic -> type."""
     counts: Mapping[str, int]
     """Topic -> number of messages."""
+    stated: Mapping[str, int] = {}
+    """Topic -> number of messages by the files' own statistics; nothing where they have none."""
     definitions: Mapping[str, str]
     """Type -> its definition, where the bag has it."""
     compression: str = ""
@@ -107,6 +109,10 @@ class McapSource(Source):
                 if block.repeated:
                     copies.update({file.channels[key].topic: count for key, count in block.counts.items()})
         self.repeated = copies
+        stated: Counter[str] = Counter()
+        for file in self._files:
+            stated.update({file.channels[key].topic: n for key, n in file.stated.items() if key in file.channels})
+        self.stated = stated
 
     @override
     def messages(self, topics: Collection[str]) -> Iterator[Raw]:

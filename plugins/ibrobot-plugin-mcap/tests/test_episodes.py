@@ -118,10 +118,50 @@ def test_repair_makes_an_episode_whole_with_all_that_was_there(tmp_path, cut):
     after, again = contents(path)
     assert after.finished
     assert again == messages
-    assert after.metadata == {**before.metadata, rewrite.REPAIRED: "true"}
+    stated = {rewrite.STATED: "success"} if before.stated_outcome == "success" else {}
+    assert after.metadata == {**before.metadata, rewrite.REPAIRED: "true", **stated}
+    assert after.outcome == "unknown"
     assert [p.name for p in path.parent.iterdir()] == [path.name], "nothing else is left"
     assert "is whole" in run("repair", path)
     assert "good" in run("verify", path)
+
+
+def test_a_cut_episode_is_no_success_and_keeps_what_is_missing_until_a_person_decides(tmp_path):
+    path = made(tmp_path, count=3000)
+    (file,) = path.glob("*.mcap")
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    before, messages = contents(path)
+    missing = 3000 - len(messages)
+    assert missing > 0
+    assert (before.outcome, before.finished, before.topics[JOINTS].missing) == ("unknown", False, missing)
+    assert f"{JOINTS}: {len(messages)} messages, metadata.yaml says 3000" in run("verify", path, code=1)
+    with pytest.raises(RecorderError, match="is unfinished, or lacks messages; `ibrobot episodes repair` first"):
+        run("mark", path, "success")
+    assert f"{missing} are missing; its outcome was success, now it is unknown" in run("repair", path)
+    assert "is whole" in run("repair", path)
+    after, again = contents(path)
+    assert again == messages
+    assert (after.outcome, after.finished, after.topics[JOINTS].missing) == ("unknown", True, missing)
+    told = f"{JOINTS}: {missing} messages that the recorder wrote are missing"
+    assert told in run("verify", path, code=1)
+    run("trim", path, "--to", "1", "-o", tmp_path / "cut")
+    assert told in run("info", tmp_path / "cut")
+    run("mark", path, "success")
+    marked, again = contents(path)
+    assert again == messages
+    assert (marked.outcome, marked.metadata["marked"]) == ("success", "true")
+    assert told in run("verify", path, code=1)
+
+
+def test_messages_that_are_missing_from_within_keep_an_episode_from_being_read(tmp_path):
+    path = made(tmp_path)
+    text = (path / "metadata.yaml").read_text()
+    (path / "metadata.yaml").write_text(text.replace("message_count: 100", "message_count: 103"))
+    assert "100 messages, metadata.yaml says 103" in run("verify", path, code=1)
+    with pytest.raises(RecorderError, match=r"missing from within it: 3 of 103 of /joint_states; `ibrobot episodes re"):
+        contents(path)
+    assert "repaired, 100 messages, 0.99 s, 3 are missing" in run("repair", path)
+    assert len(contents(path)[1]) == 100
 
 
 def test_a_repair_that_fails_leaves_the_original(tmp_path, monkeypatch):

@@ -8,6 +8,7 @@ from ibrobot_mcap.commands.delete import delete
 from ibrobot_mcap.commands.export import export
 from ibrobot_mcap.commands.info import info
 from ibrobot_mcap.commands.list_episodes import list_episodes
+from ibrobot_mcap.commands.mark import mark
 from ibrobot_mcap.commands.plot import plot
 from ibrobot_mcap.commands.repair import repair
 from ibrobot_mcap.commands.trim import trim
@@ -16,12 +17,12 @@ from ibrobot_mcap.commands.verify import verify
 
 @click.group()
 def episodes() -> None:
-    """List, check, mend, cut and export recorded episodes.
+    """List, check, mend, mark, cut and export recorded episodes.
 
     An episode is a folder such as episodes/pick_cube/episodes/episode_000001; where several are meant, a dataset or the
     folder of all of them does too.
     """
 
 
-for command in (list_episodes, info, verify, repair, plot, trim, export, delete):
+for command in (list_episodes, info, verify, repair, mark, plot, trim, export, delete):
     episodes.add_command(command)

@@ -41,6 +41,9 @@ def info(episode: Path, as_json: bool) -> None:
         rate = f"{(topic.count - 1) / span_s:.1f}" if span_s and topic.count > 1 else ""
         table.add_row(name, topic.type, str(topic.count), rate, str(topic.dropped or ""))
     console.print(table)
+    for name, topic in summary.topics.items():
+        if topic.missing:
+            console.print(f"{name}: {topic.missing} messages that the recorder wrote are missing", soft_wrap=True)
     for key, value in summary.metadata.items():
         shown = value if len(value) <= _LONG else f"({len(value)} characters; --json shows them)"
         console.print(f"{key}: {shown}", soft_wrap=True, highlight=False)

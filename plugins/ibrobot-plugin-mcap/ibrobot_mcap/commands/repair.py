@@ -7,15 +7,17 @@ from pathlib import Path
 import click
 
 from ibrobot_core.errors import RecorderError
+from ibrobot_core.interfaces import EpisodeSummary
 
 
 @click.command()
 @click.argument("path", type=click.Path(path_type=Path))
 def repair(path: Path) -> None:
-    """Make unfinished episodes in PATH whole: the file's index and metadata.yaml, from all that was written.
+    """Make episodes in PATH whole that are unfinished or lack messages: index and metadata.yaml, of all that is there.
 
-    Only what the recorder had not written when it was killed is lost. An original is removed when the new episode has
-    been read back and has every message of it.
+    What is missing stays written in the episode, and `verify` reports it. The outcome becomes unknown, since the end
+    may be missing: look at the episode, and set it by `mark`. An original is removed when the new episode has been
+    read back and has every message of it.
     """
     from ibrobot_mcap import rewrite
     from ibrobot_mcap.commands.found import duration_s, episodes_in
@@ -32,6 +34,16 @@ def repair(path: Path) -> None:
             click.echo(f"{episode}: is whole")
         else:
             count = sum(topic.count for topic in made.summary.topics.values())
-            click.echo(f"{episode}: repaired, {count} messages, {duration_s(made.summary):.2f} s")
+            click.echo(f"{episode}: repaired, {count} messages, {duration_s(made.summary):.2f} s{_told(made.summary)}")
     if failed:
         raise SystemExit(1)
+
+
+def _told(summary: EpisodeSummary) -> str:
+    """What is missing, and what its outcome was."""
+    from ibrobot_mcap.rewrite import STATED
+
+    missing = sum(topic.missing for topic in summary.topics.values())
+    lost = f", {missing} are missing" if missing else ""
+    stated = summary.metadata.get(STATED)
+    return lost + (f"; its outcome was {stated}, now it is unknown: `ibrobot episodes mark` sets it" if stated else "")

@@ -1,0 +1,30 @@
+"""`ibrobot episodes mark`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from ibrobot_core.errors import RecorderError
+
+
+@click.command()
+@click.argument("episodes", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("outcome", type=click.Choice(("success", "failure", "unknown")))
+def mark(episodes: tuple[Path, ...], outcome: str) -> None:
+    """Set the OUTCOME of EPISODES, e.g. after a repair: what you say counts, and that you said it is written down."""
+    from ibrobot_mcap.facts import set_custom
+    from ibrobot_mcap.metadata import MARKED, OUTCOME
+    from ibrobot_mcap.reader import Rosbag2Reader
+
+    for episode in episodes:
+        reader = Rosbag2Reader(episode)
+        try:
+            whole = episode.is_dir() and reader.finished and not reader.short()
+        finally:
+            reader.close()
+        if not whole:
+            raise RecorderError(f"{episode}: is unfinished, or lacks messages; `ibrobot episodes repair` first")
+        set_custom(episode, {OUTCOME: outcome, MARKED: "true"})
+        click.echo(f"{episode}: {outcome}")

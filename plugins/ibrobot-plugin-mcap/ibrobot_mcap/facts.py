@@ -1,0 +1,115 @@
+"""What a bag says of itself: `metadata.yaml`, or the same in a metadata record of an MCAP file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import attrs
+import yaml
+
+from ibrobot_core.errors import RecorderError
+from ibrobot_mcap.metadata import INFORMATION, METADATA, quoted, write_metadata
+
+_PER_TOPIC = "topics_with_message_count"
+_PLAIN = (str, int, float)
+
+
+@attrs.frozen
+class Facts:
+    """What a bag says of itself."""
+
+    files: tuple[str, ...] = ()
+    counts: Mapping[str, int] = attrs.field(factory=dict)
+    """Topic -> messages, with the copies that later files have."""
+    types: Mapping[str, str] = attrs.field(factory=dict)
+    """Topic -> type."""
+    custom: Mapping[str, str] = attrs.field(factory=dict)
+    """`custom_data`."""
+    compressed: str = ""
+    """`message` or `file`; empty where neither is. Chunks tell themselves how they are compressed."""
+
+
+def read_facts(path: Path) -> Facts | None:
+    """What a `metadata.yaml` says; None where there is none.
+
+    Raises:
+        RecorderError: when it cannot be read.
+    """
+    try:
+        return parse_facts(path.read_text(encoding="utf-8"), path)
+    except FileNotFoundError:
+        return None
+    except (OSError, UnicodeDecodeError) as error:
+        raise RecorderError(f"{path}: cannot be read: {error}") from error
+
+
+def parse_facts(text: str, path: Path) -> Facts:
+    """The facts in a YAML text.
+
+    Args:
+        text: of a whole document, or of what is below its first key.
+        path: where it is from, for errors.
+
+    Raises:
+        RecorderError: when it is not that of a rosbag2.
+    """
+    try:
+        document = yaml.load(text, getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+        found: Mapping[str, Any] = document.get(INFORMATION, document)
+        counts: dict[str, int] = {}
+        types: dict[str, str] = {}
+        for each in found.get(_PER_TOPIC) or ():
+            topic = _text(each["topic_metadata"]["name"])
+            counts[topic] = counts.get(topic, 0) + _count(each["message_count"])
+            types[topic] = _text(each["topic_metadata"]["type"])
+        return Facts(
+            tuple(Path(_text(name)).name for name in found.get("relative_file_paths") or ()),
+            counts,
+            types,
+            {_text(key): _text(value) for key, value in dict(found.get("custom_data") or {}).items()},
+            _compressed(found),
+        )
+    except (yaml.YAMLError, AttributeError, LookupError, TypeError, ValueError, RecursionError) as error:
+        raise RecorderError(f"{path}: its metadata is not that of a rosbag2: {error}") from error
+
+
+def set_custom(directory: Path, values: Mapping[str, str]) -> None:
+    """Set keys of `custom_data` in the `metadata.yaml` of a bag; all else stays.
+
+    Raises:
+        RecorderError: when it cannot be read or written.
+    """
+    path = directory / METADATA
+    facts = read_facts(path)
+    if facts is None:
+        raise RecorderError(f"{directory}: has no {METADATA}")
+    try:
+        document = yaml.safe_load(path.read_text(encoding="utf-8"))
+        found = document.get(INFORMATION, document)
+        write_metadata(directory, {**found, "custom_data": quoted({**facts.custom, **values})})
+    except OSError as error:
+        raise RecorderError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def _compressed(found: Mapping[str, Any]) -> str:
+    mode = _text(found.get("compression_mode") or "").lower()
+    format_ = _text(found.get("compression_format") or "")
+    if mode not in ("message", "file"):
+        return ""
+    if format_ != "zstd":
+        raise ValueError(f"compression_format {format_!r} is not known, zstd is")
+    return mode
+
+
+def _text(value: object) -> str:
+    if not isinstance(value, _PLAIN):
+        raise TypeError(f"{value!r:.80} must be text")
+    return str(value)
+
+
+def _count(value: object) -> int:
+    if type(value) is not int or value < 0:
+        raise ValueError(f"message_count {value!r:.80} must be a number of messages")
+    return value
