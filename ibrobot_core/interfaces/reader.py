@@ -107,5 +107,13 @@ class EpisodeReader(ABC):
         """
 
     @abstractmethod
+    def digest(self) -> str:
+        """A hash of all messages as they are stored, with topics and stamps: copies have equal ones.
+
+        Raises:
+            RecorderError: when they cannot be read.
+        """
+
+    @abstractmethod
     def close(self) -> None:
         """Release the files. Safe to call twice."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
+from uuid import NAMESPACE_OID, uuid4, uuid5
 
 import ibrobot_core
 from ibrobot_core.config import RobotConfig
@@ -25,7 +26,7 @@ def episode_folder(dataset: Path, number: int) -> Path:
 
 def episode_start(
     config: RobotConfig, recording: Recording, topics: Mapping[str, str], *, mode: str, seed: int, stamp_ns: int,
-    prompt: str = "", plugins: Mapping[str, str] | None = None,
+    lockstep: bool, prompt: str = "", plugins: Mapping[str, str] | None = None,
 ) -> EpisodeStart:  # fmt: skip
     """The start of the next episode of the dataset.
 
@@ -38,6 +39,7 @@ def episode_start(
         mode: the control mode.
         seed: of the scene.
         stamp_ns: when it begins [ns].
+        lockstep: whether equal runs must give equal bytes.
         prompt: what the operator calls the task.
         plugins: packages of the plugins, and their versions.
 
@@ -58,6 +60,7 @@ def episode_start(
         "ibrobot_version": ibrobot_core.__version__, "plugin_versions": json.dumps(dict(plugins or {})),
         "seed": str(seed),
     }  # fmt: skip
+    metadata["uuid"] = str(uuid5(NAMESPACE_OID, json.dumps(metadata)) if lockstep else uuid4())
     if recording.topics == "contract":
         kept = contract.topics
     else:

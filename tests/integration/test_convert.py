@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -275,6 +276,33 @@ def test_appending_takes_what_is_new_and_fits(bags: Path, tmp_path: Path) -> Non
     assert all(digest(out)[name] == known for name, known in before.items() if not name.startswith("meta"))
     otherwise = run(bags, "--out", out, "--append", "--success")
     assert "was made otherwise: success False, now True" in otherwise.err
+
+
+def test_appending_tells_episodes_by_their_content_whatever_they_are_called(tmp_path: Path) -> None:
+    out = tmp_path / "set"
+    for run_, seed in (("monday", 1), ("tuesday", 2)):  # of equal names, and as in lockstep of equal starts
+        record(tmp_path / run_ / "blocks/episodes/episode_000001", seed, 0.5)
+    assert run(tmp_path / "monday", "--out", out).code == 0
+    added = run(tmp_path / "tuesday", "--out", out, "--append", "--json")
+    assert (added.report["episodes"], added.report["passed_over"]) == (1, 0), added.err
+    shutil.copytree(tmp_path / "monday", tmp_path / "copy/of_monday")
+    twice = run(tmp_path / "copy", tmp_path / "tuesday", "--out", out, "--append")
+    assert twice.err.count("in the dataset already") == 2
+    copied = run(tmp_path / "copy", tmp_path / "monday", "--out", tmp_path / "once", "--json")
+    assert [each["passed_over"] for each in copied.report["reports"]] == ["", "is a copy of blocks/episode_000001"]
+
+
+def test_an_episode_that_changed_since_it_was_converted_is_an_error(tmp_path: Path) -> None:
+    uuid = "2b0f0c57-7f0e-4d4c-9d7b-1f6a3c2f9a10"
+    episode = tmp_path / "blocks/episodes/episode_000001"
+    record(episode, 1, 0.5, uuid=uuid)
+    assert run(tmp_path / "blocks", "--out", tmp_path / "set").code == 0
+    assert "already" in run(tmp_path / "blocks", "--out", tmp_path / "set", "--append").err
+    shutil.rmtree(episode)
+    record(episode, 1, 0.8, uuid=uuid)
+    changed = run(tmp_path / "blocks", "--out", tmp_path / "set", "--append")
+    assert changed.code == 1
+    assert "the dataset has another state of this episode, as blocks/episode_000001" in changed.err
 
 
 def test_joints_in_lerobots_units(bags: Path, tmp_path: Path) -> None:

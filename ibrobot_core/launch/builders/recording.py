@@ -110,7 +110,7 @@ class Recording(Worker):
         with self._order:
             start = episode_start(
                 session.config, self._config, topics, mode=session.mode, seed=seed, stamp_ns=session.bus.snapshot_ns(),
-                prompt=prompt, plugins=session.registry.versions(),
+                lockstep=session.request.lockstep, prompt=prompt, plugins=session.registry.versions(),
             )  # fmt: skip
             latched = tuple(i for i in session.bus.latched().values() if i.received_ns <= start.stamp_ns)
             self._orders.append(_Begin(start, latched, self._lost_now()))

@@ -23,6 +23,7 @@ from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import ContractError, DatasetError, IbrobotError, RecorderError
 from ibrobot_core.interfaces import Context, DatasetWriter, EpisodeAddress, EpisodeReader, EpisodeSummary, Feature
 from ibrobot_core.plugins import installed
+from ibrobot_core.recording.convert.identity import identity
 from ibrobot_core.recording.convert.request import EpisodeReport, Request
 from ibrobot_core.recording.convert.ticks import Ticks
 from ibrobot_core.robot import Robot
@@ -31,7 +32,7 @@ SUCCESS = "next.success"
 DATASET = "dataset"
 """The dataset within a unit."""
 _RECORD = "episode.json"
-_VERSION = 2
+_VERSION = 3
 """Of what a unit is made of; older ones are made anew."""
 
 
@@ -125,7 +126,7 @@ def convert_episode(job: Job, progress: Callable[[int], None]) -> EpisodeReport:
         key = unit_key(job)
         reader = installed().open_episode(job.episode)
         summary = reader.summary()
-        report = _described(report, summary, job.request)
+        report = attrs.evolve(_described(report, summary, job.request), identity=identity(reader, summary))
         unit = _write(job, key, reader, summary, report, making, progress)
         shutil.rmtree(job.unit, ignore_errors=True)
         _sync(making)

@@ -74,7 +74,9 @@ class EpisodeReport:
     outcome: str = "unknown"
     prompt: str = ""
     start_ns: int = 0
-    """Of the episode's first message [ns]; with `source` it tells episodes apart."""
+    """Of the episode's first message [ns]."""
+    identity: str = ""
+    """What tells the episode from others; see `identity`."""
     error: str = ""
     """Why it was left out; empty where it was not."""
     passed_over: str = ""

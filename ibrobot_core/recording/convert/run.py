@@ -36,6 +36,7 @@ from ibrobot_core.recording.convert.episode import (
     unexpected,
     unit_key,
 )
+from ibrobot_core.recording.convert.identity import KnownEpisodes
 from ibrobot_core.recording.convert.provenance import conversion, provenance
 from ibrobot_core.recording.convert.request import EpisodeReport, Report, Request
 from ibrobot_core.units import seconds
@@ -93,7 +94,8 @@ def convert(request: Request, episodes: Sequence[Path], watch: Watch = lambda do
         reports = plan.run(watch)
         units = [unit for unit in plan.units() if not reports[unit.report.source].error]
         reports |= _refuse_misfits(units, old)
-        units = [unit for unit in units if not reports.get(unit.report.source, unit.report).error]
+        reports |= _pass_over_copies([unit for unit in units if not reports[unit.report.source].error])
+        units = [unit for unit in units if reports[unit.report.source] == unit.report]
         if units:
             metadata = provenance(request, old, units)
             make_writer(request).merge(request.out, [unit.dataset for unit in units], metadata)
@@ -161,19 +163,20 @@ class _Plan:
         """Source -> frames, by its length."""
         self.resumed = 0
         self.sources: list[str] = []
-        known = {(each["source"], each["start_ns"]) for each in old.metadata["episodes"]} if old is not None else set()
+        known = KnownEpisodes(old.metadata["episodes"] if old is not None else ())
         for path in episodes:
             source = _source(path, self.sources)
             self.sources.append(source)
             mark = hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:12]
             self._add(Job(request, path, source, staging / f"{path.name}-{mark}"), known)
 
-    def _add(self, job: Job, known: set[tuple[str, int]]) -> None:
+    def _add(self, job: Job, known: KnownEpisodes) -> None:
         source, report = job.source, EpisodeReport(job.source)
         try:
             reader = installed().open_episode(job.episode)
             try:
                 summary = reader.summary()
+                there = known.find(source, reader, summary)
             finally:
                 reader.close()
         except (IbrobotError, OSError) as error:
@@ -183,8 +186,8 @@ class _Plan:
             self._reports[source] = attrs.evolve(report, error=unexpected(error))
             return
         report = attrs.evolve(report, outcome=summary.outcome, start_ns=summary.start_ns)
-        if (source, summary.start_ns) in known:
-            self._reports[source] = attrs.evolve(report, passed_over="in the dataset already")
+        if there:
+            self._reports[source] = attrs.evolve(report, passed_over=there)
         elif summary.outcome not in self._request.outcomes:
             self._reports[source] = attrs.evolve(report, passed_over=f"its outcome is {summary.outcome}")
         else:
@@ -318,6 +321,18 @@ def _refuse_misfits(units: Sequence[Unit], old: DatasetSummary | None) -> dict[s
         if wrong:
             refused[unit.report.source] = attrs.evolve(unit.report, error=wrong)
     return refused
+
+
+def _pass_over_copies(units: Sequence[Unit]) -> dict[str, EpisodeReport]:
+    """The reports of units that are another's copy."""
+    first: dict[str, str] = {}
+    copies = {}
+    for unit in units:
+        report = unit.report
+        original = first.setdefault(report.identity, report.source)
+        if original != report.source:
+            copies[report.source] = attrs.evolve(report, frames=0, passed_over=f"is a copy of {original}")
+    return copies
 
 
 def _source(path: Path, taken: Sequence[str]) -> str:

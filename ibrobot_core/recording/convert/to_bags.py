@@ -28,6 +28,8 @@ RECORDER = "mcap"
 """What writes episodes."""
 _STAGING = ".staging"
 """Where an episode is written within the folder, until it is whole."""
+_DIGEST = "source_digest"
+"""Key of the metadata: what tells the dataset's episode from others."""
 _TOLD_EVERY = 30
 """Messages of a topic from one sign of life to the next."""
 
@@ -103,7 +105,7 @@ class _Job:
             prompt = summary.metadata.get("prompt") or self._request.prompt
             report = attrs.evolve(report, outcome=summary.outcome, prompt=prompt, start_ns=summary.start_ns)
             if self._target.exists():
-                return attrs.evolve(report, passed_over=self._known(summary))
+                return attrs.evolve(report, passed_over=self._known(summary, reader.digest()))
             contract = self._check(summary)
             frames = self._write(reader, summary, contract, prompt, progress)
         except (IbrobotError, OSError) as error:
@@ -114,15 +116,15 @@ class _Job:
             shutil.rmtree(self._making, ignore_errors=True)
         return attrs.evolve(report, frames=frames)
 
-    def _known(self, summary: EpisodeSummary) -> str:
+    def _known(self, summary: EpisodeSummary, digest: str) -> str:
         """Why it need not be converted: what lies there is it."""
         reader = installed().open_episode(self._target)
         try:
             there = reader.summary()
         finally:
             reader.close()
-        found = there.metadata.get("source", "a recording"), there.start_ns
-        if found != (self._source(summary), summary.start_ns):
+        found = there.metadata.get("source", "a recording"), there.metadata.get(_DIGEST)
+        if found != (self._source(summary), digest):
             raise RecorderError(f"{self._target}: is another episode ({found[0]}); convert into another folder")
         return "there already"
 
@@ -143,7 +145,7 @@ class _Job:
     ) -> int:  # fmt: skip
         metadata = {
             "ibrobot_version": ibrobot_core.__version__, **summary.metadata, "prompt": prompt,
-            "source": self._source(summary),
+            "source": self._source(summary), _DIGEST: reader.digest(),
         }  # fmt: skip
         self._making.parent.mkdir(parents=True, exist_ok=True)
         shutil.rmtree(self._making, ignore_errors=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -106,6 +107,14 @@ class Rosbag2Reader(EpisodeReader):
             except (CodecError, RecorderError) as error:
                 raise RecorderError(f"{self._path}: {raw.topic} at {raw.received_ns} ns: {error}") from error
             yield Recorded(raw.topic, message, raw.received_ns, raw.published_ns)
+
+    @override
+    def digest(self) -> str:
+        found = hashlib.sha256()
+        for raw in self.raw():
+            found.update(f"{raw.topic} {raw.type} {raw.received_ns} {raw.published_ns} {len(raw.data)}\n".encode())
+            found.update(raw.data)
+        return found.hexdigest()
 
     def raw(self) -> Iterator[Raw]:
         """The messages as they are stored, in the order of receipt."""

@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
+from uuid import NAMESPACE_OID, uuid5
 
 import attrs
 
@@ -57,6 +58,8 @@ def rewrite(
         topics = {name: reader.stored(name) for name in reader.topics}
         start_ns = summary.start_ns if begin_ns is None else begin_ns
         metadata = {**summary.metadata, **(marks or {})}
+        if begin_ns is not None or end_ns is not None:  # another episode than the whole one
+            metadata["uuid"] = str(uuid5(NAMESPACE_OID, f"{metadata.get('uuid', source.name)} {begin_ns} {end_ns}"))
         if missing := {name: topic.missing for name, topic in summary.topics.items() if topic.missing}:
             metadata[MISSING] = json.dumps(missing)
         options = McapOptions(min_free=0, compression=reader.compression())
