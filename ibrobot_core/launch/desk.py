@@ -14,6 +14,7 @@ from ibrobot_core.launch.builders.recording import Recording
 from ibrobot_core.launch.episodes import Episodes
 from ibrobot_core.launch.session import Session
 from ibrobot_core.recording.dataset import Dataset
+from ibrobot_core.recording.episode import is_kept
 from ibrobot_core.units import seconds
 
 START = "/record_episode/start"
@@ -38,7 +39,8 @@ class EpisodeDesk:
         by_mode: whether the mode begins and ends them itself, so that here they can only be watched.
 
     Raises:
-        RecorderError: when the dataset has episodes of another contract.
+        RecorderError: when the dataset has episodes of another contract or cannot be written, or an operator is to
+            record and `recording.topics` leaves out a topic of the contract.
     """
 
     def __init__(self, session: Session, episodes: Episodes, recording: Recording, *, by_mode: bool) -> None:
@@ -51,7 +53,15 @@ class EpisodeDesk:
         assert config is not None
         self.folder: Path = config.root / config.dataset
         self._dataset = Dataset(self.folder)
-        self._dataset.check(Contract.from_config(session.config))
+        contract = Contract.from_config(session.config)
+        self._dataset.check_writable()
+        self._dataset.check(contract)
+        left_out = [topic for topic in contract.topics if not is_kept(topic, config, contract)]
+        if session.request.by_operator and left_out:
+            raise RecorderError(
+                f"recording.topics leaves out {', '.join(left_out)}, which the contract needs; no episode could be "
+                "converted: add them, or write `topics: contract`"
+            )
 
     @property
     def saved(self) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 import yaml
@@ -65,6 +66,21 @@ class Dataset:
                 f"{self._file}: its episodes have another contract; record into another dataset "
                 f"(recording.dataset), or change the contract back:\n{difference}"
             )
+
+    def check_writable(self) -> None:
+        """See that files can be made where the dataset is or shall be; nothing is left there.
+
+        Raises:
+            RecorderError: when they cannot.
+        """
+        folder = next(path for path in (self._folder, *self._folder.absolute().parents) if path.exists())
+        try:
+            TemporaryFile(dir=folder).close()
+        except OSError as error:
+            raise RecorderError(
+                f"recording.root: {self._folder} cannot be written: {folder}: {error.strerror}; "
+                "--root records elsewhere"
+            ) from None
 
     def _read(self) -> dict[str, Any]:
         try:

@@ -37,6 +37,21 @@ def folders(runs: Runs) -> list[str]:
     return sorted(path.name for path in (runs.folder / "kept" / "pick" / "episodes").glob("*"))
 
 
+def test_a_list_of_topics_must_have_the_contracts(runs: Runs):
+    with pytest.raises(
+        RecorderError, match=r"recording.topics leaves out .*/arm/commands.*which the contract needs.*add th"
+    ):
+        runs.make(RECORDING, "recording.topics=[/joint_states]", mode="teleop", by_operator=True)
+    runs.make(RECORDING, "recording.topics=[/joint_states]", mode="teleop")  # a log, which nobody waits for
+
+
+@pytest.mark.parametrize("root", ["/proc/none", "file/below"])
+def test_a_root_that_cannot_be_written_is_found_before_anything_starts(runs: Runs, root: str):
+    (runs.folder / "file").write_text("")
+    with pytest.raises(RecorderError, match=r"recording.root: .* cannot be written: .*; --root records elsewhere"):
+        runs.make(RECORDING, f"recording.root={root}", mode="teleop", by_operator=True)
+
+
 def test_services_begin_end_and_discard_episodes(run: Runtime, runs: Runs):
     bus = run.session.bus
     bus.call(START, "pick the cube")

@@ -131,6 +131,23 @@ def test_a_recorder_that_does_not_begin_costs_its_episode_and_the_robot_goes_on(
     assert runtime.plan.episodes.saved == saved + 1
 
 
+@pytest.mark.parametrize("call", ["begin", "write", "end"])
+def test_whatever_a_recorder_raises_is_a_fault_of_the_episode(runs: Runs, monkeypatch: pytest.MonkeyPatch, call: str):
+    runtime, _ = note(runs, monkeypatch)
+    saved = runtime.plan.episodes.saved
+
+    def broken(*_: object) -> None:
+        raise ValueError("not so")
+
+    monkeypatch.setattr(runs.parts.MADE["recording"], call, broken)
+    runtime.plan.episodes.begin()
+    ticks(runtime, 3)
+    runtime.plan.episodes.end("success")
+    runtime.stop()  # also where the end of the run comes first
+    assert runtime.session.outcome.faults == ["recording ended: the recorder 'lines' failed: ValueError: not so"]
+    assert runtime.plan.episodes.saved == saved
+
+
 @pytest.mark.parametrize(("topics", "kept"), [("all", True), ("[/late]", True), ("contract", False)])
 def test_a_topic_that_appears_during_the_episode_is_recorded(
     runs: Runs, monkeypatch: pytest.MonkeyPatch, topics: str, kept: bool

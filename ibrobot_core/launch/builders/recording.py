@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import override
 
 import attrs
@@ -197,12 +198,9 @@ class Recording(Worker):
         if isinstance(order, _Begin):
             self.failure = None
             self._lost = order.lost
-            try:
-                recorder.begin(order.start)
-            except RecorderError as error:
-                self._fail(error)
+            self._open = self._did(partial(recorder.begin, order.start))
+            if not self._open:
                 return
-            self._open = True
             for item in order.latched:
                 self._write(recorder, item, order.stamp_ns)
         else:
@@ -219,21 +217,27 @@ class Recording(Worker):
         self._open = False
         # Counted now: what waited when the episode ended may have been lost since.
         lost = {topic: n - self._lost.get(topic, 0) for topic, n in self._lost_now().items() if self._keeps(topic)}
-        try:
-            recorder.end(attrs.evolve(end, dropped={topic: n for topic, n in lost.items() if n}))
-        except RecorderError as error:
-            self._fail(error)
-            return False
-        return True
+        dropped = {topic: n for topic, n in lost.items() if n}
+        return self._did(partial(recorder.end, attrs.evolve(end, dropped=dropped)))
 
     def _write(self, recorder: Recorder, item: Received, received_ns: int) -> None:
         if not self._open or not self._keeps(item.topic):
             return
+        if not self._did(partial(recorder.write, item.topic, item.message, received_ns)):
+            self._finish(recorder, EpisodeEnd(received_ns, "unknown"))
+
+    def _did(self, act: Callable[[], object]) -> bool:
+        """Let the recorder do something; a failure of any kind is a fault of the episode, and no other's."""
         try:
-            recorder.write(item.topic, item.message, received_ns)
+            act()
         except RecorderError as error:
             self._fail(error)
-            self._finish(recorder, EpisodeEnd(received_ns, "unknown"))
+        except Exception as error:  # a plugin's bug must neither end the run nor go untold
+            self._session.log.debug("the recorder failed", exc_info=error)
+            self._fail(RecorderError(f"the recorder {self._config.type!r} failed: {cause(error)}"))
+        else:
+            return True
+        return False
 
     def _fail(self, error: RecorderError) -> None:
         session = self._session
@@ -273,6 +277,6 @@ class Recording(Worker):
                 self.work(0.0)
         finally:
             if self._recorder is not None:
-                self._recorder.close()
+                self._did(self._recorder.close)
             if self._incoming is not None:
                 self._incoming.close()
