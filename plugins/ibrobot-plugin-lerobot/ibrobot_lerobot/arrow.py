@@ -52,6 +52,22 @@ def table_of(rows: Sequence[Mapping[str, Any]], schema: pa.Schema | None = None)
     )
 
 
+def to_numpy(column: pa.ChunkedArray) -> Any:
+    """The values of a column of numbers or of lists of one length: shape (N, D)."""
+    blocks = [_block(chunk) for chunk in column.chunks]
+    return np.concatenate(blocks) if blocks else np.empty((0, 1))
+
+
+def _block(array: pa.Array) -> Any:
+    length = len(array)
+    values = array.flatten() if types.is_fixed_size_list(array.type) or types.is_list(array.type) else array
+    if types.is_boolean(values.type):
+        numbers = np.array(values.to_pylist(), bool)
+    else:
+        numbers = np.frombuffer(values.buffers()[1], _NUMBERS[values.type])[values.offset : values.offset + len(values)]
+    return numbers.reshape(length, -1)
+
+
 def _type_of(value: Any) -> pa.DataType:
     if isinstance(value, list):
         return pa.list_(_type_of(value[0]))

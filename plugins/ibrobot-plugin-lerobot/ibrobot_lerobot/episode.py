@@ -17,7 +17,7 @@ from ibrobot_lerobot import layout
 from ibrobot_lerobot.arrow import table_of, to_array
 from ibrobot_lerobot.layout import Column
 from ibrobot_lerobot.pictures import PngEncoder, tiff
-from ibrobot_lerobot.stats import DepthStats, PixelStats, Stats, vector_stats
+from ibrobot_lerobot.stats import PictureStats, Stats, picture_stats, vector_stats
 from ibrobot_lerobot.video import Encoder, VideoTrack, describe_video
 
 _ROWS_BYTES = 16 << 20
@@ -56,7 +56,7 @@ class EpisodeWriter:
         self._rows_bytes = 0
         self._vectors: dict[str, list[NDArray[Any]]] = {"task_index": []}
         """Blocks of rows that have been written, for their statistics."""
-        self._pictures: dict[str, tuple[Any, PixelStats | DepthStats]] = {}
+        self._pictures: dict[str, tuple[Any, PictureStats]] = {}
         self._tracks: dict[str, VideoTrack] = {}
         path = root / layout.chunk_file(layout.DATA, 0, "parquet")
         path.parent.mkdir(parents=True)
@@ -77,9 +77,9 @@ class EpisodeWriter:
             path.parent.mkdir(parents=True)
             self._tracks[column.key] = VideoTrack(path, self._form.fps, shape, self._form.encoder)
         elif column.storage == "image":
-            self._pictures[column.key] = (PngEncoder(*shape), PixelStats(shape[2]))
+            self._pictures[column.key] = (PngEncoder(*shape), picture_stats(column.feature))
         elif column.storage == "depth":
-            self._pictures[column.key] = (tiff, DepthStats())
+            self._pictures[column.key] = (tiff, picture_stats(column.feature))
         else:
             self._vectors[column.key] = []
 
@@ -136,8 +136,8 @@ class EpisodeWriter:
             if self._rows:
                 self._flush()
             self._table.close()
-            stats = {key: track.close() for key, track in self._tracks.items()}
-            self._write_meta(stats)
+            videos = {key: track.close() for key, track in self._tracks.items()}
+            self._write_meta({**videos, **{key: pixels for key, (_, pixels) in self._pictures.items()}})
         except OSError as error:
             raise DatasetError(f"{self._root}: cannot be written: {error}") from error
         finally:
@@ -149,11 +149,11 @@ class EpisodeWriter:
             track.abort()
         self._table.close()
 
-    def _write_meta(self, stats: dict[str, Stats]) -> None:
+    def _write_meta(self, pictures: Mapping[str, PictureStats]) -> None:
         form, n = self._form, self.frames
         vectors = {key: np.concatenate(blocks) for key, blocks in self._vectors.items()}
-        stats |= {key: vector_stats(values) for key, values in vectors.items() if key in form.stored}
-        stats |= {key: pixels.stats() for key, (_, pixels) in self._pictures.items()}
+        stats = {key: vector_stats(values) for key, values in vectors.items() if key in form.stored}
+        stats |= {key: pixels.stats() for key, pixels in pictures.items()}
         stats = {key: stats[key] for key in form.stored} | counter_stats(n, form.fps, 0, 0, vectors["task_index"])
         info = {**form.info, "features": {key: dict(entry) for key, entry in form.info["features"].items()}}
         for key in self._tracks:
@@ -174,6 +174,8 @@ class EpisodeWriter:
         pq.write_table(table_of([row]), path)
         pq.write_table(layout.task_table(list(self._tasks)), self._root / layout.TASKS)
         layout.write_json(self._root / layout.STATS, plain(stats))
+        if pictures:
+            layout.write_json(self._root / layout.PIXELS, {key: each.state() for key, each in pictures.items()})
         layout.write_json(self._root / layout.OWN, self._metadata)
         layout.write_json(self._root / layout.INFO, info)
 

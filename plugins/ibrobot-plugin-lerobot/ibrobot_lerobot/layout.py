@@ -21,6 +21,8 @@ STATS = "meta/stats.json"
 TASKS = "meta/tasks.parquet"
 OWN = "meta/ibrobot.json"
 """What `create` and `merge` were told; LeRobot passes it over."""
+PIXELS = "meta/ibrobot_pixels.json"
+"""What the statistics of the pictures were made of, so that they can be continued: key -> `PictureStats.state`."""
 DATA = "data"
 EPISODES = "meta/episodes"
 VIDEOS = "videos"
@@ -166,6 +168,8 @@ class OnDisk:
     tasks: list[str]
     """In the order of their numbers."""
     metadata: dict[str, Any]
+    pixels: dict[str, Any]
+    """Key of a camera -> what its statistics were made of; nothing for a dataset of others."""
 
     @property
     def videos(self) -> list[str]:
@@ -206,12 +210,13 @@ def open_dataset(root: Path) -> OnDisk | None:
         stats = json.loads((root / STATS).read_bytes()) if (root / STATS).exists() else {}
         tasks = _read_tasks(root / TASKS) if (root / TASKS).exists() else []
         metadata = json.loads((root / OWN).read_bytes()) if (root / OWN).exists() else {}
+        pixels = json.loads((root / PIXELS).read_bytes()) if (root / PIXELS).exists() else {}
         version = info["codebase_version"]
     except (OSError, ValueError, KeyError, TypeError, pa.ArrowException) as error:
         raise DatasetError(f"{root}: no dataset of LeRobot's: {error!r}") from error
     if version != _VERSION:
         raise DatasetError(f"{root}: is of version {version!r}, must be {_VERSION!r}; LeRobot converts older ones")
-    return OnDisk(root, info, stats, tasks, metadata)
+    return OnDisk(root, info, stats, tasks, metadata, pixels)
 
 
 def _read_tasks(path: Path) -> list[str]:

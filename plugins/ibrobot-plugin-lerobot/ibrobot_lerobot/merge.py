@@ -14,10 +14,10 @@ import pyarrow.parquet as pq
 
 from ibrobot_core.errors import DatasetError
 from ibrobot_lerobot import layout
-from ibrobot_lerobot.arrow import table_of, to_array
+from ibrobot_lerobot.arrow import table_of, to_array, to_numpy
 from ibrobot_lerobot.episode import counter_stats, plain
 from ibrobot_lerobot.layout import OnDisk
-from ibrobot_lerobot.stats import Stats, aggregate
+from ibrobot_lerobot.stats import PictureStats, Stats, picture_stats, vector_stats
 from ibrobot_lerobot.video import VideoFile, join_videos
 
 _MERGING = ".merging"
@@ -97,7 +97,7 @@ class _Merge:
         self._target = target
         self._old = old
         self._tasks = {task: i for i, task in enumerate(old.tasks)} if old else {}
-        self._stats = _arrays(old.stats) if old else {}
+        self._pictures: dict[str, PictureStats] = {}
         self._episode = old.info["total_episodes"] if old else 0
         self._frame = old.info["total_frames"] if old else 0
         self._table: pq.ParquetWriter | None = None
@@ -110,12 +110,15 @@ class _Merge:
         self._info: dict[str, Any] = old.info if old else {}
 
     def run(self, parts: Iterable[Path], metadata: Mapping[str, Any]) -> None:
+        if self._old is not None:
+            self._count_pictures(self._old)
         try:
             for path in parts:
                 part = layout.open_dataset(path)
                 if part is None:
                     raise DatasetError(f"{path}: there is no dataset")
                 self._check(part)
+                self._count_pictures(part)
                 self._append(part)
                 if len(self._rows) >= _EPISODES_AT_ONCE:
                     self._flush_rows()
@@ -160,11 +163,31 @@ class _Merge:
                     moved[f"videos/{key}/{name}"] = row[f"videos/{key}/{name}"] + begin_s
             moved |= {f"stats/{key}/{name}": v.tolist() for key, each in stats.items() for name, v in each.items()}
             self._rows.append(moved | _indices("meta/episodes", self._rows_number))
-            self._stats = {
-                key: aggregate([self._stats[key], each]) if key in self._stats else each for key, each in stats.items()
-            }
             self._episode += 1
             self._frame += n
+
+    def _count_pictures(self, part: OnDisk) -> None:
+        for key, feature in part.features.items():
+            if len(feature.shape) != 3:
+                continue
+            if key not in part.pixels:
+                raise DatasetError(
+                    f"{part.root}: does not keep what the statistics of {key} were made of ({layout.PIXELS}), so they "
+                    "cannot be continued; convert its episodes anew"
+                )
+            self._pictures.setdefault(key, picture_stats(feature)).join(part.pixels[key])
+
+    def _stats(self) -> dict[str, Stats]:
+        """Of all rows, old and new: one column at a time in memory."""
+        old = self._old.files(layout.DATA, "parquet") if self._old else []
+        files = [*old, *sorted((self._target / layout.DATA).glob("chunk-*/file-*.parquet"))]
+        found = {}
+        for key in self._info["features"]:
+            if key in self._pictures:
+                found[key] = self._pictures[key].stats()
+            else:
+                found[key] = vector_stats(np.concatenate([_column(path, key) for path in files]))
+        return found
 
     def _append_table(self, path: Path, tasks: np.ndarray[Any, Any]) -> int:
         """Append a table of a part, renumbered; returns the number of the file that it became a part of."""
@@ -230,7 +253,10 @@ class _Merge:
             "splits": {"train": f"0:{self._episode}"},
         }  # fmt: skip
         pq.write_table(layout.task_table(list(self._tasks)), self._target / layout.TASKS)
-        layout.write_json(self._target / layout.STATS, plain(self._stats))
+        layout.write_json(self._target / layout.STATS, plain(self._stats()))
+        if self._pictures:
+            pixels = {key: each.state() for key, each in self._pictures.items()}
+            layout.write_json(self._target / layout.PIXELS, pixels)
         layout.write_json(self._target / layout.OWN, metadata)
         layout.write_json(self._target / layout.INFO, info)
 
@@ -255,6 +281,13 @@ def _indices(what: str, number: int) -> dict[str, int]:
     return {f"{what}/chunk_index": chunk, f"{what}/file_index": file}
 
 
+def _column(path: Path, name: str) -> np.ndarray[Any, Any]:
+    """A column of vectors: shape (N, D)."""
+    with pq.ParquetFile(path) as file:
+        values: np.ndarray[Any, Any] = to_numpy(file.read([name]).column(0))
+    return values
+
+
 def _numbers(table: pa.Table, name: str) -> np.ndarray[Any, np.dtype[np.int64]]:
     return np.array(table.column(name).to_pylist(), np.int64)  # to_numpy imports pandas
 
@@ -272,10 +305,6 @@ def _row_stats(row: Mapping[str, Any]) -> dict[str, Stats]:
             key, _, name = column.removeprefix("stats/").rpartition("/")
             found.setdefault(key, {})[name] = np.array(value)
     return found
-
-
-def _arrays(stats: Mapping[str, Any]) -> dict[str, Stats]:
-    return {key: {name: np.array(value) for name, value in each.items()} for key, each in stats.items()}
 
 
 def _difference(found: Any, wanted: Any) -> str:

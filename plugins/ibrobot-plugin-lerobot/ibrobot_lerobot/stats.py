@@ -1,12 +1,19 @@
-"""Statistics of features, by LeRobot's names and shapes: exact within an episode, whole pictures never in memory."""
+"""Statistics of features, by LeRobot's names and shapes: of all rows of a dataset, whole pictures never in memory.
+
+LeRobot 0.6.1 takes the mean of the episodes' quantiles for those of the dataset. Where episodes differ, much of a
+column then lies outside of [q01, q99]. Here quantiles are those of all rows.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from ibrobot_core.errors import DatasetError
+from ibrobot_core.interfaces import Feature
 
 Stats = dict[str, NDArray[Any]]
 """`min`, `max`, `mean`, `std`, `count` (shape (1,)), `q01` to `q99`."""
@@ -27,9 +34,9 @@ def vector_stats(values: NDArray[Any]) -> Stats:
 
 
 class PixelStats:
-    """Statistics of the pixels of uint8 pictures, per channel and over 255: each of shape (C, 1, 1).
+    """Statistics of the pixels of uint8 pictures, per channel and over 255: each of shape (C, 1, 1). All are exact.
 
-    Large pictures are thinned out as LeRobot does it, to about 150 pixels along the longer side.
+    Every picture counts, large ones thinned out as LeRobot does it, to about 150 pixels along the longer side.
     """
 
     def __init__(self, channels: int) -> None:
@@ -49,7 +56,6 @@ class PixelStats:
         values = np.arange(256) / 255.0
         share = self._histogram / self._histogram.sum(1, keepdims=True)
         mean = share @ values
-        below = np.cumsum(self._histogram, 1)
         seen = self._histogram > 0
         stats = {
             "min": values[seen.argmax(1)],
@@ -57,31 +63,87 @@ class PixelStats:
             "mean": mean,
             "std": np.sqrt(np.maximum(share @ values**2 - mean**2, 0.0)),
         }
-        for name, quantile in QUANTILES.items():
-            wanted = quantile * below[:, -1:]
-            stats[name] = values[(below >= wanted).argmax(1)]
+        stats |= {name: values[_below(self._histogram, share)] for name, share in QUANTILES.items()}
         shaped: Stats = {name: value.reshape(-1, 1, 1) for name, value in stats.items()}
         return shaped | {"count": np.array([self._pictures])}
 
+    def state(self) -> dict[str, Any]:
+        """What was counted, as JSON values; `join` takes it."""
+        return {"pictures": self._pictures, "histogram": self._histogram.tolist()}
+
+    def join(self, state: Mapping[str, Any]) -> None:
+        """Count what another one counted."""
+        self._histogram += np.array(state["histogram"], np.int64)
+        self._pictures += state["pictures"]
+
 
 class DepthStats:
-    """Statistics of depth pictures in their own unit: each of shape (1, 1, 1). Quantiles are means over pictures."""
+    """Statistics of depth pictures in their own unit: each of shape (1, 1, 1).
 
-    def __init__(self) -> None:
-        self._joined: Stats = {}
+    Quantiles of uint16 are exact. Those of float32 are right to 0.4 %: values are counted by their upper 16 bits, which
+    order as they do, and a quantile is the middle of such a bin, 2**-7 of its value wide.
+    """
+
+    def __init__(self, dtype: str) -> None:
+        self._dtype = np.dtype(dtype)
+        self._histogram = np.zeros((1, 1 << 16), np.int64)
+        self._moments = np.zeros(2)
+        """Sum, and sum of squares."""
+        self._range = np.array([np.inf, -np.inf])
         self._pictures = 0
 
     def add(self, depth: NDArray[Any]) -> None:
         """Count a picture, shape (H, W, 1)."""
         step = thinning(*depth.shape[:2])
-        stats = vector_stats(depth[::step, ::step].reshape(-1, 1))
-        self._joined = aggregate([self._joined, stats]) if self._pictures else stats
+        values = np.ascontiguousarray(depth[::step, ::step]).astype(self._dtype, copy=False).ravel()
+        if self._dtype.kind == "f" and not (np.isfinite(values) & (values >= 0)).all():
+            raise DatasetError("a depth picture has values that are negative or not finite")
+        bins = values if self._dtype.kind == "u" else np.abs(values).view(np.uint32) >> 16
+        self._histogram[0] += np.bincount(bins, minlength=1 << 16)
+        exact = values.astype(np.float64)
+        self._moments += [exact.sum(), (exact**2).sum()]
+        self._range = np.array([min(self._range[0], exact.min()), max(self._range[1], exact.max())])
         self._pictures += 1
 
     def stats(self) -> Stats:
         """Of what was counted, at least one picture."""
-        shaped: Stats = {name: value.reshape(-1, 1, 1) for name, value in self._joined.items()}
+        mean, square = self._moments / self._histogram.sum()
+        stats = {"min": self._range[0], "max": self._range[1], "mean": mean, "std": np.sqrt(max(square - mean**2, 0.0))}
+        for name, share in QUANTILES.items():
+            stats[name] = np.clip(self._value(_below(self._histogram, share)), *self._range)
+        shaped: Stats = {name: np.reshape(value, (1, 1, 1)) for name, value in stats.items()}
         return shaped | {"count": np.array([self._pictures])}
+
+    def state(self) -> dict[str, Any]:
+        """What was counted, as JSON values; `join` takes it."""
+        (bins,) = self._histogram[0].nonzero()
+        return {
+            "pictures": self._pictures, "moments": self._moments.tolist(), "range": self._range.tolist(),
+            "bins": bins.tolist(), "histogram": self._histogram[0, bins].tolist(),
+        }  # fmt: skip
+
+    def join(self, state: Mapping[str, Any]) -> None:
+        """Count what another one counted."""
+        self._histogram[0, state["bins"]] += np.array(state["histogram"], np.int64)
+        self._moments += state["moments"]
+        low, high = state["range"]
+        self._range = np.array([min(self._range[0], low), max(self._range[1], high)])
+        self._pictures += state["pictures"]
+
+    def _value(self, number: NDArray[np.intp]) -> NDArray[np.float64]:
+        """What a bin stands for."""
+        if self._dtype.kind == "u":
+            return number.astype(np.float64)
+        edges = [((number + i).astype(np.uint32) << 16).view(np.float32).astype(np.float64) for i in (0, 1)]
+        return (edges[0] + edges[1]) / 2
+
+
+PictureStats = PixelStats | DepthStats
+
+
+def picture_stats(feature: Feature) -> PictureStats:
+    """Empty statistics of a camera's pictures."""
+    return PixelStats(feature.shape[2]) if feature.dtype == "image" else DepthStats(feature.dtype)
 
 
 def thinning(height: int, width: int) -> int:
@@ -90,22 +152,7 @@ def thinning(height: int, width: int) -> int:
     return 1 if longer < _LARGE else longer // _SAMPLED
 
 
-def aggregate(each: Sequence[Stats]) -> Stats:
-    """Statistics of several episodes together, as LeRobot joins them: quantiles are means weighted by count."""
-    weights = np.array([stats["count"][0] for stats in each], dtype=np.float64)
-    weights /= weights.sum()
-
-    def weighted(values: Sequence[NDArray[Any]]) -> NDArray[Any]:
-        mean: NDArray[Any] = np.tensordot(weights, np.stack(values), 1)
-        return mean
-
-    mean = weighted([stats["mean"] for stats in each])
-    variance = weighted([stats["std"] ** 2 + (stats["mean"] - mean) ** 2 for stats in each])
-    joined: Stats = {
-        "min": np.min([stats["min"] for stats in each], axis=0),
-        "max": np.max([stats["max"] for stats in each], axis=0),
-        "mean": mean,
-        "std": np.sqrt(variance),
-        "count": np.sum([stats["count"] for stats in each], axis=0),
-    }
-    return joined | {name: weighted([stats[name] for stats in each]) for name in QUANTILES}
+def _below(histogram: NDArray[np.int64], share: float) -> NDArray[np.intp]:
+    """The first bin of each row by which `share` of the row's counts have come."""
+    counted = np.cumsum(histogram, 1)
+    return (counted >= share * counted[:, -1:]).argmax(1)

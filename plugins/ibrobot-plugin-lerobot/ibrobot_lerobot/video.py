@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ibrobot_core.errors import DatasetError
 from ibrobot_lerobot.options import LeRobotOptions
-from ibrobot_lerobot.stats import PixelStats, Stats
+from ibrobot_lerobot.stats import PixelStats
 
 PIXEL_FORMAT = "yuv420p"
 _GPU = ("h264_nvenc", "hevc_nvenc", "h264_videotoolbox", "hevc_videotoolbox")
@@ -137,7 +137,7 @@ class VideoTrack:
         self._count += 1
         self._put(frame)
 
-    def close(self) -> Stats:
+    def close(self) -> PixelStats:
         """Finish the file; returns the statistics of its pixels.
 
         Raises:
@@ -147,7 +147,7 @@ class VideoTrack:
         self._thread.join()
         if self._failure is not None:
             raise self._failed()
-        return self._stats.stats()
+        return self._stats
 
     def abort(self) -> None:
         """Give the file up. Safe after `close`."""

@@ -77,7 +77,8 @@ def test_appending_leaves_the_old_files_alone(tmp_path: Path) -> None:
     merging.merge(root, rest, {"n": 2})
     after = content(root)
     changed = {name for name in before if after[name] != before[name]}
-    assert changed == {"meta/info.json", "meta/stats.json", "meta/tasks.parquet", "meta/ibrobot.json"}
+    meta = ("info.json", "stats.json", "tasks.parquet", "ibrobot.json", "ibrobot_pixels.json")
+    assert changed == {f"meta/{name}" for name in meta}
     check(root, FEATURES, (5, 3, 4))
     writer = LeRobotDatasetWriter(LeRobotOptions())
     summary = writer.summary(root)
