@@ -179,7 +179,7 @@ def load_calibration(
     Args:
         name: a name or a path, see `calibration_path`.
         joints: names of the joints that it must have; for IB-Robot's file, in the order of their ids from 1.
-        zero_at: take the numbers alone, with 0 rad there: one of `ZERO_AT`.
+        zero_at: put 0 rad there, one of `ZERO_AT`, whatever the companion says and whichever numbers it is of.
 
     Raises:
         CalibrationError: when it is missing or cannot be true; names file, joint, key, value and what would be right.
@@ -204,9 +204,8 @@ def load_calibration(
         calibration = Calibration(found, path=path)
     except ValueError as error:
         raise CalibrationError(f"{path}: {error}") from None
-    if zero_at is not None:
-        return calibration.with_zero_at(zero_at)
-    return _with_meta(calibration.with_zero_at(POSE if numbered else RANGE), path)
+    loaded = _with_meta(calibration.with_zero_at(POSE if numbered else RANGE), path, any_numbers=zero_at is not None)
+    return loaded if zero_at is None else loaded.with_zero_at(zero_at)
 
 
 def save_calibration(
@@ -302,7 +301,7 @@ def _by_name(document: dict[str, Any], path: Path, joints: Sequence[str] | None)
     return named
 
 
-def _with_meta(calibration: Calibration, path: Path) -> Calibration:
+def _with_meta(calibration: Calibration, path: Path, *, any_numbers: bool) -> Calibration:
     companion = _meta_path(path)
     if not companion.exists():
         return calibration
@@ -313,7 +312,7 @@ def _with_meta(calibration: Calibration, path: Path) -> Calibration:
     zero_at = POSE if meta["version"] == 1 else str(meta.get("zero_at"))
     if zero_at not in ZERO_AT:
         raise CalibrationError(f"{companion}: zero_at: must be one of {', '.join(ZERO_AT)}, not {zero_at!r}")
-    if meta.get("sha256") != calibration.fingerprint():
+    if meta.get("sha256") != calibration.fingerprint() and not any_numbers:
         changed = datetime.fromtimestamp(path.stat().st_mtime, UTC).isoformat(timespec="seconds")
         raise CalibrationError(
             f"{path}: the numbers, changed {changed}, are not those calibrated {meta.get('date')} that "

@@ -71,9 +71,8 @@ def check_adapter(calibration: Calibration, port: str) -> None:
     there = f"has the USB serial number {found.serial_number}" if found.serial_number else "has no USB serial number"
     elsewhere = next((each for each in usb_ports() if each.serial_number == calibration.adapter), None)
     where = f", which is at {elsewhere.stable or elsewhere.path}: give that port" if elsewhere else ""
-    name = f"`ibrobot feetech import {calibration.path} --port {port} --yes`"
     raise HardwareError(
-        f"{port}: this is another arm: its adapter {there}, and {calibration.path} was made at "
-        f"{calibration.adapter}{where}; are the ports of leader and follower swapped? "
-        f"If the adapter was replaced, {name} remembers the new one"
+        f"{port}: this is another arm: its adapter {there}, {calibration.path} was made with "
+        f"{calibration.adapter}{where}; are the ports of leader and follower swapped? If the adapter was replaced, "
+        f"`ibrobot feetech import {calibration.path} --port {port} --yes` remembers the new one"
     )

@@ -7,9 +7,12 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 
+import attrs
 import pytest
 from click.testing import CliRunner
 from ibrobot_feetech.commands import feetech
+from ibrobot_feetech.commands.joints import Joint
+from ibrobot_feetech.commands.ranges import Range, doubtful
 from ibrobot_feetech.emulator import EmulatedServo, Emulator
 
 from ibrobot_core.calibration import load_calibration
@@ -295,6 +298,14 @@ def test_an_arm_of_lerobot_is_imported_with_its_0_or_with_the_pose(home, tmp_pat
     found = load_calibration("theirs")
     assert (found.zero_at, found.robot, found.joints["gripper"].zero()) == ("pose", "left", 2048)
     assert found.numbers() == numbers
+
+
+def test_zero_in_the_middle_of_the_range_asks_for_limits_about_zero():
+    measured = Range(1000, 2000, 3000)
+    aside = Joint("elbow_flex", 3, 0.0, 3.0)
+    assert "take --zero-at pose" in str(doubtful(aside, measured, "range"))
+    assert doubtful(Joint("elbow_flex", 3, -1.5, 1.5), measured, "range") is None
+    assert doubtful(attrs.evolve(aside, anchored=True), measured, "range") is None
 
 
 def test_drift_is_reported_and_written_back(emulator, calibration_file):

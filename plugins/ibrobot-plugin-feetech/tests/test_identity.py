@@ -7,7 +7,9 @@ from pathlib import Path
 
 import attrs
 import pytest
+from click.testing import CliRunner
 from ibrobot_feetech.bus import FeetechBus
+from ibrobot_feetech.commands import feetech
 from ibrobot_feetech.commands.check import differences
 from ibrobot_feetech.emulator import Emulator
 from ibrobot_feetech.errors import PortError, PortForbidden, PortHeld
@@ -18,7 +20,7 @@ from ibrobot_feetech.port import SerialPort
 from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
-from ibrobot_core.calibration import save_calibration
+from ibrobot_core.calibration import load_calibration, save_calibration
 from ibrobot_core.errors import HardwareError, TeleopError
 from ibrobot_core.testing.contexts import control_context, host_context
 
@@ -71,7 +73,13 @@ class TestAdapter:
         plug_in(monkeypatch, {emulator.port: "LEADER", "/dev/ttyACM7": "FOLLOWER"})
         with pytest.raises(HardwareError) as refused:
             follower(emulator.port, file).connect()
-        for words in (emulator.port, "LEADER", "follower.json was made at FOLLOWER", "is at /dev/ttyACM7", "swapped?"):
+        for words in (
+            emulator.port,
+            "LEADER",
+            "follower.json was made with FOLLOWER",
+            "is at /dev/ttyACM7",
+            "swapped?",
+        ):
             assert words in str(refused.value)
         assert not any(servo.torque for servo in emulator.servos.values())
 
@@ -81,8 +89,26 @@ class TestAdapter:
     ):
         plug_in(monkeypatch, {emulator.port: serial_number})
         leader = LeaderTeleop(LeaderOptions(emulator.port, str(file), deadman="none"), host_context("leader"))
-        with pytest.raises(TeleopError, match=r"leader: .*another arm: its adapter has .* made at FOLLOWER"):
+        with pytest.raises(TeleopError, match=r"leader: .*another arm: its adapter has .* made with FOLLOWER"):
             leader.connect()
+
+    def test_a_replaced_adapter_is_remembered_as_the_message_says(
+        self, emulator: Emulator, file: Path, monkeypatch: pytest.MonkeyPatch
+    ):
+        plug_in(monkeypatch, {emulator.port: "NEW"})
+        with pytest.raises(HardwareError, match=f"`ibrobot feetech import {file} --port {emulator.port} --yes`"):
+            follower(emulator.port, file).connect()
+        run = CliRunner().invoke
+        absent = run(feetech, ["import", str(file), "--port", "/dev/ttyACM9", "--yes"])
+        assert isinstance(absent.exception, HardwareError)
+        assert "no USB adapter is there" in str(absent.exception)
+        assert run(feetech, ["import", str(file), "--port", emulator.port, "--yes"]).exit_code == 0
+        assert load_calibration(file).adapter == "NEW"
+        arm = follower(emulator.port, file)
+        arm.connect()
+        arm.disconnect()
+        assert run(feetech, ["import", str(file), "--zero-at", "range", "--yes"]).exit_code == 0
+        assert load_calibration(file).adapter == "NEW", "another 0 rad is no other arm"
 
     def test_a_port_that_is_not_behind_usb_has_nothing_to_compare(self, emulator: Emulator, file: Path):
         arm = follower(emulator.port, file)

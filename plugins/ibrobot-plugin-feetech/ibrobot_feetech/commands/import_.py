@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import attrs
 import click
 
 from ibrobot_core.calibration import ZERO_AT, calibration_path, load_calibration, save_calibration
+from ibrobot_core.errors import HardwareError
 from ibrobot_feetech.commands.calibrate import backup
 from ibrobot_feetech.commands.dialogue import agree
 from ibrobot_feetech.commands.joints import joints_of
@@ -16,7 +15,7 @@ from ibrobot_feetech.usb import usb_port
 
 
 @click.command("import")
-@click.argument("file", type=click.Path(path_type=Path))
+@click.argument("file")
 @click.option("--name", help="Of the calibration that is made, or a path.  [default: FILE itself]")
 @click.option(
     "--zero-at",
@@ -28,18 +27,23 @@ from ibrobot_feetech.usb import usb_port
 @click.option("--robot", metavar="CONFIG", help="Robot YAML with the joints; an SO-101's by default.")
 @click.option("--yes", is_flag=True, help="Overwrite without asking; the former file is kept.")
 def import_calibration(
-    file: Path, name: str | None, zero_at: str | None, port: str | None, arm: str | None, robot: str | None, yes: bool
+    file: str, name: str | None, zero_at: str | None, port: str | None, arm: str | None, robot: str | None, yes: bool
 ) -> None:
-    """Take the calibration FILE of LeRobot or IB-Robot, and say where its 0 rad is. No servo is touched."""
+    """Take the calibration FILE, a path or a name, and say where its 0 rad is. No servo is touched."""
     path = calibration_path(name or file)
     found = load_calibration(file, [joint.name for joint in joints_of(robot, name)], zero_at=zero_at)
     if path.exists() and not yes and not agree(f"{path} is there already. Overwrite it?", flag="--yes"):
         raise click.Abort
-    adapter = usb_port(port) if port is not None else None
-    made = attrs.evolve(
-        found, robot=arm or found.robot, adapter=adapter.serial_number if adapter is not None else found.adapter
-    )
+    adapter = found.adapter if port is None else _adapter(port)
+    made = attrs.evolve(found, robot=arm or found.robot, adapter=adapter)
     backup(path)
     save_calibration(made, path, overwrite=True)
     click.echo(f"saved: {path}")
     click.echo(zero_text(made))
+
+
+def _adapter(port: str) -> str:
+    found = usb_port(port)
+    if found is None:
+        raise HardwareError(f"{port}: no USB adapter is there; `ibrobot feetech find-port --list` lists them")
+    return found.serial_number
