@@ -182,6 +182,11 @@ class Inference:
         None, ge=1, le=100, help="send pictures to the server as JPEG: far fewer bytes, other pixels; null: as they are"
     )
 
+    accept_new_weights: bool = option(
+        False,
+        help="go on, with a warning, when the server or process comes back with other weights; else the arm holds",
+    )
+
     def __attrs_post_init__(self) -> None:
         if self.jpeg_quality is not None and self.execution_mode != "distributed":
             raise ValueError(f"jpeg_quality has no meaning for execution_mode {self.execution_mode}: nothing is sent")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from abc import ABC, abstractmethod
@@ -9,6 +10,7 @@ from typing import override
 
 import attrs
 
+from ibrobot_core.errors import PolicyError
 from ibrobot_core.interfaces import Policy, Tensors
 
 
@@ -19,6 +21,8 @@ class EngineStats:
     mode: str
     alive: bool = False
     """Whether there is a model that answers."""
+    weights: str = ""
+    """Hash of the weights that act, as `Policy.weights`."""
     requests: int = 0
     failures: int = 0
     """Requests without outputs; those that were on their way when one failed count as one with it."""
@@ -88,6 +92,26 @@ class Engine(ABC):
         """Release what it took; a request that goes on fails soon. Safe to call twice."""
 
 
+def check_weights(before: str, now: str, whose: str, *, accept: bool) -> None:
+    """Compare the weights of a model that was started again with those that acted before.
+
+    Args:
+        before: hash of those that acted; empty at the first start.
+        now: hash of those that would act.
+        whose: which model, for the message.
+        accept: whether others may act, with a warning.
+
+    Raises:
+        PolicyError: when they are others, and are not accepted.
+    """
+    if before in ("", now):
+        return
+    told = f"{whose} came back with other weights, {now or 'of no known hash'}; those that acted were {before}"
+    if not accept:
+        raise PolicyError(f"{told}; start the run again, or set inference.accept_new_weights: true")
+    logging.getLogger("ibrobot.inference").warning("%s; they act from now on", told)
+
+
 class LocalEngine(Engine):
     """The policy itself. Whoever owns it resets and closes it."""
 
@@ -98,6 +122,7 @@ class LocalEngine(Engine):
     @override
     def start(self) -> None:
         self._policy.load()
+        self.stats.weights = self._policy.weights()
         self.stats.alive = True
 
     @override

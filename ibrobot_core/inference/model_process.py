@@ -134,7 +134,7 @@ def main(pipe: int, request: int, answer: int) -> int:
         config = from_document(order["document"], source=Path(order["source"]), sim=order["sim"], registry=registry)
         policy = build_policy(config, registry, order["model"], order["seed"])
         policy.load()
-        events.send("ready", fingerprint=policy.fingerprint())
+        events.send("ready", fingerprint=policy.fingerprint(), weights=policy.weights())
         frames = [memoryview(mmap.mmap(descriptor, LIMITS.size)) for descriptor in (request, answer)]
         ModelLoop(policy, connection, events, frames[0], frames[1]).run()
     except EOFError:

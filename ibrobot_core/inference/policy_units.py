@@ -43,6 +43,10 @@ class PolicyInItsUnits(Policy):
         return self._policy.fingerprint()
 
     @override
+    def weights(self) -> str:
+        return self._policy.weights()
+
+    @override
     def picture_codec(self, quality: int = 90) -> PictureCodec | None:
         return self._policy.picture_codec(quality)
 

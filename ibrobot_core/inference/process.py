@@ -18,7 +18,7 @@ from typing import Any, override
 
 from ibrobot_core.config import RobotConfig
 from ibrobot_core.errors import PolicyError
-from ibrobot_core.inference.engine import Engine
+from ibrobot_core.inference.engine import Engine, check_weights
 from ibrobot_core.inference.wire import LIMITS, Decoder, Encoder, Kind, Message
 from ibrobot_core.interfaces import Tensors
 from ibrobot_core.memory import create_memory
@@ -44,11 +44,12 @@ class ProcessEngine(Engine):
         seed: the run's.
         given_up: set when nobody waits for it any more, e.g. while it loads.
         hang_timeout_s: how long it may be at work on one request before it is taken to hang [s].
+        accept_new_weights: go on, with a warning, when the process starts again with other weights.
     """
 
     def __init__(
         self, config: RobotConfig, model: str, fingerprint: str, seed: int = 0,
-        given_up: threading.Event | None = None, hang_timeout_s: float = 30.0,
+        given_up: threading.Event | None = None, hang_timeout_s: float = 30.0, *, accept_new_weights: bool = False,
     ) -> None:  # fmt: skip
         super().__init__("process")
         self._order = {
@@ -56,6 +57,7 @@ class ProcessEngine(Engine):
             "seed": seed, "host": os.getpid(),
         }  # fmt: skip
         self._fingerprint = fingerprint
+        self._accept_new_weights = accept_new_weights
         self._log = logging.getLogger("ibrobot.inference")
         self._robot = config.robot.name
         self._lock = threading.Lock()
@@ -163,7 +165,7 @@ class ProcessEngine(Engine):
                     elif event["event"] == "failed":
                         self._failure = event["error"]
                     elif event["event"] == "ready":
-                        self._check(event["fingerprint"])
+                        self._check(event["fingerprint"], event["weights"])
                     elif event["event"] == "answer":
                         self._at_work_s = None if event["id"] == self._sent else time.monotonic()
                     if event["event"] == wanted:
@@ -179,14 +181,20 @@ class ProcessEngine(Engine):
                 state = "did not answer" if self.stats.alive else "is still loading"
                 raise PolicyError(f"the model's process {self.pid} {state} in time")
 
-    def _check(self, fingerprint: str) -> None:
+    def _check(self, fingerprint: str, weights: str) -> None:
         """Take a process that is ready, unless its model is another: the files may have changed since the start."""
-        if fingerprint != self._fingerprint:
+        try:
+            if fingerprint != self._fingerprint:
+                raise PolicyError(
+                    f"the model's process has another policy, {fingerprint!r}, than the host, {self._fingerprint!r}; "
+                    "start the run again"
+                )
+            check_weights(self.stats.weights, weights, "the model's process", accept=self._accept_new_weights)
+        except PolicyError:
             self._bury()
-            raise PolicyError(
-                f"the model's process has another policy, {fingerprint!r}, than the host, {self._fingerprint!r}; "
-                "start the run anew"
-            )
+            self._start_again_s = time.monotonic() + _LONGEST_PAUSE_S
+            raise
+        self.stats.weights = weights
         self.stats.alive = True
 
     def _revive(self, deadline_s: float) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 import time
 import uuid
 from collections.abc import Callable, Mapping
@@ -11,10 +12,11 @@ from typing import Any, override
 import attrs
 
 from ibrobot_core.errors import ContractError, PolicyError, TransportError, WireError
-from ibrobot_core.inference.engine import Engine
+from ibrobot_core.inference.engine import Engine, check_weights
 from ibrobot_core.inference.service import health_name, service_name
 from ibrobot_core.inference.wire import LIMITS, Buffer, Decoder, Encoder, Kind, Limits, Message
 from ibrobot_core.interfaces import PictureCodec, Policy, Tensors, Transport
+from ibrobot_core.interfaces.policy import whole_fingerprint
 from ibrobot_core.units import NS_PER_S
 
 _HEALTH_TIMEOUT_S = 2.0
@@ -38,15 +40,21 @@ class RemoteEngine(Engine):
         start_timeout_s: how long `start` waits for a server [s].
         codec: makes JPEG of camera pictures on thin links.
         limits: the server's.
+        accept_new_weights: go on, with a warning, with a server that comes back with other weights.
     """
 
     def __init__(
         self, policy: Policy, transport: Transport, model: str, robot: str, start_timeout_s: float = 5.0,
-        codec: PictureCodec | None = None, limits: Limits = LIMITS,
+        codec: PictureCodec | None = None, limits: Limits = LIMITS, *, accept_new_weights: bool = False,
     ) -> None:  # fmt: skip
         super().__init__("distributed")
         self._policy = policy
         self._fingerprint = policy.fingerprint()
+        """With the server's weights, once it is known."""
+        self._accept_new_weights = accept_new_weights
+        self._changed = threading.Event()
+        """Set when an answer was another policy's."""
+        self._looking = threading.Lock()
         self._transport = transport
         self._model = model
         self._robot = f"{robot}-{uuid.uuid4().hex[:8]}"
@@ -70,17 +78,19 @@ class RemoteEngine(Engine):
                 if time.monotonic() >= deadline_s:
                     raise PolicyError(f"no server for model {self._model!r}: {error}") from None
                 time.sleep(_RETRY_S)
-        if health.get("fingerprint") != self._fingerprint:
-            raise ContractError(self._differences(health))
+        self._adopt(health)
         self._end_watch = self._transport.watch(service_name(self._model), self._served)
 
     @override
     def run(self, tensors: Tensors, request_id: int, deadline_ns: int) -> Tensors:
+        if self._changed.is_set():
+            self._look_again()
+        fingerprint = self._fingerprint
         left_ns = deadline_ns - time.monotonic_ns()
         if left_ns <= 0:
             raise PolicyError(f"request {request_id} expired before it was sent")
         message = Message(
-            Kind.REQUEST, request_id, tensors, self._robot, self._fingerprint, stamp_ns=time.time_ns(),
+            Kind.REQUEST, request_id, tensors, self._robot, fingerprint, stamp_ns=time.time_ns(),
             deadline_ns=left_ns, episode=self._episode, seed=self._seed,
         )  # fmt: skip
         buffer = self._buffers.pop()
@@ -93,12 +103,14 @@ class RemoteEngine(Engine):
         finally:
             self._buffers.append(buffer)
         self.stats.pace_ms = answer.pace_ns / 1e6
+        if answer.fingerprint not in ("", fingerprint):
+            self._changed.set()
         if answer.kind is Kind.FAILURE:
             raise PolicyError(f"the server of {self._model}: {answer.text}")
-        if answer.id != request_id or answer.fingerprint != self._fingerprint:
+        if answer.id != request_id or answer.fingerprint != fingerprint:
             raise PolicyError(
                 f"the server of {self._model} answered request {answer.id} by policy {answer.fingerprint!r}, "
-                f"asked was {request_id} by {self._fingerprint!r}"
+                f"asked was {request_id} by {fingerprint!r}"
             )
         self.stats.queue_ms = min(answer.queued_ns / 1e6, answer.latency_ms)
         self.stats.model_ms = answer.latency_ms - self.stats.queue_ms
@@ -115,6 +127,32 @@ class RemoteEngine(Engine):
         if end is not None:
             end()
 
+    def _look_again(self) -> None:
+        """See which policy the server has now.
+
+        Raises:
+            PolicyError: when it is another, or has other weights that are not accepted.
+        """
+        with self._looking:
+            if not self._changed.is_set():
+                return
+            try:
+                self._adopt(self._health())
+            except (TransportError, ContractError) as error:
+                raise PolicyError(str(error)) from None
+            self._changed.clear()
+
+    def _adopt(self, health: Mapping[str, Any]) -> None:
+        """Take the server's weights for those that act, where its policy is the robot's."""
+        weights = str(health.get("weights", ""))[:128]
+        fingerprint = whole_fingerprint(self._policy.fingerprint(), weights)
+        if health.get("fingerprint") != fingerprint:
+            raise ContractError(self._differences(health, fingerprint))
+        check_weights(
+            self.stats.weights, weights, f"the server of {self._model}", accept=self._accept_new_weights
+        )  # fmt: skip
+        self._fingerprint, self.stats.weights = fingerprint, weights
+
     def _served(self, alive: bool) -> None:
         self.stats.restarts += alive and self.stats.requests > 0
         self.stats.alive = alive
@@ -129,7 +167,7 @@ class RemoteEngine(Engine):
             raise PolicyError(f"what serves {health_name(self._model)} is no server of ibrobot: {bytes(reply)[:40]!r}…")
         return health
 
-    def _differences(self, health: Mapping[str, Any]) -> str:
+    def _differences(self, health: Mapping[str, Any], fingerprint: str) -> str:
         """Both policies, where they differ."""
         known = health["spec"] if isinstance(health.get("spec"), dict) else {}
         ours = json.loads(json.dumps(attrs.asdict(self._policy.spec)))
@@ -137,7 +175,7 @@ class RemoteEngine(Engine):
         for field in known:
             if known[field] != ours.get(field):
                 lines.append(f"  {field}\n      robot: {ours.get(field)}\n     server: {known[field]}")
-        lines.append(f"  fingerprint\n      robot: {self._fingerprint}\n     server: {health.get('fingerprint')}")
+        lines.append(f"  fingerprint\n      robot: {fingerprint}\n     server: {health.get('fingerprint')}")
         if len(lines) == 2:  # the fingerprint alone
             lines.append(
                 "  they look alike, but files or options differ, e.g. statistics: copy the server's, without weights"

@@ -20,7 +20,7 @@ from ibrobot_core.inference.fair_queue import FairQueue
 from ibrobot_core.inference.pacing import Pacing
 from ibrobot_core.inference.wire import LIMITS, Decoder, Encoder, Kind, Limits, Message
 from ibrobot_core.interfaces import Payload, PictureCodec, Policy, Tensors, Transport
-from ibrobot_core.interfaces.policy import copied
+from ibrobot_core.interfaces.policy import copied, whole_fingerprint
 from ibrobot_core.units import NS_PER_S
 
 _ROBOTS_KEPT = 256
@@ -133,7 +133,8 @@ class InferenceService:
         self._model = model
         self._options = options or ServiceOptions()
         self._decoder, self._encoder = Decoder(self._options.limits, codec), Encoder(self._options.limits)
-        self._fingerprint = policy.fingerprint()
+        self._weights = policy.weights()
+        self._fingerprint = whole_fingerprint(policy.fingerprint(), self._weights)
         self._queue: FairQueue[_Ticket] = FairQueue(self._options.queue)
         self._pacing = Pacing()
         self._lock = threading.Lock()
@@ -203,7 +204,7 @@ class InferenceService:
             batches = {str(size): count for size, count in sorted(self._batches.items())}
             return {
                 "model": self._model, "state": self.state,
-                "fingerprint": self._fingerprint, "spec": attrs.asdict(self._policy.spec),
+                "fingerprint": self._fingerprint, "weights": self._weights, "spec": attrs.asdict(self._policy.spec),
                 "uptime_s": round((time.monotonic_ns() - self._begun_ns) / NS_PER_S, 1), "waiting": len(self._queue),
                 "malformed": self._malformed, **self._all.summary(), "batches": batches, "robots": robots,
             }  # fmt: skip
@@ -243,8 +244,8 @@ class InferenceService:
             return "the server is stopping"
         if message.fingerprint != self._fingerprint:
             return (
-                f"another policy: the robot's is {message.fingerprint!r}, the server's {self._fingerprint!r}; "
-                "start the robot anew to see where they differ"
+                f"another policy, or other weights: the robot's is {message.fingerprint!r}, the server's "
+                f"{self._fingerprint!r}; start the run again to see where they differ"
             )
         return ""
 

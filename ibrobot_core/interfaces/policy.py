@@ -75,6 +75,16 @@ def copied(tensors: Tensors) -> dict[str, NDArray[np.generic]]:
     return {name: np.array(array) for name, array in tensors.items()}
 
 
+def whole_fingerprint(fingerprint: str, weights: str) -> str:
+    """Of a policy with its weights: what requests and answers carry, so that one side notices when the other's change.
+
+    Args:
+        fingerprint: `Policy.fingerprint`.
+        weights: `Policy.weights`.
+    """
+    return hashlib.sha256(f"{fingerprint}\0{weights}".encode()).hexdigest()[:32] if weights else fingerprint
+
+
 class PictureCodec(ABC):
     """JPEG for tensors that are camera pictures: `uint8`, shape (H, W, 3) or (H, W, 1)."""
 
@@ -137,12 +147,16 @@ class Policy(ABC):
         return [copied(self.infer(tensors)) for tensors in batch]
 
     def fingerprint(self) -> str:
-        """What both sides of `infer` must agree on; of the spec, where a policy does not add e.g. its weights' hash.
+        """What both sides of `infer` must agree on; of the spec, where a policy does not add e.g. its statistics' hash.
 
-        Known once constructed. It has at most 128 bytes.
+        Known once constructed, without the weights, which the robot's side may lack. It has at most 128 bytes.
         """
         spec = attrs.asdict(self.spec)
         return hashlib.sha256(json.dumps(spec, sort_keys=True).encode()).hexdigest()[:16]
+
+    def weights(self) -> str:
+        """Hash of the weights that `load` read; empty before, and for a policy that has none. At most 128 bytes."""
+        return ""
 
     def picture_codec(self, quality: int = 90) -> PictureCodec | None:
         """What makes JPEG of the pictures among its inputs, and pictures of JPEG, for thin links.

@@ -109,6 +109,8 @@ class Session:
         self.state: ControlState | None = None
         self.stats: DispatchStats | None = None
         self.engine_stats: EngineStats | None = None
+        self.policy: Callable[[], Mapping[str, str]] | None = None
+        """Says which policy acts, and with which weights; None in a mode without one."""
         self.rates: dict[str, float] = {}
         """Measured rate of each sensor [Hz]."""
         self.ages: dict[str, float] = {}

@@ -27,6 +27,7 @@ def episode_folder(dataset: Path, number: int) -> Path:
 def episode_start(
     config: RobotConfig, recording: Recording, topics: Mapping[str, str], *, mode: str, seed: int, stamp_ns: int,
     lockstep: bool, prompt: str = "", plugins: Mapping[str, str] | None = None,
+    policy: Mapping[str, str] | None = None,
 ) -> EpisodeStart:  # fmt: skip
     """The start of the next episode of the dataset.
 
@@ -42,6 +43,7 @@ def episode_start(
         lockstep: whether equal runs must give equal bytes.
         prompt: what the operator calls the task.
         plugins: packages of the plugins, and their versions.
+        policy: which policy acts, and with which weights; None where none does.
 
     Raises:
         RecorderError: when the folder cannot be made, or the dataset has episodes of another contract.
@@ -60,6 +62,8 @@ def episode_start(
         "ibrobot_version": ibrobot_core.__version__, "plugin_versions": json.dumps(dict(plugins or {})),
         "seed": str(seed),
     }  # fmt: skip
+    if policy is not None:
+        metadata["policy"] = json.dumps(dict(policy))
     metadata["uuid"] = str(uuid5(NAMESPACE_OID, json.dumps(metadata)) if lockstep else uuid4())
     if recording.topics == "contract":
         kept = contract.topics

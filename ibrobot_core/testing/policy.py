@@ -187,6 +187,12 @@ class PolicySuite(Suite[Policy]):
             finally:
                 edge.close()
 
+    def test_weights_have_one_hash(self) -> None:
+        """`weights` is empty or a short text that is the same whenever the same weights are loaded."""
+        with self.loaded() as (one, _), self.loaded() as (other, _):
+            assert one.weights() == other.weights()
+            assert len(one.weights().encode()) <= 128
+
     def test_infer_remembers_nothing(self) -> None:
         """The same input gives the same output, whatever came between, unless the spec says that it is stateful."""
         with self.loaded() as (policy, ctx):

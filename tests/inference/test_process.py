@@ -40,6 +40,9 @@ class Net(FakePolicy):
     def load(self):
         print(end="")
         self.loaded = True
+    def weights(self):
+        from pathlib import Path
+        return (Path(__file__).parent / "weights").read_text() if (Path(__file__).parent / "weights").exists() else ""
     def reset(self, seed):
         self.seeds += (seed,)
     def infer(self, tensors):
@@ -231,3 +234,28 @@ def test_closing_ends_a_model_that_hangs(engine: ProcessEngine, ask: Callable[..
     engine.close()
     with pytest.raises(PolicyError, match="was closed"):
         ask()
+
+
+@pytest.mark.parametrize("accept", [False, True])
+def test_process_that_starts_again_with_other_weights_is_accepted_only_where_the_user_says_so(
+    config: RobotConfig, site: Site, caplog: pytest.LogCaptureFixture, accept: bool
+):
+    (site.folder / "weights").write_text("a1")
+    engine = ProcessEngine(config, "net", fingerprint(config), accept_new_weights=accept)
+    try:
+        engine.start()
+        assert engine.stats.weights == "a1"
+        (site.folder / "weights").write_text("b2")
+        die = {"x": np.arange(3), "do": np.frombuffer(b"die", np.uint8)}
+        with pytest.raises(PolicyError, match="died"):
+            engine.infer(die, 1, time.monotonic_ns() + PATIENCE_NS)
+        if accept:
+            outputs = engine.infer({"x": np.arange(3)}, 2, time.monotonic_ns() + PATIENCE_NS)
+            assert outputs["twice"].tolist() == [0, 2, 4]
+            assert "the model's process came back with other weights, b2; those that acted were a1" in caplog.text
+        else:
+            with pytest.raises(PolicyError, match="the model's process came back with other weights, b2"):
+                engine.infer({"x": np.arange(3)}, 2, time.monotonic_ns() + PATIENCE_NS)
+        assert engine.stats.weights == ("b2" if accept else "a1")
+    finally:
+        engine.close()

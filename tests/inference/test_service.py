@@ -487,6 +487,75 @@ def test_the_engine_goes_on_with_a_server_that_was_started_again():
             service.close()
 
 
+class Weighted(Net):
+    """With weights of a given hash."""
+
+    def __init__(self, weights: str) -> None:
+        super().__init__()
+        self._weights = weights
+
+    @override
+    def weights(self) -> str:
+        return self._weights
+
+
+def swap_weights(cloud: Cloud, weights: str) -> InferenceService:
+    """A server with other weights in place of the one that was there."""
+    cloud.service.close()
+    again = Weighted(weights)
+    again.gate.release(10)
+    cloud.service = InferenceService(again, cloud.transport, "net")
+    cloud.service.start()
+    return cloud.service
+
+
+def test_server_that_comes_back_with_other_weights_is_refused():
+    with served(Weighted("a1")) as cloud, engine(cloud) as remote:
+        cloud.policy.gate.release(10)
+        remote.start()
+        assert remote.stats.weights == cloud.health()["weights"] == "a1"
+        remote.infer({"x": np.ones(1)}, 1, deadline())
+        swap_weights(cloud, "b2")
+        with pytest.raises(PolicyError, match="another policy, or other weights"):
+            remote.infer({"x": np.ones(1)}, 2, deadline())
+        for number in (3, 4):
+            with pytest.raises(
+                PolicyError, match=r"came back with other weights, b2; those that acted were a1; start the"
+            ):
+                remote.infer({"x": np.ones(1)}, number, deadline())
+        assert remote.stats.weights == "a1"
+        swap_weights(cloud, "a1")
+        assert remote.infer({"x": np.ones(1)}, 5, deadline())["twice"].tolist() == [2]
+
+
+def test_other_weights_are_accepted_with_a_warning_where_the_user_says_so(caplog: pytest.LogCaptureFixture):
+    with served(Weighted("a1")) as cloud:
+        cloud.policy.gate.release(10)
+        remote = RemoteEngine(Net(), cloud.transport, "net", "so101", accept_new_weights=True)
+        remote.start()
+        swap_weights(cloud, "b2")
+        with pytest.raises(PolicyError, match="another policy, or other weights"):
+            remote.infer({"x": np.ones(1)}, 1, deadline())
+        assert remote.infer({"x": np.ones(1)}, 2, deadline())["twice"].tolist() == [2]
+        assert remote.stats.weights == "b2"
+        assert "came back with other weights, b2; those that acted were a1; they act from now on" in caplog.text
+        remote.close()
+
+
+def test_server_that_comes_back_with_another_policy_is_refused_whatever_its_weights(monkeypatch: pytest.MonkeyPatch):
+    with served(Weighted("a1")) as cloud:
+        cloud.policy.gate.release(10)
+        remote = RemoteEngine(Net(), cloud.transport, "net", "so101", accept_new_weights=True)
+        remote.start()
+        monkeypatch.setattr(Weighted, "fingerprint", lambda self: "0ther")
+        swap_weights(cloud, "b2")
+        with pytest.raises(PolicyError, match="another policy, or other weights"):
+            remote.infer({"x": np.ones(1)}, 1, deadline())
+        with pytest.raises(PolicyError, match="is not the robot's model 'net'"):
+            remote.infer({"x": np.ones(1)}, 2, deadline())
+        remote.close()
+
+
 @pytest.mark.parametrize(
     ("answer", "said"),
     [

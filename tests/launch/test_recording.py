@@ -221,3 +221,26 @@ def test_a_listed_topic_that_nobody_publishes_is_told_once(
     told = "recording.topics: nothing of /joint_stats has come so far, nor was recorded; there are: "
     assert caplog.text.count(told) == 1
     assert "/joint_states" in caplog.text.partition(told)[2]
+
+
+def test_recording_says_which_policy_acts_with_which_weights(runs: Runs, monkeypatch: pytest.MonkeyPatch):
+    runs.make()
+    monkeypatch.setattr(runs.parts.Net, "weights", lambda self: "a1")
+    runtime = runs.start("recording={type: lines}")
+    ticks(runtime, 2)
+    runtime.plan.episodes.end("unknown")
+    ticks(runtime, 1)
+    notes = Notes(runs.parts.MADE["recording"], monkeypatch)
+    runtime.plan.episodes.begin()
+    ticks(runtime, 2)
+    policy = json.loads(notes.begun[0].metadata["policy"])
+    fingerprint = runs.parts.MADE["net"].fingerprint()
+    assert policy == {
+        "model": "net", "type": "net", "fingerprint": fingerprint, "weights": "a1", "execution_mode": "monolithic"
+    }  # fmt: skip
+    runtime.plan.episodes.end("unknown")
+    runtime.switch_mode("teleop")
+    ticks(runtime, 2)
+    runtime.plan.episodes.begin()
+    ticks(runtime, 2)
+    assert "policy" not in notes.begun[1].metadata

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,6 +16,7 @@ import torch
 from ibrobot_lerobot.options import LeRobotPolicyOptions
 from ibrobot_lerobot.policy import SEED, LeRobotPolicy
 from numpy.typing import NDArray
+from safetensors.torch import load_file, save_file
 
 from ibrobot_core.errors import PolicyError
 from ibrobot_core.interfaces import Frame, Policy
@@ -280,6 +283,20 @@ def test_weights_that_can_run_code_are_refused(tmp_path: Path) -> None:
     (path / "pytorch_model.bin").unlink()
     with pytest.raises(PolicyError, match=r"has no weights: model.safetensors is missing"):
         make(path).load()
+
+
+def test_weights_are_hashed(tmp_path: Path, folders: dict[str, Path]) -> None:
+    path = folders["act"]
+    policy = make(path)
+    assert policy.weights() == ""
+    policy.load()
+    assert policy.weights() == hashlib.sha256((path / "model.safetensors").read_bytes()).hexdigest()[:32]
+    other = shutil.copytree(path, tmp_path / "act")
+    weights = load_file(other / "model.safetensors")
+    save_file({name: tensor * 1.0001 for name, tensor in weights.items()}, other / "model.safetensors")
+    trained_further = loaded(other)
+    assert trained_further.fingerprint() == policy.fingerprint(), "the robot's side, without weights, still fits"
+    assert trained_further.weights() != policy.weights()
 
 
 def test_weights_that_do_not_fit_are_refused(tmp_path: Path) -> None:

@@ -164,6 +164,11 @@ class ReusesItsOutputs(AnswersABatchFromOneArray):
         return FakePolicy.infer_batch(self, batch)
 
 
+class HashesTheObject(FakePolicy):
+    def weights(self):
+        return str(id(self))
+
+
 class NeedsWeightsAtTheEdge(FakePolicy):
     scale = None
 
@@ -175,6 +180,7 @@ class NeedsWeightsAtTheEdge(FakePolicy):
 
 
 WRONG = {
+    HashesTheObject: "weights_have_one_hash",
     AnswersABatchFromOneArray: "a_batch_is_as_good_as_one_by_one",
     CountsRequests: "infer_remembers_nothing",
     ReversesBatches: "a_batch_is_as_good_as_one_by_one",

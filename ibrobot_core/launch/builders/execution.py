@@ -56,6 +56,14 @@ class Model(Component):
         assert self._engine is not None
         return self._engine
 
+    def described(self) -> dict[str, str]:
+        """Which policy acts, and with which weights, for recordings."""
+        model, engine = self._model, self.engine
+        return {
+            "model": model.name, "type": model.type, "fingerprint": self.policy.fingerprint(),
+            "weights": engine.stats.weights, "execution_mode": engine.stats.mode,
+        }  # fmt: skip
+
     @override
     def start(self) -> None:
         model, session = self._model, self._session
@@ -94,12 +102,13 @@ class Model(Component):
             case "process":
                 return ProcessEngine(
                     session.config, inference.model, policy.fingerprint(), session.request.seed, session.finished,
-                    inference.hang_timeout,
+                    inference.hang_timeout, accept_new_weights=inference.accept_new_weights,
                 )  # fmt: skip
             case "distributed":
                 return RemoteEngine(
                     policy, session.transport, inference.server_model or inference.model, session.config.robot.name,
                     start_timeout_s=inference.request_timeout, codec=self._codec(policy),
+                    accept_new_weights=inference.accept_new_weights,
                 )  # fmt: skip
             case _:
                 return LocalEngine(policy)
@@ -174,6 +183,7 @@ class InferenceFeeder(Feeder):
     def begin_feeding(self, seed: int) -> None:
         self.session.stats = self.dispatcher.stats
         self.session.engine_stats = self._model.engine.stats
+        self.session.policy = self._model.described
         self._next_ns = self.session.bus.snapshot_ns() + self._step_ns
         self.dispatcher.begin(seed)
         self.session.bus.serve(TOGGLE_SMOOTHING, self.toggle_smoothing)
@@ -184,6 +194,7 @@ class InferenceFeeder(Feeder):
         self.dispatcher.end()
         self.session.stats = None
         self.session.engine_stats = None
+        self.session.policy = None
 
     @override
     def work(self, timeout_s: float) -> None:

@@ -112,6 +112,7 @@ class Recording(Worker):
             start = episode_start(
                 session.config, self._config, topics, mode=session.mode, seed=seed, stamp_ns=session.bus.snapshot_ns(),
                 lockstep=session.request.lockstep, prompt=prompt, plugins=session.registry.versions(),
+                policy=session.policy() if session.policy is not None else None,
             )  # fmt: skip
             latched = tuple(i for i in session.bus.latched().values() if i.received_ns <= start.stamp_ns)
             self._orders.append(_Begin(start, latched, self._lost_now()))

@@ -191,6 +191,12 @@ def check_weights(path: Path) -> None:
     )
 
 
+def hash_weights(path: Path) -> str:
+    """SHA-256, the first 32 hexadecimal digits, of the weights in the folder at `path`."""
+    with (path / WEIGHTS).open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()[:32]
+
+
 def _note_path(path: Path) -> Path | None:
     """What tells of the training set: the note beside the checkpoint, else the dataset, where it still lies here."""
     if (path / NOTE).is_file():

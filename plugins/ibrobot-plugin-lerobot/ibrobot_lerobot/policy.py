@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ibrobot_core.errors import PolicyError
 from ibrobot_core.interfaces import Context, Frame, PictureCodec, Policy, PolicySpec, Tensors
-from ibrobot_lerobot.checkpoint import ACTION, POSTPROCESSOR, PREPROCESSOR, check_weights, read_checkpoint
+from ibrobot_lerobot.checkpoint import ACTION, POSTPROCESSOR, PREPROCESSOR, check_weights, hash_weights, read_checkpoint
 from ibrobot_lerobot.options import LeRobotPolicyOptions
 from ibrobot_lerobot.steps import read_steps
 
@@ -65,10 +65,12 @@ class LeRobotPolicy(Policy):
         self._taken: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {}
         """Tensors of a request without a prefix: their dtypes and shapes; -1 stands for any size."""
         self._seed = ctx.seed
+        self._weights = ""
 
     @override
     def load(self) -> None:
         check_weights(self._options.path)
+        weights = hash_weights(self._options.path)
         model = _import("model").Model(self._checkpoint, self._options, self._pre, self._pictures, self._ctx.log)
         tensors = self.preprocess(self._zeros())
         model.warm_up(tensors)
@@ -77,7 +79,7 @@ class LeRobotPolicy(Policy):
             name: (array.dtype, (-1,) * array.ndim if self._pre.others and name != SEED else array.shape)
             for name, array in tensors.items()
         }
-        self._model = model
+        self._model, self._weights = model, weights
 
     @override
     def reset(self, seed: int) -> None:
@@ -90,6 +92,10 @@ class LeRobotPolicy(Policy):
     @override
     def fingerprint(self) -> str:
         return self._checkpoint.fingerprint()
+
+    @override
+    def weights(self) -> str:
+        return self._weights
 
     @override
     def picture_codec(self, quality: int = 90) -> PictureCodec | None:
