@@ -18,6 +18,7 @@ from noting import Noting
 
 from ibrobot_core.calibration import Calibration, JointCalibration, save_calibration
 from ibrobot_core.config import load
+from ibrobot_core.contract.joint_units import calibrations
 from ibrobot_core.control import host
 from ibrobot_core.errors import IbrobotError
 from ibrobot_core.launch.runtime import ESTOP, RESET, Runtime
@@ -239,3 +240,12 @@ def test_the_emergency_stop_holds_until_the_reset(station: Callable[..., Station
     arms.press_space()
     arms.until_at("shoulder_pan", -0.3)
     arms.assert_no_jump()
+
+
+def test_a_recording_keeps_where_0_rad_is(tmp_path: Path):
+    _, file = arm(tmp_path, "follower")
+    hardware = f"hardware={{type: feetech_so101, port: {tmp_path}/follower, calibration: {file}}}"
+    for zero_at in ("pose", "range"):
+        (kept,) = calibrations(load(CONFIG, overrides=(hardware,), mode="teleop")).values()
+        assert {joint["zero_at"] for joint in kept.values()} == {zero_at}
+        file.with_suffix(".meta.json").unlink(missing_ok=True)  # as LeRobot's own
