@@ -36,14 +36,19 @@ def config() -> None:
 @config.command()
 @config_options
 @click.option("--json", "as_json", is_flag=True, help="Print a list of {file, line, path, message}.")
-def check(config: str | None, sim: bool, overrides: tuple[str, ...], mode: str | None, as_json: bool) -> None:
+@click.option("--deep", is_flag=True, help="Compare the models of all modes with the contract, too; loads no weights.")
+def check(
+    config: str | None, sim: bool, overrides: tuple[str, ...], mode: str | None, as_json: bool, deep: bool
+) -> None:  # fmt: skip
     """Tell everything that is wrong with CONFIG; exit 2 if anything is."""
     from ibrobot_core.config import find_config, load
+    from ibrobot_core.launch.models import check_models
     from ibrobot_core.plugins import installed
 
     try:
         path = find_config(config, installed())
         found = load(path, overrides=overrides, mode=mode, sim=sim)
+        models = check_models(found, installed(), found.control_modes) if deep else []
     except ConfigError as error:
         if not as_json:
             raise
@@ -56,6 +61,8 @@ def check(config: str | None, sim: bool, overrides: tuple[str, ...], mode: str |
     body = "simulation" if found.simulated else "hardware"
     click.echo(f"{path}: ok ({found.robot.name}, {len(found.robot.joints)} joints, {body})")
     click.echo(f"modes: {', '.join(found.control_modes)}; starts in {found.default_control_mode}")
+    for line in models:
+        click.echo(line)
 
 
 @config.command()

@@ -21,6 +21,7 @@ from ibrobot_core.cli.panel import RecentLog, panel, plain_line
 from ibrobot_core.config import RobotConfig, find_config, load
 from ibrobot_core.control.core import EMERGENCY_STOP
 from ibrobot_core.errors import IbrobotError
+from ibrobot_core.launch.models import check_models
 from ibrobot_core.launch.runtime import Runtime
 from ibrobot_core.launch.session import Request, Session
 from ibrobot_core.plugins import installed
@@ -90,7 +91,9 @@ _OPTIONS: dict[str, Callable[..., Any]] = {
     ),
     "window": click.option("--window", is_flag=True, help="Show the simulation in a desktop window."),
     "headless": click.option("--headless", is_flag=True, help="No window, no viewer, no panel: plain lines."),
-    "dry_run": click.option("--dry-run", is_flag=True, help="Print the plan and start nothing."),
+    "dry_run": click.option(
+        "--dry-run", is_flag=True, help="Print the plan, compare the model with the contract, and start nothing."
+    ),
     "as_json": click.option("--json", "as_json", is_flag=True, help="Print a summary as JSON, in the last line."),
 }
 
@@ -192,6 +195,8 @@ def run_loaded(robot: RobotConfig, request: Request, options: dict[str, Any], wa
         runtime = Runtime(Session(robot, installed(), request))
         if options["dry_run"]:
             click.echo("\n".join(runtime.plan.lines()))
+            for line in check_models(robot, installed(), [runtime.session.mode]):
+                click.echo(line)
             return
         watcher.attach(runtime)
         _stop_on_signals(runtime.session, keys)

@@ -27,6 +27,10 @@ class PolicyInItsUnits(Policy):
         self.spec = policy.spec
 
     @override
+    def check_weights(self) -> None:
+        self._policy.check_weights()
+
+    @override
     def load(self) -> None:
         self._policy.load()
 

@@ -169,6 +169,13 @@ class Policy(ABC):
         """
         return None
 
+    def check_weights(self) -> None:
+        """See, without loading them, that the weights are there and fit the configuration, as far as that is quick.
+
+        Raises:
+            PolicyError: where they are not.
+        """
+
     def load(self) -> None:
         """Load weights and warm up; when it returns the policy is ready.
 

@@ -11,6 +11,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from ibrobot_core.errors import PolicyError
+from ibrobot_core.testing.fakes import FakePolicy
+
 if TYPE_CHECKING:
     from conftest import Ran, Site
 
@@ -19,7 +22,7 @@ import signal
 from ibrobot_core import hookimpl
 from ibrobot_core.descriptors import (
     HardwareDescriptor, PlannerDescriptor, PolicyDescriptor, RecorderDescriptor, SensorDescriptor,
-    TeleopDescriptor,
+    TeleopDescriptor, TransportDescriptor,
 )
 from ibrobot_core.errors import HardwareError, MissingDependency, TeleopError
 from ibrobot_core.testing.fakes import FakeHardware, FakePlanner, FakePolicy, FakeRealHardware, FakeTeleop
@@ -77,6 +80,10 @@ def ibrobot_recorders():
 def ibrobot_hardware():
     yield HardwareDescriptor("scene", lambda options, ctx: Scene(ctx), "a scene", simulated=True)
     yield HardwareDescriptor("arm", lambda options, ctx: FakeRealHardware(ctx), "an arm")
+
+@hookimpl
+def ibrobot_transports():
+    yield TransportDescriptor("net", lambda options, ctx: None, "a network")
 
 @hookimpl
 def ibrobot_policies():
@@ -237,9 +244,60 @@ def test_the_first_ctrl_c_ends_the_run_in_order(launch: Callable[..., Ran]):
 def test_dry_run_prints_the_plan(launch: Callable[..., Ran]):
     ran = launch(*LOCKSTEP, "--dry-run")
     assert (ran.code, ran.err) == (0, "")
-    assert [line.split()[1] for line in ran.out.splitlines()[:-1]] == [
+    assert [line.split()[1] for line in ran.out.splitlines()[:-2]] == [
         "model:net", "control", "mode:policy", "status", "episodes",
     ]  # fmt: skip
+    assert ran.out.splitlines()[-1] == (
+        "model net fits the contract: observation.state -> 1 joints in chunks of 10; "
+        "what it was trained on is not known"
+    )
+
+
+WRONG_CONTRACT = """\
+error: mini.yaml: models.net: model 'net' does not fit the contract of mini.yaml
+error: the policy does not fit the contract:
+error:   observation.state
+error:       policy: (1,)
+error:     contract: (2,)
+"""
+
+
+def test_dry_run_compares_the_model_with_the_contract(launch: Callable[..., Ran]):
+    config = Path("mini.yaml")
+    config.write_text(config.read_text().replace("select: [position.pan]", "select: [position.pan, velocity.pan]"))
+    ran = launch(*LOCKSTEP, "--dry-run")
+    assert (ran.code, ran.err) == (2, WRONG_CONTRACT)
+    assert launch(*LOCKSTEP, "--dry-run", "--mode", "stick").code == 0, "this mode has no model"
+
+
+def test_deep_check_compares_the_models_of_all_modes(launch: Callable[..., Ran], ibrobot: Callable[..., Ran]):
+    deep = ("config", "check", "mini.yaml", "--sim", "--mode", "stick", "--deep")
+    ran = ibrobot(*deep)
+    assert (ran.code, ran.err) == (0, "")
+    assert ran.out.splitlines()[-1].startswith("model net fits the contract: observation.state -> 1 joints")
+    config = Path("mini.yaml")
+    config.write_text(config.read_text().replace("select: [position.pan]", "select: [position.pan, velocity.pan]"))
+    assert ibrobot(*deep[:-1]).code == 0, "without --deep nothing of the model is read"
+    ran = ibrobot(*deep)
+    assert (ran.code, ran.err) == (2, WRONG_CONTRACT)
+    [problem] = json.loads(ibrobot(*deep, "--json").out)
+    assert problem["path"] == "models.net"
+
+
+@pytest.mark.parametrize(("mode", "code"), [("monolithic", 2), ("process", 2), ("distributed", 0)])
+def test_deep_check_wants_weights_only_where_they_are_loaded(
+    launch: Callable[..., Ran], ibrobot: Callable[..., Ran], monkeypatch: pytest.MonkeyPatch, mode: str, code: int
+):
+    def check_weights(self: object) -> None:
+        raise PolicyError("model.safetensors is missing")
+
+    monkeypatch.setattr(FakePolicy, "check_weights", check_weights)
+    ran = ibrobot(
+        "config", "check", "mini.yaml", "--sim", "--deep", "--set",
+        f"control_modes.policy.inference.execution_mode={mode}", "--set", "transport={type: net}",
+    )  # fmt: skip
+    assert ran.code == code
+    assert ran.err == ("" if code == 0 else "error: mini.yaml: models.net: model.safetensors is missing\n")
 
 
 @pytest.mark.parametrize(

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from typing import override
 
-from ibrobot_core.calibration import load_calibration
 from ibrobot_core.config.schema import ControlMode, Inference
-from ibrobot_core.contract.check import check_policy
-from ibrobot_core.contract.joint_units import JointUnits, calibrations
 from ibrobot_core.contract.specs import Contract
-from ibrobot_core.dispatch.dispatcher import Dispatcher, check_strategy
-from ibrobot_core.errors import ContractError, PolicyError
+from ibrobot_core.dispatch.dispatcher import Dispatcher
+from ibrobot_core.errors import PolicyError
 from ibrobot_core.inference.client import EngineClient, InferenceClient, LockstepClient
 from ibrobot_core.inference.engine import Engine, LocalEngine
 from ibrobot_core.inference.policy_units import PolicyInItsUnits
@@ -21,6 +18,7 @@ from ibrobot_core.launch.absence import refuse
 from ibrobot_core.launch.builders.transport import NAME as TRANSPORT
 from ibrobot_core.launch.component import Component
 from ibrobot_core.launch.feeder import Feeder
+from ibrobot_core.launch.models import check_model
 from ibrobot_core.launch.session import Session
 from ibrobot_core.robot import Vector
 from ibrobot_core.units import NS_PER_S
@@ -68,30 +66,11 @@ class Model(Component):
     def start(self) -> None:
         model, session = self._model, self._session
         policy = session.registry.find("policy", model.type).make(model.options, session.context(model.name))
-        try:
-            check_policy(self.contract, policy.spec, model.norm_mode)
-        except ContractError as error:
-            raise ContractError(
-                f"model {model.name!r} does not fit the contract of {session.config.source}\n{error}"
-            ) from None
+        units = check_model(session.config, model, policy.spec, session.log)
         topics = {part.topic for key in policy.spec.observations for part in self.contract.parts(key)}
         refuse(session.absent, f"model {model.name!r}", topics.__contains__)
-        for mode in session.config.control_modes.values():
-            if mode.inference is not None and mode.inference.model == model.name:
-                where = f"{session.config.source}: control_modes.{mode.name}"
-                try:
-                    check_strategy(mode.dispatch, policy.spec)
-                except ContractError as error:
-                    raise ContractError(f"{where}.{error}") from None
-                if policy.spec.prompt and not mode.inference.prompt:
-                    raise ContractError(
-                        f"{where}.inference.prompt: is missing; model {model.name!r} wants to be told what to do, "
-                        "e.g. prompt: put the cube into the bin"
-                    )
-                if mode.inference.prompt and not policy.spec.prompt:
-                    session.log.warning("%s.inference.prompt: model %r takes no prompt", where, model.name)
-        if model.norm_mode != "radians":
-            policy = PolicyInItsUnits(policy, self._units())
+        if units is not None:
+            policy = PolicyInItsUnits(policy, units)
         self._policy = policy
         self._engine = self._made_engine(policy)
         self._engine.start()
@@ -126,12 +105,6 @@ class Model(Component):
             "model %s: pictures are sent as JPEG of quality %d, with a loss", self._model.name, quality
         )
         return codec
-
-    def _units(self) -> JointUnits:
-        config, name = self._session.config, self._model.calibration
-        each = {"model": load_calibration(name).snapshot()} if name is not None else calibrations(config)
-        joined = {joint: numbers for joints in each.values() for joint, numbers in joints.items()}
-        return JointUnits(self._model.norm_mode, self.contract, joined, config.document)
 
     @override
     def stop(self) -> None:

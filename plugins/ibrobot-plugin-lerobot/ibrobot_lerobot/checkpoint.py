@@ -41,6 +41,8 @@ _REAL_TIME_CHUNKING = frozenset({"evo1", "groot", "molmoact2", "pi0", "pi05", "s
 _CHUNK_SIZES = ("chunk_size", "action_chunk_size", "action_horizon", "n_action_steps")
 _SHORTER_CHUNKS = frozenset({"diffusion", "multi_task_dit"})
 """They predict a horizon, and give `n_action_steps` of it."""
+_ACTION_HEADS = {"act": "model.action_head.weight", "diffusion": "diffusion.unet.final_conv.1.weight"}
+"""Type -> the tensor of weights whose first dimension is the size of an action."""
 _EMPTY_CAMERA = "observation.images.empty_camera_"
 """Stands for a camera that a pretrained model had and the robot has not; the model fills it in."""
 
@@ -167,19 +169,23 @@ def rename_map(path: Path, step: Mapping[str, Any]) -> dict[str, str]:
     return names
 
 
-def check_weights(path: Path) -> None:
-    """See that there are weights, and that reading them runs no code.
+def check_weights(checkpoint: Checkpoint) -> None:
+    """See that there are weights, that reading them runs no code, and that they give actions of the right size.
 
     Raises:
-        PolicyError: when there are none, or in a format that carries code.
+        PolicyError: when there are none, in a format that carries code, or for another number of joints.
     """
+    path = checkpoint.path
     if (path / WEIGHTS).exists():
-        file = own_file(path, WEIGHTS)
+        file, head = own_file(path, WEIGHTS), _ACTION_HEADS.get(checkpoint.type, "")
         try:
-            with safe_open(file, framework="numpy"):
-                return  # the header was read, and fits the file
+            with safe_open(file, framework="numpy") as weights:  # reads the header alone
+                size = weights.get_slice(head).get_shape()[0] if head in weights.keys() else checkpoint.action_size  # noqa: SIM118
         except (OSError, SafetensorError) as error:
             raise PolicyError(f"{file}: cannot be read: {error}") from None
+        if size != checkpoint.action_size:
+            raise PolicyError(f"{file}: gives actions of {size} numbers, config.json says {checkpoint.action_size}")
+        return
     others = sorted(each.name for each in path.iterdir() if each.suffix in (".bin", ".pt", ".pth", ".ckpt", ".pkl"))
     if others:
         raise PolicyError(

@@ -68,8 +68,12 @@ class LeRobotPolicy(Policy):
         self._weights = ""
 
     @override
+    def check_weights(self) -> None:
+        check_weights(self._checkpoint)
+
+    @override
     def load(self) -> None:
-        check_weights(self._options.path)
+        self.check_weights()
         weights = hash_weights(self._options.path)
         model = _import("model").Model(self._checkpoint, self._options, self._pre, self._pictures, self._ctx.log)
         tensors = self.preprocess(self._zeros())

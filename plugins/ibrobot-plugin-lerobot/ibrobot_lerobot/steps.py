@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -145,6 +146,7 @@ def _normalise(path: Path, entry: Mapping[str, Any], *, inverse: bool) -> Normal
         names = [f"{key}.{statistic}" for statistic in _STATISTICS[mode]]
         if missing := [each for each in names if each not in flat]:
             raise PolicyError(f"{path.parent / entry['state_file']}: {mode} needs {missing[0]}, which is missing")
+        _check_sizes(path.parent / entry["state_file"], {each: flat[each] for each in names}, kind, feature["shape"])
         low, high = (_of_channels(flat[each], kind).astype(np.float32) for each in names)
         if mode != "MEAN_STD":
             high = np.where(high == low, eps, high - low)
@@ -152,6 +154,14 @@ def _normalise(path: Path, entry: Mapping[str, Any], *, inverse: bool) -> Normal
             high = high + eps
         modes[key], statistics[key] = mode, (low, high)
     return Normalise(modes, statistics, inverse)
+
+
+def _check_sizes(file: Path, statistics: Mapping[str, Array], kind: str, shape: Sequence[int]) -> None:
+    """See that statistics have a number for each of a feature's, or for each of a camera's channels."""
+    wanted = {math.prod(shape), *shape[:1]} if kind == "VISUAL" else {math.prod(shape)}
+    for name, statistic in statistics.items():
+        if statistic.size not in wanted:
+            raise PolicyError(f"{file}: {name} has shape {statistic.shape}, its feature {tuple(shape)}")
 
 
 def _of_channels(statistic: Array, kind: str) -> Array:

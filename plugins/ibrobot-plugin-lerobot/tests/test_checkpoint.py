@@ -247,6 +247,23 @@ def _relative(path: Path) -> None:
     file.write_text(json.dumps(document))
 
 
+def _statistics_of_another_robot(path: Path) -> None:
+    save_file({**STATISTICS, "action.mean": np.zeros(7, np.float32)}, path / "policy_postprocessor.safetensors")
+
+
+@pytest.mark.parametrize(("size", "fits"), [(6, True), (7, False)])
+def test_weights_are_compared_with_the_configuration_without_torch(tmp_path: Path, size: int, fits: bool) -> None:
+    policy = make(write(tmp_path / "act"))
+    with pytest.raises(PolicyError, match=r"has no weights: model.safetensors is missing"):
+        policy.check_weights()
+    save_file({"model.action_head.weight": np.zeros((size, 2), np.float32)}, tmp_path / "act/model.safetensors")
+    if fits:
+        policy.check_weights()
+    else:
+        with pytest.raises(PolicyError, match=r"safetensors: gives actions of 7 numbers, config.json says 6"):
+            policy.check_weights()
+
+
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
@@ -258,6 +275,7 @@ def _relative(path: Path) -> None:
         (_adapter, "has an adapter only"),
         (_no_statistics, "policy_preprocessor.safetensors: cannot be read"),
         (_too_few, "MIN_MAX needs observation.state.max, which is missing"),
+        (_statistics_of_another_robot, r"action.mean has shape \(7,\), its feature \(6,\)"),
         (_garbage, "policy_preprocessor.safetensors: cannot be read"),
         (_relative, "actions relative to the state"),
     ],

@@ -1,0 +1,106 @@
+"""A model against the robot: what can be compared before its weights are loaded, and before anything is powered."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable
+
+from ibrobot_core.calibration import load_calibration
+from ibrobot_core.config import RobotConfig
+from ibrobot_core.config.schema import ModelConfig
+from ibrobot_core.contract.check import check_policy
+from ibrobot_core.contract.joint_units import JointUnits, calibrations
+from ibrobot_core.contract.specs import Contract
+from ibrobot_core.dispatch.dispatcher import check_strategy
+from ibrobot_core.errors import ConfigError, ContractError, IbrobotError, Problem
+from ibrobot_core.inference.build import build_policy
+from ibrobot_core.interfaces import Policy, PolicySpec
+from ibrobot_core.plugins import Registry
+
+
+def check_model(config: RobotConfig, model: ModelConfig, spec: PolicySpec, log: logging.Logger) -> JointUnits | None:
+    """Compare a policy with the contract, and with the modes that use it.
+
+    Args:
+        config: the robot.
+        model: its entry under `models`.
+        spec: of its policy.
+        log: for what is odd, and no error.
+
+    Returns:
+        The conversion to the policy's unit of joint positions; None where that is radians.
+
+    Raises:
+        ContractError: where they differ, with both sides.
+        CalibrationError: when the unit needs a calibration that is not there.
+    """
+    contract = Contract.from_config(config, model.extra_observations)
+    try:
+        check_policy(contract, spec, model.norm_mode)
+    except ContractError as error:
+        raise ContractError(f"model {model.name!r} does not fit the contract of {config.source}\n{error}") from None
+    for mode in config.control_modes.values():
+        if mode.inference is None or mode.inference.model != model.name:
+            continue
+        where = f"{config.source}: control_modes.{mode.name}"
+        try:
+            check_strategy(mode.dispatch, spec)
+        except ContractError as error:
+            raise ContractError(f"{where}.{error}") from None
+        if spec.prompt and not mode.inference.prompt:
+            raise ContractError(
+                f"{where}.inference.prompt: is missing; model {model.name!r} wants to be told what to do, "
+                "e.g. prompt: put the cube into the bin"
+            )
+        if mode.inference.prompt and not spec.prompt:
+            log.warning("%s.inference.prompt: model %r takes no prompt", where, model.name)
+    return _units(config, model, contract) if model.norm_mode != "radians" else None
+
+
+def check_models(config: RobotConfig, registry: Registry, modes: Iterable[str]) -> list[str]:
+    """Compare the models of some modes with the robot, without loading any.
+
+    Returns:
+        A line for each model.
+
+    Raises:
+        ConfigError: with a problem for each model that does not fit, or cannot be read.
+    """
+    used = [mode.inference for name in modes if (mode := config.control_modes[name]).inference is not None]
+    loaded_here = {inference.model for inference in used if inference.execution_mode != "distributed"}
+    lines, problems = [], []
+    for name in dict.fromkeys(inference.model for inference in used):
+        try:
+            policy = build_policy(config, registry, name)
+            try:
+                _check(config, name, policy, weights=name in loaded_here)
+                lines.append(_line(name, policy.spec))
+            finally:
+                policy.close()
+        except IbrobotError as error:
+            problems.append(Problem(config.source, 0, f"models.{name}", str(error)))
+    if problems:
+        raise ConfigError(problems)
+    return lines
+
+
+def _check(config: RobotConfig, name: str, policy: Policy, *, weights: bool) -> None:
+    check_model(config, config.models[name], policy.spec, logging.getLogger("ibrobot"))
+    if weights:
+        policy.check_weights()
+
+
+def _line(name: str, spec: PolicySpec) -> str:
+    rate = f" at {spec.rate_hz:g} Hz" if spec.rate_hz is not None else ""
+    trained = "" if spec.contract is not None else "; what it was trained on is not known"
+    return (
+        f"model {name} fits the contract: {', '.join(spec.observations) or 'no observations'} -> "
+        f"{spec.action_size} joints in chunks of {spec.chunk_size}{rate}{trained}"
+    )
+
+
+def _units(config: RobotConfig, model: ModelConfig, contract: Contract) -> JointUnits:
+    name = model.calibration
+    each = {"model": load_calibration(name).numbers()} if name is not None else calibrations(config)
+    joined = {joint: numbers for joints in each.values() for joint, numbers in joints.items()}
+    return JointUnits(model.norm_mode, contract, joined, config.document)
