@@ -65,6 +65,14 @@ def test_options_refuse_what_makes_no_sense(make: object, message: str) -> None:
         make()  # type: ignore[operator]
 
 
+def test_egl_that_finds_no_driver_is_not_usable(tmp_path: Path) -> None:
+    """As with the package libegl1 alone. Real libraries, told of an empty folder of drivers."""
+    code = "from ibrobot_mujoco import gl; print(gl.usable())"
+    environment = {"__EGL_VENDOR_LIBRARY_DIRS": str(tmp_path), "PATH": ""}
+    ran = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert "egl" not in ran.stdout
+
+
 class TestOpenGl:
     """The choice of a backend, with the machine's libraries and display made up."""
 
