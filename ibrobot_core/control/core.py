@@ -426,7 +426,6 @@ class ControlCore:
     def _take_back(self) -> None:
         self._relaxed = False
         self._hardware.retake()
-        self._following.restart()
         self._health.restart()
         self._shedding = False
 

@@ -29,11 +29,7 @@ class FollowingError:
         distance = np.minimum(options.distance, robot.max_lead / 2)
         self._distance: Vector = np.where(robot.grips, np.inf, distance)
         self._longest = max(1, round(ns(options.timeout) / period_ns))
-        self.restart()
-
-    def restart(self) -> None:
-        """Begin to watch: no joint has been away yet."""
-        self._ticks = np.zeros(len(self._distance), dtype=np.int64)
+        self._ticks = np.zeros(len(distance), dtype=np.int64)
 
     @property
     def lost(self) -> NDArray[np.bool_]:

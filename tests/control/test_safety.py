@@ -238,6 +238,20 @@ def test_a_joint_that_is_pushed_away_takes_its_command_along() -> None:
     assert watched.tick(ZERO, np.array([-2.0]))[0] == pytest.approx(-2.0 + watched.robot.max_lead[0])
 
 
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_moving_joint_that_is_pushed_away_rests_where_its_lead_ends(side: int) -> None:
+    watched = Watched(one_joint(), PERIOD_NS)
+    watched.start(ZERO)
+    for _ in range(15):
+        watched.tick(np.array([1.9]))
+    assert watched.layer.velocity[0] > 2.0
+    pushed = watched.layer.current + side * 1.5
+    lead = watched.robot.max_lead[0]
+
+    for _ in range(10):
+        assert watched.tick(None, pushed)[0] == pytest.approx(pushed[0] - side * lead)
+
+
 def test_readings_that_repeat_do_not_let_the_command_run_away() -> None:
     watched = Watched(one_joint(), PERIOD_NS)
     watched.start(ZERO)
