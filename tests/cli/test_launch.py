@@ -25,10 +25,13 @@ from ibrobot_core.descriptors import (
     TeleopDescriptor, TransportDescriptor,
 )
 from ibrobot_core.errors import HardwareError, MissingDependency, TeleopError
+from ibrobot_core.interfaces import Holding
 from ibrobot_core.testing.fakes import FakeHardware, FakePlanner, FakePolicy, FakeRealHardware, FakeTeleop
 
 class Scene(FakeHardware):
-    """Done after half a second, but never with seed 13; silent after two seconds with seed 66."""
+    """Done after half a second, but never with seed 13; silent after two seconds with seed 66; seed 7 holds torque."""
+    def holding(self):
+        return Holding("/dev/ttyARM", "arm torque off") if self.seed == 7 else None
     def reset(self, episode):
         super().reset(episode)
         self.ticks, self.seed = 0, episode.seed
@@ -314,3 +317,10 @@ def test_options_that_make_no_sense_are_refused(launch: Callable[..., Ran], argu
     assert ran.code == 2
     assert told in ran.err
     assert ran.out == ""
+
+
+@pytest.mark.parametrize("mode", ["plan", "person", "bug"], ids=["ended", "interrupted", "failed"])
+def test_what_holds_torque_is_said_however_the_run_ends(launch, mode):
+    ran = launch("--sim", "--lockstep", "--headless", "--mode", mode, "--duration", "2", "--seed", "7")
+
+    assert ran.err.count("/dev/ttyARM holds torque; to take it off: arm torque off") == 1
