@@ -14,7 +14,7 @@ from ibrobot_core.errors import HardwareError
 from ibrobot_core.robot import Vector
 from ibrobot_core.units import radians_to_ticks, ticks_to_radians
 from ibrobot_feetech.bus import FeetechBus
-from ibrobot_feetech.errors import FeetechError, NoReply
+from ibrobot_feetech.errors import FeetechError, NoReply, TorqueStaysOn
 from ibrobot_feetech.registers import MODEL_STS3215
 from ibrobot_feetech.supply import check_supply
 
@@ -164,32 +164,34 @@ def write_eprom(bus: FeetechBus, servo: int, values: Mapping[str, int]) -> None:
     Raises:
         FeetechError: when it did not take one.
     """
-    bus.write(servo, "torque_enable", 0)
-    bus.write(servo, "lock", 0)
+    bus.write(servo, "torque_enable", 0, faulty=True)
+    bus.write(servo, "lock", 0, faulty=True)
     try:
         for name, value in values.items():
-            bus.write(servo, name, value)
+            bus.write(servo, name, value, faulty=True)
     finally:
-        bus.write(servo, "lock", 1)
+        bus.write(servo, "lock", 1, faulty=True)
     for name, value in values.items():
-        if (found := bus.read(servo, name)) != value:
+        if (found := bus.read_faulty(servo, name)) != value:
             raise FeetechError(bus.place(servo, name), f"it was set to {value} and reads {found}")
 
 
 def set_up(bus: FeetechBus, arm: Arm, tuning: Tuning, servo: int, *, torque: bool = True) -> None:
     """Set one servo up: torque off, unlock, its registers, lock, and with `torque` on again where the joint stands.
 
+    Errors that it reports meanwhile are accepted: taking torque off is what ends some of them.
+
     Raises:
         FeetechError: when it does not take a register.
     """
-    bus.write(servo, "torque_enable", 0)
-    bus.write(servo, "lock", 0)
-    phase = bus.read(servo, "phase")
+    bus.write(servo, "torque_enable", 0, faulty=True)
+    bus.write(servo, "lock", 0, faulty=True)
+    phase = bus.read_faulty(servo, "phase")
     if phase & _ANGLE_BEYOND_A_TURN:
-        bus.write(servo, "phase", phase & ~_ANGLE_BEYOND_A_TURN)
+        bus.write(servo, "phase", phase & ~_ANGLE_BEYOND_A_TURN, faulty=True)
     for name, value in {**tuning.registers, **tuning.special.get(arm.names[servo], {})}.items():
-        bus.write(servo, name, value)
-    bus.write(servo, "lock", 1)
+        bus.write(servo, name, value, faulty=True)
+    bus.write(servo, "lock", 1, faulty=True)
     if torque:
         hold(bus, servo)
 
@@ -210,22 +212,23 @@ def hold(bus: FeetechBus, servo: int) -> None:
 
 
 def relax(bus: FeetechBus, servos: Sequence[int]) -> None:
-    """Torque off, on all servos at once, and see that it is.
+    """Torque off, on all servos at once, and see that it is; errors that they report are no reason to leave it on.
 
     Raises:
-        FeetechError: naming a servo whose torque is not known to be off.
+        TorqueStaysOn: naming a servo that says so.
+        FeetechError: naming one that did not say whether it is off, or a port that is gone.
     """
     last: FeetechError | None = None
     for _ in range(bus.retries + 1):
         bus.sync_write("torque_enable", dict.fromkeys(servos, 0))
         try:
-            on = [servo for servo, value in bus.sync_read("torque_enable", servos).items() if value]
-        except FeetechError as error:
+            on = [servo for servo, value in bus.sync_read("torque_enable", servos, faulty=True).items() if value]
+        except NoReply as error:
             last = error
             continue
         if not on:
             return
-        last = FeetechError(bus.place(on[0], "torque_enable"), "its torque stays on")
+        last = TorqueStaysOn(bus.place(on[0], "torque_enable"), "its torque stays on")
     assert last is not None
     raise last
 

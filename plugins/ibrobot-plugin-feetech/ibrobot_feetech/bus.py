@@ -135,8 +135,14 @@ class FeetechBus:
         """As `read`, also from a servo that reports an error of its own."""
         return self._retried(lambda: self._read_once(servo, register(name), faulty=True))
 
-    def write(self, servo: int, name: str, value: int) -> None:
+    def write(self, servo: int, name: str, value: int, *, faulty: bool = False) -> None:
         """Set a register and wait for the servo to say that it is set.
+
+        Args:
+            servo: its id.
+            name: of the register.
+            value: what it is set to.
+            faulty: whether a servo may report an error of its own meanwhile, e.g. while its torque is taken off.
 
         Raises:
             FeetechError: when it did not, after all retries, or for a register of EPROM while that is locked.
@@ -147,7 +153,7 @@ class FeetechBus:
         # A servo acknowledges this all the same, and forgets the value without power.
         if target.area == "eprom" and self.read_faulty(servo, "lock"):
             raise EpromLocked(self.place(servo, name), f"EPROM is locked, {value} was not written")
-        self._retried(lambda: self._write_once(servo, target, value, request))
+        self._retried(lambda: self._write_once(servo, target, value, request, faulty=faulty))
 
     def reg_write(self, servo: int, name: str, value: int) -> None:
         """Prepare a register's value, which `action` sets.
@@ -157,15 +163,15 @@ class FeetechBus:
         """
         target = writable(name)
         request = protocol.reg_write(servo, target.address, target.encode(value))
-        self._acknowledged(servo, target, request)
+        self._acknowledged(servo, target, request, faulty=False)
 
     def action(self) -> None:
         """Set on all servos at once what `reg_write` prepared; none answers."""
         self.counters["requests"] += 1
         self.port.write(protocol.action())
 
-    def sync_read(self, name: str, servos: Sequence[int]) -> dict[int, int]:
-        """Servo id -> value of a register, asked for in one request.
+    def sync_read(self, name: str, servos: Sequence[int], *, faulty: bool = False) -> dict[int, int]:
+        """Servo id -> value of a register, asked for in one request; with `faulty` also of servos that report errors.
 
         Raises:
             FeetechError: when a servo did not answer well, after all retries.
@@ -177,7 +183,7 @@ class FeetechBus:
             if not self._span(missing, target.address, target.size)[1]:
                 self.resynchronise()
             for servo, (content, code) in self.sync_read_span(target.address, target.size, missing).items():
-                if code:
+                if code and not faulty:
                     raise ServoFault(self.place(servo, name), protocol.faults(code))
                 values[servo] = target.decode(content)
             missing = [servo for servo in servos if servo not in values]
@@ -265,10 +271,10 @@ class FeetechBus:
         skip = target.address - start
         return target.decode(packet.parameters[skip : skip + target.size])
 
-    def _write_once(self, servo: int, target: Register, value: int, request: bytes) -> None:
+    def _write_once(self, servo: int, target: Register, value: int, request: bytes, *, faulty: bool) -> None:
         if not self.may_be_late(servo, 0):
             try:
-                self._acknowledged(servo, target, request)
+                self._acknowledged(servo, target, request, faulty=faulty)
             except NoReply:
                 pass  # it may have been set all the same: the register tells
             else:
@@ -282,10 +288,10 @@ class FeetechBus:
         if found != value:
             raise UnexpectedReply(self.place(servo, target.name), f"it was set to {value} and reads {found}")
 
-    def _acknowledged(self, servo: int, target: Register, request: bytes) -> None:
+    def _acknowledged(self, servo: int, target: Register, request: bytes, *, faulty: bool) -> None:
         extra_s = _EPROM_S if target.area == "eprom" else 0.0
         packet = self._exchange(servo, 0, request, target.name, extra_s)
-        if packet.code:
+        if packet.code and not faulty:
             raise ServoFault(self.place(servo, target.name), protocol.faults(packet.code))
 
     def _exchange(self, servo: int, length: int, request: bytes, name: str, extra_s: float = 0.0) -> Packet:

@@ -85,6 +85,12 @@ class EpromLocked(FeetechError):
     check = "set `lock` to 0 first, and to 1 afterwards"
 
 
+class TorqueStaysOn(FeetechError):
+    """A servo whose torque was taken off and that says it is on."""
+
+    check = "cut its power before you touch the arm"
+
+
 class ServoFault(FeetechError):
     """A servo that reports an error of its own, e.g. overheating; `faults` names them."""
 

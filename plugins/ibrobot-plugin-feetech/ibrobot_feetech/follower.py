@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import shlex
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import override
 
 import numpy as np
@@ -11,15 +13,16 @@ from numpy.typing import NDArray
 
 from ibrobot_core.calibration import load_calibration
 from ibrobot_core.errors import HardwareError
-from ibrobot_core.interfaces import Context, Hardware, JointReading, Signal, Torque, nan_vector
+from ibrobot_core.interfaces import Condition, Context, Hardware, Holding, JointReading, Signal, Torque, nan_vector
 from ibrobot_core.robot import Vector
 from ibrobot_core.units import ns, seconds
 from ibrobot_feetech import arm as servos
 from ibrobot_feetech.arm import Arm, Tuning
 from ibrobot_feetech.bus import RETURN_DELAY_S, FeetechBus
-from ibrobot_feetech.errors import FeetechError, NoReply, Place, PortError, ServoFault
+from ibrobot_feetech.errors import FeetechError, NoReply, Place, PortError, ServoFault, TorqueStaysOn
+from ibrobot_feetech.health import Health, Measured, SteadyLoad, Supply
 from ibrobot_feetech.options import FollowerOptions
-from ibrobot_feetech.protocol import faults
+from ibrobot_feetech.protocol import OVER_CURRENT, OVERLOAD, faults
 from ibrobot_feetech.sync import Replies, SyncReader, SyncWriter
 from ibrobot_feetech.usb import check_adapter
 
@@ -30,16 +33,18 @@ _MAX_ACCELERATION, _MAX_SPEED = 40_000, 4_000
 """What a joint can do beside that [ticks/s^2, ticks/s]."""
 _AGAIN = 0.4
 """Part of a tick within which servos that did not answer well are asked once more."""
-_HEALTH = (("temperature", "present_temperature", 1.0), ("voltage", "present_voltage", 0.1))
-_CURRENT_A = 0.0065
+_HEALTH_AGAIN_S = 0.05
+"""After which a health read that was not complete is tried again [s]: it is long, and more of it may be damaged."""
+_VOLTAGE_V, _CURRENT_A, _LOAD = 0.1, 0.0065, 1e-3
 
 
 class FeetechFollower(Hardware):
     """Each tick one sync read of position, velocity and load, and one sync write of goals.
 
     A reply that is lost, damaged or implausible leaves the joint where it was, for `lost_replies` ticks, in readings
-    that are stale; then, and at once for an error that a servo reports, it is a fault, which `reset_faults` ends by
-    setting the servos up anew. Until then `read` fails without waiting for anything.
+    that are stale; then it is a fault, and until `reset_faults` `read` fails without waiting for anything. What servos
+    report of themselves is in `health`; a fault there leaves `read` as it is. `reset_faults` sets servos up that lost
+    power, torque or their connection or are in error; a joint that holds on in overload keeps its grasp.
 
     Args:
         options: the YAML's.
@@ -69,16 +74,17 @@ class FeetechFollower(Hardware):
             Signal(f"/{ctx.name}/{name}", size, f"of each servo [{unit}]")
             for name, unit in (("temperature", "deg C"), ("voltage", "V"), ("current", "A"), ("load", "of full torque"))
         )
-        self._health = [nan_vector(size) for _ in self.signals]
+        self._values = [nan_vector(size) for _ in self.signals]
+        self._health = Health(options, ctx.joints, self._place)
+        self._load = SteadyLoad(size, ns(options.health_period))
         self._lost = np.zeros(size, dtype=np.intp)
         self._health_due_ns = 0
         self._speed: Vector = np.zeros(size)
         self._velocity: Vector = np.zeros(size)
-        self._complaints = np.zeros(size, dtype=np.uint8)
         self._counts = {"lost_replies": 0, "implausible_positions": 0}
         self._again_s = _AGAIN * seconds(ctx.period_ns)
         self._fault: HardwareError | None = None
-        self._relaxed = False
+        self._relaxed = self._holding = False
         self._limits = ctx.robot.lower[order], ctx.robot.upper[order]
 
     @override
@@ -87,14 +93,16 @@ class FeetechFollower(Hardware):
         self._fault = HardwareError(f"{self._ctx.name}: not connected")
         bus.open()
         bus.return_delay_s = RETURN_DELAY_S
+        self._relaxed = False
         try:
             check_adapter(arm.calibration, self._options.port)
             servos.find_servos(bus, arm)
             self._check_calibration()
-            for servo in arm.servos:
-                servos.set_up(bus, arm, self._tuning(), servo)
+            self._set_up(arm.servos)
             self._start()
+            self._health.begin(self._supply())
         except BaseException:
+            self._undo()
             bus.close()
             raise
         self._ctx.log.info("%s: %s", self._ctx.name, arm.zero_text)
@@ -105,21 +113,22 @@ class FeetechFollower(Hardware):
         if self._fault is not None:
             raise self._fault
         begun_ns = self._ctx.clock.now_ns()
-        healthy = begun_ns >= self._health_due_ns
+        reader = self._health_reader if begun_ns >= self._health_due_ns else self._reader
         try:
-            reader = self._health_reader if healthy else self._reader
             replies = reader.read(time.monotonic() + self._again_s)
             stamp_ns = (begun_ns + self._ctx.clock.now_ns()) // 2
             values = replies.values
-            good = replies.answered & self._plausible(values[:, 0], replies.answered, stamp_ns)
-            self._check(replies, good)
+            motion = values[:, reader.registers.index("present_position") :]
+            good = replies.answered & self._plausible(motion[:, 0], replies.answered, stamp_ns)
+            self._check_lost(replies, good)
         except FeetechError as error:
             self._fault = error
             raise
-        self._take(values, good, stamp_ns)
-        if healthy and good.all():
-            self._health_due_ns = begun_ns + ns(self._options.health_period)
-            self._take_health(values)
+        self._health.report(replies.errors, replies.answered)
+        self._take(motion, good, stamp_ns)
+        if reader is self._health_reader:
+            pause_s = self._take_health(values, begun_ns) if good.all() else _HEALTH_AGAIN_S
+            self._health_due_ns = begun_ns + ns(pause_s)
         stale = bool(self._lost.any())
         position = self._arm.radians(self._ticks.astype(np.float64))
         return JointReading(stamp_ns, position, self._velocity.copy(), self._effort(), stale)
@@ -131,6 +140,7 @@ class FeetechFollower(Hardware):
         if not self._bus.is_open:
             raise HardwareError(f"{self._ctx.name}: not connected")
         if self._relaxed:
+            self._holding = True
             for servo in self._arm.servos:
                 servos.hold(self._bus, servo)
             self._relaxed = False
@@ -138,14 +148,33 @@ class FeetechFollower(Hardware):
 
     @override
     def relax(self) -> Torque:
-        servos.relax(self._bus, self._arm.servos)
-        self._relaxed = True
+        try:
+            servos.relax(self._bus, self._arm.servos)
+        except TorqueStaysOn:
+            raise
+        except FeetechError as error:
+            self._relaxed = True
+            self._ctx.log.warning("whether the torque is off is not known: %s", error)
+            return Torque.UNKNOWN
+        self._relaxed, self._holding = True, False
         return Torque.OFF
+
+    @override
+    def holding(self) -> Holding | None:
+        if not self._holding:
+            return None
+        port, ids = self._options.port, self._arm.servos
+        others = "" if sorted(ids) == [*range(1, 7)] else "".join(f" --id {servo}" for servo in ids)
+        return Holding(port, f"ibrobot feetech torque off {shlex.quote(port)}{others}")
+
+    @override
+    def health(self) -> Sequence[Condition]:
+        return self._health.conditions
 
     @override
     def reset_faults(self) -> None:
         fault = self._fault
-        if fault is None:
+        if fault is None and not self._health.faulty:
             return
         bus, arm = self._bus, self._arm
         if isinstance(fault, PortError) or not bus.is_open:
@@ -155,12 +184,10 @@ class FeetechFollower(Hardware):
         bus.return_delay_s = RETURN_DELAY_S
         bus.resynchronise()
         servos.find_servos(bus, arm)
-        for servo in arm.servos:
-            # A servo that kept its settings and its torque goes on holding its joint.
-            troubled = bus.read_faulty(servo, "status") or bus.read_faulty(servo, "torque_enable") != 1
-            if troubled or servo == _servo(fault):
-                servos.set_up(bus, arm, self._tuning(), servo, torque=not self._relaxed)
+        # A servo that kept its settings and its torque goes on holding its joint.
+        self._set_up([servo for servo in arm.servos if self._is_troubled(servo)])
         self._start()
+        self._health.reset()
 
     @override
     def disconnect(self) -> None:
@@ -173,21 +200,52 @@ class FeetechFollower(Hardware):
 
     @override
     def read_signal(self, index: int, out: Vector) -> None:
-        out[:] = self._health[index]
+        out[:] = self._values[index]
+
+    def _set_up(self, ids: Sequence[int]) -> None:
+        """Set servos up; torque on where they stand, unless the arm is relaxed."""
+        for servo in ids:
+            self._holding = self._holding or not self._relaxed
+            servos.set_up(self._bus, self._arm, self._tuning(), servo, torque=not self._relaxed)
+
+    def _undo(self) -> None:
+        """After a start that failed: torque off, as far as can be; what is not known to be off counts as held."""
+        if self._holding:
+            with suppress(TorqueStaysOn):
+                self.relax()
+
+    def _is_troubled(self, servo: int) -> bool:
+        """Whether a servo has lost its settings or torque, or is in an error that torque off and on ends.
+
+        Raises:
+            ServoFault: for an error that lasts all the same, e.g. heat; its torque stays as it is.
+        """
+        code = self._bus.read_faulty(servo, "status")
+        if lasting := code & ~(OVERLOAD | OVER_CURRENT):
+            raise ServoFault(self._bus.place(servo, "status"), faults(lasting))
+        if code == OVERLOAD and self._arm.names[servo] in self._options.gentle:
+            code = 0
+        return bool(code) or self._bus.read_faulty(servo, "torque_enable") != 1
+
+    def _supply(self) -> Supply:
+        names = ("min_voltage_limit", "max_voltage_limit", "present_voltage")
+        values = (self._bus.sync_read(name, self._arm.servos, faulty=True) for name in names)
+        return Supply(*(np.array(list(each.values())) * _VOLTAGE_V for each in values))
 
     def _start(self) -> None:
         """Begin to read anew: from where the joints stand, which every servo must say."""
         bus, ids = self._bus, self._arm.servos
         bus.return_delay_s = 0.0
         self._reader = SyncReader(bus, ids, "present_position", "present_load")
-        self._health_reader = SyncReader(bus, ids, "present_position", "present_current")
+        self._health_reader = SyncReader(bus, ids, "torque_enable", "present_current")
         self._writer = SyncWriter(bus, ids)
-        self._ticks = np.array(list(bus.sync_read("present_position", ids).values()), dtype=np.intp)
+        self._ticks = np.array(list(bus.sync_read("present_position", ids, faulty=True).values()), dtype=np.intp)
         self._doubtful = self._ticks
         self._ticks_ns = self._doubtful_ns = np.full(len(ids), self._ctx.clock.now_ns())
         self._speed = np.zeros(len(ids))
         self._velocity = np.zeros(len(ids))
         self._lost[:] = 0
+        self._load.begin(self._ctx.clock.now_ns())
         self._health_due_ns = 0
         self._fault = None
 
@@ -206,13 +264,8 @@ class FeetechFollower(Hardware):
         self._doubtful_ns = np.where(answered & inside, stamp_ns, self._doubtful_ns)
         return good
 
-    def _check(self, replies: Replies, good: NDArray[np.bool_]) -> None:
-        """Raise what ends the reading: errors that servos report, and replies that are missing for too long."""
-        # Damage that passes the checksum must not stop the robot: an error counts when it is reported twice.
-        lasting, self._complaints = replies.errors & self._complaints, replies.errors
-        if lasting.any():
-            index = int(np.flatnonzero(lasting)[0])
-            raise ServoFault(self._place(index), faults(int(lasting[index])))
+    def _check_lost(self, replies: Replies, good: NDArray[np.bool_]) -> None:
+        """Raise where good replies are missing for too long."""
         self._lost = np.where(good, 0, self._lost + 1)
         self._counts["lost_replies"] += int((~replies.answered).sum())
         if (self._lost > self._options.lost_replies).any():
@@ -227,26 +280,26 @@ class FeetechFollower(Hardware):
         self._ticks_ns = np.where(good, stamp_ns, self._ticks_ns)
         self._speed = np.where(good, velocity, self._speed)
         self._velocity = self._speed * self._arm.sign * _RADIANS_PER_TICK
-        self._health[3] = np.where(good, load * self._arm.sign * 1e-3, self._health[3])
+        self._values[3] = np.where(good, load * self._arm.sign * _LOAD, self._values[3])
+        self._load.add(self._values[3], good)
 
-    def _take_health(self, values: NDArray[np.intp]) -> None:
-        columns = self._health_reader.registers
-        for index, (_, name, unit) in enumerate(_HEALTH):
-            self._health[index] = values[:, columns.index(name)].astype(np.float64) * unit
-        self._health[2] = values[:, columns.index("present_current")].astype(np.float64) * _CURRENT_A
-        hot = np.flatnonzero(self._health[0] > self._options.max_temperature)
-        if hot.size:
-            found = f"{self._health[0][hot[0]]:.0f} deg C, above max_temperature ({self._options.max_temperature:g})"
-            self._fault = ServoFault(self._place(int(hot[0])), (f"overheating: {found}",))
-            raise self._fault
+    def _take_health(self, values: NDArray[np.intp], now_ns: int) -> float:
+        """Take a complete slow reading in; returns how long until the next one [s]."""
+        columns = dict(zip(self._health_reader.registers, values.T.astype(np.float64), strict=True))
+        self._values[0] = columns["present_temperature"]
+        self._values[1] = columns["present_voltage"] * _VOLTAGE_V
+        self._values[2] = columns["present_current"] * _CURRENT_A
+        torque = None if self._relaxed else columns["torque_enable"] == 1
+        measured = Measured(self._values[0], self._values[1], self._load.held(now_ns), torque)
+        return 0.0 if self._health.measure(measured) else self._options.health_period
 
     def _effort(self) -> Vector:
         if self._options.stall_torque is None:
             return nan_vector(len(self.joints))
-        return self._health[3] * self._options.stall_torque
+        return self._values[3] * self._options.stall_torque
 
     def _place(self, index: int) -> Place:
-        return self._bus.place(self._arm.servos[index], "status")
+        return self._bus.place(self._arm.servos[index])
 
     def _check_calibration(self) -> None:
         differences = servos.calibration_differences(self._bus, self._arm)
@@ -291,7 +344,3 @@ def _reach(elapsed_s: Vector) -> Vector:
     """How far from the expected position a joint can get in that time [ticks]."""
     reach: Vector = _SLACK_TICKS + np.minimum(_MAX_ACCELERATION * elapsed_s, _MAX_SPEED) * elapsed_s
     return reach
-
-
-def _servo(fault: HardwareError) -> int | None:
-    return fault.place.servo if isinstance(fault, ServoFault) else None

@@ -28,8 +28,26 @@ class FollowerOptions:
     gentle: tuple[str, ...] = option(
         ("gripper",), help="joints that hold things: half the torque and current, a quarter of the torque in overload"
     )
-    health_period: float = option(1.0, unit="s", gt=0, help="how often voltage, temperature and current are read")
+    health_period: float = option(
+        1.0, unit="s", gt=0, help="how often torque, voltage, temperature and current are read"
+    )
+    warning_temperature: float = option(55.0, unit="deg C", gt=0, le=80, help="of a servo; above it is a warning")
     max_temperature: float = option(65.0, unit="deg C", gt=0, le=80, help="of a servo; above it is a fault")
+    warning_voltage_drop: float = option(
+        0.15, gt=0, lt=1, help="part of the voltage at the start by which it may fall; more is a warning"
+    )
+    max_voltage_drop: float = option(
+        0.3,
+        gt=0,
+        lt=1,
+        help="part of the voltage at the start by which it may fall; more is a fault, as are the servos' own limits",
+    )
+    warning_load: float = option(
+        0.7, unit="of full torque", gt=0, le=1, help="of a joint, not gentle, for a whole health_period: a warning"
+    )
+    max_load: float = option(
+        0.95, unit="of full torque", gt=0, le=1, help="of a joint, not gentle, for a whole health_period: a fault"
+    )
     stall_torque: float | None = option(
         None, unit="Nm", gt=0, help="turns the servos' load into an estimate of effort; without it there is none"
     )

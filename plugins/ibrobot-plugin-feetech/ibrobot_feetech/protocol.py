@@ -28,6 +28,8 @@ class Instruction(IntEnum):
     SYNC_WRITE = 0x83
 
 
+OVERLOAD, OVER_CURRENT = 0x20, 0x08
+"""Bits of a status packet's error byte that last until torque was off."""
 FAULTS: Mapping[int, str] = {0: "voltage", 1: "angle sensor", 2: "overheating", 3: "over-current", 5: "overload"}
 """Bit of a status packet's error byte -> what it means."""
 

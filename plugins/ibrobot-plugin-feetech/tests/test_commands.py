@@ -403,6 +403,32 @@ def test_torque_comes_without_a_jump_and_goes_after_asking(emulator):
     assert emulator.servos[5].torque
 
 
+def test_torque_off_ends_well_although_a_servo_is_in_overload(emulator):
+    for servo in emulator.servos.values():
+        servo.set("torque_enable", 1)
+    emulator.faults.errors[6] = 0x20
+    code, screen = ran("torque", "off", emulator.port, "--yes")
+    assert code == 0, screen
+    assert not any(servo.torque for servo in emulator.servos.values())
+
+
+def test_torque_off_that_nothing_confirms_is_an_error_that_names_the_servo(emulator):
+    emulator.faults.silent.add(4)
+    code, screen = ran("torque", "off", emulator.port, "--yes")
+    assert code == 1
+    assert "servo 4 (wrist_flex), torque_enable: no reply" in screen
+
+
+def test_torque_of_servos_by_their_ids(emulator):
+    for servo in emulator.servos.values():
+        servo.set("torque_enable", 1)
+    assert ran("torque", "off", emulator.port, "--id", "2", "--id", "5", "--yes")[0] == 0
+    assert [servo for servo, each in emulator.servos.items() if each.torque] == [1, 3, 4, 6]
+    code, screen = ran("torque", "off", emulator.port, "--id", "2", "--joint", "gripper")
+    assert code == 2
+    assert "give one or the other" in screen
+
+
 def test_a_port_that_is_missing_forbidden_or_not_said_is_told(tmp_path):
     code, screen = ran("scan", str(tmp_path / "ttyACM9"))
     assert code == 1

@@ -14,14 +14,15 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from ibrobot_feetech.emulator import EmulatedServo, Emulator
-from ibrobot_feetech.errors import FeetechError, NoReply, PortError, ServoFault
+from ibrobot_feetech.errors import NoReply, PortError, ServoFault
 from ibrobot_feetech.follower import FeetechFollower
 from ibrobot_feetech.options import FollowerOptions
+from ibrobot_feetech.protocol import OVERLOAD
 
-from ibrobot_core.calibration import Calibration, save_calibration
+from ibrobot_core.calibration import Calibration, load_calibration, save_calibration
 from ibrobot_core.clock import SteppedClock
 from ibrobot_core.errors import CalibrationError, HardwareError
-from ibrobot_core.interfaces import Context, Hardware
+from ibrobot_core.interfaces import Context, Hardware, Holding, Severity, Torque
 from ibrobot_core.testing.contexts import START_NS, control_context
 from ibrobot_core.testing.hardware import HardwareSuite
 
@@ -89,11 +90,11 @@ def rig(calibration_file: Path) -> Iterator[Rig]:
 
 
 @contextmanager
-def rig_of(file: Path, link: Path | None = None, **options: Any) -> Iterator[Rig]:
+def rig_of(file: Path, link: Path | None = None, servos: Any = 6, **options: Any) -> Iterator[Rig]:
     """On a line; with `link` on a pseudo-terminal."""
     clock = SteppedClock(START_NS)
-    with Line(6, clock=clock) if link is None else Emulator(6, clock=clock, link=link) as emulator:
-        prepare(emulator, arm_calibration())
+    with Line(servos, clock=clock) if link is None else Emulator(servos, clock=clock, link=link) as emulator:
+        prepare(emulator, load_calibration(file))
         ctx = control_context("arm", clock=clock)
         port = str(link) if link is not None else emulator.port
         follower = FeetechFollower(FollowerOptions(port=port, calibration=str(file), **options), ctx)
@@ -199,26 +200,6 @@ class TestFaults:
         rig.run(2)
         rig.emulator.faults.silent.clear()
         assert not rig.tick().stale
-
-    @pytest.mark.parametrize(
-        ("bits", "names"), [(0x04, "overheating"), (0x20, "overload"), (0x09, "voltage, over-cur")]
-    )
-    def test_what_a_servo_reports_twice_is_a_fault(self, rig: Rig, bits: int, names: str) -> None:
-        rig.emulator.faults.errors[5] = bits
-        rig.tick()
-        with pytest.raises(ServoFault, match=rf"servo 5 \(wrist_roll\), status: the servo reports {names}"):
-            rig.tick()
-        rig.emulator.faults.errors.clear()
-        with pytest.raises(ServoFault):
-            rig.tick()
-        rig.follower.reset_faults()
-        assert not rig.tick().stale
-
-    def test_a_hot_servo_is_a_fault_before_it_reports_it(self, rig: Rig) -> None:
-        rig.tick()
-        rig.emulator.servos[2].set("present_temperature", 66)
-        with pytest.raises(ServoFault, match=r"shoulder_lift.*overheating: 66 deg C, above max_temperature \(65\)"):
-            rig.run(101)
 
     def test_writes_go_on_after_a_fault(self, rig: Rig) -> None:
         goal = rig.tick().position + 0.1
@@ -330,11 +311,242 @@ class TestTorque:
         rig.run(2, rig.run(2)[-1].position)
         assert rig.register("torque_enable") == [1] * 6
 
-    def test_torque_that_stays_on_is_an_error_and_not_a_hope(self, rig: Rig) -> None:
+    def test_an_overload_is_no_reason_to_leave_torque_on(self, rig: Rig) -> None:
+        rig.emulator.faults.overloaded |= {2, 6}
+        rig.run(210)
+        assert [code & OVERLOAD for code in rig.register("status")] == [0, OVERLOAD, 0, 0, 0, OVERLOAD]
+        assert rig.follower.relax() is Torque.OFF
+        assert rig.register("torque_enable") == [0] * 6
+        assert rig.follower.holding() is None
+
+    def test_torque_that_nothing_confirms_is_unknown_and_named(
+        self, rig: Rig, caplog: pytest.LogCaptureFixture
+    ) -> None:
         rig.emulator.faults.silent.add(4)
-        with pytest.raises(FeetechError, match=r"servo 4 \(wrist_flex\), torque_enable: no reply"):
-            rig.follower.relax()
+        assert rig.follower.relax() is Torque.UNKNOWN
         assert [value for i, value in enumerate(rig.register("torque_enable")) if i != 3] == [0] * 5
+        assert "servo 4 (wrist_flex), torque_enable: no reply" in caplog.text
+        assert rig.follower.holding() == Holding(rig.emulator.port, f"ibrobot feetech torque off '{rig.emulator.port}'")
+
+    def test_torque_that_stays_on_is_an_error(self, rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(rig.emulator.servos[4], "write", lambda address, content: None)
+        with pytest.raises(HardwareError, match=r"servo 4 \(wrist_flex\), torque_enable: its torque stays on; cut its"):
+            rig.follower.relax()
+        assert rig.register("torque_enable") == [0, 0, 0, 1, 0, 0]
+        assert rig.follower.holding() is not None
+
+    def test_a_port_that_is_gone_leaves_it_unknown(self, ports: None, tmp_path: Path, calibration_file: Path) -> None:
+        with rig_of(calibration_file, link=tmp_path / "port") as rig:
+            assert rig.follower.holding() is None
+            rig.follower.connect()
+            rig.emulator.unplug()
+            assert rig.follower.relax() is Torque.UNKNOWN
+            rig.follower.disconnect()
+            command = f"ibrobot feetech torque off {tmp_path / 'port'}"
+            assert rig.follower.holding() == Holding(str(tmp_path / "port"), command)
+
+    def test_the_command_names_servos_that_are_not_those_of_an_so101(self, tmp_path: Path) -> None:
+        joints = arm_calibration().joints
+        moved = {name: attrs.evolve(joint, id=joint.id + 10) for name, joint in joints.items()}
+        file = save_calibration(Calibration(moved), tmp_path / "second.json")
+        with rig_of(file, servos={number: EmulatedServo(number) for number in range(11, 17)}) as rig:
+            rig.follower.connect()
+            held = rig.follower.holding()
+            assert held is not None
+            assert held.command.endswith("--id 11 --id 12 --id 13 --id 14 --id 15 --id 16")
+
+    @pytest.mark.parametrize("lost", [2, 6])
+    def test_a_failed_start_takes_off_the_torque_that_it_put_on(self, lost: int, calibration_file: Path) -> None:
+        with rig_of(calibration_file, retries=0) as rig:
+            servos = rig.emulator.servos
+
+            def lose() -> None:
+                if servos[lost].torque:
+                    rig.emulator.faults.silent.add(lost)
+                elif any(servo.torque for servo in servos.values()):
+                    lose.torque = True  # type: ignore[attr-defined]
+
+            rig.emulator.on_request = lose
+            with pytest.raises(NoReply, match=f"servo {lost} "):
+                rig.follower.connect()
+            assert lose.torque  # type: ignore[attr-defined]
+            assert [servo.torque for servo in servos.values()] == [number == lost for number in servos]
+            assert rig.follower.holding() is not None, "the silent servo may hold"
+
+    def test_a_start_that_fails_before_torque_is_on_holds_nothing(self, calibration_file: Path) -> None:
+        with rig_of(calibration_file) as rig:
+            rig.emulator.faults.errors[3] = 0x01
+            with pytest.raises(ServoFault, match=r"servo 3 \(elbow_flex\).*voltage"):
+                rig.follower.connect()
+            assert rig.register("torque_enable") == [0] * 6
+            assert rig.follower.holding() is None
+
+
+class TestHealth:
+    def conditions(self, rig: Rig) -> dict[tuple[str, str], Severity]:
+        return {(found.joint, found.quantity): found.severity for found in rig.follower.health()}
+
+    @pytest.mark.parametrize(
+        ("bits", "quantities", "message"),
+        [
+            (0x04, ["temperature"], "servo 5 (wrist_roll): the servo reports overheating; let the arm rest"),
+            (0x20, ["load"], "servo 5 (wrist_roll): the servo reports overload; see whether something blocks"),
+            (0x09, ["voltage", "current"], "servo 5 (wrist_roll): the servo reports voltage; check the power supply"),
+            (0x40, ["unknown error bit 6"], "servo 5 (wrist_roll): the servo reports unknown error bit 6"),
+        ],
+    )
+    def test_what_a_servo_reports_twice_is_a_fault(
+        self, rig: Rig, bits: int, quantities: list[str], message: str
+    ) -> None:
+        rig.tick()
+        rig.emulator.faults.errors[5] = bits
+        rig.tick()
+        assert not rig.follower.health()
+        assert not rig.tick().stale
+        assert self.conditions(rig) == dict.fromkeys([("wrist_roll", name) for name in quantities], Severity.FAULT)
+        assert message in rig.follower.health()[0].message
+
+    def test_an_error_ends_when_it_is_not_reported_twice(self, rig: Rig) -> None:
+        rig.emulator.faults.errors[5] = 0x20
+        rig.run(2)
+        rig.emulator.faults.errors.clear()
+        rig.tick()
+        assert rig.follower.health()
+        rig.tick()
+        assert not rig.follower.health()
+
+    def test_reset_ends_an_overload_at_the_first_attempt(self, rig: Rig) -> None:
+        rig.emulator.faults.overloaded.add(2)
+        rig.run(220)
+        assert self.conditions(rig) == {("shoulder_lift", "load"): Severity.FAULT}
+        rig.emulator.faults.overloaded.clear()
+        rig.follower.reset_faults()
+        assert not rig.follower.health()
+        rig.run(3)
+        assert not rig.follower.health()
+        assert rig.register("torque_enable") == [1] * 6
+
+    def test_reset_refuses_an_error_that_torque_off_would_not_end_and_leaves_torque_on(self, rig: Rig) -> None:
+        rig.emulator.faults.errors[2] = 0x04
+        rig.run(2)
+        with pytest.raises(ServoFault, match=r"servo 2 \(shoulder_lift\), status: the servo reports overheating"):
+            rig.follower.reset_faults()
+        assert rig.register("torque_enable") == [1] * 6
+        assert self.conditions(rig) == {("shoulder_lift", "temperature"): Severity.FAULT}
+
+    def test_a_gripper_in_overload_is_a_warning_and_keeps_its_grasp(self, rig: Rig) -> None:
+        grasp = rig.tick().position
+        rig.emulator.faults.blocked.add(6)
+        grasp[5] -= 0.6
+        rig.run(250, grasp)
+        (warning,) = rig.follower.health()
+        assert (warning.joint, warning.quantity, warning.severity) == ("gripper", "load", Severity.WARNING)
+        assert not warning.sheds_load
+        assert "servo 6 (gripper): the servo is in overload and holds on with its protective torque" in warning.message
+        assert rig.register("present_load")[5] == -200
+        released: list[bool] = []
+        rig.emulator.on_request = lambda: released.append(not rig.emulator.servos[6].torque)
+        rig.emulator.faults.silent.add(3)
+        with pytest.raises(NoReply):
+            rig.run(4, grasp)
+        rig.emulator.faults.silent.clear()
+        rig.follower.reset_faults()
+        rig.run(3, grasp)
+        assert not any(released), "the reset of another joint's fault does not let go"
+
+    def test_a_gripper_that_is_hot_in_overload_is_a_fault(self, rig: Rig) -> None:
+        rig.emulator.faults.errors[6] = 0x24
+        rig.run(2)
+        assert self.conditions(rig) == {
+            ("gripper", "load"): Severity.WARNING,
+            ("gripper", "temperature"): Severity.FAULT,
+        }
+
+    @pytest.mark.parametrize(
+        ("register", "value", "severity", "message"),
+        [
+            ("present_temperature", 56, Severity.WARNING, "temperature 56 deg C, above warning_temperature (55 deg C)"),
+            ("present_temperature", 66, Severity.FAULT, "temperature 66 deg C, above max_temperature (65 deg C)"),
+            ("present_voltage", 100, Severity.WARNING, "voltage 10 V, below warning_voltage_drop (10.3 V)"),
+            ("present_voltage", 80, Severity.FAULT, "voltage 8 V, below max_voltage_drop (8.47 V)"),
+            ("max_voltage_limit", 80, None, ""),
+        ],
+    )
+    def test_a_value_beyond_its_level_is_named_with_both(
+        self, rig: Rig, register: str, value: int, severity: Severity | None, message: str
+    ) -> None:
+        rig.tick()
+        rig.emulator.servos[2].set(register, value)
+        rig.run(103)
+        quantity = register.removeprefix("present_")
+        assert self.conditions(rig).get(("shoulder_lift", quantity)) is severity
+        assert message in "".join(found.message for found in rig.follower.health())
+
+    def test_the_servos_own_voltage_limits_are_faults(self, calibration_file: Path) -> None:
+        with rig_of(calibration_file) as rig:
+            for servo in rig.emulator.servos.values():
+                servo.set("max_voltage_limit", 80)
+                servo.set("present_voltage", 74)
+            rig.follower.connect()
+            rig.emulator.servos[1].set("present_voltage", 84)
+            rig.run(3)
+            assert self.conditions(rig) == {("shoulder_pan", "voltage"): Severity.FAULT}
+
+    def test_a_single_odd_value_is_not_believed(self, rig: Rig) -> None:
+        rig.tick()
+        rig.emulator.servos[2].set("present_temperature", 60)
+        temperature = np.zeros(6)
+        while temperature[1] != 60.0:
+            rig.tick()
+            rig.follower.read_signal(0, temperature)
+        rig.emulator.servos[2].set("present_temperature", 30)
+        rig.run(3)
+        assert not rig.follower.health()
+
+    def test_a_brown_out_is_named_and_ended_by_reset(self, rig: Rig) -> None:
+        rig.tick()
+        rig.emulator.faults.brown_out.add(3)
+        rig.run(103)
+        (fault,) = rig.follower.health()
+        assert (fault.joint, fault.quantity, fault.severity) == ("elbow_flex", "torque", Severity.FAULT)
+        assert "servo 3 (elbow_flex): its torque went off by itself, as after a loss of power" in fault.message
+        rig.follower.reset_faults()
+        assert rig.register("torque_enable") == [1] * 6
+        assert rig.register("acceleration") == [254] * 6
+        rig.run(103)
+        assert not rig.follower.health()
+
+    def test_torque_that_was_taken_off_is_no_brown_out(self, rig: Rig) -> None:
+        rig.tick()
+        rig.follower.relax()
+        for _ in range(103):
+            rig.clock.advance(10_000_000)
+            rig.follower.read()
+        assert not rig.follower.health()
+
+    def test_a_heavy_load_counts_when_it_lasts(self, rig: Rig) -> None:
+        rig.emulator.servos[2].set("overload_torque", 100)
+        rig.emulator.servos[2].set("protection_time", 254)
+        rig.tick()
+        rig.emulator.servos[2].set("torque_limit", 800)
+        rig.emulator.faults.overloaded.add(2)
+        rig.run(50)
+        rig.emulator.faults.overloaded.clear()
+        rig.run(60)
+        rig.emulator.faults.overloaded.add(2)
+        rig.run(90)
+        assert not rig.follower.health(), "it did not last for a health_period"
+        rig.run(130)
+        (warning,) = rig.follower.health()
+        assert "load 0.8 of full torque, above warning_load (0.7 of full torque)" in warning.message
+        assert (warning.severity, warning.sheds_load) == (Severity.WARNING, True)
+
+    def test_what_a_reading_does_not_see_for_lost_replies_is_seen_after_them(self, rig: Rig) -> None:
+        rig.run(2)
+        rig.emulator.servos[4].set("present_temperature", 66)
+        rig.emulator.faults.drop = 0.01
+        rig.run(200)
+        assert self.conditions(rig) == {("wrist_flex", "temperature"): Severity.FAULT}
 
 
 class TestSignals:

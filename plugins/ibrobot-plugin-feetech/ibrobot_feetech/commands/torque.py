@@ -6,8 +6,9 @@ import click
 
 from ibrobot_feetech.arm import hold, relax
 from ibrobot_feetech.commands.dialogue import agree
-from ibrobot_feetech.commands.joints import by_servo, chosen, joints_of
+from ibrobot_feetech.commands.joints import Joint, by_servo, chosen, joints_of
 from ibrobot_feetech.commands.ports import opened, port_argument
+from ibrobot_feetech.protocol import MAX_ID
 
 
 @click.command()
@@ -15,10 +16,15 @@ from ibrobot_feetech.commands.ports import opened, port_argument
 @port_argument
 @click.option("--joint", "names", multiple=True, metavar="NAME", help="Only this joint; may be repeated.")
 @click.option("--robot", metavar="CONFIG", help="Robot YAML with the joints; an SO-101's by default.")
+@click.option("--id", "ids", type=click.IntRange(0, MAX_ID), multiple=True, help="Only this servo; may be repeated.")
 @click.option("--yes", is_flag=True, help="Off without asking.")
-def torque(state: str, port: str | None, names: tuple[str, ...], robot: str | None, yes: bool) -> None:
+def torque(
+    state: str, port: str | None, names: tuple[str, ...], robot: str | None, ids: tuple[int, ...], yes: bool
+) -> None:
     """Switch the motors on where the joints stand, or off."""
-    joints = chosen(joints_of(robot), names)
+    if ids and (names or robot):
+        raise click.UsageError("--id names servos, --joint and --robot name joints: give one or the other")
+    joints = [Joint(f"servo {number}", number, 0.0, 0.0) for number in ids] or chosen(joints_of(robot), names)
     with opened(port, joints=by_servo(joints)) as bus:
         if state == "on":
             for joint in joints:

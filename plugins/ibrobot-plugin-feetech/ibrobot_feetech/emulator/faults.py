@@ -24,7 +24,7 @@ class Faults:
     silent: set[int] = attrs.field(factory=set)
     """Servos that neither hear nor answer."""
     errors: dict[int, int] = attrs.field(factory=dict)
-    """Servo id -> error bits that its replies carry."""
+    """Servo id -> error bits that it reports."""
     blocked: set[int] = attrs.field(factory=set)
     """Servos whose joints do not move; far from its goal, such a servo goes into overload."""
     overloaded: set[int] = attrs.field(factory=set)

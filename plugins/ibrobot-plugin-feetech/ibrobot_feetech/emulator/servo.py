@@ -96,7 +96,7 @@ class EmulatedServo:
     @property
     def error(self) -> int:
         """The error byte of its replies."""
-        return self.errors | self.get("status")
+        return self.get("status")
 
     @property
     def torque(self) -> bool:
@@ -219,7 +219,7 @@ class EmulatedServo:
             return
         heavy = abs(self._duty()) >= 10 * self.get("overload_torque")
         self._heavy_s = self._heavy_s + elapsed_s if heavy else 0.0
-        self._overload = self._overload or self._heavy_s >= 0.01 * self.get("protection_time")
+        self._overload = self._overload or (heavy and self._heavy_s >= 0.01 * self.get("protection_time"))
 
     def _duty(self) -> float:
         """What the motor is driven with [0.1 %], signed."""
@@ -253,7 +253,7 @@ class EmulatedServo:
         self.set("present_velocity", max(-32767, min(32767, round(self.velocity))))
         self.set("present_load", round(self._duty()))
         self.set("moving", int(abs(self.velocity) > 0))
-        status = _OVERLOAD if self._overload else 0
+        status = self.errors | (_OVERLOAD if self._overload else 0)
         if not self.get("min_voltage_limit") <= self.get("present_voltage") <= self.get("max_voltage_limit"):
             status |= _UNDERVOLTAGE
         if self.get("present_temperature") > self.get("max_temperature_limit"):

@@ -45,6 +45,7 @@ class Wire:
         self._disconnected = set(faults.disconnected)
         faults.brown_out.clear()
         for servo in self._servos:
+            servo.errors = faults.errors.get(servo.id, 0)
             servo.blocked, servo.burdened = servo.id in faults.blocked, servo.id in faults.overloaded
             if servo.id in unpowered:
                 servo.brown_out()
@@ -64,7 +65,7 @@ class Wire:
             sent_s = self._wire_s(protocol.OVERHEAD + len(packet.parameters), baud_rate)
             for asked, content in self._carry_out(packet, hearing):
                 servo = hearing[asked]
-                reply = protocol.pack(Packet(asked, servo.error | self._faults.errors.get(asked, 0), content))
+                reply = protocol.pack(Packet(asked, servo.error, content))
                 if self._throttle:
                     sent_s += servo.get("return_delay") * 2e-6
                 sent_s += self._wire_s(len(reply), baud_rate)
