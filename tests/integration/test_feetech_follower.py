@@ -158,7 +158,7 @@ def test_a_servo_that_overloads_relaxes_the_arm_where_that_is_configured(bench: 
     run.send_signal(signal.SIGINT)
     _, err = bench.end()
     assert run.returncode == 1
-    assert "servo 5 (wrist_roll), status: the servo reports overload" in err
+    assert "servo 5 (wrist_roll): the servo reports overload" in err
     assert bench.torque() == [False] * 6
 
 
