@@ -1,0 +1,19 @@
+"""The first seconds of the benchmark that lets everything on the servo buses fail in turn."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_teleoperation_survives_every_fault_of_the_buses_without_unasked_motion() -> None:
+    command = (sys.executable, ROOT / "benchmarks/feetech_faults.py", "--seconds", "12", "--pause", "0.4")
+    ran = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    assert ran.returncode == 0, f"{ran.stdout}\n{ran.stderr}"
+    seen = json.loads(ran.stdout)
+    assert sum(seen["incidents"].values()) >= 3
+    assert seen["resets"]["done"] >= 2
