@@ -354,9 +354,10 @@ def incidents(chance: np.random.Generator) -> Iterator[Incident]:
     while True:
         n = int(chance.integers(1, 6))
         name = JOINTS[n - 1]
+        heavy = rf"servo {n} \({name}\).*(reports overload|above max_load)"
         deck = [
-            Incident("blocked joint", rf"joint {name} does not follow|servo {n} \({name}\).*overload", n),
-            Incident("overload", rf"servo {n} \({name}\).*overload", n),
+            Incident("blocked joint", rf"joint {name} does not follow|{heavy}", n),
+            Incident("overload", heavy, n),
             Incident("overload of the gripper", r"servo 6 \(gripper\).*in overload and holds on", GRIPPER, stops=False),
             Incident("brown-out", rf"servo {n} \({name}\): its torque went off|joint {name} does not follow", n),
             Incident("brown-out of all", r": its torque went off|does not follow"),

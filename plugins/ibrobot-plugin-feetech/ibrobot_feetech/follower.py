@@ -20,9 +20,10 @@ from ibrobot_feetech import arm as servos
 from ibrobot_feetech.arm import Arm, Tuning
 from ibrobot_feetech.bus import RETURN_DELAY_S, FeetechBus
 from ibrobot_feetech.errors import FeetechError, NoReply, Place, PortError, ServoFault, TorqueStaysOn
-from ibrobot_feetech.health import Health, Measured, SteadyLoad, Supply
+from ibrobot_feetech.health import Health, Measured, SteadyLoad
 from ibrobot_feetech.options import FollowerOptions
 from ibrobot_feetech.protocol import OVER_CURRENT, OVERLOAD, faults
+from ibrobot_feetech.supply import supply
 from ibrobot_feetech.sync import Replies, SyncReader, SyncWriter
 from ibrobot_feetech.usb import check_adapter
 
@@ -100,7 +101,7 @@ class FeetechFollower(Hardware):
             self._check_calibration()
             self._set_up(arm.servos)
             self._start()
-            self._health.begin(self._supply())
+            self._health.begin([supply(bus, servo) for servo in arm.servos])
         except BaseException:
             self._undo()
             bus.close()
@@ -226,11 +227,6 @@ class FeetechFollower(Hardware):
         if code == OVERLOAD and self._arm.names[servo] in self._options.gentle:
             code = 0
         return bool(code) or self._bus.read_faulty(servo, "torque_enable") != 1
-
-    def _supply(self) -> Supply:
-        names = ("min_voltage_limit", "max_voltage_limit", "present_voltage")
-        values = (self._bus.sync_read(name, self._arm.servos, faulty=True) for name in names)
-        return Supply(*(np.array(list(each.values())) * _VOLTAGE_V for each in values))
 
     def _start(self) -> None:
         """Begin to read anew: from where the joints stand, which every servo must say."""

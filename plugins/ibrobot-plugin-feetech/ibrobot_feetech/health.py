@@ -13,6 +13,7 @@ from ibrobot_core.robot import Vector
 from ibrobot_feetech.errors import Place
 from ibrobot_feetech.options import FollowerOptions
 from ibrobot_feetech.protocol import OVERLOAD, faults
+from ibrobot_feetech.supply import Supply
 
 _QUANTITIES = {0: "voltage", 1: "position sensor", 2: "temperature", 3: "current", 5: "load"}
 """Error bit -> the quantity that it is about; others are about themselves."""
@@ -27,18 +28,6 @@ _REMEDIES = {
 }
 _TEMPERATURE_MARGIN, _VOLTAGE_MARGIN, _LOAD_MARGIN = 2.0, 0.2, 0.05
 """How far a value is back within its level before a condition ends [deg C, V, of full torque]."""
-
-
-@attrs.frozen(eq=False)
-class Supply:
-    """Of each servo [V], shape (S,)."""
-
-    lower: Vector
-    """The least voltage that its own settings allow."""
-    upper: Vector
-    """The greatest."""
-    start: Vector
-    """What was measured when the arm was connected."""
 
 
 @attrs.frozen(eq=False)
@@ -117,12 +106,12 @@ class Health:
         self._joints = joints
         self._place = place
         self._gentle = np.array([joint in options.gentle for joint in joints])
-        self._supply: Supply | None = None
+        self._supplies: Sequence[Supply] = ()
         self.reset()
 
-    def begin(self, supply: Supply) -> None:
-        """The arm was connected, with this supply."""
-        self._supply = supply
+    def begin(self, supplies: Sequence[Supply]) -> None:
+        """The arm was connected; its servos have these supplies, S of them."""
+        self._supplies = supplies
         self.reset()
 
     def reset(self) -> None:
@@ -209,14 +198,12 @@ class Health:
         return self._beyond(index, "load", value, "", levels, _LOAD_MARGIN)
 
     def _voltage(self, index: int, value: float) -> Condition | None:
-        supply, options = self._supply, self._options
-        assert supply is not None
-        start = float(supply.start[index])
-        too_high = (_Level("max_voltage_limit", float(supply.upper[index])),)
+        supply, options = self._supplies[index], self._options
+        too_high = (_Level("max_voltage_limit", supply.greatest),)
         too_low = (
-            _Level("min_voltage_limit", float(supply.lower[index])),
-            _Level("max_voltage_drop", (1 - options.max_voltage_drop) * start),
-            _Level("warning_voltage_drop", (1 - options.warning_voltage_drop) * start, Severity.WARNING),
+            _Level("min_voltage_limit", supply.least),
+            _Level("max_voltage_drop", (1 - options.max_voltage_drop) * supply.measured),
+            _Level("warning_voltage_drop", (1 - options.warning_voltage_drop) * supply.measured, Severity.WARNING),
         )
         return self._beyond(index, "voltage", value, "V", too_high, _VOLTAGE_MARGIN) or self._beyond(
             index, "voltage", value, "V", too_low, _VOLTAGE_MARGIN, sign=-1
