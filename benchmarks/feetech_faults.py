@@ -32,6 +32,7 @@ from typing import Any, override
 
 import attrs
 import numpy as np
+from ibrobot_feetech import bus
 from ibrobot_feetech.emulator import Emulator
 from numpy.typing import NDArray
 
@@ -59,6 +60,8 @@ SETTLE_S = 0.5
 """After a fault, until the joints stand."""
 STILL_RAD = 0.02
 """How far a joint that stands may move."""
+_SWITCH_S = 2e-4
+"""For how long one thread may keep the others from answering [s]."""
 UNSEEN_S = 0.06
 """For which a joint may have moved on since its last good reply: the driver rides out three lost ones."""
 
@@ -404,8 +407,12 @@ def main() -> int:
     parser.add_argument("--corrupt", type=float, default=0.01, help="probability of each byte")
     parser.add_argument("--drop", type=float, default=0.005, help="probability of each reply")
     parser.add_argument("--late", type=float, default=0.001, help="probability of each reply")
+    parser.add_argument("--patience", type=float, default=0.02, help="with replies, beside their time on the wire [s]")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
+    # The emulators, threads of this process on a machine that may be busy, answer later than servos.
+    bus._ADAPTER_S = arguments.patience
+    sys.setswitchinterval(_SWITCH_S)
     clock = SteppedClock(1_700_000_000 * NS_PER_S)
     begun = time.monotonic()
     with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
