@@ -11,9 +11,9 @@ ROOT = Path(__file__).parents[2]
 
 
 def test_teleoperation_survives_every_fault_of_the_buses_without_unasked_motion() -> None:
-    command = (sys.executable, ROOT / "benchmarks/feetech_faults.py", "--seconds", "12", "--pause", "0.4")
+    command = (sys.executable, ROOT / "benchmarks/feetech_faults.py", "--seconds", "8", "--pause", "0.4")
     ran = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert ran.returncode == 0, f"{ran.stdout}\n{ran.stderr}"
     seen = json.loads(ran.stdout)
-    assert sum(seen["incidents"].values()) >= 3
-    assert seen["resets"]["done"] >= 2
+    assert sum(seen["incidents"].values()) >= 2
+    assert seen["resets"]["done"] >= 1
