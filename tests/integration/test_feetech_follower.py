@@ -134,6 +134,20 @@ def test_so_does_ctrl_c(bench: Bench, stop: str, torque: bool) -> None:
     assert counts["requests"] > 0
     assert counts["bad_packets"] == counts["implausible_positions"] == 0
     assert counts["retries"] <= counts["timeouts"], "nothing was sent again but what this machine was too slow for"
+    assert (f"to take it off: ibrobot feetech torque off {bench.emulator.port}" in err) == torque
+
+
+def test_the_same_port_given_twice_ends_the_start_and_leaves_no_torque_on(bench: Bench) -> None:
+    arm = f"port: {bench.emulator.port}, calibration: {bench.folder}/arm.json"
+    run = bench.launch(
+        "--set", f"teleoperation.leader={{type: so101_leader, {arm}, deadman: none}}",
+        "--set", "control_modes.idle.teleop=leader",
+    )  # fmt: skip
+    _, err = bench.end()
+    assert run.returncode == 1
+    assert "another program holds the port" in err
+    assert bench.torque() == [False] * 6
+    assert "holds torque" not in err
 
 
 def test_a_servo_that_dies_is_named_and_the_others_hold(bench: Bench) -> None:
