@@ -97,6 +97,11 @@ class ActionSpec:
     foreign: bool = option(False, help="the commands are those in bags of others, not what this robot publishes")
     select: tuple[str, ...] = option((), help="with foreign: where the numbers are, one for each joint")
     safety_behavior: str = option("hold", choices=("hold", "relax"), help="what follows when the setpoints go stale")
+    align: str = option(
+        "hold",
+        choices=("hold", "next"),
+        help="the action of a row in a dataset: hold takes the command in effect at the tick, next the first after it",
+    )
 
 
 @attrs.frozen

@@ -51,6 +51,8 @@ class ActionPart:
     joints: tuple[str, ...]
     select: tuple[str, ...] = ()
     """Paths to the joints' numbers in messages of others; none where `data` has them, in order."""
+    align: str = "hold"
+    """Which command a tick's action is: `hold`, the newest sent by then; `next`, the first sent after it."""
 
 
 @attrs.frozen(slots=False)
@@ -110,6 +112,7 @@ class Contract:
                     "hold",
                     tuple(part["joints"]),
                     tuple(part.get("select", ())),
+                    part.get("align", "hold"),
                 )
                 for part in canonical["action"]
             ]
@@ -165,6 +168,7 @@ class Contract:
             "action": [
                 {"topic": p.topic, "type": p.type, "joints": list(p.joints)}
                 | ({"select": list(p.select)} if p.select else {})
+                | ({"align": p.align} if p.align != "hold" else {})
                 for p in self.action_parts
             ],
         }
@@ -282,7 +286,7 @@ def _action(spec: ActionSpec, config: RobotConfig) -> ActionPart:
                 f"{spec.key}: {spec.topic}: select gives {told}, executor {spec.executor!r} has "
                 f"{len(executor.joints)} joints: {', '.join(executor.joints)}"
             )
-    return ActionPart(executor.name, spec.topic, spec.type, spec.safety_behavior, executor.joints, select)
+    return ActionPart(executor.name, spec.topic, spec.type, spec.safety_behavior, executor.joints, select, spec.align)
 
 
 def _joined(features: list[Feature]) -> Feature:

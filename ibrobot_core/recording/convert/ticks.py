@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 from collections import deque
 from collections.abc import Iterator, Mapping
 from itertools import islice
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from ibrobot_core.config.schema import Align
 from ibrobot_core.contract.frames import FrameAssembler, assemble
-from ibrobot_core.contract.specs import Contract, ObservationPart
+from ibrobot_core.contract.specs import ActionPart, Contract, ObservationPart
 from ibrobot_core.errors import RecorderError
 from ibrobot_core.interfaces import EpisodeReader, Feature, Recorded
 from ibrobot_core.messages import Message
@@ -28,26 +29,62 @@ _COMMAND = Align("hold", "receive")
 def with_action(contract: Contract) -> Contract:
     """The contract whose observations include the action: what the executors were told, read back from their topics.
 
-    A row has the command in effect at its tick. What a policy learns from it is what the robot was following when
-    it saw the observation, the safety layer's limits included; at the control rate that command is one control
-    period old at most.
+    With `align: hold` a row has the command in effect at its tick: what the robot was following when it saw the
+    observation, the safety layer's limits included. At the control rate that is one control period old at most; of
+    commands as slow as the ticks it is the one before the observation. With `align: next` it is the first command
+    after the tick.
     """
     features = {part.topic: Feature("float32", (len(part.joints),)) for part in contract.action_parts}
     parts = tuple(
-        ObservationPart(ACTION, part.topic, part.type, part.select or ("data",), None, _COMMAND, features[part.topic])
+        ObservationPart(
+            ACTION, _source_of(part), part.type, part.select or ("data",), None, _COMMAND, features[part.topic]
+        )
         for part in contract.action_parts
     )
     return attrs.evolve(contract, observation_parts=(*contract.observation_parts, *parts), action_parts=())
+
+
+def _source_of(part: ActionPart) -> str:
+    """What the stream of a part's commands is called: its topic, or a name of its own where it is shifted in time."""
+    return part.topic if part.align == "hold" else f"{part.topic} (next)"
+
+
+class _Following:
+    """The commands of a topic, each as if received when the one before it was, or the episode began.
+
+    The newest of these by a tick is then the first that was really received after it.
+    """
+
+    def __init__(self, reader: EpisodeReader, part: ActionPart) -> None:
+        self._reader, self._part = reader, part
+        self.end_ns: int | None = None
+        """Receipt of the last command [ns], which none follows; None as long as it is not known."""
+
+    def __iter__(self) -> Iterator[Recorded]:
+        before_ns = self._reader.summary().start_ns
+        for item in self._reader.messages({self._part.topic}):
+            yield attrs.evolve(item, topic=_source_of(self._part), received_ns=before_ns)
+            before_ns = item.received_ns
+        self.end_ns = before_ns
 
 
 class _Source:
     """An episode's messages, and the ticks from the first to the last of them."""
 
     def __init__(self, reader: EpisodeReader, contract: Contract) -> None:
-        self._messages = reader.messages(contract.topics)
+        self._following = [_Following(reader, part) for part in contract.action_parts if part.align == "next"]
+        direct = {part.topic for part in (*contract.observation_parts, *contract.action_parts)}
+        direct -= {part.topic for part in contract.action_parts if part.align == "next"}
+        direct |= {part.topic for part in contract.observation_parts}
+        streams = (reader.messages(direct), *self._following)
+        self._messages = heapq.merge(*streams, key=lambda item: item.received_ns)
         self._read: deque[Recorded] = deque(islice(self._messages, 1))
         """Read ahead, to know whether there is a message at or after a tick."""
         self._newest_ns = self.first_ns = self._read[0].received_ns if self._read else 0
+
+    def is_over(self, t_ns: int) -> bool:
+        """Whether no command follows tick `t_ns` [ns] where one has to."""
+        return any(each.end_ns is not None and t_ns >= each.end_ns for each in self._following)
 
     def __iter__(self) -> Iterator[tuple[str, Message, int]]:
         while self._read or self._read_on():
@@ -126,6 +163,8 @@ class Ticks:
         last: dict[str, NDArray[Any]] = {}
         absent = frozenset(self._contract.observations)
         for frame in assemble(self._assembler, source, source.ticks(self._contract.step_ns)):
+            if source.is_over(frame.stamp_ns):
+                break
             if not last:
                 absent &= frame.missing
                 if frame.missing:

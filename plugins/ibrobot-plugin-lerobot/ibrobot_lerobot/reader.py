@@ -68,9 +68,11 @@ class LeRobotReader(EpisodeReader):
         try:
             for row, values in enumerate(self._rows.read(self._composer.keys(wanted))):
                 stamp_ns = self._start_ns + row * self._step_ns
-                for topic, message in self._composer(self._in_radians(values), stamp_ns).items():
+                composed = self._composer(self._in_radians(values), stamp_ns)
+                for topic in sorted(composed, key=self._delay_ns):
                     if topic in wanted:
-                        yield Recorded(topic, message, stamp_ns, stamp_ns)
+                        at_ns = stamp_ns + self._delay_ns(topic)
+                        yield Recorded(topic, composed[topic], at_ns, at_ns)
         except DatasetError as error:
             raise RecorderError(f"{self._path}: {error}") from error
 
@@ -90,6 +92,10 @@ class LeRobotReader(EpisodeReader):
     @override
     def close(self) -> None:
         pass
+
+    def _delay_ns(self, topic: str) -> int:
+        """Of a row's message behind its tick [ns]: a command that has to follow the tick does."""
+        return int(any(part.topic == topic and part.align == "next" for part in self._contract.action_parts))
 
     def _in_radians(self, values: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
         """In full precision, so that the unit's own values come out again."""
