@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from itertools import islice
 from typing import Any
 
@@ -73,10 +73,9 @@ class _Source:
 
     def __init__(self, reader: EpisodeReader, contract: Contract) -> None:
         self._following = [_Following(reader, part) for part in contract.action_parts if part.align == "next"]
-        direct = {part.topic for part in (*contract.observation_parts, *contract.action_parts)}
-        direct -= {part.topic for part in contract.action_parts if part.align == "next"}
-        direct |= {part.topic for part in contract.observation_parts}
-        streams = (reader.messages(direct), *self._following)
+        direct = {part.topic for part in contract.observation_parts}
+        direct |= {part.topic for part in contract.action_parts if part.align == "hold"}
+        streams: list[Iterable[Recorded]] = [reader.messages(direct), *self._following]
         self._messages = heapq.merge(*streams, key=lambda item: item.received_ns)
         self._read: deque[Recorded] = deque(islice(self._messages, 1))
         """Read ahead, to know whether there is a message at or after a tick."""
