@@ -83,7 +83,7 @@ class ControlCore:
         """Where joints that did not follow rest while the fault lasts [rad], NaN for the others; shape (J,)."""
         self._target: Vector | None = None
         self._health = Health(config.control.load_shedding, self._log)
-        self._shedding = False
+        self._shedding = self._has_shed = False
         self._unwell = ""
         """The fault, where it is a condition of a joint."""
         self._arriving = False
@@ -332,14 +332,20 @@ class ControlCore:
         if conditions or self._health.conditions:
             now_ns = self._clock.now_ns()
             self._health.update(conditions, now_ns)
-            if not (self._shedding or self._stopping or self._relaxed) and (why := self._health.overdue(now_ns)):
+            if not (self._has_shed or self._stopping or self._relaxed) and (why := self._health.overdue(now_ns)):
                 self._shed(why)
             if (fault := self._health.fault) and not self.fault:
                 self._unwell = fault
                 self._raise_fault(fault)
-        if self._shedding and (self._target is None or self._at_target or self._late_to_pose):
+        if self._shedding and (self._at_target or not self._may_shed_in_motion):
             self._shedding, self._target = False, None
             self._relax("load shedding")
+
+    @property
+    def _may_shed_in_motion(self) -> bool:
+        """Whether the way to the pose may go on: not after an emergency stop, nor while the joints are silent."""
+        silent = self._clock.now_ns() - self._answered_ns >= self._state_timeout_ns
+        return self._target is not None and not (self._late_to_pose or self._safety.estopped or silent)
 
     def _shed(self, why: str) -> None:
         """Move to the pose for it, where nothing but the joints' health forbids motion, and then relax."""
@@ -347,7 +353,7 @@ class ControlCore:
         moves = options.pose and self.fault in ("", self._unwell)
         then = f"goes to pose {options.pose} and relaxes" if moves else "relaxes"
         self._announce(f"{why}; this has lasted for {options.after:g} s", then)
-        self._shedding = True
+        self._shedding = self._has_shed = True
         if moves:
             self._move_to(options.pose)
 
@@ -427,7 +433,9 @@ class ControlCore:
         self._relaxed = False
         self._hardware.retake()
         self._health.restart()
-        self._shedding = False
+        if self._shedding:
+            self._target = None
+        self._shedding = self._has_shed = False
 
     def _raise_fault(self, fault: str) -> None:
         if self.fault:

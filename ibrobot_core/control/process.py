@@ -92,15 +92,15 @@ class ControlProcess:
             self._core.set_plan(plan)
         self._memory.write_state(self._core.tick(late, periods))
         self._punctuality.tick(deadline, late, periods - 1)
-        if self._ready is not None and not self._stopping and self._core.arrived():
-            self._channel.send({**self._ready, "epoch": self._core.epoch})
-            self._ready = None
         self._tell_host()
         # A process that the host forked keeps the socket open beyond the host's death.
         if self._channel.closed or os.getppid() != self._host:
-            self._begin_stop("the host is gone")
+            self._begin_stop("the host is gone", unmoved=self._ready is not None)
         elif self._terminated:
             self._begin_stop("terminated")
+        elif self._ready is not None and not self._stopping and self._core.arrived():
+            self._channel.send({**self._ready, "epoch": self._core.epoch})
+            self._ready = None
 
     def _obey(self) -> bool:
         """Carry out the host's commands; whether that took longer than a period."""

@@ -164,6 +164,32 @@ class TestShedding:
 
         assert rig.hardware.relaxed
 
+    def test_torque_that_stays_on_is_reported_once(self, make_rig):
+        rig = make_rig({"control": {"load_shedding": {"after": 1.0}}}).start()
+        rig.hardware.relax_outcome = HardwareError("servo 2 keeps it")
+        rig.hardware.conditions = (HOT,)
+        rig.tick(200)
+
+        assert [event["fault"] for event in rig.events("fault")] == [
+            f"{HOT.message}; this has lasted for 1 s", "torque of hardware cannot be taken off: servo 2 keeps it",
+        ]  # fmt: skip
+
+    @pytest.mark.parametrize("trouble", ["estop", "silent"])
+    def test_on_the_way_an_emergency_stop_or_silence_ends_the_motion(self, make_rig, trouble):
+        rig = make_rig(SHED).start()
+        rig.hardware.conditions = (HOT,)
+        rig.tick(120)
+        assert not rig.hardware.relaxed
+        if trouble == "estop":
+            rig.call("estop")
+        else:
+            rig.hardware.stale = True
+        rig.tick(12)
+
+        assert rig.hardware.relaxed
+        assert np.abs(rig.hardware.written[-1] - REST).max() > 0.1
+        rig.assert_within_limits()
+
     def test_its_pose_must_be_there(self, make_rig):
         with pytest.raises(ConfigError, match=r"control\.load_shedding\.pose"):
             make_rig({"control": {"load_shedding": {"pose": "bed"}}})
