@@ -11,6 +11,7 @@ import attrs
 import click
 
 from ibrobot_core.errors import ConfigError
+from ibrobot_core.outside import echo
 
 
 def config_options(command: Callable[..., None]) -> Callable[..., None]:
@@ -53,16 +54,16 @@ def check(
         if not as_json:
             raise
         problems: list[dict[str, Any]] = [{**attrs.asdict(p), "file": str(p.file)} for p in error.problems]
-        click.echo(json.dumps(problems, indent=2))
+        echo(json.dumps(problems, indent=2))
         sys.exit(error.exit_code)
     if as_json:
-        click.echo("[]")
+        echo("[]")
         return
     body = "simulation" if found.simulated else "hardware"
-    click.echo(f"{path}: ok ({found.robot.name}, {len(found.robot.joints)} joints, {body})")
-    click.echo(f"modes: {', '.join(found.control_modes)}; starts in {found.default_control_mode}")
+    echo(f"{path}: ok ({found.robot.name}, {len(found.robot.joints)} joints, {body})")
+    echo(f"modes: {', '.join(found.control_modes)}; starts in {found.default_control_mode}")
     for line in models:
-        click.echo(line)
+        echo(line)
 
 
 @config.command()
@@ -74,7 +75,7 @@ def show(config: str | None, sim: bool, overrides: tuple[str, ...], mode: str | 
     from ibrobot_core.plugins import installed
 
     found = load(find_config(config, installed()), overrides=overrides, mode=mode, sim=sim)
-    click.echo(to_yaml(found), nl=False)
+    echo(to_yaml(found), nl=False)
 
 
 @config.command()
@@ -83,4 +84,4 @@ def schema() -> None:
     from ibrobot_core.config.jsonschema import json_schema
     from ibrobot_core.plugins import installed
 
-    click.echo(json.dumps(json_schema(installed()), indent=2))
+    echo(json.dumps(json_schema(installed()), indent=2))

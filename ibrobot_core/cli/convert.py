@@ -18,6 +18,7 @@ from click.core import ParameterSource
 
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import DatasetError
+from ibrobot_core.outside import echo
 from ibrobot_core.recording.convert.request import MISSING, OUTCOMES, EpisodeReport, Report, Request
 from ibrobot_core.units import NORM_MODES
 
@@ -70,10 +71,10 @@ def convert(context: click.Context, /, to: str, as_json: bool, **asked: Any) -> 
     try:
         report = (_to_bags if to == "bag" else _to_dataset)(as_json=as_json, **asked)
     except KeyboardInterrupt:
-        click.echo("interrupted; finished episodes are kept, and the same command goes on from there", err=True)
+        echo("interrupted; finished episodes are kept, and the same command goes on from there", err=True)
         sys.exit(130)
     if as_json:
-        click.echo(json.dumps(report.summary()))
+        echo(json.dumps(report.summary()))
     else:
         _tell(report)
     if report.failed or not (report.converted or all(each.passed_over for each in report.episodes)):
@@ -197,15 +198,16 @@ def _progress(episodes: int, quiet: bool) -> Iterator[Any]:
             if report is not None and not quiet:
                 done += 1
                 what = report.error.splitlines()[0] if report.error else f"{report.frames} frames"
-                click.echo(f"{report.source}: {what} ({done} of {episodes}, {rate(frames)})", err=True)
+                echo(f"{report.source}: {what} ({done} of {episodes}, {rate(frames)})", err=True)
 
         yield line
         return
-    from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[rate]}"), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True)) as bar:
+    from ibrobot_core.screen import Screen, text
+
+    told, speed = (TextColumn(each, markup=False) for each in ("{task.description}", "{task.fields[rate]}"))
+    with Progress(told, BarColumn(), speed, TimeRemainingColumn(), console=Screen(stderr=True)) as bar:
         task = bar.add_task(f"0 of {episodes} episodes", total=None, rate="")
 
         def move(frames: int, total: int, report: EpisodeReport | None) -> None:
@@ -213,9 +215,15 @@ def _progress(episodes: int, quiet: bool) -> Iterator[Any]:
             if report is not None:
                 done += 1
                 if report.error:
-                    bar.console.print(f"[red]{report.source}[/]: left out: {report.error.splitlines()[0]}")
-            text = f"{done} of {episodes} episodes"
-            bar.update(task, description=text, completed=frames, total=max(total, frames), rate=rate(frames))
+                    why = report.error.splitlines()[0]
+                    bar.console.print(text(report.source, "red") + text(f": left out: {why}"))
+            bar.update(
+                task,
+                description=f"{done} of {episodes} episodes",
+                completed=frames,
+                total=max(total, frames),
+                rate=rate(frames),
+            )
 
         yield move
 
@@ -224,20 +232,20 @@ def _tell(report: Report) -> None:
     summary = report.summary()
     for error in dict.fromkeys(each.error for each in report.failed):  # many may have the same
         sources = ", ".join(each.source for each in report.failed if each.error == error)
-        click.echo(f"left out {sources}: {error}", err=True)
+        echo(f"left out {sources}: {error}", err=True)
     for each in report.episodes:
         if each.passed_over:
-            click.echo(f"passed over {each.source}: {each.passed_over}", err=True)
+            echo(f"passed over {each.source}: {each.passed_over}", err=True)
     done = report.converted
     for each in done:
         if not each.finished:
-            click.echo(f"unfinished {each.source}: its {each.frames} frames are of what could be read", err=True)
+            echo(f"unfinished {each.source}: its {each.frames} frames are of what could be read", err=True)
     if not done:
-        click.echo(f"nothing was added to {report.out}")
+        echo(f"nothing was added to {report.out}")
         return
     resumed = f", {report.resumed} of them by an earlier run" if report.resumed else ""
-    click.echo(f"{len(done)} episodes, {summary['frames']} frames{resumed} -> {report.out}")
-    click.echo(
+    echo(f"{len(done)} episodes, {summary['frames']} frames{resumed} -> {report.out}")
+    echo(
         f"gaps {summary['gaps']} (ticks skipped {summary['skipped_ticks']}, held {summary['held_ticks']}), "
         f"messages lost in recording {summary['lost_messages']}"
     )
@@ -246,7 +254,7 @@ def _tell(report: Report) -> None:
         ("lost in recording", [each.lost for each in done]), ("missing since", [each.missing for each in done]),
     ):  # fmt: skip
         if counts := sum(map(Counter, of_each), Counter[str]()):
-            click.echo(f"{what}: {', '.join(f'{name} {count}' for name, count in counts.most_common())}")
+            echo(f"{what}: {', '.join(f'{name} {count}' for name, count in counts.most_common())}")
     if summary["without_prompt"]:
-        click.echo(f"{summary['without_prompt']} without a prompt: their task is empty; --prompt TEXT gives them one")
-    click.echo(f"{summary['size_bytes'] / _MIB:.1f} MiB in {report.seconds:.1f} s")
+        echo(f"{summary['without_prompt']} without a prompt: their task is empty; --prompt TEXT gives them one")
+    echo(f"{summary['size_bytes'] / _MIB:.1f} MiB in {report.seconds:.1f} s")

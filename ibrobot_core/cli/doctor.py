@@ -13,6 +13,7 @@ import attrs
 import click
 
 from ibrobot_core.descriptors import Check
+from ibrobot_core.outside import echo
 from ibrobot_core.plugins import Registry, installed
 
 MINIMUM_PYTHON = (3, 12)
@@ -35,14 +36,14 @@ def doctor(as_json: bool) -> None:
     """Check this machine, with the remedy for what it lacks; exit 1 if something fails that matters."""
     findings = examine(installed())
     if as_json:
-        click.echo(json.dumps([{**attrs.asdict(f.check), "matters": f.matters} for f in findings], indent=2))
+        echo(json.dumps([{**attrs.asdict(f.check), "matters": f.matters} for f in findings], indent=2))
     else:
         for finding in findings:
             check = finding.check
             word = "ok  " if check.ok else ("FAIL" if finding.matters else "note")
-            click.echo(f"{word}  {check.name}: {check.found}")
+            echo(f"{word}  {check.name}: {check.found}")
             if not check.ok and check.remedy:
-                click.echo(f"      {check.remedy}")
+                echo(f"      {check.remedy}")
     if any(finding.matters and not finding.check.ok for finding in findings):
         sys.exit(1)
 

@@ -24,6 +24,7 @@ from ibrobot_core.errors import IbrobotError
 from ibrobot_core.launch.models import check_models
 from ibrobot_core.launch.runtime import Runtime
 from ibrobot_core.launch.session import Request, Session
+from ibrobot_core.outside import LogFormatter, echo
 from ibrobot_core.plugins import installed
 from ibrobot_core.terminal import Keys
 
@@ -194,9 +195,9 @@ def run_loaded(robot: RobotConfig, request: Request, options: dict[str, Any], wa
             request = attrs.evolve(request, keys=keys.subscribe)
         runtime = Runtime(Session(robot, installed(), request))
         if options["dry_run"]:
-            click.echo("\n".join(runtime.plan.lines()))
+            echo("\n".join(runtime.plan.lines()))
             for line in check_models(robot, installed(), [runtime.session.mode]):
-                click.echo(line)
+                echo(line)
             return
         watcher.attach(runtime)
         _stop_on_signals(runtime.session, keys)
@@ -204,7 +205,7 @@ def run_loaded(robot: RobotConfig, request: Request, options: dict[str, Any], wa
             status = _run(runtime, watcher, live=not options["headless"] and sys.stdout.isatty())
         finally:
             for line in runtime.session.outcome.holding:
-                click.echo(line, err=True)
+                echo(line, err=True)
     _tell(runtime, watcher, options["as_json"])
     runtime.raise_failure()
     sys.exit(status)
@@ -270,7 +271,7 @@ class _Lines:
         self._watcher = watcher
         self._next_s = time.monotonic() + _PLAIN_PERIOD_S
         handler = logging.StreamHandler(sys.stderr)
-        handler.setFormatter(logging.Formatter("%(levelname).1s %(message)s"))
+        handler.setFormatter(LogFormatter("%(levelname).1s %(message)s"))
         _log_to(handler)
 
     def starting(self, component: str) -> None:
@@ -281,7 +282,7 @@ class _Lines:
         if time.monotonic() >= self._next_s:
             self._next_s += _PLAIN_PERIOD_S
             line = plain_line(self._session)
-            click.echo(f"{line} | {more}" if (more := self._watcher.line()) else line)
+            echo(f"{line} | {more}" if (more := self._watcher.line()) else line)
 
 
 class _Panel:
@@ -290,11 +291,13 @@ class _Panel:
     def __init__(self, runtime: Runtime, watcher: Watcher, stack: ExitStack) -> None:
         from rich.live import Live
 
+        from ibrobot_core.screen import Screen
+
         self._runtime = runtime
         self._watcher = watcher
         self._log = RecentLog()
         _log_to(self._log)
-        self._display = stack.enter_context(Live(auto_refresh=False, screen=False))
+        self._display = stack.enter_context(Live(console=Screen(), auto_refresh=False, screen=False))
         self._next_s = 0.0
         self._pressed: queue.SimpleQueue[str] = queue.SimpleQueue()
         keys = runtime.session.request.keys
@@ -353,21 +356,21 @@ def _tell(runtime: Runtime, watcher: Watcher, as_json: bool) -> None:
     summary = runtime.summary()
     if as_json:
         summary |= watcher.facts()
-        click.echo(json.dumps(summary))
+        echo(json.dumps(summary))
         return
     loop = summary["loop"]
-    click.echo(f"{summary['robot']}: {summary['mode']} for {summary['duration_s']:.1f} s")
+    echo(f"{summary['robot']}: {summary['mode']} for {summary['duration_s']:.1f} s")
     if summary["episodes"]:
-        click.echo(f"episodes   {summary['episodes']}, of which {summary['successes']} succeeded")
+        echo(f"episodes   {summary['episodes']}, of which {summary['successes']} succeeded")
     if summary["lockstep"]:
-        click.echo(f"loop       {loop['ticks']} ticks in lockstep")
+        echo(f"loop       {loop['ticks']} ticks in lockstep")
     elif loop["ticks"]:
-        click.echo(
+        echo(
             f"loop       {loop['rate_hz']:.2f} Hz, lateness p50 {loop['lateness_p50_us']:.0f} us, "
             f"p99 {loop['lateness_p99_us']:.0f} us, missed {loop['missed']}"
         )
     for heading, text in watcher.told():
-        click.echo(f"{heading:10} {text}")
+        echo(f"{heading:10} {text}")
     if runtime.plan.without:
-        click.echo(f"without    {runtime.plan.without}")
-    click.echo(f"faults     {'; '.join(summary['faults']) or 'none'}")
+        echo(f"without    {runtime.plan.without}")
+    echo(f"faults     {'; '.join(summary['faults']) or 'none'}")

@@ -9,6 +9,7 @@ from typing import override
 import click
 
 from ibrobot_core import __version__
+from ibrobot_core.outside import echo
 
 COMMANDS = {
     "launch": ("ibrobot_core.cli.launch:launch", "Run a robot, real or simulated."),
@@ -63,10 +64,13 @@ def cli() -> None:
 def main() -> None:
     """Run the command line. Errors that a user may see are told in one line each and set the exit code."""
     from ibrobot_core.errors import IbrobotError
+    from ibrobot_core.outside import show_traceback
+
+    sys.excepthook = show_traceback
 
     try:
         cli(prog_name="ibrobot")
     except IbrobotError as error:
         for line in str(error).splitlines():
-            click.echo(f"error: {line}", err=True)
+            echo(f"error: {line}", err=True)
         sys.exit(error.exit_code)

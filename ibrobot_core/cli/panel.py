@@ -12,9 +12,9 @@ from rich.console import Group, RenderableType
 from rich.panel import Panel
 from rich.progress_bar import ProgressBar
 from rich.table import Table
-from rich.text import Text
 
 from ibrobot_core.launch.session import Session
+from ibrobot_core.screen import text
 
 _LOG_LINES = 6
 
@@ -24,12 +24,12 @@ class RecentLog(logging.Handler):
 
     def __init__(self) -> None:
         super().__init__()
-        self.lines: deque[Text] = deque(maxlen=_LOG_LINES)
+        self.lines: deque[RenderableType] = deque(maxlen=_LOG_LINES)
 
     @override
     def emit(self, record: logging.LogRecord) -> None:
         style = {logging.WARNING: "yellow", logging.ERROR: "bold red"}.get(record.levelno, "dim")
-        self.lines.append(Text(record.getMessage(), style=style, overflow="ellipsis", no_wrap=True))
+        self.lines.append(text(record.getMessage(), style, overflow="ellipsis", no_wrap=True))
 
 
 def _loop_text(session: Session) -> str:
@@ -76,8 +76,8 @@ def panel(session: Session, log: RecentLog, help_text: str, more: Sequence[tuple
     facts.add_column(style="bold")
     facts.add_column()
     where = "simulation" if session.config.simulated else "hardware"
-    modes = "  ".join(
-        f"F{i} [reverse]{name}[/]" if name == session.mode else f"F{i} {name}"
+    modes = text("  ").join(
+        text(f"F{i} ") + text(name, "reverse" if name == session.mode else "")
         for i, name in enumerate(session.config.control_modes, 1)
     )
     facts.add_row("mode", modes)
@@ -92,20 +92,20 @@ def panel(session: Session, log: RecentLog, help_text: str, more: Sequence[tuple
     if session.rates:
         facts.add_row("sensors", "  ".join(_sensor_text(session, name) for name in session.rates))
     facts.add_row("episodes", f"{outcome.episodes} done, {outcome.successes} successful")
-    for heading, text in more:
-        facts.add_row(heading, Text(text))
+    for heading, row in more:
+        facts.add_row(heading, row)
     state = session.state
     estop = state is not None and state.estop
-    faults = Text("; ".join(outcome.faults[-3:]), "bold red") if outcome.faults else Text("none", "green")
+    faults = text("; ".join(outcome.faults[-3:]), "bold red") if outcome.faults else text("none", "green")
     facts.add_row("faults", faults)
-    pieces: list[RenderableType] = [facts, Text(), _joints(session)]
+    pieces: list[RenderableType] = [facts, text(""), _joints(session)]
     if help_text:
-        pieces += [Text(), Text(help_text, style="cyan")]
-    pieces += [Text(), *log.lines]
+        pieces += [text(""), text(help_text, style="cyan")]
+    pieces += [text(""), *log.lines]
     title = f"{session.config.robot.name} ({where})" + (" EMERGENCY STOP: F10 resets" if estop else "")
     return Panel(
         Group(*pieces),
-        title=title,
+        title=text(title),
         subtitle="Esc emergency stop   F10 reset   Ctrl-C stop",
         border_style="red" if estop else "blue",
     )
@@ -119,5 +119,5 @@ def _joints(session: Session) -> Table:
     for i, joint in enumerate(robot.joints):
         done = float(np.clip((state.position[i] - joint.lower) / (joint.upper - joint.lower), 0.0, 1.0))
         bar = ProgressBar(total=1.0, completed=done, width=30)
-        table.add_row(joint.name, bar, f"{state.position[i]:+.3f}", Text(f"told {state.command[i]:+.3f} rad", "dim"))
+        table.add_row(joint.name, bar, f"{state.position[i]:+.3f}", text(f"told {state.command[i]:+.3f} rad", "dim"))
     return table

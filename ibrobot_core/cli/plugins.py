@@ -10,6 +10,7 @@ import attrs
 import click
 
 from ibrobot_core.errors import PluginError
+from ibrobot_core.outside import echo
 from ibrobot_core.plugins import Entry, Registry, installed
 
 
@@ -24,16 +25,16 @@ def plugins(ctx: click.Context, as_json: bool) -> None:
     entries = [registry.entries[key] for key in sorted(registry.entries)]
     if as_json:
         broken = [attrs.asdict(failure) for failure in registry.failures]
-        click.echo(json.dumps({"plugins": [_row(registry, entry) for entry in entries], "broken": broken}, indent=2))
+        echo(json.dumps({"plugins": [_row(registry, entry) for entry in entries], "broken": broken}, indent=2))
         return
     columns = ("kind", "type", "package", "version", "summary")
     rows = [_row(registry, entry) for entry in entries]
     _print_table(columns, [[str(row[column]) for column in columns] for row in rows])
     for row in rows:
         if row["missing"] is not None:
-            click.echo(f"lacking: {row['kind']} {row['type']}: {_lacking(row)}")
+            echo(f"lacking: {row['kind']} {row['type']}: {_lacking(row)}")
     for failure in registry.failures:
-        click.echo(f"broken: {failure}")
+        echo(f"broken: {failure}")
 
 
 @plugins.command()
@@ -47,17 +48,17 @@ def show(type_: str, as_json: bool) -> None:
         raise PluginError(_unknown(registry, type_))
     described = [{**_row(registry, entry), "options": _options(entry)} for entry in entries]
     if as_json:
-        click.echo(json.dumps(described, indent=2))
+        echo(json.dumps(described, indent=2))
         return
     columns = ("name", "type", "unit", "default", "allowed", "help")
     for one in described:
-        click.echo(f"{one['kind']} type {one['type']} ({one['package']} {one['version']}): {one['summary']}")
+        echo(f"{one['kind']} type {one['type']} ({one['package']} {one['version']}): {one['summary']}")
         if one["missing"] is not None:
-            click.echo(f"lacking: {_lacking(one)}")
+            echo(f"lacking: {_lacking(one)}")
         if one["options"]:
             _print_table(columns, [[_text(option[column]) for column in columns] for option in one["options"]])
         else:
-            click.echo("no options")
+            echo("no options")
 
 
 def _row(registry: Registry, entry: Entry) -> dict[str, Any]:
@@ -126,13 +127,13 @@ def _print_table(columns: tuple[str, ...], rows: list[list[str]]) -> None:
     """A table as wide as the terminal; all of every cell where there is none to fit it into."""
     import sys
 
-    from rich.console import Console
     from rich.table import Table
-    from rich.text import Text
+
+    from ibrobot_core.screen import Screen
 
     table = Table(box=None, pad_edge=False, header_style="bold")
     for column in columns:
         table.add_column(column, no_wrap=column in ("kind", "name"), overflow="fold")
     for row in rows:
-        table.add_row(*(Text(cell) for cell in row))
-    Console(width=None if sys.stdout.isatty() else 1000).print(table)
+        table.add_row(*row)
+    Screen(width=None if sys.stdout.isatty() else 1000).print(table)

@@ -18,6 +18,7 @@ from ibrobot_core.interfaces import EpisodeSummary
 from ibrobot_core.launch.builders.replay import MODE, Replay, ReplayFeeder
 from ibrobot_core.launch.runtime import Runtime
 from ibrobot_core.launch.session import Request
+from ibrobot_core.outside import echo
 from ibrobot_core.plugins import installed
 from ibrobot_core.recording.convert.provenance import told_by
 from ibrobot_core.recording.playback import read_playback
@@ -90,7 +91,7 @@ def replay(
     finally:
         reader.close()
     if not summary.finished:
-        click.echo(f"{episode}: was never finished; {playback.duration:.2f} s of it could be read", err=True)
+        echo(f"{episode}: was never finished; {playback.duration:.2f} s of it could be read", err=True)
     request = Request(
         options["lockstep"], playback.seed or 0, replay=Replay(str(episode), playback, speed),
     )  # fmt: skip

@@ -21,6 +21,7 @@ from ibrobot_core.config.single import single_options
 from ibrobot_core.inference.build import build_policy
 from ibrobot_core.inference.service import InferenceService, ServiceOptions
 from ibrobot_core.interfaces import Context, Policy, Transport
+from ibrobot_core.outside import LogFormatter, echo
 from ibrobot_core.plugins import Registry, installed
 from ibrobot_core.robot import Robot
 from ibrobot_core.workers import on_signals
@@ -70,7 +71,7 @@ def serve(what: str, **options: Any) -> None:
     """
     registry = installed()
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(logging.Formatter("%(levelname).1s %(message)s"))
+    handler.setFormatter(LogFormatter("%(levelname).1s %(message)s"))
     logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
     logging.getLogger("ibrobot").setLevel(logging.INFO)
     name, policy, make_transport = (
@@ -94,13 +95,13 @@ def serve(what: str, **options: Any) -> None:
         service = InferenceService(policy, transport, name, limits, policy.picture_codec(), replace)
         try:
             service.start()
-            click.echo(f"serving {name} (policy {policy.fingerprint()}); Ctrl-C ends")
+            echo(f"serving {name} (policy {policy.fingerprint()}); Ctrl-C ends")
             _show(service, stopping)
             if not hung.is_set() and not service.drain(options["drain"]):
                 logging.getLogger("ibrobot").warning("requests that were there were not answered in time")
         finally:
             service.close()
-        click.echo(_line(service.statistics()))
+        echo(_line(service.statistics()))
     finally:
         if transport is not None:
             transport.close()
@@ -185,11 +186,13 @@ def _show(service: InferenceService, stopping: threading.Event) -> None:
     """Tell how it goes, until it is to stop: as a table in a terminal, else as a line now and then."""
     if not sys.stdout.isatty():
         while not stopping.wait(_PLAIN_PERIOD_S):
-            click.echo(_line(service.statistics()))
+            echo(_line(service.statistics()))
         return
     from rich.live import Live
 
-    with Live(auto_refresh=False) as display:
+    from ibrobot_core.screen import Screen
+
+    with Live(console=Screen(), auto_refresh=False) as display:
         while not stopping.wait(_PANEL_PERIOD_S):
             display.update(_table(service.statistics()), refresh=True)
 

@@ -6,10 +6,11 @@ import json
 
 import attrs
 import click
-from rich.console import Console
 from rich.table import Table
 
 from ibrobot_camera import v4l2
+from ibrobot_core.outside import echo
+from ibrobot_core.screen import Screen, text
 
 
 @click.command("list")
@@ -18,18 +19,18 @@ def list_cameras(as_json: bool) -> None:
     """List the cameras of this machine: path, stable id, name, and formats, sizes and rates."""
     found = v4l2.cameras()
     if as_json:
-        click.echo(json.dumps([attrs.asdict(camera) for camera in found], indent=2))
+        echo(json.dumps([attrs.asdict(camera) for camera in found], indent=2))
         return
     if not found:
-        click.echo("no camera: there is no /dev/video*; is it plugged in, and does `lsusb` show it?")
+        echo("no camera: there is no /dev/video*; is it plugged in, and does `lsusb` show it?")
         return
-    console = Console()
+    console = Screen()
     for camera in found:
-        console.print(f"[bold]{camera.path}[/bold]  {camera.name}")
+        console.print(text(camera.path, "bold") + text(f"  {camera.name}"))
         if camera.stable_id:
             console.print(f"  device: {camera.stable_id}", soft_wrap=True)
         if camera.problem:
-            console.print(f"  [red]{camera.problem}[/red]: sudo usermod -aG video $USER, log in anew")
+            console.print(text(f"  {camera.problem}", "red") + text(": sudo usermod -aG video $USER, log in anew"))
         else:
             console.print(_table(camera))
 

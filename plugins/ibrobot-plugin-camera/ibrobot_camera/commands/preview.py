@@ -13,6 +13,7 @@ from urllib.parse import parse_qs, urlsplit
 import click
 import cv2
 
+from ibrobot_core.outside import echo
 from ibrobot_core.workers import on_signals
 
 if TYPE_CHECKING:
@@ -85,7 +86,7 @@ def preview(source: str, host: str, port: int, seconds: float | None) -> None:
         server.daemon_threads = True
         for thread in (*(view.thread for view in views.values()), threading.Thread(target=server.serve_forever)):
             thread.start()
-        click.echo(f"http://{host}:{server.server_address[1]}/?token={token}")
+        echo(f"http://{host}:{server.server_address[1]}/?token={token}")
         ended.wait(seconds)
         ended.set()
         server.shutdown()

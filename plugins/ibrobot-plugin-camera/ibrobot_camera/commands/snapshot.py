@@ -12,6 +12,7 @@ import cv2
 
 from ibrobot_core.errors import SensorError
 from ibrobot_core.messages import Image
+from ibrobot_core.outside import echo
 from ibrobot_core.units import NS_PER_S
 
 _WAIT_S = 10.0
@@ -35,7 +36,7 @@ def snapshot(source: str, output: Path | None, seconds: float) -> None:
         path = output if len(pictures) == 1 else output.with_stem(f"{output.stem}_{name}")
         if not cv2.imwrite(str(path), pixels(image)):
             raise SensorError(f"{path}: cannot be written")
-        click.echo(f"{path}: {name}, {image.width}x{image.height} {image.encoding}, {rate_hz:.1f} Hz")
+        echo(f"{path}: {name}, {image.width}x{image.height} {image.encoding}, {rate_hz:.1f} Hz")
 
 
 def _watch(name: str, read: Callable[[float], Image | None], seconds: float) -> tuple[Image, float]:

@@ -17,6 +17,7 @@ from ibrobot_core.calibration import (
     save_calibration,
 )
 from ibrobot_core.errors import HardwareError, IbrobotError
+from ibrobot_core.outside import echo
 from ibrobot_feetech.arm import relax, write_eprom
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.commands.dialogue import agree
@@ -71,7 +72,7 @@ def calibrate(
             )
             found = measurement.run()
         except BaseException:
-            click.echo("Nothing was written; the torque is off, and the servos are calibrated as before.", err=True)
+            echo("Nothing was written; the torque is off, and the servos are calibrated as before.", err=True)
             raise
         usb = usb_port(bus.port.path)
         adapter = usb.serial_number if usb is not None else ""
@@ -79,10 +80,10 @@ def calibrate(
         backup(path)
         made = Calibration(found, robot=arm or adapter or Path(name).stem, date=date, adapter=adapter)
         save_calibration(made, path, overwrite=True)
-        click.echo(f"saved: {path}")
-        click.echo(zero_text(made))
+        echo(f"saved: {path}")
+        echo(zero_text(made))
         _write(bus, found, name)
-    click.echo(f"written to servos {', '.join(str(joint.servo) for joint in joints)}")
+    echo(f"written to servos {', '.join(str(joint.servo) for joint in joints)}")
 
 
 def backup(path: Path) -> None:
@@ -93,7 +94,7 @@ def backup(path: Path) -> None:
             former = path.with_suffix(suffix)
             if former.exists():
                 shutil.copy2(former, path.with_name(f"{path.stem}.{date}{suffix}"))
-        click.echo(f"the former one is kept: {path.with_name(f'{path.stem}.{date}.json')}")
+        echo(f"the former one is kept: {path.with_name(f'{path.stem}.{date}.json')}")
 
 
 def _prepare(bus: FeetechBus, yes: bool) -> None:
@@ -106,7 +107,7 @@ def _prepare(bus: FeetechBus, yes: bool) -> None:
                 f"`ibrobot feetech setup-motors --joint {bus.joints[servo]}` sets it"
             )
     if any(bus.sync_read("torque_enable", servos).values()) and not yes:
-        click.echo("The torque goes off, and the arm falls: hold it.")
+        echo("The torque goes off, and the arm falls: hold it.")
         if not agree("Go on?", flag="--yes", default=True):
             raise click.Abort
     relax(bus, servos)
@@ -125,7 +126,7 @@ def _write(bus: FeetechBus, found: dict[str, JointCalibration], name: str) -> No
             done.append(joint)
     except (IbrobotError, KeyboardInterrupt):
         left = ", ".join(joint for joint in found if joint not in done)
-        click.echo(
+        echo(
             f"The file is saved, but not all servos have it (not: {left}). "
             f"`ibrobot feetech check {bus.port.path} --name {name} --write` writes the rest.",
             err=True,

@@ -9,6 +9,7 @@ import attrs
 import click
 
 from ibrobot_core.calibration import Calibration, load_calibration
+from ibrobot_core.outside import echo
 from ibrobot_feetech.arm import write_eprom
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.commands.dialogue import agree, show, table
@@ -47,17 +48,15 @@ class Difference:
 def check(port: str | None, name: str, robot: str | None, write: bool, yes: bool) -> None:
     """Compare the servos with a calibration; exit 1 with a table of what differs."""
     calibration = load_calibration(name, [joint.name for joint in joints_of(robot, name)])
-    click.echo(
-        f"{calibration.path}: arm {calibration.robot or 'unnamed'}, made {calibration.date or 'at an unknown time'}"
-    )
-    click.echo(zero_text(calibration))
+    echo(f"{calibration.path}: arm {calibration.robot or 'unnamed'}, made {calibration.date or 'at an unknown time'}")
+    echo(zero_text(calibration))
     with opened(port, joints={joint.id: each for each, joint in calibration.joints.items()}) as bus:
         check_adapter(calibration, bus.port.path)
         found = list(differences(bus, calibration))
         if write and (wrong := [each for each in found if not each.remedy]):
             _print(found)
             servos = sorted({each.servo for each in wrong})
-            click.echo("The torque of these servos goes off, and the arm may fall: hold it.")
+            echo("The torque of these servos goes off, and the arm may fall: hold it.")
             if not (yes or agree(f"Write to servos {', '.join(map(str, servos))}?", flag="--yes")):
                 raise click.Abort
             for servo in servos:
@@ -67,7 +66,7 @@ def check(port: str | None, name: str, robot: str | None, write: bool, yes: bool
         _print(found)
     if any(each.matters for each in found):
         sys.exit(1)
-    click.echo(f"{len(calibration.joints)} servos are as the calibration says")
+    echo(f"{len(calibration.joints)} servos are as the calibration says")
 
 
 def differences(bus: FeetechBus, calibration: Calibration) -> Iterator[Difference]:

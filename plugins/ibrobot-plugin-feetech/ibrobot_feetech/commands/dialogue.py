@@ -6,10 +6,10 @@ import sys
 
 import click
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
 from rich.table import Table
 
 from ibrobot_core.errors import IbrobotError
+from ibrobot_core.screen import Screen
 
 
 class Unanswered(IbrobotError):
@@ -60,4 +60,4 @@ def table(*columns: str) -> Table:
 
 def show(made: Table) -> None:
     """Print a table: in colour in a terminal, as plain text elsewhere."""
-    Console().print(made)
+    Screen().print(made)

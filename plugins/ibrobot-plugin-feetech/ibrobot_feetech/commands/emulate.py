@@ -22,6 +22,7 @@ from ibrobot_core.calibration import (
     load_calibration,
     save_calibration,
 )
+from ibrobot_core.outside import echo
 from ibrobot_core.units import TICKS_PER_TURN
 from ibrobot_core.workers import on_signals
 from ibrobot_feetech.commands.joints import SO101
@@ -88,7 +89,7 @@ def emulate(
         faults.overloaded, faults.disconnected = set(overloaded), set(disconnected)
         faults.errors = dict(errors)
         found = _calibrate(emulator, calibration, joints, config.robot if config is not None else None)
-        click.echo(str(link) if link is not None else emulator.port)
+        echo(str(link) if link is not None else emulator.port)
         arm = None
         if config is not None:
             assert found is not None
@@ -96,7 +97,7 @@ def emulate(
             arm.start()
             stack.callback(arm.stop)
         _hurry()
-        click.echo(f"{count} servos at {baud} baud; Ctrl-C ends it", err=True)
+        echo(f"{count} servos at {baud} baud; Ctrl-C ends it", err=True)
         _wait(ended, arm)
 
 
@@ -106,7 +107,7 @@ def _hurry() -> None:
 
     sys.setswitchinterval(_SWITCH_S)
     for refused in go_real_time(_PRIORITY):
-        click.echo(refused, err=True)
+        echo(refused, err=True)
 
 
 def _wait(ended: threading.Event, arm: PhysicsArm | None) -> None:
@@ -117,7 +118,7 @@ def _wait(ended: threading.Event, arm: PhysicsArm | None) -> None:
                 return
             if arm.success and not told:
                 told = True
-                click.echo("success: the scene's task is done")
+                echo("success: the scene's task is done")
 
 
 def _config(name: str) -> RobotConfig:
@@ -140,7 +141,7 @@ def _physics(config: RobotConfig, calibration: Calibration, emulator: Emulator, 
         arm = PhysicsArm(config, installed(), Arm(robot.joint_names, calibration, closed), emulator, socket, seed)
     except OSError as error:
         raise click.BadParameter(f"no socket can be made at {socket}: {error}", param_hint="--link") from None
-    click.echo(f"signals on {socket}")
+    echo(f"signals on {socket}")
     return arm
 
 
@@ -154,7 +155,7 @@ def _calibrate(emulator: Emulator, name: str | None, joints: Sequence[str], robo
         date = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
         calibration = Calibration(_ranges(joints, robot), robot=name or "emulated", date=date)
         if name is not None:
-            click.echo(f"calibration saved in {save_calibration(calibration, name)}", err=True)
+            echo(f"calibration saved in {save_calibration(calibration, name)}", err=True)
     with emulator.lock:
         for joint in calibration.joints.values():
             servo = emulator.servos[joint.id]

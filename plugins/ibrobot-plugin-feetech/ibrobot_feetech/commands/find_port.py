@@ -5,6 +5,7 @@ from __future__ import annotations
 import click
 
 from ibrobot_core.errors import HardwareError
+from ibrobot_core.outside import echo
 from ibrobot_feetech.commands.dialogue import wait_for_enter
 from ibrobot_feetech.usb import UsbPort, usb_ports
 
@@ -17,7 +18,7 @@ def find_port(only_list: bool) -> None:
     for port in before:
         _show(port)
     if not before:
-        click.echo("No USB serial port is there.")
+        echo("No USB serial port is there.")
     if only_list:
         return
     wait_for_enter("Pull the arm's USB cable, if it is plugged in.", flag="--list")
@@ -32,15 +33,15 @@ def find_port(only_list: bool) -> None:
         raise HardwareError("no port came with the cable; check the cable (some only charge) and the arm's board")
     if len(new) > 1:
         raise HardwareError(f"several ports came: {', '.join(port.path for port in new)}; plug in one arm at a time")
-    click.echo("\nThe arm is at:")
+    echo("\nThe arm is at:")
     _show(new[0])
 
 
 def _show(port: UsbPort) -> None:
     arm = " (an SO-101's adapter)" if port.is_arm else ""
     number = f", serial number {port.serial_number}" if port.serial_number else ""
-    click.echo(f"{port.path}  {port.description}, USB {port.usb_id}{number}{arm}")
+    echo(f"{port.path}  {port.description}, USB {port.usb_id}{number}{arm}")
     if port.stable:
-        click.echo(f"    better in a YAML, since it stays the same: {port.stable}")
+        echo(f"    better in a YAML, since it stays the same: {port.stable}")
     if not port.permitted:
-        click.echo("    no permission: sudo usermod -aG dialout $USER, then log in again")
+        echo("    no permission: sudo usermod -aG dialout $USER, then log in again")

@@ -7,6 +7,7 @@ import click
 
 from ibrobot_core.calibration import ZERO_AT, calibration_path, load_calibration, save_calibration
 from ibrobot_core.errors import HardwareError
+from ibrobot_core.outside import echo
 from ibrobot_feetech.commands.calibrate import backup
 from ibrobot_feetech.commands.dialogue import agree
 from ibrobot_feetech.commands.joints import joints_of
@@ -38,8 +39,8 @@ def import_calibration(
     made = attrs.evolve(found, robot=arm or found.robot, adapter=adapter)
     backup(path)
     save_calibration(made, path, overwrite=True)
-    click.echo(f"saved: {path}")
-    click.echo(zero_text(made))
+    echo(f"saved: {path}")
+    echo(zero_text(made))
 
 
 def _adapter(port: str) -> str:

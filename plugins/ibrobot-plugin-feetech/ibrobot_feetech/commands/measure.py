@@ -9,12 +9,13 @@ from contextlib import ExitStack
 
 import attrs
 import click
-from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
 from ibrobot_core.calibration import JointCalibration
 from ibrobot_core.errors import CalibrationError
+from ibrobot_core.outside import echo
+from ibrobot_core.screen import Screen
 from ibrobot_core.terminal import Keys
 from ibrobot_core.units import TICKS_PER_TURN
 from ibrobot_feetech.bus import FeetechBus
@@ -99,7 +100,7 @@ class Measurement:
             except CalibrationError as error:
                 if self._answers.middle_now:
                     raise
-                click.echo(f"error: {error}", err=True)
+                echo(f"error: {error}", err=True)
 
     def _ranges(self, offsets: Mapping[int, int]) -> dict[str, Range]:
         reported = self._reported(offsets)
@@ -113,7 +114,7 @@ class Measurement:
             refused = "\n".join(wrong) or "the ranges were not accepted; --accept-ranges takes them all the same"
             if crossed or self._answers.range_seconds is not None:
                 raise CalibrationError(refused)
-            click.echo(refused, err=True)
+            echo(refused, err=True)
             if not agree("Measure on?", flag="--range-seconds", default=True):
                 raise click.Abort
 
@@ -121,7 +122,7 @@ class Measurement:
         compared = [joint for joint in self._measured if joint.name in self._compared]
         doubts = [text for joint in compared if (text := doubtful(joint, ranges[joint.name], self._zero_at))]
         for text in doubts:
-            click.echo(f"warning: {text}", err=True)
+            echo(f"warning: {text}", err=True)
         if not doubts or self._answers.accept_ranges:
             return True
         return self._answers.range_seconds is None and agree("Take these ranges all the same?", flag="--accept-ranges")
@@ -136,11 +137,11 @@ class Measurement:
         if seconds is None and not interactive():
             raise Unanswered("Nobody is at a terminal to press Enter; run it in one, or give --range-seconds")
         end = "Enter ends it" if seconds is None else f"for {seconds:g} s"
-        click.echo(f"Move each joint of the table to both ends ({end}).")
+        echo(f"Move each joint of the table to both ends ({end}).")
         until = time.monotonic() + (seconds if seconds is not None else float("inf"))
         with ExitStack() as stack:
             typed = stack.enter_context(Keys()).subscribe() if interactive() else queue.SimpleQueue[str]()
-            console = Console()
+            console = Screen()
             live = Live(console=console, auto_refresh=False)
             if console.is_terminal:
                 stack.enter_context(live)
@@ -166,9 +167,9 @@ class Measurement:
             moved = (self._encoders()[joint.servo] - before + half) % TICKS_PER_TURN - half
             if abs(moved) >= _TURNED:
                 break
-            click.echo(f"error: {joint.name} moved by {moved} ticks only; again", err=True)
+            echo(f"error: {joint.name} moved by {moved} ticks only; again", err=True)
         if moved < 0:
-            click.echo(f"warning: {joint.name}: ticks fall while its angle grows: it is stored as inverted", err=True)
+            echo(f"warning: {joint.name}: ticks fall while its angle grows: it is stored as inverted", err=True)
         return moved < 0
 
 

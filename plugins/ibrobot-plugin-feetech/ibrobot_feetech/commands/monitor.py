@@ -8,11 +8,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import click
-from rich.console import Console, Group
+from rich.console import Group
 from rich.live import Live
 from rich.table import Table
-from rich.text import Text
 
+from ibrobot_core.outside import echo
+from ibrobot_core.screen import Screen, text
 from ibrobot_core.units import degrees, ticks_to_radians
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.commands.dialogue import table
@@ -44,11 +45,11 @@ def monitor(port: str | None, robot: str | None, period: float, once: bool, as_j
         try:
             if as_json:
                 while True:
-                    click.echo(json.dumps({"servos": reading(reader, joints), "bus": dict(bus.counters)}))
+                    echo(json.dumps({"servos": reading(reader, joints), "bus": dict(bus.counters)}))
                     if once:
                         return
                     time.sleep(period)
-            console = Console()
+            console = Screen()
             if once or not console.is_terminal:
                 console.print(_panel(bus, reader, joints))
                 while not once:
@@ -82,7 +83,7 @@ def reading(reader: SyncReader, joints: Sequence[Joint]) -> list[dict[str, Any]]
 def _panel(bus: FeetechBus, reader: SyncReader, joints: Sequence[Joint]) -> Group:
     rows = _rows(reading(reader, joints))
     counts = ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in bus.counters.items())
-    return Group(rows, Text(counts, style="dim"))
+    return Group(rows, text(counts, style="dim"))
 
 
 def _rows(servos: Sequence[Mapping[str, Any]]) -> Table:
@@ -90,9 +91,9 @@ def _rows(servos: Sequence[Mapping[str, Any]]) -> Table:
     for servo in servos:
         name = str(servo["id"]), servo["joint"]
         if not servo["answers"]:
-            made.add_row(*name, *[""] * 7, Text("no reply", style="red"))
+            made.add_row(*name, *[""] * 7, text("no reply", style="red"))
             continue
-        errors = Text(", ".join(servo["errors"]) or "none", style="red" if servo["errors"] else "")
+        errors = text(", ".join(servo["errors"]) or "none", style="red" if servo["errors"] else "")
         made.add_row(
             *name, str(servo["position_ticks"]), f"{servo['position_deg']:.1f}", f"{servo['velocity_deg_s']:.0f}",
             f"{servo['load_percent']:.0f}", f"{servo['temperature_c']:.0f}", f"{servo['voltage_v']:.1f}",

@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from ibrobot_core.errors import HardwareError
+from ibrobot_core.outside import echo
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.usb import ADAPTER_VENDOR, usb_ports
 
@@ -32,7 +33,7 @@ def the_port(port: str | None) -> str:
         )
     if len(arms) > 1:
         raise HardwareError(f"no port given, and there are several arms: {', '.join(arms)}; give PORT")
-    click.echo(f"port: {arms[0]}", err=True)
+    echo(f"port: {arms[0]}", err=True)
     return arms[0]
 
 

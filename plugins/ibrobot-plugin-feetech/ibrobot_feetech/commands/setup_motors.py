@@ -7,6 +7,7 @@ from contextlib import suppress
 import click
 
 from ibrobot_core.errors import HardwareError
+from ibrobot_core.outside import echo
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.commands.dialogue import agree, interactive, wait_for_enter
 from ibrobot_feetech.commands.joints import Joint, by_servo, chosen, joints_of
@@ -34,7 +35,7 @@ def setup_motors(port: str | None, names: tuple[str, ...], robot: str | None, ba
     with opened(port, joints=by_servo(every)) as bus:
         for joint in reversed(chosen(every, names)):
             _set_up(bus, joint, baud, yes)
-    click.echo("Now connect the servos in a chain; `ibrobot feetech scan` must show all of them.")
+    echo("Now connect the servos in a chain; `ibrobot feetech scan` must show all of them.")
 
 
 def _set_up(bus: FeetechBus, joint: Joint, rates: tuple[int, ...], yes: bool) -> None:
@@ -47,11 +48,11 @@ def _set_up(bus: FeetechBus, joint: Joint, rates: tuple[int, ...], yes: bool) ->
         except HardwareError as error:
             if yes or not interactive():
                 raise
-            click.echo(f"error: {error}", err=True)
+            echo(f"error: {error}", err=True)
             if not agree("Try again?", flag="--yes", default=True):
                 raise click.Abort from None
         else:
-            click.echo(f"{joint.name}: was id {servo} at {rate} baud, is id {joint.servo} at {_RATE} baud")
+            echo(f"{joint.name}: was id {servo} at {rate} baud, is id {joint.servo} at {_RATE} baud")
             return
 
 

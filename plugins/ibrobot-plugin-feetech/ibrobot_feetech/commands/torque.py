@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import click
 
+from ibrobot_core.outside import echo
 from ibrobot_feetech.arm import hold, relax
 from ibrobot_feetech.commands.dialogue import agree
 from ibrobot_feetech.commands.joints import Joint, by_servo, chosen, joints_of
@@ -30,8 +31,8 @@ def torque(
             for joint in joints:
                 hold(bus, joint.servo)
         else:
-            click.echo("Without torque the arm falls: hold it, or see that it lies.")
+            echo("Without torque the arm falls: hold it, or see that it lies.")
             if not (yes or agree("Torque off?", flag="--yes")):
                 raise click.Abort
             relax(bus, [joint.servo for joint in joints])
-    click.echo(f"torque {state}: {', '.join(joint.name for joint in joints)}")
+    echo(f"torque {state}: {', '.join(joint.name for joint in joints)}")

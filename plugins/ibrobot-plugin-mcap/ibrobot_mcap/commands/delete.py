@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 
 from ibrobot_core.errors import RecorderError
+from ibrobot_core.outside import echo
 
 
 @click.command()
@@ -28,4 +29,4 @@ def delete(episodes: tuple[Path, ...], yes: bool) -> None:
             shutil.rmtree(episode)
         except OSError as error:
             raise RecorderError(f"{episode}: cannot be deleted: {error.strerror}") from error
-        click.echo(f"{episode}: deleted")
+        echo(f"{episode}: deleted")

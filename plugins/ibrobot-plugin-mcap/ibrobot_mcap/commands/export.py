@@ -14,6 +14,7 @@ import numpy as np
 
 from ibrobot_core.errors import RecorderError
 from ibrobot_core.messages import Image, Message
+from ibrobot_core.outside import echo
 
 _TO_RGB = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2, 3), "bgra8": (2, 1, 0, 3)}
 """Encoding -> its channels in the order of a PNG."""
@@ -45,7 +46,7 @@ def export(episode: Path, topic: str, output: Path) -> None:
             raise RecorderError(f"{output}: cannot be written: {error.strerror}") from error
         finally:
             _remove(making)
-    click.echo(f"{output}: {count} messages of {topic}")
+    echo(f"{output}: {count} messages of {topic}")
 
 
 def _remove(making: Path) -> None:

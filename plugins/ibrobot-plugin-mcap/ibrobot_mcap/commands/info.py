@@ -8,8 +8,10 @@ from pathlib import Path
 
 import attrs
 import click
-from rich.console import Console
 from rich.table import Table
+
+from ibrobot_core.outside import echo
+from ibrobot_core.screen import Screen
 
 _LONG = 200
 """Metadata longer than this is only told the length of [characters]."""
@@ -24,9 +26,9 @@ def info(episode: Path, as_json: bool) -> None:
 
     summary = summary_of(episode)
     if as_json:
-        click.echo(json.dumps(attrs.asdict(summary), indent=2, default=str))
+        echo(json.dumps(attrs.asdict(summary), indent=2, default=str))
         return
-    console = Console(width=None if sys.stdout.isatty() else 1000)
+    console = Screen(width=None if sys.stdout.isatty() else 1000)
     state = summary.outcome if summary.finished else "unfinished; `ibrobot episodes repair` makes it whole"
     console.print(f"{episode}: {state}", soft_wrap=True)
     began = f"{date_of(summary)} UTC" if date_of(summary) else "no messages"
@@ -46,4 +48,4 @@ def info(episode: Path, as_json: bool) -> None:
             console.print(f"{name}: {topic.missing} messages that the recorder wrote are missing", soft_wrap=True)
     for key, value in summary.metadata.items():
         shown = value if len(value) <= _LONG else f"({len(value)} characters; --json shows them)"
-        console.print(f"{key}: {shown}", soft_wrap=True, highlight=False)
+        console.print(f"{key}: {shown}", soft_wrap=True)

@@ -7,10 +7,11 @@ import sys
 from pathlib import Path
 
 import click
-from rich.console import Console
 from rich.table import Table
 
 from ibrobot_core.errors import RecorderError
+from ibrobot_core.outside import echo
+from ibrobot_core.screen import Screen, text
 
 _WIDE = 100
 """Columns of a terminal in which prompts and years have room."""
@@ -39,9 +40,9 @@ def list_episodes(path: Path, as_json: bool) -> None:
             "outcome": summary.outcome, "finished": summary.finished, "bytes": size_of(episode),
         })  # fmt: skip
     if as_json:
-        click.echo(json.dumps(rows, indent=2))
+        echo(json.dumps(rows, indent=2))
     else:
-        console = Console(width=None if sys.stdout.isatty() else 1000)
+        console = Screen(width=None if sys.stdout.isatty() else 1000)
         table = Table(box=None, padding=(0, 1))
         wide = console.width >= _WIDE
         prompts = ("prompt",) if wide else ()
@@ -61,12 +62,13 @@ def list_episodes(path: Path, as_json: bool) -> None:
             table.add_row(
                 _shown(Path(str(row["path"])), path), str(row["date"])[0 if wide else 5 :], f"{row['duration_s']:.1f}",
                 str(row["messages"]), str(row["dropped"]),
-                str(row["outcome"]) if row["finished"] else "[red]unfinished[/red]", told_size(int(str(row["bytes"]))),
+                str(row["outcome"]) if row["finished"] else text("unfinished", "red"),
+                told_size(int(str(row["bytes"]))),
                 *([str(row["prompt"])] if prompts else []),
             )  # fmt: skip
         console.print(table)
     for problem in problems:
-        click.echo(f"unreadable: {problem}", err=True)
+        echo(f"unreadable: {problem}", err=True)
     if problems:
         raise SystemExit(1)
 

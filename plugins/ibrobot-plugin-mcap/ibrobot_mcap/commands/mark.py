@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from ibrobot_core.errors import RecorderError
+from ibrobot_core.outside import echo
 
 
 @click.command()
@@ -27,4 +28,4 @@ def mark(episodes: tuple[Path, ...], outcome: str) -> None:
         if not whole:
             raise RecorderError(f"{episode}: is unfinished, or lacks messages; `ibrobot episodes repair` first")
         set_custom(episode, {OUTCOME: outcome, MARKED: "true"})
-        click.echo(f"{episode}: {outcome}")
+        echo(f"{episode}: {outcome}")

@@ -12,6 +12,7 @@ import numpy as np
 
 from ibrobot_core.errors import RecorderError
 from ibrobot_core.messages import Float64MultiArray, Image, JointState
+from ibrobot_core.outside import echo
 from ibrobot_core.units import NS_PER_S
 from ibrobot_mcap.checks import contract_of
 
@@ -30,7 +31,7 @@ def plot(episode: Path, output: Path | None) -> None:
     mpl.use("Agg")
     output = output or Path(f"{episode.name}.png")
     _draw(Facts(episode), output)
-    click.echo(str(output))
+    echo(str(output))
 
 
 class Facts:

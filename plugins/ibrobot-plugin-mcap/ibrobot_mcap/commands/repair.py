@@ -8,6 +8,7 @@ import click
 
 from ibrobot_core.errors import RecorderError
 from ibrobot_core.interfaces import EpisodeSummary
+from ibrobot_core.outside import echo
 
 
 @click.command()
@@ -28,13 +29,13 @@ def repair(path: Path) -> None:
             made = rewrite.repair(episode)
         except RecorderError as error:
             failed += 1
-            click.echo(f"error: {error}", err=True)
+            echo(f"error: {error}", err=True)
             continue
         if made is None:
-            click.echo(f"{episode}: is whole")
+            echo(f"{episode}: is whole")
         else:
             count = sum(topic.count for topic in made.summary.topics.values())
-            click.echo(f"{episode}: repaired, {count} messages, {duration_s(made.summary):.2f} s{_told(made.summary)}")
+            echo(f"{episode}: repaired, {count} messages, {duration_s(made.summary):.2f} s{_told(made.summary)}")
     if failed:
         raise SystemExit(1)
 

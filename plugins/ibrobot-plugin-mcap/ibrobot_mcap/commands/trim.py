@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from ibrobot_core.errors import RecorderError
+from ibrobot_core.outside import echo
 
 
 @click.command()
@@ -34,4 +35,4 @@ def trim(episode: Path, begin_s: float, end_s: float | None, output: Path) -> No
         marks={"trimmed": f"{begin_s:g} s to {last_s:g} s of {episode.name}"},
     )  # fmt: skip
     count = sum(topic.count for topic in made.summary.topics.values())
-    click.echo(f"{output}: {count} messages, {duration_s(made.summary):.2f} s")
+    echo(f"{output}: {count} messages, {duration_s(made.summary):.2f} s")

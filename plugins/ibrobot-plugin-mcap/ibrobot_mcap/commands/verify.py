@@ -6,6 +6,8 @@ from pathlib import Path
 
 import click
 
+from ibrobot_core.outside import echo
+
 
 @click.command()
 @click.argument("path", type=click.Path(path_type=Path))
@@ -29,6 +31,6 @@ def verify(path: Path, gap: float) -> None:
         if fingerprint != first:
             problems.append(f"its contract is {fingerprint[:12]}, that of {where.name} is {first[:12]}")
         bad += bool(problems)
-        click.echo(f"{episode}: {'; '.join(problems) or 'good'}")
+        echo(f"{episode}: {'; '.join(problems) or 'good'}")
     if bad:
         raise SystemExit(1)

@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 
 from ibrobot_core.errors import TransportError
+from ibrobot_core.outside import echo
 from ibrobot_zenoh.certificates import CA, CERTIFICATE, KEY, ROBOTS, Authority
 from ibrobot_zenoh.options import check_robot_name
 
@@ -52,7 +53,7 @@ def certs(out_dir: Path, servers: tuple[str, ...], robots: tuple[str, ...], days
     except OSError as error:
         raise TransportError(f"{error.filename or out_dir}: cannot be written: {error.strerror}") from error
     told = "made" if authority.is_new else "signed by"
-    click.echo(f"{told} the authority {out_dir / CA}; all is valid until {authority.ends:%Y-%m-%d}")
+    echo(f"{told} the authority {out_dir / CA}; all is valid until {authority.ends:%Y-%m-%d}")
     server = next(iter(hosts), "SERVER")
     endpoint = f'"tls/[{server}]:{_PORT}"' if ":" in server else f"tls/{server}:{_PORT}"
     for name, folder in zip(machines, made, strict=True):
@@ -62,14 +63,14 @@ def certs(out_dir: Path, servers: tuple[str, ...], robots: tuple[str, ...], days
             _tell(folder, f"connect: [{endpoint}]", files=_FILES)
     for path in lists:
         if robots and path.parent.name not in hosts:
-            click.echo(f"\n# {path.parent.name}: copy {path} there again and restart it, so that it lets the robot in")
+            echo(f"\n# {path.parent.name}: copy {path} there again and restart it, so that it lets the robot in")
 
 
 def _tell(folder: Path, *lines: str, files: dict[str, str]) -> None:
     """What a machine's YAML says."""
-    click.echo(f"\n# {folder.name}: copy {folder}/ there, beside its YAML, which says:\ntransport:\n  type: zenoh")
+    echo(f"\n# {folder.name}: copy {folder}/ there, beside its YAML, which says:\ntransport:\n  type: zenoh")
     for line in lines:
-        click.echo(f"  {line}")
-    click.echo("  tls:")
+        echo(f"  {line}")
+    echo("  tls:")
     for key, file in files.items():
-        click.echo(f"    {key}: {folder.name}/{file}")
+        echo(f"    {key}: {folder.name}/{file}")

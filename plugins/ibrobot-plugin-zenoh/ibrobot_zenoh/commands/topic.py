@@ -14,6 +14,7 @@ import click
 
 from ibrobot_core.errors import TransportError
 from ibrobot_core.messages import Message
+from ibrobot_core.outside import echo
 from ibrobot_zenoh.commands.network import connected, network_options
 from ibrobot_zenoh.commands.text import message_from, shown
 from ibrobot_zenoh.transport import ZenohTransport
@@ -52,23 +53,23 @@ def list_(transport: ZenohTransport, types: bool) -> None:
     """List the topics that are shared now."""
     shared = transport.shared_topics(_LIST_S)
     if not shared:
-        click.echo("no topics are shared there now", err=True)
+        echo("no topics are shared there now", err=True)
     for found in shared:
         counts = f"  {found.type}  published by {found.publishers}, heard by {found.subscribers} ROS 2 nodes"
-        click.echo(f"{found.name}{counts if types else ''}")
+        echo(f"{found.name}{counts if types else ''}")
 
 
 @_command
 @click.argument("name", metavar="TOPIC")
 @click.option("--count", "-n", type=click.IntRange(1), help="End after so many messages.")
 @click.option("--full", is_flag=True, help="All elements of arrays.")
-def echo(transport: ZenohTransport, name: str, count: int | None, full: bool) -> None:
+def echo_(transport: ZenohTransport, name: str, count: int | None, full: bool) -> None:
     """Show the messages on TOPIC, until Ctrl-C."""
     arrived: queue.SimpleQueue[Message] = queue.SimpleQueue()
     transport.subscribe_messages(name, arrived.put)
     _tell_whether_published(transport, name)
     for _ in _counted(count):
-        click.echo(f"{shown(arrived.get(), full=full)}---")
+        echo(f"{shown(arrived.get(), full=full)}---")
 
 
 @_command
@@ -90,10 +91,10 @@ def hz(transport: ZenohTransport, name: str, count: int | None, period: float) -
         gaps = [after - before for before, after in pairwise(times)]
         last = times[-1] if times else None
         if not gaps:
-            click.echo(f"less than two messages on {name} in {period:g} s")
+            echo(f"less than two messages on {name} in {period:g} s")
             continue
         rate = len(gaps) / sum(gaps)
-        click.echo(f"{rate:.2f} Hz, gaps {min(gaps) * 1e3:.1f} to {max(gaps) * 1e3:.1f} ms, {len(gaps)} messages")
+        echo(f"{rate:.2f} Hz, gaps {min(gaps) * 1e3:.1f} to {max(gaps) * 1e3:.1f} ms, {len(gaps)} messages")
 
 
 @_command
@@ -112,7 +113,7 @@ def pub(transport: ZenohTransport, name: str, type_name: str, text: str, rate: f
     if known - {message.ros_type}:
         raise TransportError(f"topic {name} carries {', '.join(sorted(known))}, not {message.ros_type}")
     if not transport.is_heard(name, message.ros_type, _HEARD_S):
-        click.echo(f"nobody listens to {name} yet", err=True)
+        echo(f"nobody listens to {name} yet", err=True)
     due = time.monotonic()
     for _ in _counted(1 if rate is None else count):
         transport.publish_message(name, message)
@@ -125,7 +126,7 @@ def _tell_whether_published(transport: ZenohTransport, name: str) -> None:
     """Who waits for messages is told when nobody sends any."""
     published = [found.name for found in transport.shared_topics(_LIST_S) if found.publishers]
     if name not in published:
-        click.echo(f"nobody publishes {name} yet; published now: {', '.join(published) or 'nothing'}", err=True)
+        echo(f"nobody publishes {name} yet; published now: {', '.join(published) or 'nothing'}", err=True)
 
 
 def _counted(count: int | None) -> Iterator[int]:

@@ -1,0 +1,165 @@
+"""Text from outside is never markup, a control character or a secret, wherever it is shown."""
+
+from __future__ import annotations
+
+import ast
+import io
+import json
+import logging
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.table import Table
+
+from ibrobot_core import outside
+from ibrobot_core.cli import serve
+from ibrobot_core.outside import LogFormatter, echo, printable
+from ibrobot_core.screen import Screen, text
+
+ROOT = Path(__file__).parents[1]
+HOSTILE = st.lists(
+    st.sampled_from(
+        ["[/x]", "[red]", "[link=http://x]", ":warning:", "\x1b[2J", "\x1b]0;x\x07", "\x9b", "\r", "\u202e"]
+    )
+    | st.text(max_size=5),
+    max_size=8,
+).map("".join)
+UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\ud800-\udfff]")
+
+
+def rendered(*shown: object) -> str:
+    screen = Screen(file=io.StringIO(), width=1000)
+    for each in shown:
+        screen.print(each)
+    assert isinstance(screen.file, io.StringIO)
+    return screen.file.getvalue()
+
+
+@given(HOSTILE)
+def test_nothing_unprintable_comes_through(hostile: str):
+    assert not UNPRINTABLE.search(printable(hostile))
+
+
+@given(st.text(st.characters(exclude_categories=["C"]), max_size=50).filter(lambda each: "://" not in each))
+def test_ordinary_text_stays_as_it_is(ordinary: str):
+    assert printable(ordinary) == ordinary
+
+
+@given(HOSTILE)
+def test_json_says_the_same(hostile: str):
+    """What a program reads is the text itself, but for credentials."""
+    hostile = hostile.replace("/", "")
+    assert json.loads(printable(json.dumps(hostile))) == json.loads(json.dumps(hostile))
+
+
+@given(HOSTILE)
+def test_a_table_shows_markup_as_it_is(hostile: str):
+    table = Table(title=hostile)
+    table.add_column(hostile)
+    table.add_row(hostile)
+    table.add_row(text(hostile, "red"))
+    shown = rendered(table, hostile, text(hostile))
+    assert not UNPRINTABLE.search(shown)
+    assert shown.count("[/x]") >= hostile.count("[/x]")
+
+
+def test_markup_is_shown_literally():
+    table = Table(title="[b]title[/x]")
+    table.add_row("[/x] :warning:")
+    shown = rendered(table, "[red]plain", text("[red]styled"))
+    assert all(each in shown for each in ("[b]title[/x]", "[/x] :warning:", "[red]plain", "[red]styled"))
+
+
+@given(st.dictionaries(HOSTILE, st.just(None), max_size=3), HOSTILE)
+def test_the_server_s_table_takes_any_robot_s_name(robots: dict[str, None], model: str):
+    """A robot that called itself [/x] ended the server of all."""
+    counts = dict.fromkeys(("requests", "answered", "expired", "malformed", "waiting", "failed"), 0)
+    counts |= dict.fromkeys(("latency_p50_ms", "latency_p99_ms"), 0.0)
+    statistics = {**counts, "model": model, "robots": dict.fromkeys(robots, counts)}
+    assert not UNPRINTABLE.search(rendered(serve._table(statistics)))
+
+
+@given(HOSTILE)
+def test_a_log_line_cannot_look_like_another(hostile: str):
+    record = logging.LogRecord("ibrobot", logging.INFO, "", 0, "from %s", (f"{hostile}\nE a lie",), None)
+    first, *later = LogFormatter("%(levelname).1s %(message)s").format(record).split("\n")
+    assert first.startswith("I from ")
+    assert later
+    assert all(line.startswith("  ") for line in later)
+    assert not UNPRINTABLE.search("".join([first, *later]))
+
+
+def test_echo(capsys: pytest.CaptureFixture[str]):
+    echo("a\x1b[2Jb\tc")
+    echo("rtsp://me:pw@cam/1", err=True)
+    told = capsys.readouterr()
+    assert told.out == "a\\u001b[2Jb\tc\n"
+    assert told.err == "rtsp://***@cam/1\n"
+
+
+def test_a_remembered_secret_is_hidden_in_every_form(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(outside, "_secrets", set())
+    outside.remember_secret("p@ss'word")
+    for told in ("p@ss'word", "p%40ss%27word", repr("p@ss'word")):
+        assert "word" not in printable(f"it is {told}!"), told
+    outside.remember_secret("no")
+    assert printable("nobody") == "nobody"
+
+
+def sources() -> Iterator[Path]:
+    yield from (ROOT / "ibrobot_core").rglob("*.py")
+    for package in (ROOT / "plugins").glob("ibrobot*/ibrobot_*"):
+        yield from package.rglob("*.py")
+
+
+_RICH = {
+    "Console": "Screen of ibrobot_core.screen", "Text": "text of ibrobot_core.screen", "print": "echo",
+    "markup": "nothing", "escape": "nothing", "Prompt": "click.prompt", "inspect": "echo", "pretty": "echo",
+}  # fmt: skip
+_ONE_WAY = {Path("ibrobot_core/outside.py"), Path("ibrobot_core/screen.py")}
+
+
+def ways_around(tree: ast.AST) -> Iterator[str]:
+    """What a module does that shows text by another way than `echo`, `LogFormatter` and `Screen`."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] == "rich":
+            yield from (f"rich's {each.name}: use {_RICH[each.name]}" for each in node.names if each.name in _RICH)
+        elif isinstance(node, ast.Import):
+            yield from ("import rich" for each in node.names if each.name.partition(".")[0] == "rich")
+        elif isinstance(node, ast.Call):
+            called, given = ast.unparse(node.func), {word.arg: word.value for word in node.keywords}
+            if called in ("click.echo", "click.secho", "print", "logging.Formatter"):
+                yield f"{called}: use echo or LogFormatter"
+            elif called in ("Live", "Progress") and "console" not in given:
+                yield f"{called} without console=: its own takes markup"
+            elif called == "TextColumn" and "markup" not in given:
+                yield "TextColumn without markup=False"
+            elif called == "Panel":
+                for title in ("title", "subtitle"):
+                    if title in given and not isinstance(given[title], ast.Constant | ast.Call):
+                        yield f"Panel({title}=…): takes markup, give text(…)"
+
+
+def test_all_text_goes_one_way():
+    found = {
+        str(path.relative_to(ROOT)): list(ways_around(ast.parse(path.read_text(encoding="utf-8"))))
+        for path in sources()
+        if path.relative_to(ROOT) not in _ONE_WAY
+    }
+    assert len(found) > 100
+    assert {path: ways for path, ways in found.items() if ways} == {}
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "from rich.console import Console", "import rich", "from rich import print", "click.echo(1)", "print(1)",
+        "Live(a)", "TextColumn('{task.description}')", "Panel(a, title=name)", "from rich.text import Text",
+    ],
+)  # fmt: skip
+def test_the_check_finds_ways_around(code: str):
+    assert list(ways_around(ast.parse(code)))
