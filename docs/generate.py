@@ -49,6 +49,8 @@ def default(field: attrs.Attribute[Any]) -> str:
 
 def allowed(metadata: Any) -> str:
     """Range or choices of a field."""
+    if metadata.get("secret"):
+        return "secret: `${NAME}`"
     if metadata.get("choices"):
         return ", ".join(f"`{choice}`" for choice in metadata["choices"])
     signs = (("ge", "≥"), ("gt", ">"), ("le", "≤"), ("lt", "<"))

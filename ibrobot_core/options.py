@@ -14,6 +14,14 @@ class NoOptions:
     """For implementations without options."""
 
 
+HIDDEN = "***"
+"""What stands for a secret."""
+
+
+def _hidden(value: object) -> str:
+    return repr(value if value is None else HIDDEN)
+
+
 def option(
     default: Any = attrs.NOTHING,
     *,
@@ -26,6 +34,7 @@ def option(
     choices: Sequence[Any] | None = None,
     factory: Any = None,
     validator: Any = None,
+    secret: bool = False,
 ) -> Any:
     """An attrs field for an options class.
 
@@ -40,9 +49,12 @@ def option(
         choices: the allowed values.
         factory: makes the default, for mutable ones.
         validator: a further attrs validator; it raises ValueError with what would be right.
+        secret: never shown or written; recordings and `config show` have `${NAME}` as the YAML has it, else `***`.
     """
     bounds = {"ge": ge, "gt": gt, "le": le, "lt": lt}
     metadata = {"unit": unit, "help": help, "choices": tuple(choices) if choices is not None else None, **bounds}
+    metadata["secret"] = secret
+    shown: Any = _hidden if secret else True
 
     def check(instance: Any, attribute: attrs.Attribute[Any], value: Any) -> None:
         if value is None:
@@ -65,5 +77,5 @@ def option(
 
     validators = [check] if validator is None else [check, validator]
     if factory is not None:
-        return attrs.field(factory=factory, metadata=metadata, validator=validators)
-    return attrs.field(default=default, metadata=metadata, validator=validators)
+        return attrs.field(factory=factory, metadata=metadata, validator=validators, repr=shown)
+    return attrs.field(default=default, metadata=metadata, validator=validators, repr=shown)

@@ -16,12 +16,12 @@ from urllib.parse import quote
 
 import click
 
-HIDDEN = "***"
-"""What stands for a secret."""
+from ibrobot_core.options import HIDDEN
 
 _UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 """Control characters but for tab and line feed, what turns the direction of text, and lone surrogates."""
-_CREDENTIALS = re.compile(r"(?P<scheme>\b[A-Za-z][A-Za-z0-9+.-]*://)[^\s/@]*:[^\s/]*@")
+_CREDENTIALS = re.compile(r"(?P<scheme>\b[A-Za-z][A-Za-z0-9+.-]*://)[^\s/?#]*@")
+_PARAMETERS = re.compile(r"(?i)(?P<name>[?&](?:user(?:name)?|pass(?:word|wd)?|pwd|secret)=)[^&\s#'\"]+")
 _SHORTEST = 4
 """A secret of fewer characters is hidden where it is known to be one, not wherever its characters come."""
 
@@ -36,7 +36,7 @@ def remember_secret(value: str) -> None:
 
 def without_credentials(text: str) -> str:
     """A text with user and password of every URL in it hidden."""
-    return _CREDENTIALS.sub(rf"\g<scheme>{HIDDEN}@", text)
+    return _PARAMETERS.sub(rf"\g<name>{HIDDEN}", _CREDENTIALS.sub(rf"\g<scheme>{HIDDEN}@", text))
 
 
 def redacted(text: str) -> str:

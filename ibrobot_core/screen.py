@@ -17,7 +17,7 @@ class Screen(Console):
         super().__init__(**{**options, "markup": False, "emoji": False, "highlight": False})
 
     @override
-    def render_str(self, text: str, **options: Any) -> Text:  # type: ignore[override]  # options of Rich's own
+    def render_str(self, text: str, **options: Any) -> Text:
         return super().render_str(printable(text), **{**options, "markup": False, "emoji": False})
 
 

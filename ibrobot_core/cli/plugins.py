@@ -101,6 +101,7 @@ def _options(entry: Entry) -> list[dict[str, Any]]:
             "required": default is attrs.NOTHING,
             "default": "(required)" if default is attrs.NOTHING else plain(default),
             "allowed": _allowed(field),
+            "secret": bool(field.metadata.get("secret")),
             "help": field.metadata.get("help", ""),
         })  # fmt: skip
     return rows
@@ -112,6 +113,8 @@ def _type_name(kind: Any) -> str:
 
 
 def _allowed(field: attrs.Attribute[Any]) -> str:
+    if field.metadata.get("secret"):
+        return "secret: ${NAME}"
     if field.metadata.get("choices") is not None:
         return ", ".join(str(choice) for choice in field.metadata["choices"])
     signs = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}

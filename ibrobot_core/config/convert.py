@@ -238,14 +238,25 @@ def structure_fields(
     for name, field in known.items():
         if name in value:
             with faults.at(name):
-                item = converter.structure(value[name], field.type if field.type is not None else Any)
-                if field.validator is not None:
-                    # Ahead of the constructor, so that every field is checked and the fault is found at its own key.
-                    field.validator(None, field, item)
-                arguments[name] = item
+                arguments[name] = _structured(field, value[name], converter)
         elif field.default is attrs.NOTHING:
             faults.add((name,), "required key is missing")
     return arguments
+
+
+def _structured(field: attrs.Attribute[Any], value: Any, converter: Converter) -> Any:
+    try:
+        item = converter.structure(value, field.type if field.type is not None else Any)
+        if field.validator is not None:
+            # Ahead of the constructor, so that every field is checked and the fault is found at its own key.
+            field.validator(None, field, item)
+    except (ValueError, TypeError):
+        if not field.metadata.get("secret"):
+            raise
+        raise ValueError(
+            "is not a valid value, which is not shown here; text must be quoted if it looks like a number"
+        ) from None
+    return item
 
 
 def make_converter(base: Path) -> Converter:

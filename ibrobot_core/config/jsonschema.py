@@ -74,6 +74,8 @@ def _of_field(field: attrs.Attribute[Any]) -> Schema:
     limits: Schema = {
         word: field.metadata[name] for name, word in _BOUNDS.items() if field.metadata.get(name) is not None
     }
+    if field.metadata.get("secret"):
+        schema["writeOnly"] = True
     if field.metadata.get("choices") is not None:
         limits["enum"] = list(field.metadata["choices"])
     variants = [variant for variant in schema.get("anyOf", [schema]) if variant != _SCALARS[type(None)]]

@@ -26,6 +26,7 @@ from ibrobot_core.config.schema import (
     RobotConfig,
     TransportConfig,
 )
+from ibrobot_core.config.secrets import check_known, expanded_again, public, warn_of_literals
 from ibrobot_core.config.structure import Part, Parts, Structurer
 from ibrobot_core.config.yaml_nodes import MAX_BYTES, Document, Place, parse
 from ibrobot_core.errors import ConfigError, Problem
@@ -65,7 +66,9 @@ def load(
         document.add((), f"expected a mapping of sections, got {shown(document.root)}")
         document.raise_problems()
     _override(document, overrides, mode)
-    return _build(document, Path(path), sim, registry or installed())
+    config = _build(document, Path(path), sim, registry or installed())
+    warn_of_literals(document)
+    return config
 
 
 def from_document(
@@ -82,7 +85,7 @@ def from_document(
     Raises:
         ConfigError: e.g. when the plugins installed are not those it was made with.
     """
-    copied = Document(copy.deepcopy(dict(document)), {}, [], str(source))
+    copied = expanded_again(Document(copy.deepcopy(dict(document)), {}, [], str(source)))
     _override(copied, overrides, mode)
     return _build(copied, source, sim, registry or installed())
 
@@ -98,10 +101,12 @@ def _override(document: Document, overrides: Sequence[str], mode: str | None) ->
 
 def _build(document: Document, source: Path, sim: bool, registry: Registry) -> RobotConfig:
     parts = Structurer(document, registry, source.absolute().parent, sim).parts()
+    check_known(document)
     Checks(document, parts).run()
     contract_checks = ContractChecks(document, parts)
     contract = contract_checks.run()
     document.raise_problems()
+    shown, secrets = public(document)
     plain = parts.plain
     robot = plain["robot"]
     config = RobotConfig(
@@ -136,7 +141,9 @@ def _build(document: Document, source: Path, sim: bool, registry: Registry) -> R
         viewer=_component(parts.viewer),
         simulated=parts.simulated,
         source=source,
-        document=document.root,
+        document=shown,
+        complete=document.root,
+        secrets=secrets,
     )  # fmt: skip
     return attrs.evolve(config, control=plain["control"]) if "control" in plain else config
 

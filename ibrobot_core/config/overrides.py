@@ -53,6 +53,9 @@ def put(document: Document, path: str, value: Document, place: Place) -> None:
     for known in [k for k in document.places if k[: len(key)] == key]:
         del document.places[known]
     document.places[key] = place
+    for known in [k for k in document.references if k[: len(key)] == key]:
+        del document.references[known]
+    document.references |= {(*key, *inner): text for inner, text in value.references.items()}
 
 
 def _part(holder: Any, word: str) -> str | int:

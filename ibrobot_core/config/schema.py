@@ -282,7 +282,7 @@ class Control:
 
 @attrs.frozen(slots=False)
 class RobotConfig:
-    """A whole robot YAML, checked. `source` names the file; `document` is the plain data it was made of."""
+    """A whole robot YAML, checked. `source` names the file; `document` is its plain data without secrets."""
 
     robot: Robot
     executors: Mapping[str, ExecutorComponent]
@@ -302,3 +302,7 @@ class RobotConfig:
     """Whether `simulation` stands for `hardware` in this run."""
     source: Path = Path("<memory>")
     document: Mapping[str, Any] = attrs.field(factory=dict, repr=False)
+    complete: Mapping[str, Any] = attrs.field(factory=dict, repr=False, eq=False)
+    """`document` with its secrets, for other processes of the run only: never to be written or shown."""
+    secrets: Mapping[str, str] = attrs.field(factory=dict, repr=False, eq=False)
+    """Secret -> what is shown in its place."""

@@ -13,6 +13,8 @@ import yaml
 
 from ibrobot_core.config.schema import Component, ContractConfig, ControlMode, ObservationSpec, RobotConfig
 from ibrobot_core.config.yaml_nodes import is_text
+from ibrobot_core.options import HIDDEN
+from ibrobot_core.outside import without_credentials
 
 
 @singledispatch
@@ -21,8 +23,26 @@ def plain(value: Any) -> Any:
     return _fields(value) if attrs.has(type(value)) else value
 
 
+class _Secret(str):
+    """The value of a secret option, until it is replaced by what is shown of it."""
+
+
 def _fields(value: Any) -> dict[str, Any]:
-    return {field.name: plain(getattr(value, field.name)) for field in attrs.fields(type(value)) if field.init}
+    return {
+        field.name: _Secret(item) if field.metadata.get("secret") and isinstance(item, str) else plain(item)
+        for field in attrs.fields(type(value))
+        if field.init
+        for item in (getattr(value, field.name),)
+    }
+
+
+def _without_secrets(value: Any, shown: Mapping[str, str]) -> Any:
+    if isinstance(value, str):
+        hidden = HIDDEN if isinstance(value, _Secret) else without_credentials(value)
+        return value if hidden == value else shown.get(str(value), hidden)
+    if isinstance(value, Mapping):
+        return {name: _without_secrets(item, shown) for name, item in value.items()}
+    return [_without_secrets(item, shown) for item in value] if isinstance(value, list) else value
 
 
 @plain.register
@@ -76,7 +96,7 @@ def _mode(mode: ControlMode) -> dict[str, Any]:
 
 
 def document(config: RobotConfig) -> dict[str, Any]:
-    """What a YAML that says everything about this run would hold."""
+    """What a YAML that says everything about this run would hold, with `${…}` or `***` for secrets."""
     hardware = _named(config.hardware)
     sections: dict[str, Any] = {
         "robot": plain(config.robot),
@@ -94,7 +114,9 @@ def document(config: RobotConfig) -> dict[str, Any]:
         "viewer": plain(config.viewer),
         "control": plain(config.control),
     }
-    return {name: section for name, section in sections.items() if section not in (None, {}, [])}
+    given = {name: section for name, section in sections.items() if section not in (None, {}, [])}
+    without: dict[str, Any] = _without_secrets(given, config.secrets)
+    return without
 
 
 class _Dumper(yaml.SafeDumper):

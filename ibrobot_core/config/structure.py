@@ -24,6 +24,7 @@ from ibrobot_core.config.keys import (
     TransportKeys,
 )
 from ibrobot_core.config.schema import Component
+from ibrobot_core.config.secrets import note
 from ibrobot_core.config.yaml_nodes import Document, Key
 from ibrobot_core.descriptors import Descriptor, HardwareDescriptor, SensorDescriptor
 from ibrobot_core.errors import PluginError
@@ -156,6 +157,7 @@ class Structurer:
         options = None
         descriptor = self._find(kind, arguments["type"], needed, faults) if "type" in arguments else None
         if descriptor is not None:
+            note(self.document, descriptor.options, value, key)
             options = self._options(descriptor, own, value, faults)
         self._report(key, faults, below_sim)
         if faults.found or descriptor is None:

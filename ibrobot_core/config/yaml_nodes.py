@@ -18,6 +18,7 @@ from yaml.scanner import Scanner
 
 from ibrobot_core.config.expand import expand
 from ibrobot_core.errors import ConfigError, Problem
+from ibrobot_core.outside import redacted
 
 Key = tuple[str | int, ...]
 """Where a value is in a document: mapping keys and list indices from the top."""
@@ -63,6 +64,10 @@ class Document:
     file: str
     unread: set[Key] = attrs.field(factory=set)
     """Keys whose values could not be read; what stands there is no value."""
+    references: dict[Key, str] = attrs.field(factory=dict)
+    """Text with `${…}` as it was written, where a value was made of it."""
+    secrets: set[Key] = attrs.field(factory=set)
+    """Where the values are that nobody may see."""
 
     def place(self, key: Key) -> Place:
         """The place of `key`, or of what encloses it where it was not written."""
@@ -101,7 +106,10 @@ class Document:
             ConfigError: if anything was noted.
         """
         if self.problems:
-            unique = dict.fromkeys(problem for _, problem in sorted(self.problems, key=lambda item: item[0]))
+            found = (problem for _, problem in sorted(self.problems, key=lambda item: item[0]))
+            unique = dict.fromkeys(
+                attrs.evolve(each, file=redacted(str(each.file)), message=redacted(each.message)) for each in found
+            )
             raise ConfigError(unique)
 
 
@@ -253,6 +261,8 @@ class _Constructor:
         self.refuse_tag(node, key)
         try:
             text = expand(node.value)
+            if text != node.value:
+                self.document.references[key] = node.value
             return scalar(text) if node.style is None else text
         except ValueError as error:
             self.fault(node, key, str(error))

@@ -182,7 +182,7 @@ class ControlClient(ControlHost):
         super().__init__(on_state, on_event)
         self._config = config
         self._order = {
-            "document": config.document, "source": str(config.source), "sim": config.simulated, "seed": seed,
+            "document": config.complete, "source": str(config.source), "sim": config.simulated, "seed": seed,
             "mode": config.default_control_mode, "epoch_offset_ns": clock.epoch_offset_ns, "host": os.getpid(),
         }  # fmt: skip
         self._on_death = on_death

@@ -25,6 +25,7 @@ from ibrobot_core.control.link import Channel, Layout, SharedMemory
 from ibrobot_core.control.realtime import go_real_time
 from ibrobot_core.control.timing import REPORT_TICKS, Punctuality
 from ibrobot_core.errors import IbrobotError
+from ibrobot_core.outside import echo
 from ibrobot_core.plugins import installed
 
 _STARTUP_TIMEOUT_S = 30.0
@@ -170,7 +171,8 @@ def main(descriptors: list[int]) -> int:
         if core is not None:
             core.close()
             if channel.closed:  # nobody else can say it
-                print(*core.holding(), sep="\n", end="\n" if core.holding() else "", file=sys.stderr)
+                for line in core.holding():
+                    echo(line, err=True)
         channel.flush(_FAREWELL_S)
     return 0
 

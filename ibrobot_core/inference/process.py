@@ -53,7 +53,7 @@ class ProcessEngine(Engine):
     ) -> None:  # fmt: skip
         super().__init__("process")
         self._order = {
-            "document": config.document, "source": str(config.source), "sim": config.simulated, "model": model,
+            "document": config.complete, "source": str(config.source), "sim": config.simulated, "model": model,
             "seed": seed, "host": os.getpid(),
         }  # fmt: skip
         self._fingerprint = fingerprint

@@ -81,7 +81,7 @@ class ZenohOptions:
     )
     tls: Tls | None = option(None, help="certificates, for tls and quic endpoints")
     user: str | None = option(None, help="name to connect with, where the other side asks for one")
-    password: str | None = option(None, help="password to connect with, e.g. ${IBROBOT_PASSWORD}")
+    password: str | None = option(None, secret=True, help="password to connect with, e.g. ${IBROBOT_PASSWORD}")
     users: Path | None = option(None, help="who may connect to us: a file of lines NAME:PASSWORD")
     trusted_network: bool = option(
         False, help="allows to listen beyond this machine without tls or users: everybody there may do everything"

@@ -1,0 +1,101 @@
+"""Secrets in a robot YAML: where they are, and the document without them, which may be recorded and shown."""
+
+from __future__ import annotations
+
+import copy
+import logging
+import re
+from collections.abc import Iterator, Mapping
+from typing import Any, get_args
+
+import attrs
+
+from ibrobot_core.config.convert import fields
+from ibrobot_core.config.expand import expand
+from ibrobot_core.config.yaml_nodes import Document, Key
+from ibrobot_core.options import HIDDEN
+from ibrobot_core.outside import redacted, remember_secret, without_credentials
+
+_NAMES = re.compile(r"(?i)(.*_)?(password|passwd|passphrase|secret|token|api_?key)")
+"""Keys of sections whose plugin is not installed, so that nothing says what is secret there."""
+
+
+def note(document: Document, kind: type, value: Mapping[str, Any], key: Key) -> None:
+    """Note the secret options of a class among those that the section at `key` gives, so that no error shows them."""
+    for name, field in fields(kind).items():
+        item = value.get(name)
+        if item is None:
+            continue
+        if field.metadata.get("secret"):
+            document.secrets.add((*key, name))
+            remember_secret(str(item))
+        elif isinstance(item, Mapping):
+            for member in (field.type, *get_args(field.type)):
+                if isinstance(member, type) and attrs.has(member):
+                    note(document, member, item, (*key, name))
+
+
+def expanded_again(document: Document) -> Document:
+    """A recorded document with its `${…}` replaced from the environment of now. Faults are noted in it."""
+    for key, text in list(_texts(document.root)):
+        if "${" in text:
+            try:
+                _put(document.root, key, expand(text))
+                document.references[key] = text
+            except ValueError as error:
+                document.add(key, str(error))
+    return document
+
+
+def public(document: Document) -> tuple[Any, dict[str, str]]:
+    """The document's values without secrets, and what stands there for each: its `${…}`, or `***`."""
+    root, instead = copy.deepcopy(document.root), {}
+    for key, text, hidden in _secrets(document):
+        remember_secret(text)
+        instead[text] = document.references.get(key, hidden)
+        _put(root, key, instead[text])
+    return root, instead
+
+
+def warn_of_literals(document: Document) -> None:
+    """Log where a secret is written out, which is safe from recordings but not from readers of the YAML."""
+    for key, _, _ in _secrets(document):
+        if key not in document.references:
+            place = document.place(key)
+            where = f"{document.file}:{place.line}" if place.line else redacted(place.file)
+            told = "a secret is written out; take it from the environment, as ${NAME}"
+            logging.getLogger("ibrobot.config").warning("%s: %s: %s", where, document.dotted(key), told)
+
+
+def _secrets(document: Document) -> Iterator[tuple[Key, str, str]]:
+    """Key, value, and the value as it may be shown, of each text that holds a secret."""
+    for key, text in _texts(document.root):
+        by_name = bool(key) and isinstance(key[-1], str) and _NAMES.fullmatch(key[-1])
+        hidden = HIDDEN if by_name or key in document.secrets else without_credentials(text)
+        if hidden != text:
+            yield key, text, hidden
+
+
+def check_known(document: Document) -> None:
+    """Note a secret that a recording does not hold."""
+    for key in document.secrets:
+        if document.get(*key) == HIDDEN:
+            path = document.dotted(key)
+            document.add(key, f"the recording does not hold this secret; give it by --set '{path}=${{NAME}}'")
+
+
+def _texts(value: Any, key: Key = ()) -> Iterator[tuple[Key, str]]:
+    if isinstance(value, str):
+        yield key, value
+    elif isinstance(value, Mapping):
+        for name, item in value.items():
+            yield from _texts(item, (*key, name))
+    elif isinstance(value, list):
+        for i, item in enumerate(value):
+            yield from _texts(item, (*key, i))
+
+
+def _put(root: Any, key: Key, value: Any) -> None:
+    for part in key[:-1]:
+        root = root[part]
+    root[key[-1]] = value
