@@ -62,7 +62,7 @@ def test_show_as_json(ibrobot: Ibrobot, robot: Path) -> None:
 
     assert hardware["options"][1] == {
         "name": "max_speed", "type": "float", "unit": "rad/s", "required": False, "default": 3.0,
-        "allowed": "> 0, ≤ 6.5", "help": "speed limit of the servos",
+        "allowed": "> 0, ≤ 6.5", "secret": False, "help": "speed limit of the servos",
     }  # fmt: skip
     assert sensor["options"] == []
 
