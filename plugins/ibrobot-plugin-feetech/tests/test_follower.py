@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from ibrobot_feetech.emulator import EmulatedServo, Emulator
 from ibrobot_feetech.errors import NoReply, PortError, ServoFault
 from ibrobot_feetech.follower import FeetechFollower
+from ibrobot_feetech.health import SteadyLoad
 from ibrobot_feetech.options import FollowerOptions
 from ibrobot_feetech.protocol import OVERLOAD
 
@@ -541,12 +542,26 @@ class TestHealth:
         assert "load 0.8 of full torque, above warning_load (0.7 of full torque)" in warning.message
         assert (warning.severity, warning.sheds_load) == (Severity.WARNING, True)
 
-    def test_what_a_reading_does_not_see_for_lost_replies_is_seen_after_them(self, rig: Rig) -> None:
-        rig.run(2)
-        rig.emulator.servos[4].set("present_temperature", 66)
-        rig.emulator.faults.drop = 0.01
-        rig.run(200)
-        assert self.conditions(rig) == {("wrist_flex", "temperature"): Severity.FAULT}
+    @given(st.lists(st.lists(st.floats(-1.0, 1.0), min_size=1, max_size=5), min_size=1, max_size=4))
+    def test_a_steady_load_is_the_least_of_the_last_complete_period(self, periods: list[list[float]]) -> None:
+        steady = SteadyLoad(1, period_ns=10)
+        for now_ns, loads in zip(range(10, 1000, 10), periods, strict=False):
+            for load in loads:
+                steady.add(np.array([load]), np.array([True]))
+                steady.add(np.array([0.0]), np.array([False]))
+            assert steady.held(now_ns) == min(map(abs, loads))
+            assert steady.held(now_ns + 5) == min(map(abs, loads))
+
+    def test_a_slow_reading_that_was_not_complete_is_soon_repeated(self, rig: Rig) -> None:
+        temperature = np.zeros(6)
+        rig.emulator.faults.silent.add(4)
+        rig.tick()
+        rig.emulator.faults.silent.clear()
+        rig.follower.read_signal(0, temperature)
+        assert np.isnan(temperature).all()
+        rig.run(6)
+        rig.follower.read_signal(0, temperature)
+        assert temperature.tolist() == [28.0] * 6
 
 
 class TestSignals:
