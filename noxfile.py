@@ -64,10 +64,10 @@ def system_libraries(session: nox.Session) -> None:
     Tests that need what stays missing are skipped.
     """
     found = lacking(session)
-    packages = sorted({package for row in found for package in row["missing"]["apt"]})
-    if packages and os.geteuid() == 0 and shutil.which("apt-get"):
+    wanted = sorted({package for row in found for package in row["missing"]["apt"]})
+    if wanted and os.geteuid() == 0 and shutil.which("apt-get"):
         session.run("apt-get", "update", "-qq", external=True)
-        session.run("apt-get", "install", "-qq", "-y", *packages, external=True)
+        session.run("apt-get", "install", "-qq", "-y", *wanted, external=True)
         found = lacking(session)
     for row in found:
         line = f"{row['kind']} {row['type']} is not tested: {row['missing']['what']}; {row['missing']['remedy']}"
