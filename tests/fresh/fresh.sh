@@ -34,13 +34,14 @@ if [ -z "${FRESH_CHECKOUT:-}" ]; then
   FRESH_PYTHON=$(python3.12 -c 'import sys; print(sys.base_prefix)' 2>/dev/null || true)
   export FRESH_CHECKOUT FRESH_PYTHON
   scratch=$(mktemp -d)
+  trap 'rm -rf --one-file-system "$scratch"' EXIT
   status=0
   unshare --mount --pid --ipc --fork --kill-child --propagation private \
     "$0" -d "$scratch/fresh" "$@" || status=$?
-  rm -rf --one-file-system "$scratch"
   exit "$status"
 fi
 shift $((OPTIND - 1))
+trap 'exit 130' INT TERM # the first process of a namespace ignores what it does not trap
 
 inside() { chroot "$folder" "$@"; }
 
