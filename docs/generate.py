@@ -28,6 +28,7 @@ SECTIONS: tuple[tuple[str, type], ...] = (
     ("control_modes.NAME.dispatch", schema.Dispatch),
     ("control_modes.NAME.dispatch.smoothing", schema.Smoothing),
     ("control", schema.Control),
+    ("metrics", schema.MetricsConfig),
 )
 
 

@@ -19,8 +19,10 @@ from ibrobot_core.clock import RealClock
 from ibrobot_core.config import find_config, load
 from ibrobot_core.config.single import single_options
 from ibrobot_core.inference.build import build_policy
+from ibrobot_core.inference.metrics import probes
 from ibrobot_core.inference.service import InferenceService, ServiceOptions
 from ibrobot_core.interfaces import Context, Policy, Transport
+from ibrobot_core.metrics import MetricsServer
 from ibrobot_core.outside import LogFormatter, echo
 from ibrobot_core.plugins import Registry, installed
 from ibrobot_core.robot import Robot
@@ -60,6 +62,10 @@ _PANEL_PERIOD_S = 0.5
     help="A model that is at work on one batch for longer hangs: requests fail, and the server starts again.",
 )  # fmt: skip
 @click.option(
+    "--metrics-port", type=click.IntRange(0, 65535), metavar="PORT",
+    help="Port of 127.0.0.1 for /metrics (Prometheus), /healthz and /readyz; 0: any that is free.",
+)  # fmt: skip
+@click.option(
     "--drain", type=click.FloatRange(min=0), default=10.0, show_default=True, metavar="S",
     help="At the end, how long to wait for requests that are there.",
 )  # fmt: skip
@@ -93,14 +99,20 @@ def serve(what: str, **options: Any) -> None:
             stopping.set()
 
         service = InferenceService(policy, transport, name, limits, policy.picture_codec(), replace)
+        metrics = None
         try:
             service.start()
+            if options["metrics_port"] is not None:
+                metrics = MetricsServer(options["metrics_port"], probes(service))
+                logging.getLogger("ibrobot").info("metrics on %s", metrics.url)
             echo(f"serving {name} (policy {policy.fingerprint()}); Ctrl-C ends")
             _show(service, stopping)
             if not hung.is_set() and not service.drain(options["drain"]):
                 logging.getLogger("ibrobot").warning("requests that were there were not answered in time")
         finally:
             service.close()
+            if metrics is not None:
+                metrics.close()
         echo(_line(service.statistics()))
     finally:
         if transport is not None:

@@ -7,7 +7,15 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.config.schema import ContractConfig, Control, Dispatch, Inference, ObservationSpec, Share
+from ibrobot_core.config.schema import (
+    ContractConfig,
+    Control,
+    Dispatch,
+    Inference,
+    MetricsConfig,
+    ObservationSpec,
+    Share,
+)
 from ibrobot_core.options import option
 from ibrobot_core.robot import Robot
 from ibrobot_core.units import NORM_MODES
@@ -113,3 +121,4 @@ class Sections:
     transport: Mapping[str, Any] = option(None, help="how processes and machines talk")
     viewer: Mapping[str, Any] = option(None, help="what shows the robot to a person")
     control: Control = option(factory=Control, help="the control loop")
+    metrics: MetricsConfig | None = option(None, help="counts in Prometheus' text format, over HTTP on this machine")

@@ -145,7 +145,7 @@ def _build(document: Document, source: Path, sim: bool, registry: Registry) -> R
         complete=document.root,
         secrets=secrets,
     )  # fmt: skip
-    return attrs.evolve(config, control=plain["control"]) if "control" in plain else config
+    return attrs.evolve(config, **{name: plain[name] for name in ("control", "metrics") if name in plain})
 
 
 def _component(part: Part | None) -> Any:

@@ -280,6 +280,13 @@ class Control:
     load_shedding: Shedding = option(factory=Shedding, help="what relieves joints that stay hot or overloaded")
 
 
+@attrs.frozen
+class MetricsConfig:
+    """The `metrics:` section."""
+
+    port: int = option(ge=0, le=65535, help="of 127.0.0.1, where /metrics, /healthz and /readyz are; 0: any free one")
+
+
 @attrs.frozen(slots=False)
 class RobotConfig:
     """A whole robot YAML, checked. `source` names the file; `document` is its plain data without secrets."""
@@ -298,6 +305,7 @@ class RobotConfig:
     transport: TransportConfig | None = None
     viewer: Component | None = None
     control: Control = attrs.field(factory=Control)
+    metrics: MetricsConfig | None = None
     simulated: bool = False
     """Whether `simulation` stands for `hardware` in this run."""
     source: Path = Path("<memory>")

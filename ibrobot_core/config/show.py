@@ -113,6 +113,7 @@ def document(config: RobotConfig) -> dict[str, Any]:
         "transport": plain(config.transport),
         "viewer": plain(config.viewer),
         "control": plain(config.control),
+        "metrics": plain(config.metrics),
     }
     given = {name: section for name, section in sections.items() if section not in (None, {}, [])}
     without: dict[str, Any] = _without_secrets(given, config.secrets)

@@ -199,6 +199,7 @@ class InferenceService:
 
     def statistics(self) -> dict[str, Any]:
         """What `…/health` answers."""
+        pace_ms = self._pacing.pace_ns(time.monotonic_ns()) / 1e6
         with self._lock:
             robots = {name: counts.summary() for name, counts in self._robots.items()}
             batches = {str(size): count for size, count in sorted(self._batches.items())}
@@ -206,7 +207,8 @@ class InferenceService:
                 "model": self._model, "state": self.state,
                 "fingerprint": self._fingerprint, "weights": self._weights, "spec": attrs.asdict(self._policy.spec),
                 "uptime_s": round((time.monotonic_ns() - self._begun_ns) / NS_PER_S, 1), "waiting": len(self._queue),
-                "malformed": self._malformed, **self._all.summary(), "batches": batches, "robots": robots,
+                "malformed": self._malformed, "pace_ms": round(pace_ms, 1), **self._all.summary(),
+                "batches": batches, "robots": robots,
             }  # fmt: skip
 
     def _health(self, payload: Payload, sender: str | None) -> Payload:

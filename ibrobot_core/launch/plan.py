@@ -11,6 +11,7 @@ from ibrobot_core.launch.absence import describe, refuse
 from ibrobot_core.launch.builders.control import NAME as CONTROL
 from ibrobot_core.launch.builders.control import Control
 from ibrobot_core.launch.builders.execution import InferenceFeeder, Model
+from ibrobot_core.launch.builders.metrics import MetricsPort
 from ibrobot_core.launch.builders.perception import SensorWorker
 from ibrobot_core.launch.builders.planning import PlanningFeeder
 from ibrobot_core.launch.builders.recording import Recording
@@ -137,6 +138,8 @@ def build_plan(session: Session) -> LaunchPlan:
     if parts.feeder is not None:
         components.append(parts.feeder)
     components.append(Status(session, (CONTROL,)))
+    if config.metrics is not None:
+        components.append(MetricsPort(session, config.metrics, (CONTROL,)))
     if (urdf := config.robot.description.urdf) is not None:
         components.append(Transforms(session, urdf, (CONTROL,)))
     if config.viewer is not None:

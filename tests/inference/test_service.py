@@ -14,14 +14,17 @@ from typing import Any, override
 import attrs
 import numpy as np
 import pytest
+from prometheus_client.parser import text_string_to_metric_families
 
 from ibrobot_core.errors import ContractError, PolicyError, TransportError
 from ibrobot_core.inference import service as module
+from ibrobot_core.inference.metrics import probes
 from ibrobot_core.inference.remote import RemoteEngine
 from ibrobot_core.inference.service import InferenceService, ServiceOptions, health_name, service_name
 from ibrobot_core.inference.wire import Kind, Message, decode, encode
 from ibrobot_core.interfaces import Tensors
 from ibrobot_core.local_transport import LocalTransport
+from ibrobot_core.metrics import Metrics
 from ibrobot_core.testing import host_context
 from ibrobot_core.testing.fakes import FakePolicy
 
@@ -616,3 +619,32 @@ def test_the_engine_sends_nothing_that_nobody_waits_for():
         with pytest.raises(PolicyError, match="expired before it was sent"):
             remote.infer({"x": np.zeros(1)}, 1, time.monotonic_ns())
         assert cloud.health()["requests"] == 0
+
+
+def test_prometheus_learns_what_a_server_counts():
+    with served() as cloud:
+        cloud.policy.gate.release(10)
+        for robot, x in (("one", 1), ("one", 2), ('t"wo\n', 13)):
+            cloud.ask(robot, x).result(PATIENCE_S)
+        asked = probes(cloud.service)
+        metrics = Metrics()
+        asked.collect(metrics)
+        families = {family.name: family for family in text_string_to_metric_families(metrics.text())}
+        assert {"ibrobot_serve_waiting", "ibrobot_serve_pace_seconds", "ibrobot_serve_latency_p99_seconds"} < set(
+            families
+        )
+        assert families["ibrobot_serve_requests"].samples[0].value == 3
+        assert {sample.labels["robot"]: sample.value for sample in families["ibrobot_serve_robot_failed"].samples} == {
+            "one": 0,
+            't"wo\n': 1,
+        }
+        assert all(sample.labels["model"] == "net" for family in families.values() for sample in family.samples)
+        assert (asked.unhealthy(), asked.unready()) == ("", "")
+        cloud.service.drain(0.0)
+        assert (asked.unhealthy(), asked.unready()) == ("", "the server is stopping")
+
+
+def test_a_server_whose_model_hangs_is_unhealthy(caplog: pytest.LogCaptureFixture):
+    with served(hang_timeout_s=0.02) as cloud:
+        failure(cloud.busy())
+        assert probes(cloud.service).unhealthy() == "the model hangs"

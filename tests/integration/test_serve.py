@@ -11,6 +11,7 @@ import socket
 import subprocess
 import sys
 import time
+import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -158,9 +159,13 @@ def test_a_server_whose_model_hangs_starts_again(
     ibrobot: tuple[str, ...], endpoint: str, connect: Callable[..., Transport], site: Site, tmp_path: Path
 ):
     site.add("hangs-once", HANGS_ONCE)
+    port = free_endpoint().split(":")[1]
     command = [*ibrobot, "serve", tmp_path, "--type", "hangs_once", "--name", "net", "--listen", endpoint]
     process = subprocess.Popen(
-        [*command, "--hang-timeout", "0.5"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [*command, "--hang-timeout", "0.5", "--metrics-port", port],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     )
     network = connect(connect=(endpoint,))
     remote = RemoteEngine(FakePolicy(host_context()), network, "net", "so101", start_timeout_s=60.0)
@@ -177,6 +182,10 @@ def test_a_server_whose_model_hangs_starts_again(
         remote.start()
         answer = remote.infer(tensors, 2, time.monotonic_ns() + 60_000_000_000)
         assert answer["pid"].tolist() == [process.pid], "in the same process, with a new program"
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=60) as page:
+            assert 'ibrobot_serve_answered_total{model="net"} 1\n' in page.read().decode()
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/readyz", timeout=60) as page:
+            assert page.read() == b"ok\n"
         process.send_signal(signal.SIGTERM)
         out, err = process.communicate(timeout=60)
         assert process.returncode == 0

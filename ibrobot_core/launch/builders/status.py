@@ -62,29 +62,36 @@ class Status(Worker):
 
     def _diagnostics(self, now_ns: int) -> DiagnosticArray:
         session = self._session
-        report = session.control.report
-        counters: Mapping[str, Any] = report["counters"]
-        groups = {"loop": {**report["loop"], **counters.get("loop", {})}, "safety": counters.get("safety", {})}
-        groups["interventions"] = counters.get("joints", {})
-        groups |= {f"executor {name}": counts for name, counts in counters.get("executors", {}).items()}
-        groups |= {f"hardware {name}": counts for name, counts in counters.get("hardware", {}).items()}
-        if session.stats is not None:
-            groups["dispatch"] = attrs.asdict(session.stats)
-        if session.engine_stats is not None:
-            groups["inference"] = attrs.asdict(session.engine_stats)
-        for name, rate in session.rates.items():
-            age = {"age_ms": round(session.ages[name] * 1e3, 1)} if name in session.ages else {}
-            groups[f"sensor {name}"] = {"rate_hz": round(rate, 2), **age}
-        groups |= {f"sensor {sensor.name}": {"missing": str(sensor.missing)} for sensor in session.absent}
-        groups["bus drops"] = session.bus.dropped()
+        groups = counts(session)
         level = DiagnosticStatus.ERROR if session.outcome.faults else DiagnosticStatus.OK
         robot = session.config.robot.name
         statuses = [
-            DiagnosticStatus(level if name == "loop" else DiagnosticStatus.OK, name, "", robot, _values(counts))
-            for name, counts in groups.items()
+            DiagnosticStatus(level if name == "loop" else DiagnosticStatus.OK, name, "", robot, _values(values))
+            for name, values in groups.items()
         ]
-        statuses += [_of_joint(condition, robot) for condition in counters.get("conditions", ())]
+        conditions = session.control.report["counters"].get("conditions", ())
+        statuses += [_of_joint(condition, robot) for condition in conditions]
         return DiagnosticArray(Header(now_ns), tuple(statuses))
+
+
+def counts(session: Session) -> dict[str, Mapping[str, Any]]:
+    """All that is counted and measured in a run, in groups such as `loop` and `executor NAME`."""
+    report = session.control.report
+    counters: Mapping[str, Any] = report["counters"]
+    groups = {"loop": {**report["loop"], **counters.get("loop", {})}, "safety": counters.get("safety", {})}
+    groups["interventions"] = counters.get("joints", {})
+    groups |= {f"executor {name}": values for name, values in counters.get("executors", {}).items()}
+    groups |= {f"hardware {name}": values for name, values in counters.get("hardware", {}).items()}
+    if session.stats is not None:
+        groups["dispatch"] = attrs.asdict(session.stats)
+    if session.engine_stats is not None:
+        groups["inference"] = attrs.asdict(session.engine_stats)
+    for name, rate in session.rates.items():
+        age = {"age_ms": round(session.ages[name] * 1e3, 1)} if name in session.ages else {}
+        groups[f"sensor {name}"] = {"rate_hz": round(rate, 2), **age}
+    groups |= {f"sensor {sensor.name}": {"missing": str(sensor.missing)} for sensor in session.absent}
+    groups["bus drops"] = session.bus.dropped()
+    return groups
 
 
 def _of_joint(condition: Mapping[str, Any], robot: str) -> DiagnosticStatus:
