@@ -5,8 +5,8 @@
 Server and robots are processes of their own, over Zenoh on this machine, ten robots a process. Each robot is a
 dispatcher with chunks of 50 actions at 30 Hz, its observations a state and a picture of 96x96. The model takes 20 ms
 for each request; in the middle it stands still for `--hiccup` seconds. `watermark: auto` is compared with half a chunk,
-the fixed watermark that it starts from; `stepped_fleet.py` tries others, in stepped time. Then the model takes 20 ms for
-a batch of any size, as a GPU that is not full does; then one robot more asks in four threads without a pause.
+the fixed watermark that it starts from; `stepped_fleet.py` tries others, in stepped time. Then the model takes 20 ms
+for a batch of any size, as a GPU that is not full does; then one robot more asks in four threads without a pause.
 
 Prints load, latencies [ms] and holds of all robots together, before the hiccup and from 5 s after it. Exits with 1 when
 `auto` is worse by more than 10 % than the fixed watermark, or when in batches, with or without the greedy robot, p99 is
