@@ -43,7 +43,7 @@ _ONLY_TO_DATASET = (
 @click.option("--crf", type=int, metavar="N", help="Video quality; lower is better and larger.")
 @click.option("--no-videos", is_flag=True, help="Keep pictures as they are, as PNG in the tables.")
 @click.option("--set", "sets", multiple=True, metavar="OPTION=VALUE", help="Any other option of the dataset writer.")
-@click.option("--config", metavar="CONFIG", help="Robot YAML with the contract; needed for bags of others.")
+@click.option("--config", metavar="CONFIG", help="Robot YAML, or one with a contract alone; for bags of others.")
 @click.option("--force-contract", is_flag=True, help="Take --config's contract where the recorded one differs.")
 @click.option("--norm-mode", type=click.Choice(NORM_MODES), help="Unit of the dataset's joints, else radians.")
 @click.option("--calibration", metavar="NAME", help="In place of the recorded one, for --norm-mode.")
@@ -162,10 +162,10 @@ def _options(kind: str, type_: str, overrides: tuple[str, ...]) -> Any:
 
 
 def _robot(config: str) -> RobotConfig:
-    from ibrobot_core.config import find_config, load
+    from ibrobot_core.config.load import find_config, load_contract
     from ibrobot_core.plugins import installed
 
-    return load(find_config(config, installed()))
+    return load_contract(find_config(config, installed()))
 
 
 def _contract(config: str | None) -> dict[str, Any]:

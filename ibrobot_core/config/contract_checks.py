@@ -38,6 +38,8 @@ class ContractChecks:
 
     document: Document
     parts: Parts
+    alone: bool = False
+    """Whether there is no robot: actions have no executor, and say themselves what their numbers are."""
 
     def run(self) -> ContractConfig:
         """The contract, complete."""
@@ -167,6 +169,13 @@ class ContractChecks:
     def _action(self, key: Key, spec: ActionSpec, earlier: Sequence[ActionSpec]) -> ActionSpec:
         if not spec.topic.startswith("/"):
             self.document.add((*key, "topic"), f"a topic starts with /, got {spec.topic!r}")
+        if self.alone:
+            self._commands(key, spec)
+            if not spec.joints:
+                self.document.add(key, "needs joints: the names of its numbers, in order, e.g. [pan, lift, gripper]")
+            return spec
+        if spec.joints:
+            self.document.add((*key, "joints"), f"are those of executor {spec.executor!r}; leave them out")
         written = self.document.root.get("executors")
         known = list(written) if isinstance(written, Mapping) else []
         if spec.executor not in known:

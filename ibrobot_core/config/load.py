@@ -31,6 +31,7 @@ from ibrobot_core.config.structure import Part, Parts, Structurer
 from ibrobot_core.config.yaml_nodes import MAX_BYTES, Document, Place, parse
 from ibrobot_core.errors import ConfigError, Problem
 from ibrobot_core.plugins import Registry, installed
+from ibrobot_core.robot import Robot
 
 DEFAULT_CONFIG = "so101"
 
@@ -55,6 +56,42 @@ def load(
     Raises:
         ConfigError: with everything that is wrong, in file order.
     """
+    document = _parse(path)
+    _override(document, overrides, mode)
+    config = _build(document, Path(path), sim, registry or installed())
+    warn_of_literals(document)
+    return config
+
+
+def load_contract(path: str | Path, registry: Registry | None = None) -> RobotConfig:
+    """Read and check a robot YAML for its contract, or a file that has a `contract` section alone.
+
+    Such a file is for converting bags of others: its actions have `joints` in place of an executor. Its config is of a
+    robot without a name or joints.
+
+    Raises:
+        ConfigError: with everything that is wrong, in file order.
+    """
+    document = _parse(path)
+    registry = registry or installed()
+    if set(document.root) != {"contract"}:
+        return _build(document, Path(path), False, registry)
+    section = document.root["contract"]
+    actions = section.get("actions") if isinstance(section, Mapping) else None
+    for action in actions if isinstance(actions, list) else ():
+        if isinstance(action, dict):
+            for key, value in (("executor", str(action.get("topic", ""))), ("foreign", True)):
+                if action.setdefault(key, value) != value:
+                    document.add(("contract", "actions"), f"{key} has no meaning in a contract alone; leave it out")
+    parts = Structurer(document, registry, Path(path).absolute().parent, sim=False).contract()
+    contract = ContractChecks(document, parts, alone=True).run()
+    document.raise_problems()
+    parts_of = {spec.executor: spec.joints for spec in contract.actions}
+    executors = {name: ExecutorComponent("", None, name, "", joints) for name, joints in parts_of.items()}
+    return RobotConfig(Robot("", ()), executors, {}, "", contract=contract, source=Path(path), document=document.root)
+
+
+def _parse(path: str | Path) -> Document:
     try:
         with Path(path).open(encoding="utf-8") as file:
             text = file.read(MAX_BYTES + 1)
@@ -65,10 +102,7 @@ def load(
     if not isinstance(document.root, Mapping):
         document.add((), f"expected a mapping of sections, got {shown(document.root)}")
         document.raise_problems()
-    _override(document, overrides, mode)
-    config = _build(document, Path(path), sim, registry or installed())
-    warn_of_literals(document)
-    return config
+    return document
 
 
 def from_document(

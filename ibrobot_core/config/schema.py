@@ -102,6 +102,7 @@ class ActionSpec:
         choices=("hold", "next"),
         help="the action of a row in a dataset: hold takes the command in effect at the tick, next the first after it",
     )
+    joints: tuple[str, ...] = option((), help="in a file with a contract alone: names of its numbers, in order")
 
 
 @attrs.frozen

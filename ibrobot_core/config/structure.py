@@ -110,9 +110,15 @@ class Structurer:
             parts.recording = self._component("recorder", ("recording",), RecordingKeys)
         return parts
 
-    def _sections(self, parts: Parts) -> None:
+    def contract(self) -> Parts:
+        """The `contract` section of a file that has no other."""
+        parts = Parts(simulated=False)
+        self._sections(parts, ("contract",))
+        return parts
+
+    def _sections(self, parts: Parts, names: Collection[str] = tuple(fields(Sections))) -> None:
         """The file's own level: unknown and missing sections, and those that need no plugin."""
-        known = fields(Sections)
+        known = {name: field for name, field in fields(Sections).items() if name in names}
         faults = Faults()
         for name in self.document.root:
             if name not in known:

@@ -1,4 +1,4 @@
-"""The plugin's hooks: recorder `mcap`, reader `rosbag2`, the commands `ibrobot episodes …`."""
+"""The plugin's hooks: recorder `mcap`, reader `rosbag2`, the commands `ibrobot episodes …` and `contract`."""
 
 from __future__ import annotations
 
@@ -54,7 +54,14 @@ def _commands() -> click.Command:
     return episodes
 
 
+def _contract() -> click.Command:
+    from ibrobot_mcap.commands.contract import contract
+
+    return contract
+
+
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
-    """`ibrobot episodes …`."""
+    """`ibrobot episodes …` and `ibrobot contract init`."""
     yield Command("episodes", "List, check, mend, cut, plot and export recorded episodes.", _commands)
+    yield Command("contract", "Draft a contract for bags of others.", _contract)

@@ -1,0 +1,38 @@
+"""`ibrobot contract init`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from ibrobot_core.errors import RecorderError
+
+
+@click.group()
+def contract() -> None:
+    """Contracts for bags of others."""
+
+
+@contract.command()
+@click.argument("bag", type=click.Path(path_type=Path))
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="The new file; printed when left out.")
+def init(bag: Path, output: Path | None) -> None:
+    """Draft a contract for BAG, by its topics and their first messages.
+
+    The draft is a YAML file for `ibrobot convert --config`. Lines marked CHOOSE need a person: read them all.
+    """
+    from ibrobot_mcap.commands.found import opened
+    from ibrobot_mcap.draft import draft
+
+    with opened(bag) as reader:
+        text = draft(reader)
+    if output is None:
+        click.echo(text, nl=False)
+        return
+    try:
+        with output.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except OSError as error:
+        raise RecorderError(f"{output}: cannot be written: {error.strerror}") from error
+    click.echo(f"{output}: read it, then ibrobot convert {bag} --config {output} --out DATASET")

@@ -1,0 +1,173 @@
+"""A contract drafted from the topics of a bag, with comments where a person must choose."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Mapping
+from itertools import islice
+from typing import Any
+
+import attrs
+import numpy as np
+
+from ibrobot_core.errors import RecorderError
+from ibrobot_core.messages import MESSAGE_TYPES, Float64MultiArray, Image, JointState, Message
+from ibrobot_core.units import NS_PER_S
+from ibrobot_mcap.reader import Rosbag2Reader
+
+_COMMAND = re.compile(r"command|cmd|action|goal|target|leader|trajectory|desired")
+"""In the names of topics that rather tell a robot something than what it is."""
+_COMMON = frozenset(("camera", "image", "image_raw", "image_rect", "compressed", "color", "rgb", "raw"))
+_LOOKED_AT = 30
+"""Messages of a topic that tell its rate."""
+_MOST = 64
+"""Numbers of a message that a draft lists."""
+_HEAD = """\
+# A draft by `ibrobot contract init` from {bag}.
+# Read every line marked CHOOSE. Units are to be SI: a dataset has the numbers as they are in the bag.
+"""
+
+
+@attrs.frozen
+class _Topic:
+    """A topic of the bag, and its first message."""
+
+    name: str
+    type: str
+    rate_hz: float
+    first: Message
+
+    @property
+    def is_command(self) -> bool:
+        """Whether it looks like one that tells a robot something."""
+        return _COMMAND.search(self.name.lower()) is not None
+
+
+def draft(reader: Rosbag2Reader) -> str:
+    """A contract as YAML.
+
+    Raises:
+        RecorderError: when the bag has nothing that a contract could have.
+    """
+    summary = reader.summary()
+    topics = [found for name in summary.topics if (found := _topic(reader, name))]
+    cameras = [topic for topic in topics if isinstance(topic.first, Image)]
+    vectors = [topic for topic in topics if topic not in cameras and any(_numbers(topic.first))]
+    if not cameras and not vectors:
+        raise RecorderError(f"{summary.path}: has no topic with pictures or numbers")
+    actions = [topic for topic in vectors if topic.is_command]
+    states = [topic for topic in vectors if topic not in actions]
+    rate_hz = round(min((topic.rate_hz for topic in cameras), default=30.0)) or 1
+    lines = [_HEAD.format(bag=summary.path.name) + "contract:"]
+    lines.append(f"  rate_hz: {rate_hz}  # CHOOSE: rows in a second; a whole number, at most the slowest camera's rate")
+    lines.append("  observations:")
+    for topic in states:
+        lines += _state(topic)
+    for topic in cameras:
+        lines += _camera(topic)
+    lines.append("  actions:" if actions else "  actions: []  # CHOOSE: no topic looks like commands; see above")
+    for topic in actions:
+        lines += _action(topic)
+    return "\n".join(lines) + "\n"
+
+
+def _topic(reader: Rosbag2Reader, name: str) -> _Topic | None:
+    """What is known of a topic; None without a message that can be read."""
+    try:
+        found = list(islice(reader.messages({name}), _LOOKED_AT))
+    except RecorderError:
+        return None
+    if not found:
+        return None
+    periods = np.diff([item.received_ns for item in found])
+    rate_hz = NS_PER_S / float(np.median(periods)) if periods.size and np.median(periods) > 0 else 0.0
+    return _Topic(name, found[0].message.ros_type, rate_hz, found[0].message)
+
+
+def _state(topic: _Topic) -> list[str]:
+    numbers = _paths(topic)
+    if isinstance(topic.first, JointState):
+        numbers = [path for path in numbers if path.startswith("position.")] or numbers
+        key, remark = "observation.state", "the joints, in the order that the policy shall see"
+    else:
+        key, remark = f"observation.{_name(topic.name)}", "which of its numbers a policy shall see, or leave it out"
+    align = "header" if hasattr(topic.first, "header") else "receive"
+    return [
+        f"    - key: {_quoted(key)}  # CHOOSE: {remark}",
+        *_source(topic),
+        f"      select: [{', '.join(_quoted(path) for path in numbers)}]",
+        f"      align: {{strategy: hold, stamp: {align}}}",
+    ]
+
+
+def _camera(topic: _Topic) -> list[str]:
+    picture: Any = topic.first
+    tolerance_ms = round(3000 / max(topic.rate_hz, 1))
+    lines = [f"    - key: {_quoted(f'observation.images.{_name(topic.name)}')}", *_source(topic)]
+    if picture.encoding in ("16UC1", "32FC1", "mono8"):
+        lines.append(f"      image: {{encoding: {picture.encoding}}}")
+    return [
+        *lines,
+        f"      # CHOOSE: image: {{resize: [HEIGHT, WIDTH]}} makes it smaller than {picture.height} x {picture.width}",
+        f"      align: {{strategy: asof, stamp: header, tol_ms: {tolerance_ms}}}  # three periods of the camera",
+    ]
+
+
+def _action(topic: _Topic) -> list[str]:
+    paths = _paths(topic)
+    if isinstance(topic.first, JointState):
+        paths = [path for path in paths if path.startswith("position.")] or paths
+    plain = isinstance(topic.first, Float64MultiArray)
+    names = [path.rpartition("position.")[2] if "position." in path else f"joint_{i}" for i, path in enumerate(paths)]
+    select = [] if plain else [f"      select: [{', '.join(_quoted(path) for path in paths)}]"]
+    return [
+        f"    - topic: {_quoted(topic.name)}  # CHOOSE: is this what the robot was told?",
+        f"      type: {topic.type}",
+        *select,
+        f"      joints: [{', '.join(_quoted(name) for name in names)}]  # CHOOSE: their names",
+        "      # CHOOSE: hold is the command in effect at a row; next is the first after it, better for slow commands",
+        f"      align: {'hold' if topic.rate_hz > 45 else 'next'}",
+    ]
+
+
+def _source(topic: _Topic) -> Iterator[str]:
+    yield f"      topic: {_quoted(topic.name)}  # {topic.rate_hz:.1f} Hz"
+    yield f"      type: {topic.type}"
+    if topic.type not in MESSAGE_TYPES:
+        yield "      foreign: true"
+
+
+def _paths(topic: _Topic) -> list[str]:
+    return list(_numbers(topic.first))[:_MOST]
+
+
+def _numbers(value: Any, path: str = "") -> Iterator[str]:
+    """Paths to the numbers of a message; stamps left out, joints by their names."""
+    if isinstance(value, JointState):
+        for field in ("position", "velocity", "effort"):
+            if len(getattr(value, field)) == len(value.name):
+                yield from (f"{field}.{name}" for name in value.name)
+    elif isinstance(value, bool | int | float | np.number | np.bool_):
+        if not path.endswith("_ns"):
+            yield path
+    elif attrs.has(type(value)):
+        for field in attrs.fields(type(value)):
+            if field.name not in ("header", "layout"):
+                yield from _numbers(getattr(value, field.name), f"{path}.{field.name}".lstrip("."))
+    elif isinstance(value, np.ndarray | tuple | list) and 0 < len(value) <= _MOST:
+        for i, each in enumerate(value):
+            yield from _numbers(each, f"{path}.{i}")
+
+
+def _name(topic: str) -> str:
+    """A short name of a topic: what is not common to all."""
+    parts = [part for part in topic.lower().strip("/").split("/") if part]
+    return "_".join([part for part in parts if part not in _COMMON] or parts[-1:] or ["topic"])
+
+
+def _quoted(text: str) -> str:
+    return text if re.fullmatch(r"[A-Za-z_/][\w./-]*", text) and text.lower() not in _YAML_WORDS else json.dumps(text)
+
+
+_YAML_WORDS: Mapping[str, None] = dict.fromkeys(("y", "n", "yes", "no", "on", "off", "true", "false", "null"))
