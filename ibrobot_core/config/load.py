@@ -75,7 +75,7 @@ def load_contract(path: str | Path, registry: Registry | None = None) -> RobotCo
     document = _parse(path)
     registry = registry or installed()
     if set(document.root) != {"contract"}:
-        return _build(document, Path(path), False, registry)
+        return load(path, registry=registry)
     section = document.root["contract"]
     actions = section.get("actions") if isinstance(section, Mapping) else None
     for action in actions if isinstance(actions, list) else ():
