@@ -332,11 +332,11 @@ class _Panel:
     def _obey(self, key: str) -> None:
         if self._watcher.key(key):
             return
-        modes = list(self._runtime.session.config.control_modes)
+        modes = self._runtime.session.mode_keys
         if key == "f10":
             self._try(self._runtime.reset)
-        elif key.startswith("f") and key[1:].isdigit() and 0 < int(key[1:]) <= min(len(modes), 9):
-            self._try(lambda: self._runtime.switch_mode(modes[int(key[1:]) - 1]))
+        elif (mode := modes.get(key.upper())) is not None:
+            self._try(lambda: self._runtime.switch_mode(mode))
 
     def _try(self, act: Callable[[], object]) -> None:
         try:

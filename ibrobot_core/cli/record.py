@@ -190,9 +190,7 @@ class Operator(Watcher):
             self._typed += key
 
     def _resume(self) -> None:
-        session = self._runtime.session
-        if session.feeder is not None:
-            session.feeder.begin(session.request.seed)
+        self._runtime.session.feed()
 
     def _begin(self, prompt: str | None) -> None:
         if self._clock_s() < self._not_before_s:
@@ -204,7 +202,7 @@ class Operator(Watcher):
                 self._runtime.session.log.error("%s", error)
             self._refuse(str(error))
             if self._auto and isinstance(error, DiskFull):
-                self._runtime.session.outcome.faults.append(str(error))
+                self._runtime.session.add_fault(str(error))
                 self._runtime.session.finish()
         else:
             self._complaint = ""

@@ -447,11 +447,13 @@ class ControlCore:
 
     def _announce(self, fault: str, then: str) -> None:
         """Tell the host of a fault, also beside one that is set; `then` is what the robot does."""
-        self.events.append({"event": "fault", "fault": fault, "then": then, "stamp_ns": self._clock.now_ns()})
+        stamp_ns = self._clock.now_ns()
         if not self.fault:
             self.fault = fault
             self._leave()
             self._target = None
+        # With the epoch, the host knows which faults a later reset cleared.
+        self.events.append({"event": "fault", "fault": fault, "then": then, "stamp_ns": stamp_ns, "epoch": self.epoch})
 
     def _leave(self) -> None:
         """Deactivate all executors; without one, every joint brakes and holds."""
@@ -486,15 +488,20 @@ class ControlCore:
         self._safety.estop()
         self._raise_fault(EMERGENCY_STOP)
 
-    def _reset(self) -> None:
-        """Clear faults and the emergency stop, and enter the mode anew from where the joints are."""
+    def _reset(self) -> dict[str, Any]:
+        """Clear faults and the emergency stop, and enter the mode anew from where the joints are.
+
+        Answers with the fault that was `cleared`, empty where none was set.
+        """
+        cleared = self.fault
         if not self._safety.at_rest and not self._relaxed:
-            if self.fault:
+            if cleared:
                 raise HardwareError("the robot still brakes: reset it when it stands")
             # It moves as it was told: only the executors begin anew, and the commands go on within the limits.
             self._switch_mode(self.mode)
-            return
-        self._begin_anew()
+        else:
+            self._begin_anew()
+        return {"cleared": cleared}
 
     def _begin_anew(self) -> None:
         self._hardware.reset_faults()

@@ -107,6 +107,8 @@ class Runtime:
     def switch_mode(self, name: str) -> None:
         """Enter another mode: its parts become ready first, then ownership of the joints changes within one tick.
 
+        The present mode goes on where a reset made the robot hold, and is left alone otherwise.
+
         Raises:
             IbrobotError: when there is no such mode or its parts do not start; the present mode goes on.
         """
@@ -114,6 +116,8 @@ class Runtime:
         if name not in session.config.control_modes:
             raise NotSupported(f"no mode {name!r}; the modes are: {', '.join(session.config.control_modes)}")
         if name == session.mode:
+            if session.held:
+                self._go_on()
             return
         parts = mode_parts(session, name)
         new = parts.components()
@@ -126,9 +130,8 @@ class Runtime:
             raise
         self.plan.episodes.end("unknown")
         previous = session.mode
-        session.mode, session.feeder = name, parts.feeder
-        if parts.feeder is not None:
-            parts.feeder.begin(session.request.seed)
+        session.mode, session.feeder, session.held = name, parts.feeder, False
+        session.feed()
         old, self._mode_parts = self._mode_parts.components(), parts
         self._started = [component for component in self._started if component not in old] + new
         self._stop_all(old)
@@ -139,8 +142,13 @@ class Runtime:
         if not session.request.by_operator:
             self.plan.episodes.begin()
 
-    def reset(self) -> None:
+    def reset(self) -> str:
         """Clear faults and the emergency stop; the mode begins anew from where the joints are.
+
+        A mode that moves the robot by itself does not: after a fault the robot holds until the mode is entered again.
+
+        Returns:
+            What the robot does now, and how to go on.
 
         Raises:
             IbrobotError: when the hardware, or what the mode needs, does not answer yet.
@@ -149,10 +157,22 @@ class Runtime:
         if session.feeder is not None:
             session.feeder.recover()
             session.feeder.end()
-        session.command("reset")
-        if session.feeder is not None:
-            session.feeder.begin(session.request.seed)
-        session.log.info("reset: mode %s begins anew", session.mode)
+        stopped = bool(session.command("reset")["cleared"])
+        session.held = session.feeder is not None and session.feeder.autonomous and (stopped or session.held)
+        session.feed()
+        then = f"holding: {session.to_go_on()}" if session.held else f"mode {session.mode} starts over"
+        session.log.info("reset; %s", then)
+        return f"reset; {then}"
+
+    def _go_on(self) -> None:
+        """Enter the mode again in which a reset made the robot hold."""
+        session = self.session
+        session.command("switch_mode", mode=session.mode)
+        session.held = False
+        between_episodes = self.plan.episodes_worker in self._started and not self.plan.episodes.running
+        if not between_episodes:
+            session.feed()
+        session.log.info("mode %s goes on", session.mode)
 
     def stop(self) -> None:
         """Stop every component, the last started first. Errors are logged, so that all are stopped."""
@@ -243,8 +263,7 @@ class Runtime:
         try:
             session.command("switch_mode", mode=mode)
         except BaseException:
-            if session.feeder is not None:
-                session.feeder.begin(session.request.seed)
+            session.feed()
             if worker is not None and judged:
                 worker.start()
             raise
@@ -270,7 +289,6 @@ class Runtime:
         self._await_state()
         assert session.state is not None
         session.epoch = session.state.epoch
-        if session.feeder is not None:
-            session.feeder.begin(session.request.seed)
+        session.feed()
         if not session.request.by_operator:
             self.plan.episodes.begin()

@@ -61,7 +61,13 @@ class Outcome:
 
 
 class Feed(ABC):
-    """What gives the active executors something to do in a mode. It is quiet until `begin`, and after `end`."""
+    """What gives the active executors something to do in a mode. It is quiet until `begin`, and after `end`.
+
+    Attributes:
+        autonomous: whether it moves the robot with nobody at a control, so that a reset alone must not begin it.
+    """
+
+    autonomous = False
 
     @abstractmethod
     def begin(self, seed: int) -> None:
@@ -104,6 +110,8 @@ class Session:
         self.mode = config.default_control_mode
         self.epoch = 0
         self.feeder: Feed | None = None
+        self.held = False
+        """Whether the robot holds after the reset of a fault, until the operator enters the mode again."""
         self.start_failed = False
         """Whether the run ended before all of it was there: nothing has moved the robot."""
         self.state: ControlState | None = None
@@ -119,6 +127,7 @@ class Session:
         self.finished = threading.Event()
         """Set when the run should stop."""
         self.log = logging.getLogger("ibrobot")
+        self._faults: list[tuple[int, str]] = []
         self._control: ControlHost | None = None
         self._transport: Transport | None = None
         self._commanding = threading.Lock()
@@ -199,10 +208,37 @@ class Session:
         full[:, columns] = positions
         self.control.write_plan(PlanRecord(self.epoch, start_ns, step_ns, mask, full))
 
-    def command(self, do: str, **arguments: Any) -> None:
-        """Have control carry out a command that begins a new epoch: a mode switch, a reset."""
+    def command(self, do: str, **arguments: Any) -> Mapping[str, Any]:
+        """Have control carry out a command that begins a new epoch: a mode switch, a reset. Returns its answer."""
         with self._commanding:  # the epoch of the last command must be the one that stays
-            self.epoch = int(self.control.call(do, **arguments)["epoch"])
+            answer = self.control.call(do, **arguments)
+            self.epoch = int(answer["epoch"])
+            return answer
+
+    def feed(self) -> None:
+        """Begin the mode's feed, unless the robot is `held`."""
+        if self.feeder is not None and not self.held:
+            self.feeder.begin(self.request.seed)
+
+    @property
+    def mode_keys(self) -> dict[str, str]:
+        """Key -> the mode that it enters: `F1` to `F9`, in the order of the file."""
+        return {f"F{i}": name for i, name in enumerate(tuple(self.config.control_modes)[:9], 1)}
+
+    def to_go_on(self) -> str:
+        """What the operator does to enter the present mode again."""
+        keys = [key for key, mode in self.mode_keys.items() if mode == self.mode]
+        return f"{f'press {keys[0]}' if keys else 'call /set_mode'} to go on with {self.mode}"
+
+    def add_fault(self, fault: str, epoch: int | None = None) -> None:
+        """Note a fault that was raised in `epoch`, the present one when None."""
+        self.outcome.faults.append(fault)
+        self._faults.append((self.epoch if epoch is None else epoch, fault))
+
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """Faults that no reset has cleared yet; `outcome.faults` has all of the run."""
+        return tuple(fault for epoch, fault in self._faults if epoch >= self.epoch)
 
     def finish(self) -> None:
         """End the run in good order."""

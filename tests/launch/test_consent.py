@@ -1,4 +1,4 @@
-"""Nothing moves that nobody asked for: a teleoperated arm waits for its deadman whenever it may begin to move."""
+"""Nothing moves that nobody asked for: teleoperation waits for its deadman, a policy after a fault for its mode key."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from ibrobot_core.errors import TeleopError
+from ibrobot_core.errors import HardwareError, TeleopError
+from ibrobot_core.launch.runtime import RESET, SET_MODE
 
 if TYPE_CHECKING:
     from conftest import Runs
@@ -23,6 +24,7 @@ def run(runs: Runs) -> Runtime:
 
 def moves(run: Runtime, ticks: int = 30) -> bool:
     """Whether the robot moves in so many ticks."""
+    run.step()  # a reset puts the setpoint where the joints are
     assert run.session.state is not None
     before = run.session.state.command
     for _ in range(ticks):
@@ -80,3 +82,71 @@ def test_a_deadman_pressed_before_does_not_count_after(run: Runtime, runs: Runs,
     assert not moves(run)
     runs.parts.MADE["lever"].deadman = True
     assert moves(run)
+
+
+def press_the_emergency_stop(run: Runtime, runs: Runs) -> None:
+    run.session.control.call("estop")
+
+
+def silence_the_hardware(run: Runtime, runs: Runs) -> None:
+    runs.parts.MADE["simulation"].broken = True
+
+
+@pytest.fixture
+def policy(runs: Runs) -> Runtime:
+    """A policy that never succeeds, on a robot that somebody looks after."""
+    runtime = runs.start("contract.max_duration_s=100", by_operator=True)
+    runs.parts.Scene.success = lambda scene: False
+    assert moves(runtime)
+    return runtime
+
+
+@pytest.mark.parametrize("stop", [press_the_emergency_stop, silence_the_hardware], ids=lambda f: f.__name__)
+def test_after_a_fault_and_its_reset_a_policy_waits_until_its_mode_is_entered(policy: Runtime, runs: Runs, stop):
+    stop(policy, runs)
+    moves(policy, 15)  # it brakes
+    holding = "reset; holding: press F1 to go on with policy"
+    assert policy.session.bus.call(RESET, None) == holding
+    assert policy.session.bus.call(RESET, None) == holding, "a second reset starts nothing either"
+    assert not moves(policy, 100)
+    policy.session.bus.call(SET_MODE, "policy")
+    assert moves(policy)
+
+
+def test_a_held_policy_goes_on_in_no_other_way(policy: Runtime, runs: Runs, monkeypatch: pytest.MonkeyPatch) -> None:
+    press_the_emergency_stop(policy, runs)
+    moves(policy, 15)
+    policy.reset()
+    press_the_emergency_stop(policy, runs)
+    with pytest.raises(HardwareError, match="cannot enter mode policy before a reset: emergency stop"):
+        policy.switch_mode("policy")
+    policy.reset()
+    with monkeypatch.context() as patched:
+        patched.setattr(policy.session.control, "call", lambda do, **_: (_ for _ in ()).throw(HardwareError("not now")))
+        with pytest.raises(HardwareError, match="not now"):
+            policy.switch_mode("teleop")
+    assert not moves(policy)
+    policy.switch_mode("idle")
+    assert not moves(policy)
+    policy.switch_mode("policy")
+    assert moves(policy)
+
+
+def test_a_reset_that_cleared_nothing_changes_nothing_for_a_policy(policy: Runtime) -> None:
+    assert policy.reset() == "reset; mode policy starts over"
+    assert moves(policy)
+
+
+def test_a_held_episode_in_simulation_ends_and_the_next_one_waits_too(runs: Runs) -> None:
+    runtime = runs.start("contract.max_duration_s=1", episodes=2, seed=13)
+    moves(runtime, 10)
+    press_the_emergency_stop(runtime, runs)
+    moves(runtime, 15)
+    runtime.reset()
+    assert not moves(runtime, 100)
+    assert [event[0] for event in runs.parts.EVENTS] == ["started", "fault", "ended"]
+    runtime.switch_mode("policy")
+    assert moves(runtime)
+    moves(runtime, 100)
+    assert runtime.session.finished.is_set()
+    assert runtime.summary()["successes"] == 1

@@ -73,6 +73,9 @@ def test_the_next_episode_waits_for_the_reset_of_an_emergency_stop(runs: Runs):
         ("started", 1, "policy"), ("ended", 1, "failure"),
     ]  # fmt: skip
     runtime.session.bus.call(RESET, None)
+    seconds(runtime, 0.5)
+    assert len(runs.parts.EVENTS) == 3, "nor does the reset alone begin it"
+    runtime.switch_mode("policy")
     finish(runtime)
     assert runtime.summary()["successes"] == 1
 

@@ -92,7 +92,7 @@ class Control(Component):
                 session.feeder.take_goal(event)
         elif event["event"] == "fault":
             fault = str(event["fault"])
-            session.outcome.faults.append(fault)
+            session.add_fault(fault, int(event["epoch"]))
             session.log.error("fault: %s; the robot %s", fault, event["then"])
             session.registry.emit(
                 "ibrobot_fault_raised", robot=session.config.robot.name, fault=fault, stamp_ns=int(event["stamp_ns"])

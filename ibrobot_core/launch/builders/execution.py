@@ -119,6 +119,8 @@ class Model(Component):
 class InferenceFeeder(Feeder):
     """The dispatcher on the contract's ticks, fed by a model."""
 
+    autonomous = True
+
     def __init__(
         self, session: Session, mode: ControlMode, inference: Inference, model: Model, needs: tuple[str, ...]
     ) -> None:

@@ -246,7 +246,7 @@ class Recording(Worker):
             return  # what follows from the first is no news
         self.failure = error
         fault = f"recording ended: {cause(error)}"
-        session.outcome.faults.append(fault)
+        session.add_fault(fault)
         session.log.error("%s; the robot goes on", fault)
         session.registry.emit(
             "ibrobot_fault_raised", robot=session.config.robot.name, fault=fault, stamp_ns=session.clock.now_ns()

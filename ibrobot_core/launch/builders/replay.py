@@ -45,6 +45,8 @@ class ReplayFeeder(Feeder):
     In simulation the scene is set up by the recorded seed first. A fault ends the replay.
     """
 
+    autonomous = True
+
     def __init__(self, session: Session, mode: ControlMode, replay: Replay, needs: tuple[str, ...]) -> None:
         super().__init__(session, mode, f"{replay.source}, {replay.playback.duration / replay.speed:.1f} s", needs)
         self._replay = replay

@@ -38,8 +38,8 @@ class SimulatedEpisodes(Worker):
     def _judge(self, session: Session) -> None:
         state = session.state
         if self._begun_ns is None:
-            # Setting the scene up anew would clear an emergency stop, which is for a person to do.
-            if state is None or not state.estop:
+            # Setting the scene up anew would clear an emergency stop, and move on: both are for a person to do.
+            if not (session.held or (state is not None and state.estop)):
                 self._begin_episode()
         elif state is not None and state.epoch == session.epoch and state.success:
             self._end_episode("success")

@@ -63,7 +63,7 @@ class Status(Worker):
     def _diagnostics(self, now_ns: int) -> DiagnosticArray:
         session = self._session
         groups = counts(session)
-        level = DiagnosticStatus.ERROR if session.outcome.faults else DiagnosticStatus.OK
+        level = DiagnosticStatus.ERROR if session.faults else DiagnosticStatus.OK
         robot = session.config.robot.name
         statuses = [
             DiagnosticStatus(level if name == "loop" else DiagnosticStatus.OK, name, "", robot, _values(values))
