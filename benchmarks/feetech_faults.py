@@ -54,14 +54,16 @@ LIMIT, SPEED = 1.5, 3.0
 """Of every joint [rad, rad/s]."""
 RANGE = 1000, 3100
 """Calibrated, of every servo [ticks]."""
-NAMED_S = 6.0
-"""In which a fault must be named: the servos take 2 s to go into overload, control as long to see a blocked joint."""
+NAMED_S = 15.0
+"""In which a fault must be named: a slow hand takes 10 s to go to and fro, servos and control 2 s to see a block."""
 SETTLE_S = 0.5
 """After a fault, until the joints stand."""
 STILL_RAD = 0.02
 """How far a joint that stands may move."""
 _SWITCH_S = 2e-4
 """For how long one thread may keep the others from answering [s]."""
+_WRITTEN_S = 1e-3
+"""Real time for the emulator to take a goal in, while no tick waits for replies [s]."""
 UNSEEN_S = 0.06
 """For which a joint may have moved on since its last good reply: the driver rides out three lost ones."""
 
@@ -197,6 +199,8 @@ class Bench:
         if self.core.state is not None and not self.core.fault and not self._lost:
             self._teleoperate()
         self.core.tick()
+        if self.core.fault:
+            time.sleep(_WRITTEN_S)
         self.follower.settle()
         while self.core.events:
             event = self.core.events.popleft()
