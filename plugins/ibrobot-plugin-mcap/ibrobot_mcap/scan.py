@@ -12,6 +12,7 @@ from typing import BinaryIO
 
 import attrs
 import lz4.frame  # type: ignore[import-untyped]
+import numpy as np
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
@@ -26,6 +27,8 @@ REPEATED = "ibrobot.repeated"
 
 _RECORD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQII")
+_INDEX = np.dtype([("received_ns", "<u8"), ("offset", "<u8")])
+_INDEX_HEAD = struct.Struct("<HI")
 _MESSAGE = struct.Struct("<HIQQ")
 _LOOSE_SIZE = 4 << 20
 """Messages outside of chunks are taken in blocks of this size [bytes]."""
@@ -59,6 +62,8 @@ class Block:
     repeated: bool = False
     counts: dict[int, int] = attrs.field(factory=dict)
     """Channel -> number of messages."""
+    indices: dict[int, tuple[int, int]] = attrs.field(factory=dict)
+    """Channel -> where the times of its messages lie in the file, and how many bytes they take."""
 
 
 def records(content: memoryview) -> Iterator[tuple[int, memoryview]]:
@@ -142,19 +147,31 @@ class McapFile:
         Raises:
             RecorderError: when it is damaged.
         """
-        counts: dict[int, int] = {}
+        received: dict[int, list[int]] = {}
         with reading(self.path):
             for opcode, content in records(self.read(block)):
                 if opcode == Opcode.MESSAGE:
                     channel, _, received_ns, published_ns = _MESSAGE.unpack_from(content)
                     if not block.start_ns <= received_ns <= block.end_ns:
                         raise self._damaged(block, f"a message of {received_ns} ns is not within its span")
-                    counts[channel] = counts.get(channel, 0) + 1
+                    received.setdefault(channel, []).append(received_ns)
                     yield Entry(channel, received_ns, published_ns, content[_MESSAGE.size :])
                 elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                     self._note(opcode, content)
+        counts = {channel: len(times) for channel, times in received.items()}
         if counts != {channel: count for channel, count in block.counts.items() if count}:
             raise self._damaged(block, "it has other messages than its index says")
+        with reading(self.path):
+            for channel, times in received.items():
+                if channel in block.indices and sorted(times) != self._indexed(block, channel):
+                    topic = self.channels[channel].topic
+                    raise self._damaged(block, f"messages of {topic} have other times than its index says")
+
+    def _indexed(self, block: Block, channel: int) -> list[int]:
+        """The times of a channel's messages by the block's index [ns], ascending."""
+        offset, size = block.indices[channel]
+        index = np.frombuffer(os.pread(self._file.fileno(), size, offset), _INDEX)
+        return np.sort(index["received_ns"]).tolist()
 
     def _scan(self, end: int) -> None:
         """Walk over the records, looking into small ones only."""
@@ -177,8 +194,9 @@ class McapFile:
             elif opcode == Opcode.MESSAGE:
                 self._add_loose(content, length)
             elif opcode == Opcode.MESSAGE_INDEX and self.blocks:
-                channel, size = struct.unpack("<HI", file.read(6))
-                self.blocks[-1].counts[channel] = size // 16
+                channel, size = _INDEX_HEAD.unpack(file.read(_INDEX_HEAD.size))
+                self.blocks[-1].counts[channel] = size // _INDEX.itemsize
+                self.blocks[-1].indices[channel] = content + _INDEX_HEAD.size, size
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.HEADER, Opcode.STATISTICS):
                 repeated = self._note(opcode, memoryview(file.read(length))) or repeated
             self.size = position

@@ -6,6 +6,7 @@ import heapq
 import sqlite3
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any, override
 from urllib.parse import quote
@@ -57,6 +58,7 @@ class SqliteSource(Source):
         if file.execute("SELECT 1 FROM sqlite_master WHERE name = 'message_definitions'").fetchone():
             rows = file.execute("SELECT topic_type, encoded_message_definition FROM message_definitions")
             self.definitions = {**self.definitions, **{_of(str, t): _of(str, text) for t, text in rows if text}}
+        _check_times(path, file)
         for key, count, start_ns, end_ns in file.execute(
             "SELECT topic_id, count(*), min(timestamp), max(timestamp) FROM messages GROUP BY topic_id"
         ):
@@ -81,6 +83,16 @@ class SqliteSource(Source):
     def close(self) -> None:
         for _, file, _ in self._files:
             file.close()
+
+
+def _check_times(path: Path, file: sqlite3.Connection) -> None:
+    """See that the times of the messages are those of the index that rosbag2 makes of them; there are no checksums."""
+    if file.execute("SELECT 1 FROM sqlite_master WHERE type = 'index' AND name = 'timestamp_idx'").fetchone() is None:
+        return
+    by_table = file.execute("SELECT timestamp, id FROM messages NOT INDEXED ORDER BY timestamp, id")
+    by_index = file.execute("SELECT timestamp, id FROM messages INDEXED BY timestamp_idx ORDER BY timestamp, id")
+    if any(mine != other for mine, other in zip_longest(by_table, by_index)):
+        raise RecorderError(f"{path}: is damaged: its messages have other times than its index says")
 
 
 def _of[T](type_: type[T], value: Any) -> T:

@@ -1,16 +1,18 @@
 """Damages bags at random and sees that reading and conversion take no harm from them.
 
     python plugins/ibrobot-plugin-mcap/tests/fuzz.py --mutants 5000
+    python plugins/ibrobot-plugin-mcap/tests/fuzz.py --only 2:612 mcap
 
 Every mutant of every container is read, and its rows are made as `ibrobot convert` makes them. It must hold that
 
 - nothing but ibrobot's own errors is raised, and nothing hangs;
-- an episode that lacks a row is no success;
+- an episode that lacks a row is no success, unless it has every message at its time, and only their contents differ;
 - rows are those of the undamaged bag, from the first on. This can only be asked of containers with checksums, which
   all have that ibrobot records; a sqlite3 file, or an MCAP file whose writer leaves them out as that of `rosbags` does,
   cannot tell a flipped bit within a message.
 
-Prints a line for each container; exits with 1, after the first mutants that break a rule, where one does.
+Prints a line for each container, and SEED:NUMBER of the first mutants that break a rule, which `--only` runs again
+alone. Exits with 1 where there is one.
 """
 
 from __future__ import annotations
@@ -29,6 +31,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
+from itertools import islice
 from pathlib import Path
 
 import attrs
@@ -70,6 +73,7 @@ SHOWN = 3
 PATIENCE_S = 20
 
 Rows = list[dict[str, list[float]]]
+Times = list[tuple[str, int]]
 
 
 @attrs.frozen
@@ -199,51 +203,105 @@ def hurried() -> Iterator[None]:
         signal.alarm(0)
 
 
-def wrong(container: Container, found: tuple[str, Rows, str], intact: Rows) -> str:
+def times(path: Path) -> Times:
+    """Topic and receipt [ns] of every message, in order."""
+    reader = Rosbag2Reader(path)
+    try:
+        return [(raw.topic, raw.received_ns) for raw in reader.raw()]
+    finally:
+        reader.close()
+
+
+@attrs.frozen
+class Intact:
+    """What an undamaged bag has."""
+
+    rows: Rows
+    times: Times
+
+
+def wrong(container: Container, found: tuple[str, Rows, str], intact: Intact, mutant: Path) -> str:
     """The rule that a mutant breaks; empty for a good one."""
     outcome, rows, error = found
-    if outcome == "success" and not error and len(rows) < len(intact):
-        return "a success of fewer rows"
-    if container.checked and not error and rows != intact[: len(rows)]:
+    if error:
+        return ""
+    if outcome == "success" and len(rows) < len(intact.rows):
+        return "a success of fewer rows" if container.checked or times(mutant) != intact.times else ""
+    if container.checked and rows != intact.rows[: len(rows)]:
         return "rows differ from those of the undamaged bag"
     return ""
 
 
-def _ending(broken: str, error: str, *, whole: bool) -> str:
+def _ending(broken: str, found: tuple[str, Rows, str], intact: Intact) -> str:
+    outcome, rows, error = found
     if broken:
         return f"wrong: {broken}"
-    return "refused" if error else "read whole" if whole else "read in part"
+    if error:
+        return "refused"
+    if len(rows) == len(intact.rows):
+        return "read whole"
+    return "read in part" if outcome != "success" else "read, with another content of a message"
 
 
-def fuzz(name: str, mutants: int, seed: int) -> Counter[str]:
-    """Read `mutants` mutants of a container; how they ended, with `wrong: …` for each that breaks a rule."""
+def _mutants(files: dict[str, bytes], container: Container, chance: random.Random) -> Iterator[dict[str, bytes]]:
+    """The files of one mutant after the other."""
+    targets = [name for name in files if container.damages(Path(name))]
+    while True:
+        changed = chance.choice(targets)
+        yield {**files, changed: damaged(files[changed], chance)}
+
+
+def _judge(container: Container, mutant: Path, intact: Intact) -> tuple[str, str, str]:
+    """How reading a mutant ended, the rule that it breaks, and what was raised."""
+    try:
+        with hurried():
+            found = read(mutant)
+            broken = wrong(container, found, intact, mutant)
+    except Exception as error:  # noqa: BLE001 - this is what is looked for
+        broken = f"raised {type(error).__name__}"
+        return f"wrong: {broken}", broken, "".join(traceback.format_exception(error))
+    return _ending(broken, found, intact), broken, found[2]
+
+
+def fuzz(name: str, mutants: int, seed: int, only: int | None = None) -> Counter[str]:
+    """Read mutants of a container; how they ended, with `wrong: …` for each that breaks a rule.
+
+    Args:
+        name: of the container.
+        mutants: how many.
+        seed: of all that is by chance.
+        only: the number of one, of which everything is told; the others are passed over.
+    """
     container, chance = CONTAINERS[name], random.Random(f"{name} {seed}")
     ended: Counter[str] = Counter()
     with tempfile.TemporaryDirectory() as scratch:
         original, mutant = Path(scratch) / "intact", Path(scratch) / "mutant"
         container.write(original)
-        outcome, intact, error = read(original)
-        assert (outcome, len(intact) > 30, error) == ("success", True, "")
-        files = {path.name: path.read_bytes() for path in original.iterdir()}
+        outcome, rows, error = read(original)
+        assert (outcome, len(rows) > 30, error) == ("success", True, "")
+        intact = Intact(rows, times(original))
+        files = {path.name: path.read_bytes() for path in sorted(original.iterdir())}
         original.rename(mutant)
-        for number in range(mutants):
-            changed = chance.choice([file for file in files if container.damages(Path(file))])
-            for file, content in files.items():
-                (mutant / file).write_bytes(damaged(content, chance) if file == changed else content)
-            try:
-                with hurried():
-                    found = read(mutant)
-            except Exception as error:  # noqa: BLE001 - this is what is looked for
-                broken, how = f"raised {type(error).__name__}", "".join(traceback.format_exception(error))
-            else:
-                broken, how = wrong(container, found, intact), found[2]
-            ended[_ending(broken, how, whole=not broken and len(found[1]) == len(intact))] += 1
-            if broken and sum(count for key, count in ended.items() if key.startswith("wrong")) <= SHOWN:
+        for number, contents in enumerate(islice(_mutants(files, container, chance), mutants)):
+            if only not in (None, number):
+                continue
+            for file, content in contents.items():
+                (mutant / file).write_bytes(content)
+            how, broken, told = _judge(container, mutant, intact)
+            ended[how] += 1
+            if only is not None or (broken and sum(ended[key] for key in ended if key.startswith("wrong")) <= SHOWN):
                 kept = Path(tempfile.gettempdir()) / f"ibrobot-fuzz-{name}-{seed}-{number}"
                 shutil.rmtree(kept, ignore_errors=True)
                 shutil.copytree(mutant, kept)
-                print(f"{kept}: {broken}\n{how}", file=sys.stderr)
+                print(f"{name} {seed}:{number}: {how}; kept at {kept}\n{told}", file=sys.stderr)
     return ended
+
+
+def _run_alone(name: str, only: str) -> bool:
+    """Run one mutant; whether it breaks a rule."""
+    seed, number = map(int, only.split(":"))
+    (how,) = fuzz(name, number + 1, seed, number)
+    return how.startswith("wrong")
 
 
 def main() -> int:
@@ -251,8 +309,11 @@ def main() -> int:
     parser.add_argument("--mutants", type=int, default=5000, help="of each container")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", metavar="SEED:NUMBER", help="one mutant, as an earlier run named it")
     parser.add_argument("containers", nargs="*", metavar="CONTAINER", help=f"of {', '.join(CONTAINERS)}; all")
     arguments = parser.parse_args()
+    if arguments.only:
+        return any([_run_alone(name, arguments.only) for name in arguments.containers or CONTAINERS])
     failed = False
     with multiprocessing.Pool(arguments.jobs) as pool:
         for name in arguments.containers or CONTAINERS:

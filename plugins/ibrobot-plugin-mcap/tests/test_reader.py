@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import struct
 
 import numpy as np
 import pytest
@@ -216,6 +217,43 @@ def test_foreign_bags_are_read(tmp_path, storage, compression):
     lamps = read(tmp_path / "bag", {"/lamp"})
     assert {(r.message.since_ns, r.message.marks) for r in lamps} == {(1_000_000_002, ("a",))}
     assert [r.received_ns for r in lamps] == [r.published_ns for r in lamps] == [stamp(i) for i in range(20)]
+
+
+def unchecked_bag(folder, storage):
+    """A bag of 20 messages without checksums; returns its one file beside `metadata.yaml`."""
+    with RosbagsWriter(folder, version=9, storage_plugin=storage) as writer:
+        known = writer.add_connection(JOINTS, JointState.ros_type, typestore=get_typestore(Stores.ROS2_JAZZY))
+        writer.set_custom_data("outcome", "success")
+        for index in range(20):
+            writer.write(known, stamp(index), bytes(encode(joints(index))))
+    assert len(read(folder)) == 20
+    return next(path for path in folder.iterdir() if path.suffix in (".mcap", ".db3"))
+
+
+@pytest.mark.parametrize("index", [0, 7, 19])
+def test_mcap_message_with_another_time_than_its_index_is_damage(tmp_path, index):
+    """A later first message would otherwise leave an episode of fewer rows that still says success."""
+    file = unchecked_bag(tmp_path / "bag", StoragePlugin.MCAP)
+    content, ns = file.read_bytes(), stamp(index)
+    times = struct.pack("<QQ", ns, ns)
+    assert content.count(times) == 1
+    file.write_bytes(content.replace(times, struct.pack("<QQ", ns ^ 128, ns)))
+    with pytest.raises(RecorderError, match=r"is damaged|not within its span"):
+        read(tmp_path / "bag")
+
+
+@pytest.mark.parametrize("index", [0, 7, 19])
+@pytest.mark.parametrize("where", ["table", "index"])
+def test_sqlite_message_with_another_time_than_its_index_is_damage(tmp_path, where, index):
+    file = unchecked_bag(tmp_path / "bag", StoragePlugin.SQLITE3)
+    content, time = file.read_bytes(), struct.pack(">q", stamp(index))
+    assert content.count(time) == 2
+    before, middle, after = content.split(time)
+    other = struct.pack(">q", stamp(index) ^ 128)
+    first, second = (other, time) if where == "table" else (time, other)
+    file.write_bytes(before + first + middle + second + after)
+    with pytest.raises(RecorderError, match="is damaged: its messages have other times than its index says"):
+        read(tmp_path / "bag")
 
 
 def foreign_file(path, type_name, text, payloads, encoding="ros2msg"):
