@@ -17,7 +17,7 @@ from typing import Any
 import attrs
 import click
 
-from ibrobot_core.cli.panel import RecentLog, panel, plain_line
+from ibrobot_core.cli.panel import RecentLog, RecentRates, panel, plain_line
 from ibrobot_core.config import RobotConfig, find_config, load
 from ibrobot_core.control.core import EMERGENCY_STOP
 from ibrobot_core.errors import IbrobotError
@@ -269,6 +269,7 @@ class _Lines:
     def __init__(self, session: Session, watcher: Watcher) -> None:
         self._session = session
         self._watcher = watcher
+        self._rates = RecentRates()
         self._next_s = time.monotonic() + _PLAIN_PERIOD_S
         handler = logging.StreamHandler(sys.stderr)
         handler.setFormatter(LogFormatter("%(levelname).1s %(message)s"))
@@ -279,9 +280,10 @@ class _Lines:
 
     def show(self) -> None:
         """Print a line, now and then."""
+        self._rates.sample(self._session)
         if time.monotonic() >= self._next_s:
             self._next_s += _PLAIN_PERIOD_S
-            line = plain_line(self._session)
+            line = plain_line(self._session, self._rates)
             echo(f"{line} | {more}" if (more := self._watcher.line()) else line)
 
 
@@ -296,6 +298,7 @@ class _Panel:
         self._runtime = runtime
         self._watcher = watcher
         self._log = RecentLog()
+        self._rates = RecentRates()
         _log_to(self._log)
         self._display = stack.enter_context(Live(console=Screen(), auto_refresh=False, screen=False))
         self._next_s = 0.0
@@ -318,7 +321,8 @@ class _Panel:
         session = self._runtime.session
         help_text = session.feeder.help() if session.feeder is not None else ""
         help_text = "\n".join(text for text in (help_text, self._watcher.help()) if text)
-        self._display.update(panel(session, self._log, help_text, self._watcher.rows()), refresh=True)
+        self._rates.sample(session)
+        self._display.update(panel(session, self._log, self._rates, help_text, self._watcher.rows()), refresh=True)
 
     def _listen(self, keys: queue.SimpleQueue[str]) -> None:
         """In a thread of its own, so that the emergency stop waits for nothing, e.g. not for a mode that loads."""

@@ -4,19 +4,30 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import override
 
 import numpy as np
-from rich.console import Group, RenderableType
-from rich.panel import Panel
+from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
 from rich.progress_bar import ProgressBar
+from rich.segment import Segment
 from rich.table import Table
+from rich.text import Text
 
+from ibrobot_core.control.core import EMERGENCY_STOP
 from ibrobot_core.launch.session import Session
 from ibrobot_core.screen import text
+from ibrobot_core.units import NS_PER_S
 
+KEYS = {"Esc": "emergency stop", "F10": "reset", "Ctrl-C": "end"}
+LOOP = ""
+"""The control loop among the names of sensors."""
 _LOG_LINES = 6
+_RECENT_NS = 3 * NS_PER_S
+"""Rates are over so long [ns]."""
+_SAMPLE_NS = NS_PER_S // 4
+_JOINT_WIDTH = 45
+"""Columns of a joint's name and numbers."""
 
 
 class RecentLog(logging.Handler):
@@ -29,20 +40,45 @@ class RecentLog(logging.Handler):
     @override
     def emit(self, record: logging.LogRecord) -> None:
         style = {logging.WARNING: "yellow", logging.ERROR: "bold red"}.get(record.levelno, "dim")
-        self.lines.append(text(record.getMessage(), style, overflow="ellipsis", no_wrap=True))
+        self.lines.append(text(record.getMessage(), style))
 
 
-def _loop_text(session: Session) -> str:
+class RecentRates:
+    """Rates of the loop and of the sensors over the last seconds, from how far their counts got meanwhile."""
+
+    def __init__(self) -> None:
+        self._samples: deque[tuple[int, dict[str, int]]] = deque()
+
+    def sample(self, session: Session) -> None:
+        """Note the counts of now, a few times a second."""
+        now_ns = session.clock.now_ns()
+        if self._samples and now_ns - self._samples[-1][0] < _SAMPLE_NS:
+            return
+        ticks = {LOOP: session.state.tick} if session.state is not None else {}
+        self._samples.append((now_ns, {**session.received, **ticks}))
+        while len(self._samples) > 2 and now_ns - self._samples[1][0] >= _RECENT_NS:
+            self._samples.popleft()
+
+    def __getitem__(self, name: str) -> float:
+        """A sensor's rate, or that of `LOOP` [Hz]; 0 before there are two samples."""
+        if not self._samples:
+            return 0.0
+        (first_ns, first), (last_ns, last) = self._samples[0], self._samples[-1]
+        elapsed_ns = last_ns - first_ns
+        return (last.get(name, 0) - first.get(name, 0)) * NS_PER_S / elapsed_ns if elapsed_ns else 0.0
+
+
+def _loop_text(session: Session, rates: RecentRates) -> str:
     loop = session.control.report["loop"]
     return (
-        f"{loop['rate_hz']:.1f} Hz, late p50 {loop['lateness_p50_us']:.0f} us, "
+        f"{rates[LOOP]:.1f} Hz, late p50 {loop['lateness_p50_us']:.0f} us, "
         f"p99 {loop['lateness_p99_us']:.0f} us, missed {loop['missed']}"
     )
 
 
-def _sensor_text(session: Session, name: str) -> str:
+def _sensor_text(session: Session, rates: RecentRates, name: str) -> str:
     age = f", {session.ages[name] * 1e3:.0f} ms old" if name in session.ages else ""
-    return f"{name} {session.rates[name]:.1f} Hz{age}"
+    return f"{name} {rates[name]:.1f} Hz{age}"
 
 
 def _model_text(session: Session) -> str | None:
@@ -54,70 +90,105 @@ def _model_text(session: Session) -> str | None:
     return f"{state} ({stats.mode}, {stats.failures} failures, {stats.restarts} restarts)"
 
 
-def plain_line(session: Session) -> str:
+def plain_line(session: Session, rates: RecentRates) -> str:
     """One line of status."""
     outcome, stats = session.outcome, session.stats
-    pieces = [f"mode {session.mode}", f"loop {_loop_text(session)}"]
+    pieces = [f"mode {session.mode}", f"loop {_loop_text(session, rates)}"]
     if stats is not None:
         pieces.append(f"plan {stats.plan_length}, latency {stats.latency_ms:.0f} ms")
     if (model := _model_text(session)) is not None:
         pieces.append(f"model {model}")
-    pieces += [_sensor_text(session, name) for name in session.rates]
+    pieces += [_sensor_text(session, rates, name) for name in session.rates]
     pieces.append(f"episodes {outcome.episodes}, successes {outcome.successes}")
-    if outcome.faults:
-        pieces.append(f"FAULTS {len(outcome.faults)}")
+    pieces += [f"FAULT: {fault}" for fault in session.faults]
+    if session.held:
+        pieces.append(f"holding: {session.to_go_on()}")
     return " | ".join(pieces)
 
 
-def panel(session: Session, log: RecentLog, help_text: str, more: Sequence[tuple[str, str]] = ()) -> RenderableType:
-    """The whole panel, with `more` rows of heading and text."""
-    outcome, stats = session.outcome, session.stats
-    facts = Table.grid(padding=(0, 2))
-    facts.add_column(style="bold")
-    facts.add_column()
-    where = "simulation" if session.config.simulated else "hardware"
-    modes = text("  ").join(
-        text(f"F{i} ") + text(name, "reverse" if name == session.mode else "")
-        for i, name in enumerate(session.config.control_modes, 1)
+def panel(
+    session: Session, log: RecentLog, rates: RecentRates, help_text: str, more: Sequence[tuple[str, str]] = ()
+) -> RenderableType:
+    """The whole panel, with `more` rows of heading and text; in a small terminal its end is left out."""
+    where = "in simulation" if session.config.simulated else "on hardware"
+    modes = text(f"{session.config.robot.name} {where}  ", "bold") + text("  ").join(
+        text(f"{key} ") + text(name, "reverse" if name == session.mode else "")
+        for key, name in session.mode_keys.items()
     )
-    facts.add_row("mode", modes)
-    facts.add_row("loop", _loop_text(session))
+    return Group(  # what does not fit below, `Live` leaves out
+        text(" ").join(text(key, "bold reverse") + text(f" {does}", "bold") for key, does in KEYS.items()),
+        *_faults(session),
+        _Newest(log.lines),
+        modes,
+        *([text(help_text, "cyan")] if help_text else []),
+        *(text(f"{heading:<10}", "bold") + text(row) for heading, row in (*more, *_facts(session, rates))),
+        _Joints(session),
+    )
+
+
+def _faults(session: Session) -> list[Text]:
+    """What keeps the robot from going on, in full, the newest fault first."""
+    if session.held and not session.faults:
+        return [text(f"holding after the reset: {session.to_go_on()}", "bold yellow")]
+    estop = session.state is not None and session.state.estop
+    others = [fault for fault in reversed(session.faults) if fault != EMERGENCY_STOP]
+    return [
+        *([text("EMERGENCY STOP: F10 resets it", "bold reverse red")] if estop else []),
+        *(text(f"FAULT: {fault}; F10 resets it", "bold red") for fault in others),
+    ]
+
+
+def _facts(session: Session, rates: RecentRates) -> Iterator[tuple[str, str]]:
+    """Heading and text, the most important first."""
+    outcome, stats = session.outcome, session.stats
+    if session.rates:
+        yield "sensors", "  ".join(_sensor_text(session, rates, name) for name in session.rates)
     if stats is not None:
-        facts.add_row(
+        yield (
             "plan", f"{stats.plan_length} actions by {stats.strategy}, latency p50 {stats.latency_p50_ms:.0f}, "
             f"p99 {stats.latency_p99_ms:.0f} ms, holds {stats.holds}, failures {stats.failures}",
         )  # fmt: skip
     if (model := _model_text(session)) is not None:
-        facts.add_row("model", model)
-    if session.rates:
-        facts.add_row("sensors", "  ".join(_sensor_text(session, name) for name in session.rates))
-    facts.add_row("episodes", f"{outcome.episodes} done, {outcome.successes} successful")
-    for heading, row in more:
-        facts.add_row(heading, row)
-    state = session.state
-    estop = state is not None and state.estop
-    faults = text("; ".join(outcome.faults[-3:]), "bold red") if outcome.faults else text("none", "green")
-    facts.add_row("faults", faults)
-    pieces: list[RenderableType] = [facts, text(""), _joints(session)]
-    if help_text:
-        pieces += [text(""), text(help_text, style="cyan")]
-    pieces += [text(""), *log.lines]
-    title = f"{session.config.robot.name} ({where})" + (" EMERGENCY STOP: F10 resets" if estop else "")
-    return Panel(
-        Group(*pieces),
-        title=text(title),
-        subtitle="Esc emergency stop   F10 reset   Ctrl-C stop",
-        border_style="red" if estop else "blue",
-    )
+        yield "model", model
+    yield "loop", _loop_text(session, rates)
+    yield "episodes", f"{outcome.episodes} done, {outcome.successes} successful"
+    yield "faults", f"{len(session.faults)} now, {len(outcome.faults)} in this run"
 
 
-def _joints(session: Session) -> Table:
-    table = Table.grid(padding=(0, 2))
-    state, robot = session.state, session.config.robot
-    if state is None:
-        return table
-    for i, joint in enumerate(robot.joints):
-        done = float(np.clip((state.position[i] - joint.lower) / (joint.upper - joint.lower), 0.0, 1.0))
-        bar = ProgressBar(total=1.0, completed=done, width=30)
-        table.add_row(joint.name, bar, f"{state.position[i]:+.3f}", text(f"told {state.command[i]:+.3f} rad", "dim"))
-    return table
+class _Newest:
+    """The newest of some messages, in full; so many as `_LOG_LINES` lines hold, and at least one."""
+
+    def __init__(self, messages: Sequence[RenderableType]) -> None:
+        self._messages = messages
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        shown: list[list[Segment]] = []
+        for message in reversed(self._messages):
+            lines = console.render_lines(message, options.update(height=None), pad=False)
+            if shown and len(shown) + len(lines) > _LOG_LINES:
+                break
+            shown = lines + shown
+        for line in shown:
+            yield from line
+            yield Segment.line()
+
+
+class _Joints:
+    """Where each joint is and what it was told; where there is room, also within its limits."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        state, robot = self._session.state, self._session.config.robot
+        if state is None:
+            return
+        table = Table.grid(padding=(0, 1))
+        for i, joint in enumerate(robot.joints):
+            done = float(np.clip((state.position[i] - joint.lower) / (joint.upper - joint.lower), 0.0, 1.0))
+            room = max(0, options.max_width - _JOINT_WIDTH)
+            bar = [ProgressBar(total=1.0, completed=done, width=min(room, 30))] if room else []
+            table.add_row(
+                joint.name, f"{state.position[i]:+.3f}", text(f"told {state.command[i]:+.3f} rad", "dim"), *bar
+            )
+        yield table

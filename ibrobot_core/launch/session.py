@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -121,6 +122,8 @@ class Session:
         """Says which policy acts, and with which weights; None in a mode without one."""
         self.rates: dict[str, float] = {}
         """Measured rate of each sensor [Hz]."""
+        self.received: Counter[str] = Counter()
+        """Messages of each sensor so far."""
         self.ages: dict[str, float] = {}
         """Age of each sensor's newest message when it was published [s], by its stamp."""
         self.failure: tuple[str, Exception] | None = None

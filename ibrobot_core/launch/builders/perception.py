@@ -47,6 +47,7 @@ class SensorWorker(Worker):
         self._session.bus.publish(self._sensor.topic, message)
         now_ns = self._session.clock.now_ns()
         self._stamps.append(now_ns)
+        self._session.received[self._peripheral.name] += 1
         if (header := getattr(message, "header", None)) is not None:
             self._session.ages[self._peripheral.name] = seconds(now_ns - header.stamp_ns)
         elapsed_s = seconds(self._stamps[-1] - self._stamps[0])

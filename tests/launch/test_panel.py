@@ -1,0 +1,147 @@
+"""The panel on an emulated terminal: what matters is seen in full, however small the terminal."""
+
+from __future__ import annotations
+
+import io
+import logging
+from typing import TYPE_CHECKING
+
+import attrs
+import pyte
+import pytest
+from rich.live import Live
+
+from ibrobot_core.cli.panel import RecentLog, RecentRates, panel, plain_line
+from ibrobot_core.screen import Screen
+
+if TYPE_CHECKING:
+    from conftest import Runs
+    from ibrobot_core.launch.runtime import Runtime
+
+SIZES = [(80, 24), (40, 24), (40, 12)]
+FAULT = (
+    "servo 3 (elbow_flex) does not answer: check its cable, then `ibrobot feetech scan --port /dev/ttyACM0`, which "
+    "lists the servos that answer"
+)
+KEYS = "Esc emergency stop F10 reset Ctrl-C end"
+
+
+@attrs.define
+class Terminal:
+    """The panel of a run, drawn by Rich and shown by a terminal emulator."""
+
+    run: Runtime
+    width: int
+    height: int
+    log: RecentLog = attrs.field(factory=RecentLog)
+    rates: RecentRates = attrs.field(factory=RecentRates)
+
+    def lines(self, *messages: str, draws: int = 3) -> list[str]:
+        """What is on the screen after some draws over one another."""
+        for message in messages:
+            self.log.emit(logging.makeLogRecord({"msg": message, "levelno": logging.INFO}))
+        sent = io.StringIO()
+        console = Screen(file=sent, width=self.width, height=self.height, force_terminal=True, color_system="standard")
+        with Live(console=console, auto_refresh=False) as live:
+            for _ in range(draws):
+                self.run.step()
+                self.rates.sample(self.run.session)
+                feeder = self.run.session.feeder
+                help_text = feeder.help() if feeder is not None else ""
+                live.update(panel(self.run.session, self.log, self.rates, help_text), refresh=True)
+            drawn = sent.getvalue()  # before the display ends, which adds a line
+        screen = pyte.Screen(self.width, self.height)
+        pyte.Stream(screen).feed(drawn.replace("\n", "\r\n"))
+        return [line.rstrip() for line in screen.display]
+
+    def words(self, *messages: str) -> str:
+        """What is on the screen, with its line breaks undone."""
+        return " ".join(" ".join(self.lines(*messages)).split())
+
+
+@pytest.fixture(params=SIZES, ids=lambda size: "x".join(map(str, size)))
+def terminal(runs: Runs, request: pytest.FixtureRequest) -> Terminal:
+    runtime = runs.start("contract.max_duration_s=100", mode="policy", seed=13)  # a scene that never succeeds
+    for _ in range(5):  # the episode begins, and with it the epoch
+        runtime.step()
+    return Terminal(runtime, *request.param)
+
+
+def estop(run: Runtime) -> None:
+    run.session.control.call("estop")
+    for _ in range(20):
+        run.step()
+
+
+def test_keys_come_first_and_nothing_scrolls_away(terminal: Terminal):
+    lines = terminal.lines("a message")
+    shown = " ".join(" ".join(lines).split())
+    assert lines[0] == KEYS
+    assert shown.index("a message") < shown.index("F1 policy")
+
+
+def test_a_fault_is_shown_in_full_above_the_messages_and_the_mode_until_its_reset(terminal: Terminal):
+    terminal.run.session.control.call("fault", fault=FAULT)
+    for _ in range(20):
+        terminal.run.step()
+    shown = terminal.words("the newest message")
+    assert f"FAULT: {FAULT}; F10 resets it" in shown
+    assert shown.index(KEYS) < shown.index(FAULT) < shown.index("the newest message") < shown.index("F1 policy")
+    terminal.run.reset()
+    shown = terminal.words()
+    assert FAULT not in shown
+    assert "holding after the reset: press F1 to go on with policy" in shown
+    terminal.run.switch_mode("policy")
+    assert "holding" not in terminal.words()
+
+
+def test_an_emergency_stop_is_shown_with_its_key_until_its_reset(terminal: Terminal):
+    estop(terminal.run)
+    assert "EMERGENCY STOP: F10 resets it" in terminal.words()
+    terminal.run.reset()
+    assert "EMERGENCY STOP" not in terminal.words()
+    estop(terminal.run)
+    shown = terminal.words()
+    assert "EMERGENCY STOP: F10 resets it" in shown, "also while the robot holds after a reset"
+    assert "holding after the reset" not in shown
+
+
+def test_a_fault_during_another_is_shown_too(terminal: Terminal):
+    terminal.run.session.control.call("fault", fault="the first")
+    terminal.run.step()
+    terminal.run.session.add_fault("recording ended: the disk is full; make room")
+    shown = terminal.words()
+    assert "FAULT: recording ended: the disk is full; make room; F10 resets it FAULT: the first; F10" in shown
+
+
+def test_the_newest_messages_are_whole_and_the_oldest_go_first(terminal: Terminal):
+    shown = terminal.words(*(f"message {i} says {'much ' * 12}and ends with {i}." for i in range(6)))
+    assert "message 5 says" in shown
+    assert "and ends with 5." in shown
+    assert "ends with 0." not in shown
+
+
+def test_a_wide_terminal_shows_all_facts(runs: Runs):
+    shown = Terminal(runs.start(mode="policy"), 120, 40).words()
+    for fact in ("sensors top", "plan ", "loop ", "episodes 0 done", "faults 0 now, 0 in this run", "pan +0.", "grip"):
+        assert fact in shown, shown
+
+
+def test_rates_are_those_of_the_last_seconds(runs: Runs):
+    runtime = runs.start(mode="teleop")
+    rates = RecentRates()
+
+    def seconds(duration: float) -> None:
+        for _ in range(round(duration * 50)):
+            runtime.step()
+            rates.sample(runtime.session)
+
+    seconds(10.0)
+    assert rates["top"] == pytest.approx(50.0, rel=0.02)
+    runs.parts.MADE["top"].read = lambda timeout_s: None
+    seconds(4.0)
+    assert rates["top"] == 0.0
+    assert rates["side"] == pytest.approx(50.0, rel=0.02)
+    line = plain_line(runtime.session, rates)
+    assert "top 0.0 Hz" in line
+    assert "loop 50.0 Hz" in line
