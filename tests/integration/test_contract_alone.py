@@ -40,7 +40,7 @@ def ibrobot(folder: Path, *arguments: object) -> subprocess.CompletedProcess[str
 
 @pytest.fixture
 def kitchen(tmp_path: Path) -> Path:
-    """A clean folder with a bag of others: states at 100 Hz, commands at 30, a camera at 30, an IMU."""
+    """A clean folder with a bag of others: states at 100 Hz, commands of two parts at 30, a camera at 30, an IMU."""
     store = get_typestore(Stores.ROS2_JAZZY)
     events = []
     for i in range(100):
@@ -50,6 +50,7 @@ def kitchen(tmp_path: Path) -> Path:
     for i in range(30):
         at_ns = START_NS + 3_000_000 + i * 33_333_333
         events.append((at_ns, COMMANDS, Float64MultiArray(np.full(3, float(i)))))
+        events.append((at_ns, "/gripper_controller/commands", Float64MultiArray([0.5])))
         picture = Image(Header(at_ns), *SIZE, "rgb8", SIZE[1] * 3, numbered(i).ravel())
         events.append((at_ns, "/camera/top/image_raw", picture))
     with Writer(tmp_path / "kitchen", version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
@@ -74,7 +75,7 @@ def test_a_drafted_contract_converts_the_bag_that_it_is_from(kitchen: Path) -> N
     info = json.loads((kitchen / "set/meta/info.json").read_bytes())
     assert info["features"]["observation.images.top"]["shape"] == [*SIZE, 3]
     assert info["features"]["observation.state"]["names"] == [f"{joint}.pos" for joint in JOINTS]
-    assert info["features"]["action"]["names"] == ["joint_0.pos", "joint_1.pos", "joint_2.pos"]
+    assert info["features"]["action"]["names"] == [f"joint_{i}.pos" for i in range(4)]
     table = pq.read_table(kitchen / "set/data/chunk-000/file-000.parquet").to_pydict()
     actions = [row[0] for row in table["action"]]
     assert actions == [actions[0] + i for i in range(len(actions))], "the next command after each picture"

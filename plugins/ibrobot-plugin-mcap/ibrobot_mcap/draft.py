@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator, Mapping
-from itertools import islice
+from itertools import count, islice
 from typing import Any
 
 import attrs
@@ -67,8 +67,9 @@ def draft(reader: Rosbag2Reader) -> str:
     for topic in cameras:
         lines += _camera(topic)
     lines.append("  actions:" if actions else "  actions: []  # CHOOSE: no topic looks like commands; see above")
+    unnamed = count()
     for topic in actions:
-        lines += _action(topic)
+        lines += _action(topic, unnamed)
     return "\n".join(lines) + "\n"
 
 
@@ -114,12 +115,12 @@ def _camera(topic: _Topic) -> list[str]:
     ]
 
 
-def _action(topic: _Topic) -> list[str]:
+def _action(topic: _Topic, unnamed: Iterator[int]) -> list[str]:
     paths = _paths(topic)
     if isinstance(topic.first, JointState):
         paths = [path for path in paths if path.startswith("position.")] or paths
     plain = isinstance(topic.first, Float64MultiArray)
-    names = [path.rpartition("position.")[2] if "position." in path else f"joint_{i}" for i, path in enumerate(paths)]
+    names = [path.rpartition("position.")[2] if "position." in path else f"joint_{next(unnamed)}" for path in paths]
     select = [] if plain else [f"      select: [{', '.join(_quoted(path) for path in paths)}]"]
     return [
         f"    - topic: {_quoted(topic.name)}  # CHOOSE: is this what the robot was told?",
