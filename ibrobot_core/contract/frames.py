@@ -18,7 +18,7 @@ from ibrobot_core.contract.select import Selection
 from ibrobot_core.contract.specs import Contract, ObservationPart
 from ibrobot_core.errors import ContractError
 from ibrobot_core.interfaces.policy import Frame
-from ibrobot_core.messages import Message
+from ibrobot_core.messages import CompressedImage, Message
 
 _IMAGE_DEPTH = 32
 _VECTOR_DEPTH = 256
@@ -42,7 +42,10 @@ class _Part:
 
     def take(self, message: Message, received_ns: int) -> None:
         if message.ros_type != self.part.type:
-            raise ContractError(f"{self.part.key}: {self.part.topic} is a {self.part.type}, got a {message.ros_type}")
+            format_ = f" of format {message.format!r}" if isinstance(message, CompressedImage) else ""
+            raise ContractError(
+                f"{self.part.key}: {self.part.topic} is a {self.part.type}, got a {message.ros_type}{format_}"
+            )
         stamp_ns = message.header.stamp_ns if hasattr(message, "header") else None
         if stamp_ns is None and self.part.align.stamp == "header":  # of a type that nobody knew before
             raise ContractError(f"{self.part.key}: a {self.part.type} has no header; give `align: {{stamp: receive}}`")

@@ -217,7 +217,7 @@ def _observation(spec: ObservationSpec, config: RobotConfig) -> ObservationPart:
     if type_ == _COMPRESSED_TYPE:
         raise ContractError(
             f"{spec.key}: there is no decoder for {type_} of a robot, take the topic with raw images; of a bag, JPEG "
-            f"is read as {_CAMERA_TYPE}, give that type"
+            f"and PNG are read as {_CAMERA_TYPE}, give that type"
         )
     has_header = "header" in attrs.fields_dict(MESSAGE_TYPES[type_])
     align = spec.align if has_header else attrs.evolve(spec.align, stamp="receive")

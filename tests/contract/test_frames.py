@@ -21,7 +21,7 @@ from ibrobot_core.contract.image import encode_image
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import ContractError
 from ibrobot_core.interfaces.policy import Frame
-from ibrobot_core.messages import Float64MultiArray, Header, Imu, JointState, Message, Vector3
+from ibrobot_core.messages import CompressedImage, Float64MultiArray, Header, Imu, JointState, Message, Vector3
 from ibrobot_core.testing.contexts import ARM, GRIPPER, START_NS
 
 Make = Callable[..., Any]
@@ -246,6 +246,9 @@ def test_jumps_are_counted_per_topic(contract: Contract) -> None:
 def test_messages_that_do_not_fit_are_refused(contract: Contract, make_config: Make) -> None:
     with pytest.raises(ContractError, match=r"images.top: /camera/top/image_raw is a sensor_msgs/msg/Image, got a std"):
         offline(contract, [("/camera/top/image_raw", Float64MultiArray([1.0]), 0)], 1)
+    rvl = CompressedImage(Header(0), "16UC1; compressedDepth rvl", np.zeros(40, np.uint8))
+    with pytest.raises(ContractError, match=r"/camera/top/image_raw.*'16UC1; compressedDepth rvl'"):
+        offline(contract, [("/camera/top/image_raw", rvl, 0)], 1)
     without = JointState(Header(0), ARM, np.zeros(5))
     with pytest.raises(ContractError, match=r"observation.state: /joint_states: the message has no joint 'gripper'"):
         offline(contract, [("/joint_states", without, 0)], 1)

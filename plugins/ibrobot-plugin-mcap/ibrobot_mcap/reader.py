@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import override
 
 from ibrobot_ros2 import Codec, CodecError
+from ibrobot_ros2.png import from_png, is_png
 
-from ibrobot_core.errors import RecorderError
+from ibrobot_core.errors import ContractError, RecorderError
 from ibrobot_core.interfaces import EpisodeReader, EpisodeSummary, Recorded, TopicSummary
 from ibrobot_core.messages import CompressedImage, Image
 from ibrobot_mcap.compressed import Expanded, MessageCompressed
@@ -36,7 +37,9 @@ def is_rosbag2(path: Path) -> bool:
 
 
 class Rosbag2Reader(EpisodeReader):
-    """Reads a rosbag2 directory or a single file of one. JPEG pictures come as `Image`, as a contract asks for them.
+    """Reads a rosbag2 directory or a single file of one. Pictures come as `Image`, as a contract asks for them.
+
+    JPEG, PNG and the PNG of `compressedDepth` do; other formats stay `CompressedImage`.
 
     Raises:
         RecorderError: when it cannot be read.
@@ -102,9 +105,9 @@ class Rosbag2Reader(EpisodeReader):
         for raw in source.messages(frozenset(source.types if topics is None else topics)):
             try:
                 message = self._codec.decode(raw.type, raw.data)
-                if isinstance(message, CompressedImage) and is_jpeg(message):
-                    message = from_jpeg(message)
-            except (CodecError, RecorderError) as error:
+                if isinstance(message, CompressedImage):
+                    message = _picture(message)
+            except (CodecError, ContractError, RecorderError) as error:
                 raise RecorderError(f"{self._path}: {raw.topic} at {raw.received_ns} ns: {error}") from error
             yield Recorded(raw.topic, message, raw.received_ns, raw.published_ns)
 
@@ -126,7 +129,7 @@ class Rosbag2Reader(EpisodeReader):
         return self._source.types.keys()
 
     def stored(self, topic: str) -> Topic:
-        """A topic as it is stored (JPEG pictures are `CompressedImage`), with what the bag has of its type."""
+        """A topic as it is stored (compressed pictures are `CompressedImage`), with what the bag has of its type."""
         source, type_ = self._source, self._source.types[topic]
         definition = source.definitions.get(type_, "")
         try:
@@ -154,7 +157,7 @@ class Rosbag2Reader(EpisodeReader):
         self._closing.close()
 
     def _delivered(self, topic: str, type_: str) -> str:
-        """The type of the messages that `messages` gives of a topic: its first one tells JPEG from other pictures."""
+        """The type of the messages that `messages` gives of a topic: its first one tells the format of pictures."""
         if type_ != CompressedImage.ros_type:
             return type_
         first = next(self._source.messages({topic}), None)
@@ -164,7 +167,8 @@ class Rosbag2Reader(EpisodeReader):
             message = self._codec.decode(type_, first.data)
         except CodecError:
             return type_  # reading it tells what is wrong
-        return Image.ros_type if isinstance(message, CompressedImage) and is_jpeg(message) else type_
+        known = isinstance(message, CompressedImage) and (is_jpeg(message) or is_png(message))
+        return Image.ros_type if known else type_
 
     def _recorded(self) -> Facts | None:
         """What the newest metadata record says, for an episode without `metadata.yaml`."""
@@ -201,6 +205,13 @@ class Rosbag2Reader(EpisodeReader):
         if not files:
             raise RecorderError(f"{path}: has no .mcap or .db3 file")
         return files
+
+
+def _picture(message: CompressedImage) -> Image | CompressedImage:
+    """The pixels of a picture whose format is known, else the message as it is."""
+    if is_jpeg(message):
+        return from_jpeg(message)
+    return from_png(message) if is_png(message) else message
 
 
 def _names(files: Sequence[Path]) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import struct
+from io import BytesIO
 
 import numpy as np
 import pytest
@@ -14,12 +15,14 @@ from ibrobot_mcap.reader import Rosbag2Reader, is_rosbag2
 from ibrobot_mcap.scan import McapFile
 from ibrobot_ros2 import definition, encode
 from mcap.writer import CompressionType, Writer
+from PIL import Image as Pillow
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagsWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from ibrobot_core.contract.image import pixels
 from ibrobot_core.errors import RecorderError
-from ibrobot_core.messages import CompressedImage, Header, JointState
+from ibrobot_core.messages import CompressedImage, Header, Image, JointState
 from ibrobot_core.plugins import installed
 
 from .conftest import CAMERA, JOINTS, Bench, joints, picture, read, reading, stamp, summary
@@ -274,13 +277,42 @@ def test_a_type_that_cannot_be_read_is_told_by_topic(tmp_path):
         read(tmp_path / "file.mcap")
 
 
-def test_foreign_pictures_come_as_they_are_unless_jpeg(tmp_path):
-    png = CompressedImage(Header(1), "png", np.frombuffer(b"\x89PNG....", np.uint8))
+def png(array):
+    file = BytesIO()
+    Pillow.fromarray(array).save(file, "PNG")
+    return file.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("format_", "encoding", "header", "array"),
+    [
+        ("rgb8; png compressed bgr8", "rgb8", b"", np.arange(24, dtype=np.uint8).reshape(2, 4, 3)),
+        ("mono16; png compressed mono16", "16UC1", b"", np.arange(0, 64000, 8000, np.uint16).reshape(2, 4)),
+        ("16UC1; compressedDepth png", "16UC1", bytes(12), np.arange(0, 64000, 8000, np.uint16).reshape(2, 4)),
+    ],
+)
+def test_foreign_png_pictures_come_as_images(tmp_path, format_, encoding, header, array):
+    sent = CompressedImage(Header(1), format_, np.frombuffer(header + png(array), np.uint8))
     text = definition(CompressedImage.ros_type)
-    foreign_file(tmp_path / "file.mcap", CompressedImage.ros_type, text, [bytes(encode(png))])
+    foreign_file(tmp_path / "file.mcap", CompressedImage.ros_type, text, [bytes(encode(sent))])
+    assert summary(tmp_path / "file.mcap").topics["/it"].type == Image.ros_type
+    (found,) = [r.message for r in read(tmp_path / "file.mcap")]
+    assert (found.header, found.encoding) == (Header(1), encoding)
+    np.testing.assert_array_equal(pixels(found).reshape(array.shape), array)
+
+
+def test_foreign_pictures_of_other_formats_come_as_they_are(tmp_path):
+    rvl = CompressedImage(Header(1), "16UC1; compressedDepth rvl", np.zeros(40, np.uint8))
+    text = definition(CompressedImage.ros_type)
+    foreign_file(tmp_path / "file.mcap", CompressedImage.ros_type, text, [bytes(encode(rvl))])
     assert summary(tmp_path / "file.mcap").topics["/it"].type == CompressedImage.ros_type
-    assert [r.message for r in read(tmp_path / "file.mcap")] == [png]
-    broken = CompressedImage(Header(1), "jpeg", np.frombuffer(b"\xff\xd8\xff....", np.uint8))
+    assert [r.message for r in read(tmp_path / "file.mcap")] == [rvl]
+
+
+@pytest.mark.parametrize(("name", "begin"), [("JPEG", b"\xff\xd8\xff"), ("PNG", b"\x89PNG\r\n\x1a\n")])
+def test_damaged_foreign_picture_is_named_by_topic_and_time(tmp_path, name, begin):
+    text = definition(CompressedImage.ros_type)
+    broken = CompressedImage(Header(1), name.lower(), np.frombuffer(begin + b"....", np.uint8))
     foreign_file(tmp_path / "file.mcap", CompressedImage.ros_type, text, [bytes(encode(broken))])
-    with pytest.raises(RecorderError, match=rf"/it at {stamp(0)} ns: JPEG picture of 7 bytes: "):
+    with pytest.raises(RecorderError, match=rf"/it at {stamp(0)} ns: .*{name}"):
         read(tmp_path / "file.mcap")
