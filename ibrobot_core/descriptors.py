@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import builtins
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import attrs
 
-from ibrobot_core.options import NoOptions
+from ibrobot_core.options import NoOptions, OptionFault
+from ibrobot_core.robot import Robot
 
 if TYPE_CHECKING:
     import click
@@ -35,6 +36,16 @@ def nothing_is_missing() -> None:
     """The check of a type that needs nothing but Python packages that come with its plugin."""
 
 
+def nothing_is_wrong(options: Any, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
+    """The check of options that stand by themselves."""
+    return ()
+
+
+def no_devices(options: Any) -> Mapping[str, str]:
+    """The devices of a type that opens none, or that others may open too."""
+    return {}
+
+
 @attrs.frozen
 class Descriptor[T]:
     """One implementation of one kind.
@@ -55,6 +66,13 @@ class Descriptor[T]:
     Raises:
         MissingDependency: e.g. for a system library. A run goes on without a sensor that nothing in it needs.
     """
+    check_options: Callable[[Any, Robot, tuple[str, ...]], Iterable[OptionFault]] = attrs.field(
+        default=nothing_is_wrong, kw_only=True
+    )
+    """What is wrong with the options for a robot, e.g. a joint that it does not have; the third argument has the joints
+    that the component owns, or all where its kind owns none. Opens no device, and imports nothing heavy."""
+    devices: Callable[[Any], Mapping[str, str]] = attrs.field(default=no_devices, kw_only=True)
+    """Option -> the device that it names and that one component at a time can open, always written in the same way."""
 
 
 @attrs.frozen

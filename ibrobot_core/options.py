@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from difflib import get_close_matches
 from typing import Any
 
 import attrs
@@ -12,6 +13,28 @@ import attrs
 @attrs.frozen
 class NoOptions:
     """For implementations without options."""
+
+
+@attrs.frozen
+class OptionFault:
+    """What is wrong with an option beside the rest of the robot, e.g. a joint that the robot does not have."""
+
+    option: tuple[str | int, ...]
+    """The option, and where in it: `("inverted", 1)` is the second item of `inverted`."""
+    message: str
+
+
+def hint(word: str, known: Sequence[str], what: str) -> str:
+    """What should have stood for `word`: the nearest of `known`, or all of them."""
+    close = get_close_matches(word, known, 1)
+    return f", did you mean {close[0]!r}?" if close else f"; {what}: {', '.join(known) or 'none'}"
+
+
+def unknown_names(option: str, names: Sequence[str], known: Sequence[str], what: str) -> Iterator[OptionFault]:
+    """A fault for each of the names in a list option that is not among the known ones, e.g. of joints."""
+    for i, name in enumerate(names):
+        if name not in known:
+            yield OptionFault((option, i), f"unknown {what} {name!r}{hint(name, known, 'known')}")
 
 
 HIDDEN = "***"

@@ -80,7 +80,7 @@ def _lacking(row: dict[str, Any]) -> str:
 
 
 def _unknown(registry: Registry, type_: str) -> str:
-    from ibrobot_core.config.convert import hint
+    from ibrobot_core.options import hint
 
     broken = "".join(f"; {failure}" for failure in registry.failures)
     return f"unknown type {type_!r}{hint(type_, sorted({t for _, t in registry.entries}), 'installed')}{broken}"

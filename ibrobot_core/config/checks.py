@@ -9,13 +9,13 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.config.convert import hint
-from ibrobot_core.config.keys import ModeKeys
+from ibrobot_core.config.keys import ExecutorKeys, HardwareKeys, ModeKeys
 from ibrobot_core.config.models import READERS, Limits, Model, ModelError
 from ibrobot_core.config.schema import Control, Inference, Share
 from ibrobot_core.config.structure import Part, Parts
 from ibrobot_core.config.yaml_nodes import Document, Key
 from ibrobot_core.descriptors import ExecutorDescriptor, TransportDescriptor
+from ibrobot_core.options import hint
 from ibrobot_core.robot import Joint, Robot
 from ibrobot_core.units import radians
 
@@ -38,9 +38,11 @@ class Checks:
             self._hardware(robot)
             self._executors(robot)
             self._behaviours(robot)
+            self._options(robot)
         for name, mode in (self.parts.plain.get("control_modes") or {}).items():
             self._mode(name, mode, robot)
         self._default_mode()
+        self._devices()
         self._recording()
         self._transport()
 
@@ -158,6 +160,33 @@ class Checks:
         if owners and missing and complete and all(part.keys.joints for part in self.parts.hardware.values()):
             self.document.add(("hardware",), f"no hardware owns: {', '.join(missing)}")
 
+    def _options(self, robot: Robot) -> None:
+        """What plugins say of their options for this robot."""
+        for part in self.parts.all():
+            joints: tuple[str, ...] = robot.joint_names
+            if isinstance(part.keys, HardwareKeys):
+                joints = part.keys.joints or joints
+            elif isinstance(part.keys, ExecutorKeys):
+                joints = robot.groups.get(part.keys.group, ())
+            for fault in part.descriptor.check_options(part.options, robot, joints):
+                self.document.add((*part.key, *fault.option), fault.message)
+
+    def _devices(self) -> None:
+        """No two components open one device. Of teleoperation one is open at a time."""
+        users: dict[str, str] = {}
+        for part in self.parts.active():
+            users |= self._opened(part, users)
+        for part in self.parts.teleoperation.values():
+            self._opened(part, users)
+
+    def _opened(self, part: Part, users: Mapping[str, str]) -> dict[str, str]:
+        """Device -> who opens it, of one component; those that others open too are faults."""
+        devices = part.descriptor.devices(part.options)
+        for option, device in devices.items():
+            if device in users:
+                self.document.add((*part.key, option), f"{device} is used by {users[device]} already")
+        return {device: self.document.dotted(part.key) for device in devices.values() if device not in users}
+
     def _executors(self, robot: Robot) -> None:
         for part in self.parts.executors.values():
             self._refer((*part.key, "group"), part.keys.group, list(robot.groups), "group")
@@ -250,11 +279,24 @@ class Checks:
 
     def _transport(self) -> None:
         part = self.parts.transport
-        if part is None or part.keys.share == Share():
+        if part is None:
+            return
+        if part.keys.share == Share():
+            self._used(part)
             return
         if not (isinstance(part.descriptor, TransportDescriptor) and part.descriptor.topics):
             message = f"transport {part.descriptor.type!r} carries no topics to other machines; zenoh does"
             self.document.add(("transport", "share"), message)
+
+    def _used(self, part: Part) -> None:
+        modes = (self.parts.plain.get("control_modes") or {}).values()
+        distributed = any(mode.inference and mode.inference.execution_mode == "distributed" for mode in modes)
+        if part.descriptor.type != "local" and not distributed:
+            message = (
+                f"nothing would use {part.descriptor.type!r}; a model does with execution_mode: distributed, and "
+                "topics under share"
+            )
+            self.document.add((*part.key, "type"), message)
 
     def _recording(self) -> None:
         topics: Any = self.parts.recording.keys.topics if self.parts.recording else ()

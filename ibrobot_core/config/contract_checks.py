@@ -9,10 +9,10 @@ import attrs
 
 from ibrobot_core import messages
 from ibrobot_core.config.checks import streams
-from ibrobot_core.config.convert import hint
 from ibrobot_core.config.schema import ActionSpec, ContractConfig, ObservationSpec
 from ibrobot_core.config.structure import Part, Parts
 from ibrobot_core.config.yaml_nodes import Document, Key
+from ibrobot_core.options import hint
 
 JOINT_STATES = "/joint_states"
 PERIPHERAL_TOPICS: Mapping[str, tuple[str, type[messages.Message]]] = {
@@ -159,7 +159,12 @@ class ContractChecks:
     def _same_kind(self, key: Key, specs: Sequence[ObservationSpec], others: Sequence[ObservationSpec]) -> None:
         """Values under one key concatenate, which an image and a vector cannot."""
         kinds = {spec.key: spec.type in _IMAGES for spec in others if spec.type}
+        pictures = {spec.key for spec in others if spec.type in _IMAGES}
         for i, spec in enumerate(specs):
+            if spec.type in _IMAGES and spec.key in pictures:
+                message = f"a second picture under {spec.key}; only vectors concatenate, give it a key of its own"
+                self.document.add((*key, i, "key"), message)
+            pictures |= {spec.key} if spec.type in _IMAGES else set()
             if spec.key.startswith(_IMAGE_KEYS) and spec.type not in _IMAGES:
                 continue  # told already
             if spec.type and kinds.setdefault(spec.key, spec.type in _IMAGES) != (spec.type in _IMAGES):
@@ -186,6 +191,11 @@ class ContractChecks:
         self._commands(key, spec)
         if any(other.executor == spec.executor for other in earlier):
             self.document.add((*key, "executor"), f"executor {spec.executor!r} has an action already")
+        for other in earlier:
+            if other.topic == spec.topic and not (other.foreign or spec.foreign):
+                message = f"executor {other.executor!r} has its commands on {spec.topic}; give each a topic of its own"
+                self.document.add((*key, "topic"), message)
+                break
         part = self.parts.executors.get(spec.executor)
         if part is None:
             return spec

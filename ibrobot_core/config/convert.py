@@ -6,7 +6,6 @@ import types
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from collections.abc import Mapping as AbstractMapping
 from contextlib import contextmanager
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin
 
@@ -15,6 +14,7 @@ from cattrs import Converter
 
 from ibrobot_core.config.expand import resolve_path
 from ibrobot_core.config.yaml_nodes import Key
+from ibrobot_core.options import hint
 
 _SHOWN = 200
 """Characters of a value that a message shows."""
@@ -50,12 +50,6 @@ class Faults(ValueError):
         """Raise this if anything was noted."""
         if self.found:
             raise self
-
-
-def hint(word: str, known: Sequence[str], what: str) -> str:
-    """What should have stood for `word`: the nearest of `known`, or all of them."""
-    close = get_close_matches(word, known, 1)
-    return f", did you mean {close[0]!r}?" if close else f"; {what}: {', '.join(known) or 'none'}"
 
 
 def unknown_key(word: str, known: Sequence[str]) -> str:

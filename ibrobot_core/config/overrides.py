@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ibrobot_core.config.convert import hint, shown
+from ibrobot_core.config.convert import shown
 from ibrobot_core.config.yaml_nodes import Document, Key, Place, parse
 from ibrobot_core.errors import ConfigError, Problem
+from ibrobot_core.options import hint
 
 
 def apply(document: Document, overrides: Sequence[str], flag: str = "--set") -> None:

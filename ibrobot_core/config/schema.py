@@ -64,11 +64,21 @@ class Align:
             raise ValueError(f"tol_ms has no meaning for strategy {self.strategy}; it belongs to asof")
 
 
+_LARGEST_PX = 8192
+
+
+def _check_size(instance: Any, attribute: attrs.Attribute[Any], value: tuple[int, int] | None) -> None:
+    if value is not None and not all(1 <= size <= _LARGEST_PX for size in value):
+        raise ValueError(f"{list(value)} is no size, must be [height, width] of 1 to {_LARGEST_PX} px each")
+
+
 @attrs.frozen
 class ImageSpec:
     """How an image becomes an array."""
 
-    resize: tuple[int, int] | None = option(None, unit="px", help="[height, width]; None keeps the camera's size")
+    resize: tuple[int, int] | None = option(
+        None, unit="px", validator=_check_size, help="[height, width]; None keeps the camera's size"
+    )
     encoding: str = option("rgb8", choices=("rgb8", "bgr8", "mono8", "16UC1", "32FC1"), help="of the array")
 
 

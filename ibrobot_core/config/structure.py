@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -66,6 +66,19 @@ class Parts:
     recording: Part | None = None
     transport: Part | None = None
     viewer: Part | None = None
+
+    def active(self) -> Iterator[Part]:
+        """The components that a run opens at its start."""
+        yield from () if self.simulated else self.hardware.values()
+        yield from self.peripherals.values()
+        yield from (part for part in (self.simulation, self.recording, self.transport, self.viewer) if part is not None)
+
+    def all(self) -> Iterator[Part]:
+        """Every component."""
+        yield from self.active()
+        yield from self.hardware.values() if self.simulated else ()
+        for section in (self.executors, self.models, self.teleoperation, self.planners):
+            yield from section.values()
 
 
 @attrs.define

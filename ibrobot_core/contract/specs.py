@@ -225,8 +225,6 @@ def _observation(spec: ObservationSpec, config: RobotConfig) -> ObservationPart:
         image = spec.image or ImageSpec()
         if spec.select:
             raise ContractError(f"{spec.key}: select has no meaning for an image; leave it out")
-        if image.resize is not None and min(image.resize) < 1:
-            raise ContractError(f"{spec.key}: resize must be [height, width] of at least 1, got {list(image.resize)}")
         return ObservationPart(spec.key, topic, type_, (), image, align, _image_feature(image, camera))
     if spec.image is not None:
         raise ContractError(f"{spec.key}: image has no meaning for {type_}; it belongs to {_CAMERA_TYPE}")

@@ -102,18 +102,13 @@ def build_plan(session: Session) -> LaunchPlan:
 
     Raises:
         MissingDependency: when something needs a sensor that cannot run on this machine.
-        NotSupported: for a transport that would not be used, or a contract with topics that only bags of others have.
+        NotSupported: for a contract with topics that only bags of others have.
     """
     config = session.config
     modes = config.control_modes.values()
     distributed = any(mode.inference and mode.inference.execution_mode == "distributed" for mode in modes)
     share = config.transport.share if config.transport is not None else Share()
     used = distributed or share != Share()
-    if config.transport is not None and config.transport.type != "local" and not used:
-        raise NotSupported(
-            f"transport: {config.transport.type}: nothing would use it; a model does with execution_mode: distributed, "
-            "and topics under share"
-        )
     specs: tuple[ObservationSpec | ActionSpec, ...] = (*config.contract.observations, *config.contract.actions)
     foreign = next((spec for spec in specs if spec.foreign), None)
     if foreign is not None and (config.recording is not None or any(mode.inference for mode in modes)):

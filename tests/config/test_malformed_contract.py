@@ -8,6 +8,38 @@ import pytest
 
 # What is wrong, the text of the base YAML that is replaced, what stands there instead, and all that is told.
 CASES = {
+    "resize_negative": (
+        "peripheral: top, align",
+        "peripheral: top, image: {resize: [-240, 320]}, align",
+        (
+            "robot.yaml:36: contract.observations.1.image.resize: [-240, 320] is no size, must be [height, width] of "
+            "1 to 8192 px each"
+        ),
+    ),
+    "resize_absurd": (
+        "peripheral: top, align",
+        "peripheral: top, image: {resize: [240, 320000]}, align",
+        (
+            "robot.yaml:36: contract.observations.1.image.resize: [240, 320000] is no size, must be [height, width] of "
+            "1 to 8192 px each"
+        ),
+    ),
+    "two_images_under_one_key": (
+        "    - {key: observation.images.top",
+        "    - {key: observation.images.top, peripheral: top}\n    - {key: observation.images.top",
+        (
+            "robot.yaml:37: contract.observations.2.key: a second picture under observation.images.top; only vectors "
+            "concatenate, give it a key of its own"
+        ),
+    ),
+    "executors_share_a_topic": (
+        "topic: /grip/commands",
+        "topic: /arm/commands",
+        (
+            "robot.yaml:39: contract.actions.1.topic: executor 'arm_position' has its commands on /arm/commands; give "
+            "each a topic of its own"
+        ),
+    ),
     "contract_unknown_peripheral": (
         "peripheral: top,",
         "peripheral: tpo,",

@@ -150,7 +150,6 @@ def test_extra_observations_join(make_config: Make) -> None:
         (attrs.evolve(SCENE, type="std_msgs/Float"), "unknown message type 'std_msgs/Float'; known: std_msgs/msg/Bool"),
         (attrs.evolve(SCENE, type="sensor_msgs/msg/CompressedImage"), "take the topic with raw images"),
         (attrs.evolve(TOP, select=("data.0",)), "select has no meaning for an image"),
-        (attrs.evolve(TOP, image=ImageSpec((0, 3))), r"images.top: resize must be .* at least 1, got \[0, 3\]"),
         (attrs.evolve(STATE, image=ImageSpec()), "image has no meaning for sensor_msgs/msg/JointState"),
         (attrs.evolve(STATE, select=("positions.gripper",)), "observation.state: .*did you mean 'position'"),
         (attrs.evolve(TOP, key="observation.state"), "observation.state has several specs and one is an image"),

@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING
 import attrs
 import pytest
 
-from ibrobot_core.config.schema import ObservationSpec, TransportConfig
+from ibrobot_core.config.schema import ObservationSpec
 from ibrobot_core.errors import ComponentFailed, NotSupported, PlanningError, TeleopError
 from ibrobot_core.interfaces import Condition, Severity
 from ibrobot_core.launch.runtime import ESTOP, RESET, Runtime
 from ibrobot_core.launch.session import Session
 from ibrobot_core.messages import DiagnosticStatus, KeyValue
-from ibrobot_core.options import NoOptions
 
 if TYPE_CHECKING:
     from conftest import Runs
@@ -273,14 +272,6 @@ def test_a_goal_that_cannot_be_meant_is_refused_before_anything_starts(runs: Run
         runs.make(mode=mode, goals=(goal,))
     assert str(failure.value) == told
     assert failure.value.exit_code == 2
-
-
-def test_a_transport_that_a_run_does_not_use_is_refused(runs: Runs):
-    session = runs.make().session
-    shared = TransportConfig(type="shared", options=NoOptions())
-    with pytest.raises(NotSupported, match="transport: shared: nothing would use it"):
-        Runtime(Session(attrs.evolve(session.config, transport=shared), session.registry, session.request))
-    runs.make("transport={type: local}")
 
 
 def test_an_observation_that_only_bags_have_is_refused(runs: Runs):

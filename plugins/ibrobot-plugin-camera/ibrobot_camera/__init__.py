@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
+from ibrobot_camera.device import realsense_stream, video_device
 from ibrobot_camera.options import OpenCvOptions, RealSenseOptions
 from ibrobot_core.descriptors import Check, Command, SensorDescriptor
 from ibrobot_core.hookspecs import hookimpl
@@ -37,10 +38,11 @@ def _find_librealsense() -> None:
 def ibrobot_sensors() -> Iterable[SensorDescriptor]:
     """Cameras."""
     yield SensorDescriptor(
-        type="opencv", options=OpenCvOptions, make=_opencv, summary="V4L2 device, RTSP or HTTP stream, or video file"
-    )
+        type="opencv", options=OpenCvOptions, make=_opencv, devices=video_device,
+        summary="V4L2 device, RTSP or HTTP stream, or video file",
+    )  # fmt: skip
     yield SensorDescriptor(
-        type="realsense", options=RealSenseOptions, make=_realsense, check=_find_librealsense,
+        type="realsense", options=RealSenseOptions, make=_realsense, check=_find_librealsense, devices=realsense_stream,
         summary="Intel RealSense: colour, or aligned depth",
     )  # fmt: skip
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from urllib.parse import urlsplit
 
 import attrs
 
+from ibrobot_camera.options import OpenCvOptions, RealSenseOptions
 from ibrobot_core.errors import SensorError
 
 BY_ID = Path("/dev/v4l/by-id")
@@ -52,3 +55,18 @@ def find_device(device: int | str, name: str) -> Device:
         return Device("file", str(path))
     there = ", ".join(sorted(entry.name for entry in BY_ID.iterdir())) if BY_ID.is_dir() else "none"
     raise SensorError(f"camera {name}: no file, URL or device {text!r}; devices under {BY_ID}: {there}")
+
+
+def video_device(options: OpenCvOptions) -> Mapping[str, str]:
+    """The V4L2 device, by the name that all links to it lead to; streams and files can be opened more than once."""
+    text = str(options.device)
+    if text.isdigit():
+        return {"device": f"/dev/video{text}"}
+    path = text if text.startswith("/dev/") else str(BY_ID / text)
+    return {"device": os.path.realpath(path)} if text.startswith("/dev/") or Path(path).exists() else {}
+
+
+def realsense_stream(options: RealSenseOptions) -> Mapping[str, str]:
+    """The camera and its stream: colour and depth of one camera are peripherals of their own."""
+    camera = f"RealSense {options.serial}" if options.serial else "the only RealSense"
+    return {"serial": f"the {options.stream} stream of {camera}"}

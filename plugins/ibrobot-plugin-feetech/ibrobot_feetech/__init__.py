@@ -7,7 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 from ibrobot_core.descriptors import Command, HardwareDescriptor, SensorDescriptor, TeleopDescriptor
 from ibrobot_core.hookspecs import hookimpl
-from ibrobot_feetech.options import EmulatedSignalOptions, FollowerOptions, LeaderOptions
+from ibrobot_feetech.options import (
+    EmulatedSignalOptions,
+    FollowerOptions,
+    LeaderOptions,
+    check_follower,
+    check_leader,
+    serial_port,
+)
 
 if TYPE_CHECKING:
     import click
@@ -38,7 +45,7 @@ def ibrobot_hardware() -> Iterable[HardwareDescriptor]:
     """The SO-101 on its servo bus."""
     yield HardwareDescriptor(
         type="feetech_so101", options=FollowerOptions, make=_follower, torque_off="ibrobot feetech torque off",
-        summary="SO-101 arm: STS3215 servos on one bus",
+        summary="SO-101 arm: STS3215 servos on one bus", check_options=check_follower, devices=serial_port,
     )  # fmt: skip
 
 
@@ -55,8 +62,9 @@ def ibrobot_sensors() -> Iterable[SensorDescriptor]:
 def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
     """The SO-101's leader arm."""
     yield TeleopDescriptor(
-        type="so101_leader", options=LeaderOptions, make=_leader, summary="SO-101 leader arm, moved by hand"
-    )
+        type="so101_leader", options=LeaderOptions, make=_leader, summary="SO-101 leader arm, moved by hand",
+        check_options=check_leader, devices=serial_port,
+    )  # fmt: skip
 
 
 def _commands() -> click.Command:

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import os
+from collections.abc import Iterator, Mapping
 
 import attrs
 
-from ibrobot_core.options import option
+from ibrobot_core.options import OptionFault, hint, option, unknown_names
+from ibrobot_core.robot import Robot
+
+_GRIPPER = ("gripper",)
+"""The default of options that name joints; it is passed over where another component has the gripper."""
 
 
 @attrs.frozen
@@ -17,7 +22,7 @@ class FollowerOptions:
     calibration: str = option(help="name of a calibration, or a path to one; ibrobot feetech calibrate makes it")
     baud_rate: int = option(1_000_000, unit="baud", gt=0, help="of the bus")
     anchored: tuple[str, ...] = option(
-        ("gripper",), help="joints whose calibrated closed end is their lower limit; others have 0 rad in the middle"
+        _GRIPPER, help="joints whose calibrated closed end is their lower limit; others have 0 rad in the middle"
     )
     lost_replies: int = option(3, unit="ticks", ge=0, help="replies of one servo in a row that may be missing")
     retries: int = option(2, ge=0, help="how often a request outside of the loop is sent again")
@@ -26,7 +31,7 @@ class FollowerOptions:
     d_coefficient: int = option(32, ge=0, le=254, help="of the servos' position control")
     acceleration: int = option(254, unit="100 ticks/s^2", ge=0, le=254, help="limit of the servos' own")
     gentle: tuple[str, ...] = option(
-        ("gripper",), help="joints that hold things: half the torque and current, a quarter of the torque in overload"
+        _GRIPPER, help="joints that hold things: half the torque and current, a quarter of the torque in overload"
     )
     health_period: float = option(
         1.0, unit="s", gt=0, help="how often torque, voltage, temperature and current are read"
@@ -66,7 +71,7 @@ class LeaderOptions:
     )
     inverted: tuple[str, ...] = option((), help="joints of the leader that turn the robot's the other way")
     scaled: tuple[str, ...] = option(
-        ("gripper",), help="joints of the leader whose calibrated range becomes the robot's limits; others map by angle"
+        _GRIPPER, help="joints of the leader whose calibrated range becomes the robot's limits; others map by angle"
     )
     ramp_velocity: float = option(
         1.0, unit="rad/s", gt=0, help="at which the robot approaches the leader's pose at first and after each pause"
@@ -93,3 +98,26 @@ class EmulatedSignalOptions:
 
     socket: str = option(help="the socket that `ibrobot feetech emulate --physics` prints")
     signal: str = option(help="topic of the signal, e.g. /simulation/scene")
+
+
+def check_follower(options: FollowerOptions, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:
+    """The joints that options name exist; a component with some of the robot's joints may name the others' too."""
+    for key, names in (("anchored", options.anchored), ("gentle", options.gentle)):
+        if joints == robot.joint_names or names != _GRIPPER:
+            yield from unknown_names(key, names, robot.joint_names, "joint")
+
+
+def check_leader(options: LeaderOptions, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:
+    """The leader's joints move joints of the robot, and the options name joints of the leader."""
+    for ours, theirs in options.joints.items():
+        if theirs not in robot.joint_names:
+            yield OptionFault(("joints", ours), f"unknown joint {theirs!r}{hint(theirs, robot.joint_names, 'known')}")
+    known = tuple(options.joints) or robot.joint_names
+    for key, names in (("inverted", options.inverted), ("scaled", options.scaled)):
+        if names != _GRIPPER:
+            yield from unknown_names(key, names, known, "joint of the leader")
+
+
+def serial_port(options: FollowerOptions | LeaderOptions) -> Mapping[str, str]:
+    """The port, by the name that all links to it lead to."""
+    return {"port": os.path.realpath(options.port)}

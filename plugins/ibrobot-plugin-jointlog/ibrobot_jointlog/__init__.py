@@ -7,16 +7,29 @@ from typing import TYPE_CHECKING, Any
 
 from ibrobot_core.descriptors import DatasetDescriptor, RecorderDescriptor, TeleopDescriptor
 from ibrobot_core.hookspecs import hookimpl
+from ibrobot_core.options import OptionFault
 from ibrobot_jointlog.options import ReplayOptions
 
 if TYPE_CHECKING:
     from ibrobot_core.interfaces import Context, DatasetWriter, Recorder, Teleop
+    from ibrobot_core.robot import Robot
 
 
 def _replay(options: Any, ctx: Context) -> Teleop:
     from ibrobot_jointlog.replay import ReplayTeleop
 
     return ReplayTeleop(options, ctx)
+
+
+def _check_log(options: Any, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
+    from ibrobot_core.errors import TeleopError
+    from ibrobot_jointlog.log import read_log
+
+    try:
+        read_log(options.path, robot.joint_names)
+    except TeleopError as error:
+        return [OptionFault(("path",), str(error))]
+    return ()
 
 
 def _joint_log(options: Any, ctx: Context) -> Recorder:
@@ -35,8 +48,9 @@ def _npz(options: Any, ctx: Context) -> DatasetWriter:
 def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
     """What plays a joint log."""
     yield TeleopDescriptor(
-        type="replay", options=ReplayOptions, make=_replay, summary="plays a recorded joint log (CSV)"
-    )
+        type="replay", options=ReplayOptions, make=_replay, check_options=_check_log,
+        summary="plays a recorded joint log (CSV)",
+    )  # fmt: skip
 
 
 @hookimpl

@@ -11,6 +11,8 @@ from ibrobot_keyboard.options import KeyboardOptions
 
 if TYPE_CHECKING:
     from ibrobot_core.interfaces import Context, Teleop
+    from ibrobot_core.options import OptionFault
+    from ibrobot_core.robot import Robot
 
 
 def _keyboard(options: Any, ctx: Context) -> Teleop:
@@ -19,9 +21,16 @@ def _keyboard(options: Any, ctx: Context) -> Teleop:
     return KeyboardTeleop(options, ctx)
 
 
+def _check(options: Any, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
+    from ibrobot_keyboard.keymap import check_keys
+
+    return check_keys(options, robot)
+
+
 @hookimpl
 def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
     """Jog from the terminal."""
     yield TeleopDescriptor(
-        type="keyboard", options=KeyboardOptions, make=_keyboard, summary="joint and Cartesian jog from the terminal"
-    )
+        type="keyboard", options=KeyboardOptions, make=_keyboard, check_options=_check,
+        summary="joint and Cartesian jog from the terminal",
+    )  # fmt: skip

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from typing import Literal
 
 import attrs
 
 from ibrobot_core.errors import TeleopError
+from ibrobot_core.options import OptionFault
+from ibrobot_core.robot import Robot
+from ibrobot_keyboard.options import KeyboardOptions
 
 Mode = Literal["joints", "cartesian"]
 
@@ -95,6 +98,32 @@ def make_keymap(
     for group in (keymap.joints, keymap.cartesian):
         _check_single({**group, **keymap.common})
     return keymap
+
+
+def keymap_of(options: KeyboardOptions, robot: Robot) -> Keymap:
+    """The keys that options give a robot.
+
+    Raises:
+        TeleopError: as `make_keymap`.
+    """
+    gripper = robot.groups.get(options.gripper, ())
+    return make_keymap(
+        [name for name in robot.joint_names if name not in gripper],
+        cartesian=options.cartesian,
+        gripper=bool(gripper),
+        home="home" in robot.description.poses,
+        overrides=options.keys,
+    )
+
+
+def check_keys(options: KeyboardOptions, robot: Robot) -> Iterator[OptionFault]:
+    """Each joint has its keys, each key one meaning, and Cartesian jog a model."""
+    if options.cartesian and robot.description.mjcf is None:
+        yield OptionFault(("cartesian",), "Cartesian jog needs robot.description.mjcf: set it, or cartesian: false")
+    try:
+        keymap_of(options, robot)
+    except TeleopError as error:
+        yield OptionFault(("keys",), str(error).removeprefix("keys: "))
 
 
 def _check_single(actions: Mapping[str, str]) -> None:

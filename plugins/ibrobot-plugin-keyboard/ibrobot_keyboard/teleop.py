@@ -11,7 +11,7 @@ from ibrobot_core.errors import TeleopError
 from ibrobot_core.interfaces import Context, JointReading, Teleop, TeleopCommand
 from ibrobot_core.robot import Vector
 from ibrobot_core.units import ns, seconds
-from ibrobot_keyboard.keymap import CARTESIAN_AXES, Mode, make_keymap
+from ibrobot_keyboard.keymap import CARTESIAN_AXES, Mode, keymap_of
 from ibrobot_keyboard.options import KeyboardOptions
 
 if TYPE_CHECKING:
@@ -40,13 +40,7 @@ class KeyboardTeleop(Teleop):
         self._gripper = robot.indices(gripper)
         self._arm = tuple(name for name in robot.joint_names if name not in gripper)
         self._home = robot.pose("home") if "home" in robot.description.poses else None
-        self._keymap = make_keymap(
-            self._arm,
-            cartesian=options.cartesian,
-            gripper=bool(gripper),
-            home=self._home is not None,
-            overrides=options.keys,
-        )
+        self._keymap = keymap_of(options, robot)
         self._keys: queue.SimpleQueue[str] | None = None
         self._jog: CartesianJog | None = None
         self._mode: Mode = "joints"

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 from ibrobot_core import hookimpl
 from ibrobot_core.descriptors import HardwareDescriptor, PolicyDescriptor, SensorDescriptor, ViewerDescriptor
 from ibrobot_mujoco.gl import check_asked, choose
-from ibrobot_mujoco.options import CameraOptions, MujocoOptions
-from ibrobot_mujoco.policy_options import ScriptedPickOptions
+from ibrobot_mujoco.options import CameraOptions, MujocoOptions, check_world
+from ibrobot_mujoco.policy_options import ScriptedPickOptions, check_pick
 
 if TYPE_CHECKING:
     from ibrobot_core.interfaces import Context, Hardware, Policy, Sensor, Viewer
@@ -52,7 +52,7 @@ def ibrobot_hardware() -> Iterable[HardwareDescriptor]:
     """Physics."""
     yield HardwareDescriptor(
         type="mujoco", options=MujocoOptions, make=_hardware, simulated=True, sensors={"camera": "mujoco"},
-        summary="the robot's MJCF in MuJoCo, on an empty table or with a cube and a bin",
+        check_options=check_world, summary="the robot's MJCF in MuJoCo, on an empty table or with a cube and a bin",
     )  # fmt: skip
 
 
@@ -69,7 +69,7 @@ def ibrobot_sensors() -> Iterable[SensorDescriptor]:
 def ibrobot_policies() -> Iterable[PolicyDescriptor]:
     """An expert that needs no training."""
     yield PolicyDescriptor(
-        type="scripted_pick", options=ScriptedPickOptions, make=_scripted_pick,
+        type="scripted_pick", options=ScriptedPickOptions, make=_scripted_pick, check_options=check_pick,
         summary="picks the cube and puts it into the bin, by inverse kinematics and the scene's ground truth",
     )  # fmt: skip
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import attrs
 
-from ibrobot_core.options import option
+from ibrobot_core.options import OptionFault, hint, option
+from ibrobot_core.robot import Robot
 
 Vec3 = tuple[float, float, float]
 Range = tuple[float, float]
@@ -88,3 +90,17 @@ class CameraOptions:
     height: int = option(480, unit="px", ge=1, le=8192, help="height of the image")
     fps: float = option(30.0, unit="Hz", gt=0, le=1000, help="images a second of simulated time")
     shadows: bool = option(False, help="whether to render shadows (three times the cost)")
+
+
+def check_world(options: MujocoOptions, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:
+    """There is a model to simulate, and the pose and joints that options name."""
+    poses = list(robot.description.poses)
+    if robot.description.mjcf is None:
+        yield OptionFault((), f"robot {robot.name!r} has no MJCF to simulate: robot.description.mjcf must name one")
+    if options.start_pose not in poses:
+        message = f"unknown pose {options.start_pose!r}{hint(options.start_pose, poses, 'known')}"
+        yield OptionFault(("start_pose",), message)
+    for i, fault in enumerate(options.faults):
+        if fault.joint is not None and fault.joint not in robot.joint_names:
+            message = f"unknown joint {fault.joint!r}{hint(fault.joint, robot.joint_names, 'known')}"
+            yield OptionFault(("faults", i, "joint"), message)

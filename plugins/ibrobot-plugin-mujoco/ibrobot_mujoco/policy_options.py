@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import attrs
 
-from ibrobot_core.options import option
+from ibrobot_core.options import OptionFault, option
+from ibrobot_core.robot import Robot
 
 
 @attrs.frozen
@@ -18,3 +21,10 @@ class ScriptedPickOptions:
     release_height: float = option(0.07, unit="m", gt=0, le=0.3, help="height above the bin's centre at the release")
     gripper_open: float = option(0.6, unit="rad", help="gripper while it is open")
     gripper_closed: float = option(-0.1, unit="rad", help="gripper while it is closed; the cube stops it short of this")
+
+
+def check_pick(options: ScriptedPickOptions, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:
+    """The robot has a gripper of one joint."""
+    gripper = robot.groups.get("gripper", ())
+    if len(gripper) != 1:
+        yield OptionFault((), f"scripted_pick needs one joint in robot.groups.gripper, got {list(gripper)}")

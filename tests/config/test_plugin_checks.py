@@ -1,0 +1,111 @@
+"""What only shows between sections: a plugin's options against the robot, and devices opened by two components."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+import attrs
+import pytest
+
+from ibrobot_core.config import RobotConfig
+from ibrobot_core.descriptors import TeleopDescriptor
+from ibrobot_core.errors import ConfigError
+from ibrobot_core.options import OptionFault, option, unknown_names
+from ibrobot_core.plugins import Entry, Registry
+from ibrobot_core.robot import Robot
+
+Load = Callable[..., RobotConfig]
+
+
+@attrs.frozen
+class StickOptions:
+    port: str = option("", help="serial port")
+    inverted: tuple[str, ...] = option((), help="joints that turn the other way")
+
+
+def _check(options: Any, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
+    return unknown_names("inverted", options.inverted, joints, "joint")
+
+
+def _port(options: Any) -> Mapping[str, str]:
+    return {"port": options.port} if options.port else {}
+
+
+def _device(options: Any) -> Mapping[str, str]:
+    return {"device": f"/dev/video{options.device}"}
+
+
+@pytest.fixture(autouse=True)
+def checking(registry: Registry) -> None:
+    """The made-up plugins of these tests say what they open, and check their options."""
+    for key, changes in {
+        ("hardware", "bus"): {"devices": _port},
+        ("sensor", "webcam"): {"devices": _device},
+    }.items():
+        entry = registry.entries[key]
+        registry.entries[key] = attrs.evolve(entry, descriptor=attrs.evolve(entry.descriptor, **changes))
+    stick = TeleopDescriptor(
+        "stick", lambda options, ctx: None, "a stick", StickOptions, check_options=_check, devices=_port
+    )  # type: ignore[arg-type, return-value]
+    registry.entries["teleop", "stick"] = Entry("teleop", stick, "fake", "ibrobot-plugin-fake", "1.0")
+
+
+def faults(load_text: Load, text: str, **options: Any) -> str:
+    with pytest.raises(ConfigError) as told:
+        load_text(text, **options)
+    return str(told.value)
+
+
+def test_joint_that_an_option_names_must_exist(load_text: Load, base: str) -> None:
+    text = base.replace("stick: {type: stick}", "stick: {type: stick, inverted: [pan, litf]}")
+
+    assert faults(load_text, text) == (
+        "robot.yaml:31: teleoperation.stick.inverted.1: unknown joint 'litf', did you mean 'lift'?"
+    )
+
+
+def test_camera_used_twice_is_refused(load_text: Load, base: str) -> None:
+    text = base.replace("  - {name: chest", "  - {name: side, kind: camera, type: webcam, device: 0}\n  - {name: chest")
+
+    assert faults(load_text, text) == (
+        "robot.yaml:16: peripherals.side.device: /dev/video0 is used by peripherals.top already"
+    )
+    assert load_text(text, sim=True).simulated, "the simulation stands for both cameras"
+
+
+def test_port_of_hardware_and_leader_must_differ(load_text: Load, base: str) -> None:
+    text = base.replace("stick: {type: stick}", "stick: {type: stick, port: /dev/null}")
+
+    assert faults(load_text, text) == ("robot.yaml:31: teleoperation.stick.port: /dev/null is used by hardware already")
+    assert load_text(text, sim=True).simulated, "the leader has the port for itself"
+
+
+def test_port_of_two_arms_must_differ(load_text: Load, base: str) -> None:
+    two = textwrap.dedent("""\
+        hardware:
+          a: {type: bus, port: /dev/null, joints: [pan, lift]}
+          b: {type: bus, port: /dev/null, joints: [grip]}""")
+
+    assert faults(load_text, base.replace("hardware: {type: bus, port: /dev/null}", two)) == (
+        "robot.yaml:14: hardware.b.port: /dev/null is used by hardware.a already"
+    )
+
+
+def test_devices_of_teleoperation_may_share_a_port(load_text: Load, base: str) -> None:
+    """One drives at a time: each belongs to modes of its own."""
+    two = "stick: {type: stick, port: /dev/a}\n  mirrored: {type: stick, port: /dev/a, inverted: [pan]}"
+
+    assert load_text(base.replace("stick: {type: stick}", two)).teleoperation.keys() == {"stick", "mirrored"}
+
+
+def test_transport_that_nothing_uses_is_refused(load_text: Load, base: str, registry: Registry) -> None:
+    local = registry.entries["transport", "local"]
+    shared = attrs.evolve(local.descriptor, type="shared")
+    registry.entries["transport", "shared"] = attrs.evolve(local, descriptor=shared)
+
+    assert faults(load_text, base + "transport: {type: shared}\n") == (
+        "robot.yaml:42: transport.type: nothing would use 'shared'; a model does with execution_mode: distributed, "
+        "and topics under share"
+    )
