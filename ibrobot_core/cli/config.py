@@ -43,12 +43,13 @@ def check(
 ) -> None:  # fmt: skip
     """Tell everything that is wrong with CONFIG; exit 2 if anything is."""
     from ibrobot_core.config import find_config, load
-    from ibrobot_core.launch.models import check_models
+    from ibrobot_core.launch.models import check_contract, check_models
     from ibrobot_core.plugins import installed
 
     try:
         path = find_config(config, installed())
         found = load(path, overrides=overrides, mode=mode, sim=sim)
+        check_contract(found)
         models = check_models(found, installed(), found.control_modes) if deep else []
     except ConfigError as error:
         if not as_json:

@@ -27,6 +27,7 @@ from ibrobot_core.launch.builders.viewer import ViewerWorker
 from ibrobot_core.launch.component import Component
 from ibrobot_core.launch.episodes import Episodes
 from ibrobot_core.launch.feeder import Feeder
+from ibrobot_core.launch.models import check_contract
 from ibrobot_core.launch.session import Session
 from ibrobot_core.recording.episode import is_kept
 
@@ -102,9 +103,11 @@ def build_plan(session: Session) -> LaunchPlan:
 
     Raises:
         MissingDependency: when something needs a sensor that cannot run on this machine.
+        ConfigError: as `check_contract`.
         NotSupported: for a contract with topics that only bags of others have.
     """
     config = session.config
+    check_contract(config)
     modes = config.control_modes.values()
     distributed = any(mode.inference and mode.inference.execution_mode == "distributed" for mode in modes)
     share = config.transport.share if config.transport is not None else Share()
