@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import attrs
 
 from ibrobot_core.options import NoOptions, OptionFault
-from ibrobot_core.robot import Robot
 
 if TYPE_CHECKING:
     import click
@@ -30,6 +29,7 @@ if TYPE_CHECKING:
         Transport,
         Viewer,
     )
+    from ibrobot_core.robot import Robot
 
 
 def nothing_is_missing() -> None:

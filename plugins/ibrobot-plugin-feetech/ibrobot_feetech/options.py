@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING
 
 import attrs
 
 from ibrobot_core.options import OptionFault, hint, option, unknown_names
-from ibrobot_core.robot import Robot
+
+if TYPE_CHECKING:
+    from ibrobot_core.robot import Robot
 
 _GRIPPER = ("gripper",)
 """The default of options that name joints; it is passed over where another component has the gripper."""

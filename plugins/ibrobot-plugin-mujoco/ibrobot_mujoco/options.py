@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import attrs
 
 from ibrobot_core.options import OptionFault, hint, option
-from ibrobot_core.robot import Robot
+
+if TYPE_CHECKING:
+    from ibrobot_core.robot import Robot
 
 Vec3 = tuple[float, float, float]
 Range = tuple[float, float]

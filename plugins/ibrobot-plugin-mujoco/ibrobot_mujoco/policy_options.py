@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import attrs
 
 from ibrobot_core.options import OptionFault, option
-from ibrobot_core.robot import Robot
+
+if TYPE_CHECKING:
+    from ibrobot_core.robot import Robot
 
 
 @attrs.frozen
