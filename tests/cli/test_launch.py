@@ -295,9 +295,10 @@ def test_deep_check_wants_weights_only_where_they_are_loaded(
         raise PolicyError("model.safetensors is missing")
 
     monkeypatch.setattr(FakePolicy, "check_weights", check_weights)
+    transport = ("--set", "transport={type: net}") if mode == "distributed" else ()
     ran = ibrobot(
         "config", "check", "mini.yaml", "--sim", "--deep", "--set",
-        f"control_modes.policy.inference.execution_mode={mode}", "--set", "transport={type: net}",
+        f"control_modes.policy.inference.execution_mode={mode}", *transport,
     )  # fmt: skip
     assert ran.code == code
     assert ran.err == ("" if code == 0 else "error: mini.yaml: models.net: model.safetensors is missing\n")
