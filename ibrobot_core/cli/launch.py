@@ -27,6 +27,7 @@ from ibrobot_core.launch.session import Request, Session
 from ibrobot_core.outside import LogFormatter, echo
 from ibrobot_core.plugins import installed
 from ibrobot_core.terminal import Keys
+from ibrobot_core.workers import end_signals
 
 NOT_ALL_SUCCEEDED = 3
 _FAULTED = 1
@@ -95,7 +96,9 @@ _OPTIONS: dict[str, Callable[..., Any]] = {
     "dry_run": click.option(
         "--dry-run", is_flag=True, help="Print the plan, compare the model with the contract, and start nothing."
     ),
-    "as_json": click.option("--json", "as_json", is_flag=True, help="Print a summary as JSON, in the last line."),
+    "as_json": click.option(
+        "--json", "as_json", is_flag=True, help="Print JSON alone on standard output: the summary, or the plan."
+    ),
 }
 
 
@@ -185,6 +188,7 @@ def run_loaded(robot: RobotConfig, request: Request, options: dict[str, Any], wa
     Raises:
         IbrobotError: e.g. when a component fails.
     """
+    as_json = options["as_json"]
     if request.lockstep and not robot.simulated:
         raise click.UsageError("--lockstep is for simulation: add --sim")
     if options["headless"] and robot.viewer is not None:
@@ -195,18 +199,18 @@ def run_loaded(robot: RobotConfig, request: Request, options: dict[str, Any], wa
             request = attrs.evolve(request, keys=keys.subscribe)
         runtime = Runtime(Session(robot, installed(), request))
         if options["dry_run"]:
-            echo("\n".join(runtime.plan.lines()))
-            for line in check_models(robot, installed(), [runtime.session.mode]):
-                echo(line)
+            models = check_models(robot, installed(), [runtime.session.mode])
+            plan = runtime.plan
+            echo(json.dumps({**plan.facts(), "models": models}) if as_json else "\n".join([*plan.lines(), *models]))
             return
         watcher.attach(runtime)
         _stop_on_signals(runtime.session, keys)
         try:
-            status = _run(runtime, watcher, live=not options["headless"] and sys.stdout.isatty())
+            status = _run(runtime, watcher, live=not options["headless"], as_json=as_json)
         finally:
             for line in runtime.session.outcome.holding:
                 echo(line, err=True)
-    _tell(runtime, watcher, options["as_json"])
+    _tell(runtime, watcher, as_json)
     runtime.raise_failure()
     sys.exit(status)
 
@@ -218,12 +222,16 @@ def _terminal_keys(stack: ExitStack) -> Keys | None:
     return stack.enter_context(Keys())
 
 
-def _run(runtime: Runtime, watcher: Watcher, *, live: bool) -> int:
-    """Start, run and stop; returns the exit status of a run in which nothing failed."""
+def _run(runtime: Runtime, watcher: Watcher, *, live: bool, as_json: bool) -> int:
+    """Start, run and stop; returns the exit status of a run in which nothing failed.
+
+    What it shows meanwhile is on standard output, or on standard error where that is for JSON.
+    """
     session = runtime.session
     where = "simulation" if session.config.simulated else "hardware"
     with ExitStack() as stack:
-        display = _Panel(runtime, watcher, stack) if live else _Lines(session, watcher)
+        panel_fits = live and (sys.stderr if as_json else sys.stdout).isatty()
+        display = (_Panel if panel_fits else _Lines)(runtime, watcher, stack, err=as_json)
         robot = session.config
         session.log.info("%s from %s: %s, mode %s", robot.robot.name, robot.source, where, session.mode)
         runtime.start(display.starting)
@@ -243,13 +251,16 @@ def _run(runtime: Runtime, watcher: Watcher, *, live: bool) -> int:
 
 
 def _stop_on_signals(session: Session, keys: Keys | None) -> None:
-    """The first Ctrl-C (or SIGTERM) stops in order; a second Ctrl-C ends the host, and control stops the robot."""
+    """The first of the `end_signals` stops in order; a second Ctrl-C ends the host, and control stops the robot."""
+    terminals = [fd for fd in (1, 2) if os.isatty(fd)]
 
     def stop(number: int, frame: object) -> None:
         if session.finished.is_set() and number == signal.SIGINT:
             if keys is not None:
                 keys.close()
             os._exit(_INTERRUPTED_TWICE)
+        if number == signal.SIGHUP:  # the terminal may be gone: what is written to it must not fail
+            _discard(terminals)
         if session.request.lockstep:  # nobody waits for the end, which comes at a tick
             finish()
         else:  # see `on_signals`
@@ -259,16 +270,25 @@ def _stop_on_signals(session: Session, keys: Keys | None) -> None:
         session.log.info("stopping; Ctrl-C again stops at once")
         session.finish()
 
-    signal.signal(signal.SIGINT, stop)
-    signal.signal(signal.SIGTERM, stop)
+    for each in end_signals():
+        signal.signal(each, stop)
+
+
+def _discard(descriptors: list[int]) -> None:
+    """Have what is written to these go nowhere."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for descriptor in descriptors:
+        os.dup2(nowhere, descriptor)
+    os.close(nowhere)
 
 
 class _Lines:
     """Plain lines of status, where standard output is no terminal."""
 
-    def __init__(self, session: Session, watcher: Watcher) -> None:
-        self._session = session
+    def __init__(self, runtime: Runtime, watcher: Watcher, stack: ExitStack, *, err: bool) -> None:
+        self._session = runtime.session
         self._watcher = watcher
+        self._err = err
         self._rates = RecentRates()
         self._next_s = time.monotonic() + _PLAIN_PERIOD_S
         handler = logging.StreamHandler(sys.stderr)
@@ -284,13 +304,13 @@ class _Lines:
         if time.monotonic() >= self._next_s:
             self._next_s += _PLAIN_PERIOD_S
             line = plain_line(self._session, self._rates)
-            echo(f"{line} | {more}" if (more := self._watcher.line()) else line)
+            echo(f"{line} | {more}" if (more := self._watcher.line()) else line, err=self._err)
 
 
 class _Panel:
     """The live panel, and the runtime's own keys: F1..F9 modes, Esc emergency stop, F10 reset."""
 
-    def __init__(self, runtime: Runtime, watcher: Watcher, stack: ExitStack) -> None:
+    def __init__(self, runtime: Runtime, watcher: Watcher, stack: ExitStack, *, err: bool) -> None:
         from rich.live import Live
 
         from ibrobot_core.screen import Screen
@@ -300,7 +320,7 @@ class _Panel:
         self._log = RecentLog()
         self._rates = RecentRates()
         _log_to(self._log)
-        self._display = stack.enter_context(Live(console=Screen(), auto_refresh=False, screen=False))
+        self._display = stack.enter_context(Live(console=Screen(stderr=err), auto_refresh=False, screen=False))
         self._next_s = 0.0
         self._pressed: queue.SimpleQueue[str] = queue.SimpleQueue()
         keys = runtime.session.request.keys

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 import os
-import signal
 import sys
 import threading
 import time
@@ -90,7 +89,7 @@ def serve(what: str, **options: Any) -> None:
         policy.load()
         logging.getLogger("ibrobot").info("%s loaded in %.1f s", name, time.monotonic() - begun_s)
         stopping = threading.Event()  # only from now on: until here either signal ends it at once
-        on_signals(stopping.set, signal.SIGINT, signal.SIGTERM)
+        on_signals(stopping.set)
         transport = make_transport()
         limits = ServiceOptions(options["batch"], options["queue"], options["patience"] / 1000, options["hang_timeout"])
 

@@ -37,6 +37,7 @@ _GLANCE_S = 0.1
 """How often a start looks whether it is given up."""
 _REPLY_TIMEOUT_S = 5.0
 _STOP_TIMEOUT_S = 15.0
+"""A control process that takes longer to end is killed; to stop at a pose takes up to 10 s."""
 _GONE = "the control process is gone"
 
 OnState = Callable[[ControlState], None]
@@ -291,6 +292,9 @@ class ControlClient(ControlHost):
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
+            logging.getLogger("ibrobot").error(
+                "the control process did not end within %g s: killed%s", _STOP_TIMEOUT_S, self._aftermath
+            )
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join()
         self._channel.close()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import attrs
 
 from ibrobot_core.config.schema import ActionSpec, ObservationSpec, Peripheral, Share
@@ -56,6 +58,11 @@ class LaunchPlan:
     episodes_worker: SimulatedEpisodes | None
     without: str
     """The sensors that this machine cannot run, and why; empty where there are none."""
+
+    def facts(self) -> dict[str, Any]:
+        """The plan as `--dry-run --json` prints it."""
+        components = [{"name": c.name, "summary": c.summary, "needs": list(c.needs)} for c in self.components]
+        return {"components": components, "without": self.without}
 
     def lines(self) -> list[str]:
         """The plan as `--dry-run` prints it."""

@@ -6,6 +6,7 @@ import json
 import logging
 import signal
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -149,7 +150,7 @@ def launch(
     Path("mini.yaml").write_text(ROBOT)
     root, ours = logging.getLogger(), logging.getLogger("ibrobot")
     handlers, levels = list(root.handlers), (root.level, ours.level)
-    signals = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    signals = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     yield lambda *arguments: ibrobot("launch", "mini.yaml", *arguments)
     root.handlers[:] = handlers
     root.setLevel(levels[0])
@@ -242,6 +243,46 @@ def test_the_first_ctrl_c_ends_the_run_in_order(launch: Callable[..., Ran]):
     assert ran.code == 0, ran.err
     assert "stopping; Ctrl-C again stops at once" in ran.err
     assert 45 <= json.loads(ran.out)["loop"]["ticks"] <= 55
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_other_signals_end_the_run_as_ctrl_c_does(
+    launch: Callable[..., Ran], monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+):
+    # Where nobody handles it, the signal must not end the tests.
+    monkeypatch.setattr(signal, "raise_signal", partial(_raise_handled, signal.raise_signal, number))
+    ran = launch(*LOCKSTEP, "--mode", "person", "--duration", "3", "--json")
+    assert ran.code == 0, ran.err
+    assert 45 <= json.loads(ran.out)["loop"]["ticks"] <= 55
+
+
+def _raise_handled(raise_signal: Callable[[int], None], number: int, _: int) -> None:
+    if signal.getsignal(number) is not signal.SIG_DFL:
+        raise_signal(number)
+
+
+def test_a_hangup_that_the_caller_ignores_stays_ignored(launch: Callable[..., Ran]):
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    assert launch(*LOCKSTEP, "--duration", "0.1").code == 0
+    assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+
+
+def test_json_is_alone_on_standard_output(launch: Callable[..., Ran], monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("ibrobot_core.cli.launch._PLAIN_PERIOD_S", 0.0)
+    ran = launch(*LOCKSTEP, "--duration", "0.2", "--json")
+    assert json.loads(ran.out)["mode"] == "policy"
+    assert "mode policy | loop " in ran.err
+
+
+def test_dry_run_as_json(launch: Callable[..., Ran]):
+    ran = launch(*LOCKSTEP, "--dry-run", "--json")
+    assert (ran.code, ran.err) == (0, "")
+    plan = json.loads(ran.out)
+    assert [component["name"] for component in plan["components"]] == [
+        "model:net", "control", "mode:policy", "status", "episodes",
+    ]  # fmt: skip
+    assert plan["components"][2]["needs"] == ["control", "model:net"]
+    assert (plan["without"], len(plan["models"])) == ("", 1)
 
 
 def test_dry_run_prints_the_plan(launch: Callable[..., Ran]):

@@ -243,6 +243,18 @@ class TestProcess:
         with pytest.raises(ComponentFailed, match="control process is gone"):
             host.call("estop")
 
+    def test_one_that_ignores_its_end_is_killed_and_told(self, make, told, monkeypatch, caplog):
+        monkeypatch.setattr("ibrobot_core.control.host._STOP_TIMEOUT_S", 0.2)
+        host = make()
+        host.start()
+        told.state(lambda state: state.tick >= 1)
+        pid = host.pid
+        os.kill(pid, signal.SIGSTOP)
+        host.stop()
+
+        assert "the control process did not end within 0.2 s: killed" in caplog.text
+        assert not Path(f"/proc/{pid}").exists()
+
     def test_sigterm_stops_it_in_order(self, make, told, tmp_path):
         host = make(closed=str(tmp_path / "closed"))
         host.start()

@@ -17,6 +17,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import forkserver
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,8 @@ from ibrobot_core.units import seconds
 STAGING = ".staging"
 """Where converted episodes wait within the dataset's folder."""
 _POLL_S = 0.2
+_END_S = 5.0
+"""A converting process that takes longer to end after Ctrl-C is killed."""
 _MAP_FROM, _KEEP = 512 << 10, 8 << 20
 """Pictures are given back when freed [bytes]: among smaller things they would leave gaps, more with every minute."""
 
@@ -275,11 +278,21 @@ def _run_in_processes(
             "the same command goes on from there, with fewer --jobs if need be"
         ) from None
     except KeyboardInterrupt:
-        for process in multiprocessing.active_children():
-            process.terminate()
+        end_processes(multiprocessing.active_children())
         raise
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+def end_processes(processes: Sequence[BaseProcess]) -> None:
+    """End processes, and kill those that take longer than `_END_S`."""
+    for process in processes:
+        process.terminate()
+    deadline_s = time.monotonic() + _END_S
+    for process in processes:
+        process.join(max(0.0, deadline_s - time.monotonic()))
+        if process.is_alive():
+            process.kill()
 
 
 @contextmanager

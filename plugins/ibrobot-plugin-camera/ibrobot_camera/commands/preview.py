@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import html
 import secrets
-import signal
 import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import TYPE_CHECKING, Any
@@ -78,7 +77,7 @@ def preview(source: str, host: str, port: int, seconds: float | None) -> None:
     from ibrobot_camera.commands.sources import opened
 
     ended = threading.Event()
-    on_signals(ended.set, signal.SIGINT, signal.SIGTERM)
+    on_signals(ended.set)
     token = secrets.token_urlsafe(16)
     with opened(source) as cameras:
         views = {name: Newest(name, camera, ended) for name, camera in cameras.items()}

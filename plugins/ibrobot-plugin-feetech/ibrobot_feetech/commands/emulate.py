@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import datetime
 import math
-import signal
 import sys
 import threading
 from collections.abc import Sequence
@@ -76,7 +75,7 @@ def emulate(
     if link is not None and link.exists() and not link.is_symlink():
         raise click.BadParameter(f"{link} is there already and is no link: name another path", param_hint="--link")
     ended = threading.Event()
-    on_signals(ended.set, signal.SIGINT, signal.SIGTERM)
+    on_signals(ended.set)
     config = _config(physics) if physics is not None else None
     joints = config.robot.joint_names if config is not None else _JOINTS[:servos]
     count = len(joints) if config is not None else servos
