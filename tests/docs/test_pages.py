@@ -184,11 +184,25 @@ def _merged(base: Any, excerpt: Any) -> Any:
 CONFIG = ROOT / "configs/so101.yaml"
 
 
+LOG = "time_s,shoulder_pan,shoulder_lift,elbow_flex,wrist_flex,wrist_roll,gripper\n0,0,0,0,0,0,0\n1,0,0,0,0,0,0\n"
+
+
 def _robot() -> Any:
     """The robot that the pages speak of: that of the README, with a policy."""
     robot = parse(CONFIG.read_text(encoding="utf-8"), "so101.yaml").root
     robot["models"]["pick_cube_act"] = {"type": "lerobot", "path": "outputs/pick_cube_act"}
     return robot
+
+
+def _check_excerpt(values: Any, folder: Path, *, sim: bool) -> None:
+    """Check a whole robot, in a folder with the files that pages name; a model on a server uses its transport."""
+    (folder / "logs").mkdir(exist_ok=True)
+    for name in ("wave.csv", "logs/wave.csv"):
+        (folder / name).write_text(LOG)
+    if "transport" in values:
+        served = {"control_modes": {"model_inference": {"inference": {"execution_mode": "distributed"}}}}
+        values = _merged(values, served)
+    from_document(values, source=folder / "robot.yaml", sim=sim)
 
 
 def test_every_robot_yaml_passes_the_check(tmp_path: Path) -> None:
@@ -203,16 +217,16 @@ def test_every_robot_yaml_passes_the_check(tmp_path: Path) -> None:
                 load_contract(tmp_path / "contract.yaml")
                 continue
             last = _merged(last if excerpt.note == "goes on" else robot, excerpt.load())
-            from_document(last, source=CONFIG, sim="type: mujoco" in excerpt.text)
+            _check_excerpt(last, tmp_path, sim="type: mujoco" in excerpt.text)
         except ConfigError as error:
             wrong.append(f"{excerpt}: {error}")
     assert wrong == []
 
 
-def test_an_excerpt_is_checked_where_it_stands() -> None:
+def test_an_excerpt_is_checked_where_it_stands(tmp_path: Path) -> None:
     excerpt = Excerpt(ROOT / "README.md", 1, "dispatch: {watermrk: 3}", "under control_modes.model_inference")
     with pytest.raises(ConfigError, match=r"control_modes.model_inference.dispatch.watermrk: unknown key"):
-        from_document(_merged(_robot(), excerpt.load()), source=CONFIG, sim=False)
+        _check_excerpt(_merged(_robot(), excerpt.load()), tmp_path, sim=False)
 
 
 OPTION_TABLE = r"^\| option \|[^\n]*\n\|[-|]+\n(.*?)(?=^[^|]|\Z)"
