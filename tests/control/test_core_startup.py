@@ -10,7 +10,7 @@ from ibrobot_core.errors import HardwareError
 REST = [-0.8, 1.0, 0.1]
 
 
-def start(make_rig, **control: str):
+def start(make_rig, **control: str | float):
     """Start, without a tick."""
     rig = make_rig({"control": {"startup": "pose rest", **control}})
     rig.core.start("stream")
@@ -43,6 +43,18 @@ def test_it_arrives_slowly_and_then_the_mode_begins_from_there(rig):
     assert rig.interventions == 0
     rig.plan([-0.7, 0.9, 0.2])
     np.testing.assert_allclose(rig.tick(60).command, [-0.7, 0.9, 0.2])
+
+
+def test_the_mode_begins_from_a_new_reading_after_lost_replies(make_rig):
+    rig = start(make_rig, state_timeout=2.0)
+    while np.abs(rig.tick().position - REST).max() > 0.1:
+        pass
+    rig.hardware.stale = True
+    rig.tick(50)
+    assert not rig.core.arrived()
+    rig.hardware.stale = False
+    arrive(rig)
+    np.testing.assert_allclose(rig.tick(20).command, REST, atol=0.01)
 
 
 def test_hold_is_in_its_mode_at_once(make_rig):
