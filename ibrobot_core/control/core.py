@@ -143,7 +143,7 @@ class ControlCore:
         if self.fault or self._target is None:
             raise HardwareError(f"control.startup: {self._config.control.startup}: {self.fault}")
         away = np.abs(self._measured.position - self._target)
-        # The mode begins at the measured positions; an old reading lies behind on the way and would pull the robot back.
+        # The mode begins at the measured positions: those of an old reading would pull the robot back on its way.
         if self._at_target and not self._measured.stale and away.max() <= _POSE_TOLERANCE:
             self._target, self._arriving = None, False
             self._switch_mode(self.mode)
