@@ -29,6 +29,7 @@ if TYPE_CHECKING:
         Transport,
         Viewer,
     )
+    from ibrobot_core.messages import CompressedImage, Image
     from ibrobot_core.robot import Robot
 
 
@@ -153,6 +154,20 @@ class ReaderDescriptor:
     """
     numbered: bool = False
     """Whether many episodes lie at a path, which go by their numbers, from 0."""
+
+
+@attrs.frozen
+class DecoderDescriptor:
+    """A decoder of compressed pictures. Plugins whose messages have such register one; the first that knows one counts."""
+
+    formats: tuple[str, ...]
+    """E.g. `jpeg`; for messages to the user."""
+    make: Callable[[], Callable[[CompressedImage], Image | None]]
+    """Imports the decoder, which gives the pixels, or None for a format that it does not know.
+
+    Equal bytes give equal pixels, in a run and in a conversion. The decoder raises:
+        ContractError: for a damaged picture.
+    """
 
 
 @attrs.frozen

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
         Command,
         ConfigFile,
         DatasetDescriptor,
+        DecoderDescriptor,
         ExecutorDescriptor,
         HardwareDescriptor,
         PlannerDescriptor,
@@ -88,6 +89,11 @@ def ibrobot_recorders() -> Iterable[RecorderDescriptor]:  # type: ignore[empty-b
 @hookspec
 def ibrobot_readers() -> Iterable[ReaderDescriptor]:  # type: ignore[empty-body]
     """Formats of recorded episodes that this plugin reads."""
+
+
+@hookspec
+def ibrobot_decoders() -> Iterable[DecoderDescriptor]:  # type: ignore[empty-body]
+    """Formats of compressed pictures that this plugin decodes."""
 
 
 @hookspec

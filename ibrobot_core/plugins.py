@@ -15,11 +15,12 @@ import attrs
 import pluggy
 
 from ibrobot_core import hookspecs
-from ibrobot_core.descriptors import Check, Command, ConfigFile, Descriptor, ReaderDescriptor
-from ibrobot_core.errors import MissingDependency, PluginError, RecorderError
+from ibrobot_core.descriptors import Check, Command, ConfigFile, DecoderDescriptor, Descriptor, ReaderDescriptor
+from ibrobot_core.errors import ContractError, MissingDependency, PluginError, RecorderError
 
 if TYPE_CHECKING:
     from ibrobot_core.interfaces import EpisodeReader
+    from ibrobot_core.messages import CompressedImage, Image
 
 ENTRY_POINT_GROUP = "ibrobot"
 
@@ -95,6 +96,7 @@ class Registry:
     failures: list[Failure] = attrs.field(factory=list)
     configs: list[ConfigFile] = attrs.field(factory=list)
     readers: list[ReaderDescriptor] = attrs.field(factory=list)
+    decoders: list[DecoderDescriptor] = attrs.field(factory=list)
     commands: dict[str, Command] = attrs.field(factory=dict)
     managers: dict[str, pluggy.PluginManager] = attrs.field(factory=dict)
 
@@ -154,6 +156,18 @@ class Registry:
         formats = ", ".join(f"{reader.type} ({reader.summary})" for reader in self.readers)
         hint = "" if formats else "; pip install ibrobot-plugin-mcap reads rosbag2"
         raise RecorderError(f"{path}: not an episode of a known format; installed: {formats or 'none'}{hint}")
+
+    def decode(self, picture: CompressedImage) -> Image:
+        """The pixels of a compressed picture.
+
+        Raises:
+            ContractError: when no installed plugin decodes its format, or it is damaged.
+        """
+        for decoder in self.decoders:
+            if (image := decoder.make()(picture)) is not None:
+                return image
+        formats = ", ".join(sorted({each for decoder in self.decoders for each in decoder.formats})) or "none"
+        raise ContractError(f"no installed plugin decodes a {picture.format!r} picture; those decoded are: {formats}")
 
     def _why_missing(self, kind: str, type_: str) -> str:
         package = KNOWN_PACKAGES.get((kind, type_))
@@ -221,6 +235,8 @@ def _collect(registry: Registry, plugin: str, package: str, version: str, manage
                 found.append((kind, descriptor))
         stage = "ibrobot_readers"
         readers = [r for result in manager.hook.ibrobot_readers() for r in result]
+        stage = "ibrobot_decoders"
+        decoders = [d for result in manager.hook.ibrobot_decoders() for d in result]
         stage = "ibrobot_configs"
         configs = [c for result in manager.hook.ibrobot_configs() for c in result]
         stage = "ibrobot_commands"
@@ -236,6 +252,7 @@ def _collect(registry: Registry, plugin: str, package: str, version: str, manage
             continue
         registry.entries[kind, descriptor.type] = Entry(kind, descriptor, plugin, package, version)
     registry.readers += readers
+    registry.decoders += decoders
     registry.configs += configs
     registry.commands.update({command.name: command for command in commands})
     registry.managers[plugin] = manager

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from ibrobot_core.config.schema import ImageSpec
 from ibrobot_core.errors import ContractError
-from ibrobot_core.messages import Header, Image
+from ibrobot_core.messages import CompressedImage, Header, Image
+from ibrobot_core.plugins import installed
 
 ENCODINGS: dict[str, tuple[type[np.generic], int]] = {
     "rgb8": (np.uint8, 3),
@@ -49,7 +50,7 @@ def pixels(message: Image) -> NDArray[np.generic]:
     return typed.astype(element, copy=False)
 
 
-def decode_image(message: Image, spec: ImageSpec) -> NDArray[np.generic]:
+def decode_image(message: Image | CompressedImage, spec: ImageSpec) -> NDArray[np.generic]:
     """The array that the contract asks for: resized, then converted to its encoding.
 
     Returns:
@@ -58,6 +59,8 @@ def decode_image(message: Image, spec: ImageSpec) -> NDArray[np.generic]:
     Raises:
         ContractError: for a malformed message, or an encoding that does not become the one asked for.
     """
+    if isinstance(message, CompressedImage):
+        message = installed().decode(message)
     array = pixels(message)
     if spec.resize is not None and spec.resize != array.shape[:2]:
         array = resize(array, *spec.resize)

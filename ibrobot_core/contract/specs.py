@@ -215,10 +215,7 @@ def _observation(spec: ObservationSpec, config: RobotConfig) -> ObservationPart:
     if type_ not in MESSAGE_TYPES:
         raise ContractError(f"{spec.key}: unknown message type {type_!r}; known: {', '.join(MESSAGE_TYPES)}")
     if type_ == _COMPRESSED_TYPE:
-        raise ContractError(
-            f"{spec.key}: there is no decoder for {type_} of a robot, take the topic with raw images; of a bag, JPEG "
-            f"and PNG are read as {_CAMERA_TYPE}, give that type"
-        )
+        type_ = _CAMERA_TYPE  # a picture is a picture, however it is sent
     has_header = "header" in attrs.fields_dict(MESSAGE_TYPES[type_])
     align = spec.align if has_header else attrs.evolve(spec.align, stamp="receive")
     if type_ == _CAMERA_TYPE:

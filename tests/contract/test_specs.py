@@ -148,7 +148,6 @@ def test_extra_observations_join(make_config: Make) -> None:
         (ObservationSpec("observation.imu", peripheral="chest"), "observation.imu: nothing says where it comes from"),
         (ObservationSpec("observation.x", topic="/x"), "add for example type: sensor_msgs/msg/Image"),
         (attrs.evolve(SCENE, type="std_msgs/Float"), "unknown message type 'std_msgs/Float'; known: std_msgs/msg/Bool"),
-        (attrs.evolve(SCENE, type="sensor_msgs/msg/CompressedImage"), "take the topic with raw images"),
         (attrs.evolve(TOP, select=("data.0",)), "select has no meaning for an image"),
         (attrs.evolve(STATE, image=ImageSpec()), "image has no meaning for sensor_msgs/msg/JointState"),
         (attrs.evolve(STATE, select=("positions.gripper",)), "observation.state: .*did you mean 'position'"),

@@ -65,6 +65,14 @@ class ShortRows(FakeSensor):
         return image and attrs.evolve(image, step=image.width)
 
 
+class CutsItsJpegs(FakeSensor):
+    message_type = CompressedImage
+
+    def read(self, timeout_s):
+        image = super().read(timeout_s)
+        return image and CompressedImage(image.header, "jpeg", np.array([0xFF, 0xD8], np.uint8))
+
+
 class OtherCameraInfo(FakeSensor):
     def latched(self):
         return (("/camera/subject/camera_info", CameraInfo(Header(), height=480, width=640)),)
@@ -101,6 +109,7 @@ WRONG = {
     RepeatsTheLastImage: "silence_gives_none",
     ReusesItsBuffer: "messages_stay_as_they_were",
     ShortRows: "images_are_whole",
+    CutsItsJpegs: "images_are_whole",
     OtherCameraInfo: "latched_messages_fit",
     ClosesOnce: "close_is_safe_at_any_time",
     OpensOnce: "close_is_safe_at_any_time",

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 from ibrobot_camera.device import realsense_stream, video_device
 from ibrobot_camera.options import OpenCvOptions, RealSenseOptions
-from ibrobot_core.descriptors import Check, Command, SensorDescriptor
+from ibrobot_core.descriptors import Check, Command, DecoderDescriptor, SensorDescriptor
 from ibrobot_core.hookspecs import hookimpl
 
 if TYPE_CHECKING:
     import click
 
     from ibrobot_core.interfaces import Context, Sensor
+    from ibrobot_core.messages import CompressedImage, Image
 
 
 def _opencv(options: Any, ctx: Context) -> Sensor:
@@ -45,6 +46,18 @@ def ibrobot_sensors() -> Iterable[SensorDescriptor]:
         type="realsense", options=RealSenseOptions, make=_realsense, check=_find_librealsense, devices=realsense_stream,
         summary="Intel RealSense: colour, or aligned depth",
     )  # fmt: skip
+
+
+def _decoder() -> Callable[[CompressedImage], Image | None]:
+    from ibrobot_ros2.pictures import decode_picture
+
+    return decode_picture
+
+
+@hookimpl
+def ibrobot_decoders() -> Iterable[DecoderDescriptor]:
+    """Of the pictures that these cameras give."""
+    yield DecoderDescriptor(("jpeg", "png", "compressedDepth png"), _decoder)
 
 
 def _commands() -> click.Command:

@@ -7,14 +7,17 @@ import time
 from collections.abc import Callable
 from typing import override
 
+import attrs
+from ibrobot_ros2.jpeg import to_jpeg
+
 from ibrobot_camera.calibration import load_info
-from ibrobot_camera.capture import Capture, Picture, Pixels
+from ibrobot_camera.capture import DEPTHS, Capture, Picture, Pixels
 from ibrobot_camera.device import find_device
 from ibrobot_camera.options import OpenCvOptions
 from ibrobot_core.clock import SteppedClock
 from ibrobot_core.errors import SensorError
 from ibrobot_core.interfaces import Context, Sensor
-from ibrobot_core.messages import CameraInfo, Header, Image, Message
+from ibrobot_core.messages import CameraInfo, CompressedImage, Header, Image, Message
 from ibrobot_core.units import NS_PER_S, ns
 
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 2.0
@@ -25,6 +28,8 @@ _CLOSE_S = 5.0
 class OpenCvCamera(Sensor):
     """Pictures of a V4L2 device or a network stream, read by a thread that keeps only the newest; or of a video file.
 
+    With `encoding: jpeg` they are `CompressedImage`: the source's own bytes where it sends JPEG and nothing turns them.
+
     Args:
         options: the YAML's.
         ctx: name, clock and logger.
@@ -33,9 +38,9 @@ class OpenCvCamera(Sensor):
         SensorError: for a device that is not there, or a calibration that cannot be read.
     """
 
-    message_type = Image
-
     def __init__(self, options: OpenCvOptions, ctx: Context) -> None:
+        self._as_jpeg = wants_jpeg(options)
+        self.message_type = CompressedImage if self._as_jpeg else Image
         self.topic = f"/camera/{ctx.name}/image_raw"
         self._options = options
         self._ctx = ctx
@@ -55,17 +60,23 @@ class OpenCvCamera(Sensor):
         self._source = source
 
     @override
-    def read(self, timeout_s: float) -> Image | None:
+    def read(self, timeout_s: float) -> Image | CompressedImage | None:
         if self._source is None:
             raise SensorError(f"camera {self._ctx.name}: not open")
         found = self._source.read(timeout_s)
         if found is None:
             return None
-        pixels, stamp_ns = found
-        self._check_calibration(pixels)
+        picture, stamp_ns = found
+        self._check_calibration(picture.size)
         # A driver whose stamps stand still must not give two pictures of one time.
         self._last_ns = stamp_ns = max(stamp_ns, self._last_ns + 1)
-        return to_image(pixels, Header(stamp_ns, self._frame_id))
+        return self._message(picture.content, Header(stamp_ns, self._frame_id))
+
+    def _message(self, content: Pixels | CompressedImage, header: Header) -> Image | CompressedImage:
+        if isinstance(content, CompressedImage):
+            return attrs.evolve(content, header=header)
+        image = to_image(content, header)
+        return to_jpeg(image, self._options.jpeg_quality) if self._as_jpeg else image
 
     @override
     def close(self) -> None:
@@ -73,10 +84,10 @@ class OpenCvCamera(Sensor):
         if source is not None:
             source.close()
 
-    def _check_calibration(self, pixels: Pixels) -> None:
+    def _check_calibration(self, size: tuple[int, int]) -> None:
         if self._info is None:
             return
-        calibrated, (height, width) = self._info(Header()), pixels.shape[:2]
+        calibrated, (height, width) = self._info(Header()), size
         if (calibrated.width, calibrated.height) != (width, height):
             raise SensorError(
                 f"camera {self._ctx.name}: {self._options.info}: is for pictures of "
@@ -89,6 +100,11 @@ class OpenCvCamera(Sensor):
             return ()
         info: CameraInfo = self._info(Header(self._ctx.clock.now_ns(), self._frame_id))
         return ((f"/camera/{self._ctx.name}/camera_info", info),)
+
+
+def wants_jpeg(options: OpenCvOptions) -> bool:
+    """Whether messages are JPEG."""
+    return options.encoding == "jpeg" and options.fourcc not in DEPTHS
 
 
 def to_image(pixels: Pixels, header: Header) -> Image:
@@ -105,6 +121,7 @@ class _Live:
     def __init__(self, make: Callable[[], Capture], options: OpenCvOptions, ctx: Context) -> None:
         self._make = make
         self._patience_s = options.reconnect_timeout
+        self._as_jpeg = wants_jpeg(options)
         self._ctx = ctx
         self._changed = threading.Condition()
         self._newest: Picture | None = None
@@ -115,17 +132,19 @@ class _Live:
         capture = self._make()
         for difference in capture.differences:
             self._ctx.log.warning("camera %s %s", self._ctx.name, difference)
+        if self._as_jpeg and not capture.own_jpeg:
+            self._ctx.log.info("camera %s sends no JPEG; its pictures are encoded once, here", self._ctx.name)
         self._thread = threading.Thread(target=self._run, args=(capture,), name=f"camera {self._ctx.name}", daemon=True)
         self._thread.start()
 
-    def read(self, timeout_s: float) -> tuple[Pixels, int] | None:
+    def read(self, timeout_s: float) -> tuple[Picture, int] | None:
         with self._changed:
             if self._newest is None and self._error is None and timeout_s > 0:
                 self._changed.wait(timeout_s)
             picture, self._newest = self._newest, None
             if picture is not None:
                 age_ns = time.monotonic_ns() - picture.taken_ns
-                return picture.pixels, self._ctx.clock.now_ns() - age_ns
+                return picture, self._ctx.clock.now_ns() - age_ns
             if self._error is not None:
                 raise self._error
             return None
@@ -191,7 +210,7 @@ class _File:
         self._begun_ns = self._ctx.clock.now_ns()
         self._next = 0
 
-    def read(self, timeout_s: float) -> tuple[Pixels, int] | None:
+    def read(self, timeout_s: float) -> tuple[Picture, int] | None:
         clock = self._ctx.clock
         due_ns = self._begun_ns + self._next * self._period_ns
         now_ns = clock.now_ns()
@@ -214,7 +233,7 @@ class _File:
         if picture is None:  # the file has ended
             clock.sleep_until(now_ns + ns(timeout_s))
             return None
-        return picture.pixels, stamp_ns
+        return picture, stamp_ns
 
     def close(self) -> None:
         if self._capture is not None:

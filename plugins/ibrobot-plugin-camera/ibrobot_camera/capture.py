@@ -12,13 +12,19 @@ from typing import Any
 import attrs
 import cv2
 import numpy as np
+from ibrobot_ros2.jpeg import own_jpeg
 from numpy.typing import NDArray
 
 from ibrobot_camera.device import Device
 from ibrobot_camera.options import OpenCvOptions
 from ibrobot_camera.v4l2 import Mode, modes
-from ibrobot_core.errors import SensorError
+from ibrobot_core.errors import ContractError, SensorError
+from ibrobot_core.messages import CompressedImage, Header
 from ibrobot_core.units import NS_PER_S
+
+DEPTHS = ("Y16 ", "Z16 ")
+"""Formats of 16 bits a pixel, which JPEG cannot hold."""
+_MJPG = "MJPG"
 
 type Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 
@@ -46,8 +52,10 @@ os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", str(_TIMEOUT_MS // 10
 class Picture:
     """A picture and when it was taken."""
 
-    pixels: Pixels
-    """(H, W, 3) uint8, blue first; (H, W) uint8 or, for depth, uint16."""
+    content: Pixels | CompressedImage
+    """(H, W, 3) uint8, blue first; (H, W) uint8 or, for depth, uint16; or the camera's own JPEG, without a stamp."""
+    size: tuple[int, int]
+    """Height and width [px]."""
     taken_ns: int
     """`time.monotonic_ns()`: the driver's own stamp where there is one, else when it came."""
 
@@ -72,6 +80,8 @@ class Capture:
         try:
             if device.kind == "v4l2":
                 self._set_up()
+            self.own_jpeg = self._take_jpeg()
+            """Whether pictures are the source's own JPEG."""
             self.differences = self._differences()
             """What the source gives differently from what was asked."""
             if self.differences and options.strict:
@@ -91,13 +101,26 @@ class Capture:
                 return None
             taken_ns = self._taken_ns(time.monotonic_ns())  # before decoding, which takes time
             good, pixels = self._capture.retrieve()
-            if good and self._options.fourcc == "Z16 ":
-                good, pixels = self._depth(pixels)
-            if good:
-                if self._options.rotation:
-                    pixels = cv2.rotate(pixels, _ROTATIONS[self._options.rotation])
-                return Picture(np.ascontiguousarray(pixels), taken_ns)  # type: ignore[arg-type]
+            picture = self._picture(pixels, taken_ns) if good else None
+            if picture is not None:
+                return picture
         return None
+
+    def _picture(self, pixels: NDArray[Any], taken_ns: int) -> Picture | None:
+        """What was retrieved as a picture; None for a damaged one."""
+        if self.own_jpeg:
+            try:
+                return Picture(*own_jpeg(np.ascontiguousarray(pixels).reshape(-1), Header()), taken_ns)
+            except ContractError:
+                return None
+        if self._options.fourcc == "Z16 ":
+            good, pixels = self._depth(pixels)
+            if not good:
+                return None
+        if self._options.rotation:
+            pixels = cv2.rotate(pixels, _ROTATIONS[self._options.rotation])
+        height, width = pixels.shape[:2]
+        return Picture(np.ascontiguousarray(pixels), (height, width), taken_ns)
 
     def _depth(self, pixels: NDArray[Any]) -> tuple[bool, NDArray[Any]]:
         """Whether a picture is whole, and its depths: OpenCV does not know Z16, and gives the bytes in one row."""
@@ -133,12 +156,32 @@ class Capture:
             raise self._error(why)
         return capture
 
+    def _fourcc(self) -> str | None:
+        """The pixel format to ask a V4L2 device for."""
+        options = self._options
+        if options.fourcc is not None:
+            return options.fourcc
+        wanted = (options.width, options.height)
+        offered = {mode.fourcc for mode in modes(self._device.target) if None in wanted or mode.size == wanted}
+        return _MJPG if _MJPG in offered or not offered else None
+
+    def _take_jpeg(self) -> bool:
+        """Whether the source sends JPEG and it is wanted as it is; OpenCV then gives the bytes in one row."""
+        if self._options.encoding != "jpeg" or self._options.rotation or self._format() != _MJPG:
+            return False
+        prop, value = (cv2.CAP_PROP_CONVERT_RGB, 0) if self._device.kind == "v4l2" else (cv2.CAP_PROP_FORMAT, -1)
+        return self._capture.set(prop, value)
+
+    def _format(self) -> str:
+        return int(self._capture.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little").decode(errors="replace")
+
     def _set_up(self) -> None:
         options, capture = self._options, self._capture
         # The format first: it says which sizes there are, and those say which rates.
-        if options.fourcc is not None:
-            capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*options.fourcc))
-            if options.fourcc in ("Y16 ", "Z16 "):
+        fourcc = self._fourcc()
+        if fourcc is not None:
+            capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*fourcc))
+            if fourcc in DEPTHS:
                 capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)
         if options.width is not None and options.height is not None:
             capture.set(cv2.CAP_PROP_FRAME_WIDTH, options.width)
@@ -166,7 +209,7 @@ class Capture:
         rate = get(cv2.CAP_PROP_FPS) if self._device.kind != "stream" else 0.0
         if options.fps is not None and rate and abs(rate - options.fps) > 0.01 * options.fps:
             found.append(f"gives {rate:g} Hz, {options.fps:g} was asked for")
-        code = int(get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little").decode(errors="replace")
+        code = self._format()
         if self._device.kind == "v4l2" and options.fourcc is not None and code != options.fourcc:
             found.append(f"gives format {code}, {options.fourcc} was asked for")
         return found

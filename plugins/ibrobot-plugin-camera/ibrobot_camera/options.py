@@ -8,6 +8,12 @@ import attrs
 
 from ibrobot_core.options import option
 
+ENCODING = option(
+    "jpeg", choices=("jpeg", "raw"),
+    help="of messages: jpeg is the camera's own bytes where it sends JPEG, else encoded once; depth is always raw",
+)  # fmt: skip
+JPEG_QUALITY = option(90, ge=1, le=100, help="of pictures that the camera does not send as JPEG itself")
+
 
 @attrs.frozen
 class OpenCvOptions:
@@ -19,7 +25,12 @@ class OpenCvOptions:
     width: int | None = option(None, unit="px", gt=0, help="None: as the source gives it")
     height: int | None = option(None, unit="px", gt=0, help="None: as the source gives it")
     fps: float | None = option(None, unit="Hz", gt=0, le=1000, help="None: as the source gives it")
-    fourcc: str | None = option(None, help="pixel format of a V4L2 device, e.g. MJPG or YUYV")
+    fourcc: str | None = option(
+        None,
+        help="pixel format of a V4L2 device, e.g. MJPG or YUYV; None: MJPG where it is offered, to save the bus",
+    )
+    encoding: str = ENCODING
+    jpeg_quality: int = JPEG_QUALITY
     exposure: float | None = option(None, help="of a V4L2 device, in its driver's unit; None: automatic")
     white_balance: float | None = option(None, unit="K", gt=0, help="of a V4L2 device; None: automatic")
     brightness: float | None = option(None, help="of a V4L2 device, in its driver's unit")
@@ -46,4 +57,6 @@ class RealSenseOptions:
     width: int = option(640, unit="px", gt=0, help="of the pictures")
     height: int = option(480, unit="px", gt=0, help="of the pictures")
     fps: float = option(30.0, unit="Hz", gt=0, help="pictures a second")
+    encoding: str = ENCODING
+    jpeg_quality: int = JPEG_QUALITY
     frame_id: str = option("", help="of the messages; NAME_optical_frame where it is empty")

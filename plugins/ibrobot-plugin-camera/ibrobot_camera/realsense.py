@@ -8,6 +8,7 @@ from typing import Any, ClassVar, override
 
 import attrs
 import numpy as np
+from ibrobot_ros2.jpeg import to_jpeg
 from numpy.typing import NDArray
 
 from ibrobot_camera.camera import to_image
@@ -16,7 +17,7 @@ from ibrobot_camera.librealsense import load_library
 from ibrobot_camera.options import RealSenseOptions
 from ibrobot_core.errors import SensorError
 from ibrobot_core.interfaces import Context, Sensor
-from ibrobot_core.messages import CameraInfo, Header, Image, Message
+from ibrobot_core.messages import CameraInfo, CompressedImage, Header, Image, Message
 
 _WAIT_MS = 200
 _CLOSE_S = 5.0
@@ -185,10 +186,9 @@ class RealSenseCamera(Sensor):
         MissingDependency: as `load_library`.
     """
 
-    message_type = Image
-
     def __init__(self, options: RealSenseOptions, ctx: Context) -> None:
         load_library()
+        self.message_type = CompressedImage if (options.encoding, options.stream) == ("jpeg", "color") else Image
         self.topic = f"/camera/{ctx.name}/image_raw"
         self._options = options
         self._ctx = ctx
@@ -204,7 +204,7 @@ class RealSenseCamera(Sensor):
             self._number = self._device.number
 
     @override
-    def read(self, timeout_s: float) -> Image | None:
+    def read(self, timeout_s: float) -> Image | CompressedImage | None:
         device = self._device
         if device is None:
             raise SensorError(f"camera {self._ctx.name}: not open")
@@ -216,7 +216,8 @@ class RealSenseCamera(Sensor):
                 return None
             self._number, newest = device.number, device.newest
         self._last_ns = max(newest.taken_ns, self._last_ns + 1)
-        return to_image(newest.pictures[self._options.stream], Header(self._last_ns, self._frame_id))
+        image = to_image(newest.pictures[self._options.stream], Header(self._last_ns, self._frame_id))
+        return to_jpeg(image, self._options.jpeg_quality) if self.message_type is CompressedImage else image
 
     @override
     def close(self) -> None:

@@ -32,6 +32,11 @@ class Mode:
     height: int
     rates_hz: tuple[float, ...]
 
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height [px]."""
+        return self.width, self.height
+
 
 @attrs.frozen
 class Camera:

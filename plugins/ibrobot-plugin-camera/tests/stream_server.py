@@ -53,6 +53,12 @@ class StreamServer:
         self._server.server_close()
         self._thread.join()
 
+    @staticmethod
+    def jpeg(number: int) -> bytes:
+        """What it sends as picture `number`."""
+        _, jpeg = cv2.imencode(".jpg", numbered(number))
+        return jpeg.tobytes()
+
     def _handler(self) -> type[BaseHTTPRequestHandler]:
         server = self
 
@@ -65,9 +71,9 @@ class StreamServer:
                     while not server._ended.wait(PERIOD_S):
                         if server.running.is_set():
                             server.number += 1
-                            _, jpeg = cv2.imencode(".jpg", numbered(server.number))
+                            jpeg = server.jpeg(server.number)
                             head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
-                            self.wfile.write(head.encode() + jpeg.tobytes() + b"\r\n")
+                            self.wfile.write(head.encode() + jpeg + b"\r\n")
                 except OSError:
                     return
 

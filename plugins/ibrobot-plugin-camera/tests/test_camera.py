@@ -13,13 +13,14 @@ import pytest
 from ibrobot_camera import capture as capture_module
 from ibrobot_camera.camera import OpenCvCamera, to_image
 from ibrobot_camera.capture import Capture
+from ibrobot_camera.commands.sources import decoded
 from ibrobot_camera.device import Device, find_device
 from ibrobot_camera.options import OpenCvOptions
 
 from ibrobot_core.clock import RealClock, SteppedClock
 from ibrobot_core.errors import SensorError
 from ibrobot_core.interfaces import Context, Sensor
-from ibrobot_core.messages import CameraInfo, Header
+from ibrobot_core.messages import CameraInfo, CompressedImage, Header, Image
 from ibrobot_core.testing import SensorSuite, host_context
 from ibrobot_core.testing.contexts import START_NS
 
@@ -44,7 +45,8 @@ def camera(ctx: Context, device: Any, **options: Any) -> OpenCvCamera:
     return OpenCvCamera(OpenCvOptions(device=device, **options), ctx)
 
 
-def number(image: Any) -> int:
+def number(message: Any) -> int:
+    image = decoded(message)
     return number_of(image.data.reshape(image.height, image.width, 3))
 
 
@@ -140,6 +142,28 @@ class TestFile:
         top.close()
         assert [number(image) for image in images[11:] if image is not None] == expected
 
+    def test_its_own_jpegs_are_not_encoded_again(self, video: Path) -> None:
+        raw, own = (self.first(video, encoding=encoding) for encoding in ("raw", "jpeg"))
+        assert isinstance(raw, Image)
+        assert isinstance(own, CompressedImage)
+        assert video.read_bytes().count(own.data.tobytes()) == 1
+        assert number(raw) == number(own) == 1
+
+    def test_rotated_pictures_are_encoded_once(self, video: Path) -> None:
+        message = self.first(video, rotation=180, jpeg_quality=95)
+        assert isinstance(message, CompressedImage)
+        assert message.format == "bgr8; jpeg compressed bgr8"
+        assert number_of(np.rot90(decoded(message).data.reshape(HEIGHT, WIDTH, 3), 2)) == 1
+
+    @staticmethod
+    def first(video: Path, **options: Any) -> Image | CompressedImage:
+        top = camera(host_context("top", clock=SteppedClock(START_NS)), str(video), **options)
+        top.open()
+        message = top.read(0.0)
+        top.close()
+        assert message is not None
+        return message
+
     def test_rotation_turns_clockwise(self, video: Path) -> None:
         ctx = host_context("top", clock=SteppedClock(START_NS))
         top = camera(ctx, str(video), rotation=90)
@@ -147,6 +171,7 @@ class TestFile:
         image = top.read(0.0)
         top.close()
         assert image is not None
+        image = decoded(image)
         assert (image.height, image.width) == (WIDTH, HEIGHT)
         turned = np.rot90(image.data.reshape(WIDTH, HEIGHT, 3))
         assert number_of(turned) == 1
@@ -164,6 +189,16 @@ class TestFile:
 
 
 class TestStream:
+    def test_its_jpegs_are_published_byte_by_byte(self) -> None:
+        with StreamServer() as server:
+            top = camera(host_context("top", clock=RealClock()), server.url)
+            top.open()
+            messages = [top.read(PATIENCE_S) for _ in range(5)]
+            top.close()
+            for message in messages:
+                assert isinstance(message, CompressedImage)
+                assert message.data.tobytes() == server.jpeg(number(message))
+
     def test_each_picture_is_new_and_as_old_as_it_says(self) -> None:
         with StreamServer() as server:
             ctx = host_context("top", clock=RealClock())

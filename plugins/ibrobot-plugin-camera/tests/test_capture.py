@@ -11,18 +11,26 @@ from ibrobot_camera import capture as capture_module
 from ibrobot_camera.capture import Capture
 from ibrobot_camera.device import Device
 from ibrobot_camera.options import OpenCvOptions
+from ibrobot_camera.v4l2 import Mode
+
+from ibrobot_core.messages import CompressedImage
 
 
 class Scripted:
     """What OpenCV gives for a V4L2 device, from a list: the bytes of a picture, or None for one that is damaged."""
 
-    def __init__(self, pictures: list[np.ndarray | None]) -> None:
+    def __init__(self, pictures: list[np.ndarray | None], formats: tuple[str, ...] = ()) -> None:
         self._pictures = pictures
+        self._formats = formats
+        self.properties = {cv2.CAP_PROP_FRAME_WIDTH: 4.0, cv2.CAP_PROP_FRAME_HEIGHT: 3.0}
 
     def get(self, prop: int) -> float:
-        return {cv2.CAP_PROP_FRAME_WIDTH: 4.0, cv2.CAP_PROP_FRAME_HEIGHT: 3.0}.get(prop, 0.0)
+        return self.properties.get(prop, 0.0)
 
     def set(self, prop: int, value: float) -> bool:
+        if prop == cv2.CAP_PROP_FOURCC and int(value).to_bytes(4, "little").decode() not in self._formats:
+            return False
+        self.properties[prop] = value
         return True
 
     def grab(self) -> bool:
@@ -58,4 +66,69 @@ class TestPictures:
         raw = depth.view(np.uint8).reshape(1, -1)
         picture = self.capture(monkeypatch, [raw[:, :10], raw], fourcc="Z16 ").read()
         assert picture is not None
-        np.testing.assert_array_equal(picture.pixels, depth)
+        np.testing.assert_array_equal(picture.content, depth)  # type: ignore[arg-type]
+
+
+MJPG = float(cv2.VideoWriter.fourcc(*"MJPG"))
+
+
+def jpeg(value: int) -> np.ndarray:
+    """A grey picture of 4x3 as OpenCV gives MJPG that it is not to decode: bytes in one row."""
+    _, file = cv2.imencode(".jpg", np.full((3, 4, 3), value, np.uint8))
+    return np.asarray(file).reshape(1, -1)
+
+
+class TestMotionJpeg:
+    """A V4L2 device that offers some formats."""
+
+    @pytest.fixture(autouse=True)
+    def _device(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.patch = monkeypatch
+
+    def open(
+        self, pictures: list[np.ndarray | None], formats: tuple[str, ...], sizes: Any = ((4, 3),), **options: Any
+    ) -> tuple[Capture, Scripted]:
+        device = Scripted(pictures, formats)
+        offered = tuple(Mode(each, *size, (30.0,)) for each, size in zip(formats, sizes, strict=True))
+        self.patch.setattr(capture_module.Capture, "_open", lambda self: device)
+        self.patch.setattr(capture_module, "modes", lambda path: offered)
+        return Capture(Device("v4l2", "/dev/video7"), OpenCvOptions(device=7, **options), "top"), device
+
+    def test_it_is_asked_for_and_its_bytes_are_kept(self) -> None:
+        capture, device = self.open([jpeg(80)], ("YUYV", "MJPG"), ((4, 3), (4, 3)), width=4, height=3)
+        assert device.properties[cv2.CAP_PROP_FOURCC] == MJPG
+        assert device.properties[cv2.CAP_PROP_CONVERT_RGB] == 0
+        picture = capture.read()
+        assert picture is not None
+        assert isinstance(picture.content, CompressedImage)
+        assert (picture.content.data.tobytes(), picture.size) == (jpeg(80).tobytes(), (3, 4))
+
+    def test_a_damaged_one_is_left_out(self) -> None:
+        whole = jpeg(80)
+        capture, _ = self.open([whole[:, :-40], whole[:, :2], whole], ("MJPG",))
+        picture = capture.read()
+        assert picture is not None
+        assert isinstance(picture.content, CompressedImage)
+        assert picture.content.data.size == whole.size
+        assert capture.read() is None
+
+    def test_what_is_offered_in_another_size_only_is_not_asked_for(self) -> None:
+        pixels = np.zeros((3, 4, 3), np.uint8)
+        capture, device = self.open([pixels], ("YUYV", "MJPG"), ((4, 3), (8, 6)), width=4, height=3)
+        assert cv2.CAP_PROP_FOURCC not in device.properties
+        assert not capture.own_jpeg
+        picture = capture.read()
+        assert picture is not None
+        assert isinstance(picture.content, np.ndarray)
+
+    def test_another_format_may_be_asked_for(self) -> None:
+        capture, device = self.open([], ("YUYV", "MJPG"), ((4, 3), (4, 3)), fourcc="YUYV")
+        assert device.properties[cv2.CAP_PROP_FOURCC] == cv2.VideoWriter.fourcc(*"YUYV")
+        assert not capture.own_jpeg
+
+    @pytest.mark.parametrize("options", [{"encoding": "raw"}, {"rotation": 90}])
+    def test_it_saves_the_bus_also_where_its_bytes_cannot_be_kept(self, options: dict[str, Any]) -> None:
+        capture, device = self.open([np.zeros((3, 4, 3), np.uint8)], ("MJPG",), **options)
+        assert device.properties[cv2.CAP_PROP_FOURCC] == MJPG
+        assert cv2.CAP_PROP_CONVERT_RGB not in device.properties
+        assert not capture.own_jpeg

@@ -14,11 +14,12 @@ from ibrobot_camera import realsense
 from ibrobot_camera.librealsense import load_library
 from ibrobot_camera.options import RealSenseOptions
 from ibrobot_camera.realsense import RealSenseCamera
+from ibrobot_ros2.jpeg import from_jpeg
 
 from ibrobot_core.clock import RealClock
 from ibrobot_core.errors import MissingDependency, SensorError
 from ibrobot_core.interfaces import Context, Sensor
-from ibrobot_core.messages import CameraInfo
+from ibrobot_core.messages import CameraInfo, CompressedImage, Image
 from ibrobot_core.plugins import installed
 from ibrobot_core.testing import SensorSuite, host_context
 
@@ -165,8 +166,11 @@ def test_colour_and_aligned_depth_share_a_camera(soft: SoftwareCamera) -> None:
     assert depth.read(PATIENCE_S) is not None, "the other goes on"
     depth.close()
     assert all(picture is not None for picture in pictures)
-    assert [picture.encoding for picture in pictures if picture] == ["bgr8", "16UC1"]
-    distance = pictures[1].data.view(np.uint16).reshape(HEIGHT, WIDTH)[HEIGHT // 2, WIDTH // 2]  # type: ignore[union-attr]
+    assert isinstance(pictures[0], CompressedImage)
+    assert from_jpeg(pictures[0]).encoding == "bgr8"
+    assert isinstance(pictures[1], Image)
+    assert pictures[1].encoding == "16UC1"
+    distance = pictures[1].data.view(np.uint16).reshape(HEIGHT, WIDTH)[HEIGHT // 2, WIDTH // 2]
     assert 1000 < distance <= 1000 + soft.number
     assert isinstance(info, CameraInfo)
     assert (info.k[0], info.p[3], info.p[11]) == (50.0, 0.0, 0.0)

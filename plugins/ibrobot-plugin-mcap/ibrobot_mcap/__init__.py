@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.descriptors import Command, ReaderDescriptor, RecorderDescriptor
+from ibrobot_core.descriptors import Command, DecoderDescriptor, ReaderDescriptor, RecorderDescriptor
 from ibrobot_core.hookspecs import hookimpl
 from ibrobot_mcap.options import McapOptions
 
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     import click
 
     from ibrobot_core.interfaces import Context, EpisodeAddress, EpisodeReader, Recorder
+    from ibrobot_core.messages import CompressedImage, Image
 
 
 def _record(options: Any, ctx: Context) -> Recorder:
@@ -46,6 +47,18 @@ def ibrobot_recorders() -> Iterable[RecorderDescriptor]:
 def ibrobot_readers() -> Iterable[ReaderDescriptor]:
     """What reads bags, also those of others."""
     yield ReaderDescriptor("rosbag2", "ROS 2 bags: MCAP, also unfinished, and sqlite3", _reads, _read)
+
+
+def _decoder() -> Callable[[CompressedImage], Image | None]:
+    from ibrobot_ros2.pictures import decode_picture
+
+    return decode_picture
+
+
+@hookimpl
+def ibrobot_decoders() -> Iterable[DecoderDescriptor]:
+    """Of the pictures that bags have."""
+    yield DecoderDescriptor(("jpeg", "png", "compressedDepth png"), _decoder)
 
 
 def _commands() -> click.Command:

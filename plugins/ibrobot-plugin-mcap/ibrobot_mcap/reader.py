@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import override
 
 from ibrobot_ros2 import Codec, CodecError
-from ibrobot_ros2.png import from_png, is_png
+from ibrobot_ros2.pictures import decode_picture, is_known
 
 from ibrobot_core.errors import ContractError, RecorderError
 from ibrobot_core.interfaces import EpisodeReader, EpisodeSummary, Recorded, TopicSummary
@@ -19,7 +19,6 @@ from ibrobot_core.messages import CompressedImage, Image
 from ibrobot_mcap.compressed import Expanded, MessageCompressed
 from ibrobot_mcap.damage import reading
 from ibrobot_mcap.facts import Facts, parse_facts, read_facts
-from ibrobot_mcap.jpeg import from_jpeg, is_jpeg
 from ibrobot_mcap.metadata import DROPPED, METADATA, MISSING, OUTCOME, RECORD, RECORD_KEY, Topic
 from ibrobot_mcap.options import COMPRESSIONS
 from ibrobot_mcap.sources import McapSource, Raw, Source
@@ -106,8 +105,8 @@ class Rosbag2Reader(EpisodeReader):
             try:
                 message = self._codec.decode(raw.type, raw.data)
                 if isinstance(message, CompressedImage):
-                    message = _picture(message)
-            except (CodecError, ContractError, RecorderError) as error:
+                    message = decode_picture(message) or message
+            except (CodecError, ContractError) as error:
                 raise RecorderError(f"{self._path}: {raw.topic} at {raw.received_ns} ns: {error}") from error
             yield Recorded(raw.topic, message, raw.received_ns, raw.published_ns)
 
@@ -167,8 +166,7 @@ class Rosbag2Reader(EpisodeReader):
             message = self._codec.decode(type_, first.data)
         except CodecError:
             return type_  # reading it tells what is wrong
-        known = isinstance(message, CompressedImage) and (is_jpeg(message) or is_png(message))
-        return Image.ros_type if known else type_
+        return Image.ros_type if isinstance(message, CompressedImage) and is_known(message) else type_
 
     def _recorded(self) -> Facts | None:
         """What the newest metadata record says, for an episode without `metadata.yaml`."""
@@ -205,13 +203,6 @@ class Rosbag2Reader(EpisodeReader):
         if not files:
             raise RecorderError(f"{path}: has no .mcap or .db3 file")
         return files
-
-
-def _picture(message: CompressedImage) -> Image | CompressedImage:
-    """The pixels of a picture whose format is known, else the message as it is."""
-    if is_jpeg(message):
-        return from_jpeg(message)
-    return from_png(message) if is_png(message) else message
 
 
 def _names(files: Sequence[Path]) -> str:

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import override
 
 from ibrobot_ros2 import CodecError, encode
+from ibrobot_ros2.jpeg import fits_jpeg, to_jpeg
 
 from ibrobot_core.clock import SteppedClock
-from ibrobot_core.errors import RecorderError
+from ibrobot_core.errors import ContractError, RecorderError
 from ibrobot_core.interfaces import Context, EpisodeEnd, EpisodeStart, Recorder
 from ibrobot_core.messages import CompressedImage, Image, Message
 from ibrobot_mcap.bagfile import Item
-from ibrobot_mcap.jpeg import fits_jpeg, to_jpeg
 from ibrobot_mcap.metadata import Topic
 from ibrobot_mcap.options import McapOptions
 from ibrobot_mcap.storage import Storage
@@ -53,7 +53,7 @@ class McapRecorder(Recorder):
             return
         try:
             item = self._item(topic, message, received_ns)
-        except (CodecError, RecorderError) as error:
+        except (CodecError, ContractError, RecorderError) as error:
             raise RecorderError(f"{topic}: {error}") from error
         self._last_ns = max(self._last_ns, received_ns)
         if self._thread is not None:
@@ -89,7 +89,7 @@ class McapRecorder(Recorder):
             if isinstance(message, Image) and self._options.images == "jpeg" and fits_jpeg(message):
                 message = to_jpeg(message, self._options.jpeg_quality)
             return len(encode(message))
-        except (CodecError, RecorderError):
+        except (CodecError, ContractError, RecorderError):
             return super().size_of(message)  # writing it tells what is wrong
 
     @override

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 from ibrobot_core import hookimpl
-from ibrobot_core.descriptors import HardwareDescriptor, PolicyDescriptor, SensorDescriptor, ViewerDescriptor
+from ibrobot_core.descriptors import (
+    DecoderDescriptor,
+    HardwareDescriptor,
+    PolicyDescriptor,
+    SensorDescriptor,
+    ViewerDescriptor,
+)
 from ibrobot_mujoco.gl import check_asked, choose
 from ibrobot_mujoco.options import CameraOptions, MujocoOptions, check_world
 from ibrobot_mujoco.policy_options import ScriptedPickOptions, check_pick
 
 if TYPE_CHECKING:
     from ibrobot_core.interfaces import Context, Hardware, Policy, Sensor, Viewer
+    from ibrobot_core.messages import CompressedImage, Image
 
 
 def _hardware(options: Any, ctx: Context) -> Hardware:
@@ -72,6 +79,18 @@ def ibrobot_policies() -> Iterable[PolicyDescriptor]:
         type="scripted_pick", options=ScriptedPickOptions, make=_scripted_pick, check_options=check_pick,
         summary="picks the cube and puts it into the bin, by inverse kinematics and the scene's ground truth",
     )  # fmt: skip
+
+
+def _decoder() -> Callable[[CompressedImage], Image | None]:
+    from ibrobot_ros2.pictures import decode_picture
+
+    return decode_picture
+
+
+@hookimpl
+def ibrobot_decoders() -> Iterable[DecoderDescriptor]:
+    """Of the pictures that simulated cameras give."""
+    yield DecoderDescriptor(("jpeg", "png", "compressedDepth png"), _decoder)
 
 
 @hookimpl

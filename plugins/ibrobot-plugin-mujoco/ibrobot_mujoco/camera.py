@@ -8,11 +8,12 @@ from typing import override
 
 import mujoco
 import numpy as np
+from ibrobot_ros2.jpeg import to_jpeg
 
 from ibrobot_core.bus import Subscription
 from ibrobot_core.errors import SensorError
 from ibrobot_core.interfaces import Context, Sensor
-from ibrobot_core.messages import CameraInfo, Header, Image, Message
+from ibrobot_core.messages import CameraInfo, CompressedImage, Header, Image, Message
 from ibrobot_core.units import ns
 from ibrobot_mujoco.model import build_model
 from ibrobot_mujoco.options import CameraOptions, MujocoOptions
@@ -26,9 +27,8 @@ _QUEUE = 100
 class MujocoCamera(Sensor):
     """Renders in the thread of `open` and `read`; pictures that there was no time for are counted, not queued."""
 
-    message_type = Image
-
     def __init__(self, options: CameraOptions, ctx: Context) -> None:
+        self.message_type = CompressedImage if options.encoding == "jpeg" else Image
         self.topic = f"/camera/{ctx.name}/image_raw"
         self.skipped = 0
         """Pictures that were due and never drawn."""
@@ -66,7 +66,7 @@ class MujocoCamera(Sensor):
         raise SensorError(f"camera {self._ctx.name!r}: no {' or '.join(names)} in the scene; its cameras are: {there}")
 
     @override
-    def read(self, timeout_s: float) -> Image | None:
+    def read(self, timeout_s: float) -> Image | CompressedImage | None:
         if self._renderer is None or self._states is None:
             raise SensorError(f"camera {self._ctx.name!r} is not open")
         deadline = time.monotonic() + timeout_s
@@ -90,9 +90,10 @@ class MujocoCamera(Sensor):
         self._last_slot = slot
         return True
 
-    def _image(self, stamp_ns: int, pixels: np.ndarray) -> Image:
+    def _image(self, stamp_ns: int, pixels: np.ndarray) -> Image | CompressedImage:
         height, width, _ = pixels.shape
-        return Image(self._header(stamp_ns), height, width, "rgb8", 3 * width, pixels.reshape(-1))
+        image = Image(self._header(stamp_ns), height, width, "rgb8", 3 * width, pixels.reshape(-1))
+        return to_jpeg(image, self._options.jpeg_quality) if self.message_type is CompressedImage else image
 
     def _header(self, stamp_ns: int) -> Header:
         return Header(stamp_ns, f"{self._ctx.name}_optical_frame")

@@ -91,6 +91,8 @@ class CameraOptions:
     width: int = option(640, unit="px", ge=1, le=8192, help="width of the image")
     height: int = option(480, unit="px", ge=1, le=8192, help="height of the image")
     fps: float = option(30.0, unit="Hz", gt=0, le=1000, help="images a second of simulated time")
+    encoding: str = option("jpeg", choices=("jpeg", "raw"), help="of what is published; raw is 15 times the size")
+    jpeg_quality: int = option(90, ge=1, le=100, help="of encoding jpeg")
     shadows: bool = option(False, help="whether to render shadows (three times the cost)")
 
 

@@ -15,10 +15,11 @@ from ibrobot_mujoco.options import CameraOptions, MujocoOptions
 from ibrobot_mujoco.render import Renderer
 from ibrobot_mujoco.so101 import so101
 from ibrobot_mujoco.state import PHYSICS_TOPIC, pose_scene
+from ibrobot_ros2.jpeg import from_jpeg
 
 from ibrobot_core.errors import SensorError
 from ibrobot_core.interfaces import Context, Episode, Sensor
-from ibrobot_core.messages import CameraInfo, Float64MultiArray, Image
+from ibrobot_core.messages import CameraInfo, CompressedImage, Float64MultiArray
 from ibrobot_core.plugins import installed
 from ibrobot_core.robot import Vector
 from ibrobot_core.testing import SensorSuite, control_context, host_context
@@ -149,7 +150,7 @@ def test_calibration_follows_the_field_of_view(camera: MujocoCamera) -> None:
 
 def test_calibration_projects_the_cube_to_where_it_is_seen(ctx: Context) -> None:
     """From directly above, forward (x) is up in the image and left (y) is left."""
-    camera = MujocoCamera(CameraOptions(), ctx)
+    camera = MujocoCamera(CameraOptions(encoding="raw"), ctx)
     camera.open()
     try:
         assert ctx.bus is not None
@@ -198,8 +199,9 @@ def test_needs_a_simulation(simulation: object) -> None:
 
 def test_low_poly_looks_like_the_full_meshes(ctx: Context, camera: MujocoCamera) -> None:
     publish(ctx, SLOT_NS)
-    image = camera.read(0)
-    assert isinstance(image, Image)
+    message = camera.read(0)
+    assert isinstance(message, CompressedImage)
+    image = from_jpeg(message)
     spec = build_spec(OPTIONS, ROBOT)
     spec.visual.quality.offsamples = 0
     full = spec.compile()

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.descriptors import Command, TransportDescriptor
+from ibrobot_core.descriptors import Command, DecoderDescriptor, TransportDescriptor
 from ibrobot_core.hookspecs import hookimpl
 from ibrobot_zenoh.options import ZenohOptions
 
@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     import click
 
     from ibrobot_core.interfaces import Context, Transport
+    from ibrobot_core.messages import CompressedImage, Image
 
 
 def _zenoh(options: Any, ctx: Context) -> Transport:
@@ -28,6 +29,18 @@ def ibrobot_transports() -> Iterable[TransportDescriptor]:
         type="zenoh", options=ZenohOptions, make=_zenoh, topics=True,
         summary="between machines; ROS 2 nodes with rmw_zenoh join in",
     )  # fmt: skip
+
+
+def _decoder() -> Callable[[CompressedImage], Image | None]:
+    from ibrobot_ros2.pictures import decode_picture
+
+    return decode_picture
+
+
+@hookimpl
+def ibrobot_decoders() -> Iterable[DecoderDescriptor]:
+    """Of the pictures that ROS 2 nodes send."""
+    yield DecoderDescriptor(("jpeg", "png", "compressedDepth png"), _decoder)
 
 
 def _certs() -> click.Command:

@@ -12,6 +12,7 @@ from urllib.parse import parse_qs, urlsplit
 import click
 import cv2
 
+from ibrobot_core.messages import CompressedImage, Image
 from ibrobot_core.outside import echo
 from ibrobot_core.workers import on_signals
 
@@ -42,7 +43,6 @@ class Newest:
             return (self._number, self._jpeg) if self._number > number else (number, b"")
 
     def _run(self) -> None:
-        from ibrobot_camera.commands.sources import pixels
         from ibrobot_core.errors import SensorError
 
         while not self._ended.is_set():
@@ -54,13 +54,21 @@ class Newest:
                 return
             if image is None:
                 continue
-            found = pixels(image)
-            if image.encoding == "16UC1":
-                found = cv2.applyColorMap(cv2.convertScaleAbs(found, alpha=255 / 4000), cv2.COLORMAP_TURBO)  # type: ignore[assignment]
-            _, jpeg = cv2.imencode(".jpg", found, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+            jpeg = image.data.tobytes() if isinstance(image, CompressedImage) else _to_jpeg(image)
             with self._changed:
-                self._jpeg, self._number = jpeg.tobytes(), self._number + 1
+                self._jpeg, self._number = jpeg, self._number + 1
                 self._changed.notify_all()
+
+
+def _to_jpeg(image: Image) -> bytes:
+    """A picture as a browser shows it: depth in colours, up to 4 m."""
+    from ibrobot_camera.commands.sources import pixels
+
+    found = pixels(image)
+    if image.encoding == "16UC1":
+        found = cv2.applyColorMap(cv2.convertScaleAbs(found, alpha=255 / 4000), cv2.COLORMAP_TURBO)  # type: ignore[assignment]
+    _, jpeg = cv2.imencode(".jpg", found, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+    return jpeg.tobytes()
 
 
 @click.command()

@@ -11,7 +11,7 @@ import click
 import cv2
 
 from ibrobot_core.errors import SensorError
-from ibrobot_core.messages import Image
+from ibrobot_core.messages import CompressedImage, Image
 from ibrobot_core.outside import echo
 from ibrobot_core.units import NS_PER_S
 
@@ -39,8 +39,10 @@ def snapshot(source: str, output: Path | None, seconds: float) -> None:
         echo(f"{path}: {name}, {image.width}x{image.height} {image.encoding}, {rate_hz:.1f} Hz")
 
 
-def _watch(name: str, read: Callable[[float], Image | None], seconds: float) -> tuple[Image, float]:
+def _watch(name: str, read: Callable[[float], Image | CompressedImage | None], seconds: float) -> tuple[Image, float]:
     """The last picture within `seconds`, and the rate by the stamps [Hz]."""
+    from ibrobot_camera.commands.sources import decoded
+
     first = read(_WAIT_S)
     if first is None:
         raise SensorError(f"camera {name}: no picture within {_WAIT_S:.0f} s")
@@ -50,4 +52,4 @@ def _watch(name: str, read: Callable[[float], Image | None], seconds: float) -> 
         if image is not None:
             last, count = image, count + 1
     span_ns = last.header.stamp_ns - first.header.stamp_ns
-    return last, count * NS_PER_S / span_ns if span_ns else 0.0
+    return decoded(last), count * NS_PER_S / span_ns if span_ns else 0.0

@@ -8,6 +8,7 @@ from contextlib import ExitStack, contextmanager
 
 import cv2
 import numpy as np
+from ibrobot_ros2.jpeg import from_jpeg
 from numpy.typing import NDArray
 
 from ibrobot_camera.camera import OpenCvCamera
@@ -16,11 +17,11 @@ from ibrobot_core.clock import RealClock
 from ibrobot_core.config import find_config, load
 from ibrobot_core.errors import SensorError
 from ibrobot_core.interfaces import Context
-from ibrobot_core.messages import Image
+from ibrobot_core.messages import CompressedImage, Image
 from ibrobot_core.plugins import installed
 from ibrobot_core.robot import Robot
 
-_TO_BGR = {"bgr8": None, "mono8": cv2.COLOR_GRAY2BGR}
+_TO_BGR = {"bgr8": None, "rgb8": cv2.COLOR_RGB2BGR, "mono8": cv2.COLOR_GRAY2BGR}
 
 
 @contextmanager
@@ -54,11 +55,16 @@ def _options(source: str) -> dict[str, OpenCvOptions]:
     return found
 
 
+def decoded(message: Image | CompressedImage) -> Image:
+    """A camera's message as pixels."""
+    return from_jpeg(message) if isinstance(message, CompressedImage) else message
+
+
 def pixels(image: Image) -> NDArray[np.uint8] | NDArray[np.uint16]:
     """An image as OpenCV writes it: (H, W, 3) blue first, or (H, W) of depth."""
     if image.encoding == "16UC1":
         return image.data.view(np.uint16).reshape(image.height, image.width)
     conversion = _TO_BGR[image.encoding]
-    shape = (image.height, image.width) if conversion is not None else (image.height, image.width, 3)
+    shape = (image.height, image.width) if image.encoding == "mono8" else (image.height, image.width, 3)
     found = image.data.reshape(shape)
     return found if conversion is None else np.asarray(cv2.cvtColor(found, conversion), dtype=np.uint8)
