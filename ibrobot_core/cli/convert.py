@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import attrs
 import click
 from click.core import ParameterSource
 
@@ -30,6 +31,7 @@ _ONLY_TO_BAG = ("numbers",)
 _ONLY_TO_DATASET = (
     "append", "type_", "codec", "crf", "no_videos", "force_contract", "missing", "outcomes", "success", "jobs",
 )  # fmt: skip
+_MISSING: str = attrs.fields(Request).missing.default
 
 
 @click.command()
@@ -48,7 +50,7 @@ _ONLY_TO_DATASET = (
 @click.option("--norm-mode", type=click.Choice(NORM_MODES), help="Unit of the dataset's joints, else radians.")
 @click.option("--calibration", metavar="NAME", help="In place of the recorded one, for --norm-mode.")
 @click.option(
-    "--missing", type=click.Choice(MISSING), default="refuse", show_default=True,
+    "--missing", type=click.Choice(MISSING), default=_MISSING, show_default=True,
     help="Where something is missing: refuse the episode, skip the tick, or hold the last value.",
 )  # fmt: skip
 @click.option("--outcome", "outcomes", multiple=True, type=click.Choice(OUTCOMES), help="Only these; repeatable.")
@@ -249,6 +251,8 @@ def _tell(report: Report) -> None:
         f"gaps {summary['gaps']} (ticks skipped {summary['skipped_ticks']}, held {summary['held_ticks']}), "
         f"messages lost in recording {summary['lost_messages']}"
     )
+    if cuts := [ticks for each in done for _, ticks in each.cuts]:
+        echo(f"left out where something was missing: {len(cuts)} times, at most {max(cuts)} ticks in a row")
     for what, of_each in (
         ("missing for a time", [each.gaps for each in done]), ("stamps that jumped", [each.resets for each in done]),
         ("lost in recording", [each.lost for each in done]), ("missing since", [each.missing for each in done]),

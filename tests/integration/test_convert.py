@@ -243,7 +243,7 @@ def test_a_contract_that_differs_from_the_recorded_one_is_refused(bags: Path, tm
 
 def test_a_gap_is_refused_skipped_or_held(tmp_path: Path) -> None:
     record(tmp_path / "bag", 1, 2.0, gap={"/wrist": (0.8, 1.4)})
-    result = run(tmp_path / "bag", "--out", tmp_path / "refuse")
+    result = run(tmp_path / "bag", "--out", tmp_path / "refuse", "--missing", "refuse")
     assert result.code == 1
     assert "observation.images.wrist is missing 1.000 s after the beginning" in result.err
     assert "--missing skip" in result.err
@@ -252,6 +252,14 @@ def test_a_gap_is_refused_skipped_or_held(tmp_path: Path) -> None:
     assert (found["skip"]["gaps"], found["hold"]["gaps"]) == (1, 1)
     assert found["skip"]["skipped_ticks"] == found["hold"]["held_ticks"] > 10
     assert found["skip"]["frames"] == found["hold"]["frames"] - found["hold"]["held_ticks"]
+    ((row, ticks),) = found["skip"]["reports"][0]["cuts"]
+    assert (row > 10, ticks) == (True, found["skip"]["skipped_ticks"])
+    assert found["hold"]["reports"][0]["cuts"] == []
+    default = run(tmp_path / "bag", "--out", tmp_path / "default")
+    assert default.code == 0, default.err
+    assert f"left out where something was missing: 1 times, at most {ticks} ticks in a row\n" in default.out
+    kept = json.loads((tmp_path / "default/meta/ibrobot.json").read_bytes())["episodes"][0]
+    assert kept["cuts"] == [[row, ticks]]
     told = run(tmp_path / "bag", "--out", tmp_path / "told", "--missing", "hold").out
     assert "missing for a time: observation.images.wrist 1\n" in told
     assert "1 without a prompt: their task is empty; --prompt TEXT gives them one" in told

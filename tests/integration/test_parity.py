@@ -7,10 +7,12 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import attrs
 import numpy as np
 import pytest
 from ibrobot_mcap.options import McapOptions
 from ibrobot_mcap.recorder import McapRecorder
+from ibrobot_ros2.jpeg import to_jpeg
 from numpy.typing import NDArray
 
 from ibrobot_core.bus import Bus
@@ -67,6 +69,10 @@ def contract(rng: np.random.Generator) -> Contract:
                 align("header", "receive"), Feature("image", (*(resize or PIXELS), 3)),
             ),
             ObservationPart(
+                "observation.images.wrist", "/wrist", "sensor_msgs/msg/Image", (), ImageSpec(resize),
+                Align("hold", str(rng.choice(["header", "receive"]))), Feature("image", (*(resize or PIXELS), 3)),
+            ),
+            ObservationPart(
                 "observation.environment_state", "/scene", Float64MultiArray.ros_type, ("data",), None,
                 align("receive"), Feature("float32", (3,)),
             ),
@@ -85,13 +91,18 @@ def message(topic: str, stamp_ns: int, rng: np.random.Generator) -> Message:
         channels = {"rgba8": 4, "mono8": 1}.get(encoding, 3)
         pixels = rng.integers(0, 256, (*PIXELS, channels), np.uint8)
         return encode_image(pixels, encoding, Header(stamp_ns), padding=int(rng.integers(3)))
+    if topic == "/wrist":
+        pixels = rng.integers(0, 256, (*PIXELS, 3), np.uint8)
+        sent = to_jpeg(encode_image(pixels, "bgr8", Header(stamp_ns)), int(rng.integers(20, 100)))
+        return attrs.evolve(sent, format="jpeg") if rng.random() < 0.5 else sent
     return Float64MultiArray(rng.normal(size=2 if topic == COMMANDS else 3))
 
 
 def publications(rng: np.random.Generator, duration_ns: int) -> list[tuple[int, str, Message]]:
     """Time of receipt [ns], topic and message: jittered, late, out of order, twice, and not at all."""
     found = []
-    for topic, rate in (("/joint_states", 100), ("/imu", 60), ("/top", 30), ("/scene", 20), (COMMANDS, 50)):
+    rates = {"/joint_states": 100, "/imu": 60, "/top": 30, "/wrist": 25, "/scene": 20, COMMANDS: 50}
+    for topic, rate in rates.items():
         skew_ns = int(rng.choice([0, 3 * MS, -40 * MS, 5_000 * MS], p=[0.75, 0.12, 0.1, 0.03]))
         jump = int(rng.integers(duration_ns)) if rng.random() < 0.1 else duration_ns
         for i in range(duration_ns * rate // 10**9):

@@ -194,8 +194,9 @@ def _write(
     finally:
         writer.finalize()
     report = attrs.evolve(
-        report, frames=frames, skipped=ticks.skipped, held=ticks.held, gaps=ticks.gaps, resets=dict(ticks.resets)
-    )
+        report, frames=frames, skipped=ticks.skipped, cuts=tuple(ticks.cuts), held=ticks.held, gaps=ticks.gaps,
+        resets=dict(ticks.resets),
+    )  # fmt: skip
     unit = Unit(
         job.unit, key, report, contract.rate_hz, features, contract.canonical(), robot_type, calibration, document,
         summary.metadata,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +35,7 @@ class Request:
     calibration: Mapping[str, Mapping[str, Any]] | None = None
     """Joint -> fields of `JointCalibration`, in place of the recorded ones."""
     norm_mode: str = option("radians", choices=NORM_MODES)
-    missing: str = option("refuse", choices=MISSING)
+    missing: str = option("skip", choices=MISSING)
     """What a tick is worth at which something is missing: the episode is refused, the tick left out, or the last
     value held."""
     outcomes: tuple[str, ...] = OUTCOMES
@@ -50,6 +50,11 @@ class Request:
     """Episodes converted side by side, each in a process of its own."""
 
 
+def _pairs(lists: Iterable[Iterable[int]]) -> tuple[tuple[int, int], ...]:
+    """From JSON, which has no tuples."""
+    return tuple((first, second) for first, second in lists)
+
+
 @attrs.frozen
 class EpisodeReport:
     """What became of one episode."""
@@ -59,6 +64,8 @@ class EpisodeReport:
     frames: int = 0
     skipped: int = 0
     """Ticks left out because something was missing."""
+    cuts: tuple[tuple[int, int], ...] = attrs.field(default=(), converter=_pairs)
+    """Where ticks were left out: the number of the row that follows, from 0, and how many ticks."""
     held: int = 0
     """Ticks at which something was missing and its last value stands."""
     gaps: Mapping[str, int] = attrs.field(factory=dict)

@@ -141,10 +141,16 @@ class Ticks:
         self._missing = missing
         self._source = _Source(reader, contract)
         self._assembler = FrameAssembler(self._contract)
-        self.skipped = 0
+        self.cuts: list[tuple[int, int]] = []
+        """Where ticks were left out: the number of the row that follows, from 0, and how many ticks."""
         self.held = 0
         self.gaps: dict[str, int] = {}
         """Key -> how often it went missing."""
+
+    @property
+    def skipped(self) -> int:
+        """Ticks left out because something was missing."""
+        return sum(count for _, count in self.cuts)
 
     @property
     def resets(self) -> Mapping[str, int]:
@@ -158,7 +164,7 @@ class Ticks:
             RecorderError: when something is missing and that is to be refused, or is missing all the time.
             ContractError: for a message that does not fit the contract.
         """
-        source, before = self._source, frozenset[str]()
+        source, before, rows = self._source, frozenset[str](), 0
         last: dict[str, NDArray[Any]] = {}
         absent = frozenset(self._contract.observations)
         for frame in assemble(self._assembler, source, source.ticks(self._contract.step_ns)):
@@ -171,16 +177,17 @@ class Ticks:
             for key in frame.missing - before:
                 self.gaps[key] = self.gaps.get(key, 0) + 1
             before = frame.missing
-            if frame.missing and not self._take(frame.missing, frame.stamp_ns):
+            if frame.missing and not self._take(frame.missing, frame.stamp_ns, rows):
                 continue
             last = {**last, **frame.values}
+            rows += 1
             yield last
         if not last:
             what = f"{', '.join(sorted(absent))} is missing at every one" if absent else "each time another was missing"
             raise RecorderError(f"there is no tick at which every observation and action is there: {what}")
 
-    def _take(self, missing: frozenset[str], t_ns: int) -> bool:
-        """Whether a tick at which something is missing gives a row."""
+    def _take(self, missing: frozenset[str], t_ns: int, row: int) -> bool:
+        """Whether a tick at which something is missing gives a row, which would be number `row`."""
         if self._missing == "refuse":
             at_s = seconds(t_ns - self._source.first_ns)
             raise RecorderError(
@@ -188,7 +195,8 @@ class Ticks:
                 "--missing skip leaves such ticks out, --missing hold takes the last value"
             )
         if self._missing == "skip":
-            self.skipped += 1
+            before = self.cuts.pop()[1] if self.cuts and self.cuts[-1][0] == row else 0
+            self.cuts.append((row, before + 1))
             return False
         self.held += 1
         return True
