@@ -31,7 +31,7 @@ _ONLY_TO_BAG = ("numbers",)
 _ONLY_TO_DATASET = (
     "append", "type_", "codec", "crf", "no_videos", "force_contract", "missing", "outcomes", "success", "jobs",
 )  # fmt: skip
-_MISSING: str = attrs.fields(Request).missing.default
+_MISSING = attrs.fields(Request).missing.default
 
 
 @click.command()
