@@ -10,13 +10,17 @@ from typing import Any
 import attrs
 import numpy as np
 import pytest
+from ibrobot_camera.camera import OpenCvCamera
+from ibrobot_camera.options import OpenCvOptions
 from ibrobot_mcap.options import McapOptions
+from ibrobot_mcap.reader import Rosbag2Reader
 from ibrobot_mcap.recorder import McapRecorder
 from ibrobot_ros2.jpeg import to_jpeg
 from numpy.typing import NDArray
+from stream_server import StreamServer, number_of
 
 from ibrobot_core.bus import Bus
-from ibrobot_core.clock import SteppedClock
+from ibrobot_core.clock import RealClock, SteppedClock
 from ibrobot_core.config import find_config, load
 from ibrobot_core.config.schema import Align, ImageSpec
 from ibrobot_core.contract.frames import FrameSampler, frames
@@ -25,7 +29,7 @@ from ibrobot_core.contract.specs import ActionPart, Contract, ObservationPart
 from ibrobot_core.interfaces import EpisodeEnd, EpisodeStart, Feature, Frame
 from ibrobot_core.launch.runtime import Runtime
 from ibrobot_core.launch.session import Request, Session
-from ibrobot_core.messages import Float64MultiArray, Header, Imu, JointState, Message, Vector3
+from ibrobot_core.messages import CompressedImage, Float64MultiArray, Header, Imu, JointState, Message, Vector3
 from ibrobot_core.plugins import installed
 from ibrobot_core.recording.convert.ticks import Ticks
 from ibrobot_core.testing.contexts import host_context
@@ -194,6 +198,53 @@ def check_rows(reader: Any, spec: Contract, seen: list[Frame], sent: list[tuple[
         assert row.keys() == frame.keys()
         assert all(same(row[key], frame[key]) for key in frame)
     return len(rows)
+
+
+def test_pictures_of_a_motion_jpeg_camera(tmp_path: Path) -> None:
+    """What it sent is in the bag byte by byte, and its decoding is what a policy saw and what a dataset gets."""
+    image = ObservationPart(
+        "observation.images.top", "/camera/top/image_raw", "sensor_msgs/msg/Image", (), ImageSpec((24, 32)),
+        Align("hold", "header"), Feature("image", (24, 32, 3)),
+    )  # fmt: skip
+    spec = Contract(30.0, (image,), ())
+    clock = RealClock()
+    bus = Bus(clock)
+    sampler = FrameSampler(spec, bus)
+    recorder = McapRecorder(McapOptions(), host_context(clock=clock))
+    recorder.begin(EpisodeStart(tmp_path / "bag", clock.now_ns(), spec.topics, {}))
+    arrived = bus.subscribe(image.topic, 100)
+    sent, seen = [], []
+    with StreamServer() as server:
+        camera = OpenCvCamera(OpenCvOptions(device=server.url), host_context("top", clock=clock))
+        camera.open()
+        while len(seen) < 20:
+            picture = camera.read(30.0)
+            assert isinstance(picture, CompressedImage)
+            bus.publish(camera.topic, picture)
+            sent.append(picture.data.tobytes())
+            for item in arrived.drain():
+                recorder.write(item.topic, item.message, item.received_ns)
+            seen.append(sampler.sample(bus.snapshot_ns()))
+        camera.close()
+        assert sent[0] == server.jpeg(number_of(decoded(picture_of(sent[0]))))
+    recorder.end(EpisodeEnd(clock.now_ns(), "success"))
+    recorder.close()
+    reader = Rosbag2Reader(tmp_path / "bag")
+    assert [bytes(raw.data).endswith(one) for raw, one in zip(reader.raw(), sent, strict=True)] == [True] * 20
+    messages = ((each.topic, each.message, each.received_ns) for each in reader.messages(spec.topics))
+    for live, later in zip(seen, frames(spec, messages, [frame.stamp_ns for frame in seen]), strict=True):
+        assert not live.missing
+        assert_equal(live, later)
+    reader.close()
+
+
+def picture_of(jpeg: bytes) -> CompressedImage:
+    return CompressedImage(Header(), "jpeg", np.frombuffer(jpeg, np.uint8))
+
+
+def decoded(picture: CompressedImage) -> NDArray[Any]:
+    image = installed().decode(picture)
+    return image.data.reshape(image.height, image.width, 3)
 
 
 KEEPER = '''

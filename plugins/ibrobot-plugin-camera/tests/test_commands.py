@@ -13,10 +13,9 @@ import pytest
 from click.testing import CliRunner
 from ibrobot_camera import v4l2
 from ibrobot_camera.commands import camera
+from stream_server import StreamServer
 
 from ibrobot_core.errors import SensorError
-
-from .stream_server import StreamServer
 
 ROBOT = """
 robot: {{name: r, joints: [{{name: j, lower: -1, upper: 1, max_velocity: 1, max_acceleration: 1}}], groups: {{a: [j]}}}}
