@@ -158,7 +158,7 @@ class ReaderDescriptor:
 
 @attrs.frozen
 class DecoderDescriptor:
-    """A decoder of compressed pictures. Plugins whose messages have such register one; the first that knows one counts."""
+    """A decoder of compressed pictures, registered by plugins that send them; the first that knows a format counts."""
 
     formats: tuple[str, ...]
     """E.g. `jpeg`; for messages to the user."""

@@ -31,6 +31,8 @@ _ONLY_TO_BAG = ("numbers",)
 _ONLY_TO_DATASET = (
     "append", "type_", "codec", "crf", "no_videos", "force_contract", "missing", "outcomes", "success", "jobs",
 )  # fmt: skip
+_MUCH = 0.1
+"""An episode that lost more of its ticks is named."""
 _MISSING = attrs.fields(Request).missing.default
 
 
@@ -251,6 +253,9 @@ def _tell(report: Report) -> None:
         f"gaps {summary['gaps']} (ticks skipped {summary['skipped_ticks']}, held {summary['held_ticks']}), "
         f"messages lost in recording {summary['lost_messages']}"
     )
+    for each in done:
+        if each.skipped > _MUCH * (each.frames + each.skipped):
+            echo(f"cut {each.source}: {each.skipped} of {each.frames + each.skipped} ticks are left out", err=True)
     if cuts := [ticks for each in done for _, ticks in each.cuts]:
         echo(f"left out where something was missing: {len(cuts)} times, at most {max(cuts)} ticks in a row")
     for what, of_each in (

@@ -257,6 +257,7 @@ def test_a_gap_is_refused_skipped_or_held(tmp_path: Path) -> None:
     assert found["hold"]["reports"][0]["cuts"] == []
     default = run(tmp_path / "bag", "--out", tmp_path / "default")
     assert default.code == 0, default.err
+    assert f"cut bag: {ticks} of {found['skip']['frames'] + ticks} ticks are left out\n" in default.err
     assert f"left out where something was missing: 1 times, at most {ticks} ticks in a row\n" in default.out
     kept = json.loads((tmp_path / "default/meta/ibrobot.json").read_bytes())["episodes"][0]
     assert kept["cuts"] == [[row, ticks]]
