@@ -6,6 +6,7 @@ import threading
 from collections.abc import Iterator
 from typing import override
 
+import attrs
 import numpy as np
 import pytest
 from ibrobot_mujoco.camera import MujocoCamera
@@ -15,11 +16,11 @@ from ibrobot_mujoco.options import CameraOptions, MujocoOptions
 from ibrobot_mujoco.render import Renderer
 from ibrobot_mujoco.so101 import so101
 from ibrobot_mujoco.state import PHYSICS_TOPIC, pose_scene
-from ibrobot_ros2.jpeg import from_jpeg
+from ibrobot_ros2.jpeg import to_jpeg
 
 from ibrobot_core.errors import SensorError
 from ibrobot_core.interfaces import Context, Episode, Sensor
-from ibrobot_core.messages import CameraInfo, CompressedImage, Float64MultiArray
+from ibrobot_core.messages import CameraInfo, CompressedImage, Float64MultiArray, Image
 from ibrobot_core.plugins import installed
 from ibrobot_core.robot import Vector
 from ibrobot_core.testing import SensorSuite, control_context, host_context
@@ -197,11 +198,29 @@ def test_needs_a_simulation(simulation: object) -> None:
         camera.open()
 
 
-def test_low_poly_looks_like_the_full_meshes(ctx: Context, camera: MujocoCamera) -> None:
-    publish(ctx, SLOT_NS)
-    message = camera.read(0)
+def test_pictures_are_jpeg_of_what_was_rendered(ctx: Context, camera: MujocoCamera) -> None:
+    raw = MujocoCamera(attrs.evolve(SMALL, encoding="raw"), ctx)
+    raw.open()
+    try:
+        publish(ctx, SLOT_NS)
+        exact, message = raw.read(0), camera.read(0)
+    finally:
+        raw.close()
+    assert isinstance(exact, Image)
     assert isinstance(message, CompressedImage)
-    image = from_jpeg(message)
+    assert message == to_jpeg(exact, 90)
+    assert message.data.size < exact.data.size / 4
+
+
+def test_low_poly_looks_like_the_full_meshes(ctx: Context) -> None:
+    camera = MujocoCamera(attrs.evolve(SMALL, encoding="raw"), ctx)
+    camera.open()
+    try:
+        publish(ctx, SLOT_NS)
+        image = camera.read(0)
+    finally:
+        camera.close()
+    assert isinstance(image, Image)
     spec = build_spec(OPTIONS, ROBOT)
     spec.visual.quality.offsamples = 0
     full = spec.compile()
