@@ -27,6 +27,12 @@ def _patience(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reasons, "_TIMEOUT_S", 10.0)
 
 
+@pytest.fixture
+def brief_trials(_patience: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """For an other side that takes the connection and never answers: a longer trial finds nothing else."""
+    monkeypatch.setattr(reasons, "_TIMEOUT_S", 0.2)
+
+
 @pytest.fixture(autouse=True)
 def _closed(no_leaks: None) -> Iterator[None]:  # noqa: F811
     """A test that failed leaves no session open."""

@@ -216,13 +216,19 @@ def test_the_server_s_own_certificate_may_do_everything(lab: Path):
         end.close()
 
 
-def test_an_end_without_tls_is_told(lab: Path):
-    secured, plain = free_endpoint("tls"), free_endpoint("tcp")
-    servers = [router(secured, tls=tls(lab, "localhost")), router(plain)]
+@pytest.mark.usefixtures("brief_trials")
+def test_a_server_without_tls_is_told(lab: Path):
+    plain = free_endpoint("tcp")
+    server = router(plain)
     assert "does not speak TLS" in why_not(plain.replace("tcp", "tls"), tls(lab, "robot1"))
+    server.close()
+
+
+def test_a_client_without_tls_is_told(lab: Path):
+    secured = free_endpoint("tls")
+    server = router(secured, tls=tls(lab, "localhost"))
     assert "write tls/ for tcp/" in why_not(secured.replace("tls", "tcp"), None)
-    for server in servers:
-        server.close()
+    server.close()
 
 
 @pytest.mark.parametrize(

@@ -86,6 +86,7 @@ def test_a_file_of_users_that_says_something_else(text: str, said: str, tmp_path
         router(free_endpoint(), users=tmp_path / "users.txt")
 
 
+@pytest.mark.usefixtures("brief_trials")
 def test_passwords(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     users = tmp_path / "users.txt"
     users.write_text("robot1:secret\n")
