@@ -14,7 +14,7 @@ _LISTED = 50
 class IbrobotError(Exception):
     """Base of every error that ibrobot raises on purpose.
 
-    The command line prints `str(error)` and exits with `exit_code`; anything else is a bug and prints a traceback.
+    The command line prints `str(error)` and exits with `exit_code`; anything else is a bug: see `ibrobot_core.bugs`.
     """
 
     exit_code = 1

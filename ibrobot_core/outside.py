@@ -9,8 +9,6 @@ from __future__ import annotations
 import logging
 import re
 import sys
-import traceback
-from types import TracebackType
 from typing import override
 from urllib.parse import quote
 
@@ -53,7 +51,8 @@ def printable(text: str) -> str:
 
 def echo(message: object = "", *, err: bool = False, nl: bool = True) -> None:
     """Print a message; see `printable`."""
-    click.echo(printable(str(message)), err=err, nl=nl)
+    # Named, or click writes UTF-8 to a terminal that has said ASCII.
+    click.echo(printable(str(message)), file=sys.stderr if err else sys.stdout, nl=nl)
 
 
 class LogFormatter(logging.Formatter):
@@ -62,8 +61,3 @@ class LogFormatter(logging.Formatter):
     @override
     def format(self, record: logging.LogRecord) -> str:
         return printable(super().format(record)).replace("\n", "\n  ")
-
-
-def show_traceback(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    """For `sys.excepthook`: a crash tells no secret either."""
-    sys.stderr.write(printable("".join(traceback.format_exception(kind, error, trace))))

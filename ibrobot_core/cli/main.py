@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import os
 import sys
 from importlib import import_module
 from typing import override
@@ -9,7 +11,12 @@ from typing import override
 import click
 
 from ibrobot_core import __version__
+from ibrobot_core.bugs import DEBUG, describe_bug
+from ibrobot_core.errors import IbrobotError
 from ibrobot_core.outside import echo
+
+_FAILED, _WRONG, _INTERRUPTED = 1, 2, 130
+"""Exit codes of errors that bring none; docs/reference/exit-codes.md has all."""
 
 COMMANDS = {
     "launch": ("ibrobot_core.cli.launch:launch", "Run a robot, real or simulated."),
@@ -57,20 +64,38 @@ class LazyGroup(click.Group):
 
 @click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="ibrobot")
-def cli() -> None:
+@click.option("--debug", is_flag=True, help="Print the traceback of a bug.")
+def cli(debug: bool) -> None:
     """Embodied-AI robots from one YAML: teleoperation, recording, policies, planning and control."""
+    if debug:
+        os.environ[DEBUG] = "1"
 
 
 def main() -> None:
-    """Run the command line. Errors that a user may see are told in one line each and set the exit code."""
-    from ibrobot_core.errors import IbrobotError
-    from ibrobot_core.outside import show_traceback
-
-    sys.excepthook = show_traceback
-
+    """Run the command line. Errors are told in one line each and set the exit code: docs/reference/exit-codes.md."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # an ASCII terminal shows \u2026, and does not end the run
+            stream.reconfigure(errors="backslashreplace")
     try:
-        cli(prog_name="ibrobot")
-    except IbrobotError as error:
-        for line in str(error).splitlines():
+        sys.exit(cli(prog_name="ibrobot", standalone_mode=False))
+    except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - the end of the process: nothing else can tell it
+        lines, code = _told(error)
+        for line in lines:
             echo(f"error: {line}", err=True)
-        sys.exit(error.exit_code)
+        sys.exit(code)
+
+
+def _told(error: BaseException) -> tuple[list[str], int]:
+    """The lines that tell an error, and the exit code."""
+    if isinstance(error, IbrobotError):
+        return str(error).splitlines(), error.exit_code
+    if isinstance(error, click.Abort | KeyboardInterrupt):
+        return ["stopped"], _INTERRUPTED
+    if isinstance(error, click.UsageError):
+        hint = f"; see {error.ctx.command_path} --help" if error.ctx is not None else ""
+        return [error.format_message().replace("\n", " ").removesuffix(".") + hint], _WRONG
+    if isinstance(error, click.ClickException):
+        return error.format_message().splitlines(), _WRONG if isinstance(error, click.FileError) else error.exit_code
+    if isinstance(error, OSError) and error.strerror and str(error.filename) in sys.argv:
+        return [f"{error.filename}: {error.strerror}"], _WRONG
+    return [describe_bug(error)], _FAILED

@@ -12,11 +12,11 @@ import os
 import signal
 import socket
 import sys
-import traceback
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, override
 
+from ibrobot_core.bugs import describe_bug
 from ibrobot_core.clock import RealClock
 from ibrobot_core.config import from_document
 from ibrobot_core.control.build import build_core
@@ -163,9 +163,7 @@ def main(descriptors: list[int]) -> int:
         channel.send({**_failed(core, str(error)), "exit_code": error.exit_code})
         return 1
     except Exception as error:  # noqa: BLE001 - a bug here must still stop the robot
-        # The host tells it in one line; the traceback goes where a bug's belongs.
-        traceback.print_exc()
-        channel.send({**_failed(core, f"{type(error).__name__}: {error}"), "exit_code": 1})
+        channel.send({**_failed(core, describe_bug(error)), "exit_code": 1})
         return 1
     finally:
         if core is not None:

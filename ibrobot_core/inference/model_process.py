@@ -15,13 +15,13 @@ import signal
 import sys
 import threading
 import time
-import traceback
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, override
 
 import attrs
 
+from ibrobot_core.bugs import describe_bug
 from ibrobot_core.config import from_document
 from ibrobot_core.errors import IbrobotError
 from ibrobot_core.inference.build import build_policy
@@ -61,11 +61,8 @@ class _ToHost(logging.Handler):
 
 
 def told(error: Exception) -> str:
-    """An error in words; a traceback of one that is a bug goes to the log."""
-    if isinstance(error, IbrobotError):
-        return str(error)
-    logging.getLogger("ibrobot.inference").error("%s", "".join(traceback.format_exception(error)))
-    return f"{type(error).__name__}: {error}"
+    """An error in words; a traceback of one that is a bug goes to a file."""
+    return str(error) if isinstance(error, IbrobotError) else describe_bug(error)
 
 
 @attrs.define

@@ -8,6 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import override
 
+from ibrobot_core.bugs import describe_bug
 from ibrobot_core.errors import ComponentFailed, IbrobotError
 
 _POLL_S = 0.1
@@ -151,7 +152,7 @@ class Worker(Component):
 
 def told(error: BaseException) -> str:
     """An error in words, in as many lines as it has."""
-    return str(error).strip() if isinstance(error, IbrobotError) else f"{type(error).__name__}: {error}".strip()
+    return str(error).strip() if isinstance(error, IbrobotError) else describe_bug(error)
 
 
 def cause(error: BaseException) -> str:

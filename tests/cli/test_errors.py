@@ -1,0 +1,158 @@
+"""Errors of the command line: one form, the exit codes of the reference, and no traceback unless asked for."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ibrobot_core.bugs import DEBUG
+
+if TYPE_CHECKING:
+    from cli.conftest import Ran
+
+    from conftest import Site
+
+Ibrobot = Callable[..., "Ran"]
+
+BUGS = '''
+import click
+from ibrobot_core import hookimpl
+from ibrobot_core.descriptors import Command
+
+@click.group()
+def odd():
+    """Fail in every way."""
+
+@odd.command()
+def bug():
+    return 1 // 0
+
+@odd.command()
+@click.argument("file")
+def read(file):
+    open(file).read()
+
+@odd.command()
+@click.argument("file", type=click.File())
+def take(file):
+    pass
+
+@odd.command()
+def refuse():
+    raise click.ClickException("not today")
+
+@odd.command()
+def ask():
+    raise click.Abort()
+
+@odd.command()
+def say():
+    from ibrobot_core.outside import echo
+    echo("größer … ✓")
+    raise ValueError("größer … ✓")
+
+def _broken():
+    raise RuntimeError("cannot be loaded")
+
+@hookimpl
+def ibrobot_commands():
+    yield Command("odd", "Fail in every way.", lambda: odd)
+    yield Command("broken", "Cannot be loaded.", _broken)
+'''
+
+
+@pytest.fixture
+def bugs(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    site.add("fake-bugs", BUGS)
+    monkeypatch.delenv(DEBUG, raising=False)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "told"),
+    [
+        (("nothing",), 2, "No such command 'nothing'; see ibrobot --help"),
+        (("config", "check", "--xyzzy"), 2, "No such option '--xyzzy'; see ibrobot config check --help"),
+        (("odd", "read"), 2, "Missing argument 'FILE'; see ibrobot odd read --help"),
+        (("odd", "xyzzy"), 2, "No such command 'xyzzy'; see ibrobot odd --help"),
+        (("odd", "read", "no.txt"), 2, "no.txt: No such file or directory"),
+        (("odd", "take", "no.txt"), 2,
+         "Invalid value for 'FILE': 'no.txt': No such file or directory; see ibrobot odd take --help"),
+        (("odd", "refuse"), 1, "not today"),
+        (("odd", "ask"), 130, "stopped"),
+    ],
+)  # fmt: skip
+def test_errors_have_one_form(ibrobot: Ibrobot, bugs: None, arguments: tuple[str, ...], code: int, told: str) -> None:
+    ran = ibrobot(*arguments)
+
+    assert (ran.code, ran.out, ran.err) == (code, "", f"error: {told}\n")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("odd", "bug"), "ZeroDivisionError: integer division or modulo by zero"),
+        (("broken",), "RuntimeError: cannot be loaded"),
+    ],
+)
+def test_bug_is_one_line_that_names_the_file_with_the_traceback(
+    ibrobot: Ibrobot, bugs: None, arguments: tuple[str, ...], told: str
+) -> None:
+    ran = ibrobot(*arguments)
+
+    assert ran.code == 1
+    [line] = ran.err.splitlines()
+    assert line.startswith(f"error: {told} (a bug at site/fake_bugs.py:")
+    log = Path(line.rpartition(" is in ")[2].rstrip(")")).read_text()
+    assert log.startswith("Traceback")
+    assert told in log
+
+
+def test_debug_prints_the_traceback(ibrobot: Ibrobot, bugs: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(DEBUG, "")  # so that it is put back
+    ran = ibrobot("--debug", "odd", "bug")
+
+    assert ran.code == 1
+    assert ran.err.startswith("Traceback")
+    assert ran.err.endswith("\nerror: ZeroDivisionError: integer division or modulo by zero\n")
+
+
+def test_ascii_terminal_shows_what_it_can(bugs: None, tmp_path: Path) -> None:
+    environment = {**os.environ, "LC_ALL": "C", "PYTHONIOENCODING": "ascii", "TERM": "dumb", "TMPDIR": str(tmp_path)}
+    command = (sys.executable, "-c", "from ibrobot_core.cli.main import main; main()", "odd", "say")
+
+    ran = subprocess.run(command, env=environment, capture_output=True, check=False)
+
+    assert ran.returncode == 1
+    assert ran.stdout == b"gr\\xf6\\xdfer \\u2026 \\u2713\n"
+    assert ran.stderr.startswith(b"error: ValueError: gr\\xf6\\xdfer")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        (), ("--help",), ("launch", "--help"), ("record", "--help"), ("replay", "--help"), ("convert", "--help"),
+        ("serve", "--help"), ("plugins",), ("doctor",), ("config", "schema"), ("config", "check", "no.yaml"),
+    ],
+)  # fmt: skip
+def test_no_command_needs_more_than_ascii(
+    ibrobot: Ibrobot, bugs: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, arguments: tuple[str, ...]
+) -> None:
+    for name in ("stdout", "stderr"):
+        stream = (tmp_path / name).open("w", encoding="ascii", errors="strict")
+        monkeypatch.setattr(sys, name, stream)
+
+    ran = ibrobot(*arguments)
+
+    assert ran.code in (0, 1, 2)
+    for name in ("stdout", "stderr"):
+        getattr(sys, name).close()
+    assert "UnicodeEncodeError" not in (tmp_path / "stderr").read_text()
+    assert (tmp_path / "stdout").read_text() + (tmp_path / "stderr").read_text()
