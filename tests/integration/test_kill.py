@@ -384,7 +384,9 @@ class TestDeath:
 
         assert status == 1
         [line] = told(error)
-        assert line.startswith("error: control: the control process died (ZeroDivisionError: division by zero (a bug at ")
+        assert line.startswith(
+            "error: control: the control process died (ZeroDivisionError: division by zero (a bug at "
+        )
 
     def test_of_a_sensor_stops_the_robot(self, launch):
         run = launch("peripherals=[{name: top, kind: camera, type: brittle}]", "control.stop=pose rest", awaited=False)
