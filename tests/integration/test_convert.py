@@ -66,7 +66,7 @@ robot:
     - {{name: lift, lower: -2, upper: 2, max_velocity: 3, max_acceleration: 10}}
     - {{name: gripper, lower: -0.1, upper: 2, max_velocity: 3, max_acceleration: 10}}
   groups: {{arm: [pan, lift, gripper]}}
-simulation: {{type: mujoco}}
+hardware: {{type: feetech_so101, port: /dev/null, calibration: bench}}
 executors:
   arm: {{type: position, group: arm}}
 control_modes:
