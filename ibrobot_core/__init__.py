@@ -1,7 +1,18 @@
 """ibrobot: one robot YAML drives teleoperation, recording, policies, planning and control."""
 
-from ibrobot_core.hookspecs import hookimpl
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from ibrobot_core.hookspecs import hookimpl
 
 __all__ = ["__version__", "hookimpl"]
 
 __version__ = "0.1.0"
+
+
+def __getattr__(name: str) -> object:
+    """`hookimpl`, imported when it is asked for: the command's first moments import nothing; see `command`."""
+    if name == "hookimpl":
+        from ibrobot_core.hookspecs import hookimpl
+
+        return hookimpl
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

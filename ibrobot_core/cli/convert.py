@@ -24,7 +24,8 @@ from ibrobot_core.recording.convert.request import MISSING, OUTCOMES, EpisodeRep
 from ibrobot_core.units import NORM_MODES
 
 if TYPE_CHECKING:
-    from ibrobot_core.config import RobotConfig
+    from ibrobot_core.command import let_interrupts_raise
+from ibrobot_core.config import RobotConfig
 
 _MIB = 1 << 20
 _ONLY_TO_BAG = ("numbers",)
@@ -68,6 +69,7 @@ def convert(context: click.Context, /, to: str, as_json: bool, **asked: Any) -> 
     Interrupted, the same command goes on where it was. An episode that cannot be converted is told and left out; the
     command then exits with 1.
     """
+    let_interrupts_raise()
     given = [name for name in asked if context.get_parameter_source(name) is ParameterSource.COMMANDLINE]
     if wrong := [name for name in given if name in (_ONLY_TO_BAG if to == "dataset" else _ONLY_TO_DATASET)]:
         option = next(each.opts[0] for each in context.command.params if each.name == wrong[0])

@@ -194,7 +194,7 @@ def run_loaded(robot: RobotConfig, request: Request, options: dict[str, Any], wa
     if options["headless"] and robot.viewer is not None:
         robot = attrs.evolve(robot, viewer=None)
     with ExitStack() as stack:
-        keys = None if options["headless"] or options["dry_run"] else _terminal_keys(stack)
+        keys = Keys() if sys.stdin.isatty() and not (options["headless"] or options["dry_run"]) else None
         if keys is not None:
             request = attrs.evolve(request, keys=keys.subscribe)
         runtime = Runtime(Session(robot, installed(), request))
@@ -205,6 +205,8 @@ def run_loaded(robot: RobotConfig, request: Request, options: dict[str, Any], wa
             return
         watcher.attach(runtime)
         _stop_on_signals(runtime.session, keys)
+        if keys is not None:  # only now: until here Ctrl-C ends the process, and could not put the terminal back
+            stack.enter_context(keys)
         try:
             status = _run(runtime, watcher, live=not options["headless"], as_json=as_json)
         finally:
@@ -213,13 +215,6 @@ def run_loaded(robot: RobotConfig, request: Request, options: dict[str, Any], wa
     _tell(runtime, watcher, as_json)
     runtime.raise_failure()
     sys.exit(status)
-
-
-def _terminal_keys(stack: ExitStack) -> Keys | None:
-    """The terminal's keys, given back when `stack` unwinds; None where standard input is no terminal."""
-    if not sys.stdin.isatty():
-        return None
-    return stack.enter_context(Keys())
 
 
 def _run(runtime: Runtime, watcher: Watcher, *, live: bool, as_json: bool) -> int:

@@ -13,6 +13,7 @@ import click
 from ibrobot_core import __version__
 from ibrobot_core.bugs import DEBUG, describe_bug
 from ibrobot_core.errors import IbrobotError
+from ibrobot_core.command import let_interrupts_raise
 from ibrobot_core.outside import echo
 
 _FAILED, _WRONG, _INTERRUPTED = 1, 2, 130
@@ -49,7 +50,10 @@ class LazyGroup(click.Group):
         from ibrobot_core.plugins import installed
 
         contributed = installed().commands.get(cmd_name)
-        return contributed.load() if contributed is not None else None
+        if contributed is None:
+            return None
+        let_interrupts_raise()
+        return contributed.load()
 
     @override
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:

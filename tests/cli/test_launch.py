@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import logging
 import signal
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -366,3 +368,70 @@ def test_what_holds_torque_is_said_however_the_run_ends(launch, mode):
     ran = launch("--sim", "--lockstep", "--headless", "--mode", mode, "--duration", "2", "--seed", "7")
 
     assert ran.err.count("/dev/ttyARM holds torque; to take it off: arm torque off") == 1
+
+
+STEPPED = """
+import atexit, logging, signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # whatever the shell that started the tests set
+at, steps, begun = int(sys.argv.pop(1)), 0, False
+
+def step():
+    global steps
+    steps += 1
+    if steps == at:
+        signal.raise_signal(signal.SIGINT)
+
+def hook(event, arguments):
+    global begun
+    if event == "import":
+        begun = begun or arguments[0] == "ibrobot_core.cli.main"
+        if begun:
+            step()
+
+def log(self, record, handle=logging.Logger.handle):
+    handle(self, record)
+    step()
+
+logging.Logger.handle = log
+sys.addaudithook(hook)
+if not at:
+    atexit.register(lambda: print("steps", steps, file=sys.stderr))
+from ibrobot_core.command import main
+main()
+"""
+
+
+def test_ctrl_c_at_any_moment_of_the_start_is_one_line(site: Site, tmp_path: Path):
+    site.add("fake-parts", PARTS)
+    (tmp_path / "mini.yaml").write_text(ROBOT)
+
+    def run(at: int) -> tuple[int, str, str]:
+        command = [
+            sys.executable,
+            "-c",
+            STEPPED,
+            str(at),
+            "launch",
+            "mini.yaml",
+            *LOCKSTEP,
+            "--json",
+            "--duration",
+            "0",
+        ]
+        ran = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+        return ran.returncode, ran.stdout, ran.stderr
+
+    code, out, err = run(0)
+    assert code == 0, err
+    steps = int(err.rpartition("steps ")[2])
+    codes = []
+    for at in (1, *(int(share * steps) for share in (0.1, 0.3, 0.5, 0.7, 0.9)), steps - 1):
+        code, out, err = run(at)
+        codes.append(code)
+        if code == 130:
+            assert (out, err) == ("", "interrupted\n"), f"step {at} of {steps}"
+        else:  # it ran already, and stopped in order
+            assert code == 0, err
+            assert "Traceback" not in err
+            assert json.loads(out)["robot"] == "mini"
+    assert codes[:4] == [130] * 4
