@@ -17,6 +17,7 @@ import attrs
 import click
 from click.core import ParameterSource
 
+from ibrobot_core.cli.command import let_interrupts_raise
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import DatasetError
 from ibrobot_core.outside import echo
@@ -24,8 +25,7 @@ from ibrobot_core.recording.convert.request import MISSING, OUTCOMES, EpisodeRep
 from ibrobot_core.units import NORM_MODES
 
 if TYPE_CHECKING:
-    from ibrobot_core.command import let_interrupts_raise
-from ibrobot_core.config import RobotConfig
+    from ibrobot_core.config import RobotConfig
 
 _MIB = 1 << 20
 _ONLY_TO_BAG = ("numbers",)

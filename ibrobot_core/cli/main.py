@@ -12,8 +12,8 @@ import click
 
 from ibrobot_core import __version__
 from ibrobot_core.bugs import DEBUG, describe_bug
+from ibrobot_core.cli.command import let_interrupts_raise
 from ibrobot_core.errors import IbrobotError
-from ibrobot_core.command import let_interrupts_raise
 from ibrobot_core.outside import echo
 
 _FAILED, _WRONG, _INTERRUPTED = 1, 2, 130

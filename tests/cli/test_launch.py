@@ -396,7 +396,7 @@ logging.Logger.handle = log
 sys.addaudithook(hook)
 if not at:
     atexit.register(lambda: print("steps", steps, file=sys.stderr))
-from ibrobot_core.command import main
+from ibrobot_core.cli.command import main
 main()
 """
 
@@ -429,7 +429,7 @@ def test_ctrl_c_at_any_moment_of_the_start_is_one_line(site: Site, tmp_path: Pat
         code, out, err = run(at)
         codes.append(code)
         if code == 130:
-            assert (out, err) == ("", "interrupted\n"), f"step {at} of {steps}"
+            assert (out, err) == ("", "error: stopped\n"), f"step {at} of {steps}"
         else:  # it ran already, and stopped in order
             assert code == 0, err
             assert "Traceback" not in err

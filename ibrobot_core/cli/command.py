@@ -24,5 +24,5 @@ def let_interrupts_raise() -> None:
 
 def _end(number: int, frame: FrameType | None) -> None:
     """Nothing has begun that would have to be stopped; an exception could be swallowed, or told in many lines."""
-    os.write(2, b"interrupted\n")
+    os.write(2, b"error: stopped\n")
     os._exit(130)
