@@ -184,7 +184,8 @@ def test_a_dataset_of_others_is_told_by_a_robot_yaml(exact: Path, convert: Conve
             "joints": [each | {"max_velocity": 1, "max_acceleration": 1} for each in ROBOT["robot"]["joints"]],
             "groups": {"arm": list(JOINTS)},
         },
-        "simulation": {"type": "mujoco"}, "executors": {"arm": {"type": "position", "group": "arm"}},
+        "hardware": {"type": "feetech_so101", "port": "/dev/null", "calibration": "bench"},
+        "executors": {"arm": {"type": "position", "group": "arm"}},
         "control_modes": {"idle": {"executors": ["arm"]}}, "default_control_mode": "idle",
         "contract": {
             "rate_hz": 30, "observations": [{"key": "observation.state", "topic": "/joint_states"}],
