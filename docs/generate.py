@@ -24,6 +24,7 @@ SECTIONS: tuple[tuple[str, type], ...] = (
     ("contract.observations[].align", schema.Align),
     ("contract.observations[].image", schema.ImageSpec),
     ("contract.actions[]", schema.ActionSpec),
+    ("contract.signals[]", schema.SignalSpec),
     ("control_modes.NAME.inference", schema.Inference),
     ("control_modes.NAME.dispatch", schema.Dispatch),
     ("control_modes.NAME.dispatch.smoothing", schema.Smoothing),

@@ -9,7 +9,7 @@ import attrs
 
 from ibrobot_core import messages
 from ibrobot_core.config.checks import streams
-from ibrobot_core.config.schema import ActionSpec, ContractConfig, ObservationSpec
+from ibrobot_core.config.schema import ActionSpec, ContractConfig, ObservationSpec, SignalSpec
 from ibrobot_core.config.structure import Part, Parts
 from ibrobot_core.config.yaml_nodes import Document, Key
 from ibrobot_core.options import hint
@@ -19,6 +19,13 @@ PERIPHERAL_TOPICS: Mapping[str, tuple[str, type[messages.Message]]] = {
     "camera": ("/camera/{name}/image_raw", messages.Image),
 }
 """Peripheral kind -> where its messages go, and their type."""
+
+SIGNAL_TYPES: Mapping[str, str] = {
+    "task": messages.String.ros_type,
+    "next.reward": "std_msgs/msg/Float32",
+    "next.done": messages.Bool.ros_type,
+}
+"""Key of a signal -> type of its messages where the YAML does not say."""
 
 _IMAGES = (messages.Image.ros_type, messages.CompressedImage.ros_type)
 _IMAGE_KEYS = "observation.images."
@@ -62,7 +69,10 @@ class ContractChecks:
         if control is not None and contract.rate_hz > control.rate_hz:
             message = f"{contract.rate_hz} Hz is faster than the control loop, {control.rate_hz} Hz"
             self.document.add((*key, "rate_hz"), message)
-        return attrs.evolve(contract, observations=observations, actions=actions)
+        signals = tuple(
+            self._signal((*key, "signals", i), spec, contract.signals[:i]) for i, spec in enumerate(contract.signals)
+        )
+        return attrs.evolve(contract, observations=observations, actions=actions, signals=signals)
 
     def observations(self, key: Key, specs: Sequence[ObservationSpec]) -> tuple[ObservationSpec, ...]:
         """Observations with topic and type filled in."""
@@ -152,9 +162,14 @@ class ContractChecks:
             if spec.topic == JOINT_STATES and rest not in joints:
                 self.document.add(key, f"unknown joint {rest!r}{hint(rest, joints, 'known')}")
         else:
-            names = [field.name for field in attrs.fields(message_types()[spec.type])]
-            if first not in names:
-                self.document.add(key, f"{spec.type} has no field {first!r}{hint(first, names, 'its fields')}")
+            self._field(key, path, spec.type)
+
+    def _field(self, key: Key, path: str, type_: str) -> None:
+        """See that a known type has the field that a path begins with."""
+        first = path.partition(".")[0]
+        names = [field.name for field in attrs.fields(message_types()[type_])]
+        if first not in names:
+            self.document.add(key, f"{type_} has no field {first!r}{hint(first, names, 'its fields')}")
 
     def _same_kind(self, key: Key, specs: Sequence[ObservationSpec], others: Sequence[ObservationSpec]) -> None:
         """Values under one key concatenate, which an image and a vector cannot."""
@@ -223,6 +238,20 @@ class ContractChecks:
             example = "points.0.positions.0" if spec.type.endswith("JointTrajectory") else "data.0"
             message = f"needs a select: paths to numbers of {spec.type}, one for each joint, e.g. {example}"
             self.document.add(key, message)
+
+    def _signal(self, key: Key, spec: SignalSpec, earlier: Sequence[SignalSpec]) -> SignalSpec:
+        spec = attrs.evolve(spec, type=spec.type or SIGNAL_TYPES[spec.key])
+        if not spec.topic.startswith("/"):
+            self.document.add((*key, "topic"), f"a topic starts with /, got {spec.topic!r}")
+        if not _TYPE_NAME.fullmatch(spec.type):
+            self.document.add((*key, "type"), f"expected PACKAGE/msg/NAME, got {spec.type!r}")
+        if any(other.key == spec.key for other in earlier):
+            self.document.add((*key, "key"), f"{spec.key} is given twice; a row has one")
+        if len(spec.select) != 1:
+            self.document.add((*key, "select"), f"{spec.key} is one value: give one path, e.g. [data]")
+        elif spec.type in message_types():
+            self._field((*key, "select", 0), spec.select[0], spec.type)
+        return spec
 
     def _safety(self, key: Key, spec: ActionSpec, part: Part) -> ActionSpec:
         """One answer to what follows stale setpoints, in both, whether the action or the executor gives it."""

@@ -116,13 +116,31 @@ class ActionSpec:
 
 
 @attrs.frozen
+class SignalSpec:
+    """One topic that says something of the rows of a dataset which no policy sees."""
+
+    key: str = option(
+        choices=("task", "next.reward", "next.done"), help="task: text, in place of the prompt; the others: a number"
+    )
+    topic: str = option(help="where the messages come from")
+    type: str = option("", help="ROS 2 message type; of std_msgs, and String, Float32 or Bool, where it is not given")
+    select: tuple[str, ...] = option(("data",), help="the path to the text or number in the message")
+    align: str = option(
+        "hold",
+        choices=("hold", "next"),
+        help="hold: the newest message received by the tick; next: the first after it",
+    )
+
+
+@attrs.frozen
 class ContractConfig:
-    """The `contract:` section: rate, observations and actions."""
+    """The `contract:` section: rate, observations, actions and signals."""
 
     rate_hz: float = option(30.0, unit="Hz", gt=0, help="ticks of observations and actions")
     max_duration_s: float = option(90.0, unit="s", gt=0, help="longest episode")
     observations: tuple[ObservationSpec, ...] = option((), help="topics -> observation keys")
     actions: tuple[ActionSpec, ...] = option((), help="the action vector -> executors")
+    signals: tuple[SignalSpec, ...] = option((), help="topics -> task, reward and end of a dataset's rows")
 
 
 @attrs.frozen

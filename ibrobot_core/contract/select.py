@@ -209,8 +209,30 @@ def _foreign_reader(paths: list[list[str]]) -> _Read:
     return lambda message: np.array([_number_at(message, path) for path in paths], dtype=np.float64)
 
 
+def text_at(message: Message, path: str) -> str:
+    """The text that a path leads to.
+
+    Raises:
+        ContractError: when it leads to none.
+    """
+    value = _value_at(message, path.split("."))
+    if not isinstance(value, str):
+        raise ContractError(f"{path!r} leads to no text in a {message.ros_type}{_fields_of(value)}")
+    return value
+
+
 def _number_at(message: Any, path: Sequence[str]) -> float:
     """The number that a path leads to in a message whose class nobody knew before."""
+    value = _value_at(message, path)
+    if isinstance(value, int | float | np.number | np.bool_):
+        return float(value)
+    if isinstance(value, tuple | list | np.ndarray):
+        raise ContractError(f"{'.'.join(path)!r} leads to {len(value)} elements; they go by number, e.g. .0")
+    raise ContractError(f"{'.'.join(path)!r} leads to no number{_fields_of(value)}")
+
+
+def _value_at(message: Any, path: Sequence[str]) -> Any:
+    """What a path leads to in a message; None where it leads on from a number or text."""
     value: Any = message
     for depth, token in enumerate(path):
         before = ".".join(path[:depth]) or "the message"
@@ -224,13 +246,8 @@ def _number_at(message: Any, path: Sequence[str]) -> float:
                 raise ContractError(f"{before} has {len(value)} elements, element {token} is asked for")
             value = value[int(token)]
         else:
-            break
-    else:
-        if isinstance(value, int | float | np.number | np.bool_):
-            return float(value)
-    if isinstance(value, tuple | list | np.ndarray):
-        raise ContractError(f"{'.'.join(path)!r} leads to {len(value)} elements; they go by number, e.g. .0")
-    raise ContractError(f"{'.'.join(path)!r} leads to no number{_fields_of(value)}")
+            return value if isinstance(value, tuple | list | np.ndarray) else None
+    return value
 
 
 def _fields_of(value: Any) -> str:

@@ -10,13 +10,15 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.config.schema import ActionSpec, Align, ImageSpec, ObservationSpec, RobotConfig
+from ibrobot_core.config.schema import ActionSpec, Align, ImageSpec, ObservationSpec, RobotConfig, SignalSpec
 from ibrobot_core.contract.select import Selection
 from ibrobot_core.errors import ContractError
 from ibrobot_core.interfaces.dataset import Feature
 from ibrobot_core.messages import MESSAGE_TYPES
 from ibrobot_core.units import NS_PER_S
 
+TASK = "task"
+"""Key of the signal that is text: what a policy is asked to do."""
 _JOINTS_TYPE = "sensor_msgs/msg/JointState"
 _KNOWN_TYPES = {"/joint_states": _JOINTS_TYPE}
 _CAMERA_TYPE = "sensor_msgs/msg/Image"
@@ -55,9 +57,28 @@ class ActionPart:
     """Which command a tick's action is: `hold`, the newest sent by then; `next`, the first sent after it."""
 
 
+@attrs.frozen
+class SignalPart:
+    """A topic that says something of a dataset's rows which no policy sees."""
+
+    key: str
+    """`TASK`, `next.reward` or `next.done`."""
+    topic: str
+    type: str
+    path: str
+    """To the text or number in a message."""
+    align: str = "hold"
+    """As an action's."""
+
+    @property
+    def feature(self) -> Feature:
+        """The column of a dataset that it fills; a task has a column of its own kind."""
+        return Feature("bool" if self.key == "next.done" else "float32", (1,))
+
+
 @attrs.frozen(slots=False)
 class Contract:
-    """Rate, observations and actions of a robot: what recorder, converter and inference share.
+    """Rate, observations, actions and signals of a robot: what recorder, converter and inference share.
 
     Units are SI: radians, metres, seconds; vectors are float32, images (H, W, C).
     """
@@ -67,6 +88,8 @@ class Contract:
     """In file order; the parts of one key concatenate."""
     action_parts: tuple[ActionPart, ...]
     """In file order; their joints concatenate to the action vector."""
+    signal_parts: tuple[SignalPart, ...] = ()
+    """Of datasets alone."""
 
     @classmethod
     def from_config(cls, config: RobotConfig, extra: Sequence[ObservationSpec] = ()) -> Contract:
@@ -81,7 +104,8 @@ class Contract:
         """
         parts = tuple(_observation(spec, config) for spec in (*config.contract.observations, *extra))
         actions = tuple(_action(spec, config) for spec in config.contract.actions)
-        contract = cls(float(config.contract.rate_hz), parts, actions)
+        signals = tuple(_signal(spec) for spec in config.contract.signals)
+        contract = cls(float(config.contract.rate_hz), parts, actions, signals)
         twice = [joint for joint in contract.action_joints if contract.action_joints.count(joint) > 1]
         if twice:
             raise ContractError(f"joint {twice[0]!r} is in two parts of the action; each joint has one executor")
@@ -116,7 +140,11 @@ class Contract:
                 )
                 for part in canonical["action"]
             ]
-            contract = cls(float(canonical["rate_hz"]), tuple(parts), tuple(actions))
+            signals = tuple(
+                _signal(SignalSpec(each["key"], each["topic"], each["type"], (each["path"],), each["align"]))
+                for each in canonical.get("signals", ())
+            )
+            contract = cls(float(canonical["rate_hz"]), tuple(parts), tuple(actions), signals)
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise ContractError(f"not a contract as it is recorded: {error!r}") from None
         if canonical.get("version") != contract.canonical()["version"]:
@@ -141,16 +169,21 @@ class Contract:
 
     @cached_property
     def topics(self) -> Mapping[str, str]:
-        """Every topic of the contract, observations and actions: topic -> message type."""
-        parts: Iterable[ObservationPart | ActionPart] = (*self.observation_parts, *self.action_parts)
+        """Every topic of the contract, observations, actions and signals: topic -> message type."""
+        parts: Iterable[ObservationPart | ActionPart | SignalPart]
+        parts = (*self.observation_parts, *self.action_parts, *self.signal_parts)
         return {part.topic: part.type for part in parts}
+
+    def without_signals(self) -> Contract:
+        """What robots and policies share of it, and what a dataset gives back."""
+        return attrs.evolve(self, signal_parts=())
 
     def parts(self, key: str) -> tuple[ObservationPart, ...]:
         """The parts of an observation key, in file order."""
         return tuple(part for part in self.observation_parts if part.key == key)
 
     def features(self) -> dict[str, Feature]:
-        """All columns of a dataset made by this contract, as LeRobot describes them: observations, then `action`."""
+        """Columns of a dataset made by this contract, as LeRobot describes them: observations, then `action`."""
         names = tuple(f"{joint}.pos" for joint in self.action_joints)
         action = {"action": Feature("float32", (len(names),), names)} if names else {}
         return {**self.observations, **action}
@@ -171,7 +204,7 @@ class Contract:
                 | ({"align": p.align} if p.align != "hold" else {})
                 for p in self.action_parts
             ],
-        }
+        } | ({"signals": [attrs.asdict(p) for p in self.signal_parts]} if self.signal_parts else {})
 
     def fingerprint(self) -> str:
         """SHA-256, 64 hexadecimal digits, of `canonical`: equal if and only if the same messages give the same data."""
@@ -284,6 +317,18 @@ def _action(spec: ActionSpec, config: RobotConfig) -> ActionPart:
     return ActionPart(executor.name, spec.topic, spec.type, spec.safety_behavior, executor.joints, select, spec.align)
 
 
+def _signal(spec: SignalSpec) -> SignalPart:
+    (path,) = spec.select
+    if spec.key != TASK:
+        try:
+            size = Selection(spec.type, spec.select, foreign=True).size
+        except ContractError as error:
+            raise ContractError(f"{spec.key}: {spec.topic}: {error}") from None
+        if size != 1:
+            raise ContractError(f"{spec.key}: {spec.topic}: {path!r} must lead to one number, e.g. {path}.0")
+    return SignalPart(spec.key, spec.topic, spec.type, path, spec.align)
+
+
 def _joined(features: list[Feature]) -> Feature:
     if len(features) == 1:
         return features[0]
@@ -311,6 +356,7 @@ def _flat(canonical: Mapping[str, Any]) -> dict[str, str]:
     for key, parts in canonical["observations"].items():
         for i, part in enumerate(parts):
             rows[f"{key}[{i}]" if len(parts) > 1 else key] = _line(part)
+    rows |= {each["key"]: _line(each) for each in canonical.get("signals", ())}
     rows["action"] = "; ".join(_line(part) for part in canonical["action"]) or "(none)"
     return rows
 

@@ -31,6 +31,7 @@ from ibrobot_core.launch.episodes import Episodes
 from ibrobot_core.launch.feeder import Feeder
 from ibrobot_core.launch.models import check_contract
 from ibrobot_core.launch.session import Session
+from ibrobot_core.messages import MESSAGE_TYPES
 from ibrobot_core.recording.episode import is_kept
 
 
@@ -125,6 +126,12 @@ def build_plan(session: Session) -> LaunchPlan:
         raise NotSupported(
             f"contract: {foreign.key}: {foreign.topic} is foreign, and comes from bags alone: this contract is for "
             "`ibrobot convert`; a robot's own has nothing of the kind"
+        )
+    unknown = next((spec for spec in config.contract.signals if spec.type not in MESSAGE_TYPES), None)
+    if unknown is not None and config.recording is not None:
+        raise NotSupported(
+            f"contract.signals: {unknown.key}: {unknown.type} cannot be recorded here, but only be read from bags; "
+            f"known are: {', '.join(MESSAGE_TYPES)}"
         )
     if session.request.lockstep and share.subscribe:
         raise NotSupported("transport.share.subscribe: in lockstep nothing may come from other machines, at any time")

@@ -8,7 +8,7 @@ import logging
 import os
 import shutil
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ibrobot_core.calibration import Calibration, JointCalibration
 from ibrobot_core.clock import RealClock
 from ibrobot_core.contract.joint_units import JointUnits
-from ibrobot_core.contract.specs import Contract
+from ibrobot_core.contract.specs import TASK, Contract
 from ibrobot_core.errors import ContractError, DatasetError, IbrobotError, RecorderError
 from ibrobot_core.interfaces import Context, DatasetWriter, EpisodeAddress, EpisodeReader, EpisodeSummary, Feature
 from ibrobot_core.plugins import installed
@@ -32,6 +32,8 @@ SUCCESS = "next.success"
 DATASET = "dataset"
 """The dataset within a unit."""
 _RECORD = "episode.json"
+type _Row = tuple[dict[str, NDArray[Any]], str]
+"""Key -> value, and the task."""
 _VERSION = 3
 """Of what a unit is made of; older ones are made anew."""
 
@@ -175,18 +177,19 @@ def _write(
     ticks = Ticks(reader, contract, request.missing)
     writer = make_writer(request)
     features: dict[str, Feature] = {}
-    waiting: dict[str, NDArray[Any]] | None = None
-    frames = 0
+    waiting: _Row | None = None
+    frames, tasks = 0, dict[str, None]()
     try:
         for row in ticks:
-            values = units(row)
+            values, task = _labelled(units(row), contract, ticks.tasks, report.prompt)
             if waiting is None:
                 features = _features(contract, values, request.success)
                 folder.mkdir(parents=True)
                 writer.create(folder / DATASET, contract.rate_hz, features, {"robot_type": robot_type})
             else:
                 _add(writer, waiting, request, report, last=False)
-            waiting, frames = values, frames + 1
+            waiting, frames = (values, task), frames + 1
+            tasks.setdefault(task)
             progress(1)
         assert waiting is not None
         _add(writer, waiting, request, report, last=True)
@@ -195,7 +198,7 @@ def _write(
         writer.finalize()
     report = attrs.evolve(
         report, frames=frames, skipped=ticks.skipped, cuts=tuple(ticks.cuts), held=ticks.held, gaps=ticks.gaps,
-        resets=dict(ticks.resets),
+        resets=dict(ticks.resets), prompt="; ".join(tasks),
     )  # fmt: skip
     unit = Unit(
         job.unit, key, report, contract.rate_hz, features, contract.canonical(), robot_type, calibration, document,
@@ -206,17 +209,25 @@ def _write(
     return unit
 
 
-def _add(
-    writer: DatasetWriter, values: dict[str, NDArray[Any]], request: Request, report: EpisodeReport, *, last: bool
-) -> None:
+def _labelled(values: dict[str, NDArray[Any]], contract: Contract, tasks: Sequence[str], prompt: str) -> _Row:
+    """A row with its signals as the dataset has them, and its task: the prompt where no topic gives one."""
+    signals = {part.key: values[part.key].astype(part.feature.dtype) for part in contract.signal_parts}
+    number = signals.pop(TASK, None)
+    rest = {key: value for key, value in values.items() if key != TASK}
+    return rest | signals, prompt if number is None else tasks[int(number[0])]
+
+
+def _add(writer: DatasetWriter, row: _Row, request: Request, report: EpisodeReport, *, last: bool) -> None:
+    values, task = row
     if request.success:
         values = values | {SUCCESS: np.array([last and report.outcome == "success"])}
-    writer.add_frame(values, report.prompt)
+    writer.add_frame(values, task)
 
 
 def _features(contract: Contract, values: Mapping[str, NDArray[Any]], success: bool) -> dict[str, Feature]:
-    """The contract's features, with the sizes that only the messages know."""
+    """The contract's features, with the sizes that only the messages know, and its signals."""
     features = {key: attrs.evolve(each, shape=values[key].shape) for key, each in contract.features().items()}
+    features |= {part.key: part.feature for part in contract.signal_parts if part.key != TASK}
     return features | ({SUCCESS: Feature("bool", (1,))} if success else {})
 
 

@@ -69,7 +69,9 @@ def told_by(
         calibration: joint -> fields of `JointCalibration`, for a unit that needs them.
     """
     document = json.loads(json.dumps(config.document, default=str))
-    told = _described(Contract.from_config(config), document, {"told": calibration} if calibration else {})
+    told = _described(
+        Contract.from_config(config).without_signals(), document, {"told": calibration} if calibration else {}
+    )
     return told | ({"norm_mode": norm_mode} if norm_mode else {})
 
 
@@ -110,7 +112,7 @@ def origin(root: Path, metadata: Mapping[str, Any], number: int, told: Mapping[s
         episode = metadata["episodes"][number]
         calibration = metadata["calibrations"][episode["calibration"]] if episode["calibration"] else {}
         document = metadata["configs"][episode["config"]] if episode.get("config") else {}
-        contract = Contract.from_canonical(metadata["contract"])
+        contract = Contract.from_canonical(metadata["contract"]).without_signals()
         recorded = dict(episode.get("recorded", {}))
         norm_mode = metadata["conversion"]["norm_mode"]
         told_apart = {"prompt": episode["prompt"], "source": f"{root.resolve().name}:{number}"}

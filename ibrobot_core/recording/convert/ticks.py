@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from ibrobot_core.config.schema import Align
 from ibrobot_core.contract.frames import FrameAssembler, assemble
-from ibrobot_core.contract.specs import ActionPart, Contract, ObservationPart
+from ibrobot_core.contract.select import text_at
+from ibrobot_core.contract.specs import TASK, ActionPart, Contract, ObservationPart, SignalPart
 from ibrobot_core.errors import RecorderError
 from ibrobot_core.interfaces import EpisodeReader, Feature, Recorded
-from ibrobot_core.messages import Message
+from ibrobot_core.messages import Int32, Message
 from ibrobot_core.units import seconds
 
 ACTION = "action"
@@ -32,7 +33,7 @@ def with_action(contract: Contract) -> Contract:
     With `align: hold` a row has the command in effect at its tick: what the robot was following when it saw the
     observation, the safety layer's limits included. At the control rate that is one control period old at most; of
     commands as slow as the ticks it is the one before the observation. With `align: next` it is the first command
-    after the tick.
+    after the tick. Signals are aligned likewise; tasks come as their numbers in `Ticks.tasks`.
     """
     features = {part.topic: Feature("float32", (len(part.joints),)) for part in contract.action_parts}
     parts = tuple(
@@ -41,24 +42,39 @@ def with_action(contract: Contract) -> Contract:
         )
         for part in contract.action_parts
     )
-    return attrs.evolve(contract, observation_parts=(*contract.observation_parts, *parts), action_parts=())
+    signals = tuple(
+        ObservationPart(part.key, _source_of(part), *_read_as(part), None, _COMMAND, part.feature)
+        for part in contract.signal_parts
+    )
+    every = (*contract.observation_parts, *parts, *signals)
+    return attrs.evolve(contract, observation_parts=every, action_parts=(), signal_parts=())
 
 
-def _source_of(part: ActionPart) -> str:
-    """What the stream of a part's commands is called: its topic, or a name of its own where it is shifted in time."""
-    return part.topic if part.align == "hold" else f"{part.topic} (next)"
+def _source_of(part: ActionPart | SignalPart) -> str:
+    """What the stream of a part's messages is called: its topic, or a name of its own where they are changed."""
+    changes = ["next"] * (part.align == "next") + [TASK] * _is_task(part)
+    return f"{part.topic} ({', '.join(changes)})" if changes else part.topic
+
+
+def _read_as(part: SignalPart) -> tuple[str, tuple[str, ...]]:
+    """Type and path of the messages in a signal's stream."""
+    return (Int32.ros_type, ("data",)) if part.key == TASK else (part.type, (part.path,))
+
+
+def _is_task(part: ActionPart | SignalPart) -> bool:
+    return isinstance(part, SignalPart) and part.key == TASK
 
 
 class _Following:
-    """The commands of a topic, each as if received when the one before it was, or the episode began.
+    """The messages of a topic, each as if received when the one before it was, or the episode began.
 
     The newest of these by a tick is then the first that was really received after it.
     """
 
-    def __init__(self, reader: EpisodeReader, part: ActionPart) -> None:
+    def __init__(self, reader: EpisodeReader, part: ActionPart | SignalPart) -> None:
         self._reader, self._part = reader, part
         self.end_ns: int | None = None
-        """Receipt of the last command [ns], which none follows; None as long as it is not known."""
+        """Receipt of the last message [ns], which none follows; None as long as it is not known."""
 
     def __iter__(self) -> Iterator[Recorded]:
         before_ns = self._reader.summary().start_ns
@@ -68,21 +84,41 @@ class _Following:
         self.end_ns = before_ns
 
 
+class _Tasks:
+    """Messages with a text, each as the number of its text in `texts`."""
+
+    def __init__(self, messages: Iterable[Recorded], part: SignalPart, texts: list[str]) -> None:
+        self._messages, self._part, self._texts = messages, part, texts
+
+    def __iter__(self) -> Iterator[Recorded]:
+        for item in self._messages:
+            text = text_at(item.message, self._part.path)
+            if text not in self._texts:
+                self._texts.append(text)
+            yield attrs.evolve(item, topic=_source_of(self._part), message=Int32(self._texts.index(text)))
+
+
 class _Source:
     """An episode's messages, and the ticks from the first to the last of them."""
 
-    def __init__(self, reader: EpisodeReader, contract: Contract) -> None:
-        self._following = [_Following(reader, part) for part in contract.action_parts if part.align == "next"]
+    def __init__(self, reader: EpisodeReader, contract: Contract, tasks: list[str]) -> None:
+        aligned: tuple[ActionPart | SignalPart, ...] = (*contract.action_parts, *contract.signal_parts)
+        shifted = {_source_of(part): _Following(reader, part) for part in aligned if part.align == "next"}
+        self._following = list(shifted.values())
         direct = {part.topic for part in contract.observation_parts}
-        direct |= {part.topic for part in contract.action_parts if part.align == "hold"}
-        streams: list[Iterable[Recorded]] = [reader.messages(direct), *self._following]
-        self._messages = heapq.merge(*streams, key=lambda item: item.received_ns)
+        direct |= {part.topic for part in aligned if _source_of(part) == part.topic}
+        streams: dict[str, Iterable[Recorded]] = {"": reader.messages(direct), **shifted}
+        for part in contract.signal_parts:
+            if part.key == TASK:
+                name = _source_of(part)
+                streams[name] = _Tasks(shifted.get(name) or reader.messages({part.topic}), part, tasks)
+        self._messages = heapq.merge(*streams.values(), key=lambda item: item.received_ns)
         self._read: deque[Recorded] = deque(islice(self._messages, 1))
         """Read ahead, to know whether there is a message at or after a tick."""
         self._newest_ns = self.first_ns = self._read[0].received_ns if self._read else 0
 
     def is_over(self, t_ns: int) -> bool:
-        """Whether no command follows tick `t_ns` [ns] where one has to."""
+        """Whether no command or signal follows tick `t_ns` [ns] where one has to."""
         return any(each.end_ns is not None and t_ns >= each.end_ns for each in self._following)
 
     def __iter__(self) -> Iterator[tuple[str, Message, int]]:
@@ -138,8 +174,11 @@ class Ticks:
             has = ", ".join(sorted(present)) or "none"
             raise RecorderError(f"no message of {', '.join(absent)}, which the contract has; there are: {has}")
         self._contract = with_action(contract)
+        self._signals = frozenset(_source_of(part) for part in contract.signal_parts)
         self._missing = missing
-        self._source = _Source(reader, contract)
+        self.tasks: list[str] = []
+        """The texts of the task's topic; a row has the number of its own."""
+        self._source = _Source(reader, contract, self.tasks)
         self._assembler = FrameAssembler(self._contract)
         self.cuts: list[tuple[int, int]] = []
         """Where ticks were left out: the number of the row that follows, from 0, and how many ticks."""
@@ -154,8 +193,8 @@ class Ticks:
 
     @property
     def resets(self) -> Mapping[str, int]:
-        """How often the stamps of a topic jumped, per topic; topics without a jump left out."""
-        return self._assembler.resets()
+        """How often the stamps of a topic jumped; topics without a jump are left out, and signals, which may pause."""
+        return {topic: count for topic, count in self._assembler.resets().items() if topic not in self._signals}
 
     def __iter__(self) -> Iterator[dict[str, NDArray[Any]]]:
         """Key -> value of each row; once.

@@ -132,11 +132,12 @@ class _Job:
         return summary.metadata.get("source", self._path.name)
 
     def _check(self, summary: EpisodeSummary) -> Contract:
-        request, contract = self._request, Contract.from_canonical(json.loads(summary.metadata["contract"]))
-        if request.contract is not None and request.contract.fingerprint() != contract.fingerprint():
-            difference = request.contract.difference(contract, names=("--config", "dataset"))
+        contract = Contract.from_canonical(json.loads(summary.metadata["contract"]))
+        asked = self._request.contract.without_signals() if self._request.contract is not None else contract
+        if asked.fingerprint() != contract.fingerprint():
+            difference = asked.difference(contract, names=("--config", "dataset"))
             raise ContractError(f"{self._path}: was made with another contract than --config's:\n{difference}")
-        Dataset(request.out).check(contract)
+        Dataset(self._request.out).check(contract)
         return contract
 
     def _write(
