@@ -248,7 +248,7 @@ class ContractChecks:
         if any(other.key == spec.key for other in earlier):
             self.document.add((*key, "key"), f"{spec.key} is given twice; a row has one")
         if len(spec.select) != 1:
-            self.document.add((*key, "select"), f"{spec.key} is one value: give one path, e.g. [data]")
+            self.document.add((*key, "select"), f"{spec.key} takes one path, e.g. [data]")
         elif spec.type in message_types():
             self._field((*key, "select", 0), spec.select[0], spec.type)
         return spec
