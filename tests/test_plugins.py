@@ -7,9 +7,11 @@ import subprocess
 import sys
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pytest
 
-from ibrobot_core.errors import PluginError
+from ibrobot_core.errors import ContractError, PluginError
+from ibrobot_core.messages import CompressedImage, Header
 from ibrobot_core.plugins import KINDS, Registry, discover
 
 if TYPE_CHECKING:
@@ -99,6 +101,29 @@ def registry(site: Site) -> Registry:
     site.add("fake-twin", DUPLICATE)
     site.add("fake-wrong", WRONG_ARGUMENT)
     return discover(site.entry_points())
+
+
+DECODERS = """
+from ibrobot_core import hookimpl
+from ibrobot_core.descriptors import DecoderDescriptor
+
+@hookimpl
+def ibrobot_decoders():
+    yield DecoderDescriptor(("empty",), lambda: lambda picture: "nothing" if not picture.data.size else None)
+    yield DecoderDescriptor(("any", "short"), lambda: lambda picture: "something" if picture.data.size < 5 else None)
+"""
+
+
+def test_the_first_decoder_that_knows_a_picture_decodes_it(site: Site) -> None:
+    site.add("fake-decoders", DECODERS)
+    registry = discover(site.entry_points())
+
+    def picture(size: int) -> CompressedImage:
+        return CompressedImage(Header(), "odd", np.zeros(size, np.uint8))
+
+    assert [registry.decode(picture(size)) for size in (0, 1)] == ["nothing", "something"]
+    with pytest.raises(ContractError, match=r"no installed plugin decodes a 'odd' picture; .* are: any, empty, short"):
+        registry.decode(picture(9))
 
 
 def test_a_good_plugin_works_beside_broken_ones(registry: Registry) -> None:

@@ -16,12 +16,15 @@ from ibrobot_core.bus import Bus
 from ibrobot_core.clock import SteppedClock
 from ibrobot_core.config.schema import Align, ImageSpec, ObservationSpec
 from ibrobot_core.contract import frames as frames_module
+from ibrobot_core.contract import image as image_module
 from ibrobot_core.contract.frames import FrameAssembler, FrameSampler, assemble, frames
 from ibrobot_core.contract.image import encode_image
 from ibrobot_core.contract.specs import Contract
+from ibrobot_core.descriptors import DecoderDescriptor
 from ibrobot_core.errors import ContractError
 from ibrobot_core.interfaces.policy import Frame
-from ibrobot_core.messages import CompressedImage, Float64MultiArray, Header, Imu, JointState, Message, Vector3
+from ibrobot_core.messages import CompressedImage, Float64MultiArray, Header, Image, Imu, JointState, Message, Vector3
+from ibrobot_core.plugins import Registry
 from ibrobot_core.testing.contexts import ARM, GRIPPER, START_NS
 
 Make = Callable[..., Any]
@@ -184,6 +187,28 @@ def test_samples_are_decoded_once_and_only_when_a_frame_asks(
     first, second = assembler.frame(95 * MS), assembler.frame(100 * MS)
     assert decoded == [90 * MS]
     assert first.values["observation.images.top"] is second.values["observation.images.top"]
+
+
+def test_compressed_pictures_are_decoded_once_and_only_when_a_frame_asks(
+    contract: Contract, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    decoded: list[int] = []
+
+    def grey(picture: CompressedImage) -> Image:
+        decoded.append(picture.header.stamp_ns)
+        return encode_image(np.full((4, 6, 3), picture.data[0], np.uint8), "rgb8", picture.header)
+
+    registry = Registry(decoders=[DecoderDescriptor(("grey",), lambda: grey)])
+    monkeypatch.setattr(image_module, "installed", lambda: registry)
+    assembler = FrameAssembler(contract, keys=["observation.images.top"])
+    for k in range(10):
+        picture = CompressedImage(Header(k * 10 * MS), "grey", np.array([k], np.uint8))
+        assembler.take("/camera/top/image_raw", picture, k * 10 * MS)
+        assembler.advance(k * 10 * MS)
+    first, second = assembler.frame(95 * MS), assembler.frame(100 * MS)
+    assert decoded == [90 * MS]
+    assert first.values["observation.images.top"] is second.values["observation.images.top"]
+    assert (first.values["observation.images.top"] == 9).all()
 
 
 def test_arrays_of_frames_are_read_only_and_messages_are_not_touched(contract: Contract) -> None:

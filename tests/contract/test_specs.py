@@ -75,6 +75,12 @@ def test_images(make_config: Make, peripheral: str, image: ImageSpec | None, exp
     assert made.topics[f"/camera/{peripheral}/image_raw"] == "sensor_msgs/msg/Image"
 
 
+def test_a_compressed_picture_is_a_picture(make_config: Make) -> None:
+    raw = ObservationSpec("observation.images.desk", topic="/desk", type="sensor_msgs/msg/Image")
+    compressed = attrs.evolve(raw, type="sensor_msgs/msg/CompressedImage")
+    assert contract(make_config, compressed).fingerprint() == contract(make_config, raw).fingerprint()
+
+
 def test_a_message_without_a_header_goes_by_its_receipt(make_config: Make) -> None:
     made = contract(make_config, STATE, SCENE)
     assert [part.align.stamp for part in made.observation_parts] == ["header", "receive"]
