@@ -161,9 +161,13 @@ class Capture:
         options = self._options
         if options.fourcc is not None:
             return options.fourcc
-        wanted = (options.width, options.height)
-        offered = {mode.fourcc for mode in modes(self._device.target) if None in wanted or mode.size == wanted}
+        offered = {mode.fourcc for mode in modes(self._device.target) if self._fits(mode)}
         return _MJPG if _MJPG in offered or not offered else None
+
+    def _fits(self, mode: Mode) -> bool:
+        """Whether a mode has the size and the rate that the YAML asks for."""
+        size, fps = (self._options.width, self._options.height), self._options.fps
+        return (None in size or mode.size == size) and (fps is None or any(_equal(fps, r) for r in mode.rates_hz))
 
     def _take_jpeg(self) -> bool:
         """Whether the source sends JPEG and it is wanted as it is; OpenCV then gives the bytes in one row."""
@@ -207,7 +211,7 @@ class Capture:
             found.append(f"gives {size[0]}x{size[1]}, {options.width}x{options.height} was asked for")
         # A stream's rate is its sender's; what FFmpeg says of it is often a guess.
         rate = get(cv2.CAP_PROP_FPS) if self._device.kind != "stream" else 0.0
-        if options.fps is not None and rate and abs(rate - options.fps) > 0.01 * options.fps:
+        if options.fps is not None and rate and not _equal(options.fps, rate):
             found.append(f"gives {rate:g} Hz, {options.fps:g} was asked for")
         code = self._format()
         if self._device.kind == "v4l2" and options.fourcc is not None and code != options.fourcc:
@@ -231,6 +235,11 @@ class Capture:
 
     def _error(self, what: str) -> SensorError:
         return SensorError(f"camera {self._name}: {self._device}: {what}")
+
+
+def _equal(asked_hz: float, given_hz: float) -> bool:
+    """Whether two rates are the same: drivers round them."""
+    return abs(given_hz - asked_hz) <= 0.01 * asked_hz
 
 
 @contextmanager

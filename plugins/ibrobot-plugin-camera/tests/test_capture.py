@@ -86,10 +86,17 @@ class TestMotionJpeg:
         self.patch = monkeypatch
 
     def open(
-        self, pictures: list[np.ndarray | None], formats: tuple[str, ...], sizes: Any = ((4, 3),), **options: Any
+        self,
+        pictures: list[np.ndarray | None],
+        formats: tuple[str, ...],
+        sizes: Any = ((4, 3),),
+        mjpg_hz: float = 30.0,
+        **options: Any,
     ) -> tuple[Capture, Scripted]:
         device = Scripted(pictures, formats)
-        offered = tuple(Mode(each, *size, (30.0,)) for each, size in zip(formats, sizes, strict=True))
+        offered = tuple(
+            Mode(each, *size, (mjpg_hz if each == "MJPG" else 30.0,)) for each, size in zip(formats, sizes, strict=True)
+        )
         self.patch.setattr(capture_module.Capture, "_open", lambda self: device)
         self.patch.setattr(capture_module, "modes", lambda path: offered)
         return Capture(Device("v4l2", "/dev/video7"), OpenCvOptions(device=7, **options), "top"), device
@@ -111,6 +118,10 @@ class TestMotionJpeg:
         assert isinstance(picture.content, CompressedImage)
         assert picture.content.data.size == whole.size
         assert capture.read() is None
+
+    def test_what_is_offered_at_another_rate_only_is_not_asked_for(self) -> None:
+        _, device = self.open([], ("YUYV", "MJPG"), ((4, 3), (4, 3)), mjpg_hz=15.0, fps=30.0, width=4, height=3)
+        assert cv2.CAP_PROP_FOURCC not in device.properties
 
     def test_what_is_offered_in_another_size_only_is_not_asked_for(self) -> None:
         pixels = np.zeros((3, 4, 3), np.uint8)
