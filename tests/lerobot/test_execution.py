@@ -36,6 +36,7 @@ robot:
   name: mini
   joints: [{{name: pan, lower: -1.0, upper: 1.0, max_velocity: 2.0, max_acceleration: 10.0}}]
   groups: {{arm: [pan]}}
+  description: {{mjcf: package://so101_nexus/assets/SO101_menagerie/so101.xml, poses: {{rest: [0.0]}}}}
 simulation: {{type: mujoco}}
 executors: {{arm_position: {{type: position, group: arm}}}}
 models: {{net: {{type: lerobot, path: {path}, threads: 1, device: cpu}}}}
