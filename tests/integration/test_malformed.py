@@ -55,7 +55,7 @@ def test_one_error_and_the_same_from_both(
     sim = ("--sim",) if case.get("sim") else ()
 
     checked = run(monkeypatch, capsys, "config", "check", "robot.yaml", *sim)
-    launched = run(monkeypatch, capsys, "launch", "robot.yaml", "--headless", *sim)
+    launched = run(monkeypatch, capsys, "launch", "robot.yaml", "--dry-run", *sim)
 
     assert checked == launched
     code, err = checked
