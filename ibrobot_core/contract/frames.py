@@ -18,7 +18,7 @@ from ibrobot_core.contract.select import Selection
 from ibrobot_core.contract.specs import Contract, ObservationPart
 from ibrobot_core.errors import ContractError
 from ibrobot_core.interfaces.policy import Frame
-from ibrobot_core.messages import CompressedImage, Message
+from ibrobot_core.messages import MESSAGE_TYPES, CompressedImage, Message
 
 _IMAGE_DEPTH = 32
 _VECTOR_DEPTH = 256
@@ -43,7 +43,12 @@ class _Part:
     def take(self, message: Message, received_ns: int) -> None:
         if message.ros_type != self.part.type and not (self.part.image and isinstance(message, CompressedImage)):
             raise ContractError(f"{self.part.key}: {self.part.topic} is a {self.part.type}, got a {message.ros_type}")
-        stamp_ns = message.header.stamp_ns if hasattr(message, "header") else None
+        known = MESSAGE_TYPES.get(message.ros_type)
+        if known is not None and not isinstance(message, known):
+            raise ContractError(
+                f"{self.part.key}: {self.part.topic}: its bag defines {message.ros_type} otherwise than ROS 2 does"
+            )
+        stamp_ns = getattr(getattr(message, "header", None), "stamp_ns", None)
         if stamp_ns is None and self.part.align.stamp == "header":  # of a type that nobody knew before
             raise ContractError(f"{self.part.key}: a {self.part.type} has no header; give `align: {{stamp: receive}}`")
         self.stream.add(stamp_ns, received_ns, message)

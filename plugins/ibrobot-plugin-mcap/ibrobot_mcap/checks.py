@@ -40,10 +40,10 @@ def problems_of(path: Path, longest_gap: float) -> list[str]:
             problems.append("unfinished; `ibrobot episodes repair` makes it whole")
         for item in reader.messages():
             stamps[item.topic].append(item.received_ns)
-            header = getattr(item.message, "header", None)
-            if header is not None:
-                back[item.topic] += header.stamp_ns < last_header.get(item.topic, header.stamp_ns)
-                last_header[item.topic] = header.stamp_ns
+            stamp_ns = getattr(getattr(item.message, "header", None), "stamp_ns", None)
+            if stamp_ns is not None:
+                back[item.topic] += stamp_ns < last_header.get(item.topic, stamp_ns)
+                last_header[item.topic] = stamp_ns
     except RecorderError as error:
         problems.append(str(error))
     finally:

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from ibrobot_mcap import ibrobot_readers
+from ibrobot_mcap.checks import problems_of
 from ibrobot_mcap.reader import Rosbag2Reader, is_rosbag2
 from ibrobot_mcap.scan import McapFile
 from ibrobot_ros2 import definition, encode
@@ -20,10 +21,14 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagsWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from ibrobot_core.config.schema import Align
 from ibrobot_core.contract.image import pixels
-from ibrobot_core.errors import RecorderError
+from ibrobot_core.contract.specs import Contract, ObservationPart
+from ibrobot_core.errors import IbrobotError, RecorderError
+from ibrobot_core.interfaces import Feature
 from ibrobot_core.messages import CompressedImage, Header, Image, JointState
 from ibrobot_core.plugins import installed
+from ibrobot_core.recording.convert.ticks import Ticks
 
 from .conftest import CAMERA, JOINTS, Bench, joints, picture, read, reading, stamp, summary
 
@@ -257,6 +262,21 @@ def test_sqlite_message_with_another_time_than_its_index_is_damage(tmp_path, whe
     file.write_bytes(before + first + middle + second + after)
     with pytest.raises(RecorderError, match="is damaged: its messages have other times than its index says"):
         read(tmp_path / "bag")
+
+
+@pytest.mark.parametrize(("old", "new"), [("[] name", "[] nAme"), ("[] position", " position"), ("header", "hEader")])
+def test_standard_type_that_a_bag_defines_otherwise_gives_no_rows(tmp_path, old, new):
+    """Its messages have the standard type's name and not its fields; a damaged definition is one way to get there."""
+    file = tmp_path / "file.mcap"
+    text = definition(JointState.ros_type)
+    assert old in text
+    foreign_file(file, JointState.ros_type, text.replace(old, new), [bytes(encode(joints(0)))])
+    part = ObservationPart(
+        "observation.state", "/it", JointState.ros_type, ("position.pan",), None, Align(), Feature("float32", (1,))
+    )
+    with reading(file) as reader, pytest.raises(IbrobotError, match="/it"):
+        list(Ticks(reader, Contract(100.0, (part,), ()), "refuse"))
+    problems_of(file, longest_gap=10.0)  # raises nothing
 
 
 def foreign_file(path, type_name, text, payloads, encoding="ros2msg"):
