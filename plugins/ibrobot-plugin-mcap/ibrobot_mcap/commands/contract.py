@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from ibrobot_core.errors import RecorderError
+from ibrobot_core.outside import echo
 
 
 @click.group()
@@ -28,11 +29,11 @@ def init(bag: Path, output: Path | None) -> None:
     with opened(bag) as reader:
         text = draft(reader)
     if output is None:
-        click.echo(text, nl=False)
+        echo(text, nl=False)
         return
     try:
         with output.open("x", encoding="utf-8") as file:
             file.write(text)
     except OSError as error:
         raise RecorderError(f"{output}: cannot be written: {error.strerror}") from error
-    click.echo(f"{output}: read it, then ibrobot convert {bag} --config {output} --out DATASET")
+    echo(f"{output}: read it, then ibrobot convert {bag} --config {output} --out DATASET")
