@@ -125,7 +125,15 @@ _ONE_WAY = {Path("ibrobot_core/outside.py"), Path("ibrobot_core/screen.py")}
 
 def ways_around(tree: ast.AST) -> Iterator[str]:
     """What a module does that shows text by another way than `echo`, `LogFormatter` and `Screen`."""
+    types_only = {
+        each
+        for node in ast.walk(tree)
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+        for each in ast.walk(node)
+    }
     for node in ast.walk(tree):
+        if node in types_only:
+            continue
         if isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] == "rich":
             yield from (f"rich's {each.name}: use {_RICH[each.name]}" for each in node.names if each.name in _RICH)
         elif isinstance(node, ast.Import):

@@ -5,19 +5,22 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Iterator, Sequence
-from typing import override
+from typing import TYPE_CHECKING, override
 
 import numpy as np
-from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
+from rich.console import ConsoleOptions, Group, RenderableType, RenderResult
 from rich.progress_bar import ProgressBar
 from rich.segment import Segment
 from rich.table import Table
-from rich.text import Text
 
 from ibrobot_core.control.core import EMERGENCY_STOP
 from ibrobot_core.launch.session import Session
 from ibrobot_core.screen import text
 from ibrobot_core.units import NS_PER_S
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.text import Text
 
 KEYS = {"Esc": "emergency stop", "F10": "reset", "Ctrl-C": "end"}
 LOOP = ""
