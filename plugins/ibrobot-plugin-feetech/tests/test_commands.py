@@ -166,8 +166,8 @@ def test_ctrl_c_at_a_question_leaves_servos_and_files_as_they_were(emulator, per
                 break
             terminal.type("y\r" if asked.endswith("?") else "\r")
         terminal.interrupt()
-        terminal.wait_for("Aborted!")
-        assert terminal.end() == 1
+        terminal.wait_for("error: stopped")
+        assert terminal.end() == 130
     assert ("Nothing was written" in terminal.screen) == (question in QUESTIONS[2:])
     assert eprom(emulator) == before
     assert former.read_text() == "{}"
@@ -180,7 +180,7 @@ def test_an_existing_file_is_not_overwritten_against_the_answer(emulator, home):
     with Terminal("feetech", "calibrate", emulator.port, "--leader") as terminal:
         terminal.wait_for("Calibrate anew? [y/N]")
         terminal.type("n\r")
-        assert terminal.end() == 1
+        assert terminal.end() == 130
     assert (home / "so101_leader.json").read_text() == "{}"
 
 
@@ -320,7 +320,7 @@ def test_drift_is_reported_and_written_back(emulator, calibration_file):
     with Terminal("feetech", *arguments, "--write") as terminal:
         terminal.wait_for("Write to servos 3? [y/N]")
         terminal.interrupt()
-        assert terminal.end() == 1
+        assert terminal.end() == 130
     assert emulator.servos[3].get("homing_offset") == 99
     assert ran(*arguments, "--write", "--yes")[0] == 0
     assert (
@@ -350,7 +350,7 @@ def test_several_servos_are_refused_and_nothing_is_set(emulator):
     with Terminal("feetech", "setup-motors", emulator.port) as terminal:
         terminal.wait_for("Then press Enter")
         terminal.interrupt()
-        assert terminal.end() == 1
+        assert terminal.end() == 130
     assert eprom(emulator) == before
 
 
@@ -393,7 +393,7 @@ def test_torque_comes_without_a_jump_and_goes_after_asking(emulator):
     with Terminal("feetech", "torque", "off", emulator.port, "--joint", "gripper") as terminal:
         terminal.wait_for("Torque off? [y/N]")
         terminal.interrupt()
-        assert terminal.end() == 1
+        assert terminal.end() == 130
     assert emulator.servos[6].torque
     with Terminal("feetech", "torque", "off", emulator.port, "--joint", "gripper") as terminal:
         terminal.wait_for("Torque off? [y/N]")
@@ -489,4 +489,4 @@ def test_the_port_is_found_by_pulling_its_cable_and_putting_it_back(tmp_path):
     with Terminal("feetech", "find-port", before=before) as terminal:
         terminal.wait_for("Then press Enter")
         terminal.interrupt()
-        assert terminal.end() == 1
+        assert terminal.end() == 130
