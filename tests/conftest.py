@@ -11,8 +11,15 @@ from pathlib import Path
 import attrs
 import pytest
 
+from ibrobot_core import outside
 from ibrobot_core.plugins import installed
 from ibrobot_core.testing.leaks import no_leaks  # noqa: F401
+
+
+@pytest.fixture(autouse=True)
+def no_secrets_of_other_tests(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A process hides its secrets wherever they come; here each test is a process."""
+    monkeypatch.setattr(outside, "_secrets", set())
 
 
 @attrs.define

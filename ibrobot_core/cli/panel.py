@@ -62,26 +62,25 @@ class RecentRates:
         while len(self._samples) > 2 and now_ns - self._samples[1][0] >= _RECENT_NS:
             self._samples.popleft()
 
-    def __getitem__(self, name: str) -> float:
-        """A sensor's rate, or that of `LOOP` [Hz]; 0 before there are two samples."""
-        if not self._samples:
-            return 0.0
+    def __getitem__(self, name: str) -> str:
+        """A sensor's rate, or that of `LOOP`, as text; unknown before there are two samples."""
+        if len(self._samples) < 2:
+            return "- Hz"
         (first_ns, first), (last_ns, last) = self._samples[0], self._samples[-1]
-        elapsed_ns = last_ns - first_ns
-        return (last.get(name, 0) - first.get(name, 0)) * NS_PER_S / elapsed_ns if elapsed_ns else 0.0
+        return f"{(last.get(name, 0) - first.get(name, 0)) * NS_PER_S / (last_ns - first_ns):.1f} Hz"
 
 
 def _loop_text(session: Session, rates: RecentRates) -> str:
     loop = session.control.report["loop"]
     return (
-        f"{rates[LOOP]:.1f} Hz, late p50 {loop['lateness_p50_us']:.0f} us, "
+        f"{rates[LOOP]}, late p50 {loop['lateness_p50_us']:.0f} us, "
         f"p99 {loop['lateness_p99_us']:.0f} us, missed {loop['missed']}"
     )
 
 
 def _sensor_text(session: Session, rates: RecentRates, name: str) -> str:
     age = f", {session.ages[name] * 1e3:.0f} ms old" if name in session.ages else ""
-    return f"{name} {rates[name]:.1f} Hz{age}"
+    return f"{name} {rates[name]}{age}"
 
 
 def _model_text(session: Session) -> str | None:

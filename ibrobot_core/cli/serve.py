@@ -142,7 +142,7 @@ def _from_config(what: str, registry: Registry, options: dict[str, Any]) -> tupl
     if Path(what).is_dir():
         raise click.UsageError(f"{what} is a folder: give the plugin of the model in it, e.g. --type lerobot")
     path = find_config(what, registry)
-    config = load(path, overrides=changes, sim=options["sim"], registry=registry)
+    config = load(path, overrides=changes, sim=options["sim"], registry=registry, communicates=True)
     model: str = options["model"] or (next(iter(config.models)) if len(config.models) == 1 else "")
     if model not in config.models:
         raise click.UsageError(

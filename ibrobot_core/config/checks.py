@@ -29,6 +29,8 @@ class Checks:
 
     document: Document
     parts: Parts
+    communicates: bool = False
+    """Whether the caller uses the transport itself."""
 
     def run(self) -> None:
         """All checks."""
@@ -282,7 +284,8 @@ class Checks:
         if part is None:
             return
         if part.keys.share == Share():
-            self._used(part)
+            if not self.communicates:
+                self._used(part)
             return
         if not (isinstance(part.descriptor, TransportDescriptor) and part.descriptor.topics):
             message = f"transport {part.descriptor.type!r} carries no topics to other machines; zenoh does"

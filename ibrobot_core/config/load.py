@@ -43,6 +43,7 @@ def load(
     mode: str | None = None,
     sim: bool = False,
     registry: Registry | None = None,
+    communicates: bool = False,
 ) -> RobotConfig:
     """Read and check a robot YAML.
 
@@ -52,13 +53,14 @@ def load(
         mode: in place of its `default_control_mode`, and of the simulation's.
         sim: use the `simulation` section even where there is `hardware`.
         registry: the plugins; the installed ones when None.
+        communicates: whether the caller uses the transport itself, as a server does; else the robot must.
 
     Raises:
         ConfigError: with everything that is wrong, in file order.
     """
     document = _parse(path)
     _override(document, overrides, mode)
-    config = _build(document, Path(path), sim, registry or installed())
+    config = _build(document, Path(path), sim, registry or installed(), communicates)
     warn_of_literals(document)
     return config
 
@@ -133,10 +135,10 @@ def _override(document: Document, overrides: Sequence[str], mode: str | None) ->
             simulation.pop("default_control_mode", None)
 
 
-def _build(document: Document, source: Path, sim: bool, registry: Registry) -> RobotConfig:
+def _build(document: Document, source: Path, sim: bool, registry: Registry, communicates: bool = False) -> RobotConfig:
     parts = Structurer(document, registry, source.absolute().parent, sim).parts()
     check_known(document)
-    Checks(document, parts).run()
+    Checks(document, parts, communicates).run()
     contract_checks = ContractChecks(document, parts)
     contract = contract_checks.run()
     document.raise_problems()

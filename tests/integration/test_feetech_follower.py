@@ -41,8 +41,8 @@ class Bench:
     ended: int = -1
     """A descriptor that can be read once the control process has ended."""
 
-    def launch(self, *arguments: str, max_velocity: float = 3.0) -> subprocess.Popen[str]:
-        """Run the arm in a mode in which nothing moves it."""
+    def write(self, max_velocity: float = 3.0) -> None:
+        """Write the YAML of an arm with a mode in which nothing moves it."""
         joints = "".join(
             f"    - {{name: {name}, lower: -1.5, upper: 1.5, max_velocity: {max_velocity}, max_acceleration: 40.0}}\n"
             for name in JOINTS
@@ -57,6 +57,10 @@ class Bench:
             "control_modes: {idle: {executors: [position]}}\ndefault_control_mode: idle\n"
             "control: {state_timeout: 20.0}\n"
         )
+
+    def launch(self, *arguments: str, max_velocity: float = 3.0) -> subprocess.Popen[str]:
+        """Run the arm."""
+        self.write(max_velocity)
         command = [*self.ibrobot, "launch", str(self.folder / "arm.yaml"), "--headless", "--json", *arguments]
         with (self.folder / "out").open("w") as out, (self.folder / "err").open("w") as err:
             self.run = subprocess.Popen(command, stdout=out, stderr=err, text=True)
@@ -138,17 +142,27 @@ def test_so_does_ctrl_c(bench: Bench, stop: str, torque: bool) -> None:
     assert (f"to take it off: ibrobot feetech torque off {bench.emulator.port}" in err) == torque
 
 
-def test_the_same_port_given_twice_ends_the_start_and_leaves_no_torque_on(bench: Bench) -> None:
-    arm = f"port: {bench.emulator.port}, calibration: {bench.folder}/arm.json"
-    run = bench.launch(
-        "--set", f"teleoperation.leader={{type: so101_leader, {arm}, deadman: none}}",
-        "--set", "control_modes.idle.teleop=leader",
-    )  # fmt: skip
+def test_a_leader_that_is_missing_ends_the_start_and_leaves_no_torque_on(bench: Bench) -> None:
+    leader = (
+        f"{{type: so101_leader, port: {bench.folder}/unplugged, calibration: {bench.folder}/arm.json, deadman: none}}"
+    )
+    run = bench.launch("--set", f"teleoperation.leader={leader}", "--set", "control_modes.idle.teleop=leader")
     _, err = bench.end()
     assert run.returncode == 1
-    assert "another program holds the port" in err
+    assert f"{bench.folder}/unplugged: there is no such port" in err
     assert bench.torque() == [False] * 6
     assert "holds torque" not in err
+
+
+def test_the_same_port_given_twice_is_refused_before_power_up(bench: Bench, tmp_path: Path) -> None:
+    arm = f"port: {bench.emulator.port}, calibration: {bench.folder}/arm.json"
+    bench.write()
+    command = [*bench.ibrobot, "launch", str(tmp_path / "arm.yaml"), "--headless"]
+    leader = ["--set", f"teleoperation.leader={{type: so101_leader, {arm}}}"]
+    ran = subprocess.run([*command, *leader], capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+    assert ran.returncode == 2
+    assert f"teleoperation.leader.port: {bench.emulator.port} is used by hardware already" in ran.stderr
+    assert bench.torque() == [False] * 6
 
 
 def test_a_servo_that_dies_is_named_and_the_others_hold(bench: Bench) -> None:

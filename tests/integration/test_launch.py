@@ -34,7 +34,7 @@ def test_one_episode_in_real_time(launch: Callable[..., Ran]):
     assert (summary["episodes"], summary["successes"], summary["faults"]) == (1, 1, [])
     assert not summary["lockstep"]
     assert summary["loop"]["ticks"] > 200
-    assert "mode model_inference | loop " in ran.out, "plain lines while it runs"
+    assert "mode model_inference | loop " in ran.err, "plain lines while it runs"
 
 
 def test_the_whole_robot_with_its_cameras_in_lockstep(launch: Callable[..., Ran], rendering: None):
@@ -101,11 +101,10 @@ def test_a_component_that_cannot_start_is_exit_code_1(launch: Callable[..., Ran]
 def test_dry_run_prints_the_plan_and_starts_nothing(launch: Callable[..., Ran], rendering: None):
     ran = launch("--dry-run", "--mode", "moveit_planning", robot="so101")
     assert (ran.code, ran.err) == (0, "")
-    lines = ran.out.splitlines()
-    names = [line.split()[1] for line in lines[:-1]]
+    components = json.loads(ran.out)["components"]
+    names = [component["name"] for component in components]
     assert names == ["control", "sensor:top", "sensor:wrist", "mode:moveit_planning", "status", "transforms"]
-    assert "planner joint" in lines[3]
-    assert lines[-1] == "stops in reverse order"
+    assert "planner joint" in components[3]["summary"]
 
 
 def test_an_episode_is_recorded_with_what_is_to_know_of_it(

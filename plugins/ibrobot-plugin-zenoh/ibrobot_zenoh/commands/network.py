@@ -53,7 +53,7 @@ def options_from(config: str | None, endpoints: tuple[str, ...], domain: int | N
     from ibrobot_core.config import find_config, load
     from ibrobot_core.plugins import installed
 
-    found = load(find_config(config, installed()))
+    found = load(find_config(config, installed()), communicates=True)
     if found.transport is None or not isinstance(found.transport.options, ZenohOptions):
         kind = "no transport" if found.transport is None else f"transport {found.transport.type}"
         raise NotSupported(f"{found.source}: has {kind}; topics are shared by transport: {{type: zenoh, …}}")
