@@ -1,4 +1,4 @@
-"""Settings of all tests here: an example may take as long as it takes, since the machine may be busy; Ctrl-C works."""
+"""Settings of all tests here: an example may take as long as it takes, since the machine may be busy; signals work."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ import signal
 
 from hypothesis import settings
 
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-    # As a shell's background job has it; children would inherit it, and Ctrl-C could end none of them.
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+# A shell's background job ignores Ctrl-C, and one of nohup a hangup: what tests start would inherit that.
+for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
+    if signal.getsignal(number) is signal.SIG_IGN:
+        signal.signal(number, handler)
 
 settings.register_profile("untimed", deadline=None)
 settings.load_profile("untimed")
