@@ -191,7 +191,7 @@ def test_a_config_without_network(transport: TransportConfig | None, monkeypatch
 def use_config(monkeypatch: pytest.MonkeyPatch, transport: TransportConfig | None) -> None:
     config = RobotConfig(Robot("r", ()), {}, {}, "m", transport=transport)
     monkeypatch.setattr("ibrobot_core.config.find_config", lambda name, registry: Path(name))
-    monkeypatch.setattr("ibrobot_core.config.load", lambda path: config)
+    monkeypatch.setattr("ibrobot_core.config.load", lambda path, communicates: config)
 
 
 def test_messages_from_text():
