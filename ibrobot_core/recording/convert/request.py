@@ -89,6 +89,11 @@ class EpisodeReport:
     passed_over: str = ""
     """Why it was not looked at; empty where it was."""
 
+    @property
+    def kept(self) -> bool:
+        """Whether it goes into the dataset."""
+        return not self.error and not self.passed_over
+
 
 @attrs.frozen
 class Report:
@@ -106,7 +111,7 @@ class Report:
     @property
     def converted(self) -> tuple[EpisodeReport, ...]:
         """The episodes that are in the dataset now and were not before."""
-        return tuple(each for each in self.episodes if not each.error and not each.passed_over)
+        return tuple(each for each in self.episodes if each.kept)
 
     @property
     def failed(self) -> tuple[EpisodeReport, ...]:

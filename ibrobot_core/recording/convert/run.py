@@ -98,7 +98,7 @@ def convert(request: Request, episodes: Sequence[Path], watch: Watch = lambda do
         units = [unit for unit in plan.units() if not reports[unit.report.source].error]
         reports |= _refuse_misfits(units, old)
         reports |= _pass_over_copies([unit for unit in units if not reports[unit.report.source].error])
-        units = [unit for unit in units if reports[unit.report.source] == unit.report]
+        units = [unit for unit in units if reports[unit.report.source].kept]
         if units:
             metadata = provenance(request, old, units)
             make_writer(request).merge(request.out, [unit.dataset for unit in units], metadata)
