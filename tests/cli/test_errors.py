@@ -79,7 +79,7 @@ def bugs(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ("arguments", "code", "told"),
     [
         (("nothing",), 2, "No such command 'nothing'; see ibrobot --help"),
-        (("config", "check", "--mode"), 2, "Option '--mode' requires an argument; see ibrobot config check --help"),
+        (("config", "check", "a", "b"), 2, "Got unexpected extra argument (b); see ibrobot config check --help"),
         (("odd", "read"), 2, "Missing argument 'FILE'; see ibrobot odd read --help"),
         (("odd", "xyzzy"), 2, "No such command 'xyzzy'; see ibrobot odd --help"),
         (("odd", "read", "no.txt"), 2, "no.txt: No such file or directory"),
