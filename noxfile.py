@@ -1,8 +1,9 @@
-"""Every check of this repository: `nox` runs all, `nox -l` lists them, `nox -s core` runs one."""
+"""Every check of this repository: `nox` runs all side by side, `nox -l` lists them, `nox -s core` runs one."""
 
 from __future__ import annotations
 
 import atexit
+import fcntl
 import json
 import os
 import shutil
@@ -12,9 +13,19 @@ from typing import Any
 
 import nox
 
-nox.needs_version = ">=2024.10.9"
+nox.needs_version = ">=2026.8.10"
 nox.options.default_venv_backend = "uv"
 nox.options.reuse_venv = "yes"
+# The longest first, so that none is left alone at the end.
+nox.options.sessions = [
+    *("lerobot", "minimums", "integration", "core", "docs", "types", "plugin", "layers", "wheels", "lint")
+]
+# `nox` alone runs as many sessions at a time as there are cores, and prints each one's output when it ends.
+# A named session prints as it runs. `-j` says otherwise.
+nox.options.allow_parallel = True
+nox.options.parallel = 1 if sys.argv[1:] else os.cpu_count()
+# The many processes that tests start would otherwise compile what they import, each for itself.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 PROJECT = nox.project.load_toml("pyproject.toml")
 FOLDERS = {
@@ -30,8 +41,10 @@ PLATFORMS = ("x86_64-unknown-linux-gnu", "aarch64-unknown-linux-gnu", "aarch64-a
 """Where everything must install without a compiler: PCs, robots' own computers (e.g. Jetson), and Macs."""
 # A fixed seed: the same checks give the same result; `nox -s core -- --hypothesis-seed=random` explores.
 PYTEST = ("pytest", "--config-file=pyproject.toml", "--rootdir=.", "--hypothesis-seed=0", "-rs")
-NOT_TESTED: list[str] = []
-"""What no session could test on this machine, and what to do about it."""
+IS_FIRST = "NOX_NOT_TESTED" not in os.environ
+"""Whether this process started the others: those that run one session each, side by side."""
+NOT_TESTED = Path(os.environ.setdefault("NOX_NOT_TESTED", str(Path(f".nox/not-tested-{os.getpid()}").absolute())))
+"""The file of what no session could test on this machine, and what to do about it."""
 
 
 def packages(*plugins: str) -> list[str]:
@@ -63,23 +76,28 @@ def system_libraries(session: nox.Session) -> None:
 
     Tests that need what stays missing are skipped.
     """
-    found = lacking(session)
-    wanted = sorted({package for row in found for package in row["missing"]["apt"]})
-    if wanted and os.geteuid() == 0 and shutil.which("apt-get"):
-        session.run("apt-get", "update", "-qq", external=True)
-        session.run("apt-get", "install", "-qq", "-y", *wanted, external=True)
+    with Path(".nox/apt.lock").open("w") as lock:  # one session at a time; the next one finds them installed
+        fcntl.flock(lock, fcntl.LOCK_EX)
         found = lacking(session)
+        wanted = sorted({package for row in found for package in row["missing"]["apt"]})
+        if wanted and os.geteuid() == 0 and shutil.which("apt-get"):
+            session.run("apt-get", "update", "-qq", external=True)
+            session.run("apt-get", "install", "-qq", "-y", *wanted, external=True)
+            found = lacking(session)
     for row in found:
         line = f"{row['kind']} {row['type']} is not tested: {row['missing']['what']}; {row['missing']['remedy']}"
         session.warn(line)
-        NOT_TESTED.append(f"{session.name}: {line}")
+        with NOT_TESTED.open("a", encoding="utf-8") as file:
+            file.write(f"{session.name}: {line}\n")
 
 
 @atexit.register
 def list_what_was_not_tested() -> None:
     """After all sessions."""
-    for line in NOT_TESTED:
-        print(f"nox > {line}", file=sys.stderr)
+    if IS_FIRST and NOT_TESTED.exists():
+        for line in NOT_TESTED.read_text(encoding="utf-8").splitlines():
+            print(f"nox > {line}", file=sys.stderr)
+        NOT_TESTED.unlink()
 
 
 @nox.session
@@ -94,9 +112,7 @@ def lint(session: nox.Session) -> None:
 def types(session: nox.Session) -> None:
     """Types of core and of every plugin, strictly."""
     install(session, *PLUGINS, groups=("lint", "test"))
-    session.run("mypy", "--strict", "ibrobot_core")
-    for name in PLUGINS:
-        session.run("mypy", "--strict", str(FOLDERS[name] / f"ibrobot_{name}"))
+    session.run("mypy", "--strict", "ibrobot_core", *(str(FOLDERS[name] / f"ibrobot_{name}") for name in PLUGINS))
 
 
 @nox.session
