@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import nox
+from packaging.requirements import Requirement
 
 nox.needs_version = ">=2026.8.10"
 nox.options.default_venv_backend = "uv"
@@ -32,11 +33,16 @@ FOLDERS = {
     path.name.removeprefix("ibrobot-").removeprefix("plugin-"): path
     for path in sorted(Path("plugins").glob("ibrobot-*"))
 }
-"""Name -> folder, of every plugin and of the library that plugins may share."""
+"""Name -> folder, of every plugin and of the libraries that they share."""
 PLUGINS = sorted(FOLDERS)
-SHARED = "ros2"
-EXTRAS = {"camera": "[realsense]", "mcap": "[plot]", "zenoh": "[interop]"}
-"""Name -> extras that its tests use."""
+LOCAL = {"ibrobot-core": Path(), **{folder.name: folder for folder in FOLDERS.values()}}
+"""Distribution -> folder."""
+EXTRAS = {
+    "ibrobot-plugin-camera": "[realsense]",
+    "ibrobot-plugin-mcap": "[plot]",
+    "ibrobot-plugin-zenoh": "[interop]",
+}
+"""Distribution -> extras that its tests use."""
 PLATFORMS = ("x86_64-unknown-linux-gnu", "aarch64-unknown-linux-gnu", "aarch64-apple-darwin")
 """Where everything must install without a compiler: PCs, robots' own computers (e.g. Jetson), and Macs."""
 # A fixed seed: the same checks give the same result; `nox -s core -- --hypothesis-seed=random` explores.
@@ -47,22 +53,26 @@ NOT_TESTED = Path(os.environ.setdefault("NOX_NOT_TESTED", str(Path(f".nox/not-te
 """The file of what no session could test on this machine, and what to do about it."""
 
 
-def packages(*plugins: str) -> list[str]:
-    """Install arguments for core and some plugins, as they are in this folder, with the library that they share."""
-    wanted = list(plugins)
-    for name in plugins:
-        needs = nox.project.load_toml(FOLDERS[name] / "pyproject.toml")["project"]["dependencies"]
-        if SHARED not in wanted and any(need.startswith(f"ibrobot-{SHARED}") for need in needs):
-            wanted.append(SHARED)
-    return ["-e", ".", *(argument for name in wanted for argument in ("-e", f"{FOLDERS[name]}{EXTRAS.get(name, '')}"))]
+def packages(*requirements: str) -> list[str]:
+    """Install arguments for `requirements`: what is in this repository as it is here, with what of it that needs."""
+    local: list[str] = []
+    wanted = list(map(Requirement, requirements))
+    for each in wanted:  # it grows meanwhile
+        if each.name in LOCAL and each.name not in local:
+            local.append(each.name)
+            project = nox.project.load_toml(LOCAL[each.name] / "pyproject.toml")["project"]
+            wanted += map(Requirement, project["dependencies"])
+    asked = [str(each) for each in wanted[: len(requirements)] if each.name not in LOCAL]
+    return [*(argument for name in local for argument in ("-e", f"{LOCAL[name]}{EXTRAS.get(name, '')}")), *asked]
 
 
 def install(
     session: nox.Session, *plugins: str, groups: tuple[str, ...] = ("test",), options: tuple[str, ...] = ()
 ) -> None:
     """Install core, some plugins and some dependency groups."""
-    requirements = nox.project.dependency_groups(PROJECT, *groups)
-    session.install("-c", "constraints.txt", *options, *packages(*plugins), *requirements)
+    distributions = ("ibrobot-core", *(FOLDERS[name].name for name in plugins))
+    groups_need = nox.project.dependency_groups(PROJECT, *groups)
+    session.install("-c", "constraints.txt", *options, *packages(*distributions, *groups_need))
 
 
 def lacking(session: nox.Session) -> list[dict[str, Any]]:

@@ -68,13 +68,13 @@ def record(folder: Path, frames: int) -> None:
     """An episode as `ibrobot record` leaves it."""
     from ibrobot_mcap.options import McapOptions
     from ibrobot_mcap.recorder import McapRecorder
+    from ibrobot_testing.contexts import host_context
 
     from ibrobot_core.clock import SteppedClock
     from ibrobot_core.config.schema import Align, ImageSpec
     from ibrobot_core.contract.specs import ActionPart, Contract, ObservationPart
     from ibrobot_core.interfaces import EpisodeEnd, EpisodeStart, Feature
     from ibrobot_core.messages import Float64MultiArray, Header, Image, JointState
-    from ibrobot_core.testing.contexts import host_context
 
     recorder_clock = SteppedClock(start_ns := 1_700_000_000_000_000_000)
     state = "sensor_msgs/msg/JointState"

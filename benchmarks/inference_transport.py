@@ -36,6 +36,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from ibrobot_testing import host_context
 from made_up import plugin
 
 from ibrobot_core.config import load
@@ -47,13 +48,12 @@ from ibrobot_core.inference.service import InferenceService
 from ibrobot_core.inference.wire import Kind, Message, encode
 from ibrobot_core.interfaces import Frame, Transport
 from ibrobot_core.plugins import installed
-from ibrobot_core.testing import host_context
 
 PLUGIN = '''
 import numpy as np
 from ibrobot_core import hookimpl
 from ibrobot_core.descriptors import HardwareDescriptor, PolicyDescriptor
-from ibrobot_core.testing.fakes import FakeHardware, FakePolicy
+from ibrobot_testing.fakes import FakeHardware, FakePolicy
 
 class Null(FakePolicy):
     """Hands on what it is given and answers with zeros."""

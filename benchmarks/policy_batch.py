@@ -24,13 +24,13 @@ import numpy as np
 import torch
 from ibrobot_lerobot.options import LeRobotPolicyOptions
 from ibrobot_lerobot.policy import LeRobotPolicy
+from ibrobot_testing import host_context
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies import get_policy_class, make_pre_post_processors
 from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 from lerobot.policies.vqbet.configuration_vqbet import VQBeTConfig
 
 from ibrobot_core.interfaces import Frame, Tensors
-from ibrobot_core.testing import host_context
 
 LIMIT = 1e-4
 STATE, TOP, WRIST = "observation.state", "observation.images.top", "observation.images.wrist"

@@ -23,6 +23,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
+from ibrobot_testing.contexts import host_context
 from mcap.reader import make_reader
 
 from ibrobot_core.clock import RealClock
@@ -31,7 +32,6 @@ from ibrobot_core.contract.specs import ActionPart, Contract, ObservationPart
 from ibrobot_core.interfaces import EpisodeStart, Feature
 from ibrobot_core.messages import Float64MultiArray, Header, Image, JointState
 from ibrobot_core.plugins import installed
-from ibrobot_core.testing.contexts import host_context
 
 JOINTS, CAMERA, COMMANDS = "/joint_states", "/camera/top/image_raw", "/commands"
 SIZE = 320 * 240 * 3

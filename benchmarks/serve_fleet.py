@@ -28,6 +28,8 @@ from typing import Any, override
 
 import attrs
 import numpy as np
+from ibrobot_testing import host_context, make_robot
+from ibrobot_testing.fakes import FakePolicy
 
 from ibrobot_core.bus import Bus
 from ibrobot_core.clock import RealClock
@@ -51,8 +53,6 @@ from ibrobot_core.messages import Header, JointState
 from ibrobot_core.options import NoOptions
 from ibrobot_core.plugins import installed
 from ibrobot_core.robot import Vector
-from ibrobot_core.testing import host_context, make_robot
-from ibrobot_core.testing.fakes import FakePolicy
 
 MODEL_S, CHUNK, RATE_HZ = 0.02, 50, 30.0
 SETTLED_S = 5.0

@@ -38,7 +38,7 @@ import attrs
 import numpy as np
 from ibrobot_core import hookimpl
 from ibrobot_core.descriptors import HardwareDescriptor, PolicyDescriptor
-from ibrobot_core.testing.fakes import FakeHardware, FakePolicy
+from ibrobot_testing.fakes import FakeHardware, FakePolicy
 
 class Endless(FakeHardware):
     def success(self):

@@ -22,6 +22,7 @@ from typing import Any, override
 
 import attrs
 import numpy as np
+from ibrobot_testing import make_robot
 
 from ibrobot_core.bus import Bus
 from ibrobot_core.clock import SteppedClock
@@ -42,7 +43,6 @@ from ibrobot_core.inference.pacing import Pacing
 from ibrobot_core.interfaces import PolicySpec
 from ibrobot_core.messages import Header, JointState
 from ibrobot_core.options import NoOptions
-from ibrobot_core.testing import make_robot
 from ibrobot_core.units import ns
 
 RATE_HZ, CHUNK = 30.0, 50

@@ -7,11 +7,11 @@ import threading
 from typing import override
 
 import pytest
+from ibrobot_testing import TransportSuite, host_context
 
 from ibrobot_core.interfaces import Context, Transport
 from ibrobot_core.local_transport import LocalTransport
 from ibrobot_core.plugins import discover
-from ibrobot_core.testing import TransportSuite, host_context
 
 
 class TestLocalTransport(TransportSuite):

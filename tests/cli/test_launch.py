@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from ibrobot_testing.fakes import FakePolicy
 
 from ibrobot_core.errors import PolicyError
-from ibrobot_core.testing.fakes import FakePolicy
 
 if TYPE_CHECKING:
     from conftest import Ran, Site
@@ -29,7 +29,7 @@ from ibrobot_core.descriptors import (
 )
 from ibrobot_core.errors import HardwareError, MissingDependency, TeleopError
 from ibrobot_core.interfaces import Holding
-from ibrobot_core.testing.fakes import FakeHardware, FakePlanner, FakePolicy, FakeRealHardware, FakeTeleop
+from ibrobot_testing.fakes import FakeHardware, FakePlanner, FakePolicy, FakeRealHardware, FakeTeleop
 
 class Scene(FakeHardware):
     """Done after half a second, but never with seed 13; silent after two seconds with seed 66; seed 7 holds torque."""

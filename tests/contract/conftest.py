@@ -7,6 +7,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from ibrobot_testing.contexts import ARM, GRIPPER, make_robot
 
 from ibrobot_core.config.schema import (
     ActionSpec,
@@ -20,7 +21,6 @@ from ibrobot_core.config.schema import (
     RobotConfig,
 )
 from ibrobot_core.options import NoOptions
-from ibrobot_core.testing.contexts import ARM, GRIPPER, make_robot
 
 STATE = ObservationSpec("observation.state", topic="/joint_states")
 TOP = ObservationSpec(

@@ -7,12 +7,12 @@ from typing import Any
 
 import attrs
 import pytest
+from ibrobot_testing.contexts import ARM, GRIPPER
 
 from ibrobot_core.contract.check import check_policy
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import ContractError
 from ibrobot_core.interfaces.policy import PolicySpec
-from ibrobot_core.testing.contexts import ARM, GRIPPER
 
 FITS = PolicySpec(
     observations={"observation.state": (6,), "observation.images.top": (2, 3, 3)},

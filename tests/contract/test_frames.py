@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from ibrobot_testing.contexts import ARM, GRIPPER, START_NS
 
 from ibrobot_core.bus import Bus
 from ibrobot_core.clock import SteppedClock
@@ -25,7 +26,6 @@ from ibrobot_core.errors import ContractError
 from ibrobot_core.interfaces.policy import Frame
 from ibrobot_core.messages import CompressedImage, Float64MultiArray, Header, Image, Imu, JointState, Message, Vector3
 from ibrobot_core.plugins import Registry
-from ibrobot_core.testing.contexts import ARM, GRIPPER, START_NS
 
 Make = Callable[..., Any]
 MS = 1_000_000

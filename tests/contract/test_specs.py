@@ -10,6 +10,7 @@ from typing import Any
 import attrs
 import pytest
 import yaml
+from ibrobot_testing.contexts import ARM, GRIPPER
 
 from ibrobot_core.config import load
 from ibrobot_core.config.schema import ActionSpec, Align, ImageSpec, ObservationSpec
@@ -19,7 +20,6 @@ from ibrobot_core.descriptors import HardwareDescriptor
 from ibrobot_core.errors import ContractError
 from ibrobot_core.interfaces.dataset import Feature
 from ibrobot_core.plugins import Entry, discover
-from ibrobot_core.testing.contexts import ARM, GRIPPER
 
 Make = Callable[..., Any]
 

@@ -10,6 +10,8 @@ import attrs
 import numpy as np
 import pytest
 import yaml
+from ibrobot_testing.contexts import START_NS
+from ibrobot_testing.fakes import FakeHardware, FakeRealHardware
 
 from ibrobot_core.clock import SteppedClock
 from ibrobot_core.config import RobotConfig, from_document
@@ -21,8 +23,6 @@ from ibrobot_core.errors import HardwareError
 from ibrobot_core.interfaces import Condition, Context, Holding, JointReading, Torque
 from ibrobot_core.plugins import Entry, Registry, discover
 from ibrobot_core.robot import Vector
-from ibrobot_core.testing.contexts import START_NS
-from ibrobot_core.testing.fakes import FakeHardware, FakeRealHardware
 
 PERIOD_S = 0.01
 DOCUMENT = """

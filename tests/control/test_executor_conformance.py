@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from typing import override
 
+from ibrobot_testing import ExecutorSuite
+from ibrobot_testing.contexts import GRIPPER, control_context
+
 from ibrobot_core.control.executors.gripper import GripperExecutor
 from ibrobot_core.control.executors.position import PositionExecutor
 from ibrobot_core.control.executors.trajectory import TrajectoryExecutor
 from ibrobot_core.executor_options import GripperOptions, PositionOptions, TrajectoryOptions
-from ibrobot_core.testing import ExecutorSuite
-from ibrobot_core.testing.contexts import GRIPPER, control_context
 
 
 class TestPosition(ExecutorSuite):

@@ -5,10 +5,10 @@ from __future__ import annotations
 import attrs
 import numpy as np
 import pytest
+from ibrobot_testing.contexts import make_robot
 
 from ibrobot_core.config.schema import Following
 from ibrobot_core.control.following import FollowingError
-from ibrobot_core.testing.contexts import make_robot
 
 ROBOT = make_robot()
 PERIOD_NS = 10_000_000

@@ -34,7 +34,7 @@ from ibrobot_core.descriptors import HardwareDescriptor
 from ibrobot_core.errors import HardwareError
 from ibrobot_core.interfaces import Holding
 from ibrobot_core.options import option
-from ibrobot_core.testing.fakes import FakeHardware
+from ibrobot_testing.fakes import FakeHardware
 
 class Arm(FakeHardware):
     def __init__(self, options, ctx):

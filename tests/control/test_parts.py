@@ -7,12 +7,12 @@ from typing import override
 
 import numpy as np
 import pytest
+from ibrobot_testing.contexts import make_robot
 
 from ibrobot_core.control.parts import HardwareParts
 from ibrobot_core.errors import HardwareError, NotSupported
 from ibrobot_core.interfaces import Episode, Hardware, JointReading, Signal, nan_vector
 from ibrobot_core.robot import Vector
-from ibrobot_core.testing.contexts import make_robot
 
 ROBOT = make_robot()
 LEFT = ("gripper", "shoulder_pan", "elbow_flex")

@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from ibrobot_testing import make_robot
+from ibrobot_testing.contexts import START_NS
 
 from ibrobot_core.bus import Bus
 from ibrobot_core.clock import SteppedClock
@@ -26,8 +28,6 @@ from ibrobot_core.inference.client import Chunk, DispatchInfer, InferenceClient
 from ibrobot_core.interfaces import PolicySpec
 from ibrobot_core.messages import Header, JointState
 from ibrobot_core.options import NoOptions
-from ibrobot_core.testing import make_robot
-from ibrobot_core.testing.contexts import START_NS
 
 STEP = 100_000_000
 """The contract's tick at 10 Hz [ns]."""

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from ibrobot_testing import host_context
+from ibrobot_testing.contexts import START_NS
+from ibrobot_testing.fakes import FakePolicy
 
 from ibrobot_core.inference.client import LockstepClient
-from ibrobot_core.testing import host_context
-from ibrobot_core.testing.contexts import START_NS
-from ibrobot_core.testing.fakes import FakePolicy
 
 if TYPE_CHECKING:
     from conftest import Rig

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from ibrobot_testing import make_robot
+from ibrobot_testing.contexts import START_NS
 
 from ibrobot_core.errors import ContractError
 from ibrobot_core.inference.client import Chunk, DispatchInfer
-from ibrobot_core.testing import make_robot
-from ibrobot_core.testing.contexts import START_NS
 
 if TYPE_CHECKING:
     from conftest import Rig

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from ibrobot_testing.contexts import START_NS
 
 from ibrobot_core.inference.client import Chunk
-from ibrobot_core.testing.contexts import START_NS
 
 if TYPE_CHECKING:
     from conftest import Rig

@@ -7,9 +7,10 @@ import inspect
 import re
 from pathlib import Path
 
+import ibrobot_testing
 import pytest
 
-from ibrobot_core import hookspecs, interfaces, testing
+from ibrobot_core import hookspecs, interfaces
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -45,7 +46,7 @@ def test_every_method_is_listed_where_it_belongs(name: str) -> None:
 
 def test_every_suite_is_in_the_guide() -> None:
     page = (DOCS / "how-to/test-a-plugin.md").read_text()
-    suites = [name for name in testing.__all__ if name.endswith("Suite") and name != "Suite"]
+    suites = [name for name in ibrobot_testing.__all__ if name.endswith("Suite") and name != "Suite"]
     assert [name for name in suites if f"`{name}`" not in page] == []
 
 

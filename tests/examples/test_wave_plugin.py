@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from ibrobot_testing import host_context
 
 from ibrobot_core.plugins import discover
-from ibrobot_core.testing import host_context
 
 if TYPE_CHECKING:
     from conftest import Site

@@ -26,6 +26,8 @@ from pathlib import Path
 from typing import override
 
 import numpy as np
+from ibrobot_testing import host_context
+from ibrobot_testing.fakes import FakePolicy
 
 from ibrobot_core.inference.remote import RemoteEngine
 from ibrobot_core.inference.service import InferenceService, service_name
@@ -33,8 +35,6 @@ from ibrobot_core.inference.wire import Kind, Message, decode, encode
 from ibrobot_core.interfaces import Handler, Tensors, Transport
 from ibrobot_core.local_transport import LocalTransport
 from ibrobot_core.plugins import installed
-from ibrobot_core.testing import host_context
-from ibrobot_core.testing.fakes import FakePolicy
 
 GROWTH_MIB = 64
 """What the process may grow by: threads' stacks and arenas, and the counts of 256 robots."""

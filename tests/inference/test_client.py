@@ -8,14 +8,14 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
+from ibrobot_testing import host_context
+from ibrobot_testing.fakes import FakePolicy
 
 from ibrobot_core.errors import PolicyError
 from ibrobot_core.inference import client as module
 from ibrobot_core.inference.client import Chunk, DispatchInfer, EngineClient, InferenceClient, LockstepClient
 from ibrobot_core.inference.engine import LocalEngine
 from ibrobot_core.interfaces import Frame
-from ibrobot_core.testing import host_context
-from ibrobot_core.testing.fakes import FakePolicy
 
 PATIENCE_S = 30.0
 

@@ -10,6 +10,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from ibrobot_testing import PolicySuite
+from ibrobot_testing.contexts import host_context
+from ibrobot_testing.fakes import FakePolicy
 from numpy.typing import NDArray
 
 from ibrobot_core.calibration import ZERO_AT, Calibration, JointCalibration
@@ -19,9 +22,6 @@ from ibrobot_core.contract.specs import ActionPart, Contract, ObservationPart
 from ibrobot_core.errors import CalibrationError
 from ibrobot_core.inference.policy_units import PolicyInItsUnits
 from ibrobot_core.interfaces import Feature, Frame, Policy, PolicySpec, Tensors
-from ibrobot_core.testing import PolicySuite
-from ibrobot_core.testing.contexts import host_context
-from ibrobot_core.testing.fakes import FakePolicy
 from ibrobot_core.units import radians_to_lerobot, ticks_to_lerobot, ticks_to_radians
 
 JOINTS = host_context().robot.joint_names

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from ibrobot_testing import host_context
+from ibrobot_testing.fakes import FakePolicy
 
 from ibrobot_core.config import RobotConfig, load
 from ibrobot_core.errors import PolicyError
 from ibrobot_core.inference.process import ProcessEngine
 from ibrobot_core.plugins import discover
-from ibrobot_core.testing import host_context
-from ibrobot_core.testing.fakes import FakePolicy
 
 if TYPE_CHECKING:
     from conftest import Site
@@ -32,7 +32,7 @@ import numpy as np
 from ibrobot_core import hookimpl
 from ibrobot_core.descriptors import HardwareDescriptor, PolicyDescriptor
 from ibrobot_core.errors import PolicyError
-from ibrobot_core.testing.fakes import FakeHardware, FakePolicy
+from ibrobot_testing.fakes import FakeHardware, FakePolicy
 
 class Net(FakePolicy):
     """Does what the tensor `do` says."""

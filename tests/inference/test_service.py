@@ -14,6 +14,8 @@ from typing import Any, override
 import attrs
 import numpy as np
 import pytest
+from ibrobot_testing import host_context
+from ibrobot_testing.fakes import FakePolicy
 from prometheus_client.parser import text_string_to_metric_families
 
 from ibrobot_core.errors import ContractError, PolicyError, TransportError
@@ -25,8 +27,6 @@ from ibrobot_core.inference.wire import Kind, Message, decode, encode
 from ibrobot_core.interfaces import Tensors
 from ibrobot_core.local_transport import LocalTransport
 from ibrobot_core.metrics import Metrics
-from ibrobot_core.testing import host_context
-from ibrobot_core.testing.fakes import FakePolicy
 
 PATIENCE_S = 30.0
 SOON_NS = round(PATIENCE_S * 1e9)

@@ -18,6 +18,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from ibrobot_ros2 import encode
+from ibrobot_testing.terminal import Terminal
 from recordings import CONTRACT, JOINTS, SIZE, START_NS, numbered, record
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -32,7 +33,6 @@ from ibrobot_core.messages import (
     Message,
 )
 from ibrobot_core.recording.convert.run import STAGING
-from ibrobot_core.testing.terminal import Terminal
 
 pytestmark = pytest.mark.integration
 

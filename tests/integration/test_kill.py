@@ -35,7 +35,7 @@ from ibrobot_core.descriptors import HardwareDescriptor, PolicyDescriptor, Senso
 from ibrobot_core.errors import PolicyError, SensorError
 from ibrobot_core.interfaces import TeleopCommand, Torque
 from ibrobot_core.options import option
-from ibrobot_core.testing.fakes import FakePolicy, FakeRealHardware, FakeSensor, FakeTeleop
+from ibrobot_testing.fakes import FakePolicy, FakeRealHardware, FakeSensor, FakeTeleop
 from ibrobot_core.control import core, host
 
 # A way is gone by ticks: on a busy machine, which misses some, it takes longer.

@@ -16,6 +16,7 @@ from ibrobot_mcap.options import McapOptions
 from ibrobot_mcap.reader import Rosbag2Reader
 from ibrobot_mcap.recorder import McapRecorder
 from ibrobot_ros2.jpeg import to_jpeg
+from ibrobot_testing.contexts import host_context
 from numpy.typing import NDArray
 from stream_server import StreamServer, number_of
 
@@ -32,7 +33,6 @@ from ibrobot_core.launch.session import Request, Session
 from ibrobot_core.messages import CompressedImage, Float64MultiArray, Header, Imu, JointState, Message, Vector3
 from ibrobot_core.plugins import installed
 from ibrobot_core.recording.convert.ticks import Ticks
-from ibrobot_core.testing.contexts import host_context
 
 pytestmark = pytest.mark.integration
 

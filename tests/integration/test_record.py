@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 import yaml
+from ibrobot_testing.terminal import Terminal
 
 from ibrobot_core.plugins import installed
-from ibrobot_core.testing.terminal import Terminal
 
 pytestmark = pytest.mark.integration
 

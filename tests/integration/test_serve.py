@@ -18,13 +18,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from ibrobot_testing import host_context
+from ibrobot_testing.fakes import FakePolicy
 
 from ibrobot_core.errors import PolicyError
 from ibrobot_core.inference.remote import RemoteEngine
 from ibrobot_core.interfaces import Transport
 from ibrobot_core.plugins import installed
-from ibrobot_core.testing import host_context
-from ibrobot_core.testing.fakes import FakePolicy
 
 if TYPE_CHECKING:
     from conftest import Log, Ran, Site
@@ -132,8 +132,8 @@ import attrs
 import numpy as np
 from ibrobot_core import hookimpl
 from ibrobot_core.descriptors import PolicyDescriptor
-from ibrobot_core.testing import host_context
-from ibrobot_core.testing.fakes import FakePolicy
+from ibrobot_testing import host_context
+from ibrobot_testing.fakes import FakePolicy
 
 @attrs.frozen
 class Options:

@@ -29,7 +29,7 @@ from ibrobot_core.descriptors import (
 )
 from ibrobot_core.errors import HardwareError, MissingDependency, PolicyError, SensorError
 from ibrobot_core.interfaces import Hardware, Holding
-from ibrobot_core.testing.fakes import (
+from ibrobot_testing.fakes import (
     FakeHardware, FakePlanner, FakePolicy, FakeRealHardware, FakeRecorder, FakeSensor, FakeTeleop,
 )
 

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 import attrs
 import numpy as np
 import pytest
+from ibrobot_testing import host_context
 
 from ibrobot_core.errors import ComponentFailed, ConfigError
 from ibrobot_core.inference.service import InferenceService
-from ibrobot_core.testing import host_context
 
 if TYPE_CHECKING:
     from conftest import Runs, Site

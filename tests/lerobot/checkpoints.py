@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from ibrobot_testing.contexts import ARM, GRIPPER
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.policies import get_policy_class, make_pre_post_processors
 from lerobot.policies.act.configuration_act import ACTConfig
@@ -16,8 +17,6 @@ from lerobot.policies.smolvla.configuration_smolvla import SmolVLAConfig
 from lerobot.policies.utils import prepare_observation_for_inference
 from lerobot.policies.vqbet.configuration_vqbet import VQBeTConfig
 from numpy.typing import NDArray
-
-from ibrobot_core.testing.contexts import ARM, GRIPPER
 
 STATE, TOP, WRIST, SCENE = (
     "observation.state", "observation.images.top", "observation.images.wrist", "observation.environment_state",

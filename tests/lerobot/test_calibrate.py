@@ -8,10 +8,9 @@ from pathlib import Path
 import draccus
 import pytest
 from ibrobot_feetech.emulator import Emulator
+from ibrobot_testing.terminal import Terminal
 from lerobot.motors import Motor, MotorCalibration, MotorNormMode
 from lerobot.motors.feetech import FeetechMotorsBus
-
-from ibrobot_core.testing.terminal import Terminal
 
 pytestmark = [pytest.mark.lerobot, pytest.mark.usefixtures("patient_buses")]
 

@@ -15,6 +15,7 @@ import pytest
 import torch
 from ibrobot_lerobot.options import LeRobotPolicyOptions
 from ibrobot_lerobot.policy import SEED, LeRobotPolicy
+from ibrobot_testing.contexts import START_NS, host_context
 
 from ibrobot_core.config import load
 from ibrobot_core.inference.engine import Engine, LocalEngine
@@ -23,7 +24,6 @@ from ibrobot_core.inference.remote import RemoteEngine
 from ibrobot_core.inference.service import InferenceService
 from ibrobot_core.interfaces import Frame, Payload
 from ibrobot_core.local_transport import LocalTransport
-from ibrobot_core.testing.contexts import START_NS, host_context
 
 sys.path.insert(0, str(Path(__file__).parent))
 from checkpoints import CONFIGS, Theirs, save

@@ -14,12 +14,12 @@ import pytest
 from ibrobot_lerobot.options import LeRobotPolicyOptions
 from ibrobot_lerobot.policy import LeRobotPolicy
 from ibrobot_lerobot.untrusted import BASE_MODELS, check_step_name, check_type, names_a_model
+from ibrobot_testing.contexts import host_context
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import make_pre_post_processors
 from lerobot.processor import ProcessorStepRegistry
 
 from ibrobot_core.errors import PolicyError
-from ibrobot_core.testing.contexts import host_context
 
 sys.path.insert(0, str(Path(__file__).parent))
 sys.path.insert(0, str(Path(__file__).parents[2] / "plugins/ibrobot-plugin-lerobot/tests"))

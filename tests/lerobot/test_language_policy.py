@@ -15,6 +15,8 @@ import torch
 from ibrobot_lerobot.checkpoint import ACTION
 from ibrobot_lerobot.options import LeRobotPolicyOptions
 from ibrobot_lerobot.policy import SEED, LeRobotPolicy
+from ibrobot_testing import PolicySuite
+from ibrobot_testing.contexts import START_NS, host_context
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import make_pre_post_processors
 from lerobot.policies.pi0.configuration_pi0 import PI0Config
@@ -25,8 +27,6 @@ from lerobot.processor import tokenizer_processor
 
 from ibrobot_core.errors import PolicyError
 from ibrobot_core.interfaces import Frame
-from ibrobot_core.testing import PolicySuite
-from ibrobot_core.testing.contexts import START_NS, host_context
 
 sys.path.insert(0, str(Path(__file__).parent))
 from checkpoints import CHUNK, SIZE, STATE, TOP, Theirs, features, language_model, save, smolvla, statistics

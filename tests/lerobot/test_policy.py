@@ -15,13 +15,13 @@ import pytest
 import torch
 from ibrobot_lerobot.options import LeRobotPolicyOptions
 from ibrobot_lerobot.policy import SEED, LeRobotPolicy
+from ibrobot_testing import PolicySuite
+from ibrobot_testing.contexts import START_NS, host_context
 from numpy.typing import NDArray
 from safetensors.torch import load_file, save_file
 
 from ibrobot_core.errors import PolicyError
 from ibrobot_core.interfaces import Frame, Policy
-from ibrobot_core.testing import PolicySuite
-from ibrobot_core.testing.contexts import START_NS, host_context
 
 sys.path.insert(0, str(Path(__file__).parent))
 from checkpoints import CONFIGS, STATE, TOP, WRIST, Theirs, act, diffusion, normalised_by, save

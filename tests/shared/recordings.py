@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from ibrobot_mcap.options import McapOptions
 from ibrobot_mcap.recorder import McapRecorder
+from ibrobot_testing.contexts import host_context
 from numpy.typing import NDArray
 
 from ibrobot_core.clock import SteppedClock
@@ -17,7 +18,6 @@ from ibrobot_core.config.schema import Align, ImageSpec
 from ibrobot_core.contract.specs import ActionPart, Contract, ObservationPart
 from ibrobot_core.interfaces import EpisodeEnd, EpisodeStart, Feature
 from ibrobot_core.messages import Float64MultiArray, Header, Image, JointState
-from ibrobot_core.testing.contexts import host_context
 
 START_NS = 1_700_000_000_000_000_000
 JOINTS = ("pan", "lift", "gripper")

@@ -16,14 +16,14 @@ from ibrobot_camera.capture import Capture
 from ibrobot_camera.commands.sources import decoded
 from ibrobot_camera.device import Device, find_device
 from ibrobot_camera.options import OpenCvOptions
+from ibrobot_testing import SensorSuite, host_context
+from ibrobot_testing.contexts import START_NS
 from stream_server import HEIGHT, WIDTH, StreamServer, number_of, numbered
 
 from ibrobot_core.clock import RealClock, SteppedClock
 from ibrobot_core.errors import SensorError
 from ibrobot_core.interfaces import Context, Sensor
 from ibrobot_core.messages import CameraInfo, CompressedImage, Header, Image
-from ibrobot_core.testing import SensorSuite, host_context
-from ibrobot_core.testing.contexts import START_NS
 
 FRAMES, FPS = 12, 25.0
 PATIENCE_S = 30.0

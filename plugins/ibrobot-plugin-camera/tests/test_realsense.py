@@ -15,13 +15,13 @@ from ibrobot_camera.librealsense import load_library
 from ibrobot_camera.options import RealSenseOptions
 from ibrobot_camera.realsense import RealSenseCamera
 from ibrobot_ros2.jpeg import from_jpeg
+from ibrobot_testing import SensorSuite, host_context
 
 from ibrobot_core.clock import RealClock
 from ibrobot_core.errors import MissingDependency, SensorError
 from ibrobot_core.interfaces import Context, Sensor
 from ibrobot_core.messages import CameraInfo, CompressedImage, Image
 from ibrobot_core.plugins import installed
-from ibrobot_core.testing import SensorSuite, host_context
 
 WIDTH, HEIGHT = 64, 48
 PATIENCE_S = 30.0

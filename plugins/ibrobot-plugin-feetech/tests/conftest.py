@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from ibrobot_feetech import bus
 from ibrobot_feetech.emulator import Emulator
+from ibrobot_testing.contexts import ARM, GRIPPER
 
 from ibrobot_core.calibration import Calibration, JointCalibration, save_calibration
-from ibrobot_core.testing.contexts import ARM, GRIPPER
 
 from .line import lay
 

@@ -19,13 +19,13 @@ from ibrobot_feetech.follower import FeetechFollower
 from ibrobot_feetech.health import SteadyLoad
 from ibrobot_feetech.options import FollowerOptions
 from ibrobot_feetech.protocol import OVERLOAD
+from ibrobot_testing.contexts import START_NS, control_context
+from ibrobot_testing.hardware import HardwareSuite
 
 from ibrobot_core.calibration import Calibration, load_calibration, save_calibration
 from ibrobot_core.clock import SteppedClock
 from ibrobot_core.errors import CalibrationError, HardwareError
 from ibrobot_core.interfaces import Context, Hardware, Holding, Severity, Torque
-from ibrobot_core.testing.contexts import START_NS, control_context
-from ibrobot_core.testing.hardware import HardwareSuite
 
 from .conftest import JOINTS, arm_calibration, prepare
 from .line import Line

@@ -17,12 +17,12 @@ from ibrobot_feetech.follower import FeetechFollower
 from ibrobot_feetech.leader import LeaderTeleop
 from ibrobot_feetech.options import FollowerOptions, LeaderOptions
 from ibrobot_feetech.port import SerialPort
+from ibrobot_testing.contexts import control_context, host_context
 from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
 from ibrobot_core.calibration import load_calibration, save_calibration
 from ibrobot_core.errors import HardwareError, TeleopError
-from ibrobot_core.testing.contexts import control_context, host_context
 
 from .conftest import arm_calibration, prepare
 from .line import Line

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from ibrobot_jointlog import ibrobot_datasets
 from ibrobot_jointlog.npz import NpzDatasetWriter, read_npz
+from ibrobot_testing import DatasetSuite, host_context
 from numpy.typing import NDArray
 
 from ibrobot_core.errors import DatasetError
 from ibrobot_core.interfaces import Context, Feature
-from ibrobot_core.testing import DatasetSuite, host_context
 
 STATE = {"state": Feature("float32", (2,), ("a", "b"))}
 

@@ -14,12 +14,12 @@ from ibrobot_jointlog.log import read_log
 from ibrobot_jointlog.options import ReplayOptions
 from ibrobot_jointlog.recorder import JointLogRecorder
 from ibrobot_jointlog.replay import ReplayTeleop
+from ibrobot_testing import RecorderSuite, host_context, make_robot
+from ibrobot_testing.contexts import START_NS
 
 from ibrobot_core.errors import RecorderError
 from ibrobot_core.interfaces import Context, EpisodeEnd, EpisodeStart, JointReading
 from ibrobot_core.messages import Header, JointState, Message, String
-from ibrobot_core.testing import RecorderSuite, host_context, make_robot
-from ibrobot_core.testing.contexts import START_NS
 from ibrobot_core.units import NS_PER_S, ns
 
 JOINTS = make_robot().joint_names

@@ -12,10 +12,10 @@ from ibrobot_jointlog import ibrobot_teleop
 from ibrobot_jointlog.log import header, row
 from ibrobot_jointlog.options import ReplayOptions
 from ibrobot_jointlog.replay import ReplayTeleop
+from ibrobot_testing import TeleopSuite, host_context, make_robot
 
 from ibrobot_core.errors import TeleopError
 from ibrobot_core.interfaces import Context, JointReading, Teleop, TeleopCommand
-from ibrobot_core.testing import TeleopSuite, host_context, make_robot
 from ibrobot_core.units import ns
 
 ROBOT = make_robot()

@@ -11,11 +11,11 @@ import pytest
 from ibrobot_keyboard.cartesian import CartesianJog
 from ibrobot_keyboard.options import KeyboardOptions
 from ibrobot_keyboard.teleop import KeyboardTeleop
+from ibrobot_testing import host_context
 
 from ibrobot_core.errors import TeleopError
 from ibrobot_core.interfaces import JointReading
 from ibrobot_core.robot import Description, Joint, Robot, Vector
-from ibrobot_core.testing import host_context
 from ibrobot_core.units import ns
 
 mujoco = pytest.importorskip("mujoco")

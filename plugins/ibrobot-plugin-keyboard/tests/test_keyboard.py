@@ -12,12 +12,12 @@ import pytest
 from ibrobot_keyboard import ibrobot_teleop
 from ibrobot_keyboard.options import KeyboardOptions
 from ibrobot_keyboard.teleop import KeyboardTeleop
+from ibrobot_testing import TeleopSuite, host_context, make_robot
 
 from ibrobot_core.errors import TeleopError
 from ibrobot_core.interfaces import Context, JointReading, Teleop, TeleopCommand
 from ibrobot_core.robot import Description, Joint, Robot
 from ibrobot_core.terminal import Keys
-from ibrobot_core.testing import TeleopSuite, host_context, make_robot
 from ibrobot_core.units import ns
 
 JOINTS = make_robot().joint_names

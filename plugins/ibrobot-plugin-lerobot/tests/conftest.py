@@ -11,10 +11,10 @@ import pyarrow.parquet as pq
 import pytest
 from ibrobot_lerobot.options import LeRobotOptions
 from ibrobot_lerobot.writer import LeRobotDatasetWriter
+from ibrobot_testing.leaks import no_leaks  # noqa: F401
 from numpy.typing import NDArray
 
 from ibrobot_core.interfaces import Feature
-from ibrobot_core.testing.leaks import no_leaks  # noqa: F401
 
 FPS = 30
 STATE = Feature("float32", (3,), ("a", "b", "c"))

@@ -14,6 +14,7 @@ import pytest
 from ibrobot_lerobot.checkpoint import read_checkpoint
 from ibrobot_lerobot.options import LeRobotPolicyOptions
 from ibrobot_lerobot.policy import LeRobotPolicy
+from ibrobot_testing.contexts import ARM, GRIPPER, START_NS, host_context
 from safetensors.numpy import save_file
 
 from ibrobot_core.config.schema import Align
@@ -21,7 +22,6 @@ from ibrobot_core.contract.specs import ActionPart, Contract, ObservationPart
 from ibrobot_core.errors import PolicyError
 from ibrobot_core.interfaces import Feature, Frame
 from ibrobot_core.messages import Float64MultiArray, JointState
-from ibrobot_core.testing.contexts import ARM, GRIPPER, START_NS, host_context
 
 STATE, TOP = "observation.state", "observation.images.top"
 JOINTS = ARM + GRIPPER

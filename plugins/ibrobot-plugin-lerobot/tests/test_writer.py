@@ -16,11 +16,11 @@ from ibrobot_lerobot import ibrobot_datasets
 from ibrobot_lerobot.options import LeRobotOptions
 from ibrobot_lerobot.video import choose_encoder
 from ibrobot_lerobot.writer import LeRobotDatasetWriter
+from ibrobot_testing import DatasetSuite
 from numpy.typing import NDArray
 
 from ibrobot_core.errors import DatasetError
 from ibrobot_core.interfaces import Context, Feature
-from ibrobot_core.testing import DatasetSuite
 
 from .conftest import CAMERA, STATE, check, picture, rows, values, write
 

@@ -10,11 +10,11 @@ import pytest
 from ibrobot_mcap.options import McapOptions
 from ibrobot_mcap.reader import Rosbag2Reader
 from ibrobot_mcap.recorder import McapRecorder
+from ibrobot_testing.contexts import START_NS, host_context
 
 from ibrobot_core.clock import RealClock
 from ibrobot_core.interfaces import EpisodeEnd, EpisodeStart
 from ibrobot_core.messages import Header, Image, JointState
-from ibrobot_core.testing.contexts import START_NS, host_context
 
 STEP_NS = 10_000_000
 JOINTS = "/joint_states"

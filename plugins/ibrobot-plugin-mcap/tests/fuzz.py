@@ -41,6 +41,7 @@ from ibrobot_mcap.options import McapOptions
 from ibrobot_mcap.reader import Rosbag2Reader
 from ibrobot_mcap.recorder import McapRecorder
 from ibrobot_ros2 import encode
+from ibrobot_testing.contexts import START_NS, host_context
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagsWriter
 from rosbags.typesys import Stores, get_typestore
@@ -52,7 +53,6 @@ from ibrobot_core.interfaces import EpisodeEnd, EpisodeStart, Feature
 from ibrobot_core.messages import Float64MultiArray, Header, JointState
 from ibrobot_core.recording.convert.episode import recorded_contract
 from ibrobot_core.recording.convert.ticks import Ticks
-from ibrobot_core.testing.contexts import START_NS, host_context
 
 JOINTS = ("pan", "tilt")
 CONTRACT = Contract(

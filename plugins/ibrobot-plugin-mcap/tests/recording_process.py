@@ -7,11 +7,11 @@ from pathlib import Path
 
 from ibrobot_mcap.options import McapOptions
 from ibrobot_mcap.recorder import McapRecorder
+from ibrobot_testing.contexts import host_context
 
 from ibrobot_core.clock import RealClock
 from ibrobot_core.interfaces import EpisodeStart
 from ibrobot_core.messages import Header, JointState
-from ibrobot_core.testing.contexts import host_context
 
 
 def main(directory: Path, rate_hz: float, compression: str) -> None:

@@ -15,12 +15,12 @@ import yaml
 from ibrobot_mcap import bagfile, ibrobot_recorders, output
 from ibrobot_mcap.recorder import McapRecorder
 from ibrobot_ros2 import definition, encode, type_hash
+from ibrobot_testing.contexts import START_NS, host_context
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 from ibrobot_core.errors import RecorderError
 from ibrobot_core.messages import Image, JointState, String
-from ibrobot_core.testing.contexts import START_NS, host_context
 from ibrobot_core.units import NS_PER_S
 
 from .conftest import CAMERA, JOINTS, joints, picture, read, stamp, summary

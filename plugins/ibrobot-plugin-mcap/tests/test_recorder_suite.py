@@ -5,10 +5,10 @@ from __future__ import annotations
 from ibrobot_mcap.options import McapOptions
 from ibrobot_mcap.reader import Rosbag2Reader
 from ibrobot_mcap.recorder import McapRecorder
+from ibrobot_testing import RecorderSuite
+from ibrobot_testing.contexts import START_NS, host_context
 
 from ibrobot_core.clock import RealClock
-from ibrobot_core.testing import RecorderSuite
-from ibrobot_core.testing.contexts import START_NS, host_context
 
 
 class McapSuite(RecorderSuite):

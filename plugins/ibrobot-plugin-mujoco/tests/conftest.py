@@ -2,4 +2,4 @@
 
 from __future__ import annotations
 
-from ibrobot_core.testing.leaks import no_leaks  # noqa: F401
+from ibrobot_testing.leaks import no_leaks  # noqa: F401

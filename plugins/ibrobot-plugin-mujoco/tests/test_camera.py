@@ -17,13 +17,13 @@ from ibrobot_mujoco.render import Renderer
 from ibrobot_mujoco.so101 import so101
 from ibrobot_mujoco.state import PHYSICS_TOPIC, pose_scene
 from ibrobot_ros2.jpeg import to_jpeg
+from ibrobot_testing import SensorSuite, control_context, host_context
 
 from ibrobot_core.errors import SensorError
 from ibrobot_core.interfaces import Context, Episode, Sensor
 from ibrobot_core.messages import CameraInfo, CompressedImage, Float64MultiArray, Image
 from ibrobot_core.plugins import installed
 from ibrobot_core.robot import Vector
-from ibrobot_core.testing import SensorSuite, control_context, host_context
 
 MISSING = installed().missing("sensor", "mujoco")
 pytestmark = pytest.mark.skipif(MISSING is not None, reason=str(MISSING))

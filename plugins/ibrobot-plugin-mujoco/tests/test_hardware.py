@@ -11,11 +11,11 @@ from ibrobot_mujoco.hardware import MujocoHardware
 from ibrobot_mujoco.options import Fault, MujocoOptions
 from ibrobot_mujoco.so101 import so101
 from ibrobot_mujoco.state import stamp_of
+from ibrobot_testing import SimulatedHardwareSuite, control_context
 
 from ibrobot_core.errors import HardwareError
 from ibrobot_core.interfaces import Context, Episode, Hardware, JointReading
 from ibrobot_core.robot import Vector
-from ibrobot_core.testing import SimulatedHardwareSuite, control_context
 
 ROBOT = so101()
 REST = ROBOT.pose("rest")

@@ -13,11 +13,11 @@ from ibrobot_mujoco.hardware import MujocoHardware
 from ibrobot_mujoco.options import Fault, MujocoOptions, SceneCamera
 from ibrobot_mujoco.policy_options import ScriptedPickOptions
 from ibrobot_mujoco.so101 import MJCF, so101
+from ibrobot_testing import control_context
 
 from ibrobot_core.errors import MissingDependency
 from ibrobot_core.plugins import installed
 from ibrobot_core.robot import Joint
-from ibrobot_core.testing import control_context
 
 
 def test_importing_the_plugin_imports_nothing_heavy() -> None:

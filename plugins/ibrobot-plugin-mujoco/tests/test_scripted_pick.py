@@ -14,11 +14,11 @@ from ibrobot_mujoco.options import Fault, MujocoOptions
 from ibrobot_mujoco.policy_options import ScriptedPickOptions
 from ibrobot_mujoco.scripted_pick import SCENE, STATE, ScriptedPick
 from ibrobot_mujoco.so101 import so101
+from ibrobot_testing import PolicySuite, host_context
 
 from ibrobot_core.errors import PolicyError
 from ibrobot_core.interfaces import Context, Frame
 from ibrobot_core.robot import Vector
-from ibrobot_core.testing import PolicySuite, host_context
 from ibrobot_core.units import ns, seconds
 
 from .pick_loop import PERIOD_NS, RATE_HZ, Outcome, PickLoop

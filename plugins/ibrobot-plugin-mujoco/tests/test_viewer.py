@@ -16,13 +16,13 @@ from ibrobot_mujoco.options import MujocoOptions
 from ibrobot_mujoco.so101 import so101
 from ibrobot_mujoco.state import PHYSICS_TOPIC, physics_size
 from ibrobot_mujoco.viewer import MujocoViewer
+from ibrobot_testing import ViewerSuite, host_context
+from ibrobot_testing.suite import Suite
 from mujoco import viewer as mujoco_viewer
 
 from ibrobot_core.errors import IbrobotError
 from ibrobot_core.interfaces import Context, Viewer
 from ibrobot_core.messages import Float64MultiArray, Message
-from ibrobot_core.testing import ViewerSuite, host_context
-from ibrobot_core.testing.suite import Suite
 
 ROBOT = so101()
 OPTIONS = MujocoOptions()

@@ -6,10 +6,10 @@ from typing import override
 
 from ibrobot_planning.joint import JointPlanner
 from ibrobot_planning.options import JointPlannerOptions
+from ibrobot_testing import PlannerSuite
+from ibrobot_testing.leaks import no_leaks  # noqa: F401
 
 from ibrobot_core.interfaces import Context
-from ibrobot_core.testing import PlannerSuite
-from ibrobot_core.testing.leaks import no_leaks  # noqa: F401
 
 
 class TestJointPlanner(PlannerSuite):

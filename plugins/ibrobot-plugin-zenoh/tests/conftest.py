@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import pytest
+from ibrobot_testing.leaks import no_leaks  # noqa: F401
 from ibrobot_zenoh import reasons
-
-from ibrobot_core.testing.leaks import no_leaks  # noqa: F401
 
 from .pair import client, free_endpoint, made, router
 

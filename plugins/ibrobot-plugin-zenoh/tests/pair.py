@@ -8,11 +8,11 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
+from ibrobot_testing import host_context
 from ibrobot_zenoh.options import ZenohOptions
 from ibrobot_zenoh.transport import ZenohTransport
 
 from ibrobot_core.interfaces import Transport
-from ibrobot_core.testing import host_context
 
 WAIT_S = 30.0
 """How long a test waits for what must come [s]."""

@@ -5,11 +5,11 @@ from __future__ import annotations
 import sys
 import threading
 
+from ibrobot_testing import host_context
 from ibrobot_zenoh.options import ZenohOptions
 from ibrobot_zenoh.transport import ZenohTransport
 
 from ibrobot_core.interfaces import Payload
-from ibrobot_core.testing import host_context
 
 
 def answer(payload: Payload, _: str | None) -> Payload:

@@ -16,6 +16,8 @@ import zenoh
 import zenoh.ext
 from click.testing import CliRunner
 from ibrobot_ros2 import encode
+from ibrobot_testing import host_context
+from ibrobot_testing.fakes import FakePolicy
 from ibrobot_zenoh.commands.certs import certs
 from ibrobot_zenoh.options import ZenohOptions
 from ibrobot_zenoh.ros2 import Node, typed
@@ -27,8 +29,6 @@ from ibrobot_core.inference.wire import Decoder, Encoder, Kind, Message
 from ibrobot_core.interfaces import Payload, Tensors
 from ibrobot_core.messages import Int32
 from ibrobot_core.messages import Message as RosMessage
-from ibrobot_core.testing import host_context
-from ibrobot_core.testing.fakes import FakePolicy
 
 from .pair import WAIT_S, free_endpoint, keep
 

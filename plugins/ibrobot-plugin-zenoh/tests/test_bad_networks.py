@@ -102,7 +102,7 @@ def test_a_client_that_never_connected_can_be_closed():
 
 PROGRAM = """
 import sys
-from ibrobot_core.testing import host_context
+from ibrobot_testing import host_context
 from ibrobot_zenoh.options import ZenohOptions
 from ibrobot_zenoh.transport import ZenohTransport
 

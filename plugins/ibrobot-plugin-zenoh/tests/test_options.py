@@ -6,11 +6,11 @@ import queue
 from pathlib import Path
 
 import pytest
+from ibrobot_testing import host_context
 from ibrobot_zenoh.options import Tls, ZenohOptions
 
 from ibrobot_core.errors import TransportError
 from ibrobot_core.plugins import installed
-from ibrobot_core.testing import host_context
 
 from .pair import WAIT_S, client, free_endpoint, make, router, settle, wait_for
 

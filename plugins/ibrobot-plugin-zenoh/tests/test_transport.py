@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import override
 
+from ibrobot_testing import TransportSuite
+
 from ibrobot_core.interfaces import Context, Transport
-from ibrobot_core.testing import TransportSuite
 
 from .pair import client, free_endpoint, router, settle
 

@@ -2,10 +2,10 @@
 
 from typing import override
 
+from ibrobot_testing import TeleopSuite
 from ibrobot_wave import Wave, WaveOptions
 
 from ibrobot_core.interfaces import Context, Teleop
-from ibrobot_core.testing import TeleopSuite
 
 
 class TestWave(TeleopSuite):

@@ -14,8 +14,8 @@ from ibrobot_core.errors import PlanningError
 from ibrobot_core.interfaces import Context, JointGoal, Planner, PlanRequest
 from ibrobot_core.messages import JointTrajectory
 from ibrobot_core.robot import Vector
-from ibrobot_core.testing.suite import Suite
 from ibrobot_core.units import seconds
+from ibrobot_testing.suite import Suite
 
 
 class PlannerSuite(Suite[Planner]):

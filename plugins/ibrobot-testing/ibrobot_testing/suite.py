@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from ibrobot_core.interfaces import Context
-from ibrobot_core.testing.contexts import host_context
+from ibrobot_testing.contexts import host_context
 
 
 class Suite[T]:

@@ -1,8 +1,8 @@
 """The least that is a correct implementation of each kind: for tests, and as examples to read."""
 
-from ibrobot_core.testing.fakes.control import FakeExecutor, FakeHardware, FakeRealHardware
-from ibrobot_core.testing.fakes.host import FakePlanner, FakePolicy, FakeSensor, FakeTeleop, FakeViewer
-from ibrobot_core.testing.fakes.storage import FakeDataset, FakeRecorder
+from ibrobot_testing.fakes.control import FakeExecutor, FakeHardware, FakeRealHardware
+from ibrobot_testing.fakes.host import FakePlanner, FakePolicy, FakeSensor, FakeTeleop, FakeViewer
+from ibrobot_testing.fakes.storage import FakeDataset, FakeRecorder
 
 __all__ = [
     "FakeDataset",

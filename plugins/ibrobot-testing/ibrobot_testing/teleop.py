@@ -12,7 +12,7 @@ import pytest
 from ibrobot_core.errors import TeleopError
 from ibrobot_core.interfaces import Context, JointReading, Teleop, TeleopCommand
 from ibrobot_core.robot import Vector
-from ibrobot_core.testing.suite import Suite
+from ibrobot_testing.suite import Suite
 
 
 class TeleopSuite(Suite[Teleop]):

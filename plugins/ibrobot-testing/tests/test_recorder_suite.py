@@ -8,10 +8,10 @@ from typing import override
 import attrs
 import numpy as np
 import pytest
+from ibrobot_testing import RecorderSuite, checks, failed_checks
+from ibrobot_testing.fakes import FakeRecorder
 
 from ibrobot_core.messages import Header, JointState
-from ibrobot_core.testing import RecorderSuite, checks, failed_checks
-from ibrobot_core.testing.fakes import FakeRecorder
 
 
 class TestRecorder(RecorderSuite):

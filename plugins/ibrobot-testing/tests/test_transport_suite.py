@@ -7,10 +7,10 @@ import threading
 from typing import override
 
 import pytest
+from ibrobot_testing import TransportSuite, checks, failed_checks
 
 from ibrobot_core.errors import TransportError
 from ibrobot_core.local_transport import LocalTransport, _Request
-from ibrobot_core.testing import TransportSuite, checks, failed_checks
 
 
 class ShortSuite(TransportSuite):

@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import override
 
 import pytest
-
-from ibrobot_core.testing import ViewerSuite, checks, failed_checks
-from ibrobot_core.testing.fakes import FakeViewer
+from ibrobot_testing import ViewerSuite, checks, failed_checks
+from ibrobot_testing.fakes import FakeViewer
 
 
 class TestViewer(ViewerSuite):

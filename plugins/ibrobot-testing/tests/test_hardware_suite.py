@@ -6,11 +6,11 @@ from typing import ClassVar, override
 
 import numpy as np
 import pytest
+from ibrobot_testing import HardwareSuite, SimulatedHardwareSuite, checks, failed_checks
+from ibrobot_testing.fakes import FakeHardware, FakeRealHardware
 
 from ibrobot_core.errors import HardwareError
 from ibrobot_core.interfaces import Condition, Episode, Holding, JointReading, Severity, Signal
-from ibrobot_core.testing import HardwareSuite, SimulatedHardwareSuite, checks, failed_checks
-from ibrobot_core.testing.fakes import FakeHardware, FakeRealHardware
 
 
 class TestRealHardware(HardwareSuite):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ibrobot_core.errors import DatasetError
 from ibrobot_core.interfaces import DatasetWriter, Feature
-from ibrobot_core.testing.suite import Suite
+from ibrobot_testing.suite import Suite
 
 Values = Mapping[str, NDArray[np.generic]]
 

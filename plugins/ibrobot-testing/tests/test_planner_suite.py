@@ -7,11 +7,11 @@ from typing import override
 import attrs
 import numpy as np
 import pytest
+from ibrobot_testing import PlannerSuite, checks, failed_checks
+from ibrobot_testing.fakes import FakePlanner
 
 from ibrobot_core.errors import PlanningError
 from ibrobot_core.interfaces import JointGoal
-from ibrobot_core.testing import PlannerSuite, checks, failed_checks
-from ibrobot_core.testing.fakes import FakePlanner
 
 
 class TestPlanner(PlannerSuite):

@@ -7,10 +7,10 @@ from typing import override
 import attrs
 import numpy as np
 import pytest
+from ibrobot_testing import PolicySuite, checks, failed_checks
+from ibrobot_testing.fakes import FakePolicy
 
 from ibrobot_core.errors import PolicyError
-from ibrobot_core.testing import PolicySuite, checks, failed_checks
-from ibrobot_core.testing.fakes import FakePolicy
 
 
 class TestPolicy(PolicySuite):

@@ -13,9 +13,9 @@ from ibrobot_core.clock import SteppedClock
 from ibrobot_core.errors import HardwareError, NotSupported
 from ibrobot_core.interfaces import Context, Episode, Hardware, JointReading, SimulatedHardware, Torque
 from ibrobot_core.robot import Vector
-from ibrobot_core.testing.contexts import control_context
-from ibrobot_core.testing.suite import Suite
 from ibrobot_core.units import ns
+from ibrobot_testing.contexts import control_context
+from ibrobot_testing.suite import Suite
 
 
 class HardwareSuite(Suite[Hardware]):

@@ -15,8 +15,8 @@ import pytest
 from ibrobot_core.errors import RecorderError
 from ibrobot_core.interfaces import Context, EpisodeEnd, EpisodeStart, Recorder
 from ibrobot_core.messages import Header, JointState, Message, String
-from ibrobot_core.testing.suite import Suite
 from ibrobot_core.units import NS_PER_S
+from ibrobot_testing.suite import Suite
 
 Record = tuple[int, Message]
 """Receive stamp [ns] and message."""

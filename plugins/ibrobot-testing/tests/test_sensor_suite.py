@@ -7,11 +7,11 @@ from typing import override
 import attrs
 import numpy as np
 import pytest
+from ibrobot_testing import SensorSuite, checks, failed_checks
+from ibrobot_testing.fakes import FakeSensor
 
 from ibrobot_core.errors import SensorError
 from ibrobot_core.messages import CameraInfo, CompressedImage, Header
-from ibrobot_core.testing import SensorSuite, checks, failed_checks
-from ibrobot_core.testing.fakes import FakeSensor
 
 
 class TestSensor(SensorSuite):

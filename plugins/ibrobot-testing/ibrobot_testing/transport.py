@@ -12,7 +12,7 @@ import pytest
 
 from ibrobot_core.errors import TransportError
 from ibrobot_core.interfaces import Context, Payload, Transport
-from ibrobot_core.testing.suite import Suite
+from ibrobot_testing.suite import Suite
 
 _HELD_S = 120.0
 """The longest that a callback is held back [s]: longer than anything here waits, so that none goes on by itself."""

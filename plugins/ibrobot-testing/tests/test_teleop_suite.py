@@ -7,10 +7,10 @@ from typing import override
 import attrs
 import numpy as np
 import pytest
+from ibrobot_testing import TeleopSuite, checks, failed_checks
+from ibrobot_testing.fakes import FakeTeleop
 
 from ibrobot_core.errors import TeleopError
-from ibrobot_core.testing import TeleopSuite, checks, failed_checks
-from ibrobot_core.testing.fakes import FakeTeleop
 
 
 class TestTeleop(TeleopSuite):

@@ -11,7 +11,7 @@ import numpy as np
 from ibrobot_core.bus import Bus
 from ibrobot_core.interfaces import Context, Viewer
 from ibrobot_core.messages import Header, JointState, Message, String
-from ibrobot_core.testing.suite import Suite
+from ibrobot_testing.suite import Suite
 
 
 class ViewerSuite(Suite[Viewer]):

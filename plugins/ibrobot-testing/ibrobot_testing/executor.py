@@ -12,9 +12,9 @@ import pytest
 from ibrobot_core.errors import GoalRejected
 from ibrobot_core.interfaces import Context, Executor, GoalState, GoalStatus, JointReading, Plan
 from ibrobot_core.robot import Vector
-from ibrobot_core.testing.contexts import ARM, control_context
-from ibrobot_core.testing.suite import Suite
 from ibrobot_core.units import seconds
+from ibrobot_testing.contexts import ARM, control_context
+from ibrobot_testing.suite import Suite
 
 
 class ExecutorSuite(Suite[Executor]):

@@ -2,7 +2,7 @@
 
 In a plugin's `conftest.py`:
 
-    from ibrobot_core.testing.leaks import no_leaks  # noqa: F401
+    from ibrobot_testing.leaks import no_leaks  # noqa: F401
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from ibrobot_core.errors import SensorError
 from ibrobot_core.interfaces import Context, Sensor
 from ibrobot_core.messages import MESSAGE_TYPES, CameraInfo, CompressedImage, Image, Message
 from ibrobot_core.plugins import installed
-from ibrobot_core.testing.suite import Suite
+from ibrobot_testing.suite import Suite
 
 _BYTES_PER_PIXEL = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1, "mono16": 2, "16UC1": 2, "32FC1": 4}
 

@@ -6,11 +6,11 @@ from typing import override
 
 import numpy as np
 import pytest
+from ibrobot_testing import ExecutorSuite, checks, failed_checks
+from ibrobot_testing.fakes import FakeExecutor
 
 from ibrobot_core.errors import GoalRejected
 from ibrobot_core.interfaces import GoalState, GoalStatus
-from ibrobot_core.testing import ExecutorSuite, checks, failed_checks
-from ibrobot_core.testing.fakes import FakeExecutor
 
 
 class TestExecutor(ExecutorSuite):

@@ -6,10 +6,10 @@ from typing import override
 
 import numpy as np
 import pytest
+from ibrobot_testing import DatasetSuite, checks, failed_checks
+from ibrobot_testing.fakes import FakeDataset
 
 from ibrobot_core.errors import DatasetError
-from ibrobot_core.testing import DatasetSuite, checks, failed_checks
-from ibrobot_core.testing.fakes import FakeDataset
 
 
 class TestDataset(DatasetSuite):

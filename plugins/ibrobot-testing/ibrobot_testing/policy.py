@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ibrobot_core.errors import PolicyError
 from ibrobot_core.interfaces import Context, Frame, Policy, PolicySpec, Tensors
 from ibrobot_core.interfaces.policy import copied
-from ibrobot_core.testing.suite import Suite
+from ibrobot_testing.suite import Suite
 
 _STEP_NS = 33_333_333
 

@@ -1,0 +1,42 @@
+"""Conformance suites for plugin authors: subclass the one of your kind, write `make`, and run pytest."""
+
+import pkgutil
+
+import pytest
+
+# Before they are imported, and wherever they are installed: assertions in the suites say what they compared.
+pytest.register_assert_rewrite(*(f"{__name__}.{module.name}" for module in pkgutil.iter_modules(__path__)))
+
+from ibrobot_testing.contexts import control_context, host_context, make_robot
+from ibrobot_testing.dataset import DatasetSuite
+from ibrobot_testing.executor import ExecutorSuite
+from ibrobot_testing.hardware import HardwareSuite, SimulatedHardwareSuite
+from ibrobot_testing.planner import PlannerSuite
+from ibrobot_testing.policy import PolicySuite
+from ibrobot_testing.recorder import RecorderSuite
+from ibrobot_testing.sensor import SensorSuite
+from ibrobot_testing.suite import Suite, checks, failed_checks, run_checks
+from ibrobot_testing.teleop import TeleopSuite
+from ibrobot_testing.transport import TransportSuite
+from ibrobot_testing.viewer import ViewerSuite
+
+__all__ = [
+    "DatasetSuite",
+    "ExecutorSuite",
+    "HardwareSuite",
+    "PlannerSuite",
+    "PolicySuite",
+    "RecorderSuite",
+    "SensorSuite",
+    "SimulatedHardwareSuite",
+    "Suite",
+    "TeleopSuite",
+    "TransportSuite",
+    "ViewerSuite",
+    "checks",
+    "control_context",
+    "failed_checks",
+    "host_context",
+    "make_robot",
+    "run_checks",
+]
