@@ -104,14 +104,15 @@ def serial_ports(patterns: tuple[str, ...] = ("/dev/ttyACM*", "/dev/ttyUSB*")) -
 
 
 def realtime() -> Check:
-    """Whether the control process may ask for SCHED_FIFO."""
+    """Whether the control process and the sensors may ask for real-time priority."""
     if os.geteuid() == 0:
         return Check("real-time priority", True, "permitted (root)")
     limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0] if hasattr(resource, "RLIMIT_RTPRIO") else 0
     if limit > 0 or limit == resource.RLIM_INFINITY:
         return Check("real-time priority", True, f"permitted up to {limit if limit > 0 else 99}")
     remedy = "add '@realtime - rtprio 95' to /etc/security/limits.d/ibrobot.conf, join group realtime, log in again"
-    return Check("real-time priority", False, "not permitted; the control loop may be milliseconds late", remedy)
+    refused = "not permitted; the control loop and pictures may be late under load"
+    return Check("real-time priority", False, refused, remedy)
 
 
 def memory_lock() -> Check:
