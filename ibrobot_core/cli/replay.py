@@ -95,8 +95,14 @@ def replay(
     request = Request(
         options["lockstep"], playback.seed or 0, replay=Replay(str(episode), playback, speed),
     )  # fmt: skip
-    # Cameras have no part in it.
-    run_loaded(attrs.evolve(robot, peripherals={}, recording=None), request, options, _Comparison())
+    run_loaded(_without_sensors(robot), request, options, _Comparison())
+
+
+def _without_sensors(robot: RobotConfig) -> RobotConfig:
+    """The robot without cameras and other sensors, and without the observations of these: a replay needs none."""
+    observations = tuple(spec for spec in robot.contract.observations if spec.peripheral is None)
+    contract = attrs.evolve(robot.contract, observations=observations)
+    return attrs.evolve(robot, peripherals={}, contract=contract, recording=None)
 
 
 def _named(config: str, changes: tuple[str, ...], *, sim: bool) -> RobotConfig:

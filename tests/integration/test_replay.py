@@ -32,6 +32,12 @@ def replay(ibrobot: tuple[str, ...], tmp_path: Path) -> Command:
     return run
 
 
+def test_replay_leaves_out_the_cameras_of_the_contract(replay: Command, picks: Path):
+    done = replay(picks / "episode_000001", "so101", "--sim", "--lockstep", "--force-contract")
+    assert done.returncode == 0, done.stderr
+    assert "scene      success; recorded: success" in done.stdout
+
+
 def test_in_lockstep_the_cube_comes_into_the_bin_again(replay: Command, picks: Path):
     for episode in sorted(picks.iterdir()):
         done = replay(episode, "--sim", "--lockstep", "--json")
