@@ -21,7 +21,7 @@ import sys
 from pathlib import Path
 from time import perf_counter
 
-CONFIG = Path(__file__).with_name("pick_cube.yaml")
+CONFIG = Path(__file__).parents[1] / "configs" / "so101_pick_cube.yaml"
 FIRST_TRAINING_SEED = 1000
 """Trials have the seeds from 0 on."""
 NOT_ALL_SUCCEEDED = 3
@@ -91,7 +91,7 @@ def main() -> int:
     begin = perf_counter()
     model = f"models.act.path={trained}/checkpoints/last/pretrained_model"
     told = run(
-        "ibrobot", "launch", CONFIG, "--sim", "--lockstep", "--headless", "--mode", "learnt", "--episodes",
+        "ibrobot", "launch", CONFIG, "--sim", "--lockstep", "--headless", "--mode", "learned", "--episodes",
         str(arguments.trials), "--json", "--set", model,
     )  # fmt: skip
     summary = json.loads(told)

@@ -10,6 +10,7 @@ from typing import Any, get_args, get_type_hints
 
 import attrs
 import click
+from plugin_index import plugin_page
 
 from ibrobot_core.cli.main import COMMANDS, cli
 from ibrobot_core.config import schema
@@ -106,7 +107,7 @@ def cli_page() -> Iterator[str]:
 
 def write(directory: Path) -> None:
     """Write all generated pages into `directory`; a page that is the same is left alone."""
-    for name, lines in (("config.md", config_page()), ("cli.md", cli_page())):
+    for name, lines in (("config.md", config_page()), ("cli.md", cli_page()), ("plugins.md", plugin_page())):
         text = "\n".join(lines) + "\n"
         path = directory / name
         if not path.exists() or path.read_text() != text:

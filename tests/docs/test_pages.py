@@ -23,7 +23,7 @@ from ibrobot_core.plugins import installed
 pytestmark = pytest.mark.integration
 
 ROOT = Path(__file__).parents[2]
-GENERATED = {ROOT / "docs/reference/cli.md", ROOT / "docs/reference/config.md"}
+GENERATED = {ROOT / f"docs/reference/{name}.md" for name in ("cli", "config", "plugins")}
 PAGES = [
     page
     for page in (

@@ -1,0 +1,51 @@
+"""The reference page that lists what each package offers, from the plugins' descriptors."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from importlib.metadata import entry_points, metadata
+from typing import Any
+
+import pluggy
+
+from ibrobot_core.plugins import KINDS, installed
+
+CORE = "ibrobot-core"
+
+
+def plugin_page() -> Iterator[str]:
+    """Lines of the page: core first, then every installed plugin by its package's name."""
+    managers = installed().managers
+    packages = {point.name: point.dist.name for point in entry_points(group="ibrobot") if point.dist is not None}
+    shown = sorted((packages.get(name, CORE), name) for name in managers)
+    shown.sort(key=lambda pair: pair[0] != CORE)
+    yield "# Plugins\n"
+    yield "This page lists what core and the plugins of the repository offer. `ibrobot plugins` prints the list for"
+    yield "your own installation. `ibrobot plugins show TYPE` prints the options of a type, with units and defaults.\n"
+    for package, name in shown:
+        yield f"## {package}\n"
+        yield f"{metadata(package)['Summary']}.\n"
+        yield "| kind | name | |"
+        yield "|---|---|---|"
+        for kind, title, summary in _offers(managers[name]):
+            yield f"| {kind} | `{title}` | {summary} |"
+        yield ""
+
+
+def _offers(manager: pluggy.PluginManager) -> Iterator[tuple[str, str, str]]:
+    """Kind, name and summary of everything that one plugin registers."""
+    for kind, hook in KINDS.items():
+        for descriptor in _yielded(manager, hook):
+            yield kind, descriptor.type, descriptor.summary
+    for reader in _yielded(manager, "ibrobot_readers"):
+        yield "reader", reader.type, reader.summary
+    for decoder in _yielded(manager, "ibrobot_decoders"):
+        yield "decoder", ", ".join(decoder.formats), "compressed images"
+    for config in _yielded(manager, "ibrobot_configs"):
+        yield "robot YAML", config.name, config.summary
+    for command in _yielded(manager, "ibrobot_commands"):
+        yield "command", f"ibrobot {command.name}", command.summary.rstrip(".")
+
+
+def _yielded(manager: pluggy.PluginManager, hook: str) -> list[Any]:
+    return [item for result in getattr(manager.hook, hook)() for item in result]
