@@ -36,6 +36,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from ibrobot_serve.service import InferenceService
 from ibrobot_testing import host_context
 from made_up import plugin
 
@@ -44,7 +45,6 @@ from ibrobot_core.inference.client import DispatchInfer, EngineClient
 from ibrobot_core.inference.engine import Engine
 from ibrobot_core.inference.process import ProcessEngine
 from ibrobot_core.inference.remote import RemoteEngine
-from ibrobot_core.inference.service import InferenceService
 from ibrobot_core.inference.wire import Kind, Message, encode
 from ibrobot_core.interfaces import Frame, Transport
 from ibrobot_core.plugins import installed

@@ -22,6 +22,8 @@ from typing import Any, override
 
 import attrs
 import numpy as np
+from ibrobot_serve.fair_queue import FairQueue
+from ibrobot_serve.pacing import Pacing
 from ibrobot_testing import make_robot
 
 from ibrobot_core.bus import Bus
@@ -38,8 +40,6 @@ from ibrobot_core.config.schema import (
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.dispatch.dispatcher import Dispatcher
 from ibrobot_core.inference.client import Chunk, DispatchInfer, InferenceClient
-from ibrobot_core.inference.fair_queue import FairQueue
-from ibrobot_core.inference.pacing import Pacing
 from ibrobot_core.interfaces import PolicySpec
 from ibrobot_core.messages import Header, JointState
 from ibrobot_core.options import NoOptions

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from importlib import import_module
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -12,7 +11,7 @@ import attrs
 import click
 from plugin_index import plugin_page
 
-from ibrobot_core.cli.main import COMMANDS, cli
+from ibrobot_core.cli.main import cli
 from ibrobot_core.config import schema
 from ibrobot_core.robot import Description, Joint, Robot
 
@@ -100,9 +99,11 @@ def cli_page() -> Iterator[str]:
     """Lines of the page on the command line."""
     yield "# Command line\n"
     yield from command_lines(cli, "ibrobot")
-    for name, (target, _) in COMMANDS.items():
-        module, _, attribute = target.partition(":")
-        yield from command_lines(getattr(import_module(module), attribute), f"ibrobot {name}")
+    context = click.Context(cli)
+    for name in cli.list_commands(context):
+        found = cli.get_command(context, name)
+        assert found is not None
+        yield from command_lines(found, f"ibrobot {name}")
 
 
 def write(directory: Path) -> None:

@@ -20,8 +20,8 @@ from ibrobot_core.launch.runtime import Runtime
 from ibrobot_core.launch.session import Request
 from ibrobot_core.outside import echo
 from ibrobot_core.plugins import installed
-from ibrobot_core.recording.convert.provenance import told_by
 from ibrobot_core.recording.playback import read_playback
+from ibrobot_core.recording.provenance import told_by
 from ibrobot_core.units import NORM_MODES
 
 

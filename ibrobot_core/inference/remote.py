@@ -13,8 +13,17 @@ import attrs
 
 from ibrobot_core.errors import ContractError, PolicyError, TransportError, WireError
 from ibrobot_core.inference.engine import Engine, check_weights
-from ibrobot_core.inference.service import health_name, service_name
-from ibrobot_core.inference.wire import LIMITS, Buffer, Decoder, Encoder, Kind, Limits, Message
+from ibrobot_core.inference.wire import (
+    LIMITS,
+    Buffer,
+    Decoder,
+    Encoder,
+    Kind,
+    Limits,
+    Message,
+    health_name,
+    service_name,
+)
 from ibrobot_core.interfaces import PictureCodec, Policy, Tensors, Transport
 from ibrobot_core.interfaces.policy import whole_fingerprint
 from ibrobot_core.units import NS_PER_S

@@ -43,6 +43,16 @@ _LAYOUTS_KEPT = 512
 """One for each robot, as a rule: more than a server has. They take about 2 kB each."""
 
 
+def service_name(model: str) -> str:
+    """What a transport calls the service of a model."""
+    return f"infer/{model}"
+
+
+def health_name(model: str) -> str:
+    """What a transport calls its health."""
+    return f"{service_name(model)}/health"
+
+
 class Kind(enum.IntEnum):
     """What a frame is."""
 

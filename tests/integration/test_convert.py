@@ -17,6 +17,7 @@ import attrs
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from ibrobot_data.run import STAGING
 from ibrobot_ros2 import encode
 from ibrobot_testing.terminal import Terminal
 from recordings import CONTRACT, JOINTS, SIZE, START_NS, numbered, record
@@ -32,7 +33,6 @@ from ibrobot_core.messages import (
     JointTrajectoryPoint,
     Message,
 )
-from ibrobot_core.recording.convert.run import STAGING
 
 pytestmark = pytest.mark.integration
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from ibrobot_camera.camera import OpenCvCamera
 from ibrobot_camera.options import OpenCvOptions
+from ibrobot_data.ticks import Ticks
 from ibrobot_mcap.options import McapOptions
 from ibrobot_mcap.reader import Rosbag2Reader
 from ibrobot_mcap.recorder import McapRecorder
@@ -32,7 +33,6 @@ from ibrobot_core.launch.runtime import Runtime
 from ibrobot_core.launch.session import Request, Session
 from ibrobot_core.messages import CompressedImage, Float64MultiArray, Header, Imu, JointState, Message, Vector3
 from ibrobot_core.plugins import installed
-from ibrobot_core.recording.convert.ticks import Ticks
 
 pytestmark = pytest.mark.integration
 

@@ -10,6 +10,8 @@ from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
+from ibrobot_data.episode import DATASET, Job, convert_episode
+from ibrobot_data.request import EpisodeReport, Request
 from ibrobot_lerobot.options import LeRobotOptions
 from ibrobot_ros2 import encode
 from recordings import JOINTS, START_NS
@@ -21,8 +23,6 @@ from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import ConfigError
 from ibrobot_core.messages import Bool, Float64MultiArray, Header, JointState, String
 from ibrobot_core.plugins import installed
-from ibrobot_core.recording.convert.episode import DATASET, Job, convert_episode
-from ibrobot_core.recording.convert.request import EpisodeReport, Request
 
 pytestmark = pytest.mark.integration
 

@@ -9,11 +9,11 @@ from typing import Any
 import attrs
 import numpy as np
 import pytest
+from ibrobot_data.ticks import Ticks
 from ibrobot_mcap.reader import Rosbag2Reader
 from recordings import CONTRACT, record
 
 from ibrobot_core.contract.specs import Contract
-from ibrobot_core.recording.convert.ticks import Ticks
 
 pytestmark = pytest.mark.integration
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import textwrap
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,8 @@ from ibrobot_core.plugins import discover
 
 if TYPE_CHECKING:
     from conftest import Site
+
+collect_ignore = [] if find_spec("ibrobot_serve") else ["test_distributed.py"]
 
 PARTS = '''
 import time

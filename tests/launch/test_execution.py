@@ -1,98 +1,18 @@
-"""Execution modes of a run: the same motion wherever the model runs, and what is told of it."""
+"""A policy in a run: its prompt, what is told of its plan, and what its execution mode needs."""
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import attrs
-import numpy as np
 import pytest
-from ibrobot_testing import host_context
 
 from ibrobot_core.errors import ComponentFailed, ConfigError
-from ibrobot_core.inference.service import InferenceService
 
 if TYPE_CHECKING:
-    from conftest import Runs, Site
-    from ibrobot_core.launch.runtime import Runtime
+    from conftest import Runs
 
-SHARED = '''
-from ibrobot_core import hookimpl
-from ibrobot_core.descriptors import TransportDescriptor
-from ibrobot_core.local_transport import LocalTransport
-
-class Shared(LocalTransport):
-    """One for the robot and its server."""
-    def close(self):
-        pass
-
-NETWORK = Shared()
-
-@hookimpl
-def ibrobot_transports():
-    yield TransportDescriptor("shared", lambda options, ctx: NETWORK, "a network")
-'''
 MODE = "control_modes.policy.inference.execution_mode={}"
-NETWORK = "transport={type: shared}"
-
-
-@pytest.fixture
-def cloud(runs: Runs, site: Site) -> Iterator[InferenceService]:
-    """A server of the model `net`, on the transport `shared`."""
-    site.add("shared-network", SHARED)
-    robot = runs.make().session.config.robot
-    network, net = sys.modules["shared_network"].NETWORK, runs.parts.Net(host_context(robot=robot))
-    service = InferenceService(net, network, "net")
-    service.start()
-    yield service
-    service.close()
-    type(network).__mro__[1].close(network)
-
-
-def motion(runtime: Runtime) -> np.ndarray:
-    """Commands of every tick until the run ends, shape (T, J)."""
-    commands = []
-    while not runtime.step():
-        assert runtime.session.state is not None
-        commands.append(runtime.session.state.command.copy())
-    runtime.raise_failure()
-    return np.array(commands)
-
-
-@pytest.mark.parametrize("mode", [pytest.param("process", marks=pytest.mark.integration), "distributed"])
-def test_every_execution_mode_moves_alike(mode: str, runs: Runs, cloud: InferenceService):
-    here = motion(runs.start(episodes=3, seed=5))
-    assert len(here) > 50
-    assert np.ptp(here, axis=0).min() > 0.05, "nothing moved"
-    loads = runs.parts.CALLS.count("load net")
-    runtime = runs.start(
-        MODE.format(mode), NETWORK if mode == "distributed" else "transport={type: local}", episodes=3, seed=5
-    )
-    elsewhere = motion(runtime)
-    np.testing.assert_array_equal(elsewhere, here)
-    assert runs.parts.CALLS.count("load net") == loads, "the robot's side loads no weights"
-
-
-@pytest.mark.parametrize("mode", [pytest.param("process", marks=pytest.mark.integration), "distributed"])
-def test_the_plan_to_be_continued_travels_with_the_request(mode: str, runs: Runs, site: Site):
-    def told(*overrides: str, strategy: str) -> np.ndarray:
-        dispatch = f"control_modes.policy.dispatch={{watermark: 7, strategy: {strategy}}}"
-        return motion(runs.start("models.net.type=continuing", dispatch, *overrides, episodes=2, seed=5))
-
-    site.add("shared-network", SHARED)
-    here = told(strategy="rtc")
-    assert not np.array_equal(told(strategy="replace"), here)
-    robot, network = runs.made[-1].session.config.robot, sys.modules["shared_network"].NETWORK
-    service = InferenceService(runs.parts.Continuing(host_context(robot=robot)), network, "net")
-    service.start()
-    try:
-        transport = NETWORK if mode == "distributed" else "transport={type: local}"
-        np.testing.assert_array_equal(told(MODE.format(mode), transport, strategy="rtc"), here)
-    finally:
-        service.close()
-        type(network).__mro__[1].close(network)
 
 
 def test_a_prompt_is_there_where_the_policy_wants_one(
@@ -121,7 +41,9 @@ def test_the_status_and_the_diagnostics_tell_how_the_plan_is_kept_filled(runs: R
     runtime = runs.start(duration_s=1.0)
     bus = runtime.session.bus
     received = [bus.subscribe("/robot_status", 1), bus.subscribe("/diagnostics", 1)]
-    motion(runtime)
+    while not runtime.step():
+        pass
+    runtime.raise_failure()
     status, diagnostics = (subscription.get().message for subscription in received)
     for subscription in received:
         subscription.close()
@@ -134,65 +56,6 @@ def test_the_status_and_the_diagnostics_tell_how_the_plan_is_kept_filled(runs: R
     assert {name: str(getattr(status, name)) for name in told} == {name: values[name] for name in told}
     assert (status.strategy, status.smoothing, values["watermark"]) == ("ensemble", True, "5")
     assert status.requests > 1
-
-
-def test_diagnostics_tell_where_the_model_is_and_whether_it_answers(runs: Runs, cloud: InferenceService):
-    runtime = runs.start(MODE.format("distributed"), NETWORK, duration_s=1.0)
-    diagnostics = runtime.session.bus.subscribe("/diagnostics", 1)
-    motion(runtime)
-    received = diagnostics.get()
-    diagnostics.close()
-    assert received is not None
-    (status,) = (status for status in received.message.status if status.name == "inference")
-    values = {pair.key: pair.value for pair in status.values}
-    assert (values["mode"], values["alive"], values["failures"]) == ("distributed", "True", "0")
-    assert int(values["requests"]) > 0
-    assert float(values["infer_ms"]) >= float(values["model_ms"]) > 0
-
-
-def test_the_arm_holds_while_the_server_is_gone_and_goes_on_when_it_is_back(runs: Runs, cloud: InferenceService):
-    runtime = runs.start(MODE.format("distributed"), NETWORK, "contract.max_duration_s=100", mode="policy", sim=True)
-    runs.parts.Scene.success = lambda scene: False
-    session = runtime.session
-    while not (session.stats and session.stats.chunks >= 2):
-        runtime.step()
-    cloud.close()
-    stats = session.stats
-    chunks = stats.chunks
-    while stats.failures < 2 or stats.plan_length:
-        runtime.step()
-    for _ in range(25):  # it comes to rest
-        runtime.step()
-    held = session.state.command.copy()
-    for _ in range(20):
-        runtime.step()
-        np.testing.assert_array_equal(session.state.command, held)
-    again = InferenceService(runs.parts.Net(host_context(robot=session.config.robot)), session.transport, "net")
-    again.start()
-    try:
-        while stats.chunks == chunks:
-            runtime.step()
-    finally:
-        again.close()
-
-
-def test_a_run_without_its_server_does_not_start(runs: Runs, cloud: InferenceService):
-    cloud.close()
-    with pytest.raises(ComponentFailed, match=r"model:net: no server for model 'net': nobody serves"):
-        runs.start(MODE.format("distributed"), NETWORK, "control_modes.policy.inference.request_timeout=0.01")
-    assert not runs.made[-1].session.has_control, "nothing is powered"
-
-
-def test_another_policy_on_the_server_is_told_with_both_sides(runs: Runs, cloud: InferenceService):
-    made = runs.make(MODE.format("distributed"), NETWORK, "control_modes.policy.inference.server_model=other")
-    other = runs.parts.Net(host_context())
-    service = InferenceService(other, sys.modules["shared_network"].NETWORK, "other")
-    service.start()
-    try:
-        with pytest.raises(ComponentFailed, match=r"action_size\n +robot: 2\n +server: 6"):
-            made.start()
-    finally:
-        service.close()
 
 
 @pytest.mark.parametrize("transport", [(), ("transport={type: local}",)])

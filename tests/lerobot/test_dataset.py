@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from ibrobot_data.request import Request
+from ibrobot_data.run import convert, find_episodes
 from ibrobot_lerobot.options import LeRobotOptions
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from mcap.reader import make_reader
@@ -16,8 +18,6 @@ from numpy.typing import NDArray
 from recordings import CAMERAS, SIZE, record
 from rosbags.typesys import Stores, get_typestore
 from tqdm import tqdm
-
-from ibrobot_core.recording.convert import Request, convert, find_episodes
 
 pytestmark = pytest.mark.lerobot
 tqdm.monitor_interval = 0  # no thread that outlives the test

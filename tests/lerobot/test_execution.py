@@ -15,13 +15,13 @@ import pytest
 import torch
 from ibrobot_lerobot.options import LeRobotPolicyOptions
 from ibrobot_lerobot.policy import SEED, LeRobotPolicy
+from ibrobot_serve.service import InferenceService
 from ibrobot_testing.contexts import START_NS, host_context
 
 from ibrobot_core.config import load
 from ibrobot_core.inference.engine import Engine, LocalEngine
 from ibrobot_core.inference.process import ProcessEngine
 from ibrobot_core.inference.remote import RemoteEngine
-from ibrobot_core.inference.service import InferenceService
 from ibrobot_core.interfaces import Frame, Payload
 from ibrobot_core.local_transport import LocalTransport
 

@@ -15,7 +15,7 @@ from ibrobot_core.contract.joint_units import JointUnits
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import ContractError, DatasetError, RecorderError
 from ibrobot_core.interfaces import EpisodeAddress, EpisodeReader, EpisodeSummary, Feature, Recorded, TopicSummary
-from ibrobot_core.recording.convert.provenance import origin
+from ibrobot_core.recording.provenance import origin
 from ibrobot_core.units import NS_PER_S
 from ibrobot_lerobot import layout
 from ibrobot_lerobot.rows import EpisodeRows

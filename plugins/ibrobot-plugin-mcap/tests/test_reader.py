@@ -22,13 +22,13 @@ from rosbags.rosbag2 import Writer as RosbagsWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from ibrobot_core.config.schema import Align
+from ibrobot_core.contract.frames import FrameAssembler, assemble
 from ibrobot_core.contract.image import pixels
 from ibrobot_core.contract.specs import Contract, ObservationPart
 from ibrobot_core.errors import IbrobotError, RecorderError
 from ibrobot_core.interfaces import Feature
 from ibrobot_core.messages import CompressedImage, Header, Image, JointState
 from ibrobot_core.plugins import installed
-from ibrobot_core.recording.convert.ticks import Ticks
 
 from .conftest import CAMERA, JOINTS, Bench, joints, picture, read, reading, stamp, summary
 
@@ -274,8 +274,10 @@ def test_standard_type_that_a_bag_defines_otherwise_gives_no_rows(tmp_path, old,
     part = ObservationPart(
         "observation.state", "/it", JointState.ros_type, ("position.pan",), None, Align(), Feature("float32", (1,))
     )
-    with reading(file) as reader, pytest.raises(IbrobotError, match="/it"):
-        list(Ticks(reader, Contract(100.0, (part,), ()), "refuse"))
+    with reading(file) as reader:
+        stream = ((each.topic, each.message, each.received_ns) for each in reader.messages({"/it"}))
+        with pytest.raises(IbrobotError, match="/it"):
+            list(assemble(FrameAssembler(Contract(100.0, (part,), ())), stream, [stamp(1)]))
     problems_of(file, longest_gap=10.0)  # raises nothing
 
 

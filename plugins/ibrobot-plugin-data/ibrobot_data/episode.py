@@ -23,10 +23,11 @@ from ibrobot_core.contract.specs import TASK, Contract
 from ibrobot_core.errors import ContractError, DatasetError, IbrobotError, RecorderError
 from ibrobot_core.interfaces import Context, DatasetWriter, EpisodeAddress, EpisodeReader, EpisodeSummary, Feature
 from ibrobot_core.plugins import installed
-from ibrobot_core.recording.convert.identity import identity
-from ibrobot_core.recording.convert.request import EpisodeReport, Request
-from ibrobot_core.recording.convert.ticks import Ticks
+from ibrobot_core.recording.provenance import recorded_contract
 from ibrobot_core.robot import Robot
+from ibrobot_data.identity import identity
+from ibrobot_data.request import EpisodeReport, Request
+from ibrobot_data.ticks import Ticks
 
 SUCCESS = "next.success"
 DATASET = "dataset"
@@ -229,23 +230,6 @@ def _features(contract: Contract, values: Mapping[str, NDArray[Any]], success: b
     features = {key: attrs.evolve(each, shape=values[key].shape) for key, each in contract.features().items()}
     features |= {part.key: part.feature for part in contract.signal_parts if part.key != TASK}
     return features | ({SUCCESS: Feature("bool", (1,))} if success else {})
-
-
-def recorded_contract(metadata: Mapping[str, str]) -> Contract | None:
-    """The contract that an episode was recorded by; None for one without.
-
-    Raises:
-        ContractError: when it cannot be read, or is not the one that its fingerprint is of.
-    """
-    if "contract" not in metadata:
-        return None
-    try:
-        contract = Contract.from_canonical(json.loads(metadata["contract"]))
-    except (ValueError, RecursionError) as error:
-        raise ContractError(f"the recorded contract cannot be read: {error}") from None
-    if metadata.get("fingerprint", contract.fingerprint()) != contract.fingerprint():
-        raise ContractError("the recorded contract is damaged: it is not the one that the recorded fingerprint is of")
-    return contract
 
 
 def _contract(request: Request, summary: EpisodeSummary) -> Contract:

@@ -18,14 +18,14 @@ from ibrobot_core.clock import RealClock
 from ibrobot_core.config import find_config, load
 from ibrobot_core.config.single import single_options
 from ibrobot_core.inference.build import build_policy
-from ibrobot_core.inference.metrics import probes
-from ibrobot_core.inference.service import InferenceService, ServiceOptions
 from ibrobot_core.interfaces import Context, Policy, Transport
 from ibrobot_core.metrics import MetricsServer
 from ibrobot_core.outside import LogFormatter, echo
 from ibrobot_core.plugins import Registry, installed
 from ibrobot_core.robot import Robot
 from ibrobot_core.workers import on_signals
+from ibrobot_serve.metrics import probes
+from ibrobot_serve.service import InferenceService, ServiceOptions
 
 DEFAULT_LISTEN = "tcp/127.0.0.1:7447"
 _PLAIN_PERIOD_S = 10.0

@@ -28,7 +28,8 @@ from ibrobot_core.errors import DatasetError, IbrobotError
 from ibrobot_core.interfaces import DatasetSummary, EpisodeAddress
 from ibrobot_core.memory import set_malloc
 from ibrobot_core.plugins import installed
-from ibrobot_core.recording.convert.episode import (
+from ibrobot_core.units import seconds
+from ibrobot_data.episode import (
     Job,
     Unit,
     convert_episode,
@@ -37,10 +38,9 @@ from ibrobot_core.recording.convert.episode import (
     unexpected,
     unit_key,
 )
-from ibrobot_core.recording.convert.identity import KnownEpisodes
-from ibrobot_core.recording.convert.provenance import conversion, provenance
-from ibrobot_core.recording.convert.request import EpisodeReport, Report, Request
-from ibrobot_core.units import seconds
+from ibrobot_data.identity import KnownEpisodes
+from ibrobot_data.provenance import conversion, provenance
+from ibrobot_data.request import EpisodeReport, Report, Request
 
 STAGING = ".staging"
 """Where converted episodes wait within the dataset's folder."""

@@ -17,12 +17,11 @@ import attrs
 import click
 from click.core import ParameterSource
 
-from ibrobot_core.cli.command import let_interrupts_raise
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import DatasetError
 from ibrobot_core.outside import echo
-from ibrobot_core.recording.convert.request import MISSING, OUTCOMES, EpisodeReport, Report, Request
 from ibrobot_core.units import NORM_MODES
+from ibrobot_data.request import MISSING, OUTCOMES, EpisodeReport, Report, Request
 
 if TYPE_CHECKING:
     from ibrobot_core.config import RobotConfig
@@ -69,7 +68,6 @@ def convert(context: click.Context, /, to: str, as_json: bool, **asked: Any) -> 
     Interrupted, the same command goes on where it was. An episode that cannot be converted is told and left out; the
     command then exits with 1.
     """
-    let_interrupts_raise()
     given = [name for name in asked if context.get_parameter_source(name) is ParameterSource.COMMANDLINE]
     if wrong := [name for name in given if name in (_ONLY_TO_BAG if to == "dataset" else _ONLY_TO_DATASET)]:
         option = next(each.opts[0] for each in context.command.params if each.name == wrong[0])
@@ -92,8 +90,8 @@ def _to_dataset(
     outcomes: tuple[str, ...], jobs: int | None, codec: str | None, crf: int | None, no_videos: bool,
     sets: tuple[str, ...], norm_mode: str | None, numbers: str | None, **asked: Any,
 ) -> Report:  # fmt: skip
-    from ibrobot_core.recording.convert.run import convert as run
-    from ibrobot_core.recording.convert.run import find_episodes
+    from ibrobot_data.run import convert as run
+    from ibrobot_data.run import find_episodes
 
     shorthand = {"codec": codec, "crf": crf, "videos": "false" if no_videos else None}
     overrides = tuple(f"{name}={value}" for name, value in shorthand.items() if value is not None)
@@ -112,9 +110,9 @@ def _to_bags(
     sets: tuple[str, ...], norm_mode: str | None, numbers: str | None, prompt: str, **_: Any,
 ) -> Report:  # fmt: skip
     from ibrobot_core.interfaces import EpisodeAddress
-    from ibrobot_core.recording.convert.episode import make_writer
-    from ibrobot_core.recording.convert.provenance import told_by
-    from ibrobot_core.recording.convert.to_bags import RECORDER, BagRequest, convert_to_bags
+    from ibrobot_core.recording.provenance import told_by
+    from ibrobot_data.episode import make_writer
+    from ibrobot_data.to_bags import RECORDER, BagRequest, convert_to_bags
 
     if len(episodes) != 1:
         raise click.UsageError("--to bag takes one dataset at a time")

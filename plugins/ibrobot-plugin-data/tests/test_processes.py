@@ -8,8 +8,7 @@ import time
 from multiprocessing.connection import Connection
 
 import pytest
-
-from ibrobot_core.recording.convert import run
+from ibrobot_data import run
 
 
 def _deaf(ready: Connection) -> None:

@@ -1,10 +1,9 @@
-"""What a dataset keeps of where it comes from, so that its episodes can be read back as they were recorded."""
+"""Where episodes come from: the contract in a recording's metadata, and what a dataset keeps of its recordings."""
 
 from __future__ import annotations
 
-import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,50 +11,26 @@ import attrs
 
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import CalibrationError, ContractError, RecorderError
-from ibrobot_core.interfaces import DatasetSummary
 
 if TYPE_CHECKING:
     from ibrobot_core.config import RobotConfig
-    from ibrobot_core.recording.convert.episode import Unit
-    from ibrobot_core.recording.convert.request import Request
-
-_KEPT_ONCE = ("contract", "fingerprint", "config", "calibration", "prompt")
-"""What an episode's metadata says that lies elsewhere in the dataset's."""
 
 
-def conversion(request: Request) -> dict[str, Any]:
-    """What all episodes of a dataset must have been asked for alike."""
-    options = attrs.asdict(request.options)
-    return {"writer": request.type, "options": options, "norm_mode": request.norm_mode, "success": request.success}
+def recorded_contract(metadata: Mapping[str, str]) -> Contract | None:
+    """The contract that an episode was recorded by; None for one without.
 
-
-def provenance(request: Request, old: DatasetSummary | None, units: Sequence[Unit]) -> dict[str, Any]:
-    """What the dataset keeps of its making: contract, robots, calibrations, and where each episode comes from."""
-    before: Mapping[str, Any] = old.metadata if old is not None else {}
-    calibrations, configs = dict(before.get("calibrations", {})), dict(before.get("configs", {}))
-    episodes = list(before.get("episodes", ()))
-    for unit in units:
-        report = attrs.asdict(unit.report)
-        kept = {name: value for name, value in report.items() if name not in ("error", "passed_over")}
-        kept["recorded"] = {name: value for name, value in unit.recorded.items() if name not in _KEPT_ONCE}
-        kept["calibration"] = _file(calibrations, unit.calibration)
-        kept["config"] = _file(configs, unit.document)
-        episodes.append(kept)
-    contract = before.get("contract", units[0].contract)
-    return {
-        "robot_type": before.get("robot_type", units[0].robot_type), "contract": contract,
-        "fingerprint": Contract.from_canonical(contract).fingerprint(), "conversion": conversion(request),
-        "calibrations": calibrations, "configs": configs, "episodes": episodes,
-    }  # fmt: skip
-
-
-def _file(kept: dict[str, Any], document: Mapping[str, Any]) -> str:
-    """Keep a document once, under a name that equal ones share; nothing, and no name, for an empty one."""
-    if not document:
-        return ""
-    name = hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()[:12]
-    kept[name] = document
-    return name
+    Raises:
+        ContractError: when it cannot be read, or is not the one that its fingerprint is of.
+    """
+    if "contract" not in metadata:
+        return None
+    try:
+        contract = Contract.from_canonical(json.loads(metadata["contract"]))
+    except (ValueError, RecursionError) as error:
+        raise ContractError(f"the recorded contract cannot be read: {error}") from None
+    if metadata.get("fingerprint", contract.fingerprint()) != contract.fingerprint():
+        raise ContractError("the recorded contract is damaged: it is not the one that the recorded fingerprint is of")
+    return contract
 
 
 def told_by(

@@ -14,17 +14,17 @@ from typing import Any, override
 import attrs
 import numpy as np
 import pytest
+from ibrobot_serve import service as module
+from ibrobot_serve.metrics import probes
+from ibrobot_serve.service import InferenceService, ServiceOptions
 from ibrobot_testing import host_context
 from ibrobot_testing.fakes import FakePolicy
 from prometheus_client.parser import text_string_to_metric_families
 
 from ibrobot_core.errors import ContractError, PolicyError, TransportError
-from ibrobot_core.inference import service as module
-from ibrobot_core.inference.metrics import probes
 from ibrobot_core.inference.remote import RemoteEngine
-from ibrobot_core.inference.service import InferenceService, ServiceOptions, health_name, service_name
-from ibrobot_core.inference.wire import Kind, Message, decode, encode
-from ibrobot_core.interfaces import Tensors
+from ibrobot_core.inference.wire import Kind, Message, decode, encode, health_name, service_name
+from ibrobot_core.interfaces import Handler, Tensors
 from ibrobot_core.local_transport import LocalTransport
 from ibrobot_core.metrics import Metrics
 
@@ -93,9 +93,11 @@ class OneBatchOfOutputs(Net):
 class Cloud:
     """A service with its transport, and robots that ask it in threads of their own."""
 
-    def __init__(self, policy: Net, options: ServiceOptions | None = None) -> None:
+    def __init__(
+        self, policy: Net, options: ServiceOptions | None = None, transport: LocalTransport | None = None
+    ) -> None:
         self.policy = policy
-        self.transport = LocalTransport()
+        self.transport = transport or LocalTransport()
         self.hung = threading.Event()
         self.service = InferenceService(policy, self.transport, "net", options, on_hang=self.hung.set)
         self.service.start()
@@ -400,6 +402,22 @@ def test_a_model_that_has_nothing_to_do_does_not_hang():
         outputs(cloud.ask("robot", 1))
         assert not cloud.hung.wait(0.1)
         assert cloud.health()["state"] == "ready"
+
+
+class Vouching(LocalTransport):
+    """Knows every sender as `robot2`."""
+
+    @override
+    def serve(self, name: str, handler: Handler, *, workers: int = 16) -> Callable[[], None]:
+        return super().serve(name, lambda payload, sender: handler(payload, "robot2"), workers=workers)
+
+
+def test_sender_known_to_transport_counts_whatever_request_claims():
+    cloud = Cloud(Net(), transport=Vouching())
+    cloud.policy.gate.release()
+    assert outputs(cloud.ask("robot1", 1)) == [2]
+    assert list(cloud.health()["robots"]) == ["robot2"]
+    cloud.close()
 
 
 def test_a_name_is_served_once():

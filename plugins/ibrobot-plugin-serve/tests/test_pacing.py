@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
-from ibrobot_core.inference.pacing import Pacing, fair_pace_ns
+from ibrobot_serve.pacing import Pacing, fair_pace_ns
 
 MS, S = 1_000_000, 1_000_000_000
 TARGET = 0.8

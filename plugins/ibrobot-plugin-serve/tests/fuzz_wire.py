@@ -1,6 +1,6 @@
 """Feeds a service with damaged frames and its port with garbage, while a real robot asks it.
 
-    python tests/inference/fuzz_wire.py --mutants 5000000 --connections 2000
+    python plugins/ibrobot-plugin-serve/tests/fuzz_wire.py --mutants 5000000 --connections 2000
 
 Every answer to a mutant must be a frame, nothing may be raised, the process must not grow, and the robot must get its
 own outputs throughout. The connections need ibrobot-plugin-zenoh; `--connections 0` leaves them out. Exits with 1 when
@@ -26,12 +26,12 @@ from pathlib import Path
 from typing import override
 
 import numpy as np
+from ibrobot_serve.service import InferenceService
 from ibrobot_testing import host_context
 from ibrobot_testing.fakes import FakePolicy
 
 from ibrobot_core.inference.remote import RemoteEngine
-from ibrobot_core.inference.service import InferenceService, service_name
-from ibrobot_core.inference.wire import Kind, Message, decode, encode
+from ibrobot_core.inference.wire import Kind, Message, decode, encode, service_name
 from ibrobot_core.interfaces import Handler, Tensors, Transport
 from ibrobot_core.local_transport import LocalTransport
 from ibrobot_core.plugins import installed

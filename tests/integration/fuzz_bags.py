@@ -1,7 +1,7 @@
 """Damages bags at random and sees that reading and conversion take no harm from them.
 
-    python plugins/ibrobot-plugin-mcap/tests/fuzz.py --mutants 5000
-    python plugins/ibrobot-plugin-mcap/tests/fuzz.py --only 2:612 mcap
+    python tests/integration/fuzz_bags.py --mutants 5000
+    python tests/integration/fuzz_bags.py --only 2:612 mcap
 
 Every mutant of every container is read, and its rows are made as `ibrobot convert` makes them. It must hold that
 
@@ -36,6 +36,7 @@ from pathlib import Path
 
 import attrs
 import numpy as np
+from ibrobot_data.ticks import Ticks
 from ibrobot_mcap.metadata import METADATA
 from ibrobot_mcap.options import McapOptions
 from ibrobot_mcap.reader import Rosbag2Reader
@@ -51,8 +52,7 @@ from ibrobot_core.contract.specs import ActionPart, Contract, ObservationPart
 from ibrobot_core.errors import IbrobotError
 from ibrobot_core.interfaces import EpisodeEnd, EpisodeStart, Feature
 from ibrobot_core.messages import Float64MultiArray, Header, JointState
-from ibrobot_core.recording.convert.episode import recorded_contract
-from ibrobot_core.recording.convert.ticks import Ticks
+from ibrobot_core.recording.provenance import recorded_contract
 
 JOINTS = ("pan", "tilt")
 CONTRACT = Contract(

@@ -19,10 +19,10 @@ from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import ContractError, IbrobotError, RecorderError
 from ibrobot_core.interfaces import Context, EpisodeEnd, EpisodeReader, EpisodeStart, EpisodeSummary, Recorder
 from ibrobot_core.plugins import installed
-from ibrobot_core.recording.convert.request import EpisodeReport, Report
 from ibrobot_core.recording.dataset import Dataset
 from ibrobot_core.recording.episode import episode_folder
 from ibrobot_core.robot import Robot
+from ibrobot_data.request import EpisodeReport, Report
 
 RECORDER = "mcap"
 """What writes episodes."""

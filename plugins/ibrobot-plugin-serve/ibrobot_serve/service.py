@@ -16,12 +16,12 @@ import attrs
 import numpy as np
 
 from ibrobot_core.errors import IbrobotError, PolicyError, WireError
-from ibrobot_core.inference.fair_queue import FairQueue
-from ibrobot_core.inference.pacing import Pacing
-from ibrobot_core.inference.wire import LIMITS, Decoder, Encoder, Kind, Limits, Message
+from ibrobot_core.inference.wire import LIMITS, Decoder, Encoder, Kind, Limits, Message, health_name, service_name
 from ibrobot_core.interfaces import Payload, PictureCodec, Policy, Tensors, Transport
 from ibrobot_core.interfaces.policy import copied, whole_fingerprint
 from ibrobot_core.units import NS_PER_S
+from ibrobot_serve.fair_queue import FairQueue
+from ibrobot_serve.pacing import Pacing
 
 _ROBOTS_KEPT = 256
 """Robots whose counts are kept; those heard of last."""
@@ -31,16 +31,6 @@ _LEASE_NS = 5 * NS_PER_S
 _LONGEST_WAIT_S = 600.0
 _GLANCE_S = 1.0
 """The longest that the watchdog sleeps."""
-
-
-def service_name(model: str) -> str:
-    """What a transport calls the service of a model."""
-    return f"infer/{model}"
-
-
-def health_name(model: str) -> str:
-    """What a transport calls its health."""
-    return f"{service_name(model)}/health"
 
 
 @attrs.frozen

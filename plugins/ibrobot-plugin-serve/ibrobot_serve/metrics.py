@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from ibrobot_core.inference.service import InferenceService
 from ibrobot_core.metrics import Metrics, Probes
+from ibrobot_serve.service import InferenceService
 
 _COUNTS = ("requests", "answered", "failed", "expired")
 _TIMES = ("latency_p50_ms", "latency_p99_ms")

@@ -1,10 +1,12 @@
-"""A short run of the fuzzer; `fuzz.py` says what must hold of every damaged bag."""
+"""A short run of the fuzzer; `fuzz_bags.py` says what must hold of every damaged bag."""
 
 from __future__ import annotations
 
 import pytest
 
-from .fuzz import CONTAINERS, fuzz
+from .fuzz_bags import CONTAINERS, fuzz
+
+pytestmark = pytest.mark.integration
 
 
 @pytest.mark.parametrize("name", CONTAINERS)
