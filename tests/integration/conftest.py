@@ -14,6 +14,7 @@ from typing import Any
 import attrs
 import numpy as np
 import pytest
+from command_line import run_here
 
 from ibrobot_core.plugins import installed
 
@@ -73,6 +74,16 @@ def rendering() -> None:
     """Simulated cameras; what asks for this is skipped on a machine that cannot render."""
     if (missing := installed().missing("sensor", "mujoco")) is not None:
         pytest.skip(str(missing))
+
+
+@pytest.fixture(scope="session")
+def first_conversion(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """It starts a process, and opens memory, that live as long as the interpreter."""
+    from recordings import record  # where there are plugins
+
+    folder = tmp_path_factory.mktemp("first")
+    record(folder / "bag", 1, 0.3)
+    assert run_here("convert", folder / "bag", "--out", folder / "set").returncode == 0
 
 
 @pytest.fixture(scope="session")

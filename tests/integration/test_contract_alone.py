@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import subprocess
-import sys
+from contextlib import chdir
 from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from command_line import run_here
 from ibrobot_ros2 import encode
 from recordings import JOINTS, SIZE, START_NS, numbered
 from rosbags.rosbag2 import StoragePlugin, Writer
@@ -19,9 +20,8 @@ from ibrobot_core.config.load import load_contract
 from ibrobot_core.errors import ConfigError
 from ibrobot_core.messages import Float64MultiArray, Header, Image, Imu, JointState
 
-pytestmark = pytest.mark.integration
+pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("first_conversion")]
 
-PROGRAM = "from ibrobot_core.cli.main import main; main()"
 COMMANDS = "/arm_controller/commands"
 CONTRACT = """\
 contract:
@@ -34,8 +34,8 @@ contract:
 
 
 def ibrobot(folder: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-c", PROGRAM, *map(str, arguments)]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    with chdir(folder):
+        return run_here(*arguments)
 
 
 @pytest.fixture

@@ -17,6 +17,7 @@ import attrs
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from command_line import run_here
 from ibrobot_data.run import STAGING
 from ibrobot_ros2 import encode
 from ibrobot_testing.terminal import Terminal
@@ -34,7 +35,7 @@ from ibrobot_core.messages import (
     Message,
 )
 
-pytestmark = pytest.mark.integration
+pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("first_conversion")]
 
 PROGRAM = "from ibrobot_core.cli.main import main; main()"
 STUCK = """
@@ -104,8 +105,7 @@ class Ran:
 
 
 def run(*arguments: object) -> Ran:
-    command = [sys.executable, "-c", PROGRAM, "convert", *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = run_here("convert", *arguments)
     return Ran(done.returncode, done.stdout, done.stderr)
 
 

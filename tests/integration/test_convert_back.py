@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import subprocess
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from command_line import run_here
 from ibrobot_lerobot.layout import open_dataset
 from ibrobot_lerobot.rows import EpisodeRows
 from recordings import CONTRACT, JOINTS, START_NS, record
@@ -17,7 +19,7 @@ from recordings import CONTRACT, JOINTS, START_NS, record
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.plugins import installed
 
-pytestmark = pytest.mark.integration
+pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("first_conversion")]
 
 CALIBRATION = {
     joint: {"id": i + 1, "drive_mode": i % 2, "homing_offset": 0, "range_min": 1000, "range_max": 3000}
@@ -33,12 +35,8 @@ Convert = Callable[..., "subprocess.CompletedProcess[str]"]
 
 
 @pytest.fixture(scope="module")
-def convert(ibrobot: tuple[str, ...]) -> Convert:
-    def run(*arguments: object) -> subprocess.CompletedProcess[str]:
-        command = [*ibrobot, "convert", *map(str, arguments)]
-        return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
-
-    return run
+def convert() -> Convert:
+    return partial(run_here, "convert")
 
 
 @pytest.fixture(scope="module")
