@@ -37,7 +37,9 @@ OUT = {
 
 def _prose(text: str) -> str:
     """The text without code, which quotes programs as they are; line numbers stay."""
-    text = re.sub(r"^( *)```.*?^\1```", lambda block: re.sub(r"[^\n]", "", block[0]), text, flags=re.MULTILINE | re.DOTALL)
+    text = re.sub(
+        r"^( *)```.*?^\1```", lambda block: re.sub(r"[^\n]", "", block[0]), text, flags=re.MULTILINE | re.DOTALL
+    )
     text = re.sub(r"^    .*$", "", text, flags=re.MULTILINE)
     return re.sub(r"`[^`\n]*`", "", text)
 
