@@ -10,7 +10,6 @@ from pathlib import Path
 
 import attrs
 import pytest
-from ibrobot_testing.leaks import no_leaks  # noqa: F401
 
 from ibrobot_core import outside
 from ibrobot_core.plugins import installed

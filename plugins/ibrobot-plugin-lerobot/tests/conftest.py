@@ -11,7 +11,6 @@ import pyarrow.parquet as pq
 import pytest
 from ibrobot_lerobot.options import LeRobotOptions
 from ibrobot_lerobot.writer import LeRobotDatasetWriter
-from ibrobot_testing.leaks import no_leaks  # noqa: F401
 from numpy.typing import NDArray
 
 from ibrobot_core.interfaces import Feature

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import pytest
-from ibrobot_testing.leaks import no_leaks  # noqa: F401
 from ibrobot_zenoh import reasons
 
 from .pair import client, free_endpoint, made, router
@@ -33,7 +32,7 @@ def brief_trials(_patience: None, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(autouse=True)
-def _closed(no_leaks: None) -> Iterator[None]:  # noqa: F811
+def _closed(no_leaks: None) -> Iterator[None]:
     """A test that failed leaves no session open."""
     yield
     while made:

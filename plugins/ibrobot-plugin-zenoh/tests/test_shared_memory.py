@@ -9,7 +9,7 @@ import pytest
 from .pair import WAIT_S, client, free_endpoint, router, settle
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 def no_leaks() -> None:
     """Zenoh keeps its shared memory open after the last session has ended."""
 

@@ -11,6 +11,7 @@ from ibrobot_testing.contexts import control_context, host_context, make_robot
 from ibrobot_testing.dataset import DatasetSuite
 from ibrobot_testing.executor import ExecutorSuite
 from ibrobot_testing.hardware import HardwareSuite, SimulatedHardwareSuite
+from ibrobot_testing.leaks import LeakCheck
 from ibrobot_testing.planner import PlannerSuite
 from ibrobot_testing.policy import PolicySuite
 from ibrobot_testing.recorder import RecorderSuite
@@ -24,6 +25,7 @@ __all__ = [
     "DatasetSuite",
     "ExecutorSuite",
     "HardwareSuite",
+    "LeakCheck",
     "PlannerSuite",
     "PolicySuite",
     "RecorderSuite",

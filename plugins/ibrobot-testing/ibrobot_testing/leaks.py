@@ -1,30 +1,107 @@
-"""A fixture that fails any test that leaves a thread, a child process or an open file behind.
+"""What a test leaves behind: threads, child processes, open files and ports.
 
-In a plugin's `conftest.py`:
-
-    from ibrobot_testing.leaks import no_leaks  # noqa: F401
+Every suite checks it. For all other tests of a project, its pytest configuration says `usefixtures = ["no_leaks"]`.
 """
 
 from __future__ import annotations
 
 import gc
 import os
+import socket
 import threading
-from collections.abc import Iterator
-from contextlib import suppress
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
 from pathlib import Path
+from typing import Literal, Self, get_args
 
+import attrs
 import pytest
 
-GRACE_S = 30.0
-"""How long a thread that was told to end may take to do so [s]."""
+type Kind = Literal["thread", "process", "file", "port"]
+"""Kinds of leaks; a port is that of an open socket of the internet protocols."""
 
 _SHARED = ("/dev/dri", "/dev/nvidia", "/dev/urandom", "/dev/null", "anon_inode:[eventpoll]")
 """Files that libraries open once and keep, such as a GPU's device."""
 
 
-def open_files() -> dict[int, str]:
+_KINDS: tuple[Kind, ...] = get_args(Kind.__value__)
+
+
+def _check_reasons(_: object, __: object, allow: Mapping[Kind, str]) -> None:
+    for kind, reason in allow.items():
+        if kind not in _KINDS:
+            raise ValueError(f"allow: {kind!r} is not a kind of leak; the kinds are {', '.join(_KINDS)}")
+        if not reason.strip():
+            raise ValueError(f"allow: say why a {kind} may be left behind, e.g. {{{kind!r}: 'libfoo keeps it'}}")
+
+
+@attrs.frozen
+class LeakCheck:
+    """What a test may leave behind: nothing, unless `allow` says why.
+
+    Files, ports and child processes are found on Linux only.
+
+    Attributes:
+        allow: kind of leak -> the reason why it is no fault.
+        grace_s: how long threads may take to end [s].
+    """
+
+    allow: Mapping[Kind, str] = attrs.field(factory=dict[Kind, str], validator=_check_reasons)
+    grace_s: float = 30.0
+
+    @contextmanager
+    def watch(self) -> Iterator[None]:
+        """Fail the test if the block leaves something behind.
+
+        Raises:
+            pytest.fail.Exception: names each thread, process, file and port that the block has left behind.
+        """
+        if os.name == "posix":
+            resource_tracker.ensure_running()  # it lives as long as the interpreter, so it counts as there before
+        before = _Found.now()
+        yield
+        self._join_threads(before)
+        left = self._left_since(before)
+        if left:
+            gc.collect()  # a file without references is closed only now: untidy, but no leak
+            left = self._left_since(before)
+        if left:
+            pytest.fail("the test left behind: " + "; ".join(left), pytrace=False)
+
+    def _join_threads(self, before: _Found) -> None:
+        """Wait for the threads that are ending."""
+        if "thread" not in self.allow:
+            deadline = time.monotonic() + self.grace_s
+            for thread in _Found.now().threads - before.threads:
+                thread.join(max(0.0, deadline - time.monotonic()))
+
+    def _left_since(self, before: _Found) -> list[str]:
+        """What there is now beyond `before` and is not allowed, in words."""
+        now = _Found.now()
+        left: list[tuple[Kind, str]] = [("thread", f"thread {t.name!r}") for t in now.threads - before.threads]
+        left += [("process", f"process {i}: {text}") for i, text in now.children.items() if i not in before.children]
+        left += [_describe(fd, target) for fd, target in now.files.items() if before.files.get(fd) != target]
+        return [text for kind, text in left if kind not in self.allow]
+
+
+@attrs.frozen
+class _Found:
+    """What this process has at some moment."""
+
+    threads: set[threading.Thread]
+    children: dict[int, str]
+    files: dict[int, str]
+
+    @classmethod
+    def now(cls) -> Self:
+        # Dummy threads are libraries' own: Python cannot join them, and may take them for alive long after their end.
+        threads = {thread for thread in threading.enumerate() if not isinstance(thread, threading._DummyThread)}
+        return cls(threads, _child_processes(), _open_files())
+
+
+def _open_files() -> dict[int, str]:
     """Descriptor -> what it is open on; empty where the system does not tell."""
     found: dict[int, str] = {}
     directory = Path("/proc/self/fd")
@@ -38,7 +115,7 @@ def open_files() -> dict[int, str]:
     return found
 
 
-def child_processes() -> dict[int, str]:
+def _child_processes() -> dict[int, str]:
     """Process id -> command line of every child, ended ones that nobody waited for included."""
     found: dict[int, str] = {}
     for children in Path("/proc/self/task").glob("*/children"):
@@ -51,30 +128,18 @@ def child_processes() -> dict[int, str]:
     return found
 
 
-def leaks(threads: set[threading.Thread], children: set[int], files: dict[int, str]) -> list[str]:
-    """What there is now beyond `threads`, `children` and `files`, in words."""
-    left: list[str] = []
-    for thread in set(threading.enumerate()) - threads:
-        if isinstance(thread, threading._DummyThread):
-            continue  # a library's own, which Python cannot join, and may take for alive long after its end
-        thread.join(GRACE_S)
-        if thread.is_alive():
-            left.append(f"thread {thread.name!r}")
-    left += [f"child process {pid}: {name}" for pid, name in child_processes().items() if pid not in children]
-    left += [f"open file {fd}: {name}" for fd, name in open_files().items() if files.get(fd) != name]
-    return left
+def _describe(fd: int, target: str) -> tuple[Kind, str]:
+    """Kind and description of an open descriptor: sockets by their port."""
+    if target.startswith("socket:"):
+        with suppress(OSError), socket.socket(fileno=os.dup(fd)) as found:
+            if found.family in {socket.AF_INET, socket.AF_INET6} and found.getsockname()[1]:
+                host, port, *_ = found.getsockname()
+                return "port", f"port {port} on {host}"
+    return "file", f"open file {fd}: {target}"
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 def no_leaks() -> Iterator[None]:
     """Fail a test that leaves something behind."""
-    if os.name == "posix":
-        resource_tracker.ensure_running()  # it lives as long as the interpreter, so it counts as there before
-    threads, children, files = set(threading.enumerate()), set(child_processes()), open_files()
-    yield
-    left = leaks(threads, children, files)
-    if left:
-        gc.collect()  # a file without references is closed only now: untidy, but no leak
-        left = leaks(threads, children, files)
-    if left:
-        pytest.fail("the test left behind: " + "; ".join(left), pytrace=False)
+    with LeakCheck().watch():
+        yield

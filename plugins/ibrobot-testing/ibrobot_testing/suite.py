@@ -3,17 +3,32 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import ClassVar
 
 import pytest
 
 from ibrobot_core.interfaces import Context
 from ibrobot_testing.contexts import host_context
+from ibrobot_testing.leaks import LeakCheck
 
 
 class Suite[T]:
-    """Base of the suites. A plugin's test subclasses one, under a name that begins with `Test`, and writes `make`."""
+    """Base of the suites. A plugin's test subclasses one, under a name that begins with `Test`, and writes `make`.
+
+    Attributes:
+        leak_check: what a check may leave behind. By default nothing; an exception needs a reason:
+            `leak_check = LeakCheck(allow={"thread": "libfoo keeps its thread until the process ends"})`.
+    """
+
+    leak_check: ClassVar[LeakCheck] = LeakCheck()
+
+    @pytest.fixture(autouse=True)
+    def no_leaks(self) -> Iterator[None]:
+        """Fail a check that leaves a thread, a process, an open file or a port behind."""
+        with self.leak_check.watch():
+            yield
 
     def make(self, ctx: Context) -> T:
         """A new object under test, not yet connected, opened or loaded."""
@@ -42,7 +57,8 @@ def run_checks[T](suite: type[Suite[T]], directory: Path) -> dict[str, BaseExcep
         tmp_path.mkdir(parents=True)
         bound: Callable[..., None] = getattr(suite(), name)
         try:
-            bound(tmp_path) if "tmp_path" in inspect.signature(check).parameters else bound()
+            with suite.leak_check.watch():
+                bound(tmp_path) if "tmp_path" in inspect.signature(check).parameters else bound()
         except pytest.skip.Exception:
             continue
         except (Exception, pytest.fail.Exception) as error:  # noqa: BLE001 - what was raised is the result
