@@ -7,7 +7,6 @@ from typing import override
 from ibrobot_planning.joint import JointPlanner
 from ibrobot_planning.options import JointPlannerOptions
 from ibrobot_testing import PlannerSuite
-from ibrobot_testing.leaks import no_leaks  # noqa: F401
 
 from ibrobot_core.interfaces import Context
 

@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from ibrobot_planning.profile import RestToRest
-from ibrobot_testing.leaks import no_leaks  # noqa: F401
 
 
 def powers_of_ten(low: float, high: float) -> st.SearchStrategy[float]:
