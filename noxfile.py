@@ -6,6 +6,8 @@ import atexit
 import fcntl
 import json
 import os
+import re
+import shlex
 import shutil
 import sys
 from pathlib import Path
@@ -35,7 +37,11 @@ FOLDERS = {
 }
 """Name -> folder, of every plugin and of the libraries that they share."""
 PLUGINS = sorted(FOLDERS)
-LOCAL = {"ibrobot-core": Path(), **{folder.name: folder for folder in FOLDERS.values()}}
+LOCAL = {
+    "ibrobot-core": Path(),
+    "ibrobot": Path("plugins/ibrobot"),
+    **{folder.name: folder for folder in FOLDERS.values()},
+}
 """Distribution -> folder."""
 EXTRAS = {
     "ibrobot-plugin-camera": "[realsense]",
@@ -134,11 +140,32 @@ def layers(session: nox.Session) -> None:
 
 @nox.session
 def wheels(session: nox.Session) -> None:
-    """Whether core and every plugin, with all extras, install from wheels alone on each platform; only resolves."""
-    projects = ("pyproject.toml", *(str(folder / "pyproject.toml") for folder in FOLDERS.values()))
+    """Whether everything, with all extras, installs from wheels on each platform; what is installed runs by itself."""
+    projects = [str(folder / "pyproject.toml") for folder in LOCAL.values()]
     options = ("--quiet", "--all-extras", "-c", "constraints.txt", "--only-binary", ":all:", "--python-version", "3.12")
     for platform in PLATFORMS:
         session.run("uv", "pip", "compile", *options, "--python-platform", platform, "-o", os.devnull, *projects)
+    folder = Path(session.create_tmp()).absolute()
+    session.run("uv", "build", "--quiet", "--all-packages", "--wheel", "--out-dir", str(folder / "dist"))
+    for page in ("README.md", "plugins/ibrobot-plugin-feetech/README.md"):
+        requirement, *commands = installation(page)
+        environment = folder / requirement
+        session.run("uv", "venv", "--quiet", "--clear", str(environment))
+        wheels = ("--find-links", str(folder / "dist"), "-c", "constraints.txt")
+        session.run("uv", "pip", "install", "--quiet", "--python", str(environment), *wheels, requirement)
+        with session.chdir(folder):  # away from this repository
+            for command in commands:
+                program, *arguments = shlex.split(command, comments=True)
+                session.run(str(environment / "bin" / program), *arguments, external=True)
+
+
+def installation(page: str) -> list[str]:
+    """What the first `$ pip install` of a page's console blocks installs, and the commands after it in that block."""
+    text = Path(page).read_text(encoding="utf-8")
+    block = re.search(r"^```console\n\$ pip install \"?(ibrobot\S*?)\"?\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    if block is None:
+        raise ValueError(f"{page}: no console block begins with `$ pip install ibrobot…`")
+    return [block[1], *re.findall(r"^\$ (.*)$", block[2], re.MULTILINE)]
 
 
 @nox.session

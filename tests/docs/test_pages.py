@@ -84,7 +84,8 @@ def _command(arguments: list[str]) -> tuple[click.Command, click.Context, list[s
 def _check_command(text: str) -> None:
     """That click takes it as it is: options, their values, and as many arguments as there must be."""
     command, context, arguments = _command(shlex.split(text, comments=True)[1:])
-    assert not isinstance(command, click.Group), "a command of the group is missing"
+    alone = not isinstance(command, click.Group) or command.invoke_without_command
+    assert alone, "a command of the group is missing"
     values, rest, _ = command.make_parser(context).parse_args(arguments)
     assert not rest, f"too many arguments: {rest}"
     for parameter in command.params:
