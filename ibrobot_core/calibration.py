@@ -169,7 +169,7 @@ def calibration_path(name: str | Path) -> Path:
 
 
 def load_calibration(
-    name: str | Path, joints: Sequence[str] | None = None, *, zero_at: str | None = None
+    name: str | Path, joints: Sequence[str] | None = None, *, zero_at: str | None = None, tool: str | None = None
 ) -> Calibration:
     """Load a calibration: LeRobot's JSON (motor -> numbers) or IB-Robot's (servo id -> numbers).
 
@@ -180,12 +180,13 @@ def load_calibration(
         name: a name or a path, see `calibration_path`.
         joints: names of the joints that it must have; for IB-Robot's file, in the order of their ids from 1.
         zero_at: put 0 rad there, one of `ZERO_AT`, whatever the companion says and whichever numbers it is of.
+        tool: the command with `calibrate` and `import` for this hardware, named in errors, e.g. `ibrobot my_arm`.
 
     Raises:
         CalibrationError: when it is missing or cannot be true; names file, joint, key, value and what would be right.
     """
     path = calibration_path(name)
-    text, document = _document(path)
+    text, document = _document(path, tool)
     if not isinstance(document, dict) or not document:
         raise CalibrationError(f"{path}: must be an object of joints, each with {_KEYS}")
     numbered = all(key.isdigit() for key in document)
@@ -204,7 +205,8 @@ def load_calibration(
         calibration = Calibration(found, path=path)
     except ValueError as error:
         raise CalibrationError(f"{path}: {error}") from None
-    loaded = _with_meta(calibration.with_zero_at(POSE if numbered else RANGE), path, any_numbers=zero_at is not None)
+    calibration = calibration.with_zero_at(POSE if numbered else RANGE)
+    loaded = _with_meta(calibration, path, tool, any_numbers=zero_at is not None)
     return loaded if zero_at is None else loaded.with_zero_at(zero_at)
 
 
@@ -246,12 +248,13 @@ def save_calibration(
     return path
 
 
-def _document(path: Path) -> tuple[str, Any]:
+def _document(path: Path, tool: str | None = None) -> tuple[str, Any]:
     try:
         text = path.read_text()
         return text, json.loads(text, object_pairs_hook=_once)
     except FileNotFoundError:
-        raise CalibrationError(f"{path}: there is no such calibration; `ibrobot feetech calibrate` makes one") from None
+        remedy = f"`{tool} calibrate` makes one" if tool else "calibrate with the command of the hardware's plugin"
+        raise CalibrationError(f"{path}: there is no such calibration; {remedy}") from None
     except json.JSONDecodeError as error:
         raise CalibrationError(f"{path}:{error.lineno}: not JSON: {error.msg}") from None
     except (OSError, UnicodeDecodeError, ValueError) as error:
@@ -301,7 +304,7 @@ def _by_name(document: dict[str, Any], path: Path, joints: Sequence[str] | None)
     return named
 
 
-def _with_meta(calibration: Calibration, path: Path, *, any_numbers: bool) -> Calibration:
+def _with_meta(calibration: Calibration, path: Path, tool: str | None, *, any_numbers: bool) -> Calibration:
     companion = _meta_path(path)
     if not companion.exists():
         return calibration
@@ -314,10 +317,11 @@ def _with_meta(calibration: Calibration, path: Path, *, any_numbers: bool) -> Ca
         raise CalibrationError(f"{companion}: zero_at: must be one of {', '.join(ZERO_AT)}, not {zero_at!r}")
     if meta.get("sha256") != calibration.fingerprint() and not any_numbers:
         changed = datetime.fromtimestamp(path.stat().st_mtime, UTC).isoformat(timespec="seconds")
+        command = f"`{tool} import {path} --zero-at {zero_at} --yes`"
         raise CalibrationError(
             f"{path}: the numbers, changed {changed}, are not those calibrated {meta.get('date')} that "
             f"{companion.name} tells of: calibrate again, or if they are right, take them with "
-            f"`ibrobot feetech import {path} --zero-at {zero_at} --yes`"
+            f"{command if tool else 'the import command of the hardware plugin'}"
         )
     robot, date, adapter = (str(meta.get(name, "")) for name in ("robot", "date", "adapter"))
     return attrs.evolve(calibration.with_zero_at(zero_at), robot=robot, date=date, adapter=adapter)

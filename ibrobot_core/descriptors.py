@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import builtins
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -74,6 +74,8 @@ class Descriptor[T]:
     that the component owns, or all where its kind owns none. Opens no device, and imports nothing heavy."""
     devices: Callable[[Any], Mapping[str, str]] = attrs.field(default=no_devices, kw_only=True)
     """Option -> the device that it names and that one component at a time can open, always written in the same way."""
+    default: bool = attrs.field(default=False, kw_only=True)
+    """Whether commands take this type where none of its kind is named; one type of a kind at most."""
 
 
 @attrs.frozen
@@ -82,7 +84,7 @@ class HardwareDescriptor(Descriptor["Hardware"]):
 
     simulated: bool = False
     sensors: Mapping[str, str] = attrs.field(factory=dict)
-    """For simulated hardware, sensor kind -> the sensor type that stands for it, e.g. camera -> mujoco."""
+    """For simulated hardware, sensor kind, e.g. `camera` -> the sensor type that stands for it."""
     torque_off: str = ""
     """For joints that hold on when no process commands them any more: the command that takes their torque off."""
 
@@ -121,6 +123,9 @@ class TransportDescriptor(Descriptor["Transport"]):
     """A transport; `topics` says that it is a `TopicTransport`."""
 
     topics: bool = False
+    listen: Callable[[Sequence[str]], Mapping[str, Any]] | None = None
+    """Endpoints -> the options with which a server listens there and connects to nobody; at an endpoint of this machine
+    alone where none is given. None where servers cannot use this transport."""
 
 
 @attrs.frozen
@@ -129,8 +134,23 @@ class RecorderDescriptor(Descriptor["Recorder"]):
 
 
 @attrs.frozen
+class Flag:
+    """A flag of the command line that sets an option of a type."""
+
+    name: str
+    """E.g. `--codec`."""
+    option: str
+    help: str
+    value: str | None = None
+    """What the flag sets the option to; None where the value follows the flag."""
+
+
+@attrs.frozen
 class DatasetDescriptor(Descriptor["DatasetWriter"]):
     """A dataset writer."""
+
+    flags: tuple[Flag, ...] = ()
+    """Short ways, in the command that converts, to set options of this type."""
 
 
 @attrs.frozen

@@ -48,7 +48,7 @@ class ConfigError(IbrobotError):
 
 
 class PluginError(IbrobotError):
-    """A plugin that is asked for but is missing or broken, e.g. `type: feetech_so101` without its package."""
+    """A plugin that is asked for but is missing or broken, e.g. a `type` without its package."""
 
     exit_code = 2
 

@@ -3,15 +3,13 @@
 A plugin is a module (or object) named by an entry point of group `ibrobot`:
 
     [project.entry-points.ibrobot]
-    feetech = "ibrobot_feetech"
+    wave = "ibrobot_wave"
 
 with functions marked `@ibrobot_core.hookimpl`, each yielding descriptors:
 
     @hookimpl
-    def ibrobot_hardware():
-        yield HardwareDescriptor(
-            type="feetech_so101", summary="SO-101 follower", options=FollowerOptions, make=_make_follower
-        )
+    def ibrobot_teleop():
+        yield TeleopDescriptor(type="wave", summary="waves with one joint", options=WaveOptions, make=_make_wave)
 
 An implementation may leave out arguments that it does not need.
 """

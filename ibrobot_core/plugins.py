@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
@@ -38,26 +39,9 @@ KINDS: Mapping[str, str] = {
 }
 """Plugin kind -> the hook that registers it."""
 
-KNOWN_PACKAGES: Mapping[tuple[str, str], str] = {
-    ("hardware", "mujoco"): "ibrobot-plugin-mujoco",
-    ("sensor", "mujoco"): "ibrobot-plugin-mujoco",
-    ("policy", "scripted_pick"): "ibrobot-plugin-mujoco",
-    ("viewer", "mujoco"): "ibrobot-plugin-mujoco",
-    ("teleop", "keyboard"): "ibrobot-plugin-keyboard",
-    ("teleop", "replay"): "ibrobot-plugin-jointlog",
-    ("recorder", "joint_log"): "ibrobot-plugin-jointlog",
-    ("dataset", "npz"): "ibrobot-plugin-jointlog",
-    ("planner", "joint"): "ibrobot-plugin-planning",
-    ("hardware", "feetech_so101"): "ibrobot-plugin-feetech",
-    ("teleop", "so101_leader"): "ibrobot-plugin-feetech",
-    ("sensor", "opencv"): "ibrobot-plugin-camera",
-    ("sensor", "realsense"): "ibrobot-plugin-camera",
-    ("recorder", "mcap"): "ibrobot-plugin-mcap",
-    ("dataset", "lerobot"): "ibrobot-plugin-lerobot",
-    ("policy", "lerobot"): "ibrobot-plugin-lerobot",
-    ("transport", "zenoh"): "ibrobot-plugin-zenoh",
-}
-"""Types of this project's own plugins, so that a missing one can be named."""
+OFFICIAL = Path(__file__).with_name("official_plugins.json")
+"""What this project's own packages offer: package -> kind -> types; kind `default` has the kinds whose default type the
+package brings. A missing plugin can so be named. `python tests/house/official_plugins.py` writes it."""
 
 _log = logging.getLogger("ibrobot.plugins")
 
@@ -116,8 +100,23 @@ class Registry:
         """
         entry = self.entries.get((kind, type_))
         if entry is None:
-            raise PluginError(self._why_missing(kind, type_))
+            raise PluginError(self.why_missing(kind, type_))
         return entry.descriptor
+
+    def default(self, kind: str) -> str:
+        """The type of a kind that commands take where none is named.
+
+        Raises:
+            PluginError: when no installed plugin offers one, or several do; says which package would.
+        """
+        found = [entry for (k, _), entry in self.entries.items() if k == kind and entry.descriptor.default]
+        if len(found) == 1:
+            return found[0].descriptor.type
+        if found:
+            packages = ", ".join(f"{entry.descriptor.type} ({entry.package})" for entry in found)
+            raise PluginError(f"name the type of the {kind}: several plugins offer a default: {packages}")
+        package = next(name for name, offers in official_plugins().items() if kind in offers.get("default", ()))
+        raise PluginError(f"no {kind} is named, and no installed plugin offers a default one: pip install {package}")
 
     def missing(self, kind: str, type_: str) -> MissingDependency | None:
         """What this machine lacks for `type_`; None where it lacks nothing. A check that fails otherwise is told so.
@@ -154,7 +153,8 @@ class Registry:
                     raise RecorderError(f"{path}: {address.path} is a single episode; leave :{address.number} out")
                 return reader.make(address)
         formats = ", ".join(f"{reader.type} ({reader.summary})" for reader in self.readers)
-        hint = "" if formats else "; pip install ibrobot-plugin-mcap reads rosbag2"
+        packages = " or ".join(name for name, offers in official_plugins().items() if "reader" in offers)
+        hint = "" if formats else f"; pip install {packages}"
         raise RecorderError(f"{path}: not an episode of a known format; installed: {formats or 'none'}{hint}")
 
     def decode(self, picture: CompressedImage) -> Image:
@@ -169,13 +169,15 @@ class Registry:
         formats = ", ".join(sorted({each for decoder in self.decoders for each in decoder.formats})) or "none"
         raise ContractError(f"no installed plugin decodes a {picture.format!r} picture; those decoded are: {formats}")
 
-    def _why_missing(self, kind: str, type_: str) -> str:
-        package = KNOWN_PACKAGES.get((kind, type_))
+    def why_missing(self, kind: str, type_: str) -> str:
+        """Why nothing offers a type, and what to install or mend; a command is of kind `command`."""
+        package = next((name for name, offers in official_plugins().items() if type_ in offers.get(kind, ())), None)
         for failure in self.failures:
             if failure.package == package:
                 return f"{kind} type {type_!r} is not available: {failure}"
         if package is not None:
-            return f"{kind} type {type_!r} needs a plugin that is not installed: pip install {package}"
+            what = f"ibrobot {type_}" if kind == "command" else f"{kind} type {type_!r}"
+            return f"{what} needs a plugin that is not installed: pip install {package}"
         offered = self.types(kind)
         close = get_close_matches(type_, offered, 1)
         hint = f", did you mean {close[0]!r}?" if close else f"; installed: {', '.join(offered) or 'none'}"
@@ -199,6 +201,18 @@ class Registry:
                 getattr(manager.hook, event)(**facts)
             except Exception as error:  # noqa: BLE001 - contained: an observer must not stop the robot
                 _log.error("plugin %r failed in %s: %s", name, event, _reason(error))
+
+
+@cache
+def official_plugins() -> Mapping[str, Mapping[str, list[str]]]:
+    """What `OFFICIAL` says."""
+    found: dict[str, dict[str, list[str]]] = json.loads(OFFICIAL.read_bytes())
+    return found
+
+
+def example(kind: str) -> str:
+    """A type of a kind to show in a message: this project's own default, installed or not."""
+    return next(offers[kind][0] for offers in official_plugins().values() if kind in offers.get("default", ()))
 
 
 def _reason(error: BaseException) -> str:

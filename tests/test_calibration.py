@@ -151,7 +151,11 @@ def test_a_second_file_that_cannot_be_written_leaves_both_old_ones(
 
 
 def test_a_missing_file_says_how_to_make_one(tmp_path: Path) -> None:
-    with pytest.raises(CalibrationError, match=r"no such calibration; `ibrobot feetech calibrate` makes one"):
+    with pytest.raises(CalibrationError, match=r"no such calibration; `ibrobot arm calibrate` makes one"):
+        load_calibration(tmp_path / "arm.json", tool="ibrobot arm")
+    with pytest.raises(
+        CalibrationError, match="no such calibration; calibrate with the command of the hardware's plug"
+    ):
         load_calibration(tmp_path / "arm.json")
 
 
@@ -165,9 +169,9 @@ def test_numbers_changed_behind_the_companions_back_are_refused(tmp_path: Path) 
     made = Calibration({"pan": JointCalibration(**GOOD)}, date="2026-01-02")
     path = save_calibration(made, tmp_path / "arm.json")
     path.write_text(json.dumps({"pan": {**GOOD, "range_min": 701}}))
-    remedy = r"`ibrobot feetech import .*arm\.json --zero-at pose --yes`"
+    remedy = r"`ibrobot arm import .*arm\.json --zero-at pose --yes`"
     with pytest.raises(CalibrationError, match=f"changed 20.*, are not those calibrated 2026-01-02 .* {remedy}"):
-        load_calibration(path)
+        load_calibration(path, tool="ibrobot arm")
     assert load_calibration(path, zero_at="range").joints["pan"].range_min == 701, "the numbers alone"
 
 

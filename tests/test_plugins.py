@@ -175,6 +175,34 @@ def test_a_known_type_that_is_not_installed_says_what_to_install() -> None:
         discover([]).find("teleop", "keyboard")
 
 
+DEFAULT_RECORDER = """
+from ibrobot_core import hookimpl
+from ibrobot_core.descriptors import RecorderDescriptor
+
+@hookimpl
+def ibrobot_recorders():
+    yield RecorderDescriptor("tape", lambda options, ctx: None, "a tape")
+    yield RecorderDescriptor("{}", lambda options, ctx: None, "a disk", default=True)
+"""
+
+
+def test_default_type_is_the_one_whose_descriptor_says_so(site: Site) -> None:
+    site.add("disk-a", DEFAULT_RECORDER.format("disk_a"))
+    assert discover(site.entry_points()).default("recorder") == "disk_a"
+
+
+def test_missing_default_type_names_the_package_to_install() -> None:
+    with pytest.raises(PluginError, match=r"no recorder is named, .* default one: pip install ibrobot-plugin-mcap"):
+        Registry().default("recorder")
+
+
+def test_two_default_types_are_an_error_that_names_both(site: Site) -> None:
+    site.add("disk-a", DEFAULT_RECORDER.format("disk_a").replace('"tape"', '"tape_a"'))
+    site.add("disk-b", DEFAULT_RECORDER.format("disk_b"))
+    with pytest.raises(PluginError, match=r"name the type of the recorder: .* disk_a \(disk-a\), disk_b \(disk-b\)"):
+        discover(site.entry_points()).default("recorder")
+
+
 def test_a_raising_doctor_check_is_a_failed_check(registry: Registry) -> None:
     checks = {check.name: check for check in registry.doctor()}
 

@@ -133,8 +133,8 @@ def launch(config: str | None, **options: Any) -> None:
 
 
 def run_robot(
-    config: str | None, options: dict[str, Any], *, watcher: Watcher | None = None, recording: tuple[str, ...] = (),
-    prompt: str = "",
+    config: str | None, options: dict[str, Any], *, watcher: Watcher | None = None,
+    recording: tuple[str, ...] | None = None, prompt: str = "",
 ) -> None:  # fmt: skip
     """Run a robot as a command line says, to the end of the process.
 
@@ -142,8 +142,8 @@ def run_robot(
         config: the robot YAML, as `launch` takes it.
         options: those of `launch_options`.
         watcher: what looks after the run.
-        recording: overrides, of which the first makes the `recording` section where the YAML has none; where it is
-            empty, the run does what the mode does.
+        recording: overrides of the `recording` section, which is made where the YAML has none; None: the run does what
+            the mode does.
         prompt: what recorded episodes are recorded under.
 
     Raises:
@@ -153,14 +153,16 @@ def run_robot(
     path = find_config(config, registry)
     changes, chosen = overrides_of(options), {"mode": options["mode"], "sim": options["sim"], "registry": registry}
     # An override within the section must not count as the section.
-    known = [change for change in changes if not (recording and change.startswith("recording."))]
+    known = [change for change in changes if recording is None or not change.startswith("recording.")]
     robot = load(path, overrides=known, **chosen)
-    if recording:
-        default, *more = recording
-        robot = load(path, overrides=(*([default] if robot.recording is None else []), *changes, *more), **chosen)
+    if recording is not None:
+        made = []
+        if robot.recording is None:
+            made = [f"recording={{type: {registry.default('recorder')}, root: episodes, topics: contract}}"]
+        robot = load(path, overrides=(*made, *changes, *recording), **chosen)
     request = Request(
         options["lockstep"], options["seed"], options["duration"], options["episodes"], options["goals"],
-        prompt=prompt, by_operator=bool(recording),
+        prompt=prompt, by_operator=recording is not None,
     )  # fmt: skip
     run_loaded(robot, request, options, watcher or Watcher())
 
@@ -173,7 +175,8 @@ def overrides_of(options: dict[str, Any]) -> tuple[str, ...]:
     """
     if options["window"] and options["headless"]:
         raise click.UsageError("--window and --headless exclude each other")
-    return (*options["overrides"], *(["viewer={type: mujoco}"] if options["window"] else []))
+    window = [f"viewer={{type: {installed().default('viewer')}}}"] if options["window"] else []
+    return (*options["overrides"], *window)
 
 
 def run_loaded(robot: RobotConfig, request: Request, options: dict[str, Any], watcher: Watcher) -> None:

@@ -13,7 +13,7 @@ import click
 from ibrobot_core import __version__
 from ibrobot_core.bugs import DEBUG, describe_bug
 from ibrobot_core.cli.command import let_interrupts_raise
-from ibrobot_core.errors import IbrobotError
+from ibrobot_core.errors import IbrobotError, PluginError
 from ibrobot_core.outside import echo
 
 _FAILED, _WRONG, _INTERRUPTED = 1, 2, 130
@@ -45,10 +45,12 @@ class LazyGroup(click.Group):
             module, _, attribute = COMMANDS[cmd_name][0].partition(":")
             command: click.Command = getattr(import_module(module), attribute)
             return command
-        from ibrobot_core.plugins import installed
+        from ibrobot_core.plugins import installed, official_plugins
 
         contributed = installed().commands.get(cmd_name)
         if contributed is None:
+            if any(cmd_name in offers.get("command", ()) for offers in official_plugins().values()):
+                raise PluginError(installed().why_missing("command", cmd_name))
             return None
         let_interrupts_raise()
         return contributed.load()

@@ -16,8 +16,6 @@ from ibrobot_core.launch.desk import EpisodeDesk
 from ibrobot_core.launch.runtime import Runtime
 from ibrobot_core.units import seconds
 
-DEFAULT = "recording={type: mcap, root: episodes, topics: contract}"
-"""Where the YAML has no `recording` section."""
 _MIB = 1 << 20
 _START, _FAILURE, _DISCARD = "tab", "f11", "f12"
 """The keys; `_START` also ends an episode as a success. None is one that a person jogs with."""
@@ -244,4 +242,4 @@ def record(config: str | None, dataset: str | None, root: Path | None, **options
     overrides = tuple(f"recording.{key}={value}" for key, value in (("dataset", dataset), ("root", root)) if value)
     live = sys.stdin.isatty() and sys.stdout.isatty() and not options["headless"]
     operator = Operator(options["episodes"], reset_time, prompt, auto=auto, keys=live, continuous=continuous)
-    run_robot(config, options, watcher=operator, recording=(DEFAULT, *overrides), prompt=prompt or "")
+    run_robot(config, options, watcher=operator, recording=overrides, prompt=prompt or "")

@@ -16,6 +16,7 @@ from ibrobot_core.config.structure import Part, Parts
 from ibrobot_core.config.yaml_nodes import Document, Key
 from ibrobot_core.descriptors import ExecutorDescriptor, TransportDescriptor
 from ibrobot_core.options import hint
+from ibrobot_core.plugins import example
 from ibrobot_core.robot import Joint, Robot
 from ibrobot_core.units import radians
 
@@ -240,7 +241,7 @@ class Checks:
             if not isinstance(transport, Mapping) or transport.get("type") == "local":
                 message = (
                     "distributed needs a transport to the server, "
-                    "e.g. transport: {type: zenoh, connect: [tcp/127.0.0.1:7447]}"
+                    f"e.g. transport: {{type: {example('transport')}, connect: [tcp/127.0.0.1:7447]}}"
                 )
                 self.document.add((*key, "execution_mode"), message)
         elif inference.server_model:
@@ -288,7 +289,8 @@ class Checks:
                 self._used(part)
             return
         if not (isinstance(part.descriptor, TransportDescriptor) and part.descriptor.topics):
-            message = f"transport {part.descriptor.type!r} carries no topics to other machines; zenoh does"
+            does = example("transport")
+            message = f"transport {part.descriptor.type!r} carries no topics to other machines; {does} does"
             self.document.add(("transport", "share"), message)
 
     def _used(self, part: Part) -> None:

@@ -125,7 +125,7 @@ def build_plan(session: Session) -> LaunchPlan:
     if foreign is not None and (config.recording is not None or any(mode.inference for mode in modes)):
         raise NotSupported(
             f"contract: {foreign.key}: {foreign.topic} is foreign, and comes from bags alone: this contract is for "
-            "`ibrobot convert`; a robot's own has nothing of the kind"
+            "a conversion; a robot's own has nothing of the kind"
         )
     unknown = next((spec for spec in config.contract.signals if spec.type not in MESSAGE_TYPES), None)
     if unknown is not None and config.recording is not None:

@@ -101,12 +101,12 @@ def origin(root: Path, metadata: Mapping[str, Any], number: int, told: Mapping[s
 def _told(root: Path, told: Mapping[str, str]) -> Origin:
     if "contract" not in told:
         raise ContractError(
-            f"{root}: was not made by ibrobot convert, so it does not say which robot its vectors are of; "
+            f"{root}: was not made by ibrobot, so it does not say which robot its vectors are of; "
             "name a robot YAML whose contract fits it"
         )
     if "norm_mode" not in told:
         raise CalibrationError(
-            f"{root}: was not made by ibrobot convert, so it does not say the unit of its joints; "
+            f"{root}: was not made by ibrobot, so it does not say the unit of its joints; "
             "--norm-mode does: radians, degrees or range_m100_100"
         )
     contract = Contract.from_canonical(json.loads(told["contract"]))

@@ -12,6 +12,7 @@ import pytest
 
 from ibrobot_core import __version__
 from ibrobot_core.cli.main import COMMANDS
+from ibrobot_core.plugins import Registry
 
 if TYPE_CHECKING:
     from cli.conftest import Ran
@@ -59,6 +60,14 @@ def test_wrong_usage_exits_with_2(ibrobot: Ibrobot) -> None:
 
     assert ran.code == 2
     assert "No such command 'lunch'" in ran.err
+
+
+def test_command_of_a_missing_plugin_names_the_package(ibrobot: Ibrobot, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ibrobot_core.plugins.installed", Registry)
+    ran = ibrobot("convert", "episodes", "--out", "dataset")
+
+    told = "error: ibrobot convert needs a plugin that is not installed: pip install ibrobot-plugin-data\n"
+    assert (ran.code, ran.out, ran.err) == (2, "", told)
 
 
 @pytest.mark.parametrize("command", ["config", "plugins", "doctor"])

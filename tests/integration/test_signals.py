@@ -80,7 +80,7 @@ def contract(folder: Path, text: str) -> Contract:
 
 def converted(bag: Path, folder: Path, text: str) -> tuple[dict[str, list[Any]], EpisodeReport]:
     """The columns of the dataset of a bag, its task as text, and what the conversion reports."""
-    request = Request(folder / "set", LeRobotOptions(), contract=contract(folder, text), prompt="by hand")
+    request = Request(folder / "set", LeRobotOptions(), "lerobot", contract=contract(folder, text), prompt="by hand")
     report = convert_episode(Job(request, bag, "bag", folder / "unit"), lambda frames: None)
     if report.error:
         return {}, report

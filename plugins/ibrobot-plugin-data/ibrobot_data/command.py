@@ -8,7 +8,7 @@ import re
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,8 +18,10 @@ import click
 from click.core import ParameterSource
 
 from ibrobot_core.contract.specs import Contract
+from ibrobot_core.descriptors import DatasetDescriptor, Flag
 from ibrobot_core.errors import DatasetError
 from ibrobot_core.outside import echo
+from ibrobot_core.plugins import installed
 from ibrobot_core.units import NORM_MODES
 from ibrobot_data.request import MISSING, OUTCOMES, EpisodeReport, Report, Request
 
@@ -28,12 +30,24 @@ if TYPE_CHECKING:
 
 _MIB = 1 << 20
 _ONLY_TO_BAG = ("numbers",)
-_ONLY_TO_DATASET = (
-    "append", "type_", "codec", "crf", "no_videos", "force_contract", "missing", "outcomes", "success", "jobs",
-)  # fmt: skip
+_ONLY_TO_DATASET = ("append", "type_", "force_contract", "missing", "outcomes", "success", "jobs")
 _MUCH = 0.1
 """An episode that lost more of its ticks is named."""
 _MISSING = attrs.fields(Request).missing.default
+
+
+def _flags() -> dict[str, Flag]:
+    """Name of a parameter -> the flag that a dataset writer adds to this command."""
+    descriptors = (entry.descriptor for entry in installed().entries.values())
+    flags = [flag for each in descriptors if isinstance(each, DatasetDescriptor) for flag in each.flags]
+    return {flag.name.removeprefix("--").replace("-", "_"): flag for flag in flags}
+
+
+def _flags_of_writers(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the flags of the installed dataset writers."""
+    for name, flag in reversed(_flags().items()):
+        command = click.option(flag.name, name, is_flag=flag.value is not None, help=flag.help)(command)
+    return command
 
 
 @click.command()
@@ -42,10 +56,8 @@ _MISSING = attrs.fields(Request).missing.default
 @click.option("--to", type=click.Choice(("dataset", "bag")), default="dataset", show_default=True, help="What to make.")
 @click.option("--episodes", "numbers", metavar="N,N-M", help="Which of a dataset's, from 0; all when left out.")
 @click.option("--append", is_flag=True, help="Add to the dataset that is there what is not in it yet.")
-@click.option("--type", "type_", default="lerobot", show_default=True, help="Dataset writer.")
-@click.option("--codec", metavar="NAME", help="Video encoder, e.g. h264; auto takes a GPU's where one opens.")
-@click.option("--crf", type=int, metavar="N", help="Video quality; lower is better and larger.")
-@click.option("--no-videos", is_flag=True, help="Keep pictures as they are, as PNG in the tables.")
+@click.option("--type", "type_", help="Dataset writer; by default the one that an installed plugin offers as such.")
+@_flags_of_writers
 @click.option("--set", "sets", multiple=True, metavar="OPTION=VALUE", help="Any other option of the dataset writer.")
 @click.option("--config", metavar="CONFIG", help="Robot YAML, or one with a contract alone; for bags of others.")
 @click.option("--force-contract", is_flag=True, help="Take --config's contract where the recorded one differs.")
@@ -69,7 +81,8 @@ def convert(context: click.Context, /, to: str, as_json: bool, **asked: Any) -> 
     command then exits with 1.
     """
     given = [name for name in asked if context.get_parameter_source(name) is ParameterSource.COMMANDLINE]
-    if wrong := [name for name in given if name in (_ONLY_TO_BAG if to == "dataset" else _ONLY_TO_DATASET)]:
+    only_other = _ONLY_TO_BAG if to == "dataset" else (*_ONLY_TO_DATASET, *_flags())
+    if wrong := [name for name in given if name in only_other]:
         option = next(each.opts[0] for each in context.command.params if each.name == wrong[0])
         raise click.UsageError(f"{option} has no meaning for --to {to}")
     try:
@@ -86,15 +99,16 @@ def convert(context: click.Context, /, to: str, as_json: bool, **asked: Any) -> 
 
 
 def _to_dataset(
-    *, episodes: tuple[Path, ...], out: Path, type_: str, config: str | None, calibration: str | None, as_json: bool,
-    outcomes: tuple[str, ...], jobs: int | None, codec: str | None, crf: int | None, no_videos: bool,
-    sets: tuple[str, ...], norm_mode: str | None, numbers: str | None, **asked: Any,
+    *, episodes: tuple[Path, ...], out: Path, type_: str | None, config: str | None, calibration: str | None,
+    as_json: bool, outcomes: tuple[str, ...], jobs: int | None, sets: tuple[str, ...], norm_mode: str | None,
+    numbers: str | None, **asked: Any,
 ) -> Report:  # fmt: skip
     from ibrobot_data.run import convert as run
     from ibrobot_data.run import find_episodes
 
-    shorthand = {"codec": codec, "crf": crf, "videos": "false" if no_videos else None}
-    overrides = tuple(f"{name}={value}" for name, value in shorthand.items() if value is not None)
+    given = [(flag, asked.pop(name)) for name, flag in _flags().items()]
+    overrides = [f"{flag.option}={flag.value or value}" for flag, value in given if value]
+    type_ = type_ or installed().default("dataset")
     request = Request(
         out, _options("dataset", type_, (*overrides, *sets)), type_,
         outcomes=outcomes or OUTCOMES, jobs=jobs or _jobs(), calibration=_calibration(calibration),
@@ -112,18 +126,19 @@ def _to_bags(
     from ibrobot_core.interfaces import EpisodeAddress
     from ibrobot_core.recording.provenance import told_by
     from ibrobot_data.episode import make_writer
-    from ibrobot_data.to_bags import RECORDER, BagRequest, convert_to_bags
+    from ibrobot_data.to_bags import BagRequest, convert_to_bags
 
     if len(episodes) != 1:
         raise click.UsageError("--to bag takes one dataset at a time")
     address = EpisodeAddress.of(episodes[0])
-    lerobot = Request(address.path, _options("dataset", "lerobot", ()))
-    if (summary := make_writer(lerobot).summary(address.path)) is None:
-        raise DatasetError(f"{address.path}: there is no LeRobot dataset")
+    dataset, recorder = installed().default("dataset"), installed().default("recorder")
+    writer = make_writer(Request(address.path, _options("dataset", dataset, ()), dataset))
+    if (summary := writer.summary(address.path)) is None:
+        raise DatasetError(f"{address.path}: there is no dataset of type {dataset}")
     chosen = (address.number,) if address.number is not None else _numbers(numbers, summary.episodes)
     robot = _robot(config) if config is not None else None
     request = BagRequest(
-        address.path, chosen, out, _options("recorder", RECORDER, sets), prompt=prompt,
+        address.path, chosen, out, _options("recorder", recorder, sets), recorder, prompt=prompt,
         contract=Contract.from_config(robot) if robot is not None else None,
         told=told_by(robot, norm_mode, _calibration(calibration)) if robot is not None else {},
     )  # fmt: skip
@@ -158,16 +173,14 @@ def _jobs() -> int:
     return max(1, (os.cpu_count() or 1) // 2)
 
 
-def _options(kind: str, type_: str, overrides: tuple[str, ...]) -> Any:
+def _options(kind: str, type_: str, overrides: Sequence[str]) -> Any:
     from ibrobot_core.config.single import single_options
-    from ibrobot_core.plugins import installed
 
     return single_options(installed().find(kind, type_).options, overrides, type_)
 
 
 def _robot(config: str) -> RobotConfig:
     from ibrobot_core.config.load import find_config, load_contract
-    from ibrobot_core.plugins import installed
 
     return load_contract(find_config(config, installed()))
 

@@ -24,7 +24,7 @@ class Request:
     """Where the dataset is or shall be."""
     options: Any
     """Of the dataset writer."""
-    type: str = "lerobot"
+    type: str
     """Of the dataset writer."""
     contract: Contract | None = None
     """In place of the recorded ones; episodes that were not recorded by ibrobot need it."""

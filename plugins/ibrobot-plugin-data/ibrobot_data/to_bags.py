@@ -24,8 +24,6 @@ from ibrobot_core.recording.episode import episode_folder
 from ibrobot_core.robot import Robot
 from ibrobot_data.request import EpisodeReport, Report
 
-RECORDER = "mcap"
-"""What writes episodes."""
 _STAGING = ".staging"
 """Where an episode is written within the folder, until it is whole."""
 _DIGEST = "source_digest"
@@ -47,7 +45,7 @@ class BagRequest:
     """`OUT/episodes/episode_000001` becomes episode 0 of the dataset."""
     options: Any
     """Of the recorder."""
-    type: str = RECORDER
+    type: str
     """Of the recorder."""
     contract: Contract | None = None
     """What the dataset's contract must be; None takes it as it is."""

@@ -21,7 +21,7 @@ from ibrobot_feetech.arm import Arm, Tuning
 from ibrobot_feetech.bus import RETURN_DELAY_S, FeetechBus
 from ibrobot_feetech.errors import FeetechError, NoReply, Place, PortError, ServoFault, TorqueStaysOn
 from ibrobot_feetech.health import Health, Measured, SteadyLoad
-from ibrobot_feetech.options import FollowerOptions, check_follower
+from ibrobot_feetech.options import TOOL, FollowerOptions, check_follower
 from ibrobot_feetech.protocol import OVER_CURRENT, OVERLOAD, faults
 from ibrobot_feetech.supply import supply
 from ibrobot_feetech.sync import Replies, SyncReader, SyncWriter
@@ -63,7 +63,7 @@ class FeetechFollower(Hardware):
         lower = dict(zip(ctx.joints, ctx.robot.lower[order], strict=True))
         for fault in check_follower(options, ctx.robot, ctx.joints):
             raise HardwareError(f"{ctx.name}: {fault.option[0]}: {fault.message}")
-        calibration = load_calibration(options.calibration, ctx.joints)
+        calibration = load_calibration(options.calibration, ctx.joints, tool=TOOL)
         closed = {joint: float(lower[joint]) for joint in options.anchored if joint in lower}
         self._arm = Arm(ctx.joints, calibration, closed)
         self._bus = FeetechBus(

@@ -17,7 +17,7 @@ from ibrobot_core.units import TICKS_PER_TURN, ns, seconds, ticks_to_lerobot
 from ibrobot_feetech.arm import Arm, calibration_differences, find_servos, relax
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.errors import FeetechError
-from ibrobot_feetech.options import LeaderOptions
+from ibrobot_feetech.options import TOOL, LeaderOptions
 from ibrobot_feetech.sync import SyncReader
 from ibrobot_feetech.usb import check_adapter
 
@@ -46,7 +46,7 @@ class LeaderTeleop(Teleop):
         self._leader_joints = tuple(pairs)
         self._joints = tuple(pairs.values())
         self._check_names("joints", self._joints, robot.joint_names)
-        calibration = load_calibration(options.calibration, self._leader_joints)
+        calibration = load_calibration(options.calibration, self._leader_joints, tool=TOOL)
         for option, names in (("inverted", options.inverted), ("scaled", options.scaled)):
             self._check_names(option, names, tuple(calibration.joints))
         self._arm = Arm(self._leader_joints, calibration)

@@ -13,6 +13,8 @@ from ibrobot_core.options import OptionFault, hint, option, unknown_names
 if TYPE_CHECKING:
     from ibrobot_core.robot import Robot
 
+TOOL = "ibrobot feetech"
+"""The command that calibrates and imports calibrations."""
 _GRIPPER = ("gripper",)
 """The default of options that name joints; it is passed over where another component has the gripper."""
 

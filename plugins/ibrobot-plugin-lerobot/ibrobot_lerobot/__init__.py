@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.descriptors import DatasetDescriptor, PolicyDescriptor, ReaderDescriptor
+from ibrobot_core.descriptors import DatasetDescriptor, Flag, PolicyDescriptor, ReaderDescriptor
 from ibrobot_core.hookspecs import hookimpl
 from ibrobot_lerobot.options import LeRobotOptions, LeRobotPolicyOptions
 
@@ -40,8 +40,13 @@ def _policy(options: Any, ctx: Context) -> Policy:
 def ibrobot_datasets() -> Iterable[DatasetDescriptor]:
     """What writes datasets that LeRobot trains on."""
     yield DatasetDescriptor(
-        type="lerobot", options=LeRobotOptions, make=_write, summary="LeRobot v3.0: videos and tables"
-    )
+        type="lerobot", options=LeRobotOptions, make=_write, default=True, summary="LeRobot v3.0: videos and tables",
+        flags=(
+            Flag("--codec", "codec", "Video encoder, e.g. h264; auto takes a GPU's where one opens."),
+            Flag("--crf", "crf", "Video quality; lower is better and larger."),
+            Flag("--no-videos", "videos", "Keep pictures as they are, as PNG in the tables.", "false"),
+        ),
+    )  # fmt: skip
 
 
 @hookimpl

@@ -116,7 +116,11 @@ def test_joints_come_in_radians(tmp_path: Path):
 @pytest.mark.parametrize(
     ("more", "error", "words"),
     [
-        ({"nothing": "x"}, ContractError, "was not made by ibrobot convert, .*name a robot YAML whose contract fits"),
+        (
+            {"nothing": "x"},
+            ContractError,
+            "was not made by ibrobot, .*name a robot YAML whose contract fits",
+        ),
         ({"contract": told()["contract"]}, CalibrationError, "does not say the unit of its joints; --norm-mode does"),
         (told(norm_mode="degrees"), CalibrationError, "degrees needs the calibration of joint 'a'"),
         (

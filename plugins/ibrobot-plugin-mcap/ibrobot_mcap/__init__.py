@@ -39,7 +39,11 @@ def _read(address: EpisodeAddress) -> EpisodeReader:
 def ibrobot_recorders() -> Iterable[RecorderDescriptor]:
     """What writes bags."""
     yield RecorderDescriptor(
-        type="mcap", options=McapOptions, make=_record, summary="ROS 2 bags: MCAP in a rosbag2 directory"
+        type="mcap",
+        options=McapOptions,
+        make=_record,
+        default=True,
+        summary="ROS 2 bags: MCAP in a rosbag2 directory",
     )
 
 

@@ -58,8 +58,9 @@ def _viewer(options: Any, ctx: Context) -> Viewer:
 def ibrobot_hardware() -> Iterable[HardwareDescriptor]:
     """Physics."""
     yield HardwareDescriptor(
-        type="mujoco", options=MujocoOptions, make=_hardware, simulated=True, sensors={"camera": "mujoco"},
-        check_options=check_world, summary="the robot's MJCF in MuJoCo, on an empty table or with a cube and a bin",
+        type="mujoco", options=MujocoOptions, make=_hardware, default=True, simulated=True,
+        sensors={"camera": "mujoco"}, check_options=check_world,
+        summary="the robot's MJCF in MuJoCo, on an empty table or with a cube and a bin",
     )  # fmt: skip
 
 
@@ -96,4 +97,4 @@ def ibrobot_decoders() -> Iterable[DecoderDescriptor]:
 @hookimpl
 def ibrobot_viewers() -> Iterable[ViewerDescriptor]:
     """A window on a desktop."""
-    yield ViewerDescriptor(type="mujoco", make=_viewer, summary="a desktop window on the simulated scene")
+    yield ViewerDescriptor(type="mujoco", make=_viewer, default=True, summary="a desktop window on the simulated scene")

@@ -8,7 +8,7 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,18 +16,20 @@ import click
 
 from ibrobot_core.clock import RealClock
 from ibrobot_core.config import find_config, load
+from ibrobot_core.config.overrides import apply
 from ibrobot_core.config.single import single_options
+from ibrobot_core.config.yaml_nodes import parse
+from ibrobot_core.descriptors import TransportDescriptor
 from ibrobot_core.inference.build import build_policy
 from ibrobot_core.interfaces import Context, Policy, Transport
 from ibrobot_core.metrics import MetricsServer
 from ibrobot_core.outside import LogFormatter, echo
-from ibrobot_core.plugins import Registry, installed
+from ibrobot_core.plugins import Registry, example, installed
 from ibrobot_core.robot import Robot
 from ibrobot_core.workers import on_signals
 from ibrobot_serve.metrics import probes
 from ibrobot_serve.service import InferenceService, ServiceOptions
 
-DEFAULT_LISTEN = "tcp/127.0.0.1:7447"
 _PLAIN_PERIOD_S = 10.0
 _PANEL_PERIOD_S = 0.5
 
@@ -44,7 +46,7 @@ _PANEL_PERIOD_S = 0.5
 )  # fmt: skip
 @click.option(
     "--listen", multiple=True, metavar="ENDPOINT",
-    help=f"Where robots connect to, in place of the transport's connect. {DEFAULT_LISTEN} with MODEL_DIR.",
+    help="Where robots connect to, in place of the transport's connect; by default this machine with MODEL_DIR.",
 )  # fmt: skip
 @click.option(
     "--transport", "transport_options", multiple=True, metavar="OPTION=VALUE",
@@ -131,17 +133,12 @@ def _start_again() -> None:
 
 def _from_config(what: str, registry: Registry, options: dict[str, Any]) -> tuple[str, Policy, Callable[[], Transport]]:
     """Name, policy and transport of a robot YAML."""
-    changes = [*options["overrides"]]
-    if options["listen"]:
-        changes += [
-            "transport.connect=[]",
-            f"transport.listen={json.dumps(options['listen'])}",
-            "transport.mode=router",
-        ]
-    changes += [f"transport.{option}" for option in options["transport_options"]]
     if Path(what).is_dir():
         raise click.UsageError(f"{what} is a folder: give the plugin of the model in it, e.g. --type lerobot")
     path = find_config(what, registry)
+    transport = _transport_type(path, options["overrides"])
+    listening = _listening(registry, transport, options["listen"]) if transport and options["listen"] else []
+    changes = (*options["overrides"], *(f"transport.{each}" for each in (*listening, *options["transport_options"])))
     config = load(path, overrides=changes, sim=options["sim"], registry=registry, communicates=True)
     model: str = options["model"] or (next(iter(config.models)) if len(config.models) == 1 else "")
     if model not in config.models:
@@ -151,7 +148,8 @@ def _from_config(what: str, registry: Registry, options: dict[str, Any]) -> tupl
     section = config.transport
     if section is None or section.type == "local":
         raise click.UsageError(
-            f"{path} names no transport to robots: add --set 'transport={{type: zenoh}}' --listen {DEFAULT_LISTEN}"
+            f"{path} names no transport to robots: add "
+            f"--set 'transport={{type: {example('transport')}}}' --listen ENDPOINT"
         )
 
     def make_transport() -> Transport:
@@ -173,11 +171,11 @@ def _from_folder(
     policies = registry.find("policy", options["type_"])
     overrides = [f"path={folder.absolute()}", *options["overrides"]]
     policy: Policy = policies.make(single_options(policies.options, overrides, str(folder)), context)
-    transports = registry.find("transport", "zenoh")
-    listen = json.dumps(options["listen"] or (DEFAULT_LISTEN,))
+    transport = registry.default("transport")
+    transports = registry.find("transport", transport)
     settings = single_options(
         transports.options,
-        ["mode=router", f"listen={listen}", *options["transport_options"]],
+        [*_listening(registry, transport, options["listen"]), *options["transport_options"]],
         "--listen, --transport",
         "--transport",
     )
@@ -187,6 +185,25 @@ def _from_folder(
         return made
 
     return options["name"] or folder.absolute().name, policy, make_transport
+
+
+def _transport_type(path: Path, overrides: Sequence[str]) -> str:
+    """The type that the `transport` section names, before anything is checked; empty where there is none."""
+    document = parse(path.read_text(encoding="utf-8", errors="replace"), str(path))
+    if not isinstance(document.root, Mapping):
+        return ""
+    apply(document, overrides)
+    section = document.root.get("transport")
+    found = str(section.get("type", "")) if isinstance(section, Mapping) else ""
+    return "" if found == "local" else found
+
+
+def _listening(registry: Registry, transport: str, endpoints: Sequence[str]) -> list[str]:
+    """Overrides of a transport's options for a server that listens."""
+    descriptor = registry.find("transport", transport)
+    if not isinstance(descriptor, TransportDescriptor) or descriptor.listen is None:
+        raise click.UsageError(f"--listen: a server cannot listen with transport {transport!r}")
+    return [f"{option}={json.dumps(value)}" for option, value in descriptor.listen(endpoints).items()]
 
 
 def _context(robot: Robot) -> Context:

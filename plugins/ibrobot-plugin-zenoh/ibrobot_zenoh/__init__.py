@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from ibrobot_core.descriptors import Command, DecoderDescriptor, TransportDescriptor
 from ibrobot_core.hookspecs import hookimpl
-from ibrobot_zenoh.options import ZenohOptions
+from ibrobot_zenoh.options import ZenohOptions, server_options
 
 if TYPE_CHECKING:
     import click
@@ -26,7 +26,7 @@ def _zenoh(options: Any, ctx: Context) -> Transport:
 def ibrobot_transports() -> Iterable[TransportDescriptor]:
     """Between machines."""
     yield TransportDescriptor(
-        type="zenoh", options=ZenohOptions, make=_zenoh, topics=True,
+        type="zenoh", options=ZenohOptions, make=_zenoh, default=True, topics=True, listen=server_options,
         summary="between machines; ROS 2 nodes with rmw_zenoh join in",
     )  # fmt: skip
 

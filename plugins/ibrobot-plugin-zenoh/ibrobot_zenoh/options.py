@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import ipaddress
 import re
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import attrs
 
 from ibrobot_core.options import option
 
 MIB = 1024 * 1024
+DEFAULT_LISTEN = "tcp/127.0.0.1:7447"
+"""Where a server listens that is given no endpoint."""
 
 _ENDPOINT = re.compile(r"(?P<protocol>tcp|tls|quic|unixsock-stream)/(?P<address>.+)")
 _ENCRYPTED = ("tls", "quic")
@@ -42,6 +46,11 @@ def is_local(endpoint: str) -> bool:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:
         return False
+
+
+def server_options(endpoints: Sequence[str]) -> dict[str, Any]:
+    """Options of a server that listens at `endpoints`, or where none is given on this machine alone."""
+    return {"connect": [], "mode": "router", "listen": list(endpoints) or [DEFAULT_LISTEN]}
 
 
 def _check_endpoints(instance: object, attribute: attrs.Attribute[tuple[str, ...]], value: tuple[str, ...]) -> None:

@@ -17,7 +17,7 @@ from ibrobot_feetech.commands.joints import joints_of
 from ibrobot_feetech.commands.ports import opened, port_argument
 from ibrobot_feetech.commands.zero import zero_text
 from ibrobot_feetech.errors import NoReply
-from ibrobot_feetech.options import FollowerOptions
+from ibrobot_feetech.options import TOOL, FollowerOptions
 from ibrobot_feetech.registers import MODEL_STS3215
 from ibrobot_feetech.supply import supply
 from ibrobot_feetech.usb import check_adapter
@@ -47,7 +47,7 @@ class Difference:
 @click.option("--yes", is_flag=True, help="Write without asking.")
 def check(port: str | None, name: str, robot: str | None, write: bool, yes: bool) -> None:
     """Compare the servos with a calibration; exit 1 with a table of what differs."""
-    calibration = load_calibration(name, [joint.name for joint in joints_of(robot, name)])
+    calibration = load_calibration(name, [joint.name for joint in joints_of(robot, name)], tool=TOOL)
     echo(f"{calibration.path}: arm {calibration.robot or 'unnamed'}, made {calibration.date or 'at an unknown time'}")
     echo(zero_text(calibration))
     with opened(port, joints={joint.id: each for each, joint in calibration.joints.items()}) as bus:

@@ -1,0 +1,67 @@
+"""Core names no plugin: what it says of them comes from descriptors, or from `official_plugins.json`, which is data."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+
+import pytest
+
+from ibrobot_core.plugins import KINDS, OFFICIAL, example, official_plugins
+
+CORE = OFFICIAL.parent
+ORDINARY = {"joint", "keyboard", "replay"}
+"""Types that are words of the language too: they count where a text says `type: WORD`."""
+ALLOWED = {("config/models.py", '_root(path, "mujoco")')}
+"""File and text: the root element of MJCF files."""
+
+
+def patterns() -> Iterator[str]:
+    """Regular expressions of what core must not say."""
+    for package, offers in official_plugins().items():
+        name = package.removeprefix("ibrobot-plugin-")
+        yield rf"\b(ibrobot-plugin-{name}|ibrobot_{name})\b"
+        yield from (rf"\bibrobot {command}\b" for command in offers.get("command", ()))
+        for type_ in (type_ for kind in KINDS for type_ in offers.get(kind, ())):
+            yield rf"\btype: {type_}\b" if type_ in ORDINARY else rf"\b{type_}\b"
+
+
+def named(text: str, file: str = "") -> list[str]:
+    """Line number and line of everything in a source text that names a plugin."""
+    forbidden = re.compile("|".join(patterns()))
+    lines = enumerate(text.splitlines(), start=1)
+    excused = [excuse for where, excuse in ALLOWED if where == file]
+    found = [(n, line.strip()) for n, line in lines if forbidden.search(line)]
+    return [f"{file}:{n}: {line}" for n, line in found if not any(excuse in line for excuse in excused)]
+
+
+def test_core_names_no_plugin() -> None:
+    files = sorted(CORE.rglob("*.py"))
+    assert len(files) > 100
+    found = [line for path in files for line in named(path.read_text(encoding="utf-8"), str(path.relative_to(CORE)))]
+    assert found == []
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        'DEFAULT = "recording={type: mcap}"', "# as scripted_pick does", "pip install ibrobot-plugin-zenoh",
+        "import ibrobot_feetech", 'teleoperation: {jog: {type: keyboard}}', "see `ibrobot episodes verify`",
+    ],
+)  # fmt: skip
+def test_a_plugin_named_in_core_is_found(line: str) -> None:
+    assert named(f"first = 1\n{line}") == [f":2: {line}"]
+
+
+def test_examples_in_messages_are_default_types() -> None:
+    kinds = [kind for offers in official_plugins().values() for kind in offers.get("default", ())]
+    assert sorted(kinds) == ["dataset", "hardware", "recorder", "transport", "viewer"]
+    for kind in kinds:
+        assert any(example(kind) in offers.get(kind, ()) for offers in official_plugins().values())
+
+
+@pytest.mark.integration
+def test_official_plugins_are_listed_as_they_are() -> None:
+    from official_plugins import offers
+
+    assert offers() == official_plugins(), "run python tests/house/official_plugins.py"
