@@ -125,7 +125,7 @@ class Robot:
         config = RobotConfig(
             robot=robot,
             executors={"all": ExecutorComponent("position", NoOptions(), "all", "all", joints)},
-            control_modes={"idle": ControlMode("idle", ())},
+            control_modes={"idle": ControlMode(())},
             default_control_mode="idle",
             contract=ContractConfig(
                 RATE_HZ, observations=(ObservationSpec(STATE, topic="/joint_states"),),

@@ -150,7 +150,7 @@ class Robot(InferenceClient):
         config = RobotConfig(
             robot=robot,
             executors={"all": ExecutorComponent("position", NoOptions(), "all", "all", robot.joint_names)},
-            control_modes={"idle": ControlMode("idle", ())},
+            control_modes={"idle": ControlMode(())},
             default_control_mode="idle",
             contract=ContractConfig(RATE_HZ, observations=(state,), actions=(ActionSpec("all", "/commands"),)),
         )

@@ -5,6 +5,8 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+from sphinx.application import Sphinx
+
 from ibrobot_core import __version__
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -28,3 +30,14 @@ autodoc_member_order = "bysource"
 autodoc_default_options = {"members": True, "show-inheritance": True}
 # Names of other projects, of type parameters, and of what has no page of its own.
 nitpick_ignore_regex = [("py:.*", r"(?!ibrobot_core\.interfaces\.\w+\.[A-Z]).*")]
+
+
+def _keep_colons(app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
+    """Napoleon reads "word: words" at the beginning of an attribute's docstring as its type, unless a line precedes."""
+    if what == "attribute":
+        lines.insert(0, "")
+
+
+def setup(app: Sphinx) -> None:
+    """Called by Sphinx."""
+    app.connect("autodoc-process-docstring", _keep_colons, priority=400)

@@ -1,84 +1,15 @@
-"""Writes the reference pages that come from the code: the robot YAML's sections and the command line."""
+"""Writes the reference pages that come from the code: the robot YAML, options, plugins and the command line."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
 
-import attrs
 import click
+from option_pages import config_page, options_page
 from plugin_index import plugin_page
 
 from ibrobot_core.cli.main import cli
-from ibrobot_core.config import schema
-from ibrobot_core.robot import Description, Joint, Robot
-
-SECTIONS: tuple[tuple[str, type], ...] = (
-    ("robot", Robot),
-    ("robot.joints[]", Joint),
-    ("robot.description", Description),
-    ("contract", schema.ContractConfig),
-    ("contract.observations[]", schema.ObservationSpec),
-    ("contract.observations[].align", schema.Align),
-    ("contract.observations[].image", schema.ImageSpec),
-    ("contract.actions[]", schema.ActionSpec),
-    ("contract.signals[]", schema.SignalSpec),
-    ("control_modes.NAME.inference", schema.Inference),
-    ("control_modes.NAME.dispatch", schema.Dispatch),
-    ("control_modes.NAME.dispatch.smoothing", schema.Smoothing),
-    ("control", schema.Control),
-    ("metrics", schema.MetricsConfig),
-)
-
-
-def type_name(hint: Any) -> str:
-    """A type as a reader of YAML would call it."""
-    if isinstance(hint, type) and not get_args(hint):
-        return hint.__name__
-    return re.sub(r"\b(?:[a-z_]+\.)+(?=\w)", "", str(hint))
-
-
-def default(field: attrs.Attribute[Any]) -> str:
-    """A field's default, or that it is required."""
-    if field.default is attrs.NOTHING:
-        return "required"
-    if isinstance(field.default, attrs.Factory):  # type: ignore[arg-type]
-        return "as below" if attrs.has(field.default.factory) else "empty"
-    return f"`{field.default!r}`"
-
-
-def allowed(metadata: Any) -> str:
-    """Range or choices of a field."""
-    if metadata.get("secret"):
-        return "secret: `${NAME}`"
-    if metadata.get("choices"):
-        return ", ".join(f"`{choice}`" for choice in metadata["choices"])
-    signs = (("ge", "≥"), ("gt", ">"), ("le", "≤"), ("lt", "<"))
-    return " ".join(f"{sign} {metadata[key]:g}" for key, sign in signs if metadata.get(key) is not None)
-
-
-def config_page() -> Iterator[str]:
-    """Lines of the page on the robot YAML."""
-    yield "# The robot YAML\n"
-    yield "Every section, its keys, units and defaults. Unknown keys are errors. Sections with a `type` take, besides,"
-    yield "the options of that plugin, which `ibrobot plugins show TYPE` prints.\n"
-    yield "`${NAME:default}` is replaced from the environment, `~` by the home directory, and `package://PACKAGE/path`"
-    yield "by where that Python package is.\n"
-    for path, section in SECTIONS:
-        hints = get_type_hints(section)
-        yield f"## `{path}`\n"
-        yield (section.__doc__ or "").strip().splitlines()[0] + "\n"
-        yield "| key | type | unit | default | allowed | |"
-        yield "|---|---|---|---|---|---|"
-        for field in attrs.fields(section):
-            meta = field.metadata
-            cells = (f"`{field.name}`", f"`{type_name(hints[field.name])}`", meta.get("unit", ""), default(field))
-            yield (
-                "| " + " | ".join((*(c.replace("|", r"\|") for c in cells), allowed(meta), meta.get("help", ""))) + " |"
-            )
-        yield ""
 
 
 def command_lines(command: click.Command, path: str) -> Iterator[str]:
@@ -108,8 +39,9 @@ def cli_page() -> Iterator[str]:
 
 def write(directory: Path) -> None:
     """Write all generated pages into `directory`; a page that is the same is left alone."""
-    for name, lines in (("config.md", config_page()), ("cli.md", cli_page()), ("plugins.md", plugin_page())):
-        text = "\n".join(lines) + "\n"
+    pages = {"config.md": config_page, "options.md": options_page, "plugins.md": plugin_page, "cli.md": cli_page}
+    for name, page in pages.items():
+        text = "\n".join(page()) + "\n"
         path = directory / name
         if not path.exists() or path.read_text() != text:
             path.write_text(text)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import attrs
 
-from ibrobot_core.options import option
+from ibrobot_core.options import documented, option
 
 
+@documented
 @attrs.frozen
 class PositionOptions:
     """Options of `type: position`."""
@@ -17,6 +18,7 @@ class PositionOptions:
     )
 
 
+@documented
 @attrs.frozen
 class TrajectoryOptions:
     """Options of `type: trajectory`; a tolerance of 0 is not checked."""
@@ -26,6 +28,7 @@ class TrajectoryOptions:
     goal_time: float = option(1.0, unit="s", ge=0, help="time after the end to come within goal_tolerance; 0: no limit")
 
 
+@documented
 @attrs.frozen
 class GripperOptions:
     """Options of `type: gripper`."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from typing import Any
 
@@ -102,3 +103,33 @@ def option(
     if factory is not None:
         return attrs.field(factory=factory, metadata=metadata, validator=validators, repr=shown)
     return attrs.field(default=default, metadata=metadata, validator=validators, repr=shown)
+
+
+def documented[C](cls: type[C]) -> type[C]:
+    """Class decorator: append what `option` says of each field to the docstring, for `help()` and the API pages."""
+    lines = [
+        f"    {field.name}: {field.metadata['help']}{unit}."
+        for field in attrs.fields(cls)  # type: ignore[arg-type]
+        if field.metadata.get("help")
+        for unit in (f" [{field.metadata['unit']}]" if field.metadata["unit"] else "",)
+    ]
+    cls.__doc__ = "\n".join([inspect.cleandoc(cls.__doc__ or ""), "", "Attributes:", *lines])
+    return cls
+
+
+def not_a_key(default: Any = attrs.NOTHING, *, factory: Any = None, repr: bool = True, eq: bool = True) -> Any:
+    """An attrs field of a section's class that loading fills in, and that the file cannot give."""
+    default = default if factory is None else attrs.Factory(factory)
+    return attrs.field(default=default, metadata={"key": False}, repr=repr, eq=eq)
+
+
+def fields(kind: type[Any]) -> Mapping[str, attrs.Attribute[Any]]:
+    """The keys that an options class takes, with resolved types."""
+    attrs.resolve_types(kind)
+    return {field.name: field for field in attrs.fields(kind) if field.init and field.metadata.get("key", True)}
+
+
+def default_of(field: attrs.Attribute[Any]) -> Any:
+    """A field's default, made where it is a factory; `attrs.NOTHING` where it is required."""
+    default: Any = field.default
+    return default.factory() if isinstance(default, attrs.Factory) else default  # type: ignore[arg-type]

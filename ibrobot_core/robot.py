@@ -10,7 +10,7 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.options import option
+from ibrobot_core.options import documented, option
 
 Vector = NDArray[np.float64]
 
@@ -20,6 +20,7 @@ _LEAD_AT_REST = 0.2
 """How far a joint at rest may hang from its setpoint under load [rad]."""
 
 
+@documented
 @attrs.frozen
 class Joint:
     """One joint; SI units."""
@@ -48,6 +49,7 @@ class Joint:
             raise ValueError(f"lower ({self.lower}) must be below upper ({self.upper})")
 
 
+@documented
 @attrs.frozen
 class Description:
     """Where the robot's models are, and its named poses."""
@@ -58,6 +60,7 @@ class Description:
     poses: Mapping[str, tuple[float, ...]] = option(factory=dict, unit="rad", help="joint positions in joint order")
 
 
+@documented
 @attrs.frozen(slots=False)
 class Robot:
     """The `robot:` section. The order of `joints` is the order in every vector."""

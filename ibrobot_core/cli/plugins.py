@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-import re
-from typing import Any, get_args
+from typing import Any
 
 import attrs
 import click
@@ -42,16 +41,24 @@ def plugins(ctx: click.Context, as_json: bool) -> None:
 @click.option("--json", "as_json", is_flag=True, help="Print a list of {kind, type, …, options: […]}.")
 def show(type_: str, as_json: bool) -> None:
     """Print the options of TYPE, of every kind that has a type of this name."""
+    from ibrobot_core.config.describe import described
+
     registry = installed()
     entries = [registry.entries[key] for key in sorted(registry.entries) if key[1] == type_]
     if not entries:
         raise PluginError(_unknown(registry, type_))
-    described = [{**_row(registry, entry), "options": _options(entry)} for entry in entries]
+    found = [
+        {
+            **_row(registry, entry),
+            "options": [attrs.asdict(option) for option in described(entry.descriptor.options)],
+        }
+        for entry in entries
+    ]
     if as_json:
-        echo(json.dumps(described, indent=2))
+        echo(json.dumps(found, indent=2))
         return
     columns = ("name", "type", "unit", "default", "allowed", "help")
-    for one in described:
+    for one in found:
         echo(f"{one['kind']} type {one['type']} ({one['package']} {one['version']}): {one['summary']}")
         if one["missing"] is not None:
             echo(f"lacking: {_lacking(one)}")
@@ -84,42 +91,6 @@ def _unknown(registry: Registry, type_: str) -> str:
 
     broken = "".join(f"; {failure}" for failure in registry.failures)
     return f"unknown type {type_!r}{hint(type_, sorted({t for _, t in registry.entries}), 'installed')}{broken}"
-
-
-def _options(entry: Entry) -> list[dict[str, Any]]:
-    from ibrobot_core.config.convert import fields
-    from ibrobot_core.config.jsonschema import default_of
-    from ibrobot_core.config.show import plain
-
-    rows = []
-    for name, field in fields(entry.descriptor.options).items():
-        default = default_of(field)
-        rows.append({
-            "name": name,
-            "type": _type_name(field.type),
-            "unit": field.metadata.get("unit", ""),
-            "required": default is attrs.NOTHING,
-            "default": "(required)" if default is attrs.NOTHING else plain(default),
-            "allowed": _allowed(field),
-            "secret": bool(field.metadata.get("secret")),
-            "help": field.metadata.get("help", ""),
-        })  # fmt: skip
-    return rows
-
-
-def _type_name(kind: Any) -> str:
-    text = kind.__name__ if isinstance(kind, type) and not get_args(kind) else str(kind)
-    return re.sub(r"\w+\.(?=\w)", "", text)
-
-
-def _allowed(field: attrs.Attribute[Any]) -> str:
-    if field.metadata.get("secret"):
-        return "secret: ${NAME}"
-    if field.metadata.get("choices") is not None:
-        return ", ".join(str(choice) for choice in field.metadata["choices"])
-    signs = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
-    bounds = [f"{sign} {field.metadata[name]}" for name, sign in signs.items() if field.metadata.get(name) is not None]
-    return ", ".join(bounds)
 
 
 def _text(value: Any) -> str:

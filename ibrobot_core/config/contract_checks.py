@@ -9,7 +9,7 @@ import attrs
 
 from ibrobot_core import messages
 from ibrobot_core.config.checks import streams
-from ibrobot_core.config.schema import ActionSpec, ContractConfig, ObservationSpec, SignalSpec
+from ibrobot_core.config.schema import ActionSpec, ContractConfig, ExecutorComponent, ObservationSpec, SignalSpec
 from ibrobot_core.config.structure import Part, Parts
 from ibrobot_core.config.yaml_nodes import Document, Key
 from ibrobot_core.options import hint
@@ -57,7 +57,7 @@ class ContractChecks:
         observations = self.observations((*key, "observations"), contract.observations)
         for name, part in self.parts.models.items():
             extra: Key = ("models", name, "extra_observations")
-            self._same_kind(extra, self.observations(extra, part.keys.extra_observations), observations)
+            self._same_kind(extra, self.observations(extra, part.component.extra_observations), observations)
         self._same_kind((*key, "observations"), observations, ())
         given = contract.actions
         before = len(self.document.problems)
@@ -253,14 +253,15 @@ class ContractChecks:
             self._field((*key, "select", 0), spec.select[0], spec.type)
         return spec
 
-    def _safety(self, key: Key, spec: ActionSpec, part: Part) -> ActionSpec:
+    def _safety(self, key: Key, spec: ActionSpec, part: Part[ExecutorComponent]) -> ActionSpec:
         """One answer to what follows stale setpoints, in both, whether the action or the executor gives it."""
-        there = getattr(part.options, "safety_behavior", None)
+        there = getattr(part.component.options, "safety_behavior", None)
         if there is None:
             return spec
         if self.document.get(*part.key, "safety_behavior") is None:
-            options = attrs.evolve(part.options, safety_behavior=spec.safety_behavior)
-            self.parts.executors[spec.executor] = attrs.evolve(part, options=options)
+            options = attrs.evolve(part.component.options, safety_behavior=spec.safety_behavior)
+            component = attrs.evolve(part.component, options=options)
+            self.parts.executors[spec.executor] = attrs.evolve(part, component=component)
         elif self.document.get(*key, "safety_behavior") is None:
             spec = attrs.evolve(spec, safety_behavior=there)
         elif there != spec.safety_behavior:

@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 import types
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from collections.abc import Mapping as AbstractMapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin
 
 import attrs
-from cattrs import Converter
 
 from ibrobot_core.config.expand import resolve_path
 from ibrobot_core.config.yaml_nodes import Key
-from ibrobot_core.options import hint
+from ibrobot_core.options import fields, hint
 
 _SHOWN = 200
 """Characters of a value that a message shows."""
 _YAML_1_1_BOOLS = {"on", "off", "yes", "no", "y", "n", "true", "false"}
+_SCALARS: Mapping[Any, tuple[type | tuple[type, ...], str]] = {
+    bool: (bool, "true or false"),
+    int: (int, "a whole number"),
+    float: ((int, float), "a number"),
+    str: (str, "text"),
+}
+"""Type -> the Python types of the values that it takes, and what a message calls them."""
 
 
 def said(error: Exception) -> str:
@@ -75,30 +80,17 @@ def _wrong(expected: str, value: Any, remark: str = "") -> ValueError:
     return ValueError(f"expected {expected}, got {shown(value)}{remark}")
 
 
-def _bool(value: Any, _: Any) -> bool:
-    if isinstance(value, bool):
-        return value
-    remark = " (only true and false, unquoted, are truth values)" if str(value).lower() in _YAML_1_1_BOOLS else ""
-    raise _wrong("true or false", value, remark)
-
-
-def _int(value: Any, _: Any) -> int:
-    if isinstance(value, int) and not isinstance(value, bool):
-        return value
-    raise _wrong("a whole number", value)
-
-
-def _float(value: Any, _: Any) -> float:
-    if isinstance(value, int | float) and not isinstance(value, bool):
-        return float(value)
-    raise _wrong("a number", value)
-
-
-def _str(value: Any, _: Any) -> str:
-    if isinstance(value, str):
-        return value
-    is_number = isinstance(value, int | float)
-    raise _wrong("text", value, f" (quote it: '{shown(value)}')" if is_number else "")
+def _scalar(value: Any, kind: type) -> Any:
+    taken, expected = _SCALARS[kind]
+    fits = isinstance(value, taken) and (kind is bool or not isinstance(value, bool))
+    if fits:
+        return float(value) if kind is float else value
+    remark = ""
+    if kind is bool and str(value).lower() in _YAML_1_1_BOOLS:
+        remark = " (only true and false, unquoted, are truth values)"
+    elif kind is str and isinstance(value, int | float):
+        remark = f" (quote it: '{shown(value)}')"
+    raise _wrong(expected, value, remark)
 
 
 def is_sequence(kind: Any) -> bool:
@@ -108,7 +100,7 @@ def is_sequence(kind: Any) -> bool:
 
 def is_mapping(kind: Any) -> bool:
     """Whether a type annotation says dict or Mapping."""
-    return (get_origin(kind) or kind) in (dict, AbstractMapping)
+    return (get_origin(kind) or kind) in (dict, Mapping)
 
 
 def is_union(kind: Any) -> bool:
@@ -118,61 +110,113 @@ def is_union(kind: Any) -> bool:
 
 def is_literal(kind: Any) -> bool:
     """Whether a type annotation says `Literal[...]`."""
-    return get_origin(kind) in (Literal,)
+    return get_origin(kind) is Literal
 
 
-Hook = Callable[[Any, Any], Any]
+@attrs.frozen
+class Converter:
+    """Makes what a type annotation asks for of plain values."""
 
+    base: Path
+    """Where relative paths start."""
 
-def _sequence_hook(kind: Any, converter: Converter) -> Hook:
-    args = get_args(kind) or (Any, ...)
-    build = list if (get_origin(kind) or kind) is list else tuple
-    any_length = build is list or len(args) == 1 or args[1] is Ellipsis
+    def structure(self, value: Any, kind: Any) -> Any:
+        """`value` as a `kind`.
 
-    def structure(value: Any, _: Any) -> Any:
+        Raises:
+            Faults: for what is wrong below it.
+            ValueError: for what is wrong with it as a whole.
+            TypeError: for a kind that is not supported, which is a mistake in an options class.
+        """
+        if kind is Any:
+            return value
+        if kind in _SCALARS:
+            return _scalar(value, kind)
+        if kind is Path:
+            return resolve_path(_scalar(value, str), self.base)
+        for fits, structure in (
+            (is_union, self._union),
+            (is_literal, self._literal),
+            (is_sequence, self._sequence),
+            (is_mapping, self._mapping),
+            (attrs.has, self._attrs),
+        ):
+            if fits(kind):
+                return structure(value, kind)
+        raise TypeError(f"options of type {kind} are not supported")
+
+    def arguments(
+        self, known: Mapping[str, attrs.Attribute[Any]], value: Mapping[str, Any], faults: Faults
+    ) -> dict[str, Any]:
+        """The fields that `value` gives, each converted and validated; what is wrong or missing goes to `faults`."""
+        arguments: dict[str, Any] = {}
+        for name, field in known.items():
+            if name in value:
+                with faults.at(name):
+                    arguments[name] = self._field(field, value[name])
+            elif field.default is attrs.NOTHING:
+                faults.add((name,), "required key is missing")
+        return arguments
+
+    def _field(self, field: attrs.Attribute[Any], value: Any) -> Any:
+        try:
+            item = self.structure(value, field.type if field.type is not None else Any)
+            if field.validator is not None:
+                # Ahead of the constructor, so that every field is checked and the fault is found at its own key.
+                field.validator(None, field, item)
+        except (ValueError, TypeError):
+            if not field.metadata.get("secret"):
+                raise
+            raise ValueError(
+                "is not a valid value, which is not shown here; text must be quoted if it looks like a number"
+            ) from None
+        return item
+
+    def _attrs(self, value: Any, kind: type) -> Any:
+        if not isinstance(value, Mapping):
+            raise _wrong("a mapping", value)
+        known, faults = fields(kind), Faults()
+        for name in value:
+            if name not in known:
+                faults.add((name,), unknown_key(name, list(known)))
+        arguments = self.arguments(known, value, faults)
+        faults.raise_any()
+        return kind(**arguments)
+
+    def _sequence(self, value: Any, kind: Any) -> Any:
         if not isinstance(value, list | tuple):
             raise _wrong("a list", value)
+        args = get_args(kind) or (Any, ...)
+        build = list if (get_origin(kind) or kind) is list else tuple
+        any_length = build is list or len(args) == 1 or args[1] is Ellipsis
         if not any_length and len(value) != len(args):
             raise ValueError(f"expected a list of {len(args)} values, got {len(value)}")
-        faults = Faults()
-        items = []
+        faults, items = Faults(), []
         for i, item in enumerate(value):
             with faults.at(i):
-                items.append(converter.structure(item, args[0] if any_length else args[i]))
+                items.append(self.structure(item, args[0] if any_length else args[i]))
         faults.raise_any()
         return build(items)
 
-    return structure
-
-
-def _mapping_hook(kind: Any, converter: Converter) -> Hook:
-    _, item_kind = get_args(kind) or (str, Any)
-
-    def structure(value: Any, _: Any) -> dict[str, Any]:
+    def _mapping(self, value: Any, kind: Any) -> dict[str, Any]:
         if not isinstance(value, Mapping):
             raise _wrong("a mapping", value)
-        faults = Faults()
-        items = {}
+        _, item_kind = get_args(kind) or (str, Any)
+        faults, items = Faults(), {}
         for name, item in value.items():
             with faults.at(name):
-                items[name] = converter.structure(item, item_kind)
+                items[name] = self.structure(item, item_kind)
         faults.raise_any()
         return items
 
-    return structure
-
-
-def _union_hook(kind: Any, converter: Converter) -> Hook:
-    members = [member for member in get_args(kind) if member is not type(None)]
-    optional = len(members) < len(get_args(kind))
-
-    def structure(value: Any, _: Any) -> Any:
-        if value is None and optional:
+    def _union(self, value: Any, kind: Any) -> Any:
+        members = [member for member in get_args(kind) if member is not type(None)]
+        if value is None and len(members) < len(get_args(kind)):
             return None
         reasons = []
         for member in members:
             try:
-                return converter.structure(value, member)
+                return self.structure(value, member)
             except Faults:
                 raise
             except ValueError as error:
@@ -187,83 +231,8 @@ def _union_hook(kind: Any, converter: Converter) -> Hook:
         ]
         raise _wrong(" or ".join(expected), value)
 
-    return structure
-
-
-def _literal_hook(kind: Any, converter: Converter) -> Hook:
-    choices = get_args(kind)
-
-    def structure(value: Any, _: Any) -> Any:
+    def _literal(self, value: Any, kind: Any) -> Any:
+        choices = get_args(kind)
         if value in choices:
             return value
         raise ValueError(f"{value!r} is not one of: {', '.join(str(c) for c in choices)}")
-
-    return structure
-
-
-def fields(kind: type) -> dict[str, attrs.Attribute[Any]]:
-    """The keys that an options class takes, with resolved types."""
-    attrs.resolve_types(kind)
-    return {field.name: field for field in attrs.fields(kind) if field.init}
-
-
-def _class_hook(kind: type, converter: Converter) -> Hook:
-    known = fields(kind)
-
-    def structure(value: Any, _: Any) -> Any:
-        if not isinstance(value, Mapping):
-            raise _wrong("a mapping", value)
-        faults = Faults()
-        for name in value:
-            if name not in known:
-                faults.add((name,), unknown_key(name, list(known)))
-        arguments = structure_fields(known, value, converter, faults)
-        faults.raise_any()
-        return kind(**arguments)
-
-    return structure
-
-
-def structure_fields(
-    known: Mapping[str, attrs.Attribute[Any]], value: Mapping[str, Any], converter: Converter, faults: Faults
-) -> dict[str, Any]:
-    """The fields that `value` gives, each converted and validated; what is wrong or missing goes to `faults`."""
-    arguments: dict[str, Any] = {}
-    for name, field in known.items():
-        if name in value:
-            with faults.at(name):
-                arguments[name] = _structured(field, value[name], converter)
-        elif field.default is attrs.NOTHING:
-            faults.add((name,), "required key is missing")
-    return arguments
-
-
-def _structured(field: attrs.Attribute[Any], value: Any, converter: Converter) -> Any:
-    try:
-        item = converter.structure(value, field.type if field.type is not None else Any)
-        if field.validator is not None:
-            # Ahead of the constructor, so that every field is checked and the fault is found at its own key.
-            field.validator(None, field, item)
-    except (ValueError, TypeError):
-        if not field.metadata.get("secret"):
-            raise
-        raise ValueError(
-            "is not a valid value, which is not shown here; text must be quoted if it looks like a number"
-        ) from None
-    return item
-
-
-def make_converter(base: Path) -> Converter:
-    """A strict converter whose relative paths start at `base`."""
-    converter = Converter(forbid_extra_keys=True, detailed_validation=True)
-    converter.register_structure_hook(bool, _bool)
-    converter.register_structure_hook(int, _int)
-    converter.register_structure_hook(float, _float)
-    converter.register_structure_hook(str, _str)
-    converter.register_structure_hook(Path, lambda value, _: resolve_path(_str(value, str), base))
-    converter.register_structure_hook_factory(is_sequence, _sequence_hook)
-    converter.register_structure_hook_factory(is_mapping, _mapping_hook)
-    converter.register_structure_hook_factory(is_union, _union_hook)
-    converter.register_structure_hook_factory(is_literal, _literal_hook)
-    converter.register_structure_hook_factory(attrs.has, _class_hook)
-    return converter

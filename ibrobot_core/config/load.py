@@ -15,17 +15,7 @@ from ibrobot_core.config.checks import Checks
 from ibrobot_core.config.contract_checks import ContractChecks
 from ibrobot_core.config.convert import shown
 from ibrobot_core.config.overrides import apply, put
-from ibrobot_core.config.schema import (
-    ControlMode,
-    Dispatch,
-    ExecutorComponent,
-    HardwareComponent,
-    ModelConfig,
-    Peripheral,
-    Recording,
-    RobotConfig,
-    TransportConfig,
-)
+from ibrobot_core.config.schema import Component, ExecutorComponent, RobotConfig
 from ibrobot_core.config.secrets import check_known, expanded_again, public, warn_of_literals
 from ibrobot_core.config.structure import Part, Parts, Structurer
 from ibrobot_core.config.yaml_nodes import MAX_BYTES, Document, Place, parse
@@ -90,7 +80,15 @@ def load_contract(path: str | Path, registry: Registry | None = None) -> RobotCo
     document.raise_problems()
     parts_of = {spec.executor: spec.joints for spec in contract.actions}
     executors = {name: ExecutorComponent("", None, name, "", joints) for name, joints in parts_of.items()}
-    return RobotConfig(Robot("", ()), executors, {}, "", contract=contract, source=Path(path), document=document.root)
+    return RobotConfig(
+        robot=Robot("", ()),
+        executors=executors,
+        control_modes={},
+        default_control_mode="",
+        contract=contract,
+        source=Path(path),
+        document=document.root,
+    )
 
 
 def _parse(path: str | Path) -> Document:
@@ -143,76 +141,57 @@ def _build(document: Document, source: Path, sim: bool, registry: Registry, comm
     contract = contract_checks.run()
     document.raise_problems()
     shown, secrets = public(document)
-    plain = parts.plain
-    robot = plain["robot"]
-    config = RobotConfig(
-        robot=robot,
-        executors={
-            name: ExecutorComponent(part.descriptor.type, part.options, name, group, robot.groups[group])
-            for name, part in parts.executors.items()
-            for group in (part.keys.group,)
+    robot = parts.plain["robot"]
+    executors, models = _components(parts.executors), _components(parts.models)
+    hardware = {} if parts.simulated else _components(parts.hardware)
+    sections = {
+        **parts.plain,
+        "executors": {name: attrs.evolve(each, joints=robot.groups[each.group]) for name, each in executors.items()},
+        "control_modes": {
+            name: attrs.evolve(mode, name=name, planner=_component(parts.planners.get(name)))
+            for name, mode in parts.plain["control_modes"].items()
         },
-        control_modes=_modes(parts),
-        default_control_mode=_default_mode(parts),
-        hardware={} if parts.simulated else {
-            name: HardwareComponent(part.descriptor.type, part.options, name, part.keys.joints or robot.joint_names)
-            for name, part in parts.hardware.items()
+        "default_control_mode": _default_mode(parts),
+        "hardware": {
+            name: attrs.evolve(each, joints=each.joints or robot.joint_names) for name, each in hardware.items()
         },
-        simulation=_component(parts.simulation),
-        peripherals={
-            name: Peripheral(part.descriptor.type, part.options, name, part.keys.kind)
-            for name, part in parts.peripherals.items()
-        },
-        models={
-            name: ModelConfig(
-                part.descriptor.type, part.options, name, part.keys.norm_mode, part.keys.calibration,
-                contract_checks.observations(part.key, part.keys.extra_observations),
+        "simulation": _component(parts.simulation),
+        "peripherals": {name: attrs.evolve(part.component, sim={}) for name, part in parts.peripherals.items()},
+        "models": {
+            name: attrs.evolve(
+                each,
+                extra_observations=contract_checks.observations(parts.models[name].key, each.extra_observations),
             )
-            for name, part in parts.models.items()
+            for name, each in models.items()
         },
-        teleoperation={name: part.component for name, part in parts.teleoperation.items()},
-        contract=contract,
-        recording=_recording(parts.recording),
-        transport=_transport(parts.transport),
-        viewer=_component(parts.viewer),
+        "teleoperation": _components(parts.teleoperation),
+        "contract": contract,
+        "recording": _component(parts.recording),
+        "transport": _component(parts.transport),
+        "viewer": _component(parts.viewer),
+    }
+    return RobotConfig(
+        **sections,
         simulated=parts.simulated,
         source=source,
         document=shown,
         complete=document.root,
         secrets=secrets,
-    )  # fmt: skip
-    return attrs.evolve(config, **{name: plain[name] for name in ("control", "metrics") if name in plain})
+    )
 
 
-def _component(part: Part | None) -> Any:
+def _component[C: Component](part: Part[C] | None) -> C | None:
     return part.component if part is not None else None
 
 
+def _components[C: Component](parts: Mapping[str, Part[C]]) -> dict[str, C]:
+    return {name: part.component for name, part in parts.items()}
+
+
 def _default_mode(parts: Parts) -> str:
-    simulated = parts.simulation.keys.default_control_mode if parts.simulated and parts.simulation else None
+    simulated = parts.simulation.component.default_control_mode if parts.simulated and parts.simulation else None
     mode: str = simulated or parts.plain["default_control_mode"]
     return mode
-
-
-def _modes(parts: Parts) -> dict[str, ControlMode]:
-    return {
-        name: ControlMode(
-            name, mode.executors, mode.teleop, mode.inference,
-            mode.dispatch or Dispatch(), _component(parts.planners.get(name)),
-        )
-        for name, mode in parts.plain["control_modes"].items()
-    }  # fmt: skip
-
-
-def _recording(part: Part | None) -> Recording | None:
-    if part is None:
-        return None
-    keys = part.keys
-    return Recording(part.descriptor.type, part.options, Path(keys.root), keys.dataset, keys.topics)
-
-
-def _transport(part: Part | None) -> TransportConfig | None:
-    return None if part is None else TransportConfig(part.descriptor.type, part.options, part.keys.share)
 
 
 def shipped_configs(registry: Registry) -> dict[str, Path]:

@@ -1,50 +1,138 @@
-"""The robot YAML as frozen attrs classes: what each section may say, its defaults and its ranges."""
+"""The robot YAML as frozen attrs classes: the keys of each section, their types, units, defaults, ranges and words.
+
+Loading, `config show`, the JSON Schema and the reference pages derive from these classes, beginning with `RobotConfig`.
+"""
 
 from __future__ import annotations
 
+import types
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal, get_args, get_origin
 
 import attrs
 
-from ibrobot_core.options import option
+from ibrobot_core.descriptors import Descriptor, HardwareDescriptor
+from ibrobot_core.options import documented, fields, not_a_key, option
 from ibrobot_core.robot import Robot
+from ibrobot_core.units import NORM_MODES
 
 
+@documented
 @attrs.frozen
 class Component:
-    """A section with a `type`: which plugin, and that plugin's own options (an instance of its options class)."""
+    """A section with a `type`: which plugin, and that plugin's own options."""
 
-    type: str
-    options: Any
+    plugin_kind: ClassVar[str] = ""
+    """The kind of plugins whose types it takes."""
+    may_be_alone: ClassVar[bool] = False
+    """Whether the section may be one component in place of several by name."""
+
+    type: str = option(help="which plugin; `ibrobot plugins` lists them")
+    options: Any = not_a_key()
+    """An instance of the plugin's options class."""
+
+    @classmethod
+    def takes(cls, descriptor: Descriptor[Any]) -> bool:
+        """Whether a plugin of the kind can stand in this section."""
+        return True
 
 
 @attrs.frozen
-class HardwareComponent(Component):
-    """Hardware, and the joints that it owns (all of the robot's where the YAML does not say)."""
+class NamedComponent(Component):
+    """One of several components that the file has by name."""
 
-    name: str
-    joints: tuple[str, ...]
+    name: str = not_a_key()
 
 
+def component_of(kind: Any) -> type[Component] | None:
+    """The component class in a type annotation: that of a section, or of each of its items."""
+    members = (kind, *get_args(kind))
+    return next((each for each in members if isinstance(each, type) and issubclass(each, Component)), None)
+
+
+@documented
+@attrs.frozen
+class HardwareComponent(NamedComponent):
+    """Hardware, and the joints that it owns."""
+
+    plugin_kind = "hardware"
+    may_be_alone = True
+
+    joints: tuple[str, ...] = option(
+        (), help="the joints that it owns; the only component may leave them out and owns all"
+    )
+
+    @classmethod
+    def takes(cls, descriptor: Descriptor[Any]) -> bool:
+        """Whether it is real hardware."""
+        return not Simulation.takes(descriptor)
+
+
+@documented
+@attrs.frozen
+class Simulation(Component):
+    """What stands for the hardware with `--sim`, or where there is none."""
+
+    plugin_kind = "hardware"
+
+    default_control_mode: str | None = option(None, help="with --sim, in place of the file's default_control_mode")
+
+    @classmethod
+    def takes(cls, descriptor: Descriptor[Any]) -> bool:
+        """Whether it is simulated hardware."""
+        return isinstance(descriptor, HardwareDescriptor) and descriptor.simulated
+
+
+@documented
 @attrs.frozen
 class Peripheral(Component):
     """A sensor. Under `--sim` the simulation's own sensor of the same kind stands for it."""
 
-    name: str
-    kind: str
+    plugin_kind = "sensor"
+
+    name: str = option(help="what the contract calls it")
+    kind: str = option(help="camera, imu, …")
+    sim: Mapping[str, Any] = option(factory=dict, help="further options for the simulated sensor that stands for it")
 
 
+@documented
 @attrs.frozen
-class ExecutorComponent(Component):
-    """An executor and the joints that it owns: those of its group, in group order."""
+class ExecutorComponent(NamedComponent):
+    """An executor, which moves the joints of a group."""
 
-    name: str
-    group: str
-    joints: tuple[str, ...]
+    plugin_kind = "executor"
+
+    group: str = option(help="the joint group that it owns")
+    joints: tuple[str, ...] = not_a_key(())
+    """Those of its group, in group order."""
 
 
+@documented
+@attrs.frozen
+class Teleop(NamedComponent):
+    """A teleoperation device."""
+
+    plugin_kind = "teleop"
+
+
+@documented
+@attrs.frozen
+class Planner(Component):
+    """The planner of a mode."""
+
+    plugin_kind = "planner"
+
+
+@documented
+@attrs.frozen
+class Viewer(Component):
+    """What shows the robot to a person."""
+
+    plugin_kind = "viewer"
+
+
+@documented
 @attrs.frozen
 class Align:
     """How samples become a value at tick t; only samples with stamp <= t count."""
@@ -72,6 +160,7 @@ def _check_size(instance: Any, attribute: attrs.Attribute[Any], value: tuple[int
         raise ValueError(f"{list(value)} is no size, must be [height, width] of 1 to {_LARGEST_PX} px each")
 
 
+@documented
 @attrs.frozen
 class ImageSpec:
     """How an image becomes an array."""
@@ -82,6 +171,7 @@ class ImageSpec:
     encoding: str = option("rgb8", choices=("rgb8", "bgr8", "mono8", "16UC1", "32FC1"), help="of the array")
 
 
+@documented
 @attrs.frozen
 class ObservationSpec:
     """One topic that feeds one key of the observations. Several under one key concatenate in file order."""
@@ -96,6 +186,7 @@ class ObservationSpec:
     align: Align = option(factory=Align, help="how samples become a value at a tick")
 
 
+@documented
 @attrs.frozen
 class ActionSpec:
     """One part of the action vector, for one executor. Several under one key split it in file order."""
@@ -115,6 +206,7 @@ class ActionSpec:
     joints: tuple[str, ...] = option((), help="in a file with a contract alone: names of its numbers, in order")
 
 
+@documented
 @attrs.frozen
 class SignalSpec:
     """One topic that says something of the rows of a dataset which no policy sees."""
@@ -132,6 +224,7 @@ class SignalSpec:
     )
 
 
+@documented
 @attrs.frozen
 class ContractConfig:
     """The `contract:` section: rate, observations, actions and signals."""
@@ -143,17 +236,19 @@ class ContractConfig:
     signals: tuple[SignalSpec, ...] = option((), help="topics -> task, reward and end of a dataset's rows")
 
 
+@documented
 @attrs.frozen
-class ModelConfig(Component):
+class ModelConfig(NamedComponent):
     """A policy, the unit of its vectors, and what it sees beyond the contract."""
 
-    name: str
-    norm_mode: str = "radians"
-    calibration: str | None = None
-    """In place of the hardware's."""
-    extra_observations: tuple[ObservationSpec, ...] = ()
+    plugin_kind = "policy"
+
+    norm_mode: str = option("radians", choices=NORM_MODES, help="unit of the joints in its vectors")
+    calibration: str | None = option(None, help="in place of the hardware's, for norm_mode: a name, or a path to one")
+    extra_observations: tuple[ObservationSpec, ...] = option((), help="what it sees beyond the contract")
 
 
+@documented
 @attrs.frozen
 class Smoothing:
     """How an arriving chunk joins the plan."""
@@ -167,6 +262,7 @@ def _check_watermark(_: object, __: object, value: int | str) -> None:
         raise ValueError(f"{value} is too small, must be at least 0 actions, or auto")
 
 
+@documented
 @attrs.frozen
 class Dispatch:
     """How the plan is kept filled."""
@@ -196,6 +292,7 @@ class Dispatch:
         return self.strategy or ("ensemble" if self.smoothing.enabled else "replace")
 
 
+@documented
 @attrs.frozen
 class Inference:
     """Which model a mode runs, and where."""
@@ -226,25 +323,40 @@ class Inference:
             raise ValueError(f"jpeg_quality has no meaning for execution_mode {self.execution_mode}: nothing is sent")
 
 
+@documented
 @attrs.frozen
 class ControlMode:
     """A mode: the executors that are active in it, and what feeds them."""
 
-    name: str
-    executors: tuple[str, ...]
-    teleop: str | None = None
-    inference: Inference | None = None
-    dispatch: Dispatch = attrs.field(factory=Dispatch)
-    planner: Component | None = None
+    executors: tuple[str, ...] = option(help="the executors that are active in it")
+    teleop: str | None = option(None, help="the device under teleoperation that drives it")
+    inference: Inference | None = option(None, help="the model that drives it")
+    dispatch: Dispatch = option(factory=Dispatch, help="how a model's plan is kept filled")
+    planner: Planner | None = option(None, help="the planner that drives it, with its options")
+    name: str = not_a_key("")
 
 
+def _check_dataset(_: object, __: object, value: str) -> None:
+    folder = Path(value)
+    if folder.is_absolute() or ".." in folder.parts or not folder.parts:
+        raise ValueError(f"{str(folder)!r} does not lie below recording.root; give a folder's name, e.g. pick_cube")
+
+
+@documented
 @attrs.frozen
 class Recording(Component):
-    """The `recording:` section."""
+    """How episodes are recorded."""
 
-    root: Path = Path("episodes")
-    dataset: str = "default"
-    topics: str | tuple[str, ...] = "contract"
+    plugin_kind = "recorder"
+
+    root: str = option("episodes", help="where episodes go; relative to the working directory")
+    dataset: str = option("default", validator=_check_dataset, help="folder of one task's episodes, below root")
+    topics: str | tuple[str, ...] = option("contract", help="contract, all, or a list of topics")
+
+    @property
+    def folder(self) -> Path:
+        """The dataset's folder."""
+        return Path(self.root) / self.dataset
 
 
 def _check_topics(instance: Any, attribute: attrs.Attribute[tuple[str, ...]], value: tuple[str, ...]) -> None:
@@ -255,6 +367,7 @@ def _check_topics(instance: Any, attribute: attrs.Attribute[tuple[str, ...]], va
             raise ValueError(f"{topic} is given twice")
 
 
+@documented
 @attrs.frozen
 class Share:
     """Topics shared with other machines."""
@@ -271,13 +384,17 @@ class Share:
             raise ValueError(f"{both[0]} is both published and subscribed; it can only go one way")
 
 
+@documented
 @attrs.frozen
 class TransportConfig(Component):
-    """The `transport:` section."""
+    """How processes and machines talk."""
 
-    share: Share = attrs.field(factory=Share)
+    plugin_kind = "transport"
+
+    share: Share = option(factory=Share, help="topics shared with other machines")
 
 
+@documented
 @attrs.frozen
 class Following:
     """When a joint does not follow its setpoint, which is a fault."""
@@ -288,6 +405,7 @@ class Following:
     timeout: float = option(2.0, unit="s", gt=0, help="time that it may be so far away")
 
 
+@documented
 @attrs.frozen
 class Shedding:
     """What relieves joints that stay hot or overloaded: the arm goes to a pose, if one is given, and relaxes."""
@@ -296,6 +414,7 @@ class Shedding:
     pose: str = option("", help="named pose in which the arm can lie without torque; empty: it relaxes where it is")
 
 
+@documented
 @attrs.frozen
 class Control:
     """The `control:` section."""
@@ -309,6 +428,7 @@ class Control:
     load_shedding: Shedding = option(factory=Shedding, help="what relieves joints that stay hot or overloaded")
 
 
+@documented
 @attrs.frozen
 class MetricsConfig:
     """The `metrics:` section."""
@@ -316,30 +436,48 @@ class MetricsConfig:
     port: int = option(ge=0, le=65535, help="of 127.0.0.1, where /metrics, /healthz and /readyz are; 0: any free one")
 
 
-@attrs.frozen(slots=False)
+@documented
+@attrs.frozen(slots=False, kw_only=True)
 class RobotConfig:
     """A whole robot YAML, checked. `source` names the file; `document` is its plain data without secrets."""
 
-    robot: Robot
-    executors: Mapping[str, ExecutorComponent]
-    control_modes: Mapping[str, ControlMode]
-    default_control_mode: str
-    hardware: Mapping[str, HardwareComponent] = attrs.field(factory=dict)
-    simulation: Component | None = None
-    peripherals: Mapping[str, Peripheral] = attrs.field(factory=dict)
-    models: Mapping[str, ModelConfig] = attrs.field(factory=dict)
-    teleoperation: Mapping[str, Component] = attrs.field(factory=dict)
-    contract: ContractConfig = attrs.field(factory=ContractConfig)
-    recording: Recording | None = None
-    transport: TransportConfig | None = None
-    viewer: Component | None = None
-    control: Control = attrs.field(factory=Control)
-    metrics: MetricsConfig | None = None
-    simulated: bool = False
+    robot: Robot = option(help="joints, groups, models and poses")
+    hardware: Mapping[str, HardwareComponent] = option(
+        factory=dict, help="one component, or several by name, each with its joints"
+    )
+    simulation: Simulation | None = option(None, help="stands for the hardware with --sim, or where there is none")
+    peripherals: Mapping[str, Peripheral] = option(factory=dict, help="cameras and other sensors")
+    executors: Mapping[str, ExecutorComponent] = option(help="what moves the joints: name -> type, group, options")
+    models: Mapping[str, ModelConfig] = option(factory=dict, help="policies by name")
+    control_modes: Mapping[str, ControlMode] = option(help="name -> the executors active in it, and what feeds them")
+    default_control_mode: str = option(help="the mode to start in")
+    teleoperation: Mapping[str, Teleop] = option(factory=dict, help="devices by name")
+    contract: ContractConfig = option(factory=ContractConfig, help="how topics become observations and actions")
+    recording: Recording | None = option(None, help="how episodes are recorded")
+    transport: TransportConfig | None = option(None, help="how processes and machines talk")
+    viewer: Viewer | None = option(None, help="what shows the robot to a person")
+    control: Control = option(factory=Control, help="the control loop")
+    metrics: MetricsConfig | None = option(None, help="counts in Prometheus' text format, over HTTP on this machine")
+    simulated: bool = not_a_key(False)
     """Whether `simulation` stands for `hardware` in this run."""
-    source: Path = Path("<memory>")
-    document: Mapping[str, Any] = attrs.field(factory=dict, repr=False)
-    complete: Mapping[str, Any] = attrs.field(factory=dict, repr=False, eq=False)
+    source: Path = not_a_key(Path("<memory>"))
+    document: Mapping[str, Any] = not_a_key(factory=dict, repr=False)
+    complete: Mapping[str, Any] = not_a_key(factory=dict, repr=False, eq=False)
     """`document` with its secrets, for other processes of the run only: never to be written or shown."""
-    secrets: Mapping[str, str] = attrs.field(factory=dict, repr=False, eq=False)
+    secrets: Mapping[str, str] = not_a_key(factory=dict, repr=False, eq=False)
     """Secret -> what is shown in its place."""
+
+
+def _as_written(field: attrs.Attribute[Any]) -> attrs.Attribute[Any]:
+    """A section's field with the type that it has in the file, where it is left out rather than null."""
+    kind: Any = field.type
+    component = component_of(kind)
+    if get_origin(kind) is types.UnionType:
+        kind, _ = get_args(kind)
+    elif component is not None and "name" in fields(component):
+        return field.evolve(type=tuple[component, ...], default=())  # type: ignore[valid-type]
+    return field.evolve(type=kind)
+
+
+SECTIONS: Mapping[str, attrs.Attribute[Any]] = {name: _as_written(field) for name, field in fields(RobotConfig).items()}
+"""The sections of a robot YAML, with the types that they have in the file."""

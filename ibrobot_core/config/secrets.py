@@ -10,10 +10,9 @@ from typing import Any, get_args
 
 import attrs
 
-from ibrobot_core.config.convert import fields
 from ibrobot_core.config.expand import expand
 from ibrobot_core.config.yaml_nodes import Document, Key
-from ibrobot_core.options import HIDDEN
+from ibrobot_core.options import HIDDEN, fields
 from ibrobot_core.outside import redacted, remember_secret, without_credentials
 
 _NAMES = re.compile(r"(?i)(.*_)?(password|passwd|passphrase|secret|token|api_?key)")

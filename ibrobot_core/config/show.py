@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import enum
 from collections.abc import Mapping
 from functools import singledispatch
 from pathlib import Path
@@ -11,9 +10,18 @@ from typing import Any
 import attrs
 import yaml
 
-from ibrobot_core.config.schema import Component, ContractConfig, ControlMode, ObservationSpec, RobotConfig
+from ibrobot_core.config.schema import (
+    SECTIONS,
+    Component,
+    ContractConfig,
+    ControlMode,
+    ObservationSpec,
+    Peripheral,
+    RobotConfig,
+    Simulation,
+)
 from ibrobot_core.config.yaml_nodes import is_text
-from ibrobot_core.options import HIDDEN
+from ibrobot_core.options import HIDDEN, fields
 from ibrobot_core.outside import without_credentials
 
 
@@ -29,10 +37,9 @@ class _Secret(str):
 
 def _fields(value: Any) -> dict[str, Any]:
     return {
-        field.name: _Secret(item) if field.metadata.get("secret") and isinstance(item, str) else plain(item)
-        for field in attrs.fields(type(value))
-        if field.init
-        for item in (getattr(value, field.name),)
+        name: _Secret(item) if field.metadata.get("secret") and isinstance(item, str) else plain(item)
+        for name, field in fields(type(value)).items()
+        for item in (getattr(value, name),)
     }
 
 
@@ -52,11 +59,20 @@ def _(value: ObservationSpec) -> dict[str, Any]:
     return {name: item for name, item in _fields(value).items() if name not in left_out}
 
 
+_RESOLVED: Mapping[type, str] = {Peripheral: "sim", Simulation: "default_control_mode"}
+"""Component -> a key that loading has resolved: a simulated sensor's options, the mode that a simulation begins in."""
+
+
 @plain.register
 def _(value: Component) -> dict[str, Any]:
-    own = _fields(value)
-    options = own.pop("options")
-    return {**own, **options}
+    own = {name: item for name, item in _fields(value).items() if name != _RESOLVED.get(type(value))}
+    return {**own, **plain(value.options)}
+
+
+@plain.register
+def _(value: ControlMode) -> dict[str, Any]:
+    left_out = ("dispatch",) if value.inference is None else ()
+    return {name: item for name, item in _fields(value).items() if item is not None and name not in left_out}
 
 
 @plain.register
@@ -75,46 +91,14 @@ def _(value: Path) -> str:
     return str(value)
 
 
-@plain.register
-def _(value: enum.Enum) -> Any:
-    return value.value
-
-
-def _named(components: Mapping[str, Component], *left_out: str) -> dict[str, Any]:
-    return {
-        name: {key: item for key, item in plain(component).items() if key not in ("name", *left_out)}
-        for name, component in components.items()
-    }
-
-
-def _mode(mode: ControlMode) -> dict[str, Any]:
-    own = _fields(mode)
-    del own["name"]
-    if mode.inference is None:
-        del own["dispatch"]
-    return {key: item for key, item in own.items() if item is not None}
-
-
 def document(config: RobotConfig) -> dict[str, Any]:
     """What a YAML that says everything about this run would hold, with `${…}` or `***` for secrets."""
-    hardware = _named(config.hardware)
-    sections: dict[str, Any] = {
-        "robot": plain(config.robot),
-        "hardware": hardware["hardware"] if list(hardware) == ["hardware"] else hardware,
-        "simulation": plain(config.simulation),
-        "peripherals": [plain(peripheral) for peripheral in config.peripherals.values()],
-        "executors": _named(config.executors, "joints"),
-        "models": _named(config.models),
-        "control_modes": {name: _mode(mode) for name, mode in config.control_modes.items()},
-        "default_control_mode": config.default_control_mode,
-        "teleoperation": _named(config.teleoperation),
-        "contract": plain(config.contract) if config.contract != ContractConfig() else None,
-        "recording": plain(config.recording),
-        "transport": plain(config.transport),
-        "viewer": plain(config.viewer),
-        "control": plain(config.control),
-        "metrics": plain(config.metrics),
-    }
+    sections = {name: plain(getattr(config, name)) for name in SECTIONS}
+    sections["peripherals"] = list(sections["peripherals"].values())
+    if list(config.hardware) == ["hardware"]:
+        sections["hardware"] = sections["hardware"]["hardware"]
+    if config.contract == ContractConfig():
+        del sections["contract"]
     given = {name: section for name, section in sections.items() if section not in (None, {}, [])}
     without: dict[str, Any] = _without_secrets(given, config.secrets)
     return without

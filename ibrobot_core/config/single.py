@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from ibrobot_core.config.convert import Faults, make_converter, said
+from ibrobot_core.config.convert import Converter, Faults, said
 from ibrobot_core.config.overrides import apply
 from ibrobot_core.config.yaml_nodes import Document
 
@@ -26,7 +26,7 @@ def single_options[T](kind: type[T], overrides: Sequence[str], name: str, flag: 
     apply(document, overrides, flag)
     document.raise_problems()
     try:
-        options: T = make_converter(Path.cwd()).structure(document.root, kind)
+        options: T = Converter(Path.cwd()).structure(document.root, kind)
     except Faults as faults:
         for key, message in faults.found:
             document.add(key, message)

@@ -9,43 +9,41 @@ from pathlib import Path
 from typing import Any
 
 import attrs
-from cattrs import Converter
 
-from ibrobot_core.config.convert import Faults, fields, make_converter, said, structure_fields, unknown_key
-from ibrobot_core.config.keys import (
-    ComponentKeys,
-    ExecutorKeys,
-    HardwareKeys,
-    ModelKeys,
-    PeripheralKeys,
-    RecordingKeys,
-    Sections,
-    SimulationKeys,
-    TransportKeys,
+from ibrobot_core.config.convert import Converter, Faults, said, unknown_key
+from ibrobot_core.config.schema import (
+    SECTIONS,
+    Component,
+    ExecutorComponent,
+    HardwareComponent,
+    ModelConfig,
+    NamedComponent,
+    Peripheral,
+    Planner,
+    Recording,
+    Simulation,
+    Teleop,
+    TransportConfig,
+    Viewer,
+    component_of,
 )
-from ibrobot_core.config.schema import Component
 from ibrobot_core.config.secrets import note
 from ibrobot_core.config.yaml_nodes import Document, Key
 from ibrobot_core.descriptors import Descriptor, HardwareDescriptor, SensorDescriptor
 from ibrobot_core.errors import PluginError
+from ibrobot_core.options import fields
 from ibrobot_core.plugins import Registry, example
 
 _NAME = re.compile(r"[A-Za-z0-9_-]+")
 
 
 @attrs.frozen
-class Part:
-    """A structured component: core's own keys of it, its descriptor and its options."""
+class Part[C: Component]:
+    """A structured component with its place and its plugin's descriptor."""
 
     key: Key
-    keys: Any
+    component: C
     descriptor: Descriptor[Any]
-    options: Any
-
-    @property
-    def component(self) -> Component:
-        """Type and options."""
-        return Component(self.descriptor.type, self.options)
 
 
 @attrs.define
@@ -55,30 +53,40 @@ class Parts:
     simulated: bool
     plain: dict[str, Any] = attrs.field(factory=dict)
     """Sections that are attrs classes by themselves."""
-    hardware: dict[str, Part] = attrs.field(factory=dict)
-    simulation: Part | None = None
-    peripherals: dict[str, Part] = attrs.field(factory=dict)
-    executors: dict[str, Part] = attrs.field(factory=dict)
-    models: dict[str, Part] = attrs.field(factory=dict)
-    teleoperation: dict[str, Part] = attrs.field(factory=dict)
-    planners: dict[str, Part] = attrs.field(factory=dict)
+    hardware: dict[str, Part[HardwareComponent]] = attrs.field(factory=dict)
+    simulation: Part[Simulation] | None = None
+    peripherals: dict[str, Part[Peripheral]] = attrs.field(factory=dict)
+    executors: dict[str, Part[ExecutorComponent]] = attrs.field(factory=dict)
+    models: dict[str, Part[ModelConfig]] = attrs.field(factory=dict)
+    teleoperation: dict[str, Part[Teleop]] = attrs.field(factory=dict)
+    planners: dict[str, Part[Planner]] = attrs.field(factory=dict)
     """By control mode."""
-    recording: Part | None = None
-    transport: Part | None = None
-    viewer: Part | None = None
+    recording: Part[Recording] | None = None
+    transport: Part[TransportConfig] | None = None
+    viewer: Part[Viewer] | None = None
 
-    def active(self) -> Iterator[Part]:
+    def active(self) -> Iterator[Part[Any]]:
         """The components that a run opens at its start."""
         yield from () if self.simulated else self.hardware.values()
         yield from self.peripherals.values()
         yield from (part for part in (self.simulation, self.recording, self.transport, self.viewer) if part is not None)
 
-    def all(self) -> Iterator[Part]:
+    def all(self) -> Iterator[Part[Any]]:
         """Every component."""
         yield from self.active()
         yield from self.hardware.values() if self.simulated else ()
         for section in (self.executors, self.models, self.teleoperation, self.planners):
             yield from section.values()
+
+
+class _Outline(Converter):
+    """Takes components as mappings: they are structured afterwards, by their plugins."""
+
+    def structure(self, value: Any, kind: Any) -> Any:
+        component = component_of(kind)
+        if component is kind or (component is not None and component.may_be_alone):
+            kind = Mapping[str, Any]
+        return super().structure(value, kind)
 
 
 @attrs.define
@@ -93,7 +101,7 @@ class Structurer:
     _converter: Converter = attrs.field(init=False)
 
     def __attrs_post_init__(self) -> None:
-        self._converter = make_converter(self.base)
+        self._converter = Converter(self.base)
 
     def parts(self) -> Parts:
         """All sections."""
@@ -108,19 +116,16 @@ class Structurer:
         self._simulation(parts)
         self._hardware(parts)
         self._peripherals(parts)
-        parts.executors = self._named("executor", "executors", ExecutorKeys)
-        parts.models = self._named("policy", "models", ModelKeys)
-        parts.teleoperation = self._named("teleop", "teleoperation", ComponentKeys)
+        parts.executors = self._named("executors", ExecutorComponent)
+        parts.models = self._named("models", ModelConfig)
+        parts.teleoperation = self._named("teleoperation", Teleop)
         for name, mode in (parts.plain.get("control_modes") or {}).items():
             if mode.planner is not None:
-                planner = self._component("planner", ("control_modes", name, "planner"), ComponentKeys)
+                planner = self._component(("control_modes", name, "planner"), Planner)
                 parts.planners |= {name: planner} if planner is not None else {}
-        if "transport" in given:
-            parts.transport = self._component("transport", ("transport",), TransportKeys)
-        if "viewer" in given:
-            parts.viewer = self._component("viewer", ("viewer",), ComponentKeys)
-        if "recording" in given:
-            parts.recording = self._component("recorder", ("recording",), RecordingKeys)
+        parts.transport = self._component(("transport",), TransportConfig)
+        parts.viewer = self._component(("viewer",), Viewer)
+        parts.recording = self._component(("recording",), Recording)
         return parts
 
     def contract(self) -> Parts:
@@ -129,14 +134,14 @@ class Structurer:
         self._sections(parts, ("contract",))
         return parts
 
-    def _sections(self, parts: Parts, names: Collection[str] = tuple(fields(Sections))) -> None:
+    def _sections(self, parts: Parts, names: Collection[str] = tuple(SECTIONS)) -> None:
         """The file's own level: unknown and missing sections, and those that need no plugin."""
-        known = {name: field for name, field in fields(Sections).items() if name in names}
+        known = {name: field for name, field in SECTIONS.items() if name in names}
         faults = Faults()
         for name in self.document.root:
             if name not in known:
                 faults.add((name,), unknown_key(name, list(known)))
-        parts.plain = structure_fields(known, self.document.root, self._converter, faults)
+        parts.plain = _Outline(self.base).arguments(known, self.document.root, faults)
         self._report((), faults)
 
     def _report(self, key: Key, faults: Faults, below_sim: Collection[str] = ()) -> None:
@@ -144,44 +149,45 @@ class Structurer:
             middle = ("sim",) if inner and inner[0] in below_sim else ()
             self.document.add((*key, *middle, *inner), message)
 
-    def _component(
+    def _component[C: Component](
         self,
-        kind: str,
         key: Key,
-        keys_class: type,
+        kind: type[C],
         value: Mapping[str, Any] | None = None,
         *,
+        name: str | None = None,
         needed: bool = True,
         below_sim: Collection[str] = (),
-    ) -> Part | None:
-        """The component at `key` (or `value` in its place); None with its faults noted.
+    ) -> Part[C] | None:
+        """The component at `key` (or `value` in its place); None with its faults noted, or where there is none.
 
         Args:
-            kind: plugin kind.
             key: where it is in the document.
-            keys_class: core's own keys of such a component.
+            kind: its class.
             value: what to structure, where it is not what the document says.
+            name: its name, where it is not one of its keys.
             needed: whether a plugin that is not installed is a fault; where not, only core's own keys are checked.
             below_sim: keys of `value` that the document has under `sim`.
         """
         value = self.document.get(*key) if value is None else value
         if not isinstance(value, Mapping):
             return None  # told already, with the sections
-        own = fields(keys_class)
+        own = fields(kind)
         faults = Faults()
         if "type" not in value and (close := get_close_matches("type", [k for k in value if k not in own], 1)):
             self.document.add((*key, close[0]), "unknown key, did you mean 'type'?")
             return None
-        arguments = structure_fields(own, value, self._converter, faults)
+        arguments = self._converter.arguments(own, value, faults)
         options = None
-        descriptor = self._find(kind, arguments["type"], needed, faults) if "type" in arguments else None
+        descriptor = self._find(kind.plugin_kind, arguments["type"], needed, faults) if "type" in arguments else None
         if descriptor is not None:
             note(self.document, descriptor.options, value, key)
             options = self._options(descriptor, own, value, faults)
         self._report(key, faults, below_sim)
         if faults.found or descriptor is None:
             return None
-        return Part(key, keys_class(**arguments), descriptor, options)
+        named = {} if name is None else {"name": name}
+        return Part(key, kind(**arguments, **named, options=options), descriptor)
 
     def _find(self, kind: str, type_: str, needed: bool, faults: Faults) -> Descriptor[Any] | None:
         if not needed and (kind, type_) not in self.registry.entries:
@@ -200,7 +206,7 @@ class Structurer:
             if name not in own and name not in known:
                 faults.add((name,), unknown_key(name, [*own, *known]))
         before = len(faults.found)
-        arguments = structure_fields(known, value, self._converter, faults)
+        arguments = self._converter.arguments(known, value, faults)
         if len(faults.found) > before:
             return None
         try:
@@ -209,12 +215,12 @@ class Structurer:
             faults.add((), said(error))
             return None
 
-    def _named(self, kind: str, section: str, keys_class: type) -> dict[str, Part]:
+    def _named[C: NamedComponent](self, section: str, kind: type[C]) -> dict[str, Part[C]]:
         value = self.document.root.get(section)
         found = {}
         for name in value if isinstance(value, Mapping) else ():
             self._check_name((section, name), name)
-            part = self._component(kind, (section, name), keys_class)
+            part = self._component((section, name), kind, name=name)
             if part is not None:
                 found[name] = part
         return found
@@ -226,10 +232,10 @@ class Structurer:
     def _simulation(self, parts: Parts) -> None:
         if "simulation" not in self.document.root:
             return
-        part = self._component("hardware", ("simulation",), SimulationKeys, needed=parts.simulated or self._elsewhere)
+        part = self._component(("simulation",), Simulation, needed=parts.simulated or self._elsewhere)
         if part is None:
             return
-        if not getattr(part.descriptor, "simulated", False):
+        if not Simulation.takes(part.descriptor):
             message = f"{part.descriptor.type!r} is no simulation; it belongs in the hardware section"
             self.document.add(("simulation", "type"), message)
         elif parts.simulated or self._elsewhere:
@@ -250,10 +256,10 @@ class Structurer:
         for name in value if several else ("hardware",):
             key: Key = ("hardware", name) if several else ("hardware",)
             self._check_name(key, name)
-            part = self._component("hardware", key, HardwareKeys, needed=not parts.simulated)
+            part = self._component(key, HardwareComponent, name=name, needed=not parts.simulated)
             if part is None:
                 continue
-            if getattr(part.descriptor, "simulated", False):
+            if not HardwareComponent.takes(part.descriptor):
                 message = f"{part.descriptor.type!r} is a simulation; it belongs in the simulation section"
                 self.document.add((*key, "type"), message)
             parts.hardware[name] = part
@@ -278,28 +284,29 @@ class Structurer:
             needed = not parts.simulated or (parts.simulation is not None and stand_in is None)
             part = self._peripheral(key, item, stand_in, needed=needed, simulated=parts.simulated)
             if part is not None:
-                parts.peripherals[part.keys.name] = part
+                parts.peripherals[part.component.name] = part
 
     def _peripheral(
         self, key: Key, item: Mapping[str, Any], stand_in: str | None, *, needed: bool, simulated: bool
-    ) -> Part | None:
+    ) -> Part[Peripheral] | None:
         """The sensor as it is, or the simulation's of its kind with the options that both have."""
         before = len(self.document.problems)
-        as_is = self._component("sensor", key, PeripheralKeys, needed=needed)
+        as_is = self._component(key, Peripheral, needed=needed)
         if as_is is not None and isinstance(as_is.descriptor, SensorDescriptor):
-            if as_is.descriptor.kind != as_is.keys.kind:
+            kind, type_ = as_is.component.kind, as_is.component.type
+            if as_is.descriptor.kind != kind:
                 found = as_is.descriptor.kind
-                self.document.add((*key, "kind"), f"sensor type {as_is.descriptor.type!r} is of kind {found!r}")
-            if not simulated and not self._elsewhere and self._only_simulated(as_is.keys.kind, as_is.descriptor.type):
-                message = f"{as_is.descriptor.type!r} exists only in simulation; run with --sim, or name a real sensor"
+                self.document.add((*key, "kind"), f"sensor type {type_!r} is of kind {found!r}")
+            if not simulated and not self._elsewhere and self._only_simulated(kind, type_):
+                message = f"{type_!r} exists only in simulation; run with --sim, or name a real sensor"
                 self.document.add((*key, "type"), message)
         if stand_in is None or len(self.document.problems) > before:
             return as_is
         entry = self.registry.entries.get(("sensor", stand_in))
-        shared = [*fields(PeripheralKeys), *(fields(entry.descriptor.options) if entry else ())]
+        shared = [*fields(Peripheral), *(fields(entry.descriptor.options) if entry else ())]
         kept = {name: value for name, value in item.items() if name in shared}
         added = item.get("sim", {})
-        return self._component("sensor", key, PeripheralKeys, {**kept, **added, "type": stand_in}, below_sim=added)
+        return self._component(key, Peripheral, {**kept, **added, "type": stand_in}, below_sim=added)
 
     def _only_simulated(self, kind: str, type_: str) -> bool:
         descriptors = (entry.descriptor for entry in self.registry.entries.values())

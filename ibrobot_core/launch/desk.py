@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 from ibrobot_core.contract.specs import Contract
@@ -51,7 +50,7 @@ class EpisodeDesk:
         self._lock = threading.Lock()
         config = session.config.recording
         assert config is not None
-        self.folder: Path = config.root / config.dataset
+        self.folder = config.folder
         self._dataset = Dataset(self.folder)
         contract = Contract.from_config(session.config)
         self._dataset.check_writable()

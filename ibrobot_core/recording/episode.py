@@ -49,7 +49,7 @@ def episode_start(
         RecorderError: when the folder cannot be made, or the dataset has episodes of another contract.
     """
     contract = Contract.from_config(config)
-    root = recording.root / recording.dataset / "episodes"
+    root = recording.folder / "episodes"
     try:
         root.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -37,7 +37,7 @@ def test_help_imports_nothing_slow() -> None:
         "sys.argv = ['ibrobot', '--help']\n"
         "from ibrobot_core.cli.main import main\n"
         "try:\n    main()\nexcept SystemExit:\n    pass\n"
-        "slow = ('numpy', 'rich', 'yaml', 'cattrs', 'mujoco', 'torch', 'cv2', 'ibrobot_core.config')\n"
+        "slow = ('numpy', 'rich', 'yaml', 'mujoco', 'torch', 'cv2', 'ibrobot_core.config')\n"
         "print('slow:', [name for name in slow if name in sys.modules])\n"
     )
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)

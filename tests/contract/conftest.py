@@ -53,7 +53,7 @@ def make_config(
     return RobotConfig(
         robot=make_robot(),
         executors=executors,
-        control_modes={"idle": ControlMode("idle", ())},
+        control_modes={"idle": ControlMode(())},
         default_control_mode="idle",
         peripherals=peripherals,
         contract=ContractConfig(rate_hz=rate_hz, observations=tuple(observations), actions=tuple(actions)),

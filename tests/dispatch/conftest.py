@@ -64,7 +64,7 @@ def make_contract(safety_behavior: str) -> Contract:
     config = RobotConfig(
         robot=ROBOT,
         executors={"all": ExecutorComponent("position", NoOptions(), "all", "all", ROBOT.joint_names)},
-        control_modes={"idle": ControlMode("idle", ())},
+        control_modes={"idle": ControlMode(())},
         default_control_mode="idle",
         contract=ContractConfig(rate_hz=10.0, observations=(state,), actions=(action,)),
     )

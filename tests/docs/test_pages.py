@@ -23,7 +23,7 @@ from ibrobot_core.plugins import installed
 pytestmark = pytest.mark.integration
 
 ROOT = Path(__file__).parents[2]
-GENERATED = {ROOT / f"docs/reference/{name}.md" for name in ("cli", "config", "plugins")}
+GENERATED = {ROOT / f"docs/reference/{name}.md" for name in ("cli", "config", "options", "plugins")}
 PAGES = [
     page
     for page in (

@@ -13,7 +13,7 @@ PAGES = sorted({
     *(ROOT / "docs").glob("*/*.md"),
     *(ROOT / "docs").glob("*.md"),
     *(ROOT / "plugins").glob("*/README.md"),
-} - {ROOT / f"docs/reference/{name}.md" for name in ("cli", "config", "plugins")})  # fmt: skip
+} - {ROOT / f"docs/reference/{name}.md" for name in ("cli", "config", "options", "plugins")})  # fmt: skip
 """Written pages; the generated ones take their words from the code."""
 
 OUT = {

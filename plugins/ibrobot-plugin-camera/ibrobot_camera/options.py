@@ -6,7 +6,7 @@ from pathlib import Path
 
 import attrs
 
-from ibrobot_core.options import option
+from ibrobot_core.options import documented, option
 
 ENCODING = option(
     "jpeg", choices=("jpeg", "raw"),
@@ -15,6 +15,7 @@ ENCODING = option(
 JPEG_QUALITY = option(90, ge=1, le=100, help="of pictures that the camera does not send as JPEG itself")
 
 
+@documented
 @attrs.frozen
 class OpenCvOptions:
     """Options of `type: opencv`: a V4L2 device, a network stream, or a video file."""
@@ -36,7 +37,7 @@ class OpenCvOptions:
     brightness: float | None = option(None, help="of a V4L2 device, in its driver's unit")
     rotation: int = option(0, unit="deg", choices=(0, 90, 180, 270), help="clockwise, of the pictures")
     strict: bool = option(True, help="whether size, rate or format that differ from what was asked are an error")
-    loop: bool = option(True, help="whether a video file begins anew at its end")
+    loop: bool = option(True, help="whether a video file begins again at its end")
     reconnect_timeout: float = option(30.0, unit="s", ge=0, help="how long to try after the camera was lost")
     frame_id: str = option("", help="of the messages; NAME_optical_frame where it is empty")
     info: Path | None = option(None, help="calibration as ROS's camera_calibration writes it (YAML)")
@@ -48,6 +49,7 @@ class OpenCvOptions:
             raise ValueError(f"fourcc has four characters, e.g. MJPG, not {self.fourcc!r}")
 
 
+@documented
 @attrs.frozen
 class RealSenseOptions:
     """Options of `type: realsense`; needs the extra `realsense` of this package."""

@@ -9,13 +9,14 @@ from typing import Any
 import attrs
 
 from ibrobot_core.contract.specs import Contract
-from ibrobot_core.options import option
+from ibrobot_core.options import documented, option
 from ibrobot_core.units import NORM_MODES
 
 MISSING = ("refuse", "skip", "hold")
 OUTCOMES = ("success", "failure", "unknown")
 
 
+@documented
 @attrs.frozen
 class Request:
     """One conversion. Equal requests over equal episodes give equal bytes, whatever the number of jobs."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import attrs
 
-from ibrobot_core.options import OptionFault, hint, option, unknown_names
+from ibrobot_core.options import OptionFault, documented, hint, option, unknown_names
 
 if TYPE_CHECKING:
     from ibrobot_core.robot import Robot
@@ -19,6 +19,7 @@ _GRIPPER = ("gripper",)
 """The default of options that name joints; it is passed over where another component has the gripper."""
 
 
+@documented
 @attrs.frozen
 class FollowerOptions:
     """Options of `type: feetech_so101`: an arm whose joints are STS3215 servos on one bus."""
@@ -64,6 +65,7 @@ class FollowerOptions:
     write_calibration: bool = option(False, help="write the calibration to servos that have another, at the start")
 
 
+@documented
 @attrs.frozen
 class LeaderOptions:
     """Options of `type: so101_leader`: an arm of STS3215 servos that a person moves."""
@@ -97,6 +99,7 @@ class LeaderOptions:
     lost_replies: int = option(3, unit="reads", ge=0, help="replies of one servo in a row that may be missing")
 
 
+@documented
 @attrs.frozen
 class EmulatedSignalOptions:
     """Options of `type: feetech_emulator`: a signal of the simulation that moves an emulated arm."""

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import attrs
 
-from ibrobot_core.options import option
+from ibrobot_core.options import documented, option
 
 
+@documented
 @attrs.frozen
 class ReplayOptions:
     """Options of `type: replay`."""

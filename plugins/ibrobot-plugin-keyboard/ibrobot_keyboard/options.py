@@ -7,7 +7,7 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.options import option
+from ibrobot_core.options import documented, option
 
 RESERVED = ("q", "esc", "tab", *(f"f{n}" for n in range(1, 13)))
 """Keys that belong to `ibrobot launch`: quit, emergency stop, modes, reset."""
@@ -19,6 +19,7 @@ def _check_keys(instance: Any, attribute: attrs.Attribute[Any], keys: Mapping[st
             raise ValueError(f"{action}: key {key!r} is taken by ibrobot itself; so are {', '.join(RESERVED)}")
 
 
+@documented
 @attrs.frozen
 class KeyboardOptions:
     """Options of `type: keyboard`; the joints' own limits bound every speed."""

@@ -6,12 +6,13 @@ from pathlib import Path
 
 import attrs
 
-from ibrobot_core.options import option
+from ibrobot_core.options import documented, option
 
 CODECS = ("libsvtav1", "h264", "hevc", "h264_nvenc", "hevc_nvenc", "h264_videotoolbox", "hevc_videotoolbox")
 """Encoders by LeRobot's names; those from `h264_nvenc` on need a GPU."""
 
 
+@documented
 @attrs.frozen
 class LeRobotOptions:
     """How pictures are stored, and how large files become."""
@@ -30,6 +31,7 @@ class LeRobotOptions:
     video_file_mb: int = option(200, unit="MiB", ge=1, help="size at which a new video begins")
 
 
+@documented
 @attrs.frozen
 class LeRobotPolicyOptions:
     """Which checkpoint, and how it is computed."""

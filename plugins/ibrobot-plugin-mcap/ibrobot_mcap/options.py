@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import attrs
 
-from ibrobot_core.options import option
+from ibrobot_core.options import documented, option
 
 MIB = 1 << 20
 COMPRESSIONS = ("none", "lz4", "zstd")
 
 
+@documented
 @attrs.frozen
 class McapOptions:
     """How episodes are written."""

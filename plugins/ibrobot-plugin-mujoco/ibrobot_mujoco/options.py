@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import attrs
 
-from ibrobot_core.options import OptionFault, hint, option
+from ibrobot_core.options import OptionFault, documented, hint, option
 
 if TYPE_CHECKING:
     from ibrobot_core.robot import Robot
@@ -21,6 +21,7 @@ def _ordered(instance: Any, attribute: attrs.Attribute[Any], value: Range) -> No
         raise ValueError(f"[{value[0]}, {value[1]}] is no range, the first must not exceed the second")
 
 
+@documented
 @attrs.frozen
 class SceneCamera:
     """A camera added to the scene. Without `parent` it stands still in the robot's base frame."""
@@ -36,6 +37,7 @@ class SceneCamera:
             raise ValueError(f"lookat must differ from pos, both are {list(self.pos)}")
 
 
+@documented
 @attrs.frozen
 class Fault:
     """A fault to inject, at a time counted from the beginning of each episode."""
@@ -55,6 +57,7 @@ class Fault:
             raise ValueError(f"a fault of kind {self.kind} {need} joint")
 
 
+@documented
 @attrs.frozen
 class MujocoOptions:
     """Options of the simulation. Servo values that are None are those of the MJCF."""
@@ -83,6 +86,7 @@ class MujocoOptions:
     cameras: tuple[SceneCamera, ...] = option((), help="cameras beside `top`, `front` and those of the MJCF")
 
 
+@documented
 @attrs.frozen
 class CameraOptions:
     """Options of a simulated camera."""

@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING
 
 import attrs
 
-from ibrobot_core.options import OptionFault, option
+from ibrobot_core.options import OptionFault, documented, option
 
 if TYPE_CHECKING:
     from ibrobot_core.robot import Robot
 
 
+@documented
 @attrs.frozen
 class ScriptedPickOptions:
     """Options of the scripted pick. The gripper's positions suit the SO-101 and a cube of 2 to 3 cm."""

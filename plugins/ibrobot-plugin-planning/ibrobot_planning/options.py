@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import attrs
 
-from ibrobot_core.options import option
+from ibrobot_core.options import documented, option
 
 
+@documented
 @attrs.frozen
 class JointPlannerOptions:
     """Options of `type: joint`."""

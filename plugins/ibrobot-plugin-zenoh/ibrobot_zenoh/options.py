@@ -10,7 +10,7 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.options import option
+from ibrobot_core.options import documented, option
 
 MIB = 1024 * 1024
 DEFAULT_LISTEN = "tcp/127.0.0.1:7447"
@@ -63,6 +63,7 @@ def _check_endpoints(instance: object, attribute: attrs.Attribute[tuple[str, ...
             raise ValueError(f"{endpoint!r} has no port, give PROTOCOL/HOST:PORT, e.g. {endpoint}:7447")
 
 
+@documented
 @attrs.frozen
 class Tls:
     """Certificates, as `ibrobot certs` makes them; both sides must have one that `ca` signed."""
@@ -73,6 +74,7 @@ class Tls:
     robots: Path | None = option(None, help="where to listen: the robots that are let in, a file with one name a line")
 
 
+@documented
 @attrs.frozen
 class ZenohOptions:
     """What the YAML may say."""

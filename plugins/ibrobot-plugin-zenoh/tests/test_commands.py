@@ -189,7 +189,9 @@ def test_a_config_without_network(transport: TransportConfig | None, monkeypatch
 
 
 def use_config(monkeypatch: pytest.MonkeyPatch, transport: TransportConfig | None) -> None:
-    config = RobotConfig(Robot("r", ()), {}, {}, "m", transport=transport)
+    config = RobotConfig(
+        robot=Robot("r", ()), executors={}, control_modes={}, default_control_mode="m", transport=transport
+    )
     monkeypatch.setattr("ibrobot_core.config.find_config", lambda name, registry: Path(name))
     monkeypatch.setattr("ibrobot_core.config.load", lambda path, communicates: config)
 

@@ -8,8 +8,9 @@ from typing import Any, get_origin
 
 import attrs
 import numpy as np
+from numpy.typing import NDArray
 
-from ibrobot_core.config.convert import Faults, make_converter
+from ibrobot_core.config.convert import Converter, Faults
 from ibrobot_core.config.show import dump
 from ibrobot_core.config.yaml_nodes import parse
 from ibrobot_core.errors import NotSupported
@@ -36,8 +37,11 @@ def _plain(value: Any, full: bool) -> Any:
     return value
 
 
-def _is_array(kind: Any) -> bool:
-    return get_origin(kind) is np.ndarray
+class _Messages(Converter):
+    """Leaves arrays to the message classes."""
+
+    def structure(self, value: Any, kind: Any) -> Any:
+        return value if get_origin(kind) in (np.ndarray, NDArray) else super().structure(value, kind)
 
 
 def message_from(type_name: str, text: str) -> Message:
@@ -54,10 +58,8 @@ def message_from(type_name: str, text: str) -> Message:
         raise NotSupported(f"{type_name!r} is no type that can be published, {hint}")
     document = parse(text, "MESSAGE")
     document.raise_problems()
-    converter = make_converter(Path.cwd())
-    converter.register_structure_hook_func(_is_array, lambda value, _: value)
     try:
-        message: Message = converter.structure(document.root, kind)
+        message: Message = _Messages(Path.cwd()).structure(document.root, kind)
     except Faults as faults:
         for key, told in faults.found:
             document.add(key, told)

@@ -1,0 +1,134 @@
+"""The reference pages on the robot YAML and on the options of plugins, from the classes that loading uses."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator
+from typing import Any, get_args
+
+import attrs
+
+from ibrobot_core.config.convert import is_mapping, is_sequence
+from ibrobot_core.config.describe import described
+from ibrobot_core.config.schema import SECTIONS, Component
+from ibrobot_core.options import fields
+from ibrobot_core.plugins import KINDS, installed
+
+
+def config_page() -> Iterator[str]:
+    """Lines of the page on the robot YAML."""
+    yield "# The robot YAML\n"
+    yield "Every section, its keys, units and defaults. Unknown keys are errors. A section with a `type` also takes the"
+    yield "[options of that plugin](options.md).\n"
+    yield "`${NAME:default}` is replaced from the environment, `~` by the home directory, and `package://PACKAGE/path`"
+    yield "by where that Python package is.\n"
+    yield "| section | | |"
+    yield "|---|---|---|"
+    for name, field in SECTIONS.items():
+        required = "required" if field.default is attrs.NOTHING else ""
+        target = next((f"[`{name}`](#{_anchor(kind)})" for _, kind in _classes(name, field.type)), f"`{name}`")
+        yield f"| {target} | {required} | {field.metadata['help']} |"
+    yield ""
+    shown: set[type] = set()
+    for name, field in SECTIONS.items():
+        for path, kind in _classes(name, field.type):
+            yield from _class_lines(path, kind, shown)
+
+
+def options_page() -> Iterator[str]:
+    """Lines of the page on the options of plugins."""
+    registry = installed()
+    yield "# Options of plugins\n"
+    yield "The options of every type that core and the plugins of the repository offer. For the types installed on your"
+    yield "machine, `ibrobot plugins show TYPE` prints them.\n"
+    for kind in KINDS:
+        entries = [registry.entries[kind, type_] for type_ in registry.types(kind)]
+        for entry in entries:
+            descriptor = entry.descriptor
+            yield f"({_options_anchor(kind, descriptor.type)})=\n"
+            yield f"## {kind}: `{descriptor.type}`\n"
+            yield f"From `{entry.package}`: {descriptor.summary}.\n"
+            if fields(descriptor.options):
+                yield from _class_tables(descriptor.options)
+            else:
+                yield "It has no options.\n"
+
+
+def _class_lines(path: str, kind: type[Any], shown: set[type]) -> Iterator[str]:
+    """The part of the page on a class and those within it, each class once."""
+    if kind in shown:
+        return
+    shown.add(kind)
+    yield f"({_anchor(kind)})=\n"
+    yield f"## `{path}`\n"
+    yield _first_line(kind) + "\n"
+    yield from _table(kind)
+    if issubclass(kind, Component):
+        yield from _types(kind)
+    for name, field in fields(kind).items():
+        for inner_path, inner in _classes(f"{path}.{name}", field.type):
+            yield from _class_lines(inner_path, inner, shown)
+
+
+def _types(kind: type[Component]) -> Iterator[str]:
+    registry = installed()
+    found = [registry.find(kind.plugin_kind, type_) for type_ in registry.types(kind.plugin_kind)]
+    links = [f"[`{each.type}`](#{_options_anchor(kind.plugin_kind, each.type)})" for each in found if kind.takes(each)]
+    yield f"`type` is one of {', '.join(links)}, each with options of its own.\n"
+
+
+def _class_tables(kind: type[Any]) -> Iterator[str]:
+    """The options of a plugin, and the keys of those that are mappings themselves."""
+    yield from _table(kind, links=False)
+    for name, field in fields(kind).items():
+        for path, inner in _classes(name, field.type):
+            yield f"Keys of `{path}`:\n"
+            yield from _table(inner, links=False)
+
+
+def _table(kind: type[Any], *, links: bool = True) -> Iterator[str]:
+    yield "| key | type | unit | default | allowed | |"
+    yield "|---|---|---|---|---|---|"
+    for each in described(kind):
+        inner = [(path, found) for path, found in _classes(each.name, fields(kind)[each.name].type) if links]
+        keys = "".join(f"; keys of [`{path}`](#{_anchor(found)})" for path, found in inner)
+        cells = (f"`{each.name}`", f"`{each.type}`", each.unit, _default(each.default), each.allowed, each.help + keys)
+        yield _row(cells)
+    yield ""
+
+
+def _row(cells: Iterable[str]) -> str:
+    return "| " + " | ".join(cell.replace("|", r"\|") for cell in cells) + " |"
+
+
+def _default(value: Any) -> str:
+    if value == "(required)":
+        return "required"
+    return "" if isinstance(value, dict) and value else f"`{json.dumps(value, ensure_ascii=False)}`"
+
+
+def _classes(path: str, kind: Any) -> Iterator[tuple[str, type[Any]]]:
+    """The classes in a type annotation, each with the path of its values in the YAML."""
+    if isinstance(kind, type) and attrs.has(kind):
+        yield path, kind
+        return
+    for member in get_args(kind):
+        alone = isinstance(member, type) and issubclass(member, Component) and member.may_be_alone
+        if is_sequence(kind):
+            yield from _classes(f"{path}[]", member)
+        elif is_mapping(kind) and not alone:
+            yield from _classes(f"{path}.NAME", member)
+        else:
+            yield from _classes(path, member)
+
+
+def _first_line(kind: type[Any]) -> str:
+    return (kind.__doc__ or "").strip().splitlines()[0]
+
+
+def _anchor(kind: type[Any]) -> str:
+    return f"keys-{kind.__name__.lower()}"
+
+
+def _options_anchor(kind: str, type_: str) -> str:
+    return f"options-{kind}-{type_}"

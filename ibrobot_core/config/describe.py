@@ -1,0 +1,61 @@
+"""The keys of a section and the options of a plugin in words, for `ibrobot plugins show` and the reference pages."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import Any, get_args
+
+import attrs
+
+from ibrobot_core.config.show import plain
+from ibrobot_core.options import default_of, fields
+
+
+@attrs.frozen
+class KeyDescription:
+    """One key in words."""
+
+    name: str
+    type: str
+    unit: str
+    required: bool
+    default: Any
+    """As YAML knows it; `(required)` where there is none."""
+    allowed: str
+    """Range or choices."""
+    secret: bool
+    help: str
+
+
+def described(kind: type[Any]) -> Iterator[KeyDescription]:
+    """The keys that a class takes, in order."""
+    for name, field in fields(kind).items():
+        default = default_of(field)
+        required = default is attrs.NOTHING
+        yield KeyDescription(
+            name=name,
+            type=type_name(field.type),
+            unit=field.metadata.get("unit", ""),
+            required=required,
+            default="(required)" if required else plain(default),
+            allowed=_allowed(field),
+            secret=bool(field.metadata.get("secret")),
+            help=field.metadata.get("help", ""),
+        )
+
+
+def type_name(kind: Any) -> str:
+    """A type annotation without the modules of its names."""
+    text = kind.__name__ if isinstance(kind, type) and not get_args(kind) else str(kind)
+    return re.sub(r"\w+\.(?=\w)", "", text)
+
+
+def _allowed(field: attrs.Attribute[Any]) -> str:
+    if field.metadata.get("secret"):
+        return "secret: ${NAME}"
+    if field.metadata.get("choices") is not None:
+        return ", ".join(str(choice) for choice in field.metadata["choices"])
+    signs = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
+    bounds = [f"{sign} {field.metadata[name]}" for name, sign in signs.items() if field.metadata.get(name) is not None]
+    return ", ".join(bounds)
