@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import attrs
 import numpy as np
+from ibrobot_kinematics import KinematicModel, Target, solve
 
 from ibrobot_core.robot import Vector
-from ibrobot_mujoco.ik import InverseKinematics, TipPose
 from ibrobot_mujoco.policy_options import ScriptedPickOptions
 from ibrobot_mujoco.trajectory import Limits, Segment, move, rest
 
@@ -40,7 +40,7 @@ class Scene:
 class PickPlanner:
     """Plans from the model of the robot alone; `gripper` is the index of the gripper's joint."""
 
-    ik: InverseKinematics
+    arm: KinematicModel
     options: ScriptedPickOptions
     limits: Limits
     gripper: int
@@ -49,7 +49,7 @@ class PickPlanner:
         """The segments that pick the cube from `start`, put it into the bin, and go `home`; both shape (J,) [rad].
 
         Raises:
-            PlanningError: when the cube or the bin is out of reach.
+            UnreachableError: when the cube or the bin is out of reach.
         """
         opened, closed = self.options.gripper_open, self.options.gripper_closed
         above = scene.cube + np.array([0.0, 0.0, self.options.hover_height])
@@ -72,7 +72,7 @@ class PickPlanner:
         ]
 
     def _solve(self, position: Vector, rotation: Vector, start: Vector, gripper: float, turn: float) -> Vector:
-        joints = self.ik.solve(TipPose(position, rotation), start, orientation_tolerance=turn)
+        joints = solve(self.arm, Target(position, rotation), start, rotation_tolerance=turn)
         return self._at(joints, gripper)
 
     def _at(self, joints: Vector, gripper: float) -> Vector:

@@ -6,13 +6,13 @@ from typing import override
 
 import attrs
 import numpy as np
+from ibrobot_kinematics import KinematicsError, UnreachableError, robot_model
 from numpy.typing import NDArray
 
-from ibrobot_core.errors import PlanningError, PolicyError
+from ibrobot_core.errors import PolicyError
 from ibrobot_core.interfaces import Context, Frame, Policy, PolicySpec, Tensors
 from ibrobot_core.robot import Vector
 from ibrobot_core.units import NS_PER_S, seconds
-from ibrobot_mujoco.ik import InverseKinematics
 from ibrobot_mujoco.pick_planner import PickPlanner, Scene
 from ibrobot_mujoco.policy_options import ScriptedPickOptions
 from ibrobot_mujoco.state import SCENE_SIZE
@@ -23,6 +23,8 @@ SCENE = "observation.environment_state"
 STAMP = "stamp_ns"
 ACTION = "action"
 
+LIMIT_MARGIN_RAD = 1e-3
+"""Plans keep this far from the joint limits: a setpoint that rounding puts beyond one counts as an intervention."""
 LEAD_IN_S = 0.2
 """Rest before the first motion, so that a chunk which comes late still begins at rest."""
 MOVED_M = 0.01
@@ -93,12 +95,11 @@ class ScriptedPick(Policy):
     @override
     def load(self) -> None:
         try:
-            ik = InverseKinematics(self._robot)
-            middle = (self._robot.lower + self._robot.upper) / 2
-            ik.solve(ik.forward(middle), middle)  # the first call loads the solver
-        except PlanningError as error:
+            arm = robot_model(self._robot)
+        except KinematicsError as error:
             raise PolicyError(f"scripted_pick cannot be loaded: {error}") from error
-        self._planner = PickPlanner(ik, self._options, self._limits, self._gripper)
+        arm = attrs.evolve(arm, lower=arm.lower + LIMIT_MARGIN_RAD, upper=arm.upper - LIMIT_MARGIN_RAD)
+        self._planner = PickPlanner(arm, self._options, self._limits, self._gripper)
 
     @override
     def reset(self, seed: int) -> None:
@@ -156,7 +157,7 @@ class ScriptedPick(Policy):
         assert self._planner is not None
         try:
             plan = self._planner.plan(kept[-1].end, scene, home)
-        except PlanningError as error:
+        except UnreachableError as error:
             where = ", ".join(f"{value:.3f}" for value in scene.cube)
             raise PolicyError(f"scripted_pick cannot pick the cube at ({where}) m: {error}") from error
         return Trajectory([*kept, *plan]), len(kept), scene.cube
@@ -169,7 +170,7 @@ class ScriptedPick(Policy):
         if index < episode.first or name in {"hover", "descend"}:
             return bool(np.linalg.norm(scene.cube - episode.cube) > MOVED_M)
         if name == "carry":
-            return bool(np.linalg.norm(scene.cube - self._planner.ik.forward(state).position) > LOST_M)
+            return bool(np.linalg.norm(scene.cube - self._planner.arm.forward(state).position) > LOST_M)
         return name == "return" and bool(np.hypot(*(scene.cube - scene.bin)[:2]) > DELIVERED_M)
 
 

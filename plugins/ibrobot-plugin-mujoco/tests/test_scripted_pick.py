@@ -9,7 +9,7 @@ import attrs
 import mujoco
 import numpy as np
 import pytest
-from ibrobot_mujoco.ik import InverseKinematics
+from ibrobot_kinematics import robot_model
 from ibrobot_mujoco.options import Fault, MujocoOptions
 from ibrobot_mujoco.policy_options import ScriptedPickOptions
 from ibrobot_mujoco.scripted_pick import SCENE, STATE, ScriptedPick
@@ -140,7 +140,7 @@ def test_a_cube_pushed_away_is_followed_from_where_it_is_clear(policy: ScriptedP
         np.testing.assert_allclose(later[:20], earlier[30:], rtol=0, atol=1e-12)
     np.testing.assert_array_equal(pushed[1], undisturbed[1])  # down, closed on nothing, and up again
     assert np.abs(pushed[3] - undisturbed[3]).max() > 0.2
-    tip = InverseKinematics(ROBOT).forward
+    tip = robot_model(ROBOT).forward
     there = [tip(action).position for action in pushed[5]]
     assert min(np.linalg.norm(position - (0.20, -0.12, 0.0125)) for position in there) < 0.002
 
@@ -161,7 +161,7 @@ def test_a_cube_lost_on_the_way_is_not_carried_on(policy: ScriptedPick) -> None:
         policy.reset(0)
         chunks = [chunk(policy, float(second)) for second in range(4)]
         on_the_way = chunks[-1][20]
-        cube = CUBE if lost else tuple(InverseKinematics(ROBOT).forward(on_the_way).position)
+        cube = CUBE if lost else tuple(robot_model(ROBOT).forward(on_the_way).position)
         ends.append(chunk(policy, 3.0 + 20 / RATE_HZ, cube, on_the_way))
     np.testing.assert_allclose(ends[1][:20], ends[0][:20], rtol=0, atol=1e-12)
     assert np.abs(ends[1][-1] - ends[0][-1]).max() > 0.1
@@ -238,5 +238,5 @@ def test_a_robot_without_a_gripper_is_refused() -> None:
 
 def test_a_robot_without_a_model_is_refused() -> None:
     robot = attrs.evolve(ROBOT, description=attrs.evolve(ROBOT.description, mjcf=None))
-    with pytest.raises(PolicyError, match=r"scripted_pick cannot be loaded: robot 'so101' has no description.mjcf"):
+    with pytest.raises(PolicyError, match=r"cannot be loaded: robot 'so101' has no robot\.description\.mjcf"):
         ScriptedPick(ScriptedPickOptions(), host_context(robot=robot)).load()

@@ -1,0 +1,141 @@
+"""Kinematic models from MJCF files.
+
+MuJoCo reads the file, since defaults, includes, frames and orientations mean what its compiler makes of them; what
+follows is numpy alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ibrobot_core.robot import Robot, Vector
+from ibrobot_kinematics.errors import KinematicsError
+from ibrobot_kinematics.model import ChainJoint, KinematicModel, TipPose
+
+_SLIDE, _HINGE = 2, 3
+"""Values of mujoco.mjtJoint."""
+
+
+def robot_model(robot: Robot, joints: Sequence[str] | None = None) -> KinematicModel:
+    """The kinematic model of a robot's tip, within the robot's joint limits.
+
+    Args:
+        robot: its description names the MJCF and the tip, a site of it.
+        joints: the joints that may move, in the order of vectors; None: all of the robot's. Others stay at zero.
+
+    Raises:
+        KinematicsError: when there is no MJCF, or it cannot be read, or it lacks the tip or one of the joints.
+        KeyError: for a name in `joints` that is no joint of the robot.
+    """
+    if robot.description.mjcf is None:
+        raise KinematicsError(f"robot {robot.name!r} has no robot.description.mjcf; kinematics needs a MuJoCo model")
+    names = robot.joint_names if joints is None else tuple(joints)
+    order = robot.indices(names)
+    lower, upper = robot.lower[order], robot.upper[order]
+    try:
+        return read_mjcf(robot.description.mjcf, robot.description.tip, names, lower=lower, upper=upper)
+    except KinematicsError as error:
+        raise KinematicsError(f"robot.description: {error}") from error
+
+
+def read_mjcf(
+    path: Path, tip: str, joints: Sequence[str], *, lower: Vector | None = None, upper: Vector | None = None
+) -> KinematicModel:
+    """The kinematic model of a site in an MJCF.
+
+    Args:
+        path: the MJCF.
+        tip: name of the site.
+        joints: names of the joints that may move, in the order of vectors. Others stay at their reference position.
+        lower: lower position limits [rad or m], shape (J,); None: those of the MJCF.
+        upper: upper position limits [rad or m], shape (J,); None: those of the MJCF.
+
+    Raises:
+        KinematicsError: when the file cannot be read, or lacks the site or a joint, or a joint is neither a hinge nor
+            a slide, or has no limits, or the tip moves with a free or ball joint.
+    """
+    model = _compiled(path)
+    sites = {model.site(i).name: i for i in range(model.nsite)}
+    known = {model.joint(i).name: i for i in range(model.njnt)}
+    if tip not in sites:
+        raise KinematicsError(f"{path} has no site {tip!r}; it has: {', '.join(sites)}")
+    for name in joints:
+        if name not in known:
+            raise KinematicsError(f"{path} has no joint {name!r}; it has: {', '.join(known)}")
+        if model.jnt_type[known[name]] not in (_SLIDE, _HINGE):
+            raise KinematicsError(f"{path}: joint {name!r} is neither a hinge nor a slide")
+        if (lower is None or upper is None) and not model.jnt_limited[known[name]]:
+            raise KinematicsError(f"{path}: joint {name!r} has no limits")
+    ids = [known[name] for name in joints]
+    chain, tip_pose = _chain(model, sites[tip], {joint: index for index, joint in enumerate(ids)}, path)
+    return KinematicModel(
+        tuple(joints),
+        model.jnt_range[ids, 0].copy() if lower is None else lower,
+        model.jnt_range[ids, 1].copy() if upper is None else upper,
+        chain,
+        tip,
+        tip_pose,
+    )
+
+
+def _compiled(path: Path) -> Any:
+    """The MJCF without its shapes, which take a second to load and move nothing."""
+    import mujoco
+
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+        for element in (*spec.sensors, *spec.pairs, *spec.geoms, *spec.meshes, *spec.materials, *spec.textures):
+            spec.delete(element)
+        # Bodies that got their mass from their shapes are left without; kinematics needs none, the compiler does.
+        spec.compiler.boundmass = spec.compiler.boundinertia = 1e-6
+        for joint in spec.joints:
+            joint.armature = 1.0
+        return spec.compile()
+    except ValueError as error:
+        raise KinematicsError(f"{path} cannot be loaded: {error}") from error
+
+
+def _chain(model: Any, site: int, order: dict[int, int], path: Path) -> tuple[tuple[ChainJoint, ...], TipPose]:
+    """The joints of `order` (joint id -> index) from the base to a site, and the site in the last one's frame."""
+    bodies = [int(model.site_bodyid[site])]
+    while bodies[-1] != 0:
+        bodies.append(int(model.body_parentid[bodies[-1]]))
+    chain = []
+    # The frame so far, in that of the last joint.
+    position, rotation = np.zeros(3), np.eye(3)
+    for body in reversed(bodies):
+        position = position + rotation @ model.body_pos[body]
+        rotation = rotation @ _matrix(model.body_quat[body])
+        first = int(model.body_jntadr[body])
+        for joint in range(first, first + int(model.body_jntnum[body])):
+            if model.jnt_type[joint] not in (_SLIDE, _HINGE):
+                raise KinematicsError(f"{path}: the tip moves with {model.joint(joint).name!r}, a free or ball joint")
+            if joint not in order:
+                continue
+            anchor = model.jnt_pos[joint].copy()
+            chain.append(
+                ChainJoint(
+                    index=order[joint],
+                    position=position + rotation @ anchor,
+                    rotation=rotation,
+                    axis=model.jnt_axis[joint].copy(),
+                    reference=float(model.qpos0[model.jnt_qposadr[joint]]),
+                    slides=bool(model.jnt_type[joint] == _SLIDE),
+                )
+            )
+            position, rotation = -anchor, np.eye(3)
+    return tuple(chain), TipPose(position + rotation @ model.site_pos[site], rotation @ _matrix(model.site_quat[site]))
+
+
+def _matrix(quaternion: Vector) -> Vector:
+    """Rotation matrix, shape (3, 3), of a unit quaternion (w, x, y, z)."""
+    w, x, y, z = quaternion / np.linalg.norm(quaternion)
+    return np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ])  # fmt: skip

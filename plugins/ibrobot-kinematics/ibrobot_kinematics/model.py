@@ -1,0 +1,138 @@
+"""The kinematic model of an arm: the chain of joints from the base to the tip, in numpy."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import attrs
+import numpy as np
+
+from ibrobot_core.robot import Vector
+from ibrobot_kinematics.rotations import cross, skew
+
+
+@attrs.frozen(eq=False)
+class TipPose:
+    """Where the tip is in the base frame."""
+
+    position: Vector
+    """Origin of the tip [m], shape (3,)."""
+    rotation: Vector
+    """Axes of the tip as columns, shape (3, 3)."""
+
+
+@attrs.frozen(eq=False)
+class ChainJoint:
+    """One joint on the way from the base to the tip."""
+
+    index: int
+    """Position of the joint in `KinematicModel.joint_names`."""
+    position: Vector
+    """Origin of the joint in the frame of the joint before it, or of the base [m], shape (3,)."""
+    rotation: Vector
+    """Axes of the joint in that frame, as columns, at the reference position, shape (3, 3)."""
+    axis: Vector
+    """Unit vector of the joint's axis in its own frame, shape (3,)."""
+    reference: float = 0.0
+    """Joint position [rad or m] at which the joint moves nothing."""
+    slides: bool = False
+    """Whether it is prismatic; revolute otherwise."""
+
+
+@attrs.frozen(eq=False, slots=False)
+class KinematicModel:
+    """Kinematics of the tip of an arm.
+
+    Vectors of joint positions have the order of `joint_names`; revolute joints are in rad, prismatic ones in m. The
+    base frame is the world frame of the MJCF.
+    """
+
+    joint_names: tuple[str, ...]
+    """All joints, J in number. Those that are not in `chain` do not move the tip."""
+    lower: Vector
+    """Lower position limits, shape (J,)."""
+    upper: Vector
+    """Upper position limits, shape (J,)."""
+    chain: tuple[ChainJoint, ...]
+    """The joints that move the tip, from the base outwards."""
+    tip: str
+    """Name of the tip's frame."""
+    tip_pose: TipPose
+    """The tip in the frame of the last joint of the chain."""
+
+    def forward(self, q: Vector) -> TipPose:
+        """Pose of the tip in the base frame.
+
+        Args:
+            q: joint positions, shape (J,).
+        """
+        return self._frames(q)[0]
+
+    def jacobian(self, q: Vector) -> Vector:
+        """How the tip moves with the joints.
+
+        Args:
+            q: joint positions, shape (J,).
+
+        Returns:
+            Shape (6, J): velocity of the tip's origin [m/s] in rows 0-2 and angular velocity of the tip [rad/s] in rows
+            3-5 for each joint at unit speed, both in the base frame.
+        """
+        return self.forward_and_jacobian(q)[1]
+
+    def forward_and_jacobian(self, q: Vector) -> tuple[TipPose, Vector]:
+        """`forward(q)` and `jacobian(q)` for little more than the time of one."""
+        tip, origins, axes = self._frames(q)
+        slides = self._slides[:, None]
+        columns = np.where(
+            slides, np.hstack([axes, np.zeros_like(axes)]), np.hstack([cross(axes, tip.position - origins), axes])
+        )
+        jacobian = np.zeros((6, len(self.joint_names)))
+        jacobian[:, self.moving] = columns.T
+        return tip, jacobian
+
+    @cached_property
+    def moving(self) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
+        """Indices of the joints of `chain`, from the base outwards."""
+        return np.array([joint.index for joint in self.chain], dtype=np.intp)
+
+    @cached_property
+    def _slides(self) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+        return np.array([joint.slides for joint in self.chain], dtype=bool)
+
+    @cached_property
+    def _reference(self) -> Vector:
+        return np.array([joint.reference for joint in self.chain])
+
+    @cached_property
+    def _rodrigues(self) -> Vector:
+        """Rotation of each joint in its predecessor's frame as A + sin(q) B + (1 - cos(q)) C, shape (3, n, 3, 3)."""
+        crosses = [skew(joint.axis) for joint in self.chain]
+        terms = [
+            (joint.rotation, joint.rotation @ k, joint.rotation @ k @ k)
+            for joint, k in zip(self.chain, crosses, strict=True)
+        ]
+        return np.array(terms).reshape(-1, 3, 3, 3).swapaxes(0, 1)
+
+    @cached_property
+    def _offsets(self) -> tuple[Vector, Vector]:
+        """Origin of each joint in its predecessor's frame, and how it moves with the joint; both shape (n, 3)."""
+        still = np.array([joint.position for joint in self.chain]).reshape(-1, 3)
+        moves = [joint.rotation @ joint.axis * joint.slides for joint in self.chain]
+        return still, np.array(moves).reshape(-1, 3)
+
+    def _frames(self, q: Vector) -> tuple[TipPose, Vector, Vector]:
+        """The tip, and the origins and axes of the chain's joints in the base frame, both shape (n, 3)."""
+        way = q[self.moving] - self._reference
+        angle = np.where(self._slides, 0.0, way)[:, None, None]
+        still, turning, turned = self._rodrigues
+        turns = still + np.sin(angle) * turning + (1 - np.cos(angle)) * turned
+        offsets = self._offsets[0] + self._offsets[1] * way[:, None]
+        origins, axes = np.empty_like(offsets), np.empty_like(offsets)
+        position, rotation = np.zeros(3), np.eye(3)
+        for i, joint in enumerate(self.chain):
+            origins[i] = position = position + rotation @ offsets[i]
+            rotation = rotation @ turns[i]
+            axes[i] = rotation @ joint.axis
+        tip = self.tip_pose
+        return TipPose(position + rotation @ tip.position, rotation @ tip.rotation), origins, axes

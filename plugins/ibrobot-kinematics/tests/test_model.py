@@ -1,0 +1,113 @@
+"""Models from MJCF: forward kinematics and Jacobians against MuJoCo and finite differences; errors name the fault."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from ibrobot_kinematics import KinematicModel, KinematicsError, read_mjcf, robot_model
+from ibrobot_kinematics.rotations import log
+
+from ibrobot_core.robot import Description, Joint, Robot, Vector
+
+from .arms import FIVE, SIX, by_mujoco, chains, load, write_arm
+
+SHARED_FOLDER = settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+def within(model: KinematicModel, share: list[float]) -> Vector:
+    return model.lower + np.resize(share, len(model.lower)) * (model.upper - model.lower)
+
+
+shares = st.lists(st.floats(0, 1), min_size=12, max_size=12)
+
+
+@SHARED_FOLDER
+@given(chain=chains(), share=shares)
+def test_forward_and_jacobian_agree_with_mujoco(tmp_path: Path, chain: tuple[str, tuple[str, ...]], share: list[float]):
+    path, model = load(tmp_path, *chain)
+    q = within(model, share)
+    tip, jacobian = by_mujoco(path, model, q)
+    np.testing.assert_allclose(model.forward(q).position, tip.position, atol=1e-9)
+    np.testing.assert_allclose(model.forward(q).rotation, tip.rotation, atol=1e-9)
+    np.testing.assert_allclose(model.jacobian(q), jacobian, atol=1e-9)
+
+
+@SHARED_FOLDER
+@given(chain=chains(), share=shares)
+def test_jacobian_agrees_with_finite_differences(
+    tmp_path: Path, chain: tuple[str, tuple[str, ...]], share: list[float]
+):
+    _, model = load(tmp_path, *chain)
+    q, step = within(model, share), 1e-6
+    jacobian = model.jacobian(q)
+    for i in range(len(q)):
+        offset = np.zeros(len(q))
+        offset[i] = step
+        before, after = model.forward(q - offset), model.forward(q + offset)
+        difference = [after.position - before.position, log(after.rotation @ before.rotation.T)]
+        np.testing.assert_allclose(jacobian[:, i], np.concatenate(difference) / (2 * step), atol=1e-6)
+
+
+def test_joint_off_the_chain_does_not_move_the_tip(tmp_path: Path):
+    model = read_mjcf(write_arm(tmp_path, *FIVE), "tool", FIVE)
+    q = np.zeros(6)
+    assert not model.jacobian(q)[:, -1].any()
+    np.testing.assert_array_equal(model.forward(q).position, model.forward(np.array([0, 0, 0, 0, 0, 1.0])).position)
+
+
+def test_joints_that_are_not_listed_stay_at_zero(tmp_path: Path):
+    path = write_arm(tmp_path, *SIX)
+    whole, part = (read_mjcf(path, "tool", joints) for joints in (SIX, ("lift", "pan")))
+    np.testing.assert_allclose(
+        part.forward(np.array([0.4, 0.3])).position,
+        whole.forward(np.array([0.3, 0.4, 0, 0, 0, 0, 0])).position,
+        atol=1e-12,
+    )
+
+
+def test_limits_are_the_robots(tmp_path: Path):
+    joints = tuple(Joint(name, -1.0, 1.2, max_velocity=3.0, max_acceleration=20.0) for name in FIVE)
+    robot = Robot("arm", joints, description=Description(mjcf=write_arm(tmp_path, *FIVE), tip="tool"))
+    model = robot_model(robot, ("elbow", "pan"))
+    assert model.joint_names == ("elbow", "pan")
+    np.testing.assert_array_equal([model.lower, model.upper], [[-1.0, -1.0], [1.2, 1.2]])
+
+
+@pytest.mark.parametrize(
+    ("tip", "joints", "message"),
+    [
+        ("nose", FIVE, "has no site 'nose'; it has: tool, on the cube"),
+        ("tool", ("pan", "tail"), "has no joint 'tail'; it has: pan, lift"),
+        ("tool", ("cube",), "joint 'cube' is neither a hinge nor a slide"),
+        ("on the cube", FIVE, "the tip moves with 'cube', a free or ball joint"),
+    ],
+)
+def test_request_that_does_not_fit_the_file_is_refused(tmp_path: Path, tip: str, joints: tuple[str, ...], message: str):
+    path = write_arm(tmp_path, *FIVE)
+    with pytest.raises(KinematicsError, match=f"{path}.*{message}"):
+        read_mjcf(path, tip, joints)
+
+
+def test_joint_without_limits_is_refused(tmp_path: Path):
+    path = write_arm(tmp_path, *FIVE)
+    path.write_text(path.read_text().replace('range="-1.6 1.6" limited="true"', "", 1))
+    with pytest.raises(KinematicsError, match="joint 'pan' has no limits"):
+        read_mjcf(path, "tool", FIVE)
+
+
+@pytest.mark.parametrize("text", ["<mujoco", "<mujoco><worldbody><body><geom/></body></worldbody></mujoco>"])
+def test_file_that_cannot_be_loaded_is_named(tmp_path: Path, text: str):
+    path = tmp_path / "arm.xml"
+    path.write_text(text)
+    with pytest.raises(KinematicsError, match=r"arm\.xml (cannot be loaded: .+|has no site 'tool')"):
+        read_mjcf(path, "tool", ())
+
+
+def test_robot_without_an_mjcf_is_refused():
+    robot = Robot("arm", (Joint("pan", -1.0, 1.0, max_velocity=3.0, max_acceleration=20.0),))
+    with pytest.raises(KinematicsError, match=r"robot 'arm' has no robot\.description\.mjcf"):
+        robot_model(robot)

@@ -1,0 +1,45 @@
+"""Rotations, and quadratic programs with bounds."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from ibrobot_kinematics.quadratic import bounded_minimum
+from ibrobot_kinematics.rotations import exp, log
+
+from ibrobot_core.robot import Vector
+
+seeds = st.integers(0, 2**32 - 1).map(np.random.default_rng)
+angles = st.floats(0, np.pi) | st.sampled_from([0.0, 1e-12, 1e-7, 1e-6, np.pi - 1e-6, np.pi - 1e-9, np.pi])
+
+
+@given(rng=seeds, angle=angles)
+def test_log_undoes_exp(rng: np.random.Generator, angle: float):
+    axis = rng.normal(size=3)
+    vector = angle * axis / np.linalg.norm(axis)
+    rotation = exp(vector)
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(exp(log(rotation)), rotation, atol=1e-9)
+    if angle < 3.1:
+        np.testing.assert_allclose(log(rotation), vector, atol=1e-9)
+
+
+@st.composite
+def programs(draw: st.DrawFn) -> tuple[Vector, Vector, Vector, Vector]:
+    rng, n = draw(seeds), draw(st.integers(1, 7))
+    rows = rng.normal(size=(draw(st.integers(1, 8)), n))
+    bounds = [rng.random(n) * rng.choice([0.0, 0.01, 1.0, 100.0], size=n) for _ in range(2)]
+    return rows.T @ rows + 1e-7 * np.eye(n), rng.normal(size=n), -bounds[0], bounds[1]
+
+
+@given(programs())
+def test_bounded_minimum_is_optimal(program: tuple[Vector, Vector, Vector, Vector]):
+    """At a minimum of a convex function no step inwards goes down (Karush, Kuhn and Tucker)."""
+    hessian, gradient, lower, upper = program
+    x = bounded_minimum(hessian, gradient, lower, upper)
+    assert np.all((lower <= x) & (x <= upper))
+    slope = hessian @ x + gradient
+    tolerance = 1e-6 * (1 + np.abs(hessian).max() * np.abs(x).max())
+    assert np.all((slope >= -tolerance) | (x >= upper))
+    assert np.all((slope <= tolerance) | (x <= lower))
