@@ -20,15 +20,15 @@ def plugin_page() -> Iterator[str]:
     shown = sorted((packages.get(name, CORE), name) for name in managers)
     shown.sort(key=lambda pair: pair[0] != CORE)
     yield "# Plugins\n"
-    yield "This page lists what core and the plugins of the repository offer. `ibrobot plugins` prints the list for"
-    yield "your own installation. `ibrobot plugins show TYPE` prints the options of a type, with units and defaults.\n"
+    yield "This page lists what core and the plugins of the repository offer. Each type links to its"
+    yield "options. `ibrobot plugins` prints the list for your own installation.\n"
     for package, name in shown:
         yield f"## {package}\n"
         yield f"{metadata(package)['Summary']}.\n"
         yield "| kind | name | |"
         yield "|---|---|---|"
         for kind, title, summary in _offers(managers[name]):
-            yield f"| {kind} | `{title}` | {summary} |"
+            yield f"| {kind} | {title} | {summary} |"
         yield ""
 
 
@@ -36,15 +36,15 @@ def _offers(manager: pluggy.PluginManager) -> Iterator[tuple[str, str, str]]:
     """Kind, name and summary of everything that one plugin registers."""
     for kind, hook in KINDS.items():
         for descriptor in _yielded(manager, hook):
-            yield kind, descriptor.type, descriptor.summary
+            yield kind, f"[`{descriptor.type}`](#options-{kind}-{descriptor.type})", descriptor.summary
     for reader in _yielded(manager, "ibrobot_readers"):
-        yield "reader", reader.type, reader.summary
+        yield "reader", f"`{reader.type}`", reader.summary
     for decoder in _yielded(manager, "ibrobot_decoders"):
-        yield "decoder", ", ".join(decoder.formats), "compressed images"
+        yield "decoder", f"`{', '.join(decoder.formats)}`", "compressed images"
     for config in _yielded(manager, "ibrobot_configs"):
-        yield "robot YAML", config.name, config.summary
+        yield "robot YAML", f"`{config.name}`", config.summary
     for command in _yielded(manager, "ibrobot_commands"):
-        yield "command", f"ibrobot {command.name}", command.summary.rstrip(".")
+        yield "command", f"`ibrobot {command.name}`", command.summary.rstrip(".")
 
 
 def _yielded(manager: pluggy.PluginManager, hook: str) -> list[Any]:
