@@ -12,8 +12,8 @@ import click
 
 from ibrobot_core.cli.launch import Watcher, launch_options, run_robot
 from ibrobot_core.errors import DiskFull, IbrobotError
-from ibrobot_core.launch.desk import EpisodeDesk
 from ibrobot_core.launch.runtime import Runtime
+from ibrobot_core.recording.desk import EpisodeDesk
 from ibrobot_core.units import seconds
 
 _MIB = 1 << 20

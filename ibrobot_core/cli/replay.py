@@ -15,9 +15,9 @@ from ibrobot_core.config import RobotConfig, find_config, from_document, load
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import ContractError, RecorderError
 from ibrobot_core.interfaces import EpisodeSummary
-from ibrobot_core.launch.builders.replay import MODE, Replay, ReplayFeeder
 from ibrobot_core.launch.runtime import Runtime
 from ibrobot_core.launch.session import Request
+from ibrobot_core.launch.sources.replay import MODE, Replay, ReplayFeeder
 from ibrobot_core.outside import echo
 from ibrobot_core.plugins import installed
 from ibrobot_core.recording.playback import read_playback

@@ -6,33 +6,33 @@ from typing import Any
 
 import attrs
 
+from ibrobot_core.component import Component
 from ibrobot_core.config.schema import ActionSpec, ObservationSpec, Peripheral, Share
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import ComponentFailed, NotSupported
 from ibrobot_core.launch.absence import describe, refuse
-from ibrobot_core.launch.builders.control import NAME as CONTROL
-from ibrobot_core.launch.builders.control import Control
-from ibrobot_core.launch.builders.execution import InferenceFeeder, Model
-from ibrobot_core.launch.builders.metrics import MetricsPort
-from ibrobot_core.launch.builders.perception import SensorWorker
-from ibrobot_core.launch.builders.planning import PlanningFeeder
-from ibrobot_core.launch.builders.recording import Recording
-from ibrobot_core.launch.builders.replay import MODE as REPLAY
-from ibrobot_core.launch.builders.replay import ReplayFeeder
-from ibrobot_core.launch.builders.sharing import PublishedTopic, SubscribedTopics
-from ibrobot_core.launch.builders.simulation import SimulatedEpisodes
-from ibrobot_core.launch.builders.status import Status
-from ibrobot_core.launch.builders.teleop import TeleopFeeder
-from ibrobot_core.launch.builders.transforms import Transforms
-from ibrobot_core.launch.builders.transport import TransportLink
-from ibrobot_core.launch.builders.viewer import ViewerWorker
-from ibrobot_core.launch.component import Component
-from ibrobot_core.launch.episodes import Episodes
-from ibrobot_core.launch.feeder import Feeder
+from ibrobot_core.launch.control import NAME as CONTROL
+from ibrobot_core.launch.control import Control
 from ibrobot_core.launch.models import check_contract
+from ibrobot_core.launch.outputs.metrics import MetricsPort
+from ibrobot_core.launch.outputs.sharing import PublishedTopic, SubscribedTopics
+from ibrobot_core.launch.outputs.status import Status
+from ibrobot_core.launch.outputs.transforms import Transforms
+from ibrobot_core.launch.outputs.viewer import ViewerWorker
+from ibrobot_core.launch.perception import SensorWorker
 from ibrobot_core.launch.session import Session
+from ibrobot_core.launch.simulation import SimulatedEpisodes
+from ibrobot_core.launch.sources.feeder import Feeder
+from ibrobot_core.launch.sources.planner import PlanningFeeder
+from ibrobot_core.launch.sources.policy import InferenceFeeder, Model
+from ibrobot_core.launch.sources.replay import MODE as REPLAY
+from ibrobot_core.launch.sources.replay import ReplayFeeder
+from ibrobot_core.launch.sources.teleop import TeleopFeeder
+from ibrobot_core.launch.transport import TransportLink
 from ibrobot_core.messages import MESSAGE_TYPES
 from ibrobot_core.recording.episode import is_kept
+from ibrobot_core.recording.episodes import Episodes
+from ibrobot_core.recording.worker import Recording
 
 
 @attrs.frozen

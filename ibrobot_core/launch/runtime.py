@@ -6,13 +6,13 @@ from collections.abc import Callable
 from typing import Any
 
 from ibrobot_core.clock import SteppedClock
+from ibrobot_core.component import Component, Worker, cause, exit_code, told
 from ibrobot_core.errors import ComponentFailed, HardwareError, NotSupported
-from ibrobot_core.launch.builders.control import Control
-from ibrobot_core.launch.builders.planning import check_goals
-from ibrobot_core.launch.component import Component, Worker, cause, exit_code, told
-from ibrobot_core.launch.desk import EpisodeDesk
+from ibrobot_core.launch.control import Control
 from ibrobot_core.launch.plan import LaunchPlan, build_plan, mode_parts
 from ibrobot_core.launch.session import Session
+from ibrobot_core.launch.sources.planner import check_goals
+from ibrobot_core.recording.desk import EpisodeDesk
 from ibrobot_core.units import ns
 
 SET_MODE = "/set_mode"

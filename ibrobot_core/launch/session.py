@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from ibrobot_core.control.host import ControlHost
     from ibrobot_core.dispatch.dispatcher import DispatchStats
     from ibrobot_core.inference.engine import EngineStats
-    from ibrobot_core.launch.builders.replay import Replay
+    from ibrobot_core.launch.sources.replay import Replay
 
 
 @attrs.frozen

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ibrobot_core.config import load
-from ibrobot_core.launch.builders.transforms import read_urdf
+from ibrobot_core.launch.outputs.transforms import read_urdf
 from ibrobot_core.messages import Quaternion, Vector3
 
 pytestmark = pytest.mark.integration

@@ -11,7 +11,7 @@ import yaml
 
 from ibrobot_core.cli.record import Operator
 from ibrobot_core.errors import DiskFull, NotSupported, RecorderError
-from ibrobot_core.launch.desk import DISCARD, START, STATUS, STOP
+from ibrobot_core.recording.desk import DISCARD, START, STATUS, STOP
 
 if TYPE_CHECKING:
     from conftest import Runs

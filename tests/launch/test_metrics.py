@@ -10,7 +10,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from ibrobot_core.errors import ComponentFailed, ConfigError, SensorError
-from ibrobot_core.launch.builders.metrics import MetricsPort
+from ibrobot_core.launch.outputs.metrics import MetricsPort
 
 if TYPE_CHECKING:
     from conftest import Runs

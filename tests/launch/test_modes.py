@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from ibrobot_core.errors import ComponentFailed, HardwareError, NotSupported
-from ibrobot_core.launch.builders.planning import GO_TO
 from ibrobot_core.launch.runtime import SET_MODE, Runtime
+from ibrobot_core.launch.sources.planner import GO_TO
 
 if TYPE_CHECKING:
     from conftest import Runs

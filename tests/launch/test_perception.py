@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from ibrobot_core.launch.builders.perception import SensorWorker
+from ibrobot_core.launch.perception import SensorWorker
 
 if TYPE_CHECKING:
     from conftest import Runs

@@ -11,8 +11,8 @@ import pytest
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import RecorderError
 from ibrobot_core.interfaces import EpisodeEnd, EpisodeStart
-from ibrobot_core.launch.builders import recording
 from ibrobot_core.messages import String
+from ibrobot_core.recording import worker as recording
 
 if TYPE_CHECKING:
     from conftest import Runs

@@ -8,8 +8,8 @@ import attrs
 import numpy as np
 import pytest
 
-from ibrobot_core.launch.builders.replay import MODE, Replay, ReplayFeeder
 from ibrobot_core.launch.runtime import ESTOP, Runtime
+from ibrobot_core.launch.sources.replay import MODE, Replay, ReplayFeeder
 from ibrobot_core.recording.playback import Playback, Track
 
 if TYPE_CHECKING:

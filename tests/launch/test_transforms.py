@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from ibrobot_core.errors import ConfigError
-from ibrobot_core.launch.builders.transforms import read_urdf
+from ibrobot_core.launch.outputs.transforms import read_urdf
 from ibrobot_core.messages import Vector3
 
 URDF = """<robot name="r">

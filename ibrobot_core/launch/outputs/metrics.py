@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, override
 
+from ibrobot_core.component import Component, cause
 from ibrobot_core.config.schema import MetricsConfig
-from ibrobot_core.launch.builders.status import counts
-from ibrobot_core.launch.component import Component, cause
+from ibrobot_core.launch.outputs.status import counts
 from ibrobot_core.launch.session import Session
 from ibrobot_core.metrics import Metrics, MetricsServer, Probes
 

@@ -16,8 +16,8 @@ from ibrobot_core.config.schema import ControlMode
 from ibrobot_core.control.executors.trajectory_goal import goal_from_message
 from ibrobot_core.errors import HardwareError, PlanningError
 from ibrobot_core.interfaces import JointGoal, Planner, PlanRequest
-from ibrobot_core.launch.feeder import Feeder
 from ibrobot_core.launch.session import Session
+from ibrobot_core.launch.sources.feeder import Feeder
 from ibrobot_core.robot import Robot
 
 GO_TO = "/planning/go_to"

@@ -6,8 +6,8 @@ import threading
 from abc import abstractmethod
 from typing import override
 
+from ibrobot_core.component import Worker
 from ibrobot_core.config.schema import ControlMode
-from ibrobot_core.launch.component import Worker
 from ibrobot_core.launch.session import Feed, Session
 
 

@@ -11,14 +11,14 @@ from typing import override
 import attrs
 
 from ibrobot_core.bus import Received, Subscription
+from ibrobot_core.component import Worker, cause
 from ibrobot_core.config.schema import Recording as RecordingConfig
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import RecorderError
 from ibrobot_core.interfaces import EpisodeEnd, EpisodeStart, Recorder
-from ibrobot_core.launch.component import Worker, cause
-from ibrobot_core.launch.session import Session
 from ibrobot_core.messages import Message
 from ibrobot_core.recording.episode import episode_start, is_kept
+from ibrobot_core.recording.run import Run
 from ibrobot_core.units import NS_PER_S, seconds
 
 _DEPTH = 4096
@@ -61,7 +61,7 @@ class Recording(Worker):
     and the next episode is recorded again.
     """
 
-    def __init__(self, session: Session, config: RecordingConfig) -> None:
+    def __init__(self, session: Run, config: RecordingConfig) -> None:
         super().__init__(
             "recording", f"{config.type} into {config.root}", on_failure=session.fail,
             lockstep=session.request.lockstep,

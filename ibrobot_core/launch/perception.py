@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections import deque
 from typing import override
 
+from ibrobot_core.component import Worker
 from ibrobot_core.config.schema import Peripheral
 from ibrobot_core.control.realtime import raise_thread_priority
 from ibrobot_core.interfaces import Sensor
-from ibrobot_core.launch.component import Worker
 from ibrobot_core.launch.session import Session
 from ibrobot_core.units import seconds
 

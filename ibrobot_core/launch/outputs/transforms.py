@@ -11,8 +11,8 @@ import attrs
 import numpy as np
 
 from ibrobot_core.bus import Subscription
+from ibrobot_core.component import Worker
 from ibrobot_core.errors import ConfigError, Problem
-from ibrobot_core.launch.component import Worker
 from ibrobot_core.launch.session import Session
 from ibrobot_core.messages import Header, JointState, Quaternion, TFMessage, TransformStamped, Vector3
 

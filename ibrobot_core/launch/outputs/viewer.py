@@ -5,9 +5,9 @@ from __future__ import annotations
 import time
 from typing import override
 
+from ibrobot_core.component import Worker
 from ibrobot_core.config.schema import Component as ConfigComponent
 from ibrobot_core.interfaces import Viewer
-from ibrobot_core.launch.component import Worker
 from ibrobot_core.launch.session import Session
 
 _RATE_HZ = 30.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import override
 
+from ibrobot_core.component import Component
 from ibrobot_core.config.schema import ControlMode, Inference
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.dispatch.dispatcher import Dispatcher
@@ -15,11 +16,10 @@ from ibrobot_core.inference.process import ProcessEngine
 from ibrobot_core.inference.remote import RemoteEngine
 from ibrobot_core.interfaces import PictureCodec, Policy
 from ibrobot_core.launch.absence import refuse
-from ibrobot_core.launch.builders.transport import NAME as TRANSPORT
-from ibrobot_core.launch.component import Component
-from ibrobot_core.launch.feeder import Feeder
 from ibrobot_core.launch.models import check_model
 from ibrobot_core.launch.session import Session
+from ibrobot_core.launch.sources.feeder import Feeder
+from ibrobot_core.launch.transport import NAME as TRANSPORT
 from ibrobot_core.robot import Vector
 from ibrobot_core.units import NS_PER_S
 

@@ -7,8 +7,8 @@ from typing import Any, override
 
 import attrs
 
+from ibrobot_core.component import Worker
 from ibrobot_core.interfaces import Severity
-from ibrobot_core.launch.component import Worker
 from ibrobot_core.launch.session import Session
 from ibrobot_core.messages import DiagnosticArray, DiagnosticStatus, Header, KeyValue, RobotStatus
 from ibrobot_core.units import NS_PER_S

@@ -6,11 +6,11 @@ from collections.abc import Callable
 from typing import override
 
 from ibrobot_core.bus import Subscription
+from ibrobot_core.component import Component, Worker
 from ibrobot_core.errors import IbrobotError, NotSupported
 from ibrobot_core.interfaces import TopicTransport
-from ibrobot_core.launch.builders.transport import NAME as TRANSPORT
-from ibrobot_core.launch.component import Component, Worker
 from ibrobot_core.launch.session import Session
+from ibrobot_core.launch.transport import NAME as TRANSPORT
 from ibrobot_core.messages import Message
 from ibrobot_core.options import hint
 from ibrobot_core.units import NS_PER_S

@@ -5,16 +5,16 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from ibrobot_core.errors import RecorderError
-from ibrobot_core.launch.session import Session
+from ibrobot_core.recording.run import Run
 
 if TYPE_CHECKING:
-    from ibrobot_core.launch.builders.recording import Recording
+    from ibrobot_core.recording.worker import Recording
 
 
 class Episodes:
     """Begins and ends episodes. One thread at a time uses it."""
 
-    def __init__(self, session: Session, recording: Recording | None) -> None:
+    def __init__(self, session: Run, recording: Recording | None) -> None:
         self._session = session
         self._recording = recording
         self.number = 0

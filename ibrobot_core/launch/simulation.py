@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import override
 
-from ibrobot_core.launch.component import Worker
-from ibrobot_core.launch.episodes import Episodes
+from ibrobot_core.component import Worker
 from ibrobot_core.launch.session import Session
+from ibrobot_core.recording.episodes import Episodes
 from ibrobot_core.units import NS_PER_S, ns
 
 

@@ -10,8 +10,8 @@ import numpy as np
 from ibrobot_core.bus import Subscription
 from ibrobot_core.config.schema import ControlMode
 from ibrobot_core.control.link import ControlState
-from ibrobot_core.launch.feeder import Feeder
 from ibrobot_core.launch.session import Session
+from ibrobot_core.launch.sources.feeder import Feeder
 from ibrobot_core.recording.playback import Playback, Track
 from ibrobot_core.robot import Vector
 from ibrobot_core.units import NS_PER_S, ns, seconds

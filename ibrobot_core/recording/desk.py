@@ -9,11 +9,11 @@ from typing import Any
 
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import DiskFull, NotSupported, RecorderError
-from ibrobot_core.launch.builders.recording import Recording
-from ibrobot_core.launch.episodes import Episodes
-from ibrobot_core.launch.session import Session
 from ibrobot_core.recording.dataset import Dataset
 from ibrobot_core.recording.episode import is_kept
+from ibrobot_core.recording.episodes import Episodes
+from ibrobot_core.recording.run import Run
+from ibrobot_core.recording.worker import Recording
 from ibrobot_core.units import seconds
 
 START = "/record_episode/start"
@@ -42,7 +42,7 @@ class EpisodeDesk:
             record and `recording.topics` leaves out a topic of the contract.
     """
 
-    def __init__(self, session: Session, episodes: Episodes, recording: Recording, *, by_mode: bool) -> None:
+    def __init__(self, session: Run, episodes: Episodes, recording: Recording, *, by_mode: bool) -> None:
         self._session = session
         self._episodes = episodes
         self._recording = recording

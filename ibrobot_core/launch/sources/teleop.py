@@ -10,8 +10,8 @@ from ibrobot_core.bus import Subscription
 from ibrobot_core.config.schema import ControlMode
 from ibrobot_core.errors import TeleopError
 from ibrobot_core.interfaces import Teleop
-from ibrobot_core.launch.feeder import Feeder
 from ibrobot_core.launch.session import Session
+from ibrobot_core.launch.sources.feeder import Feeder
 
 
 class TeleopFeeder(Feeder):

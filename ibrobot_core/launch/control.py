@@ -8,11 +8,11 @@ from typing import Any, override
 import numpy as np
 
 from ibrobot_core.clock import RealClock, SteppedClock
+from ibrobot_core.component import Component
 from ibrobot_core.control.host import ControlClient, ControlHost, InlineControl
 from ibrobot_core.control.link import ControlState
 from ibrobot_core.descriptors import HardwareDescriptor
 from ibrobot_core.errors import HardwareError
-from ibrobot_core.launch.component import Component
 from ibrobot_core.launch.session import Session
 from ibrobot_core.messages import Float64MultiArray, Header, JointState
 

@@ -1,1 +1,0 @@
-"""What turns a checked config into the components of a run; one file for each part of the robot YAML."""
