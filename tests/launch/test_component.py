@@ -7,9 +7,9 @@ from collections.abc import Iterator
 
 import pytest
 
+from ibrobot_core import component as module
 from ibrobot_core.component import Worker
 from ibrobot_core.errors import ComponentFailed, SensorError
-from ibrobot_core.launch import component as module
 
 PATIENCE_S = 30.0
 
