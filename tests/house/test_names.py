@@ -10,7 +10,7 @@ import pytest
 from ibrobot_core.plugins import KINDS, OFFICIAL, example, official_plugins
 
 CORE = OFFICIAL.parent
-ORDINARY = {"joint", "keyboard", "replay"}
+ORDINARY = {"joint", "keyboard"}
 """Types that are words of the language too: they count where a text says `type: WORD`."""
 ALLOWED = {("config/models.py", '_root(path, "mujoco")')}
 """File and text: the root element of MJCF files."""

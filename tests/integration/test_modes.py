@@ -64,25 +64,6 @@ def test_a_goal_outside_the_limits_is_told_and_exit_code_3(recorded: Callable[..
     assert log.joint(joint) == pytest.approx(log.joint(joint)[0], abs=0.05)
 
 
-def test_a_recorded_episode_is_replayed_by_teleop(recorded: Callable[..., tuple[Ran, list[Log]]], tmp_path: Path):
-    ran, (log,) = recorded("--lockstep", "--episodes", "1", "--seed", "2", dataset="original")
-    assert ran.code == 0, ran.err
-    path = tmp_path / "kept" / "original" / "episodes" / "episode_000001" / "joints.csv"
-    ran, (again,) = recorded(
-        "--lockstep", "--mode", "teleop", "--set", f"teleoperation.replay={{type: replay, path: {path}}}",
-        "--set", "control_modes.teleop.teleop=replay", dataset="again",
-    )  # fmt: skip
-    assert ran.code == 0, ran.err
-    assert ran.summary["faults"] == []
-    # The replay approaches the log's first sample, then follows it with the servos' lag.
-    length = len(log.times)
-    lags = range(max(len(again.times) - length - 20, 0), len(again.times) - length + 1)
-    worst = min(np.abs(again.positions[lag : lag + length] - log.positions).max() for lag in lags)
-    assert worst < 0.15
-    assert again.positions[-1] == pytest.approx(log.positions[-1], abs=0.1)
-    assert np.ptp(log.positions, axis=0)[:2].min() > 0.3, "it is a motion worth following"
-
-
 class Terminal:
     """`ibrobot launch` in a terminal of its own, and a person at it."""
 

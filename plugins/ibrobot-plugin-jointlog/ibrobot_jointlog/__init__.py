@@ -1,35 +1,28 @@
-"""The plugin's hooks: teleop `replay`, recorder `joint_log`, dataset writer `npz`."""
+"""The plugin's hooks: recorder and reader `joint_log`, dataset writer `npz`."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.descriptors import DatasetDescriptor, RecorderDescriptor, TeleopDescriptor
+from ibrobot_core.descriptors import DatasetDescriptor, ReaderDescriptor, RecorderDescriptor
 from ibrobot_core.hookspecs import hookimpl
-from ibrobot_core.options import OptionFault
-from ibrobot_jointlog.options import ReplayOptions
 
 if TYPE_CHECKING:
-    from ibrobot_core.interfaces import Context, DatasetWriter, Recorder, Teleop
-    from ibrobot_core.robot import Robot
+    from ibrobot_core.interfaces import Context, DatasetWriter, EpisodeAddress, EpisodeReader, Recorder
 
 
-def _replay(options: Any, ctx: Context) -> Teleop:
-    from ibrobot_jointlog.replay import ReplayTeleop
+def _reads(path: Path) -> bool:
+    from ibrobot_jointlog.reader import is_joint_log
 
-    return ReplayTeleop(options, ctx)
+    return is_joint_log(path)
 
 
-def _check_log(options: Any, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
-    from ibrobot_core.errors import TeleopError
-    from ibrobot_jointlog.log import read_log
+def _read(address: EpisodeAddress) -> EpisodeReader:
+    from ibrobot_jointlog.reader import JointLogReader
 
-    try:
-        read_log(options.path, robot.joint_names)
-    except TeleopError as error:
-        return [OptionFault(("path",), str(error))]
-    return ()
+    return JointLogReader(address)
 
 
 def _joint_log(options: Any, ctx: Context) -> Recorder:
@@ -45,12 +38,9 @@ def _npz(options: Any, ctx: Context) -> DatasetWriter:
 
 
 @hookimpl
-def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
-    """What plays a joint log."""
-    yield TeleopDescriptor(
-        type="replay", options=ReplayOptions, make=_replay, check_options=_check_log,
-        summary="plays a recorded joint log (CSV)",
-    )  # fmt: skip
+def ibrobot_readers() -> Iterable[ReaderDescriptor]:
+    """What reads joint logs."""
+    yield ReaderDescriptor("joint_log", "joint logs: CSV", _reads, _read)
 
 
 @hookimpl

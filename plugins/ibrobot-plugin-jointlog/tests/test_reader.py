@@ -1,0 +1,107 @@
+"""Joint logs as episodes: states, commands where a contract is told, and logs that cannot be read."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ibrobot_jointlog import ibrobot_readers
+from ibrobot_jointlog.log import header, row
+from ibrobot_testing import make_robot
+
+from ibrobot_core.contract.specs import ActionPart, Contract
+from ibrobot_core.errors import RecorderError
+from ibrobot_core.interfaces import EpisodeAddress, EpisodeReader
+from ibrobot_core.messages import Float64MultiArray
+from ibrobot_core.recording.playback import read_playback
+from ibrobot_core.units import ns
+
+JOINTS = make_robot().joint_names
+WAVE = np.array([[0.1 * i, -0.2 * i, 0.3, 0.0, 0.01 * i, 0.5] for i in range(5)])
+"""Positions at 2.0, 2.1, … 2.4 s."""
+
+
+def write_log(path: Path, joints: tuple[str, ...] = JOINTS) -> Path:
+    columns = [JOINTS.index(joint) for joint in joints]
+    path.write_text(header(joints) + "".join(row(ns(2.0 + 0.1 * i), p[columns]) for i, p in enumerate(WAVE)))
+    return path
+
+
+def contract(*joints: tuple[str, ...]) -> Contract:
+    """A contract with an action for each group of joints."""
+    kind = Float64MultiArray.ros_type
+    parts = [ActionPart("action", f"/group_{i}/commands", kind, "hold", each) for i, each in enumerate(joints)]
+    return Contract(30.0, (), tuple(parts))
+
+
+def read(path: Path, known: Contract | None = None) -> EpisodeReader:
+    (descriptor,) = ibrobot_readers()
+    assert descriptor.reads(path)
+    told = {"contract": json.dumps(known.canonical())} if known is not None else {}
+    return descriptor.make(EpisodeAddress.of(path, told))
+
+
+@pytest.mark.parametrize("joints", [JOINTS, JOINTS[::-1]])
+def test_log_plays_as_the_commands_of_the_contract(tmp_path: Path, joints: tuple[str, ...]):
+    known = contract(JOINTS[:5], JOINTS[5:])
+    playback = read_playback(read(write_log(tmp_path / "wave.csv", joints), known), known)
+    assert playback.joints == JOINTS
+    np.testing.assert_allclose(playback.commands.times, [0.0, 0.1, 0.2, 0.3, 0.4], atol=1e-9)
+    np.testing.assert_array_equal(playback.commands.positions, WAVE)
+    assert playback.states is not None
+    np.testing.assert_array_equal(playback.states.positions, WAVE)
+
+
+def test_log_without_a_contract_has_no_commands(tmp_path: Path):
+    reader = read(write_log(tmp_path / "wave.csv"))
+    assert list(reader.summary().topics) == ["/joint_states"]
+    assert {each.topic for each in reader.messages()} == {"/joint_states"}
+
+
+def test_joint_of_the_contract_that_the_log_lacks_is_named(tmp_path: Path):
+    path = write_log(tmp_path / "wave.csv", JOINTS[:5])
+    with pytest.raises(RecorderError, match=r"wave\.csv:1: joint 'gripper' of /group_0/commands is missing"):
+        read(path, contract(JOINTS))
+
+
+def test_other_files_are_no_joint_logs(tmp_path: Path):
+    (descriptor,) = ibrobot_readers()
+    (tmp_path / "table.csv").write_text("a,b\n1,2\n")
+    (tmp_path / "folder").mkdir()
+    assert not descriptor.reads(tmp_path / "table.csv")
+    assert not descriptor.reads(tmp_path / "folder")
+
+
+NUMBERS = ",0,0,0,0,0,0\n"
+HEADER = header(JOINTS)
+BAD = {
+    "no joint": ("time_s,\n", "1: the header begins with 'time_s', must be time_s,JOINT,…"),
+    "joint twice": (
+        HEADER.replace("elbow_flex", "gripper"), "1: joint 'gripper' has 2 columns, must have one"
+    ),
+    "no rows": (HEADER, "1: no row follows the header, there must be at least one"),
+    "short row": (HEADER + "0" + NUMBERS + "1,0,0\n", "3: 3 values, must be 7 as in the header"),
+    "blank row": (HEADER + "0" + NUMBERS + "\n" + "1" + NUMBERS, "3: 1 values, must be 7 as in the header"),
+    "text": (HEADER + "0,0,x,0,0,0,0\n", "2: shoulder_lift is 'x', must be a number"),
+    "not finite": (HEADER + "0" + NUMBERS + "1,0,0,0,0,nan,0\n", "3: wrist_roll is nan, must be finite"),
+    "time not finite": (HEADER + "inf" + NUMBERS, "2: time_s is inf, must be finite"),
+    "time stands": (HEADER + "1" + NUMBERS + "1" + NUMBERS, "3: time_s is 1.0, must be above 1.0 of the row before"),
+    "time runs back": (HEADER + "2" + NUMBERS + "1" + NUMBERS, "3: time_s is 1.0, must be above 2.0 of the row before"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("text", "message"), BAD.values(), ids=BAD.keys())
+def test_a_log_that_does_not_fit_is_refused_with_file_and_line(tmp_path: Path, text: str, message: str):
+    path = tmp_path / "bad.csv"
+    path.write_text(text)
+    with pytest.raises(RecorderError) as refused:
+        read(path)
+    assert str(refused.value) == f"{path}:{message}"
+
+
+def test_what_a_spreadsheet_saves_can_be_read(tmp_path: Path):
+    path = tmp_path / "log.csv"
+    path.write_bytes(b"\xef\xbb\xbf" + (HEADER + "0" + NUMBERS).replace("\n", "\r\n").encode())
+    assert len(list(read(path).messages())) == 1
