@@ -23,12 +23,14 @@ nox.options.reuse_venv = "yes"
 nox.options.sessions = [
     *("lerobot", "minimums", "integration", "core", "docs", "types", "plugin", "layers", "wheels", "lint")
 ]
-# `nox` alone runs as many sessions at a time as there are cores, and prints each one's output when it ends.
-# A named session prints as it runs. `-j` says otherwise.
+# `nox` alone runs sessions side by side, one more than there are cores since tests wait too, and prints each one's
+# output when it ends. A named session prints as it runs. `-j` says otherwise.
 nox.options.allow_parallel = True
-nox.options.parallel = 1 if sys.argv[1:] else os.cpu_count()
+nox.options.parallel = 1 if sys.argv[1:] else (os.cpu_count() or 1) + 1
 # The many processes that tests start would otherwise compile what they import, each for itself.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+# More threads than one gain nothing beside other sessions: torch's and NumPy's wait for one another by spinning.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 PROJECT = nox.project.load_toml("pyproject.toml")
 FOLDERS = {
@@ -210,10 +212,14 @@ def docs(session: nox.Session) -> None:
 
 @nox.session
 def minimums(session: nox.Session) -> None:
-    """Core's and the plugins' tests with the oldest versions that they allow."""
+    """Core's and the plugins' tests with the oldest versions that they allow.
+
+    Every test runs, with few examples of Hypothesis: the search for rare ones is that of the other sessions.
+    """
     install(session, *PLUGINS, options=("--resolution=lowest-direct",))
     system_libraries(session)
-    session.run(*PYTEST, "-m", "not integration and not lerobot", "tests", "plugins", *session.posargs)
+    few = ("--hypothesis-profile=few", "-m", "not integration and not lerobot")
+    session.run(*PYTEST, *few, "tests", "plugins", *session.posargs)
 
 
 @nox.session(default=False, venv_backend="none")
