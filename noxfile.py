@@ -19,12 +19,9 @@ from packaging.requirements import Requirement
 nox.needs_version = ">=2026.8.10"
 nox.options.default_venv_backend = "uv"
 nox.options.reuse_venv = "yes"
-# The longest first, so that none is left alone at the end.
-nox.options.sessions = [
-    *("lerobot", "minimums", "integration", "core", "docs", "types", "plugin", "layers", "wheels", "lint")
-]
 # `nox` alone runs sessions side by side, one more than there are cores since tests wait too, and prints each one's
-# output when it ends. A named session prints as it runs. `-j` says otherwise.
+# output when it ends. They start in the order of this file: the longest come first, so that none is left alone at the
+# end. A named session prints as it runs. `-j` says otherwise.
 nox.options.allow_parallel = True
 nox.options.parallel = 1 if sys.argv[1:] else (os.cpu_count() or 1) + 1
 # The many processes that tests start would otherwise compile what they import, each for itself.
@@ -118,12 +115,56 @@ def list_what_was_not_tested() -> None:
         NOT_TESTED.unlink()
 
 
+def installation(page: str) -> list[str]:
+    """What the first `$ pip install` of a page's console blocks installs, and the commands after it in that block."""
+    text = Path(page).read_text(encoding="utf-8")
+    block = re.search(r"^```console\n\$ pip install \"?(ibrobot\S*?)\"?\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    if block is None:
+        raise ValueError(f"{page}: no console block begins with `$ pip install ibrobot…`")
+    return [block[1], *re.findall(r"^\$ (.*)$", block[2], re.MULTILINE)]
+
+
 @nox.session
-def lint(session: nox.Session) -> None:
-    """Style, formatting, docstrings."""
-    session.install("-c", "constraints.txt", *nox.project.dependency_groups(PROJECT, "lint"))
-    session.run("ruff", "check", "--no-cache", ".")
-    session.run("ruff", "format", "--no-cache", "--check", ".")
+def integration(session: nox.Session) -> None:
+    """What needs every plugin, or starts processes."""
+    install(session, *PLUGINS)
+    system_libraries(session)
+    session.run(*PYTEST, "-m", "integration", "tests", *session.posargs)
+
+
+@nox.session
+def minimums(session: nox.Session) -> None:
+    """Core's and the plugins' tests with the oldest versions that they allow.
+
+    Every test runs, with few examples of Hypothesis: the search for rare ones is that of the other sessions.
+    """
+    install(session, *PLUGINS, options=("--resolution=lowest-direct",))
+    system_libraries(session)
+    few = ("--hypothesis-profile=few", "-m", "not integration and not lerobot")
+    session.run(*PYTEST, *few, "tests", "plugins", *session.posargs)
+
+
+@nox.session
+def lerobot(session: nox.Session) -> None:
+    """LeRobot itself, unmodified, against what the plugins offer; the one session with torch."""
+    install(session, *PLUGINS, options=("lerobot[dataset,diffusion,feetech,smolvla,training]>=0.6.1,<0.7",))
+    system_libraries(session)
+    session.run(*PYTEST, "-m", "lerobot", "tests", *session.posargs)
+
+
+@nox.session
+def core(session: nox.Session) -> None:
+    """Core's tests with no plugin installed."""
+    install(session)
+    session.run(*PYTEST, "-m", "not integration and not lerobot", "tests", *session.posargs)
+
+
+@nox.session
+def docs(session: nox.Session) -> None:
+    """The documentation: every warning is an error, every example runs."""
+    install(session, *PLUGINS, groups=("docs", "test"))
+    session.run("sphinx-build", "-q", "-W", "--keep-going", "-n", "-b", "html", "docs", "docs/_build/html")
+    session.run("sphinx-build", "-q", "-W", "--keep-going", "-b", "doctest", "docs", "docs/_build/doctest")
 
 
 @nox.session
@@ -134,10 +175,12 @@ def types(session: nox.Session) -> None:
 
 
 @nox.session
-def layers(session: nox.Session) -> None:
-    """Which module may import which: the contracts in pyproject.toml."""
-    install(session, *PLUGINS, groups=("lint",))
-    session.run("lint-imports")
+@nox.parametrize("name", PLUGINS, ids=PLUGINS)
+def plugin(session: nox.Session, name: str) -> None:
+    """A plugin's tests with that plugin and core alone."""
+    install(session, name)
+    system_libraries(session)
+    session.run(*PYTEST, str(FOLDERS[name] / "tests"), *session.posargs)
 
 
 @nox.session
@@ -161,65 +204,19 @@ def wheels(session: nox.Session) -> None:
                 session.run(str(environment / "bin" / program), *arguments, external=True)
 
 
-def installation(page: str) -> list[str]:
-    """What the first `$ pip install` of a page's console blocks installs, and the commands after it in that block."""
-    text = Path(page).read_text(encoding="utf-8")
-    block = re.search(r"^```console\n\$ pip install \"?(ibrobot\S*?)\"?\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
-    if block is None:
-        raise ValueError(f"{page}: no console block begins with `$ pip install ibrobot…`")
-    return [block[1], *re.findall(r"^\$ (.*)$", block[2], re.MULTILINE)]
+@nox.session
+def layers(session: nox.Session) -> None:
+    """Which module may import which: the contracts in pyproject.toml."""
+    install(session, *PLUGINS, groups=("lint",))
+    session.run("lint-imports")
 
 
 @nox.session
-def core(session: nox.Session) -> None:
-    """Core's tests with no plugin installed."""
-    install(session)
-    session.run(*PYTEST, "-m", "not integration and not lerobot", "tests", *session.posargs)
-
-
-@nox.session
-@nox.parametrize("name", PLUGINS, ids=PLUGINS)
-def plugin(session: nox.Session, name: str) -> None:
-    """A plugin's tests with that plugin and core alone."""
-    install(session, name)
-    system_libraries(session)
-    session.run(*PYTEST, str(FOLDERS[name] / "tests"), *session.posargs)
-
-
-@nox.session
-def integration(session: nox.Session) -> None:
-    """What needs every plugin, or starts processes."""
-    install(session, *PLUGINS)
-    system_libraries(session)
-    session.run(*PYTEST, "-m", "integration", "tests", *session.posargs)
-
-
-@nox.session
-def lerobot(session: nox.Session) -> None:
-    """LeRobot itself, unmodified, against what the plugins offer; the one session with torch."""
-    install(session, *PLUGINS, options=("lerobot[dataset,diffusion,feetech,smolvla,training]>=0.6.1,<0.7",))
-    system_libraries(session)
-    session.run(*PYTEST, "-m", "lerobot", "tests", *session.posargs)
-
-
-@nox.session
-def docs(session: nox.Session) -> None:
-    """The documentation: every warning is an error, every example runs."""
-    install(session, *PLUGINS, groups=("docs", "test"))
-    session.run("sphinx-build", "-q", "-W", "--keep-going", "-n", "-b", "html", "docs", "docs/_build/html")
-    session.run("sphinx-build", "-q", "-W", "--keep-going", "-b", "doctest", "docs", "docs/_build/doctest")
-
-
-@nox.session
-def minimums(session: nox.Session) -> None:
-    """Core's and the plugins' tests with the oldest versions that they allow.
-
-    Every test runs, with few examples of Hypothesis: the search for rare ones is that of the other sessions.
-    """
-    install(session, *PLUGINS, options=("--resolution=lowest-direct",))
-    system_libraries(session)
-    few = ("--hypothesis-profile=few", "-m", "not integration and not lerobot")
-    session.run(*PYTEST, *few, "tests", "plugins", *session.posargs)
+def lint(session: nox.Session) -> None:
+    """Style, formatting, docstrings."""
+    session.install("-c", "constraints.txt", *nox.project.dependency_groups(PROJECT, "lint"))
+    session.run("ruff", "check", "--no-cache", ".")
+    session.run("ruff", "format", "--no-cache", "--check", ".")
 
 
 @nox.session(default=False, venv_backend="none")
