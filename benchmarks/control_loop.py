@@ -21,12 +21,12 @@ from pathlib import Path
 from typing import Any
 
 from ibrobot_core.clock import RealClock
-from ibrobot_core.config import load
+from ibrobot_core.config import load_config
 from ibrobot_core.control.realtime import go_real_time
 from ibrobot_core.control.timing import Punctuality
 from ibrobot_core.launch.runtime import Runtime
 from ibrobot_core.launch.session import Request, Session
-from ibrobot_core.plugins import installed
+from ibrobot_core.plugins import installed_plugins
 from ibrobot_core.units import ns
 
 CONFIG = Path(__file__).parents[1] / "configs" / "so101.yaml"
@@ -53,7 +53,7 @@ def bare(seconds: float, period_ns: int, priority: int) -> dict[str, Any]:
 
 def system(seconds: float, *, busy: bool) -> dict[str, Any]:
     """A run as `ibrobot launch` makes it."""
-    runtime = Runtime(Session(load(CONFIG, sim=True), installed(), Request(duration_s=seconds)))
+    runtime = Runtime(Session(load_config(CONFIG, sim=True), installed_plugins(), Request(duration_s=seconds)))
     end = threading.Event()
     thread = threading.Thread(target=_count, args=(end,), daemon=True)
     runtime.start()
@@ -124,7 +124,7 @@ def main() -> int:
     if arguments.only is None:
         return compare(arguments.repetitions, arguments.seconds)
     if arguments.only == "bare":
-        control = load(CONFIG, sim=True).control
+        control = load_config(CONFIG, sim=True).control
         result = bare(arguments.seconds, ns(1.0 / control.rate_hz), control.priority)
     else:
         result = system(arguments.seconds, busy=arguments.only == "busy")

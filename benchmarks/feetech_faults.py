@@ -43,7 +43,7 @@ from ibrobot_core.control.build import build_core
 from ibrobot_core.control.link import PlanRecord
 from ibrobot_core.errors import TeleopError
 from ibrobot_core.interfaces import Context, JointReading, Teleop
-from ibrobot_core.plugins import installed
+from ibrobot_core.plugins import installed_plugins
 from ibrobot_core.units import NS_PER_S
 
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
@@ -161,11 +161,11 @@ class Bench:
         self.keys: queue.SimpleQueue[str] = queue.SimpleQueue()
         self.chance = np.random.default_rng(seed)
         self.said = Said()
-        self.core = build_core(config, installed(), clock, seed)
+        self.core = build_core(config, installed_plugins(), clock, seed)
         self._max_lead = config.robot.max_lead
         component = config.teleoperation["leader"]
         ctx = Context("leader", clock, logging.getLogger("ibrobot.leader"), config.robot, keys=lambda: self.keys)
-        self.device: Teleop = installed().find("teleop", component.type).make(component.options, ctx)
+        self.device: Teleop = installed_plugins().find("teleop", component.type).make(component.options, ctx)
         self._lost = False
         self._before: NDArray[np.float64] | None = None
         self._still: NDArray[np.float64] | None = None

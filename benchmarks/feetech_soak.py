@@ -27,7 +27,7 @@ from ibrobot_core.clock import SteppedClock
 from ibrobot_core.config import from_document
 from ibrobot_core.control.build import build_core
 from ibrobot_core.control.link import PlanRecord
-from ibrobot_core.plugins import installed
+from ibrobot_core.plugins import installed_plugins
 from ibrobot_core.units import NS_PER_S
 
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
@@ -68,7 +68,7 @@ def main() -> int:
             servo.set("max_position_limit", 3100)
         file = save_calibration(calibration, Path(folder) / "arm.json")
         config = from_document(document(emulator.port, file), source=Path("soak.yaml"), sim=False)
-        core = build_core(config, installed(), clock, 0)
+        core = build_core(config, installed_plugins(), clock, 0)
         core.start("follow")
         emulator.faults.corrupt, emulator.faults.drop = arguments.corrupt, arguments.drop
         ticks = round(arguments.seconds * 1e9 / core.period_ns)

@@ -40,14 +40,14 @@ from ibrobot_serve.service import InferenceService
 from ibrobot_testing import host_context
 from made_up import plugin
 
-from ibrobot_core.config import load
+from ibrobot_core.config import load_config
 from ibrobot_core.inference.client import DispatchInfer, EngineClient
 from ibrobot_core.inference.engine import Engine
 from ibrobot_core.inference.process import ProcessEngine
 from ibrobot_core.inference.remote import RemoteEngine
-from ibrobot_core.inference.wire import Kind, Message, encode
+from ibrobot_core.inference.wire import WireKind, WireMessage, encode
 from ibrobot_core.interfaces import Frame, Transport
-from ibrobot_core.plugins import installed
+from ibrobot_core.plugins import installed_plugins
 
 PLUGIN = '''
 import numpy as np
@@ -210,7 +210,7 @@ def echo(port: int, certificates: Path | None) -> None:
 def floor(pictures: np.ndarray, count: int, pause_s: float, certificates: Path | None = None) -> dict[str, Any]:
     """A plain socket, or one with TLS."""
     tensors = {"state": STATE, "top": pictures[0], "wrist": pictures[1]}
-    frame = bytes(encode(Message(Kind.REQUEST, 1, tensors)))
+    frame = bytes(encode(WireMessage(WireKind.REQUEST, 1, tensors)))
     buffer = memoryview(bytearray(1 << 20))
     port = free_port()
     with started("--echo", str(port), *told(certificates)) as pid:
@@ -229,7 +229,7 @@ def floor(pictures: np.ndarray, count: int, pause_s: float, certificates: Path |
 
 def transport(**options: Any) -> Transport:
     """One of type zenoh."""
-    descriptor = installed().find("transport", "zenoh")
+    descriptor = installed_plugins().find("transport", "zenoh")
     made: Transport = descriptor.make(descriptor.options(**options), host_context())
     return made
 
@@ -248,7 +248,7 @@ def tls(folder: Path | None, machine: str) -> dict[str, Any]:
 
 def serve(endpoint: str, certificates: Path | None) -> None:
     """The server, until its standard input ends."""
-    null = installed().find("policy", "null").make(None, host_context())
+    null = installed_plugins().find("policy", "null").make(None, host_context())
     network = transport(mode="router", listen=(endpoint,), **tls(certificates, "localhost"))
     service = InferenceService(null, network, "null")
     service.start()
@@ -265,7 +265,7 @@ def through(
     with ExitStack() as stack:
         stack.callback(engine.close)
         engine.start()
-        client = EngineClient(installed().find("policy", "null").make(None, host_context()), engine)
+        client = EngineClient(installed_plugins().find("policy", "null").make(None, host_context()), engine)
         stack.callback(client.close)
         return measure(asking(client, pictures), other(), count, pause_s)
 
@@ -278,7 +278,7 @@ def over_zenoh(
     with started("--serve", endpoint, *told(certificates)) as pid:
         network = transport(connect=(endpoint,), shared_memory=shared, **tls(certificates, "robot"))
         try:
-            null = installed().find("policy", "null").make(None, host_context())
+            null = installed_plugins().find("policy", "null").make(None, host_context())
             return through(RemoteEngine(null, network, "null", "robot"), lambda: pid, pictures, count, pause_s)
         finally:
             network.close()
@@ -287,8 +287,8 @@ def over_zenoh(
 def in_process(pictures: np.ndarray, count: int, pause_s: float, folder: Path) -> dict[str, Any]:
     """Execution mode process."""
     (folder / "mini.yaml").write_text(ROBOT)
-    config = load(folder / "mini.yaml", sim=True)
-    fingerprint = installed().find("policy", "null").make(None, host_context(robot=config.robot)).fingerprint()
+    config = load_config(folder / "mini.yaml", sim=True)
+    fingerprint = installed_plugins().find("policy", "null").make(None, host_context(robot=config.robot)).fingerprint()
     engine = ProcessEngine(config, "null", fingerprint)
     return through(engine, lambda: engine.pid or 0, pictures, count, pause_s)
 

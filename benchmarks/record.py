@@ -26,7 +26,7 @@ import attrs
 import numpy as np
 import yaml
 
-from ibrobot_core.config import load
+from ibrobot_core.config import load_config
 from ibrobot_core.descriptors import SensorDescriptor
 from ibrobot_core.interfaces import Context, Sensor
 from ibrobot_core.launch.runtime import Runtime
@@ -89,7 +89,7 @@ def run(seconds: float, root: Path | None) -> dict[str, Any]:
         path = Path(folder) / "so101.yaml"
         path.write_text(yaml.safe_dump(document, sort_keys=False))
         found = registry()
-        runtime = Runtime(Session(load(path, sim=True, registry=found), found, Request(duration_s=seconds)))
+        runtime = Runtime(Session(load_config(path, sim=True, registry=found), found, Request(duration_s=seconds)))
         runtime.start()
         try:
             while not runtime.wait(0.2):

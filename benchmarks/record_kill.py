@@ -31,7 +31,7 @@ from ibrobot_core.config.schema import Align, ImageSpec
 from ibrobot_core.contract.specs import ActionPart, Contract, ObservationPart
 from ibrobot_core.interfaces import EpisodeStart, Feature
 from ibrobot_core.messages import Float64MultiArray, Header, Image, JointState
-from ibrobot_core.plugins import installed
+from ibrobot_core.plugins import installed_plugins
 
 JOINTS, CAMERA, COMMANDS = "/joint_states", "/camera/top/image_raw", "/commands"
 SIZE = 320 * 240 * 3
@@ -60,7 +60,7 @@ def picture(index: int) -> np.ndarray:
 
 def record(directory: Path, compression: str) -> None:
     """Record until killed, and print the stamp [ns] of every joint state that was handed over."""
-    descriptor = installed().find("recorder", "mcap")
+    descriptor = installed_plugins().find("recorder", "mcap")
     clock = RealClock()
     recorder = descriptor.make(descriptor.options(compression=compression), host_context(clock=clock))
     start_ns = clock.now_ns()
@@ -141,7 +141,7 @@ def ibrobot(*arguments: object) -> list[str]:
 
 def read(path: Path) -> Iterator[tuple[str, int]]:
     """Topic and number of each message that is as it was written."""
-    reader = installed().open_episode(path)
+    reader = installed_plugins().open_episode(path)
     for item in reader.messages():
         message = item.message
         if isinstance(message, JointState) and message.position.tolist() == [float(message.header.stamp_ns)]:

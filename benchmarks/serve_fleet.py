@@ -51,7 +51,7 @@ from ibrobot_core.inference.remote import RemoteEngine
 from ibrobot_core.interfaces import Frame, Tensors, Transport
 from ibrobot_core.messages import Header, JointState
 from ibrobot_core.options import NoOptions
-from ibrobot_core.plugins import installed
+from ibrobot_core.plugins import installed_plugins
 from ibrobot_core.robot import Vector
 
 MODEL_S, CHUNK, RATE_HZ = 0.02, 50, 30.0
@@ -97,7 +97,7 @@ class TwentyMilliseconds(FakePolicy):
 
 def transport(**options: Any) -> Transport:
     """One of type zenoh."""
-    descriptor = installed().find("transport", "zenoh")
+    descriptor = installed_plugins().find("transport", "zenoh")
     made: Transport = descriptor.make(descriptor.options(**options), host_context())
     return made
 

@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from made_up import plugin
 
-from ibrobot_core.config import load
+from ibrobot_core.config import load_config
 from ibrobot_core.launch.runtime import Runtime
 from ibrobot_core.launch.session import Request, Session
 from ibrobot_core.plugins import discover
@@ -200,7 +200,7 @@ def run(kills: int, slack_s: float, folder: Path) -> int:
     theirs = [entry for found in distributions() for entry in found.entry_points if entry.group == "ibrobot"]
     registry = discover([entry for entry in (*theirs, *mine)])
     server = Server(folder, endpoint)
-    runtime = Runtime(Session(load(folder / "mini.yaml", sim=True, registry=registry), registry, Request()))
+    runtime = Runtime(Session(load_config(folder / "mini.yaml", sim=True, registry=registry), registry, Request()))
     session = runtime.session
     known, held, resumed, grown = [], [], [], []
     try:

@@ -24,7 +24,7 @@ from flow_policy import FlowPolicy
 
 from ibrobot_core.bus import Bus
 from ibrobot_core.clock import SteppedClock
-from ibrobot_core.config import RobotConfig, load
+from ibrobot_core.config import RobotConfig, load_config
 from ibrobot_core.config.schema import Dispatch
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.control.host import InlineControl
@@ -34,7 +34,7 @@ from ibrobot_core.inference.client import Chunk, DispatchInfer, InferenceClient,
 from ibrobot_core.inference.engine import LocalEngine
 from ibrobot_core.interfaces import Policy
 from ibrobot_core.messages import Header, JointState
-from ibrobot_core.plugins import installed
+from ibrobot_core.plugins import installed_plugins
 from ibrobot_core.robot import Vector
 from ibrobot_core.units import NS_PER_S, ns
 
@@ -103,7 +103,7 @@ class Arm:
         self._seed = seed
         self.clock = SteppedClock(0)
         self.bus = Bus(self.clock)
-        self.control = InlineControl(config, installed(), self.clock, seed, self._publish, lambda _: None)
+        self.control = InlineControl(config, installed_plugins(), self.clock, seed, self._publish, lambda _: None)
         self.contract = Contract.from_config(config)
         policy = FlowPolicy(config.robot, self.contract.rate_hz, chunk, seed)
         outage = range(ns(OUTAGE_AT_S), ns(OUTAGE_AT_S + OUTAGE_S))
@@ -203,7 +203,7 @@ def main() -> int:
     parser.add_argument("--chunk", type=int, nargs="+", default=[50, 100], help="actions in a chunk")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
-    config = load(CONFIG, sim=True)
+    config = load_config(CONFIG, sim=True)
     results = []
     for chunk, latency_ms, strategy in product(arguments.chunk, LATENCIES_MS, STRATEGIES):
         results.append(measure(config, strategy, latency_ms, chunk, arguments.duration, arguments.seed))

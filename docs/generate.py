@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import click
+from api_page import api_page
 from option_pages import config_page, options_page
 from plugin_index import plugin_page
 
@@ -39,9 +40,15 @@ def cli_page() -> Iterator[str]:
 
 def write(directory: Path) -> None:
     """Write all generated pages into `directory`; a page that is the same is left alone."""
-    pages = {"config.md": config_page, "options.md": options_page, "plugins.md": plugin_page, "cli.md": cli_page}
+    pages = {
+        "config.md": config_page,
+        "options.md": options_page,
+        "plugins.md": plugin_page,
+        "cli.md": cli_page,
+        "api.md": api_page,
+    }
     for name, page in pages.items():
         text = "\n".join(page()) + "\n"
-        path = directory / name
+        path = directory / f"{name}.md"
         if not path.exists() or path.read_text() != text:
             path.write_text(text)

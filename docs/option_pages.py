@@ -12,7 +12,7 @@ from ibrobot_core.config.convert import is_mapping, is_sequence
 from ibrobot_core.config.describe import described
 from ibrobot_core.config.schema import SECTIONS, Component
 from ibrobot_core.options import fields
-from ibrobot_core.plugins import KINDS, installed
+from ibrobot_core.plugins import KINDS, installed_plugins
 
 
 def config_page() -> Iterator[str]:
@@ -37,7 +37,7 @@ def config_page() -> Iterator[str]:
 
 def options_page() -> Iterator[str]:
     """Lines of the page on the options of plugins."""
-    registry = installed()
+    registry = installed_plugins()
     yield "# Options of plugins\n"
     yield "The options of every type that core and the plugins of the repository offer. For the types installed on your"
     yield "machine, `ibrobot plugins show TYPE` prints them.\n"
@@ -71,7 +71,7 @@ def _class_lines(path: str, kind: type[Any], shown: set[type]) -> Iterator[str]:
 
 
 def _types(kind: type[Component]) -> Iterator[str]:
-    registry = installed()
+    registry = installed_plugins()
     found = [registry.find(kind.plugin_kind, type_) for type_ in registry.types(kind.plugin_kind)]
     links = [f"[`{each.type}`](#{_options_anchor(kind.plugin_kind, each.type)})" for each in found if kind.takes(each)]
     yield f"`type` is one of {', '.join(links)}, each with options of its own.\n"

@@ -8,14 +8,14 @@ from typing import Any
 
 import pluggy
 
-from ibrobot_core.plugins import KINDS, installed
+from ibrobot_core.plugins import KINDS, installed_plugins
 
 CORE = "ibrobot-core"
 
 
 def plugin_page() -> Iterator[str]:
     """Lines of the page: core first, then every installed plugin by its package's name."""
-    managers = installed().managers
+    managers = installed_plugins().managers
     packages = {point.name: point.dist.name for point in entry_points(group="ibrobot") if point.dist is not None}
     shown = sorted((packages.get(name, CORE), name) for name in managers)
     shown.sort(key=lambda pair: pair[0] != CORE)

@@ -20,15 +20,15 @@ from ibrobot_core.units import TICKS_PER_TURN
 
 VERSION = 2
 """Of the companion file. Version 1 did not say where 0 rad is: it was the pose."""
-POSE, RANGE = "pose", "range"
+ZERO_AT_POSE, ZERO_AT_RANGE = "pose", "range"
 ZERO_AT: Mapping[str, str] = {
-    POSE: "the pose that was set by hand at calibration (tick 2048)",
-    RANGE: "the middle of each joint's calibrated range, as in LeRobot",
+    ZERO_AT_POSE: "the pose that was set by hand at calibration (tick 2048)",
+    ZERO_AT_RANGE: "the middle of each joint's calibrated range, as in LeRobot",
 }
 """Where a joint is at 0 rad, and what that means."""
-MAX_OFFSET = 2047
+MAX_HOMING_OFFSET = 2047
 """Greatest homing offset that a servo can keep: sign and 11 bits."""
-MIDDLE = TICKS_PER_TURN // 2
+MIDDLE_TICK = TICKS_PER_TURN // 2
 _LAST = TICKS_PER_TURN - 1
 
 
@@ -46,7 +46,7 @@ class JointCalibration:
     """Least reported position [ticks], 0 to 4094."""
     range_max: int
     """Greatest reported position [ticks], above `range_min`, at most 4095."""
-    zero_at: str = POSE
+    zero_at: str = ZERO_AT_POSE
     """Where it is at 0 rad: one of `ZERO_AT`. LeRobot's files do not have it."""
 
     def __attrs_post_init__(self) -> None:
@@ -59,11 +59,11 @@ class JointCalibration:
             raise ValueError(f"id: must be 0 to 253, not {self.id}")
         if self.drive_mode not in (0, 1):
             raise ValueError(f"drive_mode: must be 0 or 1, not {self.drive_mode}")
-        if abs(self.homing_offset) > MAX_OFFSET:
+        if abs(self.homing_offset) > MAX_HOMING_OFFSET:
             raise ValueError(
-                f"homing_offset: must be -{MAX_OFFSET} to {MAX_OFFSET}, not {self.homing_offset}; the servo's horn "
-                "sits so that the joint's middle is at the encoder's end (0/4095): mount it half a turn on, "
-                "and re-run the calibration"
+                f"homing_offset: must be -{MAX_HOMING_OFFSET} to {MAX_HOMING_OFFSET}, not {self.homing_offset}; "
+                "the servo's horn sits so that the joint's middle is at the encoder's end (0/4095): "
+                "mount it half a turn on, and re-run the calibration"
             )
         for name in ("range_min", "range_max"):
             if not 0 <= getattr(self, name) <= _LAST:
@@ -96,7 +96,7 @@ class JointCalibration:
                 closed end is at `range_min`, or at `range_max` where inverted.
         """
         if lower is None:
-            return float(MIDDLE) if self.zero_at == POSE else self.range_middle
+            return float(MIDDLE_TICK) if self.zero_at == ZERO_AT_POSE else self.range_middle
         ticks = lower * TICKS_PER_TURN / (2 * math.pi)
         return self.range_max + ticks if self.inverted else self.range_min - ticks
 
@@ -134,7 +134,7 @@ class Calibration:
     @property
     def zero_at(self) -> str:
         """Where its joints are at 0 rad: one of `ZERO_AT`."""
-        return next((joint.zero_at for joint in self.joints.values()), POSE)
+        return next((joint.zero_at for joint in self.joints.values()), ZERO_AT_POSE)
 
     def with_zero_at(self, zero_at: str) -> Calibration:
         """The same calibration with 0 rad elsewhere."""
@@ -205,7 +205,7 @@ def load_calibration(
         calibration = Calibration(found, path=path)
     except ValueError as error:
         raise CalibrationError(f"{path}: {error}") from None
-    calibration = calibration.with_zero_at(POSE if numbered else RANGE)
+    calibration = calibration.with_zero_at(ZERO_AT_POSE if numbered else ZERO_AT_RANGE)
     loaded = _with_meta(calibration, path, tool, any_numbers=zero_at is not None)
     return loaded if zero_at is None else loaded.with_zero_at(zero_at)
 
@@ -312,7 +312,7 @@ def _with_meta(calibration: Calibration, path: Path, tool: str | None, *, any_nu
     if not isinstance(meta, dict) or meta.get("version") not in (1, VERSION):
         found = meta.get("version") if isinstance(meta, dict) else meta
         raise CalibrationError(f"{companion}: version: must be 1 or {VERSION}, not {found!r}")
-    zero_at = POSE if meta["version"] == 1 else str(meta.get("zero_at"))
+    zero_at = ZERO_AT_POSE if meta["version"] == 1 else str(meta.get("zero_at"))
     if zero_at not in ZERO_AT:
         raise CalibrationError(f"{companion}: zero_at: must be one of {', '.join(ZERO_AT)}, not {zero_at!r}")
     if meta.get("sha256") != calibration.fingerprint() and not any_numbers:

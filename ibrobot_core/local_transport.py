@@ -10,7 +10,7 @@ from typing import override
 import attrs
 
 from ibrobot_core.errors import TransportError
-from ibrobot_core.interfaces.transport import WORKERS, Handler, Payload, Transport
+from ibrobot_core.interfaces.transport import HANDLER_THREADS, Handler, Payload, Transport
 from ibrobot_core.workers import Workers
 
 
@@ -50,7 +50,7 @@ class LocalTransport(Transport):
         return lambda: self._end(self._subscribers, topic, subscriber)
 
     @override
-    def serve(self, name: str, handler: Handler, *, workers: int = WORKERS) -> Callable[[], None]:
+    def serve(self, name: str, handler: Handler, *, workers: int = HANDLER_THREADS) -> Callable[[], None]:
         def answer(request: _Request) -> None:
             try:
                 request.answer.put(handler(request.payload, None))

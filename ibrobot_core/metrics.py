@@ -94,7 +94,7 @@ def _number(value: float) -> str:
 
 
 @attrs.frozen(eq=False)
-class Probes:
+class MetricsProbes:
     """What is asked over HTTP. Each is called in the server's thread."""
 
     collect: Callable[[Metrics], object]
@@ -116,7 +116,7 @@ class MetricsServer:
         IbrobotError: when the port cannot be had.
     """
 
-    def __init__(self, port: int, probes: Probes) -> None:
+    def __init__(self, port: int, probes: MetricsProbes) -> None:
         handler = type("Handler", (_Handler,), {"probes": probes})
         try:
             self._server = _Server((_HOST, port), handler)
@@ -148,7 +148,7 @@ class _Server(HTTPServer):
 class _Handler(BaseHTTPRequestHandler):
     """One request; then the connection ends."""
 
-    probes: Probes
+    probes: MetricsProbes
     server_version, sys_version = "ibrobot", ""
     timeout = _REQUEST_S
     """Of each read and write; a client that sends a byte now and then meets the timer."""

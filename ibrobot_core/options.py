@@ -25,7 +25,7 @@ class OptionFault:
     message: str
 
 
-def hint(word: str, known: Sequence[str], what: str) -> str:
+def did_you_mean(word: str, known: Sequence[str], what: str) -> str:
     """What should have stood for `word`: the nearest of `known`, or all of them."""
     close = get_close_matches(word, known, 1)
     return f", did you mean {close[0]!r}?" if close else f"; {what}: {', '.join(known) or 'none'}"
@@ -35,7 +35,7 @@ def unknown_names(option: str, names: Sequence[str], known: Sequence[str], what:
     """A fault for each of the names in a list option that is not among the known ones, e.g. of joints."""
     for i, name in enumerate(names):
         if name not in known:
-            yield OptionFault((option, i), f"unknown {what} {name!r}{hint(name, known, 'known')}")
+            yield OptionFault((option, i), f"unknown {what} {name!r}{did_you_mean(name, known, 'known')}")
 
 
 HIDDEN = "***"

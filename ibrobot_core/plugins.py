@@ -210,7 +210,7 @@ def official_plugins() -> Mapping[str, Mapping[str, list[str]]]:
     return found
 
 
-def example(kind: str) -> str:
+def example_type(kind: str) -> str:
     """A type of a kind to show in a message: this project's own default, installed or not."""
     return next(offers[kind][0] for offers in official_plugins().values() if kind in offers.get("default", ()))
 
@@ -309,6 +309,6 @@ def discover(found: Iterable[EntryPoint] | None = None) -> Registry:
 
 
 @cache
-def installed() -> Registry:
+def installed_plugins() -> Registry:
     """The registry of the installed plugins, discovered once per process."""
     return discover()

@@ -21,6 +21,6 @@ class Screen(Console):
         return super().render_str(printable(text), **{**options, "markup": False, "emoji": False})
 
 
-def text(value: object, style: str = "", **options: Any) -> Text:
+def styled(value: object, style: str = "", **options: Any) -> Text:
     """A text with a style, and otherwise as it is; `options` are those of Rich's `Text`."""
     return Text(printable(str(value)), style, **options)

@@ -94,7 +94,7 @@ def _sequence_key(console: str, parameters: str, last: str, application: str) ->
     return [key] if key else []
 
 
-class Keys:
+class KeyReader:
     """Reads keys from a terminal while open, and gives each to every subscriber.
 
     The terminal shows no typed characters meanwhile; Ctrl-C and its like remain signals. Use it as a context manager:
@@ -149,7 +149,7 @@ class Keys:
             self._subscribers.add(subscriber)
         return subscriber
 
-    def __enter__(self) -> Keys:
+    def __enter__(self) -> KeyReader:
         self.open()
         return self
 

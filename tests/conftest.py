@@ -12,7 +12,7 @@ import attrs
 import pytest
 
 from ibrobot_core import outside
-from ibrobot_core.plugins import installed
+from ibrobot_core.plugins import installed_plugins
 
 
 @pytest.fixture(autouse=True)
@@ -47,13 +47,13 @@ class Site:
 
 @pytest.fixture
 def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
-    """An empty site, seen by this process and by those that it starts; `installed()` is discovered anew."""
+    """An empty site, seen by this process and by those that it starts; `installed_plugins()` discovers again."""
     made = Site(tmp_path / "site")
     made.folder.mkdir()
     monkeypatch.syspath_prepend(str(made.folder))
     monkeypatch.setenv("PYTHONPATH", str(made.folder))
-    installed.cache_clear()
+    installed_plugins.cache_clear()
     yield made
-    installed.cache_clear()
+    installed_plugins.cache_clear()
     for module in made.modules:
         sys.modules.pop(module, None)

@@ -15,7 +15,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from ibrobot_core import metrics as module
 from ibrobot_core.errors import IbrobotError
-from ibrobot_core.metrics import Metrics, MetricsServer, Probes
+from ibrobot_core.metrics import Metrics, MetricsProbes, MetricsServer
 
 TEXTS = st.text(st.characters(codec="utf-8"), max_size=60)
 HOSTILE = 'a"} 1\nibrobot_forged{x="\\'
@@ -94,7 +94,7 @@ def state() -> State:
 
 @pytest.fixture
 def server(state: State) -> Iterator[MetricsServer]:
-    made = MetricsServer(0, Probes(state.collect, lambda: state.unhealthy, lambda: state.unready))
+    made = MetricsServer(0, MetricsProbes(state.collect, lambda: state.unhealthy, lambda: state.unready))
     yield made
     made.close()
 
@@ -184,4 +184,4 @@ def test_it_listens_on_this_machine_alone_and_a_port_that_is_taken_is_named(serv
     with pytest.raises(
         IbrobotError, match=rf"port {port(server)} of 127\.0\.0\.1 cannot be had: Address already in use"
     ):
-        MetricsServer(port(server), Probes(lambda metrics: None, str, str))
+        MetricsServer(port(server), MetricsProbes(lambda metrics: None, str, str))

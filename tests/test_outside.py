@@ -18,7 +18,7 @@ from rich.table import Table
 from ibrobot_core import outside
 from ibrobot_core.cli import serve
 from ibrobot_core.outside import LogFormatter, echo, printable
-from ibrobot_core.screen import Screen, text
+from ibrobot_core.screen import Screen, styled
 
 ROOT = Path(__file__).parents[1]
 HOSTILE = st.lists(
@@ -61,8 +61,8 @@ def test_a_table_shows_markup_as_it_is(hostile: str):
     table = Table(title=hostile)
     table.add_column(hostile)
     table.add_row(hostile)
-    table.add_row(text(hostile, "red"))
-    shown = rendered(table, hostile, text(hostile))
+    table.add_row(styled(hostile, "red"))
+    shown = rendered(table, hostile, styled(hostile))
     assert not UNPRINTABLE.search(shown)
     assert shown.count("[/x]") >= hostile.count("[/x]")
 
@@ -70,7 +70,7 @@ def test_a_table_shows_markup_as_it_is(hostile: str):
 def test_markup_is_shown_literally():
     table = Table(title="[b]title[/x]")
     table.add_row("[/x] :warning:")
-    shown = rendered(table, "[red]plain", text("[red]styled"))
+    shown = rendered(table, "[red]plain", styled("[red]styled"))
     assert all(each in shown for each in ("[b]title[/x]", "[/x] :warning:", "[red]plain", "[red]styled"))
 
 

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ibrobot_core.errors import TeleopError
-from ibrobot_core.terminal import Keys, decode
+from ibrobot_core.terminal import KeyReader, decode
 
 TIMEOUT_S = 30
 
@@ -104,7 +104,7 @@ def terminal() -> Iterator[tuple[int, int]]:
 
 def test_what_is_typed_reaches_every_subscriber(terminal):
     person, program = terminal
-    with Keys(program) as keys:
+    with KeyReader(program) as keys:
         first, second = keys.subscribe(), keys.subscribe()
         os.write(person, b"w\x1b[A \x1bOP")
         for subscriber in (first, second):
@@ -113,7 +113,7 @@ def test_what_is_typed_reaches_every_subscriber(terminal):
 
 def test_a_lone_escape_comes_without_a_further_key(terminal):
     person, program = terminal
-    with Keys(program) as keys:
+    with KeyReader(program) as keys:
         subscriber = keys.subscribe()
         os.write(person, b"\x1b")
         assert subscriber.get(timeout=TIMEOUT_S) == "esc"
@@ -121,7 +121,7 @@ def test_a_lone_escape_comes_without_a_further_key(terminal):
 
 def test_later_subscribers_get_later_keys_only(terminal):
     person, program = terminal
-    with Keys(program) as keys:
+    with KeyReader(program) as keys:
         first = keys.subscribe()
         os.write(person, b"a")
         assert first.get(timeout=TIMEOUT_S) == "a"
@@ -132,7 +132,7 @@ def test_later_subscribers_get_later_keys_only(terminal):
 
 def test_a_queue_that_nobody_keeps_is_fed_no_more(terminal):
     _, program = terminal
-    keys = Keys(program)
+    keys = KeyReader(program)
     subscriber = weakref.ref(keys.subscribe())
     gc.collect()
     assert subscriber() is None
@@ -142,7 +142,7 @@ def test_keys_come_unechoed_without_enter_and_the_terminal_is_restored(terminal)
     _, program = terminal
     before = termios.tcgetattr(program)
     threads = threading.active_count()
-    keys = Keys(program)
+    keys = KeyReader(program)
 
     def fail_while_open() -> None:
         with keys:
@@ -160,7 +160,7 @@ def test_keys_come_unechoed_without_enter_and_the_terminal_is_restored(terminal)
 
 def test_it_can_be_opened_again(terminal):
     person, program = terminal
-    keys = Keys(program)
+    keys = KeyReader(program)
     subscriber = keys.subscribe()
     for character in "ab":
         with keys:
@@ -171,7 +171,7 @@ def test_it_can_be_opened_again(terminal):
 def test_a_terminal_that_goes_away_ends_quietly():
     person, program = os.openpty()
     try:
-        with Keys(program):
+        with KeyReader(program):
             os.close(person)
     finally:
         os.close(program)
@@ -181,7 +181,7 @@ def test_without_a_terminal_it_says_what_to_do():
     out, into = os.pipe()
     try:
         with pytest.raises(TeleopError, match="need a terminal, but standard input is none: start it in one"):
-            Keys(out).open()
+            KeyReader(out).open()
     finally:
         os.close(out)
         os.close(into)

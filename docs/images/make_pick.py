@@ -12,7 +12,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from ibrobot_core.plugins import installed
+from ibrobot_core.plugins import installed_plugins
 
 SIZE = (480, 360)
 TOPIC = "/camera/front/image_raw"
@@ -35,7 +35,7 @@ def main() -> None:
         settings = [f"peripherals=[{CAMERA}]", "recording={type: mcap, topics: all}"]
         overrides = [word for setting in settings for word in ("--set", setting)]
         subprocess.run([*command, *overrides, "--episodes", "1", "--root", folder, "--dataset", "pick"], check=True)
-        reader = installed().open_episode(Path(folder) / "pick/episodes/episode_000001")
+        reader = installed_plugins().open_episode(Path(folder) / "pick/episodes/episode_000001")
         images = [Image.frombytes("RGB", SIZE, bytes(item.message.data)) for item in reader.messages({TOPIC})][::KEPT]
         reader.close()
     out = Path(__file__).with_name("pick.webp")

@@ -42,15 +42,15 @@ def check(
     config: str | None, sim: bool, overrides: tuple[str, ...], mode: str | None, as_json: bool, deep: bool
 ) -> None:  # fmt: skip
     """Tell everything that is wrong with CONFIG; exit 2 if anything is."""
-    from ibrobot_core.config import find_config, load
+    from ibrobot_core.config import find_config, load_config
     from ibrobot_core.launch.models import check_contract, check_models
-    from ibrobot_core.plugins import installed
+    from ibrobot_core.plugins import installed_plugins
 
     try:
-        path = find_config(config, installed())
-        found = load(path, overrides=overrides, mode=mode, sim=sim)
+        path = find_config(config, installed_plugins())
+        found = load_config(path, overrides=overrides, mode=mode, sim=sim)
         check_contract(found)
-        models = check_models(found, installed(), found.control_modes) if deep else []
+        models = check_models(found, installed_plugins(), found.control_modes) if deep else []
     except ConfigError as error:
         if not as_json:
             raise
@@ -71,11 +71,11 @@ def check(
 @config_options
 def show(config: str | None, sim: bool, overrides: tuple[str, ...], mode: str | None) -> None:
     """Print what a run of CONFIG would use, every default filled in, as a YAML that loads again."""
-    from ibrobot_core.config import find_config, load
+    from ibrobot_core.config import find_config, load_config
     from ibrobot_core.config.show import to_yaml
-    from ibrobot_core.plugins import installed
+    from ibrobot_core.plugins import installed_plugins
 
-    found = load(find_config(config, installed()), overrides=overrides, mode=mode, sim=sim)
+    found = load_config(find_config(config, installed_plugins()), overrides=overrides, mode=mode, sim=sim)
     echo(to_yaml(found), nl=False)
 
 
@@ -83,6 +83,6 @@ def show(config: str | None, sim: bool, overrides: tuple[str, ...], mode: str | 
 def schema() -> None:
     """Print a JSON Schema of robot YAMLs for editors, with the options of every installed plugin."""
     from ibrobot_core.config.jsonschema import json_schema
-    from ibrobot_core.plugins import installed
+    from ibrobot_core.plugins import installed_plugins
 
-    echo(json.dumps(json_schema(installed()), indent=2))
+    echo(json.dumps(json_schema(installed_plugins()), indent=2))

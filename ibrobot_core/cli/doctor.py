@@ -14,7 +14,7 @@ import click
 
 from ibrobot_core.descriptors import Check
 from ibrobot_core.outside import echo
-from ibrobot_core.plugins import Registry, installed
+from ibrobot_core.plugins import Registry, installed_plugins
 
 MINIMUM_PYTHON = (3, 12)
 LEAST_FREE_BYTES = 2_000_000_000
@@ -34,7 +34,7 @@ class Finding:
 @click.option("--json", "as_json", is_flag=True, help="Print a list of {name, ok, matters, found, remedy}.")
 def doctor(as_json: bool) -> None:
     """Check this machine, with the remedy for what it lacks; exit 1 if something fails that matters."""
-    findings = examine(installed())
+    findings = examine(installed_plugins())
     if as_json:
         echo(json.dumps([{**attrs.asdict(f.check), "matters": f.matters} for f in findings], indent=2))
     else:

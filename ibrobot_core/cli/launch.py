@@ -18,15 +18,15 @@ import attrs
 import click
 
 from ibrobot_core.cli.panel import RecentLog, RecentRates, panel, plain_line
-from ibrobot_core.config import RobotConfig, find_config, load
+from ibrobot_core.config import RobotConfig, find_config, load_config
 from ibrobot_core.control.core import EMERGENCY_STOP
 from ibrobot_core.errors import IbrobotError
 from ibrobot_core.launch.models import check_models
 from ibrobot_core.launch.runtime import Runtime
 from ibrobot_core.launch.session import Request, Session
 from ibrobot_core.outside import LogFormatter, echo
-from ibrobot_core.plugins import installed
-from ibrobot_core.terminal import Keys
+from ibrobot_core.plugins import installed_plugins
+from ibrobot_core.terminal import KeyReader
 from ibrobot_core.workers import end_signals
 
 NOT_ALL_SUCCEEDED = 3
@@ -149,17 +149,17 @@ def run_robot(
     Raises:
         IbrobotError: e.g. for a YAML with mistakes, or when a component fails.
     """
-    registry = installed()
+    registry = installed_plugins()
     path = find_config(config, registry)
     changes, chosen = overrides_of(options), {"mode": options["mode"], "sim": options["sim"], "registry": registry}
     # An override within the section must not count as the section.
     known = [change for change in changes if recording is None or not change.startswith("recording.")]
-    robot = load(path, overrides=known, **chosen)
+    robot = load_config(path, overrides=known, **chosen)
     if recording is not None:
         made = []
         if robot.recording is None:
             made = [f"recording={{type: {registry.default('recorder')}, root: episodes, topics: contract}}"]
-        robot = load(path, overrides=(*made, *changes, *recording), **chosen)
+        robot = load_config(path, overrides=(*made, *changes, *recording), **chosen)
     request = Request(
         options["lockstep"], options["seed"], options["duration"], options["episodes"], options["goals"],
         prompt=prompt, by_operator=recording is not None,
@@ -175,7 +175,7 @@ def overrides_of(options: dict[str, Any]) -> tuple[str, ...]:
     """
     if options["window"] and options["headless"]:
         raise click.UsageError("--window and --headless exclude each other")
-    window = [f"viewer={{type: {installed().default('viewer')}}}"] if options["window"] else []
+    window = [f"viewer={{type: {installed_plugins().default('viewer')}}}"] if options["window"] else []
     return (*options["overrides"], *window)
 
 
@@ -197,12 +197,12 @@ def run_loaded(robot: RobotConfig, request: Request, options: dict[str, Any], wa
     if options["headless"] and robot.viewer is not None:
         robot = attrs.evolve(robot, viewer=None)
     with ExitStack() as stack:
-        keys = Keys() if sys.stdin.isatty() and not (options["headless"] or options["dry_run"]) else None
+        keys = KeyReader() if sys.stdin.isatty() and not (options["headless"] or options["dry_run"]) else None
         if keys is not None:
             request = attrs.evolve(request, keys=keys.subscribe)
-        runtime = Runtime(Session(robot, installed(), request))
+        runtime = Runtime(Session(robot, installed_plugins(), request))
         if options["dry_run"]:
-            models = check_models(robot, installed(), [runtime.session.mode])
+            models = check_models(robot, installed_plugins(), [runtime.session.mode])
             plan = runtime.plan
             echo(json.dumps({**plan.facts(), "models": models}) if as_json else "\n".join([*plan.lines(), *models]))
             return
@@ -248,7 +248,7 @@ def _run(runtime: Runtime, watcher: Watcher, *, live: bool, as_json: bool) -> in
     return NOT_ALL_SUCCEEDED if outcome.successes < outcome.episodes or outcome.goals_failed else 0
 
 
-def _stop_on_signals(session: Session, keys: Keys | None) -> None:
+def _stop_on_signals(session: Session, keys: KeyReader | None) -> None:
     """The first of the `end_signals` stops in order; a second Ctrl-C ends the host, and control stops the robot."""
     terminals = [fd for fd in (1, 2) if os.isatty(fd)]
 

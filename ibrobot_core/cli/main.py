@@ -35,9 +35,9 @@ class LazyGroup(click.Group):
 
     @override
     def list_commands(self, ctx: click.Context) -> list[str]:
-        from ibrobot_core.plugins import installed
+        from ibrobot_core.plugins import installed_plugins
 
-        return [*COMMANDS, *sorted(set(installed().commands) - set(COMMANDS))]
+        return [*COMMANDS, *sorted(set(installed_plugins().commands) - set(COMMANDS))]
 
     @override
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
@@ -45,21 +45,21 @@ class LazyGroup(click.Group):
             module, _, attribute = COMMANDS[cmd_name][0].partition(":")
             command: click.Command = getattr(import_module(module), attribute)
             return command
-        from ibrobot_core.plugins import installed, official_plugins
+        from ibrobot_core.plugins import installed_plugins, official_plugins
 
-        contributed = installed().commands.get(cmd_name)
+        contributed = installed_plugins().commands.get(cmd_name)
         if contributed is None:
             if any(cmd_name in offers.get("command", ()) for offers in official_plugins().values()):
-                raise PluginError(installed().why_missing("command", cmd_name))
+                raise PluginError(installed_plugins().why_missing("command", cmd_name))
             return None
         let_interrupts_raise()
         return contributed.load()
 
     @override
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        from ibrobot_core.plugins import installed
+        from ibrobot_core.plugins import installed_plugins
 
-        contributed = installed().commands
+        contributed = installed_plugins().commands
         summaries = {name: command.summary for name, command in sorted(contributed.items())}
         summaries |= {name: summary for name, (_, summary) in COMMANDS.items()}
         with formatter.section("Commands"):

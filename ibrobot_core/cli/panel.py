@@ -15,7 +15,7 @@ from rich.table import Table
 
 from ibrobot_core.control.core import EMERGENCY_STOP
 from ibrobot_core.launch.session import Session
-from ibrobot_core.screen import text
+from ibrobot_core.screen import styled
 from ibrobot_core.units import NS_PER_S
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ class RecentLog(logging.Handler):
     @override
     def emit(self, record: logging.LogRecord) -> None:
         style = {logging.WARNING: "yellow", logging.ERROR: "bold red"}.get(record.levelno, "dim")
-        self.lines.append(text(record.getMessage(), style))
+        self.lines.append(styled(record.getMessage(), style))
 
 
 class RecentRates:
@@ -113,17 +113,17 @@ def panel(
 ) -> RenderableType:
     """The whole panel, with `more` rows of heading and text; in a small terminal its end is left out."""
     where = "in simulation" if session.config.simulated else "on hardware"
-    modes = text(f"{session.config.robot.name} {where}  ", "bold") + text("  ").join(
-        text(f"{key} ") + text(name, "reverse" if name == session.mode else "")
+    modes = styled(f"{session.config.robot.name} {where}  ", "bold") + styled("  ").join(
+        styled(f"{key} ") + styled(name, "reverse" if name == session.mode else "")
         for key, name in session.mode_keys.items()
     )
     return Group(  # what does not fit below, `Live` leaves out
-        text(" ").join(text(key, "bold reverse") + text(f" {does}", "bold") for key, does in KEYS.items()),
+        styled(" ").join(styled(key, "bold reverse") + styled(f" {does}", "bold") for key, does in KEYS.items()),
         *_faults(session),
         _Newest(log.lines),
         modes,
-        *([text(help_text, "cyan")] if help_text else []),
-        *(text(f"{heading:<10}", "bold") + text(row) for heading, row in (*more, *_facts(session, rates))),
+        *([styled(help_text, "cyan")] if help_text else []),
+        *(styled(f"{heading:<10}", "bold") + styled(row) for heading, row in (*more, *_facts(session, rates))),
         _Joints(session),
     )
 
@@ -131,12 +131,12 @@ def panel(
 def _faults(session: Session) -> list[Text]:
     """What keeps the robot from going on, in full, the newest fault first."""
     if session.held and not session.faults:
-        return [text(f"holding after the reset: {session.to_go_on()}", "bold yellow")]
+        return [styled(f"holding after the reset: {session.to_go_on()}", "bold yellow")]
     estop = session.state is not None and session.state.estop
     others = [fault for fault in reversed(session.faults) if fault != EMERGENCY_STOP]
     return [
-        *([text("EMERGENCY STOP: F10 resets it", "bold reverse red")] if estop else []),
-        *(text(f"FAULT: {fault}; F10 resets it", "bold red") for fault in others),
+        *([styled("EMERGENCY STOP: F10 resets it", "bold reverse red")] if estop else []),
+        *(styled(f"FAULT: {fault}; F10 resets it", "bold red") for fault in others),
     ]
 
 
@@ -191,6 +191,6 @@ class _Joints:
             room = max(0, options.max_width - _JOINT_WIDTH)
             bar = [ProgressBar(total=1.0, completed=done, width=min(room, 30))] if room else []
             table.add_row(
-                joint.name, f"{state.position[i]:+.3f}", text(f"told {state.command[i]:+.3f} rad", "dim"), *bar
+                joint.name, f"{state.position[i]:+.3f}", styled(f"told {state.command[i]:+.3f} rad", "dim"), *bar
             )
         yield table

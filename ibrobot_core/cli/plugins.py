@@ -10,7 +10,7 @@ import click
 
 from ibrobot_core.errors import PluginError
 from ibrobot_core.outside import echo
-from ibrobot_core.plugins import Entry, Registry, installed
+from ibrobot_core.plugins import Entry, Registry, installed_plugins
 
 
 @click.group(invoke_without_command=True)
@@ -20,7 +20,7 @@ def plugins(ctx: click.Context, as_json: bool) -> None:
     """List what the installed plugins offer, what this machine lacks for it, and the plugins that are broken."""
     if ctx.invoked_subcommand is not None:
         return
-    registry = installed()
+    registry = installed_plugins()
     entries = [registry.entries[key] for key in sorted(registry.entries)]
     if as_json:
         broken = [attrs.asdict(failure) for failure in registry.failures]
@@ -43,7 +43,7 @@ def show(type_: str, as_json: bool) -> None:
     """Print the options of TYPE, of every kind that has a type of this name."""
     from ibrobot_core.config.describe import described
 
-    registry = installed()
+    registry = installed_plugins()
     entries = [registry.entries[key] for key in sorted(registry.entries) if key[1] == type_]
     if not entries:
         raise PluginError(_unknown(registry, type_))
@@ -87,10 +87,10 @@ def _lacking(row: dict[str, Any]) -> str:
 
 
 def _unknown(registry: Registry, type_: str) -> str:
-    from ibrobot_core.options import hint
+    from ibrobot_core.options import did_you_mean
 
     broken = "".join(f"; {failure}" for failure in registry.failures)
-    return f"unknown type {type_!r}{hint(type_, sorted({t for _, t in registry.entries}), 'installed')}{broken}"
+    return f"unknown type {type_!r}{did_you_mean(type_, sorted({t for _, t in registry.entries}), 'installed')}{broken}"
 
 
 def _text(value: Any) -> str:

@@ -11,7 +11,7 @@ import click
 
 from ibrobot_core.calibration import load_calibration
 from ibrobot_core.cli.launch import Watcher, overrides_of, run_loaded, run_options
-from ibrobot_core.config import RobotConfig, find_config, from_document, load
+from ibrobot_core.config import RobotConfig, find_config, from_document, load_config
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import ContractError, RecorderError
 from ibrobot_core.interfaces import EpisodeSummary
@@ -19,9 +19,9 @@ from ibrobot_core.launch.runtime import Runtime
 from ibrobot_core.launch.session import Request
 from ibrobot_core.launch.sources.replay import MODE, Replay, ReplayFeeder
 from ibrobot_core.outside import echo
-from ibrobot_core.plugins import installed
+from ibrobot_core.plugins import installed_plugins
 from ibrobot_core.recording.playback import read_playback
-from ibrobot_core.recording.provenance import told_by
+from ibrobot_core.recording.provenance import stated_by_robot
 from ibrobot_core.units import NORM_MODES
 
 
@@ -81,7 +81,9 @@ def replay(
     changes, sim = overrides_of(options), options["sim"]
     robot = _named(config, changes, sim=sim) if config is not None else None
     numbers = load_calibration(calibration).snapshot() if calibration is not None else None
-    reader = installed().open_episode(episode, told_by(robot, norm_mode, numbers) if robot is not None else None)
+    reader = installed_plugins().open_episode(
+        episode, stated_by_robot(robot, norm_mode, numbers) if robot is not None else None
+    )
     try:
         summary = reader.summary()
         robot = robot or _recorded(summary, changes, sim=sim)
@@ -107,10 +109,10 @@ def _without_sensors(robot: RobotConfig) -> RobotConfig:
 
 def _named(config: str, changes: tuple[str, ...], *, sim: bool) -> RobotConfig:
     """The robot of a YAML, with one mode more: that of the replay."""
-    registry = installed()
+    registry = installed_plugins()
     path = find_config(config, registry)
-    robot = load(path, overrides=changes, sim=sim, registry=registry)
-    return load(path, overrides=(*changes, _mode(robot)), mode=MODE, sim=sim, registry=registry)
+    robot = load_config(path, overrides=changes, sim=sim, registry=registry)
+    return load_config(path, overrides=(*changes, _mode(robot)), mode=MODE, sim=sim, registry=registry)
 
 
 def _recorded(summary: EpisodeSummary, changes: tuple[str, ...], *, sim: bool) -> RobotConfig:

@@ -20,8 +20,8 @@ from ibrobot_core.config.schema import (
 from ibrobot_core.config.structure import Part, Parts
 from ibrobot_core.config.yaml_nodes import Document, Key
 from ibrobot_core.descriptors import ExecutorDescriptor, TransportDescriptor
-from ibrobot_core.options import hint
-from ibrobot_core.plugins import example
+from ibrobot_core.options import did_you_mean
+from ibrobot_core.plugins import example_type
 from ibrobot_core.robot import Joint, Robot
 from ibrobot_core.units import radians
 
@@ -62,7 +62,7 @@ class Checks:
     def _refer(self, key: Key, name: str, known: list[str], what: str) -> bool:
         if name in known:
             return True
-        self.document.add(key, f"unknown {what} {name!r}{hint(name, known, 'known')}")
+        self.document.add(key, f"unknown {what} {name!r}{did_you_mean(name, known, 'known')}")
         return False
 
     def _unique(self, key: Key, names: tuple[str, ...], what: str) -> None:
@@ -246,7 +246,7 @@ class Checks:
             if not isinstance(transport, Mapping) or transport.get("type") == "local":
                 message = (
                     "distributed needs a transport to the server, "
-                    f"e.g. transport: {{type: {example('transport')}, connect: [tcp/127.0.0.1:7447]}}"
+                    f"e.g. transport: {{type: {example_type('transport')}, connect: [tcp/127.0.0.1:7447]}}"
                 )
                 self.document.add((*key, "execution_mode"), message)
         elif inference.server_model:
@@ -295,7 +295,7 @@ class Checks:
                 self._used(part)
             return
         if not (isinstance(part.descriptor, TransportDescriptor) and part.descriptor.topics):
-            does = example("transport")
+            does = example_type("transport")
             message = f"transport {part.descriptor.type!r} carries no topics to other machines; {does} does"
             self.document.add(("transport", "share"), message)
 

@@ -12,7 +12,7 @@ from ibrobot_core.config.checks import streams
 from ibrobot_core.config.schema import ActionSpec, ContractConfig, ExecutorComponent, ObservationSpec, SignalSpec
 from ibrobot_core.config.structure import Part, Parts
 from ibrobot_core.config.yaml_nodes import Document, Key
-from ibrobot_core.options import hint
+from ibrobot_core.options import did_you_mean
 
 JOINT_STATES = "/joint_states"
 PERIPHERAL_TOPICS: Mapping[str, tuple[str, type[messages.Message]]] = {
@@ -96,7 +96,7 @@ class ContractChecks:
             known = sorted(message_types())
             self.document.add(
                 (*key, "type"),
-                f"unknown message type {spec.type!r}{hint(spec.type, known, 'known')} "
+                f"unknown message type {spec.type!r}{did_you_mean(spec.type, known, 'known')} "
                 "(`foreign: true` takes one that only bags to convert have)",
             )
         elif spec.topic == JOINT_STATES and spec.type != messages.JointState.ros_type:
@@ -125,7 +125,7 @@ class ContractChecks:
         items = [item for item in written if isinstance(item, Mapping)] if isinstance(written, list) else []
         kinds = {str(item.get("name")): str(item.get("kind")) for item in reversed(items)}
         if spec.peripheral not in kinds:
-            remark = hint(str(spec.peripheral), list(kinds), "known")
+            remark = did_you_mean(str(spec.peripheral), list(kinds), "known")
             self.document.add((*key, "peripheral"), f"unknown peripheral {spec.peripheral!r}{remark}")
             return spec
         kind = kinds[spec.peripheral]
@@ -160,7 +160,7 @@ class ContractChecks:
             robot = self.parts.plain.get("robot")
             joints = list(robot.joint_names) if robot is not None else [rest]
             if spec.topic == JOINT_STATES and rest not in joints:
-                self.document.add(key, f"unknown joint {rest!r}{hint(rest, joints, 'known')}")
+                self.document.add(key, f"unknown joint {rest!r}{did_you_mean(rest, joints, 'known')}")
         else:
             self._field(key, path, spec.type)
 
@@ -169,7 +169,7 @@ class ContractChecks:
         first = path.partition(".")[0]
         names = [field.name for field in attrs.fields(message_types()[type_])]
         if first not in names:
-            self.document.add(key, f"{type_} has no field {first!r}{hint(first, names, 'its fields')}")
+            self.document.add(key, f"{type_} has no field {first!r}{did_you_mean(first, names, 'its fields')}")
 
     def _same_kind(self, key: Key, specs: Sequence[ObservationSpec], others: Sequence[ObservationSpec]) -> None:
         """Values under one key concatenate, which an image and a vector cannot."""
@@ -200,7 +200,7 @@ class ContractChecks:
         known = list(written) if isinstance(written, Mapping) else []
         if spec.executor not in known:
             self.document.add(
-                (*key, "executor"), f"unknown executor {spec.executor!r}{hint(spec.executor, known, 'known')}"
+                (*key, "executor"), f"unknown executor {spec.executor!r}{did_you_mean(spec.executor, known, 'known')}"
             )
             return spec
         self._commands(key, spec)

@@ -12,7 +12,7 @@ import attrs
 
 from ibrobot_core.config.expand import resolve_path
 from ibrobot_core.config.yaml_nodes import Key
-from ibrobot_core.options import fields, hint
+from ibrobot_core.options import did_you_mean, fields
 
 _SHOWN = 200
 """Characters of a value that a message shows."""
@@ -59,7 +59,7 @@ class Faults(ValueError):
 
 def unknown_key(word: str, known: Sequence[str]) -> str:
     """The message for a key that is not there."""
-    return f"unknown key{hint(word, known, 'known keys')}"
+    return f"unknown key{did_you_mean(word, known, 'known keys')}"
 
 
 def shown(value: Any) -> str:

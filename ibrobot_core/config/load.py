@@ -14,19 +14,19 @@ import ibrobot_core
 from ibrobot_core.config.checks import Checks
 from ibrobot_core.config.contract_checks import ContractChecks
 from ibrobot_core.config.convert import shown
-from ibrobot_core.config.overrides import apply, put
+from ibrobot_core.config.overrides import apply_overrides, put
 from ibrobot_core.config.schema import Component, ExecutorComponent, RobotConfig
 from ibrobot_core.config.secrets import check_known, expanded_again, public, warn_of_literals
 from ibrobot_core.config.structure import Part, Parts, Structurer
-from ibrobot_core.config.yaml_nodes import MAX_BYTES, Document, Place, parse
+from ibrobot_core.config.yaml_nodes import MAX_BYTES, Document, Place, parse_yaml
 from ibrobot_core.errors import ConfigError, Problem
-from ibrobot_core.plugins import Registry, installed
+from ibrobot_core.plugins import Registry, installed_plugins
 from ibrobot_core.robot import Robot
 
 DEFAULT_CONFIG = "so101"
 
 
-def load(
+def load_config(
     path: str | Path,
     *,
     overrides: Sequence[str] = (),
@@ -50,7 +50,7 @@ def load(
     """
     document = _parse(path)
     _override(document, overrides, mode)
-    config = _build(document, Path(path), sim, registry or installed(), communicates)
+    config = _build(document, Path(path), sim, registry or installed_plugins(), communicates)
     warn_of_literals(document)
     return config
 
@@ -65,9 +65,9 @@ def load_contract(path: str | Path, registry: Registry | None = None) -> RobotCo
         ConfigError: with everything that is wrong, in file order.
     """
     document = _parse(path)
-    registry = registry or installed()
+    registry = registry or installed_plugins()
     if set(document.root) != {"contract"}:
-        return load(path, registry=registry)
+        return load_config(path, registry=registry)
     section = document.root["contract"]
     actions = section.get("actions") if isinstance(section, Mapping) else None
     for action in actions if isinstance(actions, list) else ():
@@ -98,7 +98,7 @@ def _parse(path: str | Path) -> Document:
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
         raise ConfigError([Problem(str(path), 0, "", f"cannot be read: {reason}")]) from None
-    document = parse(text, str(path))
+    document = parse_yaml(text, str(path))
     if not isinstance(document.root, Mapping):
         document.add((), f"expected a mapping of sections, got {shown(document.root)}")
         document.raise_problems()
@@ -121,11 +121,11 @@ def from_document(
     """
     copied = expanded_again(Document(copy.deepcopy(dict(document)), {}, [], str(source)))
     _override(copied, overrides, mode)
-    return _build(copied, source, sim, registry or installed())
+    return _build(copied, source, sim, registry or installed_plugins())
 
 
 def _override(document: Document, overrides: Sequence[str], mode: str | None) -> None:
-    apply(document, overrides)
+    apply_overrides(document, overrides)
     if mode is not None:
         place = Place(len(overrides) + 1, 0, 0, f"--mode {mode}")
         put(document, "default_control_mode", Document(mode, {}, [], place.file), place)

@@ -6,12 +6,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ibrobot_core.config.convert import shown
-from ibrobot_core.config.yaml_nodes import Document, Key, Place, parse
+from ibrobot_core.config.yaml_nodes import Document, Key, Place, parse_yaml
 from ibrobot_core.errors import ConfigError, Problem
-from ibrobot_core.options import hint
+from ibrobot_core.options import did_you_mean
 
 
-def apply(document: Document, overrides: Sequence[str], flag: str = "--set") -> None:
+def apply_overrides(document: Document, overrides: Sequence[str], flag: str = "--set") -> None:
     """Put `overrides` into `document`, in order; faults in them are noted there, as of the command line's `flag`."""
     for rank, text in enumerate(overrides, start=1):
         place = Place(rank, 0, 0, f"{flag} {text}")
@@ -21,7 +21,7 @@ def apply(document: Document, overrides: Sequence[str], flag: str = "--set") -> 
             document.problems.append((place, Problem(place.file, 0, "", message)))
             continue
         try:
-            value = parse(value_text, place.file)
+            value = parse_yaml(value_text, place.file)
         except ConfigError as error:
             document.problems += [(place, Problem(place.file, 0, path, p.message)) for p in error.problems]
             continue
@@ -71,4 +71,4 @@ def _part(holder: Any, word: str) -> str | int:
     if word.isdecimal() and int(word) < len(holder):
         return int(word)
     known = [name for name in names if isinstance(name, str)] or [str(i) for i in range(len(holder))]
-    raise ValueError(f"the list has no such item{hint(word, known, 'items')}")
+    raise ValueError(f"the list has no such item{did_you_mean(word, known, 'items')}")

@@ -122,11 +122,11 @@ def _text(dumper: yaml.SafeDumper, value: str) -> yaml.ScalarNode:
 _Dumper.add_representer(str, _text)
 
 
-def dump(value: Any) -> str:
+def dump_yaml(value: Any) -> str:
     """Plain values as YAML text that the config reader reads back as they are."""
     return yaml.dump(value, Dumper=_Dumper, sort_keys=False, width=120, allow_unicode=True)
 
 
 def to_yaml(config: RobotConfig) -> str:
     """The whole config as YAML text."""
-    return dump(document(config))
+    return dump_yaml(document(config))

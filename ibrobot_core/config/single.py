@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ibrobot_core.config.convert import Converter, Faults, said
-from ibrobot_core.config.overrides import apply
+from ibrobot_core.config.overrides import apply_overrides
 from ibrobot_core.config.yaml_nodes import Document
 
 
@@ -23,7 +23,7 @@ def single_options[T](kind: type[T], overrides: Sequence[str], name: str, flag: 
         ConfigError: with everything that is wrong.
     """
     document = Document({}, {}, [], name)
-    apply(document, overrides, flag)
+    apply_overrides(document, overrides, flag)
     document.raise_problems()
     try:
         options: T = Converter(Path.cwd()).structure(document.root, kind)

@@ -32,7 +32,7 @@ from ibrobot_core.config.yaml_nodes import Document, Key
 from ibrobot_core.descriptors import Descriptor, HardwareDescriptor, SensorDescriptor
 from ibrobot_core.errors import PluginError
 from ibrobot_core.options import fields
-from ibrobot_core.plugins import Registry, example
+from ibrobot_core.plugins import Registry, example_type
 
 _NAME = re.compile(r"[A-Za-z0-9_-]+")
 
@@ -110,7 +110,9 @@ class Structurer:
         parts = Parts(simulated)
         self._sections(parts)
         if simulated and "simulation" not in given:
-            self.document.add((), f"--sim needs a simulation section, e.g. simulation: {{type: {example('hardware')}}}")
+            self.document.add(
+                (), f"--sim needs a simulation section, e.g. simulation: {{type: {example_type('hardware')}}}"
+            )
         elif not simulated and "hardware" not in given:
             self.document.add((), "needs a hardware section, a simulation section, or both")
         self._simulation(parts)

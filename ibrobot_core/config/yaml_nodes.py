@@ -182,7 +182,7 @@ def is_text(text: str) -> bool:
         return False
 
 
-def parse(text: str, file: str) -> Document:
+def parse_yaml(text: str, file: str) -> Document:
     """Read one YAML document. Faults are noted in the result, but for text that is no YAML at all.
 
     Raises:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ibrobot_core.config.schema import ImageSpec
 from ibrobot_core.errors import ContractError
 from ibrobot_core.messages import CompressedImage, Header, Image
-from ibrobot_core.plugins import installed
+from ibrobot_core.plugins import installed_plugins
 
 ENCODINGS: dict[str, tuple[type[np.generic], int]] = {
     "rgb8": (np.uint8, 3),
@@ -60,7 +60,7 @@ def decode_image(message: Image | CompressedImage, spec: ImageSpec) -> NDArray[n
         ContractError: for a malformed message, or an encoding that does not become the one asked for.
     """
     if isinstance(message, CompressedImage):
-        message = installed().decode(message)
+        message = installed_plugins().decode(message)
     array = pixels(message)
     if spec.resize is not None and spec.resize != array.shape[:2]:
         array = resize(array, *spec.resize)

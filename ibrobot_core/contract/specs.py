@@ -17,7 +17,7 @@ from ibrobot_core.interfaces.dataset import Feature
 from ibrobot_core.messages import MESSAGE_TYPES
 from ibrobot_core.units import NS_PER_S
 
-TASK = "task"
+TASK_KEY = "task"
 """Key of the signal that is text: what a policy is asked to do."""
 _JOINTS_TYPE = "sensor_msgs/msg/JointState"
 _KNOWN_TYPES = {"/joint_states": _JOINTS_TYPE}
@@ -319,7 +319,7 @@ def _action(spec: ActionSpec, config: RobotConfig) -> ActionPart:
 
 def _signal(spec: SignalSpec) -> SignalPart:
     (path,) = spec.select
-    if spec.key != TASK:
+    if spec.key != TASK_KEY:
         try:
             size = Selection(spec.type, spec.select, foreign=True).size
         except ContractError as error:

@@ -26,7 +26,7 @@ from ibrobot_core.control.realtime import go_real_time
 from ibrobot_core.control.timing import REPORT_TICKS, Punctuality
 from ibrobot_core.errors import IbrobotError
 from ibrobot_core.outside import echo
-from ibrobot_core.plugins import installed
+from ibrobot_core.plugins import installed_plugins
 
 _STARTUP_TIMEOUT_S = 30.0
 _FAREWELL_S = 1.0
@@ -151,7 +151,7 @@ def main(descriptors: list[int]) -> int:
         order = channel.wait(_STARTUP_TIMEOUT_S)[0]
         clock = RealClock(order["epoch_offset_ns"])
         config = from_document(order["document"], source=Path(order["source"]), sim=order["sim"])
-        core = build_core(config, installed(), clock, order["seed"])
+        core = build_core(config, installed_plugins(), clock, order["seed"])
         core.start(order["mode"])
         memory = SharedMemory(descriptors[1], Layout(len(config.robot.joints), core.signal_size))
         os.set_blocking(descriptors[2], False)

@@ -25,9 +25,9 @@ from ibrobot_core.bugs import describe_bug
 from ibrobot_core.config import from_document
 from ibrobot_core.errors import IbrobotError
 from ibrobot_core.inference.build import build_policy
-from ibrobot_core.inference.wire import LIMITS, Decoder, Encoder, Kind, Message
+from ibrobot_core.inference.wire import WIRE_LIMITS, WireDecoder, WireEncoder, WireKind, WireMessage
 from ibrobot_core.interfaces import Policy
-from ibrobot_core.plugins import installed
+from ibrobot_core.plugins import installed_plugins
 
 _GLANCE_S = 0.5
 """How often to look whether the host is still there."""
@@ -75,8 +75,8 @@ class ModelLoop:
     request: memoryview
     answer: memoryview
     episode: int | None = None
-    encoder: Encoder = attrs.field(factory=Encoder)
-    decoder: Decoder = attrs.field(factory=Decoder)
+    encoder: WireEncoder = attrs.field(factory=WireEncoder)
+    decoder: WireDecoder = attrs.field(factory=WireDecoder)
 
     def run(self) -> None:
         """Answer until the host hangs up."""
@@ -99,11 +99,11 @@ class ModelLoop:
                 self.episode = message.episode
             outputs = self.policy.infer(message.tensors)
             latency_ms = (time.monotonic_ns() - begun_ns) / 1e6
-            return self._put(Message(Kind.ANSWER, request_id, outputs, latency_ms=latency_ms))
+            return self._put(WireMessage(WireKind.ANSWER, request_id, outputs, latency_ms=latency_ms))
         except Exception as error:  # noqa: BLE001 - contained: one request's fault is its own answer
-            return self._put(Message(Kind.FAILURE, request_id, text=told(error)))
+            return self._put(WireMessage(WireKind.FAILURE, request_id, text=told(error)))
 
-    def _put(self, message: Message) -> int:
+    def _put(self, message: WireMessage) -> int:
         return len(self.encoder.encode(message, lambda size: self.answer[:size]))
 
 
@@ -127,12 +127,12 @@ def main(pipe: int, request: int, answer: int) -> int:
     try:
         order = json.loads(connection.recv_bytes())
         threading.Thread(target=_end_with, args=(order["host"],), daemon=True).start()
-        registry = installed()
+        registry = installed_plugins()
         config = from_document(order["document"], source=Path(order["source"]), sim=order["sim"], registry=registry)
         policy = build_policy(config, registry, order["model"], order["seed"])
         policy.load()
         events.send("ready", fingerprint=policy.fingerprint(), weights=policy.weights())
-        frames = [memoryview(mmap.mmap(descriptor, LIMITS.size)) for descriptor in (request, answer)]
+        frames = [memoryview(mmap.mmap(descriptor, WIRE_LIMITS.size)) for descriptor in (request, answer)]
         ModelLoop(policy, connection, events, frames[0], frames[1]).run()
     except EOFError:
         return 1

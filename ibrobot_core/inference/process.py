@@ -19,7 +19,7 @@ from typing import Any, override
 from ibrobot_core.config import RobotConfig
 from ibrobot_core.errors import PolicyError
 from ibrobot_core.inference.engine import Engine, check_weights
-from ibrobot_core.inference.wire import LIMITS, Decoder, Encoder, Kind, Message
+from ibrobot_core.inference.wire import WIRE_LIMITS, WireDecoder, WireEncoder, WireKind, WireMessage
 from ibrobot_core.interfaces import Tensors
 from ibrobot_core.memory import create_memory
 from ibrobot_core.units import NS_PER_S
@@ -61,7 +61,7 @@ class ProcessEngine(Engine):
         self._log = logging.getLogger("ibrobot.inference")
         self._robot = config.robot.name
         self._lock = threading.Lock()
-        self._encoder, self._decoder = Encoder(), Decoder()
+        self._encoder, self._decoder = WireEncoder(), WireDecoder()
         self._closed = threading.Event()
         self._given_up = given_up or self._closed
         self._process: subprocess.Popen[bytes] | None = None
@@ -95,8 +95,8 @@ class ProcessEngine(Engine):
         with self._lock:
             deadline_s = deadline_ns / NS_PER_S
             self._revive(deadline_s)
-            message = Message(
-                Kind.REQUEST, request_id, tensors, self._robot, episode=self._episode, seed=self._seed,
+            message = WireMessage(
+                WireKind.REQUEST, request_id, tensors, self._robot, episode=self._episode, seed=self._seed,
                 deadline_ns=max(0, deadline_ns - time.monotonic_ns()),
             )  # fmt: skip
             frame = self._encoder.encode(message, lambda size: self._request[:size])
@@ -112,7 +112,7 @@ class ProcessEngine(Engine):
             answer = self._decoder.decode(bytes(self._answer[: event["size"]]))
         self._deaths = 0
         self.stats.model_ms = answer.latency_ms
-        if answer.kind is Kind.FAILURE:
+        if answer.kind is WireKind.FAILURE:
             raise PolicyError(answer.text)
         return answer.tensors
 
@@ -139,8 +139,8 @@ class ProcessEngine(Engine):
         memories = [create_memory() for _ in range(2)]
         try:
             for memory in memories:
-                os.ftruncate(memory, LIMITS.size)  # pages are there from their first use on
-            self._request, self._answer = (memoryview(mmap.mmap(memory, LIMITS.size)) for memory in memories)
+                os.ftruncate(memory, WIRE_LIMITS.size)  # pages are there from their first use on
+            self._request, self._answer = (memoryview(mmap.mmap(memory, WIRE_LIMITS.size)) for memory in memories)
             descriptors = (theirs.fileno(), *memories)
             command = [sys.executable, "-m", "ibrobot_core.inference.model_process", *map(str, descriptors)]
             # A session of its own: Ctrl-C in the terminal is for the host, which then ends the model in order.

@@ -14,13 +14,13 @@ import attrs
 from ibrobot_core.errors import ContractError, PolicyError, TransportError, WireError
 from ibrobot_core.inference.engine import Engine, check_weights
 from ibrobot_core.inference.wire import (
-    LIMITS,
+    WIRE_LIMITS,
     Buffer,
-    Decoder,
-    Encoder,
-    Kind,
-    Limits,
-    Message,
+    WireDecoder,
+    WireEncoder,
+    WireKind,
+    WireLimits,
+    WireMessage,
     health_name,
     service_name,
 )
@@ -54,7 +54,7 @@ class RemoteEngine(Engine):
 
     def __init__(
         self, policy: Policy, transport: Transport, model: str, robot: str, start_timeout_s: float = 5.0,
-        codec: PictureCodec | None = None, limits: Limits = LIMITS, *, accept_new_weights: bool = False,
+        codec: PictureCodec | None = None, limits: WireLimits = WIRE_LIMITS, *, accept_new_weights: bool = False,
     ) -> None:  # fmt: skip
         super().__init__("distributed")
         self._policy = policy
@@ -69,7 +69,7 @@ class RemoteEngine(Engine):
         self._robot = f"{robot}-{uuid.uuid4().hex[:8]}"
         self._start_timeout_s = start_timeout_s
         self.parallel = 1 if policy.spec.stateful else _PARALLEL
-        self._encoder, self._decoder = Encoder(limits, codec), Decoder(limits)
+        self._encoder, self._decoder = WireEncoder(limits, codec), WireDecoder(limits)
         self._buffers = [Buffer() for _ in range(self.parallel)]
         """Those that are free."""
         self._episode, self._seed = time.time_ns(), 0
@@ -98,8 +98,8 @@ class RemoteEngine(Engine):
         left_ns = deadline_ns - time.monotonic_ns()
         if left_ns <= 0:
             raise PolicyError(f"request {request_id} expired before it was sent")
-        message = Message(
-            Kind.REQUEST, request_id, tensors, self._robot, fingerprint, stamp_ns=time.time_ns(),
+        message = WireMessage(
+            WireKind.REQUEST, request_id, tensors, self._robot, fingerprint, stamp_ns=time.time_ns(),
             deadline_ns=left_ns, episode=self._episode, seed=self._seed,
         )  # fmt: skip
         buffer = self._buffers.pop()
@@ -114,7 +114,7 @@ class RemoteEngine(Engine):
         self.stats.pace_ms = answer.pace_ns / 1e6
         if answer.fingerprint not in ("", fingerprint):
             self._changed.set()
-        if answer.kind is Kind.FAILURE:
+        if answer.kind is WireKind.FAILURE:
             raise PolicyError(f"the server of {self._model}: {answer.text}")
         if answer.id != request_id or answer.fingerprint != fingerprint:
             raise PolicyError(

@@ -53,7 +53,7 @@ def health_name(model: str) -> str:
     return f"{service_name(model)}/health"
 
 
-class Kind(enum.IntEnum):
+class WireKind(enum.IntEnum):
     """What a frame is."""
 
     REQUEST = 1
@@ -64,11 +64,11 @@ class Kind(enum.IntEnum):
     """Why there are none, in `text`."""
 
 
-_KINDS = {kind.value: kind for kind in Kind}
+_KINDS = {kind.value: kind for kind in WireKind}
 
 
 @attrs.frozen
-class Limits:
+class WireLimits:
     """What a frame may at most be; all are checked before anything is allocated."""
 
     size: int = 64 * 1024 * 1024
@@ -81,14 +81,14 @@ class Limits:
     """Bytes."""
 
 
-LIMITS = Limits()
+WIRE_LIMITS = WireLimits()
 
 
 @attrs.frozen(eq=False)
-class Message:
+class WireMessage:
     """A frame, decoded."""
 
-    kind: Kind
+    kind: WireKind
     id: int
     """Of the request; its answer carries the same."""
     tensors: Tensors = attrs.field(factory=dict)
@@ -187,7 +187,7 @@ def _jpegs(tensors: Tensors, codec: PictureCodec) -> Mapping[str, bytes]:
     return jpegs
 
 
-def _lay_out(message: Message, jpegs: Mapping[str, bytes], limits: Limits) -> _Layout:
+def _lay_out(message: WireMessage, jpegs: Mapping[str, bytes], limits: WireLimits) -> _Layout:
     texts = [_text(text, limits.name) for text in (message.robot, message.fingerprint)]
     texts.append(_text(message.text, limits.text))
     if len(message.tensors) > limits.tensors:
@@ -217,8 +217,8 @@ def _lay_out(message: Message, jpegs: Mapping[str, bytes], limits: Limits) -> _L
     return _Layout(message.robot, message.fingerprint, message.text, places, head, cursor)
 
 
-def _fill(frame: memoryview, layout: _Layout, message: Message, jpegs: Mapping[str, bytes]) -> memoryview:
-    asks = message.kind is Kind.REQUEST
+def _fill(frame: memoryview, layout: _Layout, message: WireMessage, jpegs: Mapping[str, bytes]) -> memoryview:
+    asks = message.kind is WireKind.REQUEST
     times = (message.deadline_ns, message.episode) if asks else (message.queued_ns, message.pace_ns)
     try:
         _NUMBERS.pack_into(
@@ -268,7 +268,7 @@ class Buffer:
         return memoryview(self._memory)
 
 
-class Encoder:
+class WireEncoder:
     """Encodes messages, the sooner those that differ from earlier ones in numbers and values alone.
 
     Args:
@@ -276,12 +276,12 @@ class Encoder:
         codec: makes JPEG of camera pictures: their pixels change.
     """
 
-    def __init__(self, limits: Limits = LIMITS, codec: PictureCodec | None = None) -> None:
+    def __init__(self, limits: WireLimits = WIRE_LIMITS, codec: PictureCodec | None = None) -> None:
         self._limits = limits
         self._codec = codec
         self._layouts: _Layouts[Hashable] = _Layouts()
 
-    def encode(self, message: Message, allocate: Callable[[int], memoryview] = _fresh) -> memoryview:
+    def encode(self, message: WireMessage, allocate: Callable[[int], memoryview] = _fresh) -> memoryview:
         """A frame; every tensor is copied once, to where it is sent from. May be called by several threads at a time.
 
         Args:
@@ -304,17 +304,17 @@ class Encoder:
         return _fill(allocate(layout.size)[: layout.size], layout, message, jpegs)
 
 
-def encode(message: Message, *, limits: Limits = LIMITS, codec: PictureCodec | None = None) -> memoryview:
+def encode(message: WireMessage, *, limits: WireLimits = WIRE_LIMITS, codec: PictureCodec | None = None) -> memoryview:
     """As `Encoder.encode`, for once."""
-    return Encoder(limits, codec).encode(message)
+    return WireEncoder(limits, codec).encode(message)
 
 
-def decode(payload: Payload, *, limits: Limits = LIMITS, codec: PictureCodec | None = None) -> Message:
+def decode(payload: Payload, *, limits: WireLimits = WIRE_LIMITS, codec: PictureCodec | None = None) -> WireMessage:
     """As `Decoder.decode`, for once."""
-    return Decoder(limits, codec).decode(payload)
+    return WireDecoder(limits, codec).decode(payload)
 
 
-class Decoder:
+class WireDecoder:
     """Decodes frames, the sooner those that differ from earlier ones in numbers and values alone.
 
     Args:
@@ -322,13 +322,13 @@ class Decoder:
         codec: for pictures that come as JPEG; none are taken without.
     """
 
-    def __init__(self, limits: Limits = LIMITS, codec: PictureCodec | None = None) -> None:
+    def __init__(self, limits: WireLimits = WIRE_LIMITS, codec: PictureCodec | None = None) -> None:
         self._limits = limits
         self._codec = codec or NoPictures()
         self._layouts: _Layouts[bytes] = _Layouts()
         """By their heads."""
 
-    def decode(self, payload: Payload) -> Message:
+    def decode(self, payload: Payload) -> WireMessage:
         """A message whose tensors are read-only views of `payload`: nothing is copied, but for JPEG.
 
         May be called by several threads at a time.
@@ -357,8 +357,8 @@ class Decoder:
             array = tensors[place.name] = np.ndarray(place.shape, place.dtype, frame, place.offset)
             if place.dtype.kind == "b" and np.any(array.view(np.uint8) > 1):
                 raise WireError(f"tensor {place.name!r} has booleans other than 0 and 1")
-        (deadline_ns, episode), (queued_ns, pace_ns) = (times, (0, 0)) if kind == Kind.REQUEST else ((0, 0), times)
-        return Message(
+        (deadline_ns, episode), (queued_ns, pace_ns) = (times, (0, 0)) if kind == WireKind.REQUEST else ((0, 0), times)
+        return WireMessage(
             _KINDS[kind], request, tensors, layout.robot, layout.fingerprint, layout.text, stamp_ns, deadline_ns,
             episode, seed, latency_ms, queued_ns, pace_ns,
         )  # fmt: skip
@@ -426,7 +426,7 @@ class _Reader:
             raise WireError("a text that is not UTF-8") from None
 
 
-def _places(reader: _Reader, count: int, limits: Limits) -> Sequence[_Place]:
+def _places(reader: _Reader, count: int, limits: WireLimits) -> Sequence[_Place]:
     table = []
     for _ in range(count):
         offset, nbytes, code, ndim, name_size = _ENTRY.unpack(reader.take(_ENTRY.size))

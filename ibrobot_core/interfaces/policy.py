@@ -70,7 +70,7 @@ class PolicySpec:
     """Unit of joint positions that it was trained in, as under `models`; None when the checkpoint does not say."""
 
 
-def copied(tensors: Tensors) -> dict[str, NDArray[np.generic]]:
+def copied_tensors(tensors: Tensors) -> dict[str, NDArray[np.generic]]:
     """The same arrays in memory of their own, e.g. outputs that the next `infer` would overwrite."""
     return {name: np.array(array) for name, array in tensors.items()}
 
@@ -144,7 +144,7 @@ class Policy(ABC):
 
         One after the other by default. The outputs of a batch share no memory; the next call may overwrite them.
         """
-        return [copied(self.infer(tensors)) for tensors in batch]
+        return [copied_tensors(self.infer(tensors)) for tensors in batch]
 
     def fingerprint(self) -> str:
         """What both sides of `infer` must agree on; of the spec, where a policy does not add e.g. its statistics' hash.

@@ -16,7 +16,7 @@ type Handler = Callable[[Payload, str | None], Payload]
 """Makes the answer to a request. It is called with the request and the sender's name, as a certificate or password has
 proved it to the transport; None where nothing proves it. What a request says of itself is no proof."""
 
-WORKERS = 16
+HANDLER_THREADS = 16
 """How many calls of a handler go on at the same time, where `serve` is not told otherwise."""
 
 
@@ -42,7 +42,7 @@ class Transport(ABC):
         """
 
     @abstractmethod
-    def serve(self, name: str, handler: Handler, *, workers: int = WORKERS) -> Callable[[], None]:
+    def serve(self, name: str, handler: Handler, *, workers: int = HANDLER_THREADS) -> Callable[[], None]:
         """Answer requests for `name`; returns a function that ends it. An exception of `handler` reaches the requester.
 
         Args:

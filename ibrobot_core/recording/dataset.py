@@ -12,7 +12,7 @@ from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import RecorderError
 
 
-class Dataset:
+class EpisodeDataset:
     """The dataset in a folder.
 
     Args:

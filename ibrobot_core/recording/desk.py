@@ -9,7 +9,7 @@ from typing import Any
 
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import DiskFull, NotSupported, RecorderError
-from ibrobot_core.recording.dataset import Dataset
+from ibrobot_core.recording.dataset import EpisodeDataset
 from ibrobot_core.recording.episode import is_kept
 from ibrobot_core.recording.episodes import Episodes
 from ibrobot_core.recording.run import Run
@@ -51,7 +51,7 @@ class EpisodeDesk:
         config = session.config.recording
         assert config is not None
         self.folder = config.folder
-        self._dataset = Dataset(self.folder)
+        self._dataset = EpisodeDataset(self.folder)
         contract = Contract.from_config(session.config)
         self._dataset.check_writable()
         self._dataset.check(contract)

@@ -14,7 +14,7 @@ from ibrobot_core.contract.joint_units import calibrations
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import RecorderError
 from ibrobot_core.interfaces import EpisodeStart
-from ibrobot_core.recording.dataset import Dataset
+from ibrobot_core.recording.dataset import EpisodeDataset
 
 _PREFIX = "episode_"
 
@@ -54,7 +54,7 @@ def episode_start(
         root.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RecorderError(f"recording.root: {root} cannot be made: {error.strerror}") from None
-    Dataset(root.parent).join(contract, config.robot.name, config.robot.robot_type)
+    EpisodeDataset(root.parent).join(contract, config.robot.name, config.robot.robot_type)
     metadata = {
         "robot": config.robot.name, "robot_type": config.robot.robot_type, "mode": mode, "prompt": prompt,
         "contract": json.dumps(contract.canonical()), "fingerprint": contract.fingerprint(),

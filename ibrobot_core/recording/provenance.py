@@ -33,7 +33,7 @@ def recorded_contract(metadata: Mapping[str, str]) -> Contract | None:
     return contract
 
 
-def told_by(
+def stated_by_robot(
     config: RobotConfig, norm_mode: str | None = None, calibration: Mapping[str, Mapping[str, Any]] | None = None
 ) -> dict[str, str]:
     """What a robot YAML tells of a dataset that keeps nothing itself; see `EpisodeAddress.told`.
@@ -68,7 +68,7 @@ class Origin:
     """Receipt of the first message of the recording [ns]."""
 
 
-def origin(root: Path, metadata: Mapping[str, Any], number: int, told: Mapping[str, str]) -> Origin:
+def episode_origin(root: Path, metadata: Mapping[str, Any], number: int, told: Mapping[str, str]) -> Origin:
     """Where episode `number` of a dataset comes from.
 
     Args:

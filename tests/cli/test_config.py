@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import jsonschema
 import pytest
 
-from ibrobot_core.config.yaml_nodes import parse
+from ibrobot_core.config.yaml_nodes import parse_yaml
 
 if TYPE_CHECKING:
     from cli.conftest import Ran
@@ -74,7 +74,7 @@ def test_check_of_what_cannot_be(ibrobot: Ibrobot, robot: Path, arguments: list[
 def test_show_fills_in_the_defaults_and_loads_again(ibrobot: Ibrobot, robot: Path) -> None:
     shown = ibrobot("config", "show", "mini.yaml", "--set", "control.rate_hz=50")
 
-    document = parse(shown.out, "shown").root
+    document = parse_yaml(shown.out, "shown").root
     assert document["hardware"]["max_speed"] == 3.0
     assert document["control"] == {
         "rate_hz": 50.0,
@@ -94,6 +94,6 @@ def test_schema_has_the_options_of_plugins(ibrobot: Ibrobot, robot: Path) -> Non
 
     jsonschema.Draft202012Validator.check_schema(schema)
     validator = jsonschema.Draft202012Validator(schema)
-    validator.validate(parse(robot.read_text(), "mini.yaml").root)
-    wrong = parse(robot.read_text().replace("port: /dev/null", "port: 5"), "mini.yaml").root
+    validator.validate(parse_yaml(robot.read_text(), "mini.yaml").root)
+    wrong = parse_yaml(robot.read_text().replace("port: /dev/null", "port: 5"), "mini.yaml").root
     assert [list(error.absolute_path) for error in validator.iter_errors(wrong)] == [["hardware", "port"]]

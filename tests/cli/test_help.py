@@ -63,7 +63,7 @@ def test_wrong_usage_exits_with_2(ibrobot: Ibrobot) -> None:
 
 
 def test_command_of_a_missing_plugin_names_the_package(ibrobot: Ibrobot, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ibrobot_core.plugins.installed", Registry)
+    monkeypatch.setattr("ibrobot_core.plugins.installed_plugins", Registry)
     ran = ibrobot("convert", "episodes", "--out", "dataset")
 
     told = "error: ibrobot convert needs a plugin that is not installed: pip install ibrobot-plugin-data\n"

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import attrs
 import pytest
 
-from ibrobot_core.config import RobotConfig, load
+from ibrobot_core.config import RobotConfig, load_config
 from ibrobot_core.descriptors import (
     ConfigFile,
     HardwareDescriptor,
@@ -116,7 +116,7 @@ def load_text(registry: Registry, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
     def load_robot(text: str, **options: Any) -> RobotConfig:
         Path("robot.yaml").write_text(text, encoding="utf-8")
-        return load("robot.yaml", registry=registry, **options)
+        return load_config("robot.yaml", registry=registry, **options)
 
     return load_robot
 

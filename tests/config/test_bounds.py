@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import pytest
 
-from ibrobot_core.config import RobotConfig, load
+from ibrobot_core.config import RobotConfig, load_config
 from ibrobot_core.config.show import to_yaml
-from ibrobot_core.config.yaml_nodes import parse
+from ibrobot_core.config.yaml_nodes import parse_yaml
 from ibrobot_core.errors import ConfigError
 
 TOO_MANY = "more than 10000 values, those that aliases repeat included"
@@ -48,14 +48,14 @@ def test_document_is_refused(case: str) -> None:
     text, expected = CASES[case]
 
     with pytest.raises(ConfigError) as refused:
-        parse(text, "robot.yaml")
+        parse_yaml(text, "robot.yaml")
 
     assert str(refused.value) == expected
 
 
 def test_endless_file_is_read_to_the_limit_only() -> None:
     with pytest.raises(ConfigError, match=TOO_LONG):
-        load("/dev/zero")
+        load_config("/dev/zero")
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import jsonschema
 import pytest
 
 from ibrobot_core.config.jsonschema import json_schema
-from ibrobot_core.config.yaml_nodes import parse
+from ibrobot_core.config.yaml_nodes import parse_yaml
 from ibrobot_core.plugins import Registry
 
 
@@ -20,13 +20,13 @@ def validator(registry: Registry) -> jsonschema.Draft202012Validator:
 
 
 def test_a_good_file_is_valid(validator: jsonschema.Draft202012Validator, base: str) -> None:
-    validator.validate(parse(base, "robot.yaml").root)
+    validator.validate(parse_yaml(base, "robot.yaml").root)
 
 
 def test_named_hardware_is_valid(validator: jsonschema.Draft202012Validator, base: str) -> None:
     both = "hardware: {l: {type: bus, port: a, joints: [pan, lift]}, r: {type: bus, port: b, joints: [grip]}}"
 
-    validator.validate(parse(base.replace("hardware: {type: bus, port: /dev/null}", both), "robot.yaml").root)
+    validator.validate(parse_yaml(base.replace("hardware: {type: bus, port: /dev/null}", both), "robot.yaml").root)
 
 
 @pytest.mark.parametrize(
@@ -53,7 +53,7 @@ def test_what_an_editor_marks(
 ) -> None:
     assert base.count(old) == 1
 
-    errors = list(validator.iter_errors(parse(base.replace(old, new), "robot.yaml").root))
+    errors = list(validator.iter_errors(parse_yaml(base.replace(old, new), "robot.yaml").root))
 
     assert {tuple(error.absolute_path) for error in errors} == {path}
 

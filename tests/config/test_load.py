@@ -9,7 +9,7 @@ from pathlib import Path
 import attrs
 import pytest
 
-from ibrobot_core.config import RobotConfig, find_config, from_document, load
+from ibrobot_core.config import RobotConfig, find_config, from_document, load_config
 from ibrobot_core.config.show import to_yaml
 from ibrobot_core.errors import ConfigError
 from ibrobot_core.plugins import Registry
@@ -236,9 +236,9 @@ def test_a_file_that_cannot_be_read(registry: Registry, tmp_path: Path) -> None:
     binary.write_bytes(b"\xff\xfe\x00")
 
     with pytest.raises(ConfigError, match=r"cannot be read: not UTF-8 text$"):
-        load(binary, registry=registry)
+        load_config(binary, registry=registry)
     with pytest.raises(ConfigError, match=r"cannot be read: Is a directory$"):
-        load(tmp_path, registry=registry)
+        load_config(tmp_path, registry=registry)
 
 
 @pytest.mark.parametrize(("text", "found"), [("", "nothing"), ("- a", "a list"), ("5", "5")])

@@ -12,10 +12,10 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from ibrobot_core.config import RobotConfig, from_document
-from ibrobot_core.config.overrides import apply
-from ibrobot_core.config.show import dump
+from ibrobot_core.config.overrides import apply_overrides
+from ibrobot_core.config.show import dump_yaml
 from ibrobot_core.config.single import single_options
-from ibrobot_core.config.yaml_nodes import Document, parse, scalar
+from ibrobot_core.config.yaml_nodes import Document, parse_yaml, scalar
 from ibrobot_core.errors import ConfigError
 from ibrobot_core.options import option
 from ibrobot_core.plugins import Registry
@@ -148,7 +148,7 @@ def _without_expansion(value: Any) -> bool:
 def test_any_value_goes_in_and_comes_out(path: list[str], value: Any) -> None:
     document = Document({}, {}, [], "robot.yaml")
 
-    apply(document, [f"{'.'.join(path)}={dump(value)}"])
+    apply_overrides(document, [f"{'.'.join(path)}={dump_yaml(value)}"])
 
     assert not document.problems
     assert document.get(*path) == value
@@ -165,8 +165,8 @@ def test_any_value_anywhere_is_taken_or_told(
     load_text: Load, base: str, registry: Registry, change: tuple[int, Any], sim: bool
 ) -> None:
     choice, value = change
-    paths = _paths(parse(base, "robot.yaml").root)
-    override = f"{'.'.join(paths[choice % len(paths)])}={dump(value)}"
+    paths = _paths(parse_yaml(base, "robot.yaml").root)
+    override = f"{'.'.join(paths[choice % len(paths)])}={dump_yaml(value)}"
 
     try:
         config = load_text(base, overrides=[override], sim=sim)
@@ -178,7 +178,7 @@ def test_any_value_anywhere_is_taken_or_told(
 @example("\x85")
 @given(values.filter(_without_expansion))
 def test_yaml_text_reads_back_with_equal_types(value: Any) -> None:
-    document = parse(dump({"key": value}), "robot.yaml")
+    document = parse_yaml(dump_yaml({"key": value}), "robot.yaml")
 
     assert not document.problems
     assert repr(document.root["key"]) == repr(value)
@@ -202,7 +202,7 @@ def test_every_float_is_read_as_a_float(value: float) -> None:
     ],
 )  # fmt: skip
 def test_scalars_of_yaml_1_2(text: str, value: object) -> None:
-    read = parse(f"key: {text}", "robot.yaml").root["key"]
+    read = parse_yaml(f"key: {text}", "robot.yaml").root["key"]
 
     assert read == value
     assert type(read) is type(value)
@@ -215,10 +215,10 @@ def test_nothing_but_true_and_false_is_a_truth_value(text: str) -> None:
 
 
 def test_quoted_scalars_are_text() -> None:
-    assert parse("a: '5'\nb: \"true\"\nc: |\n  7\n", "x").root == {"a": "5", "b": "true", "c": "7\n"}
+    assert parse_yaml("a: '5'\nb: \"true\"\nc: |\n  7\n", "x").root == {"a": "5", "b": "true", "c": "7\n"}
 
 
 def test_pyyaml_is_not_asked_for_scalars() -> None:
     # What the strict reader is for: PyYAML itself reads these otherwise.
     assert yaml.safe_load("a: on\nb: 1e-3") == {"a": True, "b": "1e-3"}
-    assert parse("a: on\nb: 1e-3", "x").root == {"a": "on", "b": 0.001}
+    assert parse_yaml("a: on\nb: 1e-3", "x").root == {"a": "on", "b": 0.001}

@@ -199,7 +199,7 @@ def test_compressed_pictures_are_decoded_once_and_only_when_a_frame_asks(
         return encode_image(np.full((4, 6, 3), picture.data[0], np.uint8), "rgb8", picture.header)
 
     registry = Registry(decoders=[DecoderDescriptor(("grey",), lambda: grey)])
-    monkeypatch.setattr(image_module, "installed", lambda: registry)
+    monkeypatch.setattr(image_module, "installed_plugins", lambda: registry)
     assembler = FrameAssembler(contract, keys=["observation.images.top"])
     for k in range(10):
         picture = CompressedImage(Header(k * 10 * MS), "grey", np.array([k], np.uint8))

@@ -12,7 +12,7 @@ import pytest
 import yaml
 from ibrobot_testing.contexts import ARM, GRIPPER
 
-from ibrobot_core.config import load
+from ibrobot_core.config import load_config
 from ibrobot_core.config.schema import ActionSpec, Align, ImageSpec, ObservationSpec
 from ibrobot_core.contract.compose import Composer
 from ibrobot_core.contract.specs import Contract
@@ -297,6 +297,6 @@ def test_the_order_of_yaml_keys_keeps_the_fingerprint(tmp_path: Path) -> None:
     for i, document in enumerate((yaml.safe_load(ROBOT), reversed_keys(yaml.safe_load(ROBOT)))):
         path = tmp_path / f"{i}.yaml"
         path.write_text(yaml.safe_dump(document, sort_keys=False))
-        contracts.append(Contract.from_config(load(path, registry=registry)))
+        contracts.append(Contract.from_config(load_config(path, registry=registry)))
     assert contracts[0].fingerprint() == contracts[1].fingerprint()
     assert contracts[0].observations["observation.state"].names == ("b.pos", "a.vel")

@@ -21,7 +21,7 @@ from ibrobot_core.config import from_document
 from ibrobot_core.control.host import ControlClient, ControlHost, InlineControl
 from ibrobot_core.control.link import ControlState, PlanRecord
 from ibrobot_core.errors import ComponentFailed, HardwareError
-from ibrobot_core.plugins import installed
+from ibrobot_core.plugins import installed_plugins
 
 if TYPE_CHECKING:
     from conftest import Site
@@ -128,7 +128,7 @@ def make(site: Site, told: Told) -> Iterator[Callable[..., ControlHost]]:
                 config, RealClock(), 0, told.states.put, told.events.put, told.deaths.put, given_up=given_up
             )
         else:
-            host = InlineControl(config, installed(), SteppedClock(), 0, told.states.put, told.events.put)
+            host = InlineControl(config, installed_plugins(), SteppedClock(), 0, told.states.put, told.events.put)
         made.append(host)
         return host
 

@@ -13,11 +13,11 @@ import pytest
 from ibrobot_core.config import RobotConfig
 from ibrobot_core.config.jsonschema import json_schema
 from ibrobot_core.options import fields
-from ibrobot_core.plugins import Entry, installed
+from ibrobot_core.plugins import Entry, installed_plugins
 
 pytestmark = pytest.mark.integration
 
-ENTRIES = list(installed().entries.values())
+ENTRIES = list(installed_plugins().entries.values())
 DOCS = Path(__file__).parents[2] / "docs"
 
 
@@ -44,7 +44,7 @@ def _keys(schema: Any) -> Iterator[str]:
 def test_every_key_of_the_schema_is_on_a_page(page: Callable[[str], str]) -> None:
     rows = page("config") + page("options")
 
-    missing = {key for key in _keys(json_schema(installed())) if f"`{key}`" not in rows}
+    missing = {key for key in _keys(json_schema(installed_plugins())) if f"`{key}`" not in rows}
 
     assert missing == set()
 

@@ -16,9 +16,9 @@ import pytest
 from ibrobot_core.cli.main import cli
 from ibrobot_core.config import from_document
 from ibrobot_core.config.load import load_contract
-from ibrobot_core.config.yaml_nodes import parse
+from ibrobot_core.config.yaml_nodes import parse_yaml
 from ibrobot_core.errors import ConfigError
-from ibrobot_core.plugins import installed
+from ibrobot_core.plugins import installed_plugins
 
 pytestmark = pytest.mark.integration
 
@@ -149,7 +149,9 @@ class Excerpt(Snippet):
 
     def load(self) -> Any:
         """Its values, below the keys that the note names."""
-        document = parse(re.sub(r"\$\{\w+(?::([^}]*))?\}", lambda match: match[1] or "value", self.text), str(self))
+        document = parse_yaml(
+            re.sub(r"\$\{\w+(?::([^}]*))?\}", lambda match: match[1] or "value", self.text), str(self)
+        )
         document.raise_problems()
         values = document.root
         for key in reversed(self.note.removeprefix("under ").split(".") if self.note.startswith("under ") else ()):
@@ -190,7 +192,7 @@ LOG = "time_s,shoulder_pan,shoulder_lift,elbow_flex,wrist_flex,wrist_roll,grippe
 
 def _robot() -> Any:
     """The robot that the pages speak of: that of the README, with a policy."""
-    robot = parse(CONFIG.read_text(encoding="utf-8"), "so101.yaml").root
+    robot = parse_yaml(CONFIG.read_text(encoding="utf-8"), "so101.yaml").root
     robot["models"]["pick_cube_act"] = {"type": "lerobot", "path": "outputs/pick_cube_act"}
     return robot
 
@@ -235,7 +237,7 @@ OPTION_TABLE = r"^\| option \|[^\n]*\n\|[-|]+\n(.*?)(?=^[^|]|\Z)"
 
 def test_every_table_of_options_names_options_that_exist() -> None:
     """Those with the heading `option`."""
-    offered = [entry.descriptor.options for entry in installed().entries.values()]
+    offered = [entry.descriptor.options for entry in installed_plugins().entries.values()]
     known = {field.name for options in offered for field in attrs.fields(options)}
     named = [
         (option, f"{page.relative_to(ROOT)}:{line}")

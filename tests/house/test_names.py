@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from ibrobot_core.plugins import KINDS, OFFICIAL, example, official_plugins
+from ibrobot_core.plugins import KINDS, OFFICIAL, example_type, official_plugins
 
 CORE = OFFICIAL.parent
 ORDINARY = {"joint", "keyboard"}
@@ -57,7 +57,7 @@ def test_examples_in_messages_are_default_types() -> None:
     kinds = [kind for offers in official_plugins().values() for kind in offers.get("default", ())]
     assert sorted(kinds) == ["dataset", "hardware", "recorder", "transport", "viewer"]
     for kind in kinds:
-        assert any(example(kind) in offers.get(kind, ()) for offers in official_plugins().values())
+        assert any(example_type(kind) in offers.get(kind, ()) for offers in official_plugins().values())
 
 
 @pytest.mark.integration

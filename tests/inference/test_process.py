@@ -15,7 +15,7 @@ import pytest
 from ibrobot_testing import host_context
 from ibrobot_testing.fakes import FakePolicy
 
-from ibrobot_core.config import RobotConfig, load
+from ibrobot_core.config import RobotConfig, load_config
 from ibrobot_core.errors import PolicyError
 from ibrobot_core.inference.process import ProcessEngine
 from ibrobot_core.plugins import discover
@@ -91,7 +91,7 @@ ROBOT = textwrap.dedent("""\
 def config(site: Site, tmp_path: Path) -> RobotConfig:
     site.add("net-parts", PARTS)
     (tmp_path / "mini.yaml").write_text(ROBOT)
-    return load(tmp_path / "mini.yaml", sim=True, registry=discover(site.entry_points()))
+    return load_config(tmp_path / "mini.yaml", sim=True, registry=discover(site.entry_points()))
 
 
 def fingerprint(config: RobotConfig) -> str:

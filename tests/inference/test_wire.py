@@ -20,12 +20,12 @@ from ibrobot_core.inference import wire
 from ibrobot_core.inference.wire import (
     ALIGNMENT,
     Buffer,
-    Decoder,
-    Encoder,
-    Kind,
-    Limits,
-    Message,
     PictureCodec,
+    WireDecoder,
+    WireEncoder,
+    WireKind,
+    WireLimits,
+    WireMessage,
     decode,
     encode,
 )
@@ -41,16 +41,23 @@ ANY = {
     "latency_ms": st.floats(0, 1e9),
 }  # fmt: skip
 WAITS, COUNTS = st.integers(0, 2**63 - 1), st.integers(0, 2**64 - 1)
-MESSAGES = st.builds(Message, kind=st.just(Kind.REQUEST), deadline_ns=WAITS, episode=COUNTS, **ANY) | st.builds(
-    Message, kind=st.sampled_from((Kind.ANSWER, Kind.FAILURE)), queued_ns=WAITS, pace_ns=COUNTS, **ANY
+MESSAGES = st.builds(WireMessage, kind=st.just(WireKind.REQUEST), deadline_ns=WAITS, episode=COUNTS, **ANY) | st.builds(
+    WireMessage, kind=st.sampled_from((WireKind.ANSWER, WireKind.FAILURE)), queued_ns=WAITS, pace_ns=COUNTS, **ANY
 )
-EXAMPLE = Message(
-    Kind.REQUEST, 7, {"state": np.array([0.5, -1.5], np.float32), "on": np.array([[True], [False]])}, "so101", "3f2a",
-    stamp_ns=1_700_000_000_000_000_000, deadline_ns=5_000_000_000, episode=2, seed=42,
-)  # fmt: skip
+EXAMPLE = WireMessage(
+    WireKind.REQUEST,
+    7,
+    {"state": np.array([0.5, -1.5], np.float32), "on": np.array([[True], [False]])},
+    "so101",
+    "3f2a",
+    stamp_ns=1_700_000_000_000_000_000,
+    deadline_ns=5_000_000_000,
+    episode=2,
+    seed=42,
+)
 
 
-def same(a: Message, b: Message) -> None:
+def same(a: WireMessage, b: WireMessage) -> None:
     assert list(a.tensors) == list(b.tensors)
     for name, array in a.tensors.items():
         assert array.shape == b.tensors[name].shape
@@ -61,13 +68,13 @@ def same(a: Message, b: Message) -> None:
 
 
 @given(MESSAGES)
-def test_what_is_encoded_is_decoded(message: Message):
+def test_what_is_encoded_is_decoded(message: WireMessage):
     same(message, decode(encode(message)))
 
 
 @given(st.lists(MESSAGES, min_size=1, max_size=4))
-def test_one_buffer_serves_one_frame_after_another(messages: list[Message]):
-    encoder, decoder, buffer = Encoder(), Decoder(), Buffer()
+def test_one_buffer_serves_one_frame_after_another(messages: list[WireMessage]):
+    encoder, decoder, buffer = WireEncoder(), WireDecoder(), Buffer()
     for message in [*messages, *messages]:
         frame = encoder.encode(message, buffer.allocate)
         assert bytes(frame) == bytes(encode(message))
@@ -76,7 +83,7 @@ def test_one_buffer_serves_one_frame_after_another(messages: list[Message]):
 
 
 def test_robots_that_come_and_go_cost_no_memory():
-    encoder, decoder = Encoder(), Decoder()
+    encoder, decoder = WireEncoder(), WireDecoder()
 
     def meet(robots: range) -> int:
         for number in robots:
@@ -97,7 +104,7 @@ def test_robots_that_take_turns_are_laid_out_once(robots: int, monkeypatch: pyte
     for name in ("_lay_out", "_places"):
         work = getattr(wire, name)
         monkeypatch.setattr(wire, name, lambda *args, work=work, name=name: laid_out.append(name) or work(*args))
-    encoder, decoder = Encoder(), Decoder()
+    encoder, decoder = WireEncoder(), WireDecoder()
     for _ in range(3):
         for number in range(robots):
             decoder.decode(encoder.encode(attrs.evolve(EXAMPLE, robot=f"robot {number}")))
@@ -117,12 +124,12 @@ def test_tensors_are_aligned_read_only_views():
 
 @settings(max_examples=200)
 @given(MESSAGES, st.lists(st.tuples(st.integers(0, 400), st.integers(0, 255)), max_size=5), st.integers(-40, 40))
-def test_damage_is_a_wire_error_or_another_message(message: Message, changes: list[tuple[int, int]], longer: int):
+def test_damage_is_a_wire_error_or_another_message(message: WireMessage, changes: list[tuple[int, int]], longer: int):
     frame = bytearray(encode(message))
     for at, value in changes:
         frame[at % len(frame)] = value
     frame = frame + bytes(longer) if longer > 0 else frame[: len(frame) + longer]
-    knowing = Decoder()
+    knowing = WireDecoder()
     knowing.decode(encode(message))
     try:
         decoded = decode(frame)
@@ -177,7 +184,7 @@ def test_false_claims_are_named(at: int, form: str, value: Any, said: str):
 
 
 def test_a_claim_of_ten_gigabytes_costs_no_memory():
-    frame = bytearray(encode(Message(Kind.REQUEST, 1, {"a": np.zeros((1, 1, 1, 1), np.float64)})))
+    frame = bytearray(encode(WireMessage(WireKind.REQUEST, 1, {"a": np.zeros((1, 1, 1, 1), np.float64)})))
     struct.pack_into("<4I", frame, 80 + 20, *(2**32 - 1, 0, 2**32 - 1, 2**32 - 1))
     tracemalloc.start()
     try:
@@ -189,7 +196,7 @@ def test_a_claim_of_ten_gigabytes_costs_no_memory():
 
 
 def test_booleans_are_zero_or_one():
-    frame = bytearray(encode(Message(Kind.REQUEST, 1, {"on": np.array([True])})))
+    frame = bytearray(encode(WireMessage(WireKind.REQUEST, 1, {"on": np.array([True])})))
     frame[-1] = 2
     with pytest.raises(WireError, match="booleans other than 0 and 1"):
         decode(frame)
@@ -216,8 +223,8 @@ def test_what_has_no_place_in_a_frame_is_not_sent(changed: dict[str, Any], said:
 
 
 def test_both_sides_keep_to_the_limits():
-    limits = Limits(size=256)
-    message = Message(Kind.REQUEST, 1, {"a": np.zeros(200, np.uint8)})
+    limits = WireLimits(size=256)
+    message = WireMessage(WireKind.REQUEST, 1, {"a": np.zeros(200, np.uint8)})
     with pytest.raises(WireError, match="larger than 256"):
         encode(message, limits=limits)
     with pytest.raises(WireError, match="a frame has 80 to 256"):
@@ -244,8 +251,8 @@ class Halves(PictureCodec):
         return np.repeat(rows, 2, axis=0)[:height]
 
 
-PICTURES = Message(
-    Kind.REQUEST, 1,
+PICTURES = WireMessage(
+    WireKind.REQUEST, 1,
     {
         "top": np.arange(48, dtype=np.uint8).reshape(4, 4, 3), "mask": np.ones((4, 4, 1), np.uint8),
         "normalised": np.ones((4, 4, 3), np.float32),
@@ -284,7 +291,7 @@ def test_a_picture_that_is_none_is_a_wire_error(answer: object, said: str):
 
 
 def test_a_small_jpeg_that_claims_a_large_picture_is_not_decoded():
-    frame = bytearray(encode(Message(Kind.REQUEST, 1, {"top": PICTURES.tensors["top"]}), codec=Halves()))
+    frame = bytearray(encode(WireMessage(WireKind.REQUEST, 1, {"top": PICTURES.tensors["top"]}), codec=Halves()))
     struct.pack_into("<2I", frame, 100, 40000, 40000)
     codec = Halves()
     codec.answer = AssertionError("it was decoded")
@@ -294,17 +301,17 @@ def test_a_small_jpeg_that_claims_a_large_picture_is_not_decoded():
 
 def test_answers_of_older_servers_say_nothing_of_waiting_and_pace():
     """As version 1 was before: the two fields were 0 in answers."""
-    old = bytearray(encode(Message(Kind.ANSWER, 7, {"action": np.zeros(2)}, "so101", "3f2a", latency_ms=20.0)))
+    old = bytearray(encode(WireMessage(WireKind.ANSWER, 7, {"action": np.zeros(2)}, "so101", "3f2a", latency_ms=20.0)))
     assert old[24:40] == bytes(16)
     answer = decode(old)
     assert (answer.queued_ns, answer.pace_ns, answer.deadline_ns, answer.episode) == (0, 0, 0, 0)
 
 
-@pytest.mark.parametrize("kind", [Kind.ANSWER, Kind.FAILURE])
-def test_waiting_and_pace_lie_where_a_request_has_deadline_and_episode(kind: Kind):
-    frame = encode(Message(kind, 7, queued_ns=30_000_000, pace_ns=750_000_000))
+@pytest.mark.parametrize("kind", [WireKind.ANSWER, WireKind.FAILURE])
+def test_waiting_and_pace_lie_where_a_request_has_deadline_and_episode(kind: WireKind):
+    frame = encode(WireMessage(kind, 7, queued_ns=30_000_000, pace_ns=750_000_000))
     assert struct.unpack_from("<qQ", frame, 24) == (30_000_000, 750_000_000)
-    assert bytes(frame[:24]) == bytes(encode(Message(kind, 7)))[:24], "the rest is as it was"
+    assert bytes(frame[:24]) == bytes(encode(WireMessage(kind, 7)))[:24], "the rest is as it was"
 
 
 def test_the_documented_example_is_what_is_sent():

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from command_line import run_here
 
-from ibrobot_core.plugins import installed
+from ibrobot_core.plugins import installed_plugins
 
 collect_ignore_glob = [] if find_spec("ibrobot_feetech") else ["test_*.py"]  # without plugins nothing runs here
 IBROBOT = (sys.executable, "-c", "from ibrobot_core.cli.main import main; main()")
@@ -72,7 +72,7 @@ def prompt_threads() -> Iterator[None]:
 @pytest.fixture(scope="session")
 def rendering() -> None:
     """Simulated cameras; what asks for this is skipped on a machine that cannot render."""
-    if (missing := installed().missing("sensor", "mujoco")) is not None:
+    if (missing := installed_plugins().missing("sensor", "mujoco")) is not None:
         pytest.skip(str(missing))
 
 

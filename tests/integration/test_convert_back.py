@@ -17,7 +17,7 @@ from ibrobot_lerobot.rows import EpisodeRows
 from recordings import CONTRACT, JOINTS, START_NS, record
 
 from ibrobot_core.contract.specs import Contract
-from ibrobot_core.plugins import installed
+from ibrobot_core.plugins import installed_plugins
 
 pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("first_conversion")]
 
@@ -87,7 +87,7 @@ def test_what_an_episode_says_of_itself_comes_back(exact: Path, convert: Convert
     assert convert(exact, "--to", "bag", "--out", tmp_path / "back", "--episodes", "1-2").returncode == 0
     folders = sorted((tmp_path / "back/episodes").iterdir())
     assert [folder.name for folder in folders] == ["episode_000002", "episode_000003"]
-    reader = installed().open_episode(folders[0])
+    reader = installed_plugins().open_episode(folders[0])
     summary = reader.summary()
     reader.close()
     assert (summary.outcome, summary.finished) == ("failure", True)
@@ -194,7 +194,7 @@ def test_a_dataset_of_others_is_told_by_a_robot_yaml(exact: Path, convert: Conve
     arguments = ["--config", tmp_path / "theirs.yaml", "--norm-mode", "radians"]
     done = convert(tmp_path / "theirs", "--to", "bag", "--out", tmp_path / "back", *arguments)
     assert done.returncode == 0, done.stderr
-    reader = installed().open_episode(tmp_path / "back/episodes/episode_000001")
+    reader = installed_plugins().open_episode(tmp_path / "back/episodes/episode_000001")
     items = [item for item in reader.messages({"/joint_states"})]
     metadata = reader.summary().metadata
     reader.close()

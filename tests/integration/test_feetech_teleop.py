@@ -17,13 +17,13 @@ from ibrobot_feetech.emulator import Emulator
 from noting import Noting
 
 from ibrobot_core.calibration import Calibration, JointCalibration, save_calibration
-from ibrobot_core.config import load
+from ibrobot_core.config import load_config
 from ibrobot_core.contract.joint_units import calibrations
 from ibrobot_core.control import host
 from ibrobot_core.errors import IbrobotError
 from ibrobot_core.launch.runtime import ESTOP, RESET, Runtime
 from ibrobot_core.launch.session import Request, Session
-from ibrobot_core.plugins import installed
+from ibrobot_core.plugins import installed_plugins
 
 pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("prompt_threads")]
 
@@ -136,9 +136,9 @@ def station(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callabl
             "teleoperation.leader.lost_replies=5",
             "control.state_timeout=20.0",
         )
-        config = load(CONFIG, overrides=(*sections, *overrides), mode="teleop")
+        config = load_config(CONFIG, overrides=(*sections, *overrides), mode="teleop")
         typed = queue.SimpleQueue[str]()
-        session = Session(config, installed(), Request(keys=lambda: typed))
+        session = Session(config, installed_plugins(), Request(keys=lambda: typed))
         station = Station(leader, follower, Runtime(session), typed)
         made.append(station)
         follower.on_request = station.count
@@ -249,6 +249,6 @@ def test_a_recording_keeps_where_0_rad_is(tmp_path: Path):
     _, file = arm(tmp_path, "follower")
     hardware = f"hardware={{type: feetech_so101, port: {tmp_path}/follower, calibration: {file}}}"
     for zero_at in ("pose", "range"):
-        (kept,) = calibrations(load(CONFIG, overrides=(hardware,), mode="teleop")).values()
+        (kept,) = calibrations(load_config(CONFIG, overrides=(hardware,), mode="teleop")).values()
         assert {joint["zero_at"] for joint in kept.values()} == {zero_at}
         file.with_suffix(".meta.json").unlink(missing_ok=True)  # as LeRobot's own

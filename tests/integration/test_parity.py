@@ -23,7 +23,7 @@ from stream_server import StreamServer, number_of
 
 from ibrobot_core.bus import Bus
 from ibrobot_core.clock import RealClock, SteppedClock
-from ibrobot_core.config import find_config, load
+from ibrobot_core.config import find_config, load_config
 from ibrobot_core.config.schema import Align, ImageSpec
 from ibrobot_core.contract.frames import FrameSampler, frames
 from ibrobot_core.contract.image import encode_image
@@ -32,7 +32,7 @@ from ibrobot_core.interfaces import EpisodeEnd, EpisodeStart, Feature, Frame
 from ibrobot_core.launch.runtime import Runtime
 from ibrobot_core.launch.session import Request, Session
 from ibrobot_core.messages import CompressedImage, Float64MultiArray, Header, Imu, JointState, Message, Vector3
-from ibrobot_core.plugins import installed
+from ibrobot_core.plugins import installed_plugins
 
 pytestmark = pytest.mark.integration
 
@@ -172,7 +172,7 @@ def test_frames_from_the_bag_are_those_of_the_run(tmp_path: Path, block: int) ->
         spec = contract(rng)
         sent = publications(rng, 1_200 * MS)
         seen = record(tmp_path / f"bag_{seed}", spec, sent)
-        reader = installed().open_episode(tmp_path / f"bag_{seed}")
+        reader = installed_plugins().open_episode(tmp_path / f"bag_{seed}")
         messages = ((each.topic, each.message, each.received_ns) for each in reader.messages(spec.topics))
         converted = list(frames(spec, messages, [frame.stamp_ns for frame in seen]))
         assert len(converted) == len(seen)
@@ -243,7 +243,7 @@ def picture_of(jpeg: bytes) -> CompressedImage:
 
 
 def decoded(picture: CompressedImage) -> NDArray[Any]:
-    image = installed().decode(picture)
+    image = installed_plugins().decode(picture)
     return image.data.reshape(image.height, image.width, 3)
 
 
@@ -284,13 +284,13 @@ def ibrobot_policies():
 
 def test_a_whole_run_in_simulation(site: Any, tmp_path: Path, rendering: None) -> None:
     site.add("frame-keeper", KEEPER)
-    registry = installed()
+    registry = installed_plugins()
     robot = find_config("so101", registry)
     overrides = (
         "models={keeper: {type: keeper}}", "control_modes.model_inference.inference.model=keeper",
         f"recording={{type: mcap, root: {tmp_path}}}",
     )  # fmt: skip
-    config = load(robot, overrides=overrides, mode="model_inference", sim=True)
+    config = load_config(robot, overrides=overrides, mode="model_inference", sim=True)
     runtime = Runtime(Session(config, registry, Request(lockstep=True, duration_s=1.5)))
     runtime.start()
     try:

@@ -10,7 +10,7 @@ import pytest
 import yaml
 from ibrobot_testing.terminal import Terminal
 
-from ibrobot_core.plugins import installed
+from ibrobot_core.plugins import installed_plugins
 
 pytestmark = pytest.mark.integration
 
@@ -19,7 +19,7 @@ def outcomes(folder: Path) -> list[tuple[str, str, int]]:
     """Outcome, prompt and number of joint states of each episode."""
     found = []
     for path in sorted((folder / "episodes").glob("episode_*")):
-        reader = installed().open_episode(path)
+        reader = installed_plugins().open_episode(path)
         summary = reader.summary()
         reader.close()
         assert summary.finished

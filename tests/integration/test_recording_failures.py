@@ -17,7 +17,7 @@ from command_line import run_here
 from recordings import CONTRACT, record
 
 from ibrobot_core.contract.specs import Contract
-from ibrobot_core.plugins import installed
+from ibrobot_core.plugins import installed_plugins
 
 pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("first_conversion")]
 
@@ -122,7 +122,7 @@ def states(folder: Path) -> list[tuple[bool, int]]:
     """Of each episode: whether it is whole, and its messages."""
     found = []
     for path in sorted((folder / "episodes").iterdir()):
-        reader = installed().open_episode(path)
+        reader = installed_plugins().open_episode(path)
         summary = reader.summary()
         assert sum(1 for _ in reader.messages()) == sum(each.count for each in summary.topics.values())
         reader.close()
@@ -379,7 +379,7 @@ class TestMissingTopic:
         assert "no message of /top, which its contract has; no message of /commands" in done.out
 
     def test_replay_names_it(self, run: Run, picks: Path, tmp_path: Path):
-        reader = installed().open_episode(picks / "episodes/episode_000001")
+        reader = installed_plugins().open_episode(picks / "episodes/episode_000001")
         metadata = dict(reader.summary().metadata)
         reader.close()
         wanted = Contract.from_canonical(json.loads(metadata["contract"]))

@@ -24,7 +24,7 @@ from ibrobot_testing.fakes import FakePolicy
 from ibrobot_core.errors import PolicyError
 from ibrobot_core.inference.remote import RemoteEngine
 from ibrobot_core.interfaces import Transport
-from ibrobot_core.plugins import installed
+from ibrobot_core.plugins import installed_plugins
 
 if TYPE_CHECKING:
     from conftest import Log, Ran, Site
@@ -52,7 +52,7 @@ def endpoint() -> str:
 @pytest.fixture(scope="module")
 def connect() -> Callable[..., Transport]:
     """Makes a transport to a router. Zenoh's own threads run already, with the files that they keep."""
-    zenoh = installed().find("transport", "zenoh")
+    zenoh = installed_plugins().find("transport", "zenoh")
 
     def made(**options: Any) -> Transport:
         transport: Transport = zenoh.make(zenoh.options(**options), host_context())

@@ -22,7 +22,7 @@ from ibrobot_core.config.load import load_contract
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import ConfigError
 from ibrobot_core.messages import Bool, Float64MultiArray, Header, JointState, String
-from ibrobot_core.plugins import installed
+from ibrobot_core.plugins import installed_plugins
 
 pytestmark = pytest.mark.integration
 
@@ -124,7 +124,7 @@ def test_signals_shape_the_data_and_do_not_come_back_from_a_dataset(bag: Path, t
     assert "next.reward" in labelled.difference(plain)
     command = [sys.executable, "-c", PROGRAM, "convert", bag, "--config", "contract.yaml", "--out", "set"]
     subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)
-    reader = installed().open_episode(tmp_path / "set:0")
+    reader = installed_plugins().open_episode(tmp_path / "set:0")
     try:
         assert set(reader.summary().topics) == {"/joint_states", "/commands"}
         assert len(list(reader.messages())) == 40

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ibrobot_core.config import load
+from ibrobot_core.config import load_config
 from ibrobot_core.launch.outputs.transforms import read_urdf
 from ibrobot_core.messages import Quaternion, Vector3
 
@@ -32,7 +32,7 @@ def matrix(translation: Vector3, rotation: Quaternion) -> np.ndarray:
 def test_links_stand_where_mujoco_has_them() -> None:
     import mujoco
 
-    robot = load(CONFIG, sim=True).robot
+    robot = load_config(CONFIG, sim=True).robot
     assert robot.description.urdf is not None
     position = np.array([0.3, -0.5, 0.7, 0.2, 0.9, 0.4])
     links = read_urdf(robot.description.urdf)

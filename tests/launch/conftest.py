@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import attrs
 import pytest
 
-from ibrobot_core.config import load
+from ibrobot_core.config import load_config
 from ibrobot_core.launch.runtime import Runtime
 from ibrobot_core.launch.session import Request, Session
 from ibrobot_core.plugins import discover
@@ -252,7 +252,7 @@ class Runs:
         path = self.folder / "mini.yaml"
         path.write_text(ROBOT)
         registry = discover(self.site.entry_points())
-        config = load(path, overrides=overrides, mode=mode, sim=sim, registry=registry)
+        config = load_config(path, overrides=overrides, mode=mode, sim=sim, registry=registry)
         runtime = Runtime(Session(config, registry, Request(**{"lockstep": True, **asked})))
         self.made.append(runtime)
         return runtime

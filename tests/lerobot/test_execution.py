@@ -18,7 +18,7 @@ from ibrobot_lerobot.policy import SEED, LeRobotPolicy
 from ibrobot_serve.service import InferenceService
 from ibrobot_testing.contexts import START_NS, host_context
 
-from ibrobot_core.config import load
+from ibrobot_core.config import load_config
 from ibrobot_core.inference.engine import Engine, LocalEngine
 from ibrobot_core.inference.process import ProcessEngine
 from ibrobot_core.inference.remote import RemoteEngine
@@ -76,7 +76,7 @@ def engines(path: Path, tmp_path: Path) -> Iterator[dict[str, Engine]]:
     service.start()
     made: dict[str, Engine] = {
         "monolithic": LocalEngine(here),
-        "process": ProcessEngine(load(tmp_path / "robot.yaml", sim=True), "net", cloud.fingerprint()),
+        "process": ProcessEngine(load_config(tmp_path / "robot.yaml", sim=True), "net", cloud.fingerprint()),
         "distributed": RemoteEngine(make(path), transport, "net", "mini"),
     }
     try:

@@ -9,7 +9,7 @@ from ibrobot_core.component import Component, cause
 from ibrobot_core.config.schema import MetricsConfig
 from ibrobot_core.launch.outputs.status import counts
 from ibrobot_core.launch.session import Session
-from ibrobot_core.metrics import Metrics, MetricsServer, Probes
+from ibrobot_core.metrics import Metrics, MetricsProbes, MetricsServer
 
 _NAMED_BY_KEY = {"interventions": "joint", "bus drops": "topic"}
 """Groups whose keys are names of joints or topics: they are labels."""
@@ -35,7 +35,9 @@ class MetricsPort(Component):
     @override
     def start(self) -> None:
         session = self._session
-        probes = Probes(lambda metrics: collect(session, metrics), lambda: unhealthy(session), lambda: unready(session))
+        probes = MetricsProbes(
+            lambda metrics: collect(session, metrics), lambda: unhealthy(session), lambda: unready(session)
+        )
         self._server = MetricsServer(self._config.port, probes)
         session.log.info("metrics on %s", self.url)
 

@@ -12,7 +12,7 @@ from ibrobot_core.interfaces import TopicTransport
 from ibrobot_core.launch.session import Session
 from ibrobot_core.launch.transport import NAME as TRANSPORT
 from ibrobot_core.messages import Message
-from ibrobot_core.options import hint
+from ibrobot_core.options import did_you_mean
 from ibrobot_core.units import NS_PER_S
 
 _DEPTH = 10
@@ -57,7 +57,7 @@ class PublishedTopic(Worker):
             self._silent_from_ns = None
         elif self._silent_from_ns is not None and self._session.clock.now_ns() - self._silent_from_ns > _SILENT_NS:
             self._silent_from_ns = None
-            known = hint(self._topic, list(self._session.bus.topics()), "topics here")
+            known = did_you_mean(self._topic, list(self._session.bus.topics()), "topics here")
             self._session.log.warning("%s is not shared: nothing publishes it so far%s", self._topic, known)
         while received is not None:
             self._send(received.message)

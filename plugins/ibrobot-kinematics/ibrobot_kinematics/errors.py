@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from ibrobot_core.errors import IbrobotError
-from ibrobot_core.robot import Vector
+from ibrobot_core.api import IbrobotError, Vector
 
 
 class KinematicsError(IbrobotError):

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import attrs
 import numpy as np
 
-from ibrobot_core.robot import Vector
+from ibrobot_core.api import Vector
 from ibrobot_kinematics.errors import UnreachableError
 from ibrobot_kinematics.model import KinematicModel, TipPose
 from ibrobot_kinematics.quadratic import bounded_minimum

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ibrobot_core.robot import Vector
+from ibrobot_core.api import Vector
 from ibrobot_kinematics.model import KinematicModel
 from ibrobot_kinematics.quadratic import bounded_minimum
 from ibrobot_kinematics.rotations import exp, log

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ibrobot_core.robot import Robot, Vector
+from ibrobot_core.api import Robot, Vector
 from ibrobot_kinematics.errors import KinematicsError
 from ibrobot_kinematics.model import ChainJoint, KinematicModel, TipPose
 

@@ -7,7 +7,7 @@ from functools import cached_property
 import attrs
 import numpy as np
 
-from ibrobot_core.robot import Vector
+from ibrobot_core.api import Vector
 from ibrobot_kinematics.rotations import cross, skew
 
 

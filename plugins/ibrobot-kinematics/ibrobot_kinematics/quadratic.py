@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ibrobot_core.robot import Vector
+from ibrobot_core.api import Vector
 
 
 def bounded_minimum(hessian: Vector, gradient: Vector, lower: Vector, upper: Vector) -> Vector:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ibrobot_core.robot import Vector
+from ibrobot_core.api import Vector
 
 _NO_SINE = 1e-6
 """Below this sine of the angle the antisymmetric part of a matrix no longer gives the axis."""

@@ -7,14 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 from ibrobot_camera.device import realsense_stream, video_device
 from ibrobot_camera.options import OpenCvOptions, RealSenseOptions
-from ibrobot_core.descriptors import Check, Command, DecoderDescriptor, SensorDescriptor
-from ibrobot_core.hookspecs import hookimpl
+from ibrobot_core.api import Check, Command, DecoderDescriptor, SensorDescriptor, hookimpl
 
 if TYPE_CHECKING:
     import click
 
-    from ibrobot_core.interfaces import Context, Sensor
-    from ibrobot_core.messages import CompressedImage, Image
+    from ibrobot_core.api import CompressedImage, Context, Image, Sensor
 
 
 def _opencv(options: Any, ctx: Context) -> Sensor:

@@ -10,8 +10,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from ibrobot_core.errors import SensorError
-from ibrobot_core.messages import CameraInfo, Header
+from ibrobot_core.api import CameraInfo, Header, SensorError
 
 _MATRICES = {"distortion_coefficients": None, "camera_matrix": 9, "rectification_matrix": 9, "projection_matrix": 12}
 """Key -> how many numbers it has."""

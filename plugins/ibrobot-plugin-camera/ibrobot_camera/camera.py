@@ -14,11 +14,19 @@ from ibrobot_camera.calibration import load_info
 from ibrobot_camera.capture import DEPTHS, Capture, Picture, Pixels
 from ibrobot_camera.device import find_device
 from ibrobot_camera.options import OpenCvOptions
-from ibrobot_core.clock import SteppedClock
-from ibrobot_core.errors import SensorError
-from ibrobot_core.interfaces import Context, Sensor
-from ibrobot_core.messages import CameraInfo, CompressedImage, Header, Image, Message
-from ibrobot_core.units import NS_PER_S, ns
+from ibrobot_core.api import (
+    NS_PER_S,
+    CameraInfo,
+    CompressedImage,
+    Context,
+    Header,
+    Image,
+    Message,
+    Sensor,
+    SensorError,
+    SteppedClock,
+    ns,
+)
 
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 2.0
 """Between attempts to open a lost source again."""

@@ -18,9 +18,7 @@ from numpy.typing import NDArray
 from ibrobot_camera.device import Device
 from ibrobot_camera.options import OpenCvOptions
 from ibrobot_camera.v4l2 import Mode, modes
-from ibrobot_core.errors import ContractError, SensorError
-from ibrobot_core.messages import CompressedImage, Header
-from ibrobot_core.units import NS_PER_S
+from ibrobot_core.api import NS_PER_S, CompressedImage, ContractError, Header, SensorError
 
 DEPTHS = ("Y16 ", "Z16 ")
 """Formats of 16 bits a pixel, which JPEG cannot hold."""

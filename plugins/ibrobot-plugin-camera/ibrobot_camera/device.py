@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 import attrs
 
 from ibrobot_camera.options import OpenCvOptions, RealSenseOptions
-from ibrobot_core.errors import SensorError
+from ibrobot_core.api import SensorError
 
 BY_ID = Path("/dev/v4l/by-id")
 _URL = re.compile(r"[a-z][a-z0-9+.-]*://", re.IGNORECASE)

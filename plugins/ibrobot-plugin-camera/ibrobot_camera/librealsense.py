@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-from ibrobot_core.errors import MissingDependency
+from ibrobot_core.api import MissingDependency
 
 _PACKAGES = {"libusb-1.0.so.0": "libusb-1.0-0", "libudev.so.1": "libudev1"}
 """System library -> the Debian package that brings it."""

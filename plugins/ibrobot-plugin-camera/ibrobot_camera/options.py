@@ -6,7 +6,7 @@ from pathlib import Path
 
 import attrs
 
-from ibrobot_core.options import documented, option
+from ibrobot_core.api import documented, option
 
 ENCODING = option(
     "jpeg", choices=("jpeg", "raw"),

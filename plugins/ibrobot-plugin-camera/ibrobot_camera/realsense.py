@@ -15,9 +15,7 @@ from ibrobot_camera.camera import to_image
 from ibrobot_camera.capture import Pixels
 from ibrobot_camera.librealsense import load_library
 from ibrobot_camera.options import RealSenseOptions
-from ibrobot_core.errors import SensorError
-from ibrobot_core.interfaces import Context, Sensor
-from ibrobot_core.messages import CameraInfo, CompressedImage, Header, Image, Message
+from ibrobot_core.api import CameraInfo, CompressedImage, Context, Header, Image, Message, Sensor, SensorError
 
 _WAIT_MS = 200
 _CLOSE_S = 5.0

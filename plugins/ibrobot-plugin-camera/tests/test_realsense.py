@@ -21,7 +21,7 @@ from ibrobot_core.clock import RealClock
 from ibrobot_core.errors import MissingDependency, SensorError
 from ibrobot_core.interfaces import Context, Sensor
 from ibrobot_core.messages import CameraInfo, CompressedImage, Image
-from ibrobot_core.plugins import installed
+from ibrobot_core.plugins import installed_plugins
 
 WIDTH, HEIGHT = 64, 48
 PATIENCE_S = 30.0
@@ -56,7 +56,7 @@ def test_what_the_library_lacks_is_named_with_its_remedy(
     with pytest.raises(MissingDependency) as missing:
         RealSenseCamera(SMALL, host_context("top"))
     assert str(missing.value) == told
-    assert str(installed().missing("sensor", "realsense")) == told
+    assert str(installed_plugins().missing("sensor", "realsense")) == told
 
 
 class SoftwareCamera:

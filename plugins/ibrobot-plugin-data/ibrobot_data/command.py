@@ -17,16 +17,11 @@ import attrs
 import click
 from click.core import ParameterSource
 
-from ibrobot_core.contract.specs import Contract
-from ibrobot_core.descriptors import DatasetDescriptor, Flag
-from ibrobot_core.errors import DatasetError
-from ibrobot_core.outside import echo
-from ibrobot_core.plugins import installed
-from ibrobot_core.units import NORM_MODES
+from ibrobot_core.api import NORM_MODES, Contract, DatasetDescriptor, DatasetError, Flag, echo, installed_plugins
 from ibrobot_data.request import MISSING, OUTCOMES, EpisodeReport, Report, Request
 
 if TYPE_CHECKING:
-    from ibrobot_core.config import RobotConfig
+    from ibrobot_core.api import RobotConfig
 
 _MIB = 1 << 20
 _ONLY_TO_BAG = ("numbers",)
@@ -38,7 +33,7 @@ _MISSING = attrs.fields(Request).missing.default
 
 def _flags() -> dict[str, Flag]:
     """Name of a parameter -> the flag that a dataset writer adds to this command."""
-    descriptors = (entry.descriptor for entry in installed().entries.values())
+    descriptors = (entry.descriptor for entry in installed_plugins().entries.values())
     flags = [flag for each in descriptors if isinstance(each, DatasetDescriptor) for flag in each.flags]
     return {flag.name.removeprefix("--").replace("-", "_"): flag for flag in flags}
 
@@ -108,7 +103,7 @@ def _to_dataset(
 
     given = [(flag, asked.pop(name)) for name, flag in _flags().items()]
     overrides = [f"{flag.option}={flag.value or value}" for flag, value in given if value]
-    type_ = type_ or installed().default("dataset")
+    type_ = type_ or installed_plugins().default("dataset")
     request = Request(
         out, _options("dataset", type_, (*overrides, *sets)), type_,
         outcomes=outcomes or OUTCOMES, jobs=jobs or _jobs(), calibration=_calibration(calibration),
@@ -123,15 +118,14 @@ def _to_bags(
     *, episodes: tuple[Path, ...], out: Path, config: str | None, calibration: str | None, as_json: bool,
     sets: tuple[str, ...], norm_mode: str | None, numbers: str | None, prompt: str, **_: Any,
 ) -> Report:  # fmt: skip
-    from ibrobot_core.interfaces import EpisodeAddress
-    from ibrobot_core.recording.provenance import told_by
+    from ibrobot_core.api import EpisodeAddress, stated_by_robot
     from ibrobot_data.episode import make_writer
     from ibrobot_data.to_bags import BagRequest, convert_to_bags
 
     if len(episodes) != 1:
         raise click.UsageError("--to bag takes one dataset at a time")
     address = EpisodeAddress.of(episodes[0])
-    dataset, recorder = installed().default("dataset"), installed().default("recorder")
+    dataset, recorder = installed_plugins().default("dataset"), installed_plugins().default("recorder")
     writer = make_writer(Request(address.path, _options("dataset", dataset, ()), dataset))
     if (summary := writer.summary(address.path)) is None:
         raise DatasetError(f"{address.path}: there is no dataset of type {dataset}")
@@ -140,7 +134,7 @@ def _to_bags(
     request = BagRequest(
         address.path, chosen, out, _options("recorder", recorder, sets), recorder, prompt=prompt,
         contract=Contract.from_config(robot) if robot is not None else None,
-        told=told_by(robot, norm_mode, _calibration(calibration)) if robot is not None else {},
+        told=stated_by_robot(robot, norm_mode, _calibration(calibration)) if robot is not None else {},
     )  # fmt: skip
     with _progress(len(chosen), as_json) as watch:
         return convert_to_bags(request, watch)
@@ -174,15 +168,15 @@ def _jobs() -> int:
 
 
 def _options(kind: str, type_: str, overrides: Sequence[str]) -> Any:
-    from ibrobot_core.config.single import single_options
+    from ibrobot_core.api import single_options
 
-    return single_options(installed().find(kind, type_).options, overrides, type_)
+    return single_options(installed_plugins().find(kind, type_).options, overrides, type_)
 
 
 def _robot(config: str) -> RobotConfig:
-    from ibrobot_core.config.load import find_config, load_contract
+    from ibrobot_core.api import find_config, load_contract
 
-    return load_contract(find_config(config, installed()))
+    return load_contract(find_config(config, installed_plugins()))
 
 
 def _contract(config: str | None) -> dict[str, Any]:
@@ -195,7 +189,7 @@ def _contract(config: str | None) -> dict[str, Any]:
 def _calibration(name: str | None) -> Mapping[str, Mapping[str, Any]] | None:
     if name is None:
         return None
-    from ibrobot_core.calibration import load_calibration
+    from ibrobot_core.api import load_calibration
 
     return load_calibration(name).snapshot()
 
@@ -221,7 +215,7 @@ def _progress(episodes: int, quiet: bool) -> Iterator[Any]:
         return
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-    from ibrobot_core.screen import Screen, text
+    from ibrobot_core.api import Screen, styled
 
     told, speed = (TextColumn(each, markup=False) for each in ("{task.description}", "{task.fields[rate]}"))
     with Progress(told, BarColumn(), speed, TimeRemainingColumn(), console=Screen(stderr=True)) as bar:
@@ -233,7 +227,7 @@ def _progress(episodes: int, quiet: bool) -> Iterator[Any]:
                 done += 1
                 if report.error:
                     why = report.error.splitlines()[0]
-                    bar.console.print(text(report.source, "red") + text(f": left out: {why}"))
+                    bar.console.print(styled(report.source, "red") + styled(f": left out: {why}"))
             bar.update(
                 task,
                 description=f"{done} of {episodes} episodes",

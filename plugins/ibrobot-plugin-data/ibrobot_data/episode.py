@@ -16,15 +16,27 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.calibration import Calibration, JointCalibration
-from ibrobot_core.clock import RealClock
-from ibrobot_core.contract.joint_units import JointUnits
-from ibrobot_core.contract.specs import TASK, Contract
-from ibrobot_core.errors import ContractError, DatasetError, IbrobotError, RecorderError
-from ibrobot_core.interfaces import Context, DatasetWriter, EpisodeAddress, EpisodeReader, EpisodeSummary, Feature
-from ibrobot_core.plugins import installed
-from ibrobot_core.recording.provenance import recorded_contract
-from ibrobot_core.robot import Robot
+from ibrobot_core.api import (
+    TASK_KEY,
+    Calibration,
+    Context,
+    Contract,
+    ContractError,
+    DatasetError,
+    DatasetWriter,
+    EpisodeAddress,
+    EpisodeReader,
+    EpisodeSummary,
+    Feature,
+    IbrobotError,
+    JointCalibration,
+    JointUnits,
+    RealClock,
+    RecorderError,
+    Robot,
+    installed_plugins,
+    recorded_contract,
+)
 from ibrobot_data.identity import identity
 from ibrobot_data.request import EpisodeReport, Request
 from ibrobot_data.ticks import Ticks
@@ -79,7 +91,7 @@ def make_writer(request: Request) -> DatasetWriter:
     Raises:
         PluginError: when it is not installed.
     """
-    descriptor = installed().find("dataset", request.type)
+    descriptor = installed_plugins().find("dataset", request.type)
     ctx = Context("convert", RealClock(), logging.getLogger("ibrobot.convert"), Robot("convert", ()))
     writer: DatasetWriter = descriptor.make(request.options, ctx)
     return writer
@@ -127,7 +139,7 @@ def convert_episode(job: Job, progress: Callable[[int], None]) -> EpisodeReport:
     report = EpisodeReport(job.source)
     try:
         key = unit_key(job)
-        reader = installed().open_episode(job.episode)
+        reader = installed_plugins().open_episode(job.episode)
         summary = reader.summary()
         report = attrs.evolve(_described(report, summary, job.request), identity=identity(reader, summary))
         unit = _write(job, key, reader, summary, report, making, progress)
@@ -213,8 +225,8 @@ def _write(
 def _labelled(values: dict[str, NDArray[Any]], contract: Contract, tasks: Sequence[str], prompt: str) -> _Row:
     """A row with its signals as the dataset has them, and its task: the prompt where no topic gives one."""
     signals = {part.key: values[part.key].astype(part.feature.dtype) for part in contract.signal_parts}
-    number = signals.pop(TASK, None)
-    rest = {key: value for key, value in values.items() if key != TASK}
+    number = signals.pop(TASK_KEY, None)
+    rest = {key: value for key, value in values.items() if key != TASK_KEY}
     return rest | signals, prompt if number is None else tasks[int(number[0])]
 
 
@@ -228,7 +240,7 @@ def _add(writer: DatasetWriter, row: _Row, request: Request, report: EpisodeRepo
 def _features(contract: Contract, values: Mapping[str, NDArray[Any]], success: bool) -> dict[str, Feature]:
     """The contract's features, with the sizes that only the messages know, and its signals."""
     features = {key: attrs.evolve(each, shape=values[key].shape) for key, each in contract.features().items()}
-    features |= {part.key: part.feature for part in contract.signal_parts if part.key != TASK}
+    features |= {part.key: part.feature for part in contract.signal_parts if part.key != TASK_KEY}
     return features | ({SUCCESS: Feature("bool", (1,))} if success else {})
 
 

@@ -8,8 +8,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 from uuid import UUID
 
-from ibrobot_core.errors import DatasetError
-from ibrobot_core.interfaces import EpisodeReader, EpisodeSummary
+from ibrobot_core.api import DatasetError, EpisodeReader, EpisodeSummary
 
 UUID_KEY = "uuid"
 """Of the metadata: random where an episode was recorded live, made of the other metadata where it was in lockstep."""

@@ -9,8 +9,7 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.contract.specs import Contract
-from ibrobot_core.interfaces import DatasetSummary
+from ibrobot_core.api import Contract, DatasetSummary
 from ibrobot_data.episode import Unit
 from ibrobot_data.request import Request
 

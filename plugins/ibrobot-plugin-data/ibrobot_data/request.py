@@ -8,9 +8,7 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.contract.specs import Contract
-from ibrobot_core.options import documented, option
-from ibrobot_core.units import NORM_MODES
+from ibrobot_core.api import NORM_MODES, Contract, documented, option
 
 MISSING = ("refuse", "skip", "hold")
 OUTCOMES = ("success", "failure", "unknown")

@@ -23,12 +23,16 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.contract.specs import Contract
-from ibrobot_core.errors import DatasetError, IbrobotError
-from ibrobot_core.interfaces import DatasetSummary, EpisodeAddress
-from ibrobot_core.memory import set_malloc
-from ibrobot_core.plugins import installed
-from ibrobot_core.units import seconds
+from ibrobot_core.api import (
+    Contract,
+    DatasetError,
+    DatasetSummary,
+    EpisodeAddress,
+    IbrobotError,
+    installed_plugins,
+    seconds,
+    set_malloc,
+)
 from ibrobot_data.episode import (
     Job,
     Unit,
@@ -60,7 +64,7 @@ def find_episodes(paths: Sequence[Path]) -> list[Path]:
     Raises:
         RecorderError: for a path that is none, or has none below.
     """
-    readers = [reader for reader in installed().readers if not reader.numbered]
+    readers = [reader for reader in installed_plugins().readers if not reader.numbered]
 
     def below(path: Path) -> Iterator[Path]:
         if any(reader.reads(path) for reader in readers):
@@ -75,7 +79,7 @@ def find_episodes(paths: Sequence[Path]) -> list[Path]:
         address = EpisodeAddress.of(path)
         here = [path] if address.number is not None else list(below(path))
         if not here:
-            installed().open_episode(path).close()  # says what would have been an episode
+            installed_plugins().open_episode(path).close()  # says what would have been an episode
         found |= {each.resolve(): each for each in here}
     return list(found.values())
 
@@ -176,7 +180,7 @@ class _Plan:
     def _add(self, job: Job, known: KnownEpisodes) -> None:
         source, report = job.source, EpisodeReport(job.source)
         try:
-            reader = installed().open_episode(job.episode)
+            reader = installed_plugins().open_episode(job.episode)
             try:
                 summary = reader.summary()
                 there = known.find(source, reader, summary)

@@ -11,14 +11,24 @@ from typing import Any
 import attrs
 from numpy.typing import NDArray
 
-from ibrobot_core.config.schema import Align
-from ibrobot_core.contract.frames import FrameAssembler, assemble
-from ibrobot_core.contract.select import text_at
-from ibrobot_core.contract.specs import TASK, ActionPart, Contract, ObservationPart, SignalPart
-from ibrobot_core.errors import RecorderError
-from ibrobot_core.interfaces import EpisodeReader, Feature, Recorded
-from ibrobot_core.messages import Int32, Message
-from ibrobot_core.units import seconds
+from ibrobot_core.api import (
+    TASK_KEY,
+    ActionPart,
+    Align,
+    Contract,
+    EpisodeReader,
+    Feature,
+    FrameAssembler,
+    Int32,
+    Message,
+    ObservationPart,
+    Recorded,
+    RecorderError,
+    SignalPart,
+    assemble,
+    seconds,
+    text_at,
+)
 
 ACTION = "action"
 _LONGEST_SILENCE_S = 60
@@ -52,17 +62,17 @@ def with_action(contract: Contract) -> Contract:
 
 def _source_of(part: ActionPart | SignalPart) -> str:
     """What the stream of a part's messages is called: its topic, or a name of its own where they are changed."""
-    changes = ["next"] * (part.align == "next") + [TASK] * _is_task(part)
+    changes = ["next"] * (part.align == "next") + [TASK_KEY] * _is_task(part)
     return f"{part.topic} ({', '.join(changes)})" if changes else part.topic
 
 
 def _read_as(part: SignalPart) -> tuple[str, tuple[str, ...]]:
     """Type and path of the messages in a signal's stream."""
-    return (Int32.ros_type, ("data",)) if part.key == TASK else (part.type, (part.path,))
+    return (Int32.ros_type, ("data",)) if part.key == TASK_KEY else (part.type, (part.path,))
 
 
 def _is_task(part: ActionPart | SignalPart) -> bool:
-    return isinstance(part, SignalPart) and part.key == TASK
+    return isinstance(part, SignalPart) and part.key == TASK_KEY
 
 
 class _Following:
@@ -109,7 +119,7 @@ class _Source:
         direct |= {part.topic for part in aligned if _source_of(part) == part.topic}
         streams: dict[str, Iterable[Recorded]] = {"": reader.messages(direct), **shifted}
         for part in contract.signal_parts:
-            if part.key == TASK:
+            if part.key == TASK_KEY:
                 name = _source_of(part)
                 streams[name] = _Tasks(shifted.get(name) or reader.messages({part.topic}), part, tasks)
         self._messages = heapq.merge(*streams.values(), key=lambda item: item.received_ns)

@@ -14,14 +14,23 @@ from typing import Any
 import attrs
 
 import ibrobot_core
-from ibrobot_core.clock import SteppedClock
-from ibrobot_core.contract.specs import Contract
-from ibrobot_core.errors import ContractError, IbrobotError, RecorderError
-from ibrobot_core.interfaces import Context, EpisodeEnd, EpisodeReader, EpisodeStart, EpisodeSummary, Recorder
-from ibrobot_core.plugins import installed
-from ibrobot_core.recording.dataset import Dataset
-from ibrobot_core.recording.episode import episode_folder
-from ibrobot_core.robot import Robot
+from ibrobot_core.api import (
+    Context,
+    Contract,
+    ContractError,
+    EpisodeDataset,
+    EpisodeEnd,
+    EpisodeReader,
+    EpisodeStart,
+    EpisodeSummary,
+    IbrobotError,
+    Recorder,
+    RecorderError,
+    Robot,
+    SteppedClock,
+    episode_folder,
+    installed_plugins,
+)
 from ibrobot_data.request import EpisodeReport, Report
 
 _STAGING = ".staging"
@@ -98,7 +107,7 @@ class _Job:
         report = EpisodeReport(self._path.name)
         reader: EpisodeReader | None = None
         try:
-            reader = installed().open_episode(self._path, self._request.told)
+            reader = installed_plugins().open_episode(self._path, self._request.told)
             summary = reader.summary()
             prompt = summary.metadata.get("prompt") or self._request.prompt
             report = attrs.evolve(report, outcome=summary.outcome, prompt=prompt, start_ns=summary.start_ns)
@@ -116,7 +125,7 @@ class _Job:
 
     def _known(self, summary: EpisodeSummary, digest: str) -> str:
         """Why it need not be converted: what lies there is it."""
-        reader = installed().open_episode(self._target)
+        reader = installed_plugins().open_episode(self._target)
         try:
             there = reader.summary()
         finally:
@@ -135,7 +144,7 @@ class _Job:
         if asked.fingerprint() != contract.fingerprint():
             difference = asked.difference(contract, names=("--config", "dataset"))
             raise ContractError(f"{self._path}: was made with another contract than --config's:\n{difference}")
-        Dataset(self._request.out).check(contract)
+        EpisodeDataset(self._request.out).check(contract)
         return contract
 
     def _write(
@@ -162,7 +171,7 @@ class _Job:
             with suppress(RecorderError):  # what it could not write either is no news
                 recorder.close()
             raise
-        Dataset(self._request.out).join(contract, metadata.get("robot", ""), metadata.get("robot_type", ""))
+        EpisodeDataset(self._request.out).join(contract, metadata.get("robot", ""), metadata.get("robot_type", ""))
         self._target.parent.mkdir(parents=True, exist_ok=True)
         self._making.rename(self._target)
         return max(counts.values(), default=0)
@@ -171,5 +180,5 @@ class _Job:
 def _make_recorder(request: BagRequest) -> Recorder:
     # A stepped clock makes it write at once, and equal datasets give equal files.
     ctx = Context("convert", SteppedClock(0), logging.getLogger("ibrobot.convert"), Robot("convert", ()))
-    recorder: Recorder = installed().find("recorder", request.type).make(request.options, ctx)
+    recorder: Recorder = installed_plugins().find("recorder", request.type).make(request.options, ctx)
     return recorder

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.descriptors import Command, HardwareDescriptor, SensorDescriptor, TeleopDescriptor
-from ibrobot_core.hookspecs import hookimpl
+from ibrobot_core.api import Command, HardwareDescriptor, SensorDescriptor, TeleopDescriptor, hookimpl
 from ibrobot_feetech.options import (
     EmulatedSignalOptions,
     FollowerOptions,
@@ -19,7 +18,7 @@ from ibrobot_feetech.options import (
 if TYPE_CHECKING:
     import click
 
-    from ibrobot_core.interfaces import Context, Hardware, Sensor, Teleop
+    from ibrobot_core.api import Context, Hardware, Sensor, Teleop
 
 
 def _follower(options: Any, ctx: Context) -> Hardware:

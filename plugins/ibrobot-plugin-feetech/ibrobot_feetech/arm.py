@@ -9,10 +9,15 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.calibration import ZERO_AT, Calibration, JointCalibration
-from ibrobot_core.errors import HardwareError
-from ibrobot_core.robot import Vector
-from ibrobot_core.units import radians_to_ticks, ticks_to_radians
+from ibrobot_core.api import (
+    ZERO_AT,
+    Calibration,
+    HardwareError,
+    JointCalibration,
+    Vector,
+    radians_to_ticks,
+    ticks_to_radians,
+)
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.errors import FeetechError, NoReply, TorqueStaysOn
 from ibrobot_feetech.registers import MODEL_STS3215

@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import attrs
 
-from ibrobot_core.errors import HardwareError
+from ibrobot_core.api import HardwareError
 
 
 @attrs.frozen

@@ -11,11 +11,21 @@ from typing import override
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.calibration import load_calibration
-from ibrobot_core.errors import HardwareError
-from ibrobot_core.interfaces import Condition, Context, Hardware, Holding, JointReading, Signal, Torque, nan_vector
-from ibrobot_core.robot import Vector
-from ibrobot_core.units import ns, seconds
+from ibrobot_core.api import (
+    Condition,
+    Context,
+    Hardware,
+    HardwareError,
+    Holding,
+    JointReading,
+    Signal,
+    Torque,
+    Vector,
+    load_calibration,
+    nan_vector,
+    ns,
+    seconds,
+)
 from ibrobot_feetech import arm as servos
 from ibrobot_feetech.arm import Arm, Tuning
 from ibrobot_feetech.bus import RETURN_DELAY_S, FeetechBus

@@ -8,8 +8,7 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.interfaces import Condition, Severity
-from ibrobot_core.robot import Vector
+from ibrobot_core.api import Condition, Severity, Vector
 from ibrobot_feetech.errors import Place
 from ibrobot_feetech.options import FollowerOptions
 from ibrobot_feetech.protocol import OVERLOAD, faults

@@ -9,11 +9,20 @@ from typing import override
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.calibration import load_calibration
-from ibrobot_core.errors import HardwareError, TeleopError
-from ibrobot_core.interfaces import Context, JointReading, Teleop, TeleopCommand
-from ibrobot_core.robot import Vector
-from ibrobot_core.units import TICKS_PER_TURN, ns, seconds, ticks_to_lerobot
+from ibrobot_core.api import (
+    TICKS_PER_TURN,
+    Context,
+    HardwareError,
+    JointReading,
+    Teleop,
+    TeleopCommand,
+    TeleopError,
+    Vector,
+    load_calibration,
+    ns,
+    seconds,
+    ticks_to_lerobot,
+)
 from ibrobot_feetech.arm import Arm, calibration_differences, find_servos, relax
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.errors import FeetechError

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import attrs
 
-from ibrobot_core.options import OptionFault, documented, hint, option, unknown_names
+from ibrobot_core.api import OptionFault, did_you_mean, documented, option, unknown_names
 
 if TYPE_CHECKING:
-    from ibrobot_core.robot import Robot
+    from ibrobot_core.api import Robot
 
 TOOL = "ibrobot feetech"
 """The command that calibrates and imports calibrations."""
@@ -119,7 +119,9 @@ def check_leader(options: LeaderOptions, robot: Robot, joints: tuple[str, ...]) 
     """The leader's joints move joints of the robot, and the options name joints of the leader."""
     for ours, theirs in options.joints.items():
         if theirs not in robot.joint_names:
-            yield OptionFault(("joints", ours), f"unknown joint {theirs!r}{hint(theirs, robot.joint_names, 'known')}")
+            yield OptionFault(
+                ("joints", ours), f"unknown joint {theirs!r}{did_you_mean(theirs, robot.joint_names, 'known')}"
+            )
     known = tuple(options.joints) or robot.joint_names
     for key, names in (("inverted", options.inverted), ("scaled", options.scaled)):
         if names != _GRIPPER:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import attrs
 
-from ibrobot_core.errors import HardwareError
+from ibrobot_core.api import HardwareError
 from ibrobot_feetech.bus import FeetechBus
 
 _VOLTS = 0.1

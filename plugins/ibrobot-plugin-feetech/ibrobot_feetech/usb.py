@@ -8,8 +8,7 @@ from pathlib import Path
 import attrs
 from serial.tools import list_ports
 
-from ibrobot_core.calibration import Calibration
-from ibrobot_core.errors import HardwareError
+from ibrobot_core.api import Calibration, HardwareError
 
 ADAPTER_VENDOR = 0x1A86
 """USB vendor of the CH340 and CH343 on the SO-101's boards."""

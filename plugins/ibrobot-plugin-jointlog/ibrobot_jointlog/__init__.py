@@ -6,11 +6,10 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.descriptors import DatasetDescriptor, ReaderDescriptor, RecorderDescriptor
-from ibrobot_core.hookspecs import hookimpl
+from ibrobot_core.api import DatasetDescriptor, ReaderDescriptor, RecorderDescriptor, hookimpl
 
 if TYPE_CHECKING:
-    from ibrobot_core.interfaces import Context, DatasetWriter, EpisodeAddress, EpisodeReader, Recorder
+    from ibrobot_core.api import Context, DatasetWriter, EpisodeAddress, EpisodeReader, Recorder
 
 
 def _reads(path: Path) -> bool:

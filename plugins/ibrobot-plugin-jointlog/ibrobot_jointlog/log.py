@@ -10,7 +10,7 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.errors import RecorderError
+from ibrobot_core.api import RecorderError
 
 TIME = "time_s"
 

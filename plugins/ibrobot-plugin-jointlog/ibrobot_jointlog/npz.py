@@ -12,8 +12,7 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.errors import DatasetError
-from ibrobot_core.interfaces import DatasetWriter, Feature
+from ibrobot_core.api import DatasetError, DatasetWriter, Feature
 from ibrobot_jointlog.files import replace_file
 
 Values = Mapping[str, NDArray[np.generic]]

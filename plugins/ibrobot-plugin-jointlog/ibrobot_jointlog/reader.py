@@ -8,11 +8,19 @@ from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any, override
 
-from ibrobot_core.contract.specs import Contract
-from ibrobot_core.errors import RecorderError
-from ibrobot_core.interfaces import EpisodeAddress, EpisodeReader, EpisodeSummary, Recorded, TopicSummary
-from ibrobot_core.messages import Float64MultiArray, Header, JointState
-from ibrobot_core.units import ns
+from ibrobot_core.api import (
+    Contract,
+    EpisodeAddress,
+    EpisodeReader,
+    EpisodeSummary,
+    Float64MultiArray,
+    Header,
+    JointState,
+    Recorded,
+    RecorderError,
+    TopicSummary,
+    ns,
+)
 from ibrobot_jointlog.log import TIME, read_log
 
 LOG, METADATA = "joints.csv", "metadata.json"

@@ -11,10 +11,7 @@ from typing import Any, override
 
 import attrs
 
-from ibrobot_core.errors import RecorderError
-from ibrobot_core.interfaces import Context, EpisodeEnd, EpisodeStart, Recorder
-from ibrobot_core.messages import JointState, Message
-from ibrobot_core.units import NS_PER_S
+from ibrobot_core.api import NS_PER_S, Context, EpisodeEnd, EpisodeStart, JointState, Message, Recorder, RecorderError
 from ibrobot_jointlog.files import replace_file
 from ibrobot_jointlog.log import header, row
 

@@ -5,14 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.descriptors import TeleopDescriptor
-from ibrobot_core.hookspecs import hookimpl
+from ibrobot_core.api import TeleopDescriptor, hookimpl
 from ibrobot_keyboard.options import KeyboardOptions
 
 if TYPE_CHECKING:
-    from ibrobot_core.interfaces import Context, Teleop
-    from ibrobot_core.options import OptionFault
-    from ibrobot_core.robot import Robot
+    from ibrobot_core.api import Context, OptionFault, Robot, Teleop
 
 
 def _keyboard(options: Any, ctx: Context) -> Teleop:

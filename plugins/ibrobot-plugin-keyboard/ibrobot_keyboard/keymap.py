@@ -8,9 +8,7 @@ from typing import Literal
 
 import attrs
 
-from ibrobot_core.errors import TeleopError
-from ibrobot_core.options import OptionFault
-from ibrobot_core.robot import Robot
+from ibrobot_core.api import OptionFault, Robot, TeleopError
 from ibrobot_keyboard.options import KeyboardOptions
 
 Mode = Literal["joints", "cartesian"]

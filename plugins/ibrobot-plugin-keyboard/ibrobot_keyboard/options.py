@@ -7,7 +7,7 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.options import documented, option
+from ibrobot_core.api import documented, option
 
 RESERVED = ("q", "esc", "tab", *(f"f{n}" for n in range(1, 13)))
 """Keys that belong to `ibrobot launch`: quit, emergency stop, modes, reset."""

@@ -7,10 +7,7 @@ from typing import TYPE_CHECKING, override
 
 import numpy as np
 
-from ibrobot_core.errors import TeleopError
-from ibrobot_core.interfaces import Context, JointReading, Teleop, TeleopCommand
-from ibrobot_core.robot import Vector
-from ibrobot_core.units import ns, seconds
+from ibrobot_core.api import Context, JointReading, Teleop, TeleopCommand, TeleopError, Vector, ns, seconds
 from ibrobot_keyboard.keymap import CARTESIAN_AXES, Mode, keymap_of
 from ibrobot_keyboard.options import KeyboardOptions
 

@@ -17,7 +17,7 @@ from ibrobot_testing import TeleopSuite, host_context, make_robot
 from ibrobot_core.errors import TeleopError
 from ibrobot_core.interfaces import Context, JointReading, Teleop, TeleopCommand
 from ibrobot_core.robot import Description, Joint, Robot
-from ibrobot_core.terminal import Keys
+from ibrobot_core.terminal import KeyReader
 from ibrobot_core.units import ns
 
 JOINTS = make_robot().joint_names
@@ -295,7 +295,7 @@ def test_without_a_terminal_it_says_what_to_do():
 def test_typing_in_a_terminal_moves_a_joint():
     person, program = os.openpty()
     try:
-        with Keys(program) as keys:
+        with KeyReader(program) as keys:
             seen = keys.subscribe()
             teleop = KeyboardTeleop(KeyboardOptions(cartesian=False), host_context(keys=keys.subscribe))
             teleop.connect()

@@ -6,12 +6,11 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.descriptors import DatasetDescriptor, Flag, PolicyDescriptor, ReaderDescriptor
-from ibrobot_core.hookspecs import hookimpl
+from ibrobot_core.api import DatasetDescriptor, Flag, PolicyDescriptor, ReaderDescriptor, hookimpl
 from ibrobot_lerobot.options import LeRobotOptions, LeRobotPolicyOptions
 
 if TYPE_CHECKING:
-    from ibrobot_core.interfaces import Context, DatasetWriter, EpisodeAddress, EpisodeReader, Policy
+    from ibrobot_core.api import Context, DatasetWriter, EpisodeAddress, EpisodeReader, Policy
 
 
 def _write(options: Any, ctx: Context) -> DatasetWriter:

@@ -10,9 +10,7 @@ from typing import Any
 import attrs
 from safetensors import SafetensorError, safe_open
 
-from ibrobot_core.contract.specs import Contract
-from ibrobot_core.errors import ContractError, PolicyError
-from ibrobot_core.interfaces import PolicySpec
+from ibrobot_core.api import Contract, ContractError, PolicyError, PolicySpec
 from ibrobot_lerobot import layout
 from ibrobot_lerobot.untrusted import (
     MAX_ACTIONS,

@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from ibrobot_core.errors import DatasetError
+from ibrobot_core.api import DatasetError
 from ibrobot_lerobot import layout
 from ibrobot_lerobot.arrow import table_of, to_array
 from ibrobot_lerobot.layout import Column

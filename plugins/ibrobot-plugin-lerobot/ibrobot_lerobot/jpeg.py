@@ -8,8 +8,7 @@ import numpy as np
 import simplejpeg  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 
-from ibrobot_core.errors import WireError
-from ibrobot_core.interfaces import PictureCodec
+from ibrobot_core.api import PictureCodec, WireError
 
 _SPACES = {3: "RGB", 1: "GRAY"}
 

@@ -12,8 +12,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from ibrobot_core.errors import DatasetError
-from ibrobot_core.interfaces import Feature
+from ibrobot_core.api import DatasetError, Feature
 from ibrobot_lerobot.arrow import table_of
 
 INFO = "meta/info.json"

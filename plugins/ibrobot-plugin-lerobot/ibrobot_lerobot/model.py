@@ -16,8 +16,7 @@ from lerobot.policies import get_policy_class
 from lerobot.policies.rtc.configuration_rtc import RTCConfig
 from numpy.typing import NDArray
 
-from ibrobot_core.errors import PolicyError
-from ibrobot_core.interfaces import Tensors
+from ibrobot_core.api import PolicyError, Tensors
 from ibrobot_lerobot.checkpoint import ACTION, Checkpoint
 from ibrobot_lerobot.draws import Draw, Draws, NotByRequest
 from ibrobot_lerobot.options import LeRobotPolicyOptions

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import attrs
 
-from ibrobot_core.options import documented, option
+from ibrobot_core.api import documented, option
 
 CODECS = ("libsvtav1", "h264", "hevc", "h264_nvenc", "hevc_nvenc", "h264_videotoolbox", "hevc_videotoolbox")
 """Encoders by LeRobot's names; those from `h264_nvenc` on need a GPU."""

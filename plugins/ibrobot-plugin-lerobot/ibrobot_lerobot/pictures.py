@@ -11,8 +11,7 @@ import av.error
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.errors import DatasetError
-from ibrobot_core.interfaces import Feature
+from ibrobot_core.api import DatasetError, Feature
 
 _PNG_FORMATS = {1: "gray", 3: "rgb24"}
 _TIFF_SAMPLES = {np.dtype(np.uint16): 1, np.dtype(np.float32): 3}

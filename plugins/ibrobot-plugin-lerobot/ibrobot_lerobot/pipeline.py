@@ -14,7 +14,7 @@ from lerobot.policies import make_pre_post_processors
 from lerobot.processor import ProcessorStep
 from numpy.typing import NDArray
 
-from ibrobot_core.errors import PolicyError
+from ibrobot_core.api import PolicyError
 from ibrobot_lerobot.checkpoint import POSTPROCESSOR, PREPROCESSOR, Checkpoint
 from ibrobot_lerobot.untrusted import check_step_name
 

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any, override
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.errors import PolicyError
-from ibrobot_core.interfaces import Context, Frame, PictureCodec, Policy, PolicySpec, Tensors
+from ibrobot_core.api import Context, Frame, PictureCodec, Policy, PolicyError, PolicySpec, Tensors
 from ibrobot_lerobot.checkpoint import ACTION, POSTPROCESSOR, PREPROCESSOR, check_weights, hash_weights, read_checkpoint
 from ibrobot_lerobot.options import LeRobotPolicyOptions
 from ibrobot_lerobot.steps import read_steps

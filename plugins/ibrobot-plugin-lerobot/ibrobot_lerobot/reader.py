@@ -10,13 +10,22 @@ from typing import Any, override
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.contract.compose import Composer
-from ibrobot_core.contract.joint_units import JointUnits
-from ibrobot_core.contract.specs import Contract
-from ibrobot_core.errors import ContractError, DatasetError, RecorderError
-from ibrobot_core.interfaces import EpisodeAddress, EpisodeReader, EpisodeSummary, Feature, Recorded, TopicSummary
-from ibrobot_core.recording.provenance import origin
-from ibrobot_core.units import NS_PER_S
+from ibrobot_core.api import (
+    NS_PER_S,
+    Composer,
+    Contract,
+    ContractError,
+    DatasetError,
+    EpisodeAddress,
+    EpisodeReader,
+    EpisodeSummary,
+    Feature,
+    JointUnits,
+    Recorded,
+    RecorderError,
+    TopicSummary,
+    episode_origin,
+)
 from ibrobot_lerobot import layout
 from ibrobot_lerobot.rows import EpisodeRows
 
@@ -45,7 +54,7 @@ class LeRobotReader(EpisodeReader):
         except DatasetError as error:
             raise RecorderError(str(error)) from error
         self._path = root.with_name(f"{root.name}:{address.number}")
-        self._origin = found = origin(root, dataset.metadata, address.number, address.told)
+        self._origin = found = episode_origin(root, dataset.metadata, address.number, address.told)
         self._contract = found.contract
         _check_features(root, dataset.features, found.contract)
         self._units = JointUnits(found.norm_mode, found.contract, found.calibration, found.document)

@@ -14,8 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from ibrobot_core.errors import DatasetError
-from ibrobot_core.interfaces import Feature
+from ibrobot_core.api import DatasetError, Feature
 from ibrobot_lerobot import layout
 from ibrobot_lerobot.layout import OnDisk
 from ibrobot_lerobot.pictures import decode_picture

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.errors import DatasetError
-from ibrobot_core.interfaces import Feature
+from ibrobot_core.api import DatasetError, Feature
 
 Stats = dict[str, NDArray[Any]]
 """`min`, `max`, `mean`, `std`, `count` (shape (1,)), `q01` to `q99`."""

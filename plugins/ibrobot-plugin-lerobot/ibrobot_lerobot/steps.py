@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load_file
 
-from ibrobot_core.errors import PolicyError
+from ibrobot_core.api import PolicyError
 from ibrobot_lerobot.checkpoint import ACTION, RENAME, Checkpoint, rename_map
 from ibrobot_lerobot.untrusted import statistics_file
 

@@ -9,7 +9,7 @@ from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from ibrobot_core.errors import PolicyError
+from ibrobot_core.api import PolicyError
 
 MAX_ACTIONS = 10_000
 """Of a chunk."""

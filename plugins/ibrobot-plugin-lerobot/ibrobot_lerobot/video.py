@@ -16,7 +16,7 @@ import av.error
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.errors import DatasetError
+from ibrobot_core.api import DatasetError
 from ibrobot_lerobot.options import LeRobotOptions
 from ibrobot_lerobot.stats import PixelStats
 

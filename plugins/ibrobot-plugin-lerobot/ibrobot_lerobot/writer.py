@@ -11,8 +11,7 @@ from typing import Any, override
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.errors import DatasetError
-from ibrobot_core.interfaces import DatasetSummary, DatasetWriter, Feature
+from ibrobot_core.api import DatasetError, DatasetSummary, DatasetWriter, Feature
 from ibrobot_lerobot import layout
 from ibrobot_lerobot.episode import EpisodeWriter, Format
 from ibrobot_lerobot.merge import adopt, complete, merge

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from ibrobot_lerobot.jpeg import Jpeg
 
 from ibrobot_core.errors import WireError
-from ibrobot_core.inference.wire import Kind, Message, decode, encode
+from ibrobot_core.inference.wire import WireKind, WireMessage, decode, encode
 
 CODEC = Jpeg(90)
 
@@ -21,7 +21,7 @@ def picture(height: int, width: int, channels: int) -> np.ndarray:
 @given(st.integers(1, 70), st.integers(1, 70), st.sampled_from([1, 3]))
 def test_pictures_come_back_nearly_as_they_were(height: int, width: int, channels: int) -> None:
     sent = picture(height, width, channels)
-    frame = encode(Message(Kind.REQUEST, 1, {"top": sent}), codec=CODEC)
+    frame = encode(WireMessage(WireKind.REQUEST, 1, {"top": sent}), codec=CODEC)
     found = decode(frame, codec=CODEC).tensors["top"]
     assert (found.shape, found.dtype) == (sent.shape, np.uint8)
     assert np.abs(found.astype(int) - sent).mean() < 30

@@ -20,7 +20,7 @@ from ibrobot_core.contract.specs import ActionPart, Contract, ObservationPart
 from ibrobot_core.errors import CalibrationError, ContractError, DatasetError, RecorderError
 from ibrobot_core.interfaces import EpisodeAddress, Feature
 from ibrobot_core.messages import Float64MultiArray, Image, JointState
-from ibrobot_core.plugins import installed
+from ibrobot_core.plugins import installed_plugins
 from ibrobot_core.units import lerobot_to_radians
 
 from .conftest import CAMERA, FPS, picture, values, write
@@ -82,7 +82,7 @@ def test_rows_and_pictures_of_an_episode_in_the_middle_come_in_step(
 
 def test_the_summary_tells_topics_times_and_task_without_decoding(tmp_path: Path):
     root = foreign(tmp_path / "set", videos=False)
-    reader = installed().open_episode(tmp_path / "set:2", told())
+    reader = installed_plugins().open_episode(tmp_path / "set:2", told())
     summary = reader.summary()
     reader.close()
     assert summary.path == tmp_path / "set:2"
@@ -143,7 +143,7 @@ def test_what_the_contract_has_and_the_dataset_lacks_is_named(tmp_path: Path):
 
 def test_an_episode_goes_by_its_number(tmp_path: Path):
     foreign(tmp_path / "set", videos=False)
-    registry = installed()
+    registry = installed_plugins()
     with pytest.raises(RecorderError, match=r"set: is a dataset of 3 episodes; name one, e.g. .*set:0"):
         registry.open_episode(tmp_path / "set", told())
     with pytest.raises(RecorderError, match=r"set: has no episode 3; there are: 0 to 2"):

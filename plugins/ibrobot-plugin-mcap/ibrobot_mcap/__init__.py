@@ -6,15 +6,13 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.descriptors import Command, DecoderDescriptor, ReaderDescriptor, RecorderDescriptor
-from ibrobot_core.hookspecs import hookimpl
+from ibrobot_core.api import Command, DecoderDescriptor, ReaderDescriptor, RecorderDescriptor, hookimpl
 from ibrobot_mcap.options import McapOptions
 
 if TYPE_CHECKING:
     import click
 
-    from ibrobot_core.interfaces import Context, EpisodeAddress, EpisodeReader, Recorder
-    from ibrobot_core.messages import CompressedImage, Image
+    from ibrobot_core.api import CompressedImage, Context, EpisodeAddress, EpisodeReader, Image, Recorder
 
 
 def _record(options: Any, ctx: Context) -> Recorder:

@@ -9,9 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ibrobot_core.contract.specs import Contract
-from ibrobot_core.errors import ContractError, RecorderError
-from ibrobot_core.units import NS_PER_S
+from ibrobot_core.api import NS_PER_S, Contract, ContractError, RecorderError
 from ibrobot_mcap.metadata import METADATA
 from ibrobot_mcap.reader import Rosbag2Reader
 

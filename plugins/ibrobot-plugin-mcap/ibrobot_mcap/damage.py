@@ -11,7 +11,7 @@ from pathlib import Path
 import zstandard
 from mcap.exceptions import McapError
 
-from ibrobot_core.errors import RecorderError
+from ibrobot_core.api import RecorderError
 
 _PARSING = (
     struct.error, ValueError, LookupError, TypeError, AttributeError, EOFError, OverflowError, RecursionError,

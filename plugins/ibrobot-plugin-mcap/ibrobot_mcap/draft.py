@@ -11,9 +11,7 @@ from typing import Any
 import attrs
 import numpy as np
 
-from ibrobot_core.errors import RecorderError
-from ibrobot_core.messages import MESSAGE_TYPES, Float64MultiArray, Image, JointState, Message
-from ibrobot_core.units import NS_PER_S
+from ibrobot_core.api import MESSAGE_TYPES, NS_PER_S, Float64MultiArray, Image, JointState, Message, RecorderError
 from ibrobot_mcap.reader import Rosbag2Reader
 
 _COMMAND = re.compile(r"command|cmd|action|goal|target|leader|trajectory|desired")

@@ -9,7 +9,7 @@ from typing import Any
 import attrs
 import yaml
 
-from ibrobot_core.errors import RecorderError
+from ibrobot_core.api import RecorderError
 from ibrobot_mcap.metadata import INFORMATION, METADATA, quoted, write_metadata
 
 _PER_TOPIC = "topics_with_message_count"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import attrs
 
-from ibrobot_core.options import documented, option
+from ibrobot_core.api import documented, option
 
 MIB = 1 << 20
 COMPRESSIONS = ("none", "lz4", "zstd")

@@ -13,9 +13,16 @@ from typing import override
 from ibrobot_ros2 import Codec, CodecError
 from ibrobot_ros2.pictures import decode_picture, is_known
 
-from ibrobot_core.errors import ContractError, RecorderError
-from ibrobot_core.interfaces import EpisodeReader, EpisodeSummary, Recorded, TopicSummary
-from ibrobot_core.messages import CompressedImage, Image
+from ibrobot_core.api import (
+    CompressedImage,
+    ContractError,
+    EpisodeReader,
+    EpisodeSummary,
+    Image,
+    Recorded,
+    RecorderError,
+    TopicSummary,
+)
 from ibrobot_mcap.compressed import Expanded, MessageCompressed
 from ibrobot_mcap.damage import reading
 from ibrobot_mcap.facts import Facts, parse_facts, read_facts

@@ -9,10 +9,18 @@ from typing import override
 from ibrobot_ros2 import CodecError, encode
 from ibrobot_ros2.jpeg import fits_jpeg, to_jpeg
 
-from ibrobot_core.clock import SteppedClock
-from ibrobot_core.errors import ContractError, RecorderError
-from ibrobot_core.interfaces import Context, EpisodeEnd, EpisodeStart, Recorder
-from ibrobot_core.messages import CompressedImage, Image, Message
+from ibrobot_core.api import (
+    CompressedImage,
+    Context,
+    ContractError,
+    EpisodeEnd,
+    EpisodeStart,
+    Image,
+    Message,
+    Recorder,
+    RecorderError,
+    SteppedClock,
+)
 from ibrobot_mcap.bagfile import Item
 from ibrobot_mcap.metadata import Topic
 from ibrobot_mcap.options import McapOptions

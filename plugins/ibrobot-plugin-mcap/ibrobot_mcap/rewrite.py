@@ -11,8 +11,7 @@ from uuid import NAMESPACE_OID, uuid5
 
 import attrs
 
-from ibrobot_core.errors import RecorderError
-from ibrobot_core.interfaces import EpisodeStart, EpisodeSummary
+from ibrobot_core.api import EpisodeStart, EpisodeSummary, RecorderError
 from ibrobot_mcap.bagfile import Item
 from ibrobot_mcap.metadata import MISSING
 from ibrobot_mcap.options import McapOptions

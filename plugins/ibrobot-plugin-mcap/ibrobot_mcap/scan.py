@@ -19,7 +19,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Header, McapRecord, Metadata, Schema, Statistics
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
-from ibrobot_core.errors import RecorderError
+from ibrobot_core.api import RecorderError
 from ibrobot_mcap.damage import reading
 
 REPEATED = "ibrobot.repeated"

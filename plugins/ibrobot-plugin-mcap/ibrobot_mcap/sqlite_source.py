@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, override
 from urllib.parse import quote
 
-from ibrobot_core.errors import RecorderError
+from ibrobot_core.api import RecorderError
 from ibrobot_mcap.damage import reading
 from ibrobot_mcap.sources import Raw, Source
 

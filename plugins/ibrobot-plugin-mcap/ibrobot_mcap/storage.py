@@ -9,9 +9,7 @@ import time
 from collections.abc import Mapping
 from typing import NoReturn
 
-from ibrobot_core.errors import RecorderError
-from ibrobot_core.interfaces import EpisodeStart
-from ibrobot_core.units import NS_PER_S, ns
+from ibrobot_core.api import NS_PER_S, EpisodeStart, RecorderError, ns
 from ibrobot_mcap.bagfile import BagFile, Item
 from ibrobot_mcap.metadata import DROPPED, OUTCOME, Counted, Topic, information, write_metadata
 from ibrobot_mcap.options import MIB, McapOptions

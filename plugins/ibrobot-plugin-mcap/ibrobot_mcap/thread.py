@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections import deque
 
-from ibrobot_core.errors import RecorderError
+from ibrobot_core.api import RecorderError
 from ibrobot_mcap.bagfile import Item
 from ibrobot_mcap.storage import Storage
 

@@ -28,7 +28,7 @@ from ibrobot_core.contract.specs import Contract, ObservationPart
 from ibrobot_core.errors import IbrobotError, RecorderError
 from ibrobot_core.interfaces import Feature
 from ibrobot_core.messages import CompressedImage, Header, Image, JointState
-from ibrobot_core.plugins import installed
+from ibrobot_core.plugins import installed_plugins
 
 from .conftest import CAMERA, JOINTS, Bench, joints, picture, read, reading, stamp, summary
 
@@ -145,7 +145,7 @@ def test_bags_are_known_by_their_looks(tmp_path, bench):
     assert is_rosbag2(made.path)
     (reader,) = ibrobot_readers()
     assert reader.reads(made.path)
-    opened = installed().open_episode(made.end())
+    opened = installed_plugins().open_episode(made.end())
     assert opened.summary().finished
     opened.close()
     opened.close()

@@ -5,21 +5,20 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
-from ibrobot_core import hookimpl
-from ibrobot_core.descriptors import (
+from ibrobot_core.api import (
     DecoderDescriptor,
     HardwareDescriptor,
     PolicyDescriptor,
     SensorDescriptor,
     ViewerDescriptor,
+    hookimpl,
 )
 from ibrobot_mujoco.gl import check_asked, choose
 from ibrobot_mujoco.options import CameraOptions, MujocoOptions, check_world
 from ibrobot_mujoco.policy_options import ScriptedPickOptions, check_pick
 
 if TYPE_CHECKING:
-    from ibrobot_core.interfaces import Context, Hardware, Policy, Sensor, Viewer
-    from ibrobot_core.messages import CompressedImage, Image
+    from ibrobot_core.api import CompressedImage, Context, Hardware, Image, Policy, Sensor, Viewer
 
 
 def _hardware(options: Any, ctx: Context) -> Hardware:

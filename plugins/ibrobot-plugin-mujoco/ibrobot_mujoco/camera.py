@@ -10,11 +10,18 @@ import mujoco
 import numpy as np
 from ibrobot_ros2.jpeg import to_jpeg
 
-from ibrobot_core.bus import Subscription
-from ibrobot_core.errors import SensorError
-from ibrobot_core.interfaces import Context, Sensor
-from ibrobot_core.messages import CameraInfo, CompressedImage, Header, Image, Message
-from ibrobot_core.units import ns
+from ibrobot_core.api import (
+    CameraInfo,
+    CompressedImage,
+    Context,
+    Header,
+    Image,
+    Message,
+    Sensor,
+    SensorError,
+    Subscription,
+    ns,
+)
 from ibrobot_mujoco.model import build_model
 from ibrobot_mujoco.options import CameraOptions, MujocoOptions
 from ibrobot_mujoco.render import Renderer

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ibrobot_core.errors import HardwareError
-from ibrobot_core.units import ns
+from ibrobot_core.api import HardwareError, ns
 from ibrobot_mujoco.options import Fault
 
 

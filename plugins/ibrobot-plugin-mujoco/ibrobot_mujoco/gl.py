@@ -7,7 +7,7 @@ import os
 import sys
 from functools import cache
 
-from ibrobot_core.errors import MissingDependency
+from ibrobot_core.api import MissingDependency
 
 # What each backend loads, any name of a group; as MuJoCo's own context classes need it.
 _LIBRARIES = {

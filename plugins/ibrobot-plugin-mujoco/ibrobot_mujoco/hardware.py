@@ -10,10 +10,17 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.errors import HardwareError
-from ibrobot_core.interfaces import Context, Episode, JointReading, Signal, SimulatedHardware, Torque
-from ibrobot_core.robot import Vector
-from ibrobot_core.units import ns
+from ibrobot_core.api import (
+    Context,
+    Episode,
+    HardwareError,
+    JointReading,
+    Signal,
+    SimulatedHardware,
+    Torque,
+    Vector,
+    ns,
+)
 from ibrobot_mujoco.faults import Faults
 from ibrobot_mujoco.model import build_model
 from ibrobot_mujoco.options import MujocoOptions

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.errors import HardwareError
+from ibrobot_core.api import HardwareError
 
 GRID_M = 0.0025
 _STL_FACET = np.dtype([("normal", "<f4", 3), ("vertices", "<f4", (3, 3)), ("attribute", "<u2")])

@@ -11,9 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.errors import HardwareError
-from ibrobot_core.robot import Robot
-from ibrobot_core.units import NS_PER_S, ns
+from ibrobot_core.api import NS_PER_S, HardwareError, Robot, ns
 from ibrobot_mujoco.lowpoly import GRID_M, low_poly
 from ibrobot_mujoco.options import MujocoOptions, SceneCamera
 

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import attrs
 
-from ibrobot_core.options import OptionFault, documented, hint, option
+from ibrobot_core.api import OptionFault, did_you_mean, documented, option
 
 if TYPE_CHECKING:
-    from ibrobot_core.robot import Robot
+    from ibrobot_core.api import Robot
 
 Vec3 = tuple[float, float, float]
 Range = tuple[float, float]
@@ -106,9 +106,9 @@ def check_world(options: MujocoOptions, robot: Robot, joints: tuple[str, ...]) -
     if robot.description.mjcf is None:
         yield OptionFault((), f"robot {robot.name!r} has no MJCF to simulate: robot.description.mjcf must name one")
     if options.start_pose not in poses:
-        message = f"unknown pose {options.start_pose!r}{hint(options.start_pose, poses, 'known')}"
+        message = f"unknown pose {options.start_pose!r}{did_you_mean(options.start_pose, poses, 'known')}"
         yield OptionFault(("start_pose",), message)
     for i, fault in enumerate(options.faults):
         if fault.joint is not None and fault.joint not in robot.joint_names:
-            message = f"unknown joint {fault.joint!r}{hint(fault.joint, robot.joint_names, 'known')}"
+            message = f"unknown joint {fault.joint!r}{did_you_mean(fault.joint, robot.joint_names, 'known')}"
             yield OptionFault(("faults", i, "joint"), message)

@@ -7,8 +7,7 @@ import math
 import mujoco
 import numpy as np
 
-from ibrobot_core.errors import HardwareError
-from ibrobot_core.robot import Vector
+from ibrobot_core.api import HardwareError, Vector
 from ibrobot_mujoco.model import BIN, BIN_HEIGHT, BIN_INNER, CUBE, TABLE
 from ibrobot_mujoco.options import MujocoOptions
 

@@ -6,7 +6,7 @@ import attrs
 import numpy as np
 from ibrobot_kinematics import KinematicModel, Target, solve
 
-from ibrobot_core.robot import Vector
+from ibrobot_core.api import Vector
 from ibrobot_mujoco.policy_options import ScriptedPickOptions
 from ibrobot_mujoco.trajectory import Limits, Segment, move, rest
 

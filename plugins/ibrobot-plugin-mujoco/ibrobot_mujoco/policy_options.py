@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import attrs
 
-from ibrobot_core.options import OptionFault, documented, option
+from ibrobot_core.api import OptionFault, documented, option
 
 if TYPE_CHECKING:
-    from ibrobot_core.robot import Robot
+    from ibrobot_core.api import Robot
 
 
 @documented

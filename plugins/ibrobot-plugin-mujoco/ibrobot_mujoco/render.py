@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.errors import SensorError
+from ibrobot_core.api import SensorError
 from ibrobot_mujoco import gl
 
 # EGL's display is global and initialised by the first context: two threads must not both be the first.

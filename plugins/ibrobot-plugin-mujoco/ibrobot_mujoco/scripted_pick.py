@@ -9,10 +9,7 @@ import numpy as np
 from ibrobot_kinematics import KinematicsError, UnreachableError, robot_model
 from numpy.typing import NDArray
 
-from ibrobot_core.errors import PolicyError
-from ibrobot_core.interfaces import Context, Frame, Policy, PolicySpec, Tensors
-from ibrobot_core.robot import Vector
-from ibrobot_core.units import NS_PER_S, seconds
+from ibrobot_core.api import NS_PER_S, Context, Frame, Policy, PolicyError, PolicySpec, Tensors, Vector, seconds
 from ibrobot_mujoco.pick_planner import PickPlanner, Scene
 from ibrobot_mujoco.policy_options import ScriptedPickOptions
 from ibrobot_mujoco.state import SCENE_SIZE

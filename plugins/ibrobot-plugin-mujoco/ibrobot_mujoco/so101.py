@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ibrobot_core.config.expand import resolve_path
-from ibrobot_core.robot import Description, Joint, Robot
+from ibrobot_core.api import Description, Joint, Robot, resolve_path
 
 MJCF = "package://so101_nexus/assets/SO101_menagerie/so101.xml"
 _RANGES = {

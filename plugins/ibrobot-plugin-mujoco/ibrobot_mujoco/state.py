@@ -5,11 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from ibrobot_core.bus import Subscription
-from ibrobot_core.errors import SensorError
-from ibrobot_core.messages import Float64MultiArray
-from ibrobot_core.robot import Vector
-from ibrobot_core.units import NS_PER_S
+from ibrobot_core.api import NS_PER_S, Float64MultiArray, SensorError, Subscription, Vector
 
 PHYSICS_TOPIC = "/simulation/physics"
 """Stamp as whole seconds and remaining nanoseconds (2, each exact as a float), then MuJoCo's state (nq)."""

@@ -8,7 +8,7 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.robot import Vector
+from ibrobot_core.api import Vector
 
 SHORTEST_S = 1e-3
 """Duration of a segment that hardly moves."""

@@ -8,9 +8,7 @@ from typing import Any, override
 
 import mujoco
 
-from ibrobot_core.bus import Subscription
-from ibrobot_core.errors import IbrobotError
-from ibrobot_core.interfaces import Context, Viewer
+from ibrobot_core.api import Context, IbrobotError, Subscription, Viewer
 from ibrobot_mujoco.model import build_model
 from ibrobot_mujoco.options import MujocoOptions
 from ibrobot_mujoco.state import PHYSICS_TOPIC, newest, pose_scene

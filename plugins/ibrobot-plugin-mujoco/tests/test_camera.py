@@ -22,10 +22,10 @@ from ibrobot_testing import SensorSuite, control_context, host_context
 from ibrobot_core.errors import SensorError
 from ibrobot_core.interfaces import Context, Episode, Sensor
 from ibrobot_core.messages import CameraInfo, CompressedImage, Float64MultiArray, Image
-from ibrobot_core.plugins import installed
+from ibrobot_core.plugins import installed_plugins
 from ibrobot_core.robot import Vector
 
-MISSING = installed().missing("sensor", "mujoco")
+MISSING = installed_plugins().missing("sensor", "mujoco")
 pytestmark = pytest.mark.skipif(MISSING is not None, reason=str(MISSING))
 
 ROBOT = so101()

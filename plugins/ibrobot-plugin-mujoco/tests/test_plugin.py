@@ -16,7 +16,7 @@ from ibrobot_mujoco.so101 import MJCF, so101
 from ibrobot_testing import control_context
 
 from ibrobot_core.errors import MissingDependency
-from ibrobot_core.plugins import installed
+from ibrobot_core.plugins import installed_plugins
 from ibrobot_core.robot import Joint
 
 
@@ -29,11 +29,11 @@ def test_importing_the_plugin_imports_nothing_heavy() -> None:
 @pytest.mark.parametrize("kind", ["hardware", "sensor", "policy", "viewer"])
 def test_is_found_by_discovery(kind: str) -> None:
     name = "scripted_pick" if kind == "policy" else "mujoco"
-    assert installed().entries[kind, name].package == "ibrobot-plugin-mujoco"
+    assert installed_plugins().entries[kind, name].package == "ibrobot-plugin-mujoco"
 
 
 def test_stands_for_the_robot_and_its_cameras() -> None:
-    descriptor = installed().find("hardware", "mujoco")
+    descriptor = installed_plugins().find("hardware", "mujoco")
     assert descriptor.simulated  # type: ignore[attr-defined]
     assert descriptor.sensors == {"camera": "mujoco"}  # type: ignore[attr-defined]
     assert isinstance(descriptor.make(MujocoOptions(), control_context(robot=so101())), MujocoHardware)
@@ -89,25 +89,25 @@ class TestOpenGl:
         monkeypatch.setattr(gl, "_egl_has_a_driver", lambda: driver)
 
     def test_without_opengl_the_camera_names_the_packages_and_all_else_works(self) -> None:
-        missing = installed().missing("sensor", "mujoco")
+        missing = installed_plugins().missing("sensor", "mujoco")
         assert missing is not None
         assert missing.remedy == "sudo apt-get install libegl1 libopengl0 libgl1-mesa-dri"
         with pytest.raises(MissingDependency, match=missing.remedy):
             gl.choose()
-        assert installed().missing("hardware", "mujoco") is None
-        assert installed().missing("policy", "scripted_pick") is None
+        assert installed_plugins().missing("hardware", "mujoco") is None
+        assert installed_plugins().missing("policy", "scripted_pick") is None
 
     def test_egl_without_a_driver_cannot_render(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.have(monkeypatch, "libEGL.so.1", "libOpenGL.so.0", driver=False)
         assert gl.usable() == ()
-        assert installed().missing("sensor", "mujoco") is not None
+        assert installed_plugins().missing("sensor", "mujoco") is not None
 
     def test_egl_comes_first(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.have(monkeypatch, "libEGL.so.1", "libGL.so.1", "libOSMesa.so.8")
         monkeypatch.setenv("DISPLAY", ":0")
         assert gl.usable() == ("egl", "osmesa", "glfw")
         assert gl.choose() == "egl"
-        assert installed().missing("sensor", "mujoco") is None
+        assert installed_plugins().missing("sensor", "mujoco") is None
 
     def test_egl_needs_opengl_too(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.have(monkeypatch, "libEGL.so.1", "libOSMesa.so.8")
@@ -128,7 +128,7 @@ class TestOpenGl:
         self.have(monkeypatch, "libEGL.so.1", "libGL.so.1")
         monkeypatch.setenv("MUJOCO_GL", "osmesa")
         told = r"MUJOCO_GL=osmesa, which does not work here \(or unset it\); sudo apt-get install libosmesa6"
-        policy = installed().find("policy", "scripted_pick")
+        policy = installed_plugins().find("policy", "scripted_pick")
         with pytest.raises(MissingDependency, match=told):
             policy.make(ScriptedPickOptions(), control_context("pick"))
 

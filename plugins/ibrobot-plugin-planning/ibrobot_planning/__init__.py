@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.descriptors import PlannerDescriptor
-from ibrobot_core.hookspecs import hookimpl
+from ibrobot_core.api import PlannerDescriptor, hookimpl
 from ibrobot_planning.options import JointPlannerOptions
 
 if TYPE_CHECKING:
-    from ibrobot_core.interfaces import Context, Planner
+    from ibrobot_core.api import Context, Planner
 
 
 def _joint(options: Any, ctx: Context) -> Planner:

@@ -8,11 +8,21 @@ from typing import override
 
 import numpy as np
 
-from ibrobot_core.errors import PlanningError
-from ibrobot_core.interfaces import Context, JointGoal, Planner, PlanRequest, PoseGoal
-from ibrobot_core.messages import Header, JointTrajectory, JointTrajectoryPoint
-from ibrobot_core.robot import Joint, Vector
-from ibrobot_core.units import ns, seconds
+from ibrobot_core.api import (
+    Context,
+    Header,
+    Joint,
+    JointGoal,
+    JointTrajectory,
+    JointTrajectoryPoint,
+    Planner,
+    PlanningError,
+    PlanRequest,
+    PoseGoal,
+    Vector,
+    ns,
+    seconds,
+)
 from ibrobot_planning.options import JointPlannerOptions
 from ibrobot_planning.profile import RestToRest
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from ibrobot_core.descriptors import Command
-from ibrobot_core.hookspecs import hookimpl
+from ibrobot_core.api import Command, hookimpl
 
 if TYPE_CHECKING:
     import click

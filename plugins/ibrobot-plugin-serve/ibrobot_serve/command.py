@@ -14,19 +14,27 @@ from typing import Any
 
 import click
 
-from ibrobot_core.clock import RealClock
-from ibrobot_core.config import find_config, load
-from ibrobot_core.config.overrides import apply
-from ibrobot_core.config.single import single_options
-from ibrobot_core.config.yaml_nodes import parse
-from ibrobot_core.descriptors import TransportDescriptor
-from ibrobot_core.inference.build import build_policy
-from ibrobot_core.interfaces import Context, Policy, Transport
-from ibrobot_core.metrics import MetricsServer
-from ibrobot_core.outside import LogFormatter, echo
-from ibrobot_core.plugins import Registry, example, installed
-from ibrobot_core.robot import Robot
-from ibrobot_core.workers import on_signals
+from ibrobot_core.api import (
+    Context,
+    LogFormatter,
+    MetricsServer,
+    Policy,
+    RealClock,
+    Registry,
+    Robot,
+    Transport,
+    TransportDescriptor,
+    apply_overrides,
+    build_policy,
+    echo,
+    example_type,
+    find_config,
+    installed_plugins,
+    load_config,
+    on_signals,
+    parse_yaml,
+    single_options,
+)
 from ibrobot_serve.metrics import probes
 from ibrobot_serve.service import InferenceService, ServiceOptions
 
@@ -76,7 +84,7 @@ def serve(what: str, **options: Any) -> None:
     CONFIG is a robot YAML, whose model and transport are used; MODEL_DIR is a folder with a model, for --type.
     Robots reach it by `execution_mode: distributed`. Ctrl-C or SIGTERM answers what is there, then ends.
     """
-    registry = installed()
+    registry = installed_plugins()
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(LogFormatter("%(levelname).1s %(message)s"))
     logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
@@ -139,7 +147,7 @@ def _from_config(what: str, registry: Registry, options: dict[str, Any]) -> tupl
     transport = _transport_type(path, options["overrides"])
     listening = _listening(registry, transport, options["listen"]) if transport and options["listen"] else []
     changes = (*options["overrides"], *(f"transport.{each}" for each in (*listening, *options["transport_options"])))
-    config = load(path, overrides=changes, sim=options["sim"], registry=registry, communicates=True)
+    config = load_config(path, overrides=changes, sim=options["sim"], registry=registry, communicates=True)
     model: str = options["model"] or (next(iter(config.models)) if len(config.models) == 1 else "")
     if model not in config.models:
         raise click.UsageError(
@@ -149,7 +157,7 @@ def _from_config(what: str, registry: Registry, options: dict[str, Any]) -> tupl
     if section is None or section.type == "local":
         raise click.UsageError(
             f"{path} names no transport to robots: add "
-            f"--set 'transport={{type: {example('transport')}}}' --listen ENDPOINT"
+            f"--set 'transport={{type: {example_type('transport')}}}' --listen ENDPOINT"
         )
 
     def make_transport() -> Transport:
@@ -189,10 +197,10 @@ def _from_folder(
 
 def _transport_type(path: Path, overrides: Sequence[str]) -> str:
     """The type that the `transport` section names, before anything is checked; empty where there is none."""
-    document = parse(path.read_text(encoding="utf-8", errors="replace"), str(path))
+    document = parse_yaml(path.read_text(encoding="utf-8", errors="replace"), str(path))
     if not isinstance(document.root, Mapping):
         return ""
-    apply(document, overrides)
+    apply_overrides(document, overrides)
     section = document.root.get("transport")
     found = str(section.get("type", "")) if isinstance(section, Mapping) else ""
     return "" if found == "local" else found
@@ -218,7 +226,7 @@ def _show(service: InferenceService, stopping: threading.Event) -> None:
         return
     from rich.live import Live
 
-    from ibrobot_core.screen import Screen
+    from ibrobot_core.api import Screen
 
     with Live(console=Screen(), auto_refresh=False) as display:
         while not stopping.wait(_PANEL_PERIOD_S):

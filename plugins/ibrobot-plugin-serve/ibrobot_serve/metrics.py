@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from ibrobot_core.metrics import Metrics, Probes
+from ibrobot_core.api import Metrics, MetricsProbes
 from ibrobot_serve.service import InferenceService
 
 _COUNTS = ("requests", "answered", "failed", "expired")
 _TIMES = ("latency_p50_ms", "latency_p99_ms")
 
 
-def probes(service: InferenceService) -> Probes:
+def probes(service: InferenceService) -> MetricsProbes:
     """What an HTTP port says of a service."""
-    return Probes(
+    return MetricsProbes(
         lambda metrics: collect(service, metrics),
         lambda: "the model hangs" if service.state == "hangs" else "",
         lambda: "the server is stopping" if service.state == "draining" else "",

@@ -7,7 +7,7 @@ from collections import OrderedDict, deque
 from collections.abc import Iterable
 from statistics import median
 
-from ibrobot_core.units import NS_PER_S
+from ibrobot_core.api import NS_PER_S
 
 _TARGET = 0.8
 """Share of the model's time that requests may take. At 0.8, random arrivals wait for two requests' time on average."""

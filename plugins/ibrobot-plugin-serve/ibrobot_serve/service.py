@@ -15,11 +15,27 @@ from typing import Any
 import attrs
 import numpy as np
 
-from ibrobot_core.errors import IbrobotError, PolicyError, WireError
-from ibrobot_core.inference.wire import LIMITS, Decoder, Encoder, Kind, Limits, Message, health_name, service_name
-from ibrobot_core.interfaces import Payload, PictureCodec, Policy, Tensors, Transport
-from ibrobot_core.interfaces.policy import copied, whole_fingerprint
-from ibrobot_core.units import NS_PER_S
+from ibrobot_core.api import (
+    NS_PER_S,
+    WIRE_LIMITS,
+    IbrobotError,
+    Payload,
+    PictureCodec,
+    Policy,
+    PolicyError,
+    Tensors,
+    Transport,
+    WireDecoder,
+    WireEncoder,
+    WireError,
+    WireKind,
+    WireLimits,
+    WireMessage,
+    copied_tensors,
+    health_name,
+    service_name,
+    whole_fingerprint,
+)
 from ibrobot_serve.fair_queue import FairQueue
 from ibrobot_serve.pacing import Pacing
 
@@ -45,7 +61,7 @@ class ServiceOptions:
     """How long a batch that is not full waits for more requests [s]; 0: only what waits already goes together."""
     hang_timeout_s: float = 30.0
     """After which a model that is at work on one batch is taken to hang [s]."""
-    limits: Limits = LIMITS
+    limits: WireLimits = WIRE_LIMITS
 
 
 @attrs.define
@@ -82,7 +98,7 @@ class _Outcome:
 class _Ticket:
     """A request that waits for its turn. The first outcome counts."""
 
-    message: Message
+    message: WireMessage
     arrived_ns: int
     deadline_ns: int
     outcomes: queue.SimpleQueue[_Outcome] = attrs.field(factory=queue.SimpleQueue)
@@ -122,7 +138,7 @@ class InferenceService:
         self._transport = transport
         self._model = model
         self._options = options or ServiceOptions()
-        self._decoder, self._encoder = Decoder(self._options.limits, codec), Encoder(self._options.limits)
+        self._decoder, self._encoder = WireDecoder(self._options.limits, codec), WireEncoder(self._options.limits)
         self._weights = policy.weights()
         self._fingerprint = whole_fingerprint(policy.fingerprint(), self._weights)
         self._queue: FairQueue[_Ticket] = FairQueue(self._options.queue)
@@ -209,12 +225,12 @@ class InferenceService:
         arrived_ns = time.monotonic_ns()
         try:
             message = self._decoder.decode(payload)
-            if message.kind is not Kind.REQUEST:
+            if message.kind is not WireKind.REQUEST:
                 raise WireError(f"a frame of kind {message.kind.name}; robots send requests")
         except WireError as error:
             with self._lock:
                 self._malformed += 1
-            return self._encoder.encode(Message(Kind.FAILURE, 0, text=str(error)))
+            return self._encoder.encode(WireMessage(WireKind.FAILURE, 0, text=str(error)))
         if sender is not None:  # whatever name the request claims
             message = attrs.evolve(message, robot=sender)
         with self._idle:
@@ -228,7 +244,7 @@ class InferenceService:
                 self._at_work -= 1
                 self._idle.notify_all()
 
-    def _refusal(self, message: Message) -> str:
+    def _refusal(self, message: WireMessage) -> str:
         state = self.state
         if state == "hangs":
             return self._hang()
@@ -241,7 +257,7 @@ class InferenceService:
             )
         return ""
 
-    def _wait_for(self, message: Message, arrived_ns: int) -> _Outcome:
+    def _wait_for(self, message: WireMessage, arrived_ns: int) -> _Outcome:
         patience_ns = min(message.deadline_ns, round(_LONGEST_WAIT_S * NS_PER_S))
         ticket = _Ticket(message, arrived_ns, arrived_ns + patience_ns)
         self._pacing.ask(message.robot, arrived_ns)
@@ -255,12 +271,12 @@ class InferenceService:
         except queue.Empty:
             return _Outcome(None, "no outputs within the deadline", expired=True)
 
-    def _reply(self, message: Message, outcome: _Outcome, arrived_ns: int) -> Payload:
+    def _reply(self, message: WireMessage, outcome: _Outcome, arrived_ns: int) -> Payload:
         now_ns = time.monotonic_ns()
         latency_ms = (now_ns - arrived_ns) / 1e6
 
-        def said(kind: Kind, outputs: Tensors, text: str = "") -> Payload:
-            answer = Message(
+        def said(kind: WireKind, outputs: Tensors, text: str = "") -> Payload:
+            answer = WireMessage(
                 kind, message.id, outputs, message.robot, self._fingerprint, text, message.stamp_ns,
                 latency_ms=latency_ms, queued_ns=outcome.queued_ns, pace_ns=self._pacing.pace_ns(now_ns),
             )  # fmt: skip
@@ -269,7 +285,7 @@ class InferenceService:
         error, reply = outcome.error, None
         if outcome.outputs is not None:
             try:
-                reply = said(Kind.ANSWER, outcome.outputs)
+                reply = said(WireKind.ANSWER, outcome.outputs)
             except WireError as unsaid:
                 error = f"the policy's outputs: {unsaid}"
         with self._lock:
@@ -279,7 +295,7 @@ class InferenceService:
                 counts.failed += reply is None
                 counts.expired += outcome.expired
                 counts.latencies_ms.append(latency_ms)
-        return reply if reply is not None else said(Kind.FAILURE, {}, error)
+        return reply if reply is not None else said(WireKind.FAILURE, {}, error)
 
     def _counts(self, robot: str) -> RobotCounts:
         counts = self._robots.setdefault(robot, RobotCounts())
@@ -331,7 +347,9 @@ class InferenceService:
             self._batches[len(live)] += 1
         try:
             # Other threads encode the answers, while the model may overwrite its outputs in the next batch.
-            outputs = [copied(each) for each in self._policy.infer_batch([ticket.message.tensors for ticket in live])]
+            outputs = [
+                copied_tensors(each) for each in self._policy.infer_batch([ticket.message.tensors for ticket in live])
+            ]
             if len(outputs) != len(live):
                 raise PolicyError(f"{len(outputs)} outputs for a batch of {len(live)}")
         except Exception as error:  # noqa: BLE001 - contained: a request that the policy cannot take is told so

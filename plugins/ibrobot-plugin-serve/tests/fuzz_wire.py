@@ -31,10 +31,10 @@ from ibrobot_testing import host_context
 from ibrobot_testing.fakes import FakePolicy
 
 from ibrobot_core.inference.remote import RemoteEngine
-from ibrobot_core.inference.wire import Kind, Message, decode, encode, service_name
+from ibrobot_core.inference.wire import WireKind, WireMessage, decode, encode, service_name
 from ibrobot_core.interfaces import Handler, Tensors, Transport
 from ibrobot_core.local_transport import LocalTransport
-from ibrobot_core.plugins import installed
+from ibrobot_core.plugins import installed_plugins
 
 GROWTH_MIB = 64
 """What the process may grow by: threads' stacks and arenas, and the counts of 256 robots."""
@@ -98,14 +98,17 @@ class Robot(threading.Thread):
 def seeds(fingerprint: str) -> list[bytes]:
     """Whole frames to damage."""
     state, one = np.arange(6.0), np.ones(6)
-    asked = Message(
-        Kind.REQUEST, 3, {"state": state, "one": one}, "fuzz", fingerprint, deadline_ns=50_000_000, episode=1
+    asked = WireMessage(
+        WireKind.REQUEST, 3, {"state": state, "one": one}, "fuzz", fingerprint, deadline_ns=50_000_000, episode=1
     )
-    picture = Message(
-        Kind.REQUEST, 4, {"top": np.zeros((4, 4, 3), np.uint8), "on": np.array([True])}, "fuzz", fingerprint,
+    picture = WireMessage(
+        WireKind.REQUEST, 4, {"top": np.zeros((4, 4, 3), np.uint8), "on": np.array([True])}, "fuzz", fingerprint,
         deadline_ns=50_000_000,
     )  # fmt: skip
-    return [bytes(encode(m)) for m in (asked, picture, Message(Kind.FAILURE, 9, text="no"), Message(Kind.ANSWER, 1))]
+    return [
+        bytes(encode(m))
+        for m in (asked, picture, WireMessage(WireKind.FAILURE, 9, text="no"), WireMessage(WireKind.ANSWER, 1))
+    ]
 
 
 def mutant(chance: random.Random, frames: list[bytes]) -> bytes:
@@ -155,7 +158,7 @@ def fuzz_frames(count: int, seed: int) -> tuple[Counter[str], Robot, float]:
         if number == min(count // 10, 100_000):
             before_mib = memory_mib()
         answer = decode(handler(mutant(chance, frames), None))
-        ended["answered" if answer.kind is Kind.ANSWER else "malformed" if answer.id == 0 else "failed"] += 1
+        ended["answered" if answer.kind is WireKind.ANSWER else "malformed" if answer.id == 0 else "failed"] += 1
     grown = memory_mib() - before_mib
     robot.stopped.set()
     robot.join()
@@ -166,7 +169,7 @@ def fuzz_frames(count: int, seed: int) -> tuple[Counter[str], Robot, float]:
 
 def fuzz_connections(count: int, seed: int) -> tuple[Robot, float]:
     """Open connections that send garbage to a listening server; the robot, and the growth [MiB]."""
-    descriptor = installed().find("transport", "zenoh")
+    descriptor = installed_plugins().find("transport", "zenoh")
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = free.getsockname()

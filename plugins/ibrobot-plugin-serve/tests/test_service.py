@@ -23,7 +23,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from ibrobot_core.errors import ContractError, PolicyError, TransportError
 from ibrobot_core.inference.remote import RemoteEngine
-from ibrobot_core.inference.wire import Kind, Message, decode, encode, health_name, service_name
+from ibrobot_core.inference.wire import WireKind, WireMessage, decode, encode, health_name, service_name
 from ibrobot_core.interfaces import Handler, Tensors
 from ibrobot_core.local_transport import LocalTransport
 from ibrobot_core.metrics import Metrics
@@ -103,25 +103,25 @@ class Cloud:
         self.service.start()
         self.pool = ThreadPoolExecutor(80)
 
-    def ask(self, robot: str, x: Any, *, wait_ns: int = SOON_NS, **changes: Any) -> Future[Message]:
+    def ask(self, robot: str, x: Any, *, wait_ns: int = SOON_NS, **changes: Any) -> Future[WireMessage]:
         """Send a request; its answer comes later."""
-        message = Message(
-            Kind.REQUEST, 5, {"x": np.atleast_1d(np.asarray(x, np.float64))}, robot, self.policy.fingerprint(),
+        message = WireMessage(
+            WireKind.REQUEST, 5, {"x": np.atleast_1d(np.asarray(x, np.float64))}, robot, self.policy.fingerprint(),
             deadline_ns=wait_ns,
         )  # fmt: skip
         return self.send(bytes(encode(attrs.evolve(message, **changes))))
 
-    def send(self, payload: bytes) -> Future[Message]:
+    def send(self, payload: bytes) -> Future[WireMessage]:
         return self.pool.submit(lambda: decode(self.transport.request(service_name("net"), payload, PATIENCE_S)))
 
-    def asked(self, robot: str, x: Any, **changes: Any) -> Future[Message]:
+    def asked(self, robot: str, x: Any, **changes: Any) -> Future[WireMessage]:
         """As `ask`; returns once the request waits for its turn."""
         before = self.health()["waiting"]
         future = self.ask(robot, x, **changes)
         self.until(lambda: self.health()["waiting"] > before)
         return future
 
-    def busy(self) -> Future[Message]:
+    def busy(self) -> Future[WireMessage]:
         """A request that keeps the model busy until the gate opens."""
         future = self.ask("busy", 0)
         assert self.policy.entered.acquire(timeout=PATIENCE_S)
@@ -157,16 +157,16 @@ def served(policy: Net | None = None, **options: Any) -> Iterator[Cloud]:
         cloud.close()
 
 
-def outputs(future: Future[Message]) -> list[float]:
+def outputs(future: Future[WireMessage]) -> list[float]:
     message = future.result(PATIENCE_S)
-    assert message.kind is Kind.ANSWER, message.text
+    assert message.kind is WireKind.ANSWER, message.text
     twice: list[float] = message.tensors["twice"].tolist()
     return twice
 
 
-def failure(future: Future[Message]) -> str:
+def failure(future: Future[WireMessage]) -> str:
     message = future.result(PATIENCE_S)
-    assert message.kind is Kind.FAILURE
+    assert message.kind is WireKind.FAILURE
     return message.text
 
 
@@ -293,7 +293,7 @@ def test_the_service_measures_who_asks_and_what_it_costs(monkeypatch: pytest.Mon
 def test_garbage_is_counted_told_and_harmless():
     with served() as cloud:
         cloud.policy.gate.release(10)
-        answer = encode(Message(Kind.ANSWER, 1))
+        answer = encode(WireMessage(WireKind.ANSWER, 1))
         for payload, said in ((b"", "0 bytes"), (b"GET / HTTP/1.1" * 10, "no frame"), (answer, "kind ANSWER")):
             assert said in failure(cloud.send(bytes(payload)))
         assert outputs(cloud.ask("robot", 3)) == [6]
@@ -581,8 +581,8 @@ def test_server_that_comes_back_with_another_policy_is_refused_whatever_its_weig
     ("answer", "said"),
     [
         (b"nonsense", "8 bytes; a frame has"),
-        (encode(Message(Kind.ANSWER, 8)), "answered request 8"),
-        (encode(Message(Kind.FAILURE, 1, text="out of memory")), "the server of net: out of memory"),
+        (encode(WireMessage(WireKind.ANSWER, 8)), "answered request 8"),
+        (encode(WireMessage(WireKind.FAILURE, 1, text="out of memory")), "the server of net: out of memory"),
     ],
 )
 def test_the_engine_believes_no_answer_but_its_own(answer: bytes, said: str):
@@ -598,8 +598,8 @@ def test_the_engine_believes_no_answer_but_its_own(answer: bytes, said: str):
 def test_the_engine_knows_waiting_from_work_and_the_pace():
     transport = LocalTransport()
     replies = [
-        Message(Kind.ANSWER, 1, {}, fingerprint=Net().fingerprint(), latency_ms=50.0, queued_ns=30_000_000),
-        Message(Kind.FAILURE, 2, text="full", pace_ns=750_000_000),
+        WireMessage(WireKind.ANSWER, 1, {}, fingerprint=Net().fingerprint(), latency_ms=50.0, queued_ns=30_000_000),
+        WireMessage(WireKind.FAILURE, 2, text="full", pace_ns=750_000_000),
     ]
     transport.serve(service_name("net"), lambda payload, sender: encode(replies[decode(payload).id - 1]))
     remote = RemoteEngine(Net(), transport, "net", "so101")

@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.descriptors import Command, DecoderDescriptor, TransportDescriptor
-from ibrobot_core.hookspecs import hookimpl
+from ibrobot_core.api import Command, DecoderDescriptor, TransportDescriptor, hookimpl
 from ibrobot_zenoh.options import ZenohOptions, server_options
 
 if TYPE_CHECKING:
     import click
 
-    from ibrobot_core.interfaces import Context, Transport
-    from ibrobot_core.messages import CompressedImage, Image
+    from ibrobot_core.api import CompressedImage, Context, Image, Transport
 
 
 def _zenoh(options: Any, ctx: Context) -> Transport:

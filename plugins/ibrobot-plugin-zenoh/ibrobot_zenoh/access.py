@@ -14,7 +14,7 @@ from typing import Any
 import attrs
 import zenoh
 
-from ibrobot_core.errors import TransportError
+from ibrobot_core.api import TransportError
 from ibrobot_zenoh.identity import Identity, Role, read_identity
 from ibrobot_zenoh.options import Tls, ZenohOptions, check_robot_name
 from ibrobot_zenoh.ros2 import ADMIN

@@ -19,7 +19,7 @@ from cryptography.hazmat.primitives.serialization import (
 )
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from ibrobot_core.errors import TransportError
+from ibrobot_core.api import TransportError
 from ibrobot_zenoh.access import read_lines
 from ibrobot_zenoh.identity import Identity, Role, identity_in, subject
 

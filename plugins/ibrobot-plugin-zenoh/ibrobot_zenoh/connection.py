@@ -14,8 +14,7 @@ from weakref import WeakSet
 
 import zenoh
 
-from ibrobot_core.errors import TransportError
-from ibrobot_core.memory import set_malloc
+from ibrobot_core.api import TransportError, set_malloc
 from ibrobot_zenoh.access import restrict
 from ibrobot_zenoh.options import ZenohOptions
 from ibrobot_zenoh.reasons import tls_context, why_not

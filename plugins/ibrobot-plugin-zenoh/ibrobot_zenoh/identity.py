@@ -9,7 +9,7 @@ import attrs
 from cryptography import x509
 from cryptography.x509.oid import NameOID
 
-from ibrobot_core.errors import TransportError
+from ibrobot_core.api import TransportError
 from ibrobot_zenoh.options import Tls, ZenohOptions
 from ibrobot_zenoh.reasons import tls_context
 

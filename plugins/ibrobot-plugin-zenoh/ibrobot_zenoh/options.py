@@ -10,7 +10,7 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.options import documented, option
+from ibrobot_core.api import documented, option
 
 MIB = 1024 * 1024
 DEFAULT_LISTEN = "tcp/127.0.0.1:7447"

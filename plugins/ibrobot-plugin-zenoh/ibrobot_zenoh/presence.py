@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import zenoh
 
-from ibrobot_core.workers import Workers
+from ibrobot_core.api import Workers
 from ibrobot_zenoh.access import SERVED
 from ibrobot_zenoh.connection import Connection
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 import ssl
 
-from ibrobot_core.errors import TransportError
+from ibrobot_core.api import TransportError
 from ibrobot_zenoh.options import Tls
 
 _TIMEOUT_S = 0.5

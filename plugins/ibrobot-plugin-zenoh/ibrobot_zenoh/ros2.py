@@ -10,8 +10,7 @@ from collections.abc import Iterable
 import attrs
 from ibrobot_ros2 import type_hash
 
-from ibrobot_core.errors import TransportError
-from ibrobot_core.interfaces.transport import SharedTopic
+from ibrobot_core.api import SharedTopic, TransportError
 
 ADMIN = "@ros2_lv"
 NO_HASH = "TypeHashNotSupported"

@@ -14,11 +14,7 @@ import zenoh
 import zenoh.ext
 from ibrobot_ros2 import decode, encode
 
-from ibrobot_core.errors import IbrobotError, TransportError
-from ibrobot_core.interfaces import Context
-from ibrobot_core.interfaces.transport import SharedTopic
-from ibrobot_core.messages import Message
-from ibrobot_core.workers import Workers
+from ibrobot_core.api import Context, IbrobotError, Message, SharedTopic, TransportError, Workers
 from ibrobot_zenoh.connection import Connection, Declared, first_line
 from ibrobot_zenoh.identity import Identity, Role
 from ibrobot_zenoh.options import ZenohOptions

@@ -10,11 +10,17 @@ from typing import Any, override
 
 import zenoh
 
-from ibrobot_core.errors import TransportError
-from ibrobot_core.interfaces import Context, Handler, Payload, SharedTopic, TopicTransport
-from ibrobot_core.interfaces.transport import WORKERS
-from ibrobot_core.messages import Message
-from ibrobot_core.workers import Workers
+from ibrobot_core.api import (
+    HANDLER_THREADS,
+    Context,
+    Handler,
+    Message,
+    Payload,
+    SharedTopic,
+    TopicTransport,
+    TransportError,
+    Workers,
+)
 from ibrobot_zenoh.access import ANYBODY, SERVED, SERVICES, TOPICS
 from ibrobot_zenoh.connection import Connection, first_line
 from ibrobot_zenoh.identity import own_identity
@@ -100,7 +106,7 @@ class ZenohTransport(TopicTransport):
         return self._keep(self._connection.declare(lambda session: session.declare_subscriber(key, take)), subscriber)
 
     @override
-    def serve(self, name: str, handler: Handler, *, workers: int = WORKERS) -> Callable[[], None]:
+    def serve(self, name: str, handler: Handler, *, workers: int = HANDLER_THREADS) -> Callable[[], None]:
         key, token = _key(f"{SERVICES}/*", name), _key(SERVED, name).join(uuid.uuid4().hex)
 
         def answer(query: zenoh.Query) -> None:

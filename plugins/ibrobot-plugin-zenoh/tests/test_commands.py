@@ -192,8 +192,8 @@ def use_config(monkeypatch: pytest.MonkeyPatch, transport: TransportConfig | Non
     config = RobotConfig(
         robot=Robot("r", ()), executors={}, control_modes={}, default_control_mode="m", transport=transport
     )
-    monkeypatch.setattr("ibrobot_core.config.find_config", lambda name, registry: Path(name))
-    monkeypatch.setattr("ibrobot_core.config.load", lambda path, communicates: config)
+    monkeypatch.setattr("ibrobot_core.api.find_config", lambda name, registry: Path(name))
+    monkeypatch.setattr("ibrobot_core.api.load_config", lambda path, communicates: config)
 
 
 def test_messages_from_text():

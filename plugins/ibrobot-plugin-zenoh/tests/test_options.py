@@ -10,7 +10,7 @@ from ibrobot_testing import host_context
 from ibrobot_zenoh.options import Tls, ZenohOptions
 
 from ibrobot_core.errors import TransportError
-from ibrobot_core.plugins import installed
+from ibrobot_core.plugins import installed_plugins
 
 from .pair import WAIT_S, client, free_endpoint, make, router, settle, wait_for
 
@@ -55,7 +55,7 @@ def test_accepted(options: dict[str, object]):
 
 def test_the_yaml_s_type():
     endpoint = free_endpoint()
-    descriptor = installed().find("transport", "zenoh")
+    descriptor = installed_plugins().find("transport", "zenoh")
     transport = descriptor.make(ZenohOptions(listen=(endpoint,), mode="peer", shared_memory=False), host_context())
     transport.close()
 

@@ -9,7 +9,7 @@ from typing import Any
 from rosbags.serde import SerdeError
 from rosbags.typesys.store import Typestore
 
-from ibrobot_core.messages import Message
+from ibrobot_core.api import Message
 from ibrobot_ros2.convert import Convert, core_class, decoder, encoder, make_class
 from ibrobot_ros2.definitions import CodecError, define, make_typestore, standard_types, type_hash
 

@@ -16,9 +16,8 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys.base import normalize_fieldname
 from rosbags.typesys.store import Typestore
 
-from ibrobot_core import messages as core
-from ibrobot_core.messages import MESSAGE_TYPES, Message
-from ibrobot_core.units import NS_PER_S
+from ibrobot_core import api as core
+from ibrobot_core.api import MESSAGE_TYPES, NS_PER_S, Message
 
 Convert = Callable[[Any], Any]
 

@@ -9,7 +9,7 @@ from typing import Any
 from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from ibrobot_core.errors import IbrobotError
+from ibrobot_core.api import IbrobotError
 
 _PACKAGE = "ibrobot_msgs"
 _SEPARATOR = "=" * 80 + "\n"

@@ -9,8 +9,7 @@ import numpy as np
 import simplejpeg  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 
-from ibrobot_core.errors import ContractError
-from ibrobot_core.messages import CompressedImage, Header, Image
+from ibrobot_core.api import CompressedImage, ContractError, Header, Image
 
 BEGINS = b"\xff\xd8\xff"
 """The first bytes of every JPEG."""

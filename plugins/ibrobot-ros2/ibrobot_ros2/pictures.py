@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ibrobot_core.messages import CompressedImage, Image
+from ibrobot_core.api import CompressedImage, Image
 from ibrobot_ros2.jpeg import from_jpeg, is_jpeg
 from ibrobot_ros2.png import from_png, is_png
 

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as Pillow
 
-from ibrobot_core.errors import ContractError
-from ibrobot_core.messages import CompressedImage, Image
+from ibrobot_core.api import CompressedImage, ContractError, Image
 
 _BEGINS = b"\x89PNG\r\n\x1a\n"
 _KIND = slice(24, 26)

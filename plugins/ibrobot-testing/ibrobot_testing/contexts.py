@@ -5,11 +5,7 @@ from __future__ import annotations
 import logging
 from typing import Any
 
-from ibrobot_core.bus import Bus
-from ibrobot_core.clock import Clock, SteppedClock
-from ibrobot_core.interfaces import Context
-from ibrobot_core.robot import Description, Joint, Robot
-from ibrobot_core.units import NS_PER_S
+from ibrobot_core.api import NS_PER_S, Bus, Clock, Context, Description, Joint, Robot, SteppedClock
 
 START_NS = 1_700_000_000 * NS_PER_S
 """Where the stepped clock of a test begins [ns]: a plausible date, so that stamps near zero stand out."""

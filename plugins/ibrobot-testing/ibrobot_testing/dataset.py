@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ibrobot_core.errors import DatasetError
-from ibrobot_core.interfaces import DatasetWriter, Feature
+from ibrobot_core.api import DatasetError, DatasetWriter, Feature
 from ibrobot_testing.suite import Suite
 
 Values = Mapping[str, NDArray[np.generic]]

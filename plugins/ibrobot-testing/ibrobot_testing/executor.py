@@ -9,10 +9,7 @@ import attrs
 import numpy as np
 import pytest
 
-from ibrobot_core.errors import GoalRejected
-from ibrobot_core.interfaces import Context, Executor, GoalState, GoalStatus, JointReading, Plan
-from ibrobot_core.robot import Vector
-from ibrobot_core.units import seconds
+from ibrobot_core.api import Context, Executor, GoalRejected, GoalState, GoalStatus, JointReading, Plan, Vector, seconds
 from ibrobot_testing.contexts import ARM, control_context
 from ibrobot_testing.suite import Suite
 

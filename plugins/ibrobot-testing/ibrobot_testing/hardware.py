@@ -9,11 +9,19 @@ from typing import override
 import numpy as np
 import pytest
 
-from ibrobot_core.clock import SteppedClock
-from ibrobot_core.errors import HardwareError, NotSupported
-from ibrobot_core.interfaces import Context, Episode, Hardware, JointReading, SimulatedHardware, Torque
-from ibrobot_core.robot import Vector
-from ibrobot_core.units import ns
+from ibrobot_core.api import (
+    Context,
+    Episode,
+    Hardware,
+    HardwareError,
+    JointReading,
+    NotSupported,
+    SimulatedHardware,
+    SteppedClock,
+    Torque,
+    Vector,
+    ns,
+)
 from ibrobot_testing.contexts import control_context
 from ibrobot_testing.suite import Suite
 

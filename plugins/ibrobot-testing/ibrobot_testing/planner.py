@@ -10,11 +10,7 @@ import attrs
 import numpy as np
 import pytest
 
-from ibrobot_core.errors import PlanningError
-from ibrobot_core.interfaces import Context, JointGoal, Planner, PlanRequest
-from ibrobot_core.messages import JointTrajectory
-from ibrobot_core.robot import Vector
-from ibrobot_core.units import seconds
+from ibrobot_core.api import Context, JointGoal, JointTrajectory, Planner, PlanningError, PlanRequest, Vector, seconds
 from ibrobot_testing.suite import Suite
 
 

@@ -11,9 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ibrobot_core.errors import PolicyError
-from ibrobot_core.interfaces import Context, Frame, Policy, PolicySpec, Tensors
-from ibrobot_core.interfaces.policy import copied
+from ibrobot_core.api import Context, Frame, Policy, PolicyError, PolicySpec, Tensors, copied_tensors
 from ibrobot_testing.suite import Suite
 
 _STEP_NS = 33_333_333
@@ -121,13 +119,13 @@ class PolicySuite(Suite[Policy]):
         """No step changes what it is given."""
         with self.loaded() as (policy, ctx):
             frame = self.frame(policy, ctx, 1)
-            before = copied(frame.values)
+            before = copied_tensors(frame.values)
             inputs = policy.preprocess(frame)
             assert _equal(frame.values, before), "preprocess changed the frame"
-            before = copied(inputs)
+            before = copied_tensors(inputs)
             outputs = policy.infer(inputs)
             assert _equal(inputs, before), "infer changed its input"
-            before = copied(outputs)
+            before = copied_tensors(outputs)
             policy.postprocess(outputs)
             assert _equal(outputs, before), "postprocess changed its input"
 
@@ -164,7 +162,7 @@ class PolicySuite(Suite[Policy]):
             if policy.spec.stateful:
                 pytest.skip("each request changes what it remembers")
             batch = [policy.preprocess(self.frame(policy, ctx, i)) for i in range(3)]
-            together = [copied(outputs) for outputs in policy.infer_batch(batch)]
+            together = [copied_tensors(outputs) for outputs in policy.infer_batch(batch)]
             assert len(together) == len(batch)
             for inputs, outputs in zip(batch, together, strict=True):
                 alone = policy.postprocess(policy.infer(inputs)).copy()
@@ -199,7 +197,7 @@ class PolicySuite(Suite[Policy]):
             if policy.spec.stateful:
                 pytest.skip("says that it remembers")
             inputs = policy.preprocess(self.frame(policy, ctx, 1))
-            first = copied(policy.infer(inputs))
+            first = copied_tensors(policy.infer(inputs))
             policy.infer(policy.preprocess(self.frame(policy, ctx, 2)))
             assert _equal(first, policy.infer(inputs))
 

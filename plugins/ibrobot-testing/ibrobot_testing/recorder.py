@@ -12,10 +12,18 @@ import attrs
 import numpy as np
 import pytest
 
-from ibrobot_core.errors import RecorderError
-from ibrobot_core.interfaces import Context, EpisodeEnd, EpisodeStart, Recorder
-from ibrobot_core.messages import Header, JointState, Message, String
-from ibrobot_core.units import NS_PER_S
+from ibrobot_core.api import (
+    NS_PER_S,
+    Context,
+    EpisodeEnd,
+    EpisodeStart,
+    Header,
+    JointState,
+    Message,
+    Recorder,
+    RecorderError,
+    String,
+)
 from ibrobot_testing.suite import Suite
 
 Record = tuple[int, Message]

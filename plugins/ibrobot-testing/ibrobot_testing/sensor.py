@@ -9,10 +9,17 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
-from ibrobot_core.errors import SensorError
-from ibrobot_core.interfaces import Context, Sensor
-from ibrobot_core.messages import MESSAGE_TYPES, CameraInfo, CompressedImage, Image, Message
-from ibrobot_core.plugins import installed
+from ibrobot_core.api import (
+    MESSAGE_TYPES,
+    CameraInfo,
+    CompressedImage,
+    Context,
+    Image,
+    Message,
+    Sensor,
+    SensorError,
+    installed_plugins,
+)
 from ibrobot_testing.suite import Suite
 
 _BYTES_PER_PIXEL = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1, "mono16": 2, "16UC1": 2, "32FC1": 4}
@@ -137,7 +144,7 @@ class SensorSuite(Suite[Sensor]):
 
 
 def _decoded(message: Message) -> Message:
-    return installed().decode(message) if isinstance(message, CompressedImage) else message
+    return installed_plugins().decode(message) if isinstance(message, CompressedImage) else message
 
 
 def _arrays(message: Message) -> dict[str, Any]:

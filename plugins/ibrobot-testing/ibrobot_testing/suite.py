@@ -9,7 +9,7 @@ from typing import ClassVar
 
 import pytest
 
-from ibrobot_core.interfaces import Context
+from ibrobot_core.api import Context
 from ibrobot_testing.contexts import host_context
 from ibrobot_testing.leaks import LeakCheck
 

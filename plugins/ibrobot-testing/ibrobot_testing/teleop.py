@@ -9,9 +9,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from ibrobot_core.errors import TeleopError
-from ibrobot_core.interfaces import Context, JointReading, Teleop, TeleopCommand
-from ibrobot_core.robot import Vector
+from ibrobot_core.api import Context, JointReading, Teleop, TeleopCommand, TeleopError, Vector
 from ibrobot_testing.suite import Suite
 
 

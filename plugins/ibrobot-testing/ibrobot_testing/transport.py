@@ -10,8 +10,7 @@ from typing import ClassVar
 
 import pytest
 
-from ibrobot_core.errors import TransportError
-from ibrobot_core.interfaces import Context, Payload, Transport
+from ibrobot_core.api import Context, Payload, Transport, TransportError
 from ibrobot_testing.suite import Suite
 
 _HELD_S = 120.0

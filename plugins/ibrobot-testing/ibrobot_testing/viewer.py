@@ -8,9 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ibrobot_core.bus import Bus
-from ibrobot_core.interfaces import Context, Viewer
-from ibrobot_core.messages import Header, JointState, Message, String
+from ibrobot_core.api import Bus, Context, Header, JointState, Message, String, Viewer
 from ibrobot_testing.suite import Suite
 
 

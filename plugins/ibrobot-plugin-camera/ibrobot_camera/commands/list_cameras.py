@@ -9,8 +9,7 @@ import click
 from rich.table import Table
 
 from ibrobot_camera import v4l2
-from ibrobot_core.outside import echo
-from ibrobot_core.screen import Screen, text
+from ibrobot_core.api import Screen, echo, styled
 
 
 @click.command("list")
@@ -26,11 +25,11 @@ def list_cameras(as_json: bool) -> None:
         return
     console = Screen()
     for camera in found:
-        console.print(text(camera.path, "bold") + text(f"  {camera.name}"))
+        console.print(styled(camera.path, "bold") + styled(f"  {camera.name}"))
         if camera.stable_id:
             console.print(f"  device: {camera.stable_id}", soft_wrap=True)
         if camera.problem:
-            console.print(text(f"  {camera.problem}", "red") + text(": sudo usermod -aG video $USER, log in anew"))
+            console.print(styled(f"  {camera.problem}", "red") + styled(": sudo usermod -aG video $USER, log in anew"))
         else:
             console.print(_table(camera))
 

@@ -12,9 +12,7 @@ from urllib.parse import parse_qs, urlsplit
 import click
 import cv2
 
-from ibrobot_core.messages import CompressedImage, Image
-from ibrobot_core.outside import echo
-from ibrobot_core.workers import on_signals
+from ibrobot_core.api import CompressedImage, Image, echo, on_signals
 
 if TYPE_CHECKING:
     from ibrobot_camera.camera import OpenCvCamera
@@ -43,7 +41,7 @@ class Newest:
             return (self._number, self._jpeg) if self._number > number else (number, b"")
 
     def _run(self) -> None:
-        from ibrobot_core.errors import SensorError
+        from ibrobot_core.api import SensorError
 
         while not self._ended.is_set():
             try:

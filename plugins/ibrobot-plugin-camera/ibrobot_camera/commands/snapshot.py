@@ -10,10 +10,7 @@ from pathlib import Path
 import click
 import cv2
 
-from ibrobot_core.errors import SensorError
-from ibrobot_core.messages import CompressedImage, Image
-from ibrobot_core.outside import echo
-from ibrobot_core.units import NS_PER_S
+from ibrobot_core.api import NS_PER_S, CompressedImage, Image, SensorError, echo
 
 _WAIT_S = 10.0
 

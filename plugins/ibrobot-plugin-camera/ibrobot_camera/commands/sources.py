@@ -13,13 +13,17 @@ from numpy.typing import NDArray
 
 from ibrobot_camera.camera import OpenCvCamera
 from ibrobot_camera.options import OpenCvOptions
-from ibrobot_core.clock import RealClock
-from ibrobot_core.config import find_config, load
-from ibrobot_core.errors import SensorError
-from ibrobot_core.interfaces import Context
-from ibrobot_core.messages import CompressedImage, Image
-from ibrobot_core.plugins import installed
-from ibrobot_core.robot import Robot
+from ibrobot_core.api import (
+    CompressedImage,
+    Context,
+    Image,
+    RealClock,
+    Robot,
+    SensorError,
+    find_config,
+    installed_plugins,
+    load_config,
+)
 
 _TO_BGR = {"bgr8": None, "rgb8": cv2.COLOR_RGB2BGR, "mono8": cv2.COLOR_GRAY2BGR}
 
@@ -45,10 +49,10 @@ def opened(source: str) -> Iterator[dict[str, OpenCvCamera]]:
 
 
 def _options(source: str) -> dict[str, OpenCvOptions]:
-    registry = installed()
+    registry = installed_plugins()
     if not source.endswith((".yaml", ".yml")):
         return {"camera": OpenCvOptions(device=source, strict=False)}
-    config = load(find_config(source, registry), registry=registry)
+    config = load_config(find_config(source, registry), registry=registry)
     found = {name: p.options for name, p in config.peripherals.items() if isinstance(p.options, OpenCvOptions)}
     if not found:
         raise SensorError(f"{source}: has no camera of type opencv")

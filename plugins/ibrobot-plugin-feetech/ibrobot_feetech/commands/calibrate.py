@@ -8,16 +8,17 @@ from pathlib import Path
 
 import click
 
-from ibrobot_core.calibration import (
-    POSE,
+from ibrobot_core.api import (
     ZERO_AT,
+    ZERO_AT_POSE,
     Calibration,
+    HardwareError,
+    IbrobotError,
     JointCalibration,
     calibration_path,
+    echo,
     save_calibration,
 )
-from ibrobot_core.errors import HardwareError, IbrobotError
-from ibrobot_core.outside import echo
 from ibrobot_feetech.arm import relax, write_eprom
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.commands.dialogue import agree
@@ -40,7 +41,7 @@ from ibrobot_feetech.usb import usb_port
 @click.option(
     "--zero-at",
     type=click.Choice(list(ZERO_AT)),
-    default=POSE,
+    default=ZERO_AT_POSE,
     show_default=True,
     help="0 rad: the middle pose, set by hand, or the middle of each range, as in LeRobot.",
 )

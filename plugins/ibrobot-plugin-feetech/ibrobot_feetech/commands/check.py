@@ -8,8 +8,7 @@ from collections.abc import Iterator
 import attrs
 import click
 
-from ibrobot_core.calibration import Calibration, load_calibration
-from ibrobot_core.outside import echo
+from ibrobot_core.api import Calibration, echo, load_calibration
 from ibrobot_feetech.arm import write_eprom
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.commands.dialogue import agree, show, table

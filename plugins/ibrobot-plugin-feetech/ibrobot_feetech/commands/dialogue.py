@@ -8,8 +8,7 @@ import click
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from ibrobot_core.errors import IbrobotError
-from ibrobot_core.screen import Screen
+from ibrobot_core.api import IbrobotError, Screen
 
 
 class Unanswered(IbrobotError):

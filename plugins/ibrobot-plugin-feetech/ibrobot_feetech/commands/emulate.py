@@ -13,22 +13,21 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ibrobot_core.calibration import (
-    MIDDLE,
+from ibrobot_core.api import (
+    MIDDLE_TICK,
+    TICKS_PER_TURN,
     Calibration,
     JointCalibration,
     calibration_path,
+    echo,
     load_calibration,
+    on_signals,
     save_calibration,
 )
-from ibrobot_core.outside import echo
-from ibrobot_core.units import TICKS_PER_TURN
-from ibrobot_core.workers import on_signals
 from ibrobot_feetech.commands.joints import SO101
 
 if TYPE_CHECKING:
-    from ibrobot_core.config import RobotConfig
-    from ibrobot_core.robot import Robot
+    from ibrobot_core.api import Robot, RobotConfig
     from ibrobot_feetech.emulator import Emulator
     from ibrobot_feetech.emulator.physics import PhysicsArm
 
@@ -102,7 +101,7 @@ def emulate(
 
 def _hurry() -> None:
     """Have the servos answer in time on a busy machine, as those with processors of their own do."""
-    from ibrobot_core.control.realtime import go_real_time
+    from ibrobot_core.api import go_real_time
 
     sys.setswitchinterval(_SWITCH_S)
     for refused in go_real_time(_PRIORITY):
@@ -121,15 +120,14 @@ def _wait(ended: threading.Event, arm: PhysicsArm | None) -> None:
 
 
 def _config(name: str) -> RobotConfig:
-    from ibrobot_core.config import find_config, load
-    from ibrobot_core.plugins import installed
+    from ibrobot_core.api import find_config, installed_plugins, load_config
 
-    registry = installed()
-    return load(find_config(name, registry), sim=True, registry=registry)
+    registry = installed_plugins()
+    return load_config(find_config(name, registry), sim=True, registry=registry)
 
 
 def _physics(config: RobotConfig, calibration: Calibration, emulator: Emulator, seed: int) -> PhysicsArm:
-    from ibrobot_core.plugins import installed
+    from ibrobot_core.api import installed_plugins
     from ibrobot_feetech.arm import Arm
     from ibrobot_feetech.emulator.physics import PhysicsArm
 
@@ -137,7 +135,9 @@ def _physics(config: RobotConfig, calibration: Calibration, emulator: Emulator, 
     closed = {joint.name: joint.lower for joint in robot.joints if joint.name == _GRIPPER}
     socket = Path(f"{emulator.link or emulator.port.replace('/dev/pts/', '/tmp/ibrobot-emulator-')}.signals")
     try:
-        arm = PhysicsArm(config, installed(), Arm(robot.joint_names, calibration, closed), emulator, socket, seed)
+        arm = PhysicsArm(
+            config, installed_plugins(), Arm(robot.joint_names, calibration, closed), emulator, socket, seed
+        )
     except OSError as error:
         raise click.BadParameter(f"no socket can be made at {socket}: {error}", param_hint="--link") from None
     echo(f"signals on {socket}")
@@ -174,6 +174,6 @@ def _ranges(joints: Sequence[str], robot: Robot | None) -> dict[str, JointCalibr
         if joint == _GRIPPER:  # anchored at its closed end: about the middle all the same
             half = (upper - lower) / 2
             lower, upper = -half, half
-        low, high = math.floor(MIDDLE + lower * per_radian), math.ceil(MIDDLE + upper * per_radian)
+        low, high = math.floor(MIDDLE_TICK + lower * per_radian), math.ceil(MIDDLE_TICK + upper * per_radian)
         found[joint] = JointCalibration(number, 0, 0, max(0, low), min(TICKS_PER_TURN - 1, high))
     return found

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import click
 
-from ibrobot_core.errors import HardwareError
-from ibrobot_core.outside import echo
+from ibrobot_core.api import HardwareError, echo
 from ibrobot_feetech.commands.dialogue import wait_for_enter
 from ibrobot_feetech.usb import UsbPort, usb_ports
 

@@ -5,9 +5,7 @@ from __future__ import annotations
 import attrs
 import click
 
-from ibrobot_core.calibration import ZERO_AT, calibration_path, load_calibration, save_calibration
-from ibrobot_core.errors import HardwareError
-from ibrobot_core.outside import echo
+from ibrobot_core.api import ZERO_AT, HardwareError, calibration_path, echo, load_calibration, save_calibration
 from ibrobot_feetech.commands.calibrate import backup
 from ibrobot_feetech.commands.dialogue import agree
 from ibrobot_feetech.commands.joints import joints_of

@@ -47,10 +47,9 @@ def joints_of(robot: str | None = None, calibration: str | None = None) -> list[
     limits: Mapping[str, tuple[float, float]] = SO101
     anchored: tuple[str, ...] = ("gripper",)
     if robot is not None:
-        from ibrobot_core.config import find_config, load
-        from ibrobot_core.plugins import installed
+        from ibrobot_core.api import find_config, installed_plugins, load_config
 
-        config = load(find_config(robot, installed()))
+        config = load_config(find_config(robot, installed_plugins()))
         arms = [arm for arm in config.hardware.values() if isinstance(arm.options, FollowerOptions)]
         arm = next((arm for arm in arms if arm.options.calibration == calibration), None)
         names = arm.joints if arm is not None else config.robot.joint_names

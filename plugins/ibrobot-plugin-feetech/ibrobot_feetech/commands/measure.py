@@ -12,12 +12,7 @@ import click
 from rich.live import Live
 from rich.table import Table
 
-from ibrobot_core.calibration import JointCalibration
-from ibrobot_core.errors import CalibrationError
-from ibrobot_core.outside import echo
-from ibrobot_core.screen import Screen
-from ibrobot_core.terminal import Keys
-from ibrobot_core.units import TICKS_PER_TURN
+from ibrobot_core.api import TICKS_PER_TURN, CalibrationError, JointCalibration, KeyReader, Screen, echo
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.commands.dialogue import Unanswered, agree, interactive, table, wait_for_enter
 from ibrobot_feetech.commands.joints import Joint
@@ -140,7 +135,7 @@ class Measurement:
         echo(f"Move each joint of the table to both ends ({end}).")
         until = time.monotonic() + (seconds if seconds is not None else float("inf"))
         with ExitStack() as stack:
-            typed = stack.enter_context(Keys()).subscribe() if interactive() else queue.SimpleQueue[str]()
+            typed = stack.enter_context(KeyReader()).subscribe() if interactive() else queue.SimpleQueue[str]()
             console = Screen()
             live = Live(console=console, auto_refresh=False)
             if console.is_terminal:

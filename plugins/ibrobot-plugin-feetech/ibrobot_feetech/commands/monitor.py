@@ -12,9 +12,7 @@ from rich.console import Group
 from rich.live import Live
 from rich.table import Table
 
-from ibrobot_core.outside import echo
-from ibrobot_core.screen import Screen, text
-from ibrobot_core.units import degrees, ticks_to_radians
+from ibrobot_core.api import Screen, degrees, echo, styled, ticks_to_radians
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.commands.dialogue import table
 from ibrobot_feetech.commands.joints import Joint, by_servo, joints_of
@@ -83,7 +81,7 @@ def reading(reader: SyncReader, joints: Sequence[Joint]) -> list[dict[str, Any]]
 def _panel(bus: FeetechBus, reader: SyncReader, joints: Sequence[Joint]) -> Group:
     rows = _rows(reading(reader, joints))
     counts = ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in bus.counters.items())
-    return Group(rows, text(counts, style="dim"))
+    return Group(rows, styled(counts, style="dim"))
 
 
 def _rows(servos: Sequence[Mapping[str, Any]]) -> Table:
@@ -91,9 +89,9 @@ def _rows(servos: Sequence[Mapping[str, Any]]) -> Table:
     for servo in servos:
         name = str(servo["id"]), servo["joint"]
         if not servo["answers"]:
-            made.add_row(*name, *[""] * 7, text("no reply", style="red"))
+            made.add_row(*name, *[""] * 7, styled("no reply", style="red"))
             continue
-        errors = text(", ".join(servo["errors"]) or "none", style="red" if servo["errors"] else "")
+        errors = styled(", ".join(servo["errors"]) or "none", style="red" if servo["errors"] else "")
         made.add_row(
             *name, str(servo["position_ticks"]), f"{servo['position_deg']:.1f}", f"{servo['velocity_deg_s']:.0f}",
             f"{servo['load_percent']:.0f}", f"{servo['temperature_c']:.0f}", f"{servo['voltage_v']:.1f}",

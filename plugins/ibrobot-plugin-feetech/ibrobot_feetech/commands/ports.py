@@ -8,8 +8,7 @@ from typing import Any
 
 import click
 
-from ibrobot_core.errors import HardwareError
-from ibrobot_core.outside import echo
+from ibrobot_core.api import HardwareError, echo
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.usb import ADAPTER_VENDOR, usb_ports
 

@@ -10,9 +10,7 @@ import math
 
 import attrs
 
-from ibrobot_core.calibration import MAX_OFFSET, MIDDLE, POSE
-from ibrobot_core.errors import CalibrationError
-from ibrobot_core.units import TICKS_PER_TURN, degrees
+from ibrobot_core.api import MAX_HOMING_OFFSET, MIDDLE_TICK, TICKS_PER_TURN, ZERO_AT_POSE, CalibrationError, degrees
 from ibrobot_feetech.commands.joints import Joint
 
 _LEAST_SPAN = 150
@@ -29,12 +27,12 @@ def homing_offset(joint: str, encoder: int) -> int:
     Raises:
         CalibrationError: when the servo cannot keep it.
     """
-    offset = encoder - MIDDLE
-    if abs(offset) > MAX_OFFSET:
+    offset = encoder - MIDDLE_TICK
+    if abs(offset) > MAX_HOMING_OFFSET:
         raise CalibrationError(
             f"{joint}: in the middle pose its encoder is at {encoder}, which needs an offset of {offset}, and a servo "
-            f"keeps -{MAX_OFFSET} to {MAX_OFFSET}: move the joint a little; if that does not help, mount the servo's "
-            "horn half a turn on"
+            f"keeps -{MAX_HOMING_OFFSET} to {MAX_HOMING_OFFSET}: move the joint a little; if that does not help, "
+            "mount the servo's horn half a turn on"
         )
     return offset
 
@@ -81,7 +79,7 @@ def impossible(joint: str, measured: Range) -> str | None:
     return None
 
 
-def doubtful(joint: Joint, measured: Range, zero_at: str = POSE) -> str | None:
+def doubtful(joint: Joint, measured: Range, zero_at: str = ZERO_AT_POSE) -> str | None:
     """Why a range does not look like the joint's limits; None where it does."""
     ticks = TICKS_PER_TURN / (2 * math.pi)
     expected = (joint.upper - joint.lower) * ticks
@@ -91,7 +89,7 @@ def doubtful(joint: Joint, measured: Range, zero_at: str = POSE) -> str | None:
             "was it moved to both ends, and is it the right joint?"
         )
     middle = abs((joint.lower + joint.upper) / 2) * ticks
-    if zero_at != POSE:
+    if zero_at != ZERO_AT_POSE:
         if joint.anchored or middle <= _OFF_CENTRE:
             return None
         return (
@@ -99,7 +97,7 @@ def doubtful(joint: Joint, measured: Range, zero_at: str = POSE) -> str | None:
             "its range: take --zero-at pose"
         )
     # The sign of the ticks is not known here: limits about 0 have their middle near 0 either way.
-    off = abs((measured.least + measured.greatest) / 2 - MIDDLE) - middle
+    off = abs((measured.least + measured.greatest) / 2 - MIDDLE_TICK) - middle
     if not joint.anchored and off > _OFF_CENTRE:
         return f"{joint.name}: the middle of its range is {_deg(off):.0f} deg off the middle pose, which is its 0 deg"
     return None

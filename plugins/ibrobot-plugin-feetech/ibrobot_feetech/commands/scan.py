@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import click
 
-from ibrobot_core.errors import HardwareError
+from ibrobot_core.api import HardwareError
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.commands.dialogue import show, table
 from ibrobot_feetech.commands.joints import by_servo, joints_of

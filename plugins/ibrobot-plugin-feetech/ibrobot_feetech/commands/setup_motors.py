@@ -6,8 +6,7 @@ from contextlib import suppress
 
 import click
 
-from ibrobot_core.errors import HardwareError
-from ibrobot_core.outside import echo
+from ibrobot_core.api import HardwareError, echo
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.commands.dialogue import agree, interactive, wait_for_enter
 from ibrobot_feetech.commands.joints import Joint, by_servo, chosen, joints_of

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from ibrobot_core.calibration import MIDDLE, RANGE, ZERO_AT, Calibration
-from ibrobot_core.units import TICKS_PER_TURN
+from ibrobot_core.api import MIDDLE_TICK, TICKS_PER_TURN, ZERO_AT, ZERO_AT_RANGE, Calibration
 
 
 def zero_text(calibration: Calibration) -> str:
     """Where 0 rad is, and how far that is from the other convention."""
-    off = {name: abs(joint.range_middle - MIDDLE) * 360 / TICKS_PER_TURN for name, joint in calibration.joints.items()}
+    off = {
+        name: abs(joint.range_middle - MIDDLE_TICK) * 360 / TICKS_PER_TURN for name, joint in calibration.joints.items()
+    }
     joint = max(off, key=off.__getitem__)
-    other = "the pose that was set by hand" if calibration.zero_at == RANGE else "LeRobot's 0, the middle of the range,"
+    other = (
+        "the pose that was set by hand"
+        if calibration.zero_at == ZERO_AT_RANGE
+        else "LeRobot's 0, the middle of the range,"
+    )
     return f"0 rad is {ZERO_AT[calibration.zero_at]}; {other} is up to {off[joint]:.1f} deg from it ({joint})"

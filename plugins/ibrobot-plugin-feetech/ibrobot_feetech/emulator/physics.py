@@ -8,12 +8,17 @@ from pathlib import Path
 
 import numpy as np
 
-from ibrobot_core.clock import RealClock
-from ibrobot_core.config import RobotConfig
-from ibrobot_core.errors import IbrobotError
-from ibrobot_core.interfaces import Context, Episode, SimulatedHardware
-from ibrobot_core.plugins import Registry
-from ibrobot_core.units import ns, radians_to_ticks
+from ibrobot_core.api import (
+    Context,
+    Episode,
+    IbrobotError,
+    RealClock,
+    Registry,
+    RobotConfig,
+    SimulatedHardware,
+    ns,
+    radians_to_ticks,
+)
 from ibrobot_feetech.arm import Arm
 from ibrobot_feetech.emulator.pty import Emulator
 from ibrobot_feetech.emulator.signals import SignalServer

@@ -18,8 +18,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from ibrobot_core.clock import Clock
-from ibrobot_core.units import seconds
+from ibrobot_core.api import Clock, seconds
 from ibrobot_feetech.emulator.faults import Faults
 from ibrobot_feetech.emulator.servo import EmulatedServo
 from ibrobot_feetech.emulator.wire import Wire

@@ -11,9 +11,7 @@ from typing import override
 
 import numpy as np
 
-from ibrobot_core.errors import SensorError
-from ibrobot_core.interfaces import Context, Hardware, Sensor, Signal
-from ibrobot_core.messages import Float64MultiArray
+from ibrobot_core.api import Context, Float64MultiArray, Hardware, Sensor, SensorError, Signal
 from ibrobot_feetech.options import EmulatedSignalOptions
 
 _LONGEST = 1 << 16

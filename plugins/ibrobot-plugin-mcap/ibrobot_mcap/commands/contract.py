@@ -6,8 +6,7 @@ from pathlib import Path
 
 import click
 
-from ibrobot_core.errors import RecorderError
-from ibrobot_core.outside import echo
+from ibrobot_core.api import RecorderError, echo
 
 
 @click.group()

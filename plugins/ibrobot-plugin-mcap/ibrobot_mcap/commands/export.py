@@ -12,9 +12,7 @@ import attrs
 import click
 import numpy as np
 
-from ibrobot_core.errors import RecorderError
-from ibrobot_core.messages import Image, Message
-from ibrobot_core.outside import echo
+from ibrobot_core.api import Image, Message, RecorderError, echo
 
 _TO_RGB = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2, 3), "bgra8": (2, 1, 0, 3)}
 """Encoding -> its channels in the order of a PNG."""

@@ -7,9 +7,7 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 
-from ibrobot_core.errors import RecorderError
-from ibrobot_core.interfaces import EpisodeSummary
-from ibrobot_core.units import NS_PER_S
+from ibrobot_core.api import NS_PER_S, EpisodeSummary, RecorderError
 from ibrobot_mcap.reader import Rosbag2Reader, is_rosbag2
 
 

@@ -10,8 +10,7 @@ import attrs
 import click
 from rich.table import Table
 
-from ibrobot_core.outside import echo
-from ibrobot_core.screen import Screen
+from ibrobot_core.api import Screen, echo
 
 _LONG = 200
 """Metadata longer than this is only told the length of [characters]."""

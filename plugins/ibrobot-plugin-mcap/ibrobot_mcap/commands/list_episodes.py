@@ -9,9 +9,7 @@ from pathlib import Path
 import click
 from rich.table import Table
 
-from ibrobot_core.errors import RecorderError
-from ibrobot_core.outside import echo
-from ibrobot_core.screen import Screen, text
+from ibrobot_core.api import RecorderError, Screen, echo, styled
 
 _WIDE = 100
 """Columns of a terminal in which prompts and years have room."""
@@ -62,7 +60,7 @@ def list_episodes(path: Path, as_json: bool) -> None:
             table.add_row(
                 _shown(Path(str(row["path"])), path), str(row["date"])[0 if wide else 5 :], f"{row['duration_s']:.1f}",
                 str(row["messages"]), str(row["dropped"]),
-                str(row["outcome"]) if row["finished"] else text("unfinished", "red"),
+                str(row["outcome"]) if row["finished"] else styled("unfinished", "red"),
                 told_size(int(str(row["bytes"]))),
                 *([str(row["prompt"])] if prompts else []),
             )  # fmt: skip

@@ -10,10 +10,7 @@ from typing import Any
 import click
 import numpy as np
 
-from ibrobot_core.errors import RecorderError
-from ibrobot_core.messages import Float64MultiArray, Image, JointState
-from ibrobot_core.outside import echo
-from ibrobot_core.units import NS_PER_S
+from ibrobot_core.api import NS_PER_S, Float64MultiArray, Image, JointState, RecorderError, echo
 from ibrobot_mcap.checks import contract_of
 
 _THUMBNAILS = 8

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import click
 
-from ibrobot_core.errors import RecorderError
-from ibrobot_core.outside import echo
+from ibrobot_core.api import RecorderError, echo
 
 
 @click.command()
@@ -20,7 +19,7 @@ def trim(episode: Path, begin_s: float, end_s: float | None, output: Path) -> No
 
     A latched topic's message from before the part is kept, as a late subscriber would have had it.
     """
-    from ibrobot_core.units import ns
+    from ibrobot_core.api import ns
     from ibrobot_mcap.commands.found import duration_s, summary_of
     from ibrobot_mcap.rewrite import rewrite
 

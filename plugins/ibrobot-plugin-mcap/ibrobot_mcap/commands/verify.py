@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from ibrobot_core.outside import echo
+from ibrobot_core.api import echo
 
 
 @click.command()

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import click
 
-from ibrobot_core.errors import TransportError
-from ibrobot_core.outside import echo
+from ibrobot_core.api import TransportError, echo
 from ibrobot_zenoh.certificates import CA, CERTIFICATE, KEY, ROBOTS, Authority
 from ibrobot_zenoh.options import check_robot_name
 

@@ -10,10 +10,7 @@ from typing import Any
 import attrs
 import click
 
-from ibrobot_core.clock import RealClock
-from ibrobot_core.errors import NotSupported, TransportError
-from ibrobot_core.interfaces import Context
-from ibrobot_core.robot import Robot
+from ibrobot_core.api import Context, NotSupported, RealClock, Robot, TransportError
 from ibrobot_zenoh.options import ZenohOptions
 from ibrobot_zenoh.transport import ZenohTransport
 
@@ -50,10 +47,9 @@ def options_from(config: str | None, endpoints: tuple[str, ...], domain: int | N
         except ValueError as error:
             told = "certificates are given by --config" if "needs tls" in str(error) else error
             raise click.UsageError(f"--endpoint: {told}") from None
-    from ibrobot_core.config import find_config, load
-    from ibrobot_core.plugins import installed
+    from ibrobot_core.api import find_config, installed_plugins, load_config
 
-    found = load(find_config(config, installed()), communicates=True)
+    found = load_config(find_config(config, installed_plugins()), communicates=True)
     if found.transport is None or not isinstance(found.transport.options, ZenohOptions):
         kind = "no transport" if found.transport is None else f"transport {found.transport.type}"
         raise NotSupported(f"{found.source}: has {kind}; topics are shared by transport: {{type: zenoh, …}}")

@@ -10,11 +10,7 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.config.convert import Converter, Faults
-from ibrobot_core.config.show import dump
-from ibrobot_core.config.yaml_nodes import parse
-from ibrobot_core.errors import NotSupported
-from ibrobot_core.messages import MESSAGE_TYPES, Message
+from ibrobot_core.api import MESSAGE_TYPES, Converter, Faults, Message, NotSupported, dump_yaml, parse_yaml
 
 _SHOWN = 16
 """Elements of an array that are shown."""
@@ -22,7 +18,7 @@ _SHOWN = 16
 
 def shown(message: Message, *, full: bool) -> str:
     """A message as YAML; of long arrays the first elements, unless `full`."""
-    return dump(_plain(message, full))
+    return dump_yaml(_plain(message, full))
 
 
 def _plain(value: Any, full: bool) -> Any:
@@ -56,7 +52,7 @@ def message_from(type_name: str, text: str) -> Message:
         close = get_close_matches(type_name, MESSAGE_TYPES, 1)
         hint = f"did you mean {close[0]!r}?" if close else f"one of: {', '.join(sorted(MESSAGE_TYPES))}"
         raise NotSupported(f"{type_name!r} is no type that can be published, {hint}")
-    document = parse(text, "MESSAGE")
+    document = parse_yaml(text, "MESSAGE")
     document.raise_problems()
     try:
         message: Message = _Messages(Path.cwd()).structure(document.root, kind)

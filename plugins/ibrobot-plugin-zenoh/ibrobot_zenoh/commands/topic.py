@@ -12,9 +12,7 @@ from typing import Any
 
 import click
 
-from ibrobot_core.errors import TransportError
-from ibrobot_core.messages import Message
-from ibrobot_core.outside import echo
+from ibrobot_core.api import Message, TransportError, echo
 from ibrobot_zenoh.commands.network import connected, network_options
 from ibrobot_zenoh.commands.text import message_from, shown
 from ibrobot_zenoh.transport import ZenohTransport

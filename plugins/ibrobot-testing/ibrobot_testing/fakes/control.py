@@ -7,23 +7,24 @@ from typing import Any, override
 
 import numpy as np
 
-from ibrobot_core.errors import GoalRejected, HardwareError
-from ibrobot_core.interfaces import (
+from ibrobot_core.api import (
     Context,
     Episode,
     Executor,
+    GoalRejected,
     GoalState,
     GoalStatus,
     Hardware,
+    HardwareError,
     JointReading,
     Plan,
     Signal,
     SimulatedHardware,
     Torque,
+    Vector,
     nan_vector,
+    seconds,
 )
-from ibrobot_core.robot import Vector
-from ibrobot_core.units import seconds
 
 
 class FakeHardware(SimulatedHardware):

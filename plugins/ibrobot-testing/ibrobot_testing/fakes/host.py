@@ -7,26 +7,34 @@ from typing import override
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.bus import Subscription
-from ibrobot_core.errors import PlanningError, PolicyError, SensorError, TeleopError
-from ibrobot_core.interfaces import (
+from ibrobot_core.api import (
     Context,
     Frame,
+    Header,
+    Image,
     JointGoal,
     JointReading,
+    JointTrajectory,
+    JointTrajectoryPoint,
+    Message,
     Planner,
+    PlanningError,
     PlanRequest,
     Policy,
+    PolicyError,
     PolicySpec,
     Sensor,
+    SensorError,
+    Subscription,
     Teleop,
     TeleopCommand,
+    TeleopError,
     Tensors,
+    Vector,
     Viewer,
+    ns,
+    seconds,
 )
-from ibrobot_core.messages import Header, Image, JointTrajectory, JointTrajectoryPoint, Message
-from ibrobot_core.robot import Vector
-from ibrobot_core.units import ns, seconds
 
 
 class FakeSensor(Sensor):

@@ -11,9 +11,18 @@ from typing import Any, override
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.errors import DatasetError, RecorderError
-from ibrobot_core.interfaces import Context, DatasetWriter, EpisodeEnd, EpisodeStart, Feature, Recorder
-from ibrobot_core.messages import JointState, Message
+from ibrobot_core.api import (
+    Context,
+    DatasetError,
+    DatasetWriter,
+    EpisodeEnd,
+    EpisodeStart,
+    Feature,
+    JointState,
+    Message,
+    Recorder,
+    RecorderError,
+)
 
 
 class FakeRecorder(Recorder):

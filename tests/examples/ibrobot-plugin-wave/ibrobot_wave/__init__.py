@@ -6,12 +6,17 @@ from typing import override
 
 import attrs
 
-from ibrobot_core import hookimpl
-from ibrobot_core.descriptors import TeleopDescriptor
-from ibrobot_core.errors import TeleopError
-from ibrobot_core.interfaces import Context, JointReading, Teleop, TeleopCommand
-from ibrobot_core.options import option
-from ibrobot_core.units import seconds
+from ibrobot_core.api import (
+    Context,
+    JointReading,
+    Teleop,
+    TeleopCommand,
+    TeleopDescriptor,
+    TeleopError,
+    hookimpl,
+    option,
+    seconds,
+)
 
 
 @attrs.frozen

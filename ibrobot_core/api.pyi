@@ -1,0 +1,219 @@
+"""Where each name of `ibrobot_core.api` lives: the one list that type checkers and `api.py` read."""
+
+from ibrobot_core.hookspecs import hookimpl as hookimpl
+from ibrobot_core.descriptors import (
+    Check as Check,
+    Command as Command,
+    ConfigFile as ConfigFile,
+    DatasetDescriptor as DatasetDescriptor,
+    DecoderDescriptor as DecoderDescriptor,
+    Descriptor as Descriptor,
+    ExecutorDescriptor as ExecutorDescriptor,
+    Flag as Flag,
+    HardwareDescriptor as HardwareDescriptor,
+    PlannerDescriptor as PlannerDescriptor,
+    PolicyDescriptor as PolicyDescriptor,
+    ReaderDescriptor as ReaderDescriptor,
+    RecorderDescriptor as RecorderDescriptor,
+    SensorDescriptor as SensorDescriptor,
+    TeleopDescriptor as TeleopDescriptor,
+    TransportDescriptor as TransportDescriptor,
+    ViewerDescriptor as ViewerDescriptor,
+)
+from ibrobot_core.options import (
+    NoOptions as NoOptions,
+    OptionFault as OptionFault,
+    did_you_mean as did_you_mean,
+    documented as documented,
+    option as option,
+    unknown_names as unknown_names,
+)
+from ibrobot_core.interfaces import (
+    Condition as Condition,
+    Context as Context,
+    DatasetSummary as DatasetSummary,
+    DatasetWriter as DatasetWriter,
+    Episode as Episode,
+    EpisodeAddress as EpisodeAddress,
+    EpisodeEnd as EpisodeEnd,
+    EpisodeReader as EpisodeReader,
+    EpisodeStart as EpisodeStart,
+    EpisodeSummary as EpisodeSummary,
+    Executor as Executor,
+    Feature as Feature,
+    Frame as Frame,
+    GoalState as GoalState,
+    GoalStatus as GoalStatus,
+    Handler as Handler,
+    Hardware as Hardware,
+    Holding as Holding,
+    JointGoal as JointGoal,
+    JointReading as JointReading,
+    Payload as Payload,
+    PictureCodec as PictureCodec,
+    Plan as Plan,
+    PlanRequest as PlanRequest,
+    Planner as Planner,
+    Policy as Policy,
+    PolicySpec as PolicySpec,
+    PoseGoal as PoseGoal,
+    Recorded as Recorded,
+    Recorder as Recorder,
+    Sensor as Sensor,
+    Severity as Severity,
+    SharedTopic as SharedTopic,
+    Signal as Signal,
+    SimulatedHardware as SimulatedHardware,
+    Teleop as Teleop,
+    TeleopCommand as TeleopCommand,
+    Tensors as Tensors,
+    TopicSummary as TopicSummary,
+    TopicTransport as TopicTransport,
+    Torque as Torque,
+    Transport as Transport,
+    Viewer as Viewer,
+    nan_vector as nan_vector,
+)
+from ibrobot_core.interfaces.policy import copied_tensors as copied_tensors, whole_fingerprint as whole_fingerprint
+from ibrobot_core.interfaces.transport import HANDLER_THREADS as HANDLER_THREADS
+from ibrobot_core.errors import (
+    CalibrationError as CalibrationError,
+    ComponentFailed as ComponentFailed,
+    ConfigError as ConfigError,
+    ContractError as ContractError,
+    DatasetError as DatasetError,
+    DiskFull as DiskFull,
+    GoalRejected as GoalRejected,
+    HardwareError as HardwareError,
+    IbrobotError as IbrobotError,
+    MissingDependency as MissingDependency,
+    NotSupported as NotSupported,
+    PlanningError as PlanningError,
+    PluginError as PluginError,
+    PolicyError as PolicyError,
+    Problem as Problem,
+    RecorderError as RecorderError,
+    SensorError as SensorError,
+    TeleopError as TeleopError,
+    TransportError as TransportError,
+    WireError as WireError,
+)
+from ibrobot_core.messages import (
+    MESSAGE_TYPES as MESSAGE_TYPES,
+    Bool as Bool,
+    CameraInfo as CameraInfo,
+    CompressedImage as CompressedImage,
+    DiagnosticArray as DiagnosticArray,
+    DiagnosticStatus as DiagnosticStatus,
+    Float32MultiArray as Float32MultiArray,
+    Float64MultiArray as Float64MultiArray,
+    Header as Header,
+    Image as Image,
+    Imu as Imu,
+    Int32 as Int32,
+    Int32MultiArray as Int32MultiArray,
+    JointState as JointState,
+    JointTrajectory as JointTrajectory,
+    JointTrajectoryPoint as JointTrajectoryPoint,
+    Joy as Joy,
+    KeyValue as KeyValue,
+    Message as Message,
+    MultiArrayDimension as MultiArrayDimension,
+    MultiArrayLayout as MultiArrayLayout,
+    PointCloud2 as PointCloud2,
+    PointField as PointField,
+    Pose as Pose,
+    PoseStamped as PoseStamped,
+    Quaternion as Quaternion,
+    RobotStatus as RobotStatus,
+    String as String,
+    TFMessage as TFMessage,
+    TransformStamped as TransformStamped,
+    Twist as Twist,
+    Variant as Variant,
+    VariantsList as VariantsList,
+    Vector3 as Vector3,
+)
+from ibrobot_core.robot import Description as Description, Joint as Joint, Robot as Robot, Vector as Vector
+from ibrobot_core.clock import Clock as Clock, RealClock as RealClock, SteppedClock as SteppedClock
+from ibrobot_core.bus import Bus as Bus, Received as Received, Subscription as Subscription
+from ibrobot_core.units import (
+    LEROBOT_MODES as LEROBOT_MODES,
+    NORM_MODES as NORM_MODES,
+    NS_PER_S as NS_PER_S,
+    TICKS_PER_TURN as TICKS_PER_TURN,
+    degrees as degrees,
+    lerobot_to_radians as lerobot_to_radians,
+    lerobot_to_ticks as lerobot_to_ticks,
+    ns as ns,
+    radians as radians,
+    radians_to_lerobot as radians_to_lerobot,
+    radians_to_ticks as radians_to_ticks,
+    seconds as seconds,
+    ticks_to_lerobot as ticks_to_lerobot,
+    ticks_to_radians as ticks_to_radians,
+)
+from ibrobot_core.calibration import (
+    MAX_HOMING_OFFSET as MAX_HOMING_OFFSET,
+    MIDDLE_TICK as MIDDLE_TICK,
+    ZERO_AT as ZERO_AT,
+    ZERO_AT_POSE as ZERO_AT_POSE,
+    ZERO_AT_RANGE as ZERO_AT_RANGE,
+    Calibration as Calibration,
+    JointCalibration as JointCalibration,
+    calibration_path as calibration_path,
+    load_calibration as load_calibration,
+    save_calibration as save_calibration,
+)
+from ibrobot_core.contract.specs import (
+    TASK_KEY as TASK_KEY,
+    ActionPart as ActionPart,
+    Contract as Contract,
+    ObservationPart as ObservationPart,
+    SignalPart as SignalPart,
+)
+from ibrobot_core.contract.compose import Composer as Composer
+from ibrobot_core.contract.frames import FrameAssembler as FrameAssembler, assemble as assemble
+from ibrobot_core.contract.joint_units import JointUnits as JointUnits
+from ibrobot_core.contract.select import text_at as text_at
+from ibrobot_core.config import RobotConfig as RobotConfig, find_config as find_config, load_config as load_config
+from ibrobot_core.config.load import load_contract as load_contract
+from ibrobot_core.config.schema import Align as Align
+from ibrobot_core.config.expand import resolve_path as resolve_path
+from ibrobot_core.config.convert import Converter as Converter, Faults as Faults
+from ibrobot_core.config.overrides import apply_overrides as apply_overrides
+from ibrobot_core.config.show import dump_yaml as dump_yaml
+from ibrobot_core.config.yaml_nodes import parse_yaml as parse_yaml
+from ibrobot_core.config.single import single_options as single_options
+from ibrobot_core.plugins import (
+    Registry as Registry,
+    example_type as example_type,
+    installed_plugins as installed_plugins,
+)
+from ibrobot_core.inference.build import build_policy as build_policy
+from ibrobot_core.inference.wire import (
+    WIRE_LIMITS as WIRE_LIMITS,
+    WireDecoder as WireDecoder,
+    WireEncoder as WireEncoder,
+    WireKind as WireKind,
+    WireLimits as WireLimits,
+    WireMessage as WireMessage,
+    health_name as health_name,
+    service_name as service_name,
+)
+from ibrobot_core.recording.dataset import EpisodeDataset as EpisodeDataset
+from ibrobot_core.recording.episode import episode_folder as episode_folder
+from ibrobot_core.recording.provenance import (
+    episode_origin as episode_origin,
+    recorded_contract as recorded_contract,
+    stated_by_robot as stated_by_robot,
+)
+from ibrobot_core.metrics import Metrics as Metrics, MetricsProbes as MetricsProbes, MetricsServer as MetricsServer
+from ibrobot_core.control.realtime import go_real_time as go_real_time
+from ibrobot_core.memory import set_malloc as set_malloc
+from ibrobot_core.workers import Workers as Workers, on_signals as on_signals
+from ibrobot_core.outside import LogFormatter as LogFormatter, echo as echo
+from ibrobot_core.screen import Screen as Screen, styled as styled
+from ibrobot_core.terminal import KeyReader as KeyReader
+
+def home_of(name: str) -> str: ...
