@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 from collections.abc import Iterator
 from importlib import invalidate_caches
@@ -21,6 +22,10 @@ def no_secrets_of_other_tests(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(outside, "_secrets", set())
 
 
+PLUGINS = Path(__file__).parent / "shared/plugins"
+"""Made-up plugins, each a module."""
+
+
 @attrs.define
 class Site:
     """A folder on the import path, with made-up distributions that are plugins."""
@@ -28,10 +33,15 @@ class Site:
     folder: Path
     modules: list[str] = attrs.field(factory=list)
 
-    def add(self, distribution: str, source: str) -> None:
-        """Install version 1.0 of `distribution`: one module with `source`, named in its entry point."""
+    def add(self, distribution: str, source: str | Path) -> None:
+        """Install version 1.0 of `distribution`: a copy of one module, named in its entry point.
+
+        Args:
+            distribution: its name, which the module gets too.
+            source: a file in `tests/shared/plugins`, or an absolute path.
+        """
         module = distribution.replace("-", "_")
-        (self.folder / f"{module}.py").write_text(source)
+        shutil.copyfile(PLUGINS / source, self.folder / f"{module}.py")
         metadata = self.folder / f"{module}-1.0.dist-info"
         metadata.mkdir()
         (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {distribution}\nVersion: 1.0\n")

@@ -22,18 +22,10 @@ if TYPE_CHECKING:
     from conftest import Site
 
 Ibrobot = Callable[..., "Ran"]
-FAILING_CHECK = """
-from ibrobot_core import hookimpl
-from ibrobot_core.descriptors import Check
-
-@hookimpl
-def ibrobot_doctor():
-    yield Check("GL", False, "no context", "apt install libegl1")
-"""
 
 
 def test_a_failing_check_of_a_plugin_is_told_with_its_remedy(ibrobot: Ibrobot, site: Site) -> None:
-    site.add("fake-gl", FAILING_CHECK)
+    site.add("fake-gl", "failing_check.py")
 
     ran = ibrobot("doctor")
 
@@ -42,27 +34,8 @@ def test_a_failing_check_of_a_plugin_is_told_with_its_remedy(ibrobot: Ibrobot, s
     assert "ok    python: " in ran.out
 
 
-LACKING_SENSORS = """
-from ibrobot_core import hookimpl
-from ibrobot_core.descriptors import SensorDescriptor
-from ibrobot_core.errors import MissingDependency
-
-def no_library():
-    raise MissingDependency("libdepth.so.1 is not there", apt=["libdepth1", "libusb-1.0-0"])
-
-def bug():
-    raise ZeroDivisionError("one over nothing")
-
-@hookimpl
-def ibrobot_sensors():
-    yield SensorDescriptor("depth", None, "a depth camera", check=no_library)
-    yield SensorDescriptor("odd", None, "an odd one", check=bug)
-    yield SensorDescriptor("sound", None, "needs nothing")
-"""
-
-
 def test_what_an_installed_type_lacks_is_noted_with_its_remedy(ibrobot: Ibrobot, site: Site) -> None:
-    site.add("fake-depth", LACKING_SENSORS)
+    site.add("fake-depth", "lacking_sensors.py")
 
     ran = ibrobot("doctor")
 
@@ -77,7 +50,7 @@ def test_what_an_installed_type_lacks_is_noted_with_its_remedy(ibrobot: Ibrobot,
 
 
 def test_plugins_names_what_a_type_lacks(ibrobot: Ibrobot, site: Site) -> None:
-    site.add("fake-depth", LACKING_SENSORS)
+    site.add("fake-depth", "lacking_sensors.py")
     lacking = "lacking: sensor depth: libdepth.so.1 is not there; sudo apt-get install libdepth1 libusb-1.0-0"
 
     assert lacking in ibrobot("plugins").out.splitlines()
@@ -92,7 +65,7 @@ def test_plugins_names_what_a_type_lacks(ibrobot: Ibrobot, site: Site) -> None:
 
 
 def test_as_json(ibrobot: Ibrobot, site: Site) -> None:
-    site.add("fake-broken", "raise ImportError('no library')")
+    site.add("fake-broken", "fails_at_import.py")
 
     found = {check["name"]: check for check in json.loads(ibrobot("doctor", "--json").out)}
 
@@ -173,7 +146,7 @@ def test_disk(monkeypatch: pytest.MonkeyPatch, free: int, ok: bool) -> None:
 
 
 def test_all_checks_are_made(site: Site) -> None:
-    site.add("fake-gl", FAILING_CHECK)
+    site.add("fake-gl", "failing_check.py")
 
     names = [finding.check.name for finding in doctor.examine(discover(site.entry_points()))]
 

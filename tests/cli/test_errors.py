@@ -20,56 +20,10 @@ if TYPE_CHECKING:
 
 Ibrobot = Callable[..., "Ran"]
 
-BUGS = '''
-import click
-from ibrobot_core import hookimpl
-from ibrobot_core.descriptors import Command
-
-@click.group()
-def odd():
-    """Fail in every way."""
-
-@odd.command()
-def bug():
-    return 1 // 0
-
-@odd.command()
-@click.argument("file")
-def read(file):
-    open(file).read()
-
-@odd.command()
-@click.argument("file", type=click.File())
-def take(file):
-    pass
-
-@odd.command()
-def refuse():
-    raise click.ClickException("not today")
-
-@odd.command()
-def ask():
-    raise click.Abort()
-
-@odd.command()
-def say():
-    from ibrobot_core.outside import echo
-    echo("größer … ✓")
-    raise ValueError("größer … ✓")
-
-def _broken():
-    raise RuntimeError("cannot be loaded")
-
-@hookimpl
-def ibrobot_commands():
-    yield Command("odd", "Fail in every way.", lambda: odd)
-    yield Command("broken", "Cannot be loaded.", _broken)
-'''
-
 
 @pytest.fixture
 def bugs(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    site.add("fake-bugs", BUGS)
+    site.add("fake-bugs", "bugs.py")
     monkeypatch.delenv(DEBUG, raising=False)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     monkeypatch.chdir(tmp_path)

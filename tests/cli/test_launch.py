@@ -20,91 +20,6 @@ from ibrobot_core.errors import PolicyError
 if TYPE_CHECKING:
     from conftest import Ran, Site
 
-PARTS = '''
-import signal
-from ibrobot_core import hookimpl
-from ibrobot_core.descriptors import (
-    HardwareDescriptor, PlannerDescriptor, PolicyDescriptor, RecorderDescriptor, SensorDescriptor,
-    TeleopDescriptor, TransportDescriptor,
-)
-from ibrobot_core.errors import HardwareError, MissingDependency, TeleopError
-from ibrobot_core.interfaces import Holding
-from ibrobot_testing.fakes import FakeHardware, FakePlanner, FakePolicy, FakeRealHardware, FakeTeleop
-
-class Scene(FakeHardware):
-    """Done after half a second, but never with seed 13; silent after two seconds with seed 66; seed 7 holds torque."""
-    def holding(self):
-        return Holding("/dev/ttyARM", "arm torque off") if self.seed == 7 else None
-    def reset(self, episode):
-        super().reset(episode)
-        self.ticks, self.seed = 0, episode.seed
-    def advance(self, step_ns):
-        super().advance(step_ns)
-        self.ticks += 1
-    def success(self):
-        return self.seed not in (13, 66) and self.ticks >= 25
-    def read(self):
-        if self.seed == 66 and self.ticks > 100:
-            raise HardwareError("the bus is silent")
-        return super().read()
-
-class Stick(FakeTeleop):
-    """Pulled out after a second."""
-    reads = 0
-    def read(self, measured):
-        self.reads += 1
-        if self.reads > 50:
-            raise TeleopError("the stick is gone")
-        return super().read(measured)
-
-class Bug(FakeTeleop):
-    """Fails in a way that nobody foresaw."""
-    def read(self, measured):
-        raise ZeroDivisionError("one over nothing")
-
-class Person(FakeTeleop):
-    """Presses Ctrl-C after a second."""
-    reads = 0
-    def read(self, measured):
-        self.reads += 1
-        if self.reads == 50:
-            signal.raise_signal(signal.SIGINT)
-        return super().read(measured)
-
-def no_library():
-    raise MissingDependency("no OpenGL", apt=["libegl1"])
-
-@hookimpl
-def ibrobot_sensors():
-    yield SensorDescriptor("camera", None, "a camera that cannot run here", check=no_library)
-
-@hookimpl
-def ibrobot_recorders():
-    yield RecorderDescriptor("unused", None, "a recorder")
-
-@hookimpl
-def ibrobot_hardware():
-    yield HardwareDescriptor("scene", lambda options, ctx: Scene(ctx), "a scene", simulated=True)
-    yield HardwareDescriptor("arm", lambda options, ctx: FakeRealHardware(ctx), "an arm")
-
-@hookimpl
-def ibrobot_transports():
-    yield TransportDescriptor("net", lambda options, ctx: None, "a network")
-
-@hookimpl
-def ibrobot_policies():
-    yield PolicyDescriptor("net", lambda options, ctx: FakePolicy(ctx), "a network")
-
-@hookimpl
-def ibrobot_teleop():
-    yield TeleopDescriptor("stick", lambda options, ctx: Stick(ctx), "a stick")
-    yield TeleopDescriptor("bug", lambda options, ctx: Bug(ctx), "a bug")
-    yield TeleopDescriptor("person", lambda options, ctx: Person(ctx), "a person")
-
-@hookimpl
-def ibrobot_planners():
-    yield PlannerDescriptor("cubic", lambda options, ctx: FakePlanner(ctx), "cubics")
-'''
 ROBOT = """\
 robot:
   name: mini
@@ -147,7 +62,7 @@ def launch(
     site: Site, ibrobot: Callable[..., Ran], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[Callable[..., Ran]]:
     """Run `ibrobot launch mini.yaml …` in this process, and put back what it sets for the whole process."""
-    site.add("fake-parts", PARTS)
+    site.add("fake-parts", "cli_parts.py")
     monkeypatch.chdir(tmp_path)
     Path("mini.yaml").write_text(ROBOT)
     root, ours = logging.getLogger(), logging.getLogger("ibrobot")
@@ -402,7 +317,7 @@ main()
 
 
 def test_ctrl_c_at_any_moment_of_the_start_is_one_line(site: Site, tmp_path: Path):
-    site.add("fake-parts", PARTS)
+    site.add("fake-parts", "cli_parts.py")
     (tmp_path / "mini.yaml").write_text(ROBOT)
 
     def run(at: int) -> tuple[int, str, str]:

@@ -28,7 +28,7 @@ def test_the_table_has_a_row_for_every_type(ibrobot: Ibrobot, robot: Path) -> No
 
 
 def test_as_json_with_what_is_broken(ibrobot: Ibrobot, robot: Path, site: Site) -> None:
-    site.add("fake-broken", "raise ImportError('no library')")
+    site.add("fake-broken", "fails_at_import.py")
 
     listed = json.loads(ibrobot("plugins", "--json").out)
 

@@ -27,44 +27,6 @@ if TYPE_CHECKING:
     from conftest import Site
 
 PATIENCE_S = 30.0
-PLUGIN = """
-import attrs
-from ibrobot_core import hookimpl
-from ibrobot_core.descriptors import HardwareDescriptor
-from ibrobot_core.errors import HardwareError
-from ibrobot_core.interfaces import Holding
-from ibrobot_core.options import option
-from ibrobot_testing.fakes import FakeHardware
-
-class Arm(FakeHardware):
-    def __init__(self, options, ctx):
-        super().__init__(ctx)
-        self.options = options
-    def connect(self):
-        if self.options.trouble == "connect":
-            raise HardwareError("servo 3 does not answer: check its cable")
-        super().connect()
-    def read(self):
-        if self.options.trouble == "read":
-            raise HardwareError("servo 3 does not answer: check its cable")
-        return super().read()
-    def holding(self):
-        return Holding("/dev/ttyARM", "arm torque off") if self.options.holds and not self.relaxed else None
-    def disconnect(self):
-        super().disconnect()
-        if self.options.closed:
-            open(self.options.closed, "w").close()
-
-@attrs.frozen
-class Options:
-    trouble: str = option("", help="when it fails")
-    closed: str = option("", help="file made when it is released")
-    holds: bool = option(False, help="whether it has torque")
-
-@hookimpl
-def ibrobot_hardware():
-    yield HardwareDescriptor("arm", Arm, "an arm", Options, simulated=True)
-"""
 DOCUMENT = """
 robot:
   name: mini
@@ -112,7 +74,7 @@ def told() -> Told:
 
 @pytest.fixture
 def make(site: Site, told: Told) -> Iterator[Callable[..., ControlHost]]:
-    site.add("ibrobot-plugin-arm", PLUGIN)
+    site.add("ibrobot-plugin-arm", "control_arm.py")
     made: list[ControlHost] = []
 
     def make_host(

@@ -19,7 +19,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def test_it_is_found_through_its_entry_point(site: Site) -> None:
-    site.add("ibrobot-plugin-wave", (EXAMPLE / "ibrobot_wave/__init__.py").read_text())
+    site.add("ibrobot-plugin-wave", EXAMPLE / "ibrobot_wave/__init__.py")
     registry = discover(site.entry_points())
     assert registry.failures == []
     descriptor = registry.find("teleop", "wave")

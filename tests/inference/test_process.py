@@ -26,54 +26,6 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.integration
 
 PATIENCE_NS = 30_000_000_000
-PARTS = '''
-import os, signal, time
-import numpy as np
-from ibrobot_core import hookimpl
-from ibrobot_core.descriptors import HardwareDescriptor, PolicyDescriptor
-from ibrobot_core.errors import PolicyError
-from ibrobot_testing.fakes import FakeHardware, FakePolicy
-
-class Net(FakePolicy):
-    """Does what the tensor `do` says."""
-    seeds = ()
-    def load(self):
-        print(end="")
-        self.loaded = True
-    def weights(self):
-        from pathlib import Path
-        return (Path(__file__).parent / "weights").read_text() if (Path(__file__).parent / "weights").exists() else ""
-    def reset(self, seed):
-        self.seeds += (seed,)
-    def infer(self, tensors):
-        assert self.loaded
-        do = tensors["do"].tobytes().decode() if "do" in tensors else ""
-        if do == "die":
-            os.kill(os.getpid(), signal.SIGKILL)
-        if do == "exit":
-            os._exit(3)
-        if do == "hang":
-            while True:
-                signal.pause()
-        if do == "fail":
-            raise ValueError("not today")
-        if do == "object":
-            return {"o": np.array([object()])}
-        return {"twice": tensors["x"] * 2, "pid": np.array([os.getpid()]), "seeds": np.array(self.seeds, np.int64)}
-
-class Lost(FakePolicy):
-    def load(self):
-        raise PolicyError("no such checkpoint: nowhere")
-
-@hookimpl
-def ibrobot_hardware():
-    yield HardwareDescriptor("scene", lambda options, ctx: FakeHardware(ctx), "a scene", simulated=True)
-
-@hookimpl
-def ibrobot_policies():
-    yield PolicyDescriptor("net", lambda options, ctx: Net(ctx), "a network")
-    yield PolicyDescriptor("lost", lambda options, ctx: Lost(ctx), "a network that is not there")
-'''
 ROBOT = textwrap.dedent("""\
     robot:
       name: mini
@@ -89,7 +41,7 @@ ROBOT = textwrap.dedent("""\
 
 @pytest.fixture
 def config(site: Site, tmp_path: Path) -> RobotConfig:
-    site.add("net-parts", PARTS)
+    site.add("net-parts", "inference_parts.py")
     (tmp_path / "mini.yaml").write_text(ROBOT)
     return load_config(tmp_path / "mini.yaml", sim=True, registry=discover(site.entry_points()))
 

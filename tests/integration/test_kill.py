@@ -27,102 +27,6 @@ PATIENCE_S = 60.0
 STOP_TICKS = 10
 """100 ms of the control loop. It brakes by ticks: those that a busy machine has it miss are none."""
 
-PLUGIN = '''
-import math, os, time
-import attrs
-from ibrobot_core import hookimpl
-from ibrobot_core.descriptors import HardwareDescriptor, PolicyDescriptor, SensorDescriptor, TeleopDescriptor
-from ibrobot_core.errors import PolicyError, SensorError
-from ibrobot_core.interfaces import TeleopCommand, Torque
-from ibrobot_core.options import option
-from ibrobot_testing.fakes import FakePolicy, FakeRealHardware, FakeSensor, FakeTeleop
-from ibrobot_core.control import core, host
-
-# A way is gone by ticks: on a busy machine, which misses some, it takes longer.
-core._POSE_TIMEOUT_S = host._STOP_TIMEOUT_S = 60.0
-
-class Arm(FakeRealHardware):
-    """Logs every command with the time; `trouble` is a bug after a second."""
-    def __init__(self, options, ctx):
-        super().__init__(ctx)
-        self._options = options
-        self._log = os.open(options.log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
-        self._reads = 0
-    def read(self):
-        self._reads += 1
-        if self._options.trouble and self._reads > 100:
-            return 1 / 0
-        return super().read()
-    def write(self, position):
-        super().write(position)
-        self._note("write", *map(repr, position.tolist()))
-    def relax(self):
-        self._note("relax")
-        return Torque.OFF
-    def _note(self, *words):
-        os.write(self._log, (" ".join([words[0], str(time.monotonic_ns()), *words[1:]]) + "\\n").encode())
-
-@attrs.frozen
-class ArmOptions:
-    log: str = option(help="file")
-    trouble: bool = option(False, help="whether it has a bug")
-
-class Swing(FakeTeleop):
-    """Swings every joint about its start; with `fork`, a child of the host outlives it."""
-    def __init__(self, options, ctx):
-        super().__init__(ctx)
-        self._options = options
-    def connect(self):
-        super().connect()
-        if self._options.fork and os.fork() == 0:
-            time.sleep(60)
-            os._exit(0)
-    def activate(self, measured):
-        super().activate(measured)
-        self._start = (measured.stamp_ns, measured.position.copy())
-    def read(self, measured):
-        begun_ns, middle = self._start
-        swung = middle + 0.6 * math.sin(4.0 * (measured.stamp_ns - begun_ns) * 1e-9)
-        return TeleopCommand(dict(zip(self._names, swung.tolist())))
-
-@attrs.frozen
-class SwingOptions:
-    fork: bool = option(False, help="whether a child outlives the host")
-
-class Camera(FakeSensor):
-    frames = 0
-    def read(self, timeout_s):
-        self.frames += 1
-        if self.frames > 200:
-            raise SensorError("the camera was unplugged")
-        time.sleep(0.002)
-        return super().read(timeout_s)
-
-class Dark(FakeSensor):
-    def read(self, timeout_s):
-        time.sleep(timeout_s)
-
-class Lost(FakePolicy):
-    def load(self):
-        raise PolicyError("no such checkpoint: lost.pt")
-
-@hookimpl
-def ibrobot_hardware():
-    yield HardwareDescriptor("logged", Arm, "an arm that logs", ArmOptions)
-
-@hookimpl
-def ibrobot_teleop():
-    yield TeleopDescriptor("swing", Swing, "swings", SwingOptions)
-
-@hookimpl
-def ibrobot_sensors():
-    yield SensorDescriptor("brittle", lambda options, ctx: Camera(ctx), "breaks")
-    yield SensorDescriptor("dark", lambda options, ctx: Dark(ctx), "gives nothing")
-
-@hookimpl
-def ibrobot_policies():
-    yield PolicyDescriptor("lost", lambda options, ctx: Lost(ctx), "is not there")
-'''
 
 ROBOT = """
 robot:
@@ -239,7 +143,7 @@ class Run:
 
 @pytest.fixture
 def launch(site: Site, tmp_path: Path) -> Iterator[Callable[..., Run]]:
-    site.add("ibrobot-plugin-logged", PLUGIN)
+    site.add("ibrobot-plugin-logged", "logged_parts.py")
     (tmp_path / "mini.yaml").write_text(ROBOT)
     runs: list[Run] = []
 

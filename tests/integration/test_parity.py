@@ -247,43 +247,8 @@ def decoded(picture: CompressedImage) -> NDArray[Any]:
     return image.data.reshape(image.height, image.width, 3)
 
 
-KEEPER = '''
-import attrs
-import numpy as np
-from ibrobot_core.descriptors import PolicyDescriptor
-from ibrobot_core.hookspecs import hookimpl
-from ibrobot_core.interfaces import Policy, PolicySpec
-
-KEPT = []
-
-
-class Keeper(Policy):
-    """Keeps every frame that it is given, and moves the arm a little."""
-
-    def __init__(self, options, ctx):
-        image = (240, 320, 3)
-        keys = {"observation.state": (6,), "observation.images.top": image, "observation.images.wrist": image}
-        self.spec = PolicySpec(keys, None, 6, 1)
-
-    def preprocess(self, frame):
-        KEPT.append(frame)
-        return {"state": frame.values["observation.state"]}
-
-    def infer(self, tensors):
-        return tensors
-
-    def postprocess(self, tensors):
-        return tensors["state"][None].astype(np.float64) + 0.02
-
-
-@hookimpl
-def ibrobot_policies():
-    yield PolicyDescriptor(type="keeper", make=Keeper, summary="keeps frames")
-'''
-
-
 def test_a_whole_run_in_simulation(site: Any, tmp_path: Path, rendering: None) -> None:
-    site.add("frame-keeper", KEEPER)
+    site.add("frame-keeper", "frame_keeper.py")
     registry = installed_plugins()
     robot = find_config("so101", registry)
     overrides = (

@@ -124,41 +124,10 @@ def test_a_server_that_is_killed_in_the_middle_of_requests_harms_nothing():
     assert told["answered_twice"] == 0
 
 
-HANGS_ONCE = """
-import os
-import threading
-from pathlib import Path
-import attrs
-import numpy as np
-from ibrobot_core import hookimpl
-from ibrobot_core.descriptors import PolicyDescriptor
-from ibrobot_testing import host_context
-from ibrobot_testing.fakes import FakePolicy
-
-@attrs.frozen
-class Options:
-    path: Path
-
-class HangsOnce(FakePolicy):
-    def __init__(self, options, ctx):
-        super().__init__(host_context())
-        self.mark = options.path / "hung"
-    def infer(self, tensors):
-        if not self.mark.exists():
-            self.mark.touch()
-            threading.Event().wait()
-        return {"pid": np.array([os.getpid()])}
-
-@hookimpl
-def ibrobot_policies():
-    yield PolicyDescriptor("hangs_once", HangsOnce, "hangs at its first request", Options)
-"""
-
-
 def test_a_server_whose_model_hangs_starts_again(
     ibrobot: tuple[str, ...], endpoint: str, connect: Callable[..., Transport], site: Site, tmp_path: Path
 ):
-    site.add("hangs-once", HANGS_ONCE)
+    site.add("hangs-once", "hangs_once.py")
     port = free_endpoint().split(":")[1]
     command = [*ibrobot, "serve", tmp_path, "--type", "hangs_once", "--name", "net", "--listen", endpoint]
     process = subprocess.Popen(

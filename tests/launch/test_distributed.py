@@ -19,22 +19,6 @@ if TYPE_CHECKING:
 
 pytestmark = pytest.mark.integration
 
-SHARED = '''
-from ibrobot_core import hookimpl
-from ibrobot_core.descriptors import TransportDescriptor
-from ibrobot_core.local_transport import LocalTransport
-
-class Shared(LocalTransport):
-    """One for the robot and its server."""
-    def close(self):
-        pass
-
-NETWORK = Shared()
-
-@hookimpl
-def ibrobot_transports():
-    yield TransportDescriptor("shared", lambda options, ctx: NETWORK, "a network")
-'''
 MODE = "control_modes.policy.inference.execution_mode={}"
 NETWORK = "transport={type: shared}"
 
@@ -42,7 +26,7 @@ NETWORK = "transport={type: shared}"
 @pytest.fixture
 def cloud(runs: Runs, site: Site) -> Iterator[InferenceService]:
     """A server of the model `net`, on the transport `shared`."""
-    site.add("shared-network", SHARED)
+    site.add("shared-network", "shared_network.py")
     robot = runs.make().session.config.robot
     network, net = sys.modules["shared_network"].NETWORK, runs.parts.Net(host_context(robot=robot))
     service = InferenceService(net, network, "net")
@@ -82,7 +66,7 @@ def test_the_plan_to_be_continued_travels_with_the_request(mode: str, runs: Runs
         dispatch = f"control_modes.policy.dispatch={{watermark: 7, strategy: {strategy}}}"
         return motion(runs.start("models.net.type=continuing", dispatch, *overrides, episodes=2, seed=5))
 
-    site.add("shared-network", SHARED)
+    site.add("shared-network", "shared_network.py")
     here = told(strategy="rtc")
     assert not np.array_equal(told(strategy="replace"), here)
     robot, network = runs.made[-1].session.config.robot, sys.modules["shared_network"].NETWORK

@@ -14,55 +14,11 @@ from ibrobot_core.units import NS_PER_S
 if TYPE_CHECKING:
     from conftest import Runs, Site
 
-NETWORK = """
-import threading
-
-from ibrobot_core import hookimpl
-from ibrobot_core.descriptors import TransportDescriptor
-from ibrobot_core.errors import TransportError
-from ibrobot_core.interfaces import TopicTransport
-from ibrobot_core.local_transport import LocalTransport
-
-class Network(LocalTransport, TopicTransport):
-    def __init__(self):
-        super().__init__()
-        self.sent, self.callbacks, self.refuses, self.goes_on = [], {}, False, threading.Event()
-        self.goes_on.set()
-        self.closed = False
-
-    def publish_message(self, topic, message, *, latched=False):
-        self.goes_on.wait(60)
-        if self.refuses:
-            raise TransportError("the network says no")
-        self.sent.append((topic, message, latched))
-
-    def subscribe_messages(self, topic, callback):
-        self.callbacks[topic] = callback
-        return lambda: self.callbacks.pop(topic)
-
-    def shared_topics(self, timeout_s):
-        return []
-
-    def close(self):
-        super().close()
-        self.closed = True
-
-MADE = []
-
-def make(options, ctx):
-    MADE.append(Network())
-    return MADE[-1]
-
-@hookimpl
-def ibrobot_transports():
-    yield TransportDescriptor("network", make, "a network", topics=True)
-"""
-
 
 @pytest.fixture
 def network(site: Site) -> Any:
     """The module of a plugin with the transport `network`; what it made is in `MADE`."""
-    site.add("a-network", NETWORK)
+    site.add("a-network", "recording_network.py")
 
 
 def made() -> Any:
