@@ -93,19 +93,8 @@ def test_a_known_type_that_is_not_installed_says_what_to_install() -> None:
         discover([]).find("teleop", "keyboard")
 
 
-DEFAULT_RECORDER = """
-from ibrobot_core import hookimpl
-from ibrobot_core.descriptors import RecorderDescriptor
-
-@hookimpl
-def ibrobot_recorders():
-    yield RecorderDescriptor("tape", lambda options, ctx: None, "a tape")
-    yield RecorderDescriptor("{}", lambda options, ctx: None, "a disk", default=True)
-"""
-
-
 def test_default_type_is_the_one_whose_descriptor_says_so(site: Site) -> None:
-    site.add("disk-a", DEFAULT_RECORDER.format("disk_a"))
+    site.add("disk-a", "default_recorder.py")
     assert discover(site.entry_points()).default("recorder") == "disk_a"
 
 
@@ -115,8 +104,8 @@ def test_missing_default_type_names_the_package_to_install() -> None:
 
 
 def test_two_default_types_are_an_error_that_names_both(site: Site) -> None:
-    site.add("disk-a", DEFAULT_RECORDER.format("disk_a").replace('"tape"', '"tape_a"'))
-    site.add("disk-b", DEFAULT_RECORDER.format("disk_b"))
+    site.add("disk-a", "default_recorder.py")
+    site.add("disk-b", "default_recorder.py")
     with pytest.raises(PluginError, match=r"name the type of the recorder: .* disk_a \(disk-a\), disk_b \(disk-b\)"):
         discover(site.entry_points()).default("recorder")
 
