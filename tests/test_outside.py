@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 from rich.table import Table
 
 from ibrobot_core import outside
-from ibrobot_core.cli import serve
 from ibrobot_core.outside import LogFormatter, echo, printable
 from ibrobot_core.screen import Screen, styled
 
@@ -72,15 +71,6 @@ def test_markup_is_shown_literally():
     table.add_row("[/x] :warning:")
     shown = rendered(table, "[red]plain", styled("[red]styled"))
     assert all(each in shown for each in ("[b]title[/x]", "[/x] :warning:", "[red]plain", "[red]styled"))
-
-
-@given(st.dictionaries(HOSTILE, st.just(None), max_size=3), HOSTILE)
-def test_the_server_s_table_takes_any_robot_s_name(robots: dict[str, None], model: str):
-    """A robot that called itself [/x] ended the server of all."""
-    counts = dict.fromkeys(("requests", "answered", "expired", "malformed", "waiting", "failed"), 0)
-    counts |= dict.fromkeys(("latency_p50_ms", "latency_p99_ms"), 0.0)
-    statistics = {**counts, "model": model, "robots": dict.fromkeys(robots, counts)}
-    assert not UNPRINTABLE.search(rendered(serve._table(statistics)))
 
 
 @given(HOSTILE)
