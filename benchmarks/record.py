@@ -27,7 +27,6 @@ import numpy as np
 import yaml
 
 from ibrobot_core.config import load_config
-from ibrobot_core.descriptors import SensorDescriptor
 from ibrobot_core.interfaces import Context, Sensor
 from ibrobot_core.launch.runtime import Runtime
 from ibrobot_core.launch.session import Request, Session
@@ -68,10 +67,7 @@ def registry() -> Registry:
     """What is installed, with the synthetic camera in place of the rendered one."""
     found = discover()
     entry = found.entries["sensor", "mujoco"]
-    camera = SensorDescriptor(
-        type="mujoco", kind="camera", options=entry.descriptor.options, make=lambda options, ctx: Camera(ctx),
-        summary="synthetic",
-    )  # fmt: skip
+    camera = attrs.evolve(entry.descriptor, make=lambda options, ctx: Camera(ctx), summary="synthetic")
     found.entries["sensor", "mujoco"] = attrs.evolve(entry, descriptor=camera)
     return found
 

@@ -28,6 +28,7 @@ from ibrobot_core.options import (
     option as option,
     unknown_names as unknown_names,
 )
+from ibrobot_core.executor_options import StreamOptions as StreamOptions
 from ibrobot_core.interfaces import (
     Condition as Condition,
     Context as Context,
@@ -175,6 +176,7 @@ from ibrobot_core.contract.specs import (
 from ibrobot_core.contract.compose import Composer as Composer
 from ibrobot_core.contract.frames import FrameAssembler as FrameAssembler, assemble as assemble
 from ibrobot_core.contract.joint_units import JointUnits as JointUnits
+from ibrobot_core.contract.joint_units import with_closed_ends as with_closed_ends
 from ibrobot_core.contract.select import text_at as text_at
 from ibrobot_core.config import RobotConfig as RobotConfig, find_config as find_config, load_config as load_config
 from ibrobot_core.config.load import load_contract as load_contract

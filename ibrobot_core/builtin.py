@@ -49,7 +49,7 @@ def ibrobot_executors() -> Iterable[ExecutorDescriptor]:
         summary="follows joint trajectories, with path and goal tolerances",
     )  # fmt: skip
     yield ExecutorDescriptor(
-        type="gripper", options=GripperOptions, make=_gripper,
+        type="gripper", options=GripperOptions, make=_gripper, goals="position",
         summary="opens or closes a gripper; a stall counts as grasped",
     )  # fmt: skip
 

@@ -48,6 +48,8 @@ class JointCalibration:
     """Greatest reported position [ticks], above `range_min`, at most 4095."""
     zero_at: str = ZERO_AT_POSE
     """Where it is at 0 rad: one of `ZERO_AT`. LeRobot's files do not have it."""
+    closed_at: float | None = None
+    """Its lower limit [rad], where the hardware anchors the joint at its closed end; recordings alone have it."""
 
     def __attrs_post_init__(self) -> None:
         for name, value in self.numbers().items():
@@ -55,6 +57,8 @@ class JointCalibration:
                 raise ValueError(f"{name}: must be a whole number, not {value!r}")
         if self.zero_at not in ZERO_AT:
             raise ValueError(f"zero_at: must be one of {', '.join(ZERO_AT)}, not {self.zero_at!r}")
+        if self.closed_at is not None and not (isinstance(self.closed_at, float) and math.isfinite(self.closed_at)):
+            raise ValueError(f"closed_at: must be an angle [rad] or nothing, not {self.closed_at!r}")
         if not 0 <= self.id <= 253:
             raise ValueError(f"id: must be 0 to 253, not {self.id}")
         if self.drive_mode not in (0, 1):
@@ -101,7 +105,7 @@ class JointCalibration:
         return self.range_max + ticks if self.inverted else self.range_min - ticks
 
 
-_NUMBERS = tuple(field.name for field in attrs.fields(JointCalibration) if field.name != "zero_at")
+_NUMBERS = tuple(field.name for field in attrs.fields(JointCalibration) if field.name not in ("zero_at", "closed_at"))
 _KEYS = ", ".join(_NUMBERS)
 
 
@@ -147,8 +151,8 @@ class Calibration:
         return {name: joint.numbers() for name, joint in self.joints.items()}
 
     def snapshot(self) -> dict[str, dict[str, Any]]:
-        """Joint -> fields of `JointCalibration`, as a recording keeps them."""
-        return {name: attrs.asdict(joint) for name, joint in self.joints.items()}
+        """Joint -> fields of `JointCalibration` that a calibration has; `closed_at` is the hardware's."""
+        return {name: {**joint.numbers(), "zero_at": joint.zero_at} for name, joint in self.joints.items()}
 
     def fingerprint(self) -> str:
         """SHA-256 of the numbers, 64 hexadecimal digits."""

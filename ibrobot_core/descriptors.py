@@ -5,7 +5,7 @@ from __future__ import annotations
 import builtins
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import attrs
 
@@ -78,6 +78,21 @@ class Descriptor[T]:
     """Whether commands take this type where none of its kind is named; one type of a kind at most."""
 
 
+def no_calibration(options: Any) -> str | None:
+    """For hardware that works without a calibration."""
+    return None
+
+
+def no_joints(options: Any) -> tuple[str, ...]:
+    """For hardware whose joints are all at 0 rad where their calibration says."""
+    return ()
+
+
+def no_picture(options: Any) -> tuple[int, int] | None:
+    """For sensors that give no pictures, or whose size only the pictures tell."""
+    return None
+
+
 @attrs.frozen
 class HardwareDescriptor(Descriptor["Hardware"]):
     """Hardware; `simulated` ones are `SimulatedHardware` and may stand in the `simulation:` section."""
@@ -87,6 +102,11 @@ class HardwareDescriptor(Descriptor["Hardware"]):
     """For simulated hardware, sensor kind, e.g. `camera` -> the sensor type that stands for it."""
     torque_off: str = ""
     """For joints that hold on when no process commands them any more: the command that takes their torque off."""
+    calibration: Callable[[Any], str | None] = attrs.field(default=no_calibration, kw_only=True)
+    """Name or path of the calibration that the options name, as `load_calibration` takes it; recordings keep it."""
+    anchored: Callable[[Any], tuple[str, ...]] = attrs.field(default=no_joints, kw_only=True)
+    """The joints whose calibrated closed end is their lower limit, as a gripper's may be. In LeRobot's units these are
+    0 to 100."""
 
 
 @attrs.frozen
@@ -94,6 +114,8 @@ class SensorDescriptor(Descriptor["Sensor"]):
     """A sensor of a kind, e.g. `camera` or `imu`."""
 
     kind: str = "camera"
+    picture: Callable[[Any], tuple[int, int] | None] = attrs.field(default=no_picture, kw_only=True)
+    """Height and width of the pictures [px], as far as the options say them."""
 
 
 @attrs.frozen
@@ -108,9 +130,15 @@ class PolicyDescriptor(Descriptor["Policy"]):
 
 @attrs.frozen
 class ExecutorDescriptor(Descriptor["Executor"]):
-    """An executor; `streams` says that it follows setpoints (from policies and teleop) rather than goals."""
+    """An executor; `streams` says that it follows setpoints (from policies and teleop) rather than goals.
+
+    The options of one that streams derive from `ibrobot_core.executor_options.StreamOptions`.
+    """
 
     streams: bool = False
+    goals: Literal["trajectory", "position"] = "trajectory"
+    """What a planner sends to one that does not stream: a timed path, as `goal_from_message` gives it, or
+    `{"position": q}`, where the first of its joints goes [rad]."""
 
 
 @attrs.frozen

@@ -12,6 +12,7 @@ from ibrobot_core.config.checks import streams
 from ibrobot_core.config.schema import ActionSpec, ContractConfig, ExecutorComponent, ObservationSpec, SignalSpec
 from ibrobot_core.config.structure import Part, Parts
 from ibrobot_core.config.yaml_nodes import Document, Key
+from ibrobot_core.executor_options import StreamOptions
 from ibrobot_core.options import did_you_mean
 
 JOINT_STATES = "/joint_states"
@@ -255,11 +256,12 @@ class ContractChecks:
 
     def _safety(self, key: Key, spec: ActionSpec, part: Part[ExecutorComponent]) -> ActionSpec:
         """One answer to what follows stale setpoints, in both, whether the action or the executor gives it."""
-        there = getattr(part.component.options, "safety_behavior", None)
-        if there is None:
+        executor = part.component.options
+        if not isinstance(executor, StreamOptions):
             return spec
+        there = executor.safety_behavior
         if self.document.get(*part.key, "safety_behavior") is None:
-            options = attrs.evolve(part.component.options, safety_behavior=spec.safety_behavior)
+            options = attrs.evolve(executor, safety_behavior=spec.safety_behavior)
             component = attrs.evolve(part.component, options=options)
             self.parts.executors[spec.executor] = attrs.evolve(part, component=component)
         elif self.document.get(*key, "safety_behavior") is None:

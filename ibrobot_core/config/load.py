@@ -173,11 +173,22 @@ def _build(document: Document, source: Path, sim: bool, registry: Registry, comm
     return RobotConfig(
         **sections,
         simulated=parts.simulated,
+        closed_ends=_closed_ends(robot, parts),
         source=source,
         document=shown,
         complete=document.root,
         secrets=secrets,
     )
+
+
+def _closed_ends(robot: Robot, parts: Parts) -> dict[str, float | None]:
+    lower = dict(zip(robot.joint_names, robot.lower.tolist(), strict=True))
+    components = [part.component for part in parts.hardware.values()]
+    return {
+        joint: lower[joint] if joint in each.anchored else None
+        for each in components
+        for joint in each.joints or robot.joint_names
+    }
 
 
 def _component[C: Component](part: Part[C] | None) -> C | None:

@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Literal, get_args, get_origin
 
 import attrs
 
-from ibrobot_core.descriptors import Descriptor, HardwareDescriptor
+from ibrobot_core.descriptors import Descriptor, ExecutorDescriptor, HardwareDescriptor, SensorDescriptor
 from ibrobot_core.options import documented, fields, not_a_key, option
 from ibrobot_core.robot import Robot
 from ibrobot_core.units import NORM_MODES
@@ -36,6 +36,11 @@ class Component:
     def takes(cls, descriptor: Descriptor[Any]) -> bool:
         """Whether a plugin of the kind can stand in this section."""
         return True
+
+    @classmethod
+    def described(cls, descriptor: Descriptor[Any], options: Any) -> Mapping[str, Any]:
+        """Fields that are no keys: what the plugin's descriptor says of the options."""
+        return {}
 
 
 @attrs.frozen
@@ -62,11 +67,21 @@ class HardwareComponent(NamedComponent):
     joints: tuple[str, ...] = option(
         (), help="the joints that it owns; the only component may leave them out and owns all"
     )
+    calibration: str | None = not_a_key(None)
+    """Name or path of its calibration."""
+    anchored: tuple[str, ...] = not_a_key(())
+    """Joints whose calibrated closed end is their lower limit."""
 
     @classmethod
     def takes(cls, descriptor: Descriptor[Any]) -> bool:
         """Whether it is real hardware."""
         return not Simulation.takes(descriptor)
+
+    @classmethod
+    def described(cls, descriptor: Descriptor[Any], options: Any) -> Mapping[str, Any]:
+        """Its calibration and its anchored joints."""
+        assert isinstance(descriptor, HardwareDescriptor)
+        return {"calibration": descriptor.calibration(options), "anchored": descriptor.anchored(options)}
 
 
 @documented
@@ -94,6 +109,14 @@ class Peripheral(Component):
     name: str = option(help="what the contract calls it")
     kind: str = option(help="camera, imu, …")
     sim: Mapping[str, Any] = option(factory=dict, help="further options for the simulated sensor that stands for it")
+    picture: tuple[int, int] | None = not_a_key(None)
+    """Height and width of its pictures [px], where its options say them."""
+
+    @classmethod
+    def described(cls, descriptor: Descriptor[Any], options: Any) -> Mapping[str, Any]:
+        """The size of its pictures."""
+        assert isinstance(descriptor, SensorDescriptor)
+        return {"picture": descriptor.picture(options)}
 
 
 @documented
@@ -106,6 +129,14 @@ class ExecutorComponent(NamedComponent):
     group: str = option(help="the joint group that it owns")
     joints: tuple[str, ...] = not_a_key(())
     """Those of its group, in group order."""
+    goals: str = not_a_key("trajectory")
+    """What a planner sends to it."""
+
+    @classmethod
+    def described(cls, descriptor: Descriptor[Any], options: Any) -> Mapping[str, Any]:
+        """The goals that it takes."""
+        assert isinstance(descriptor, ExecutorDescriptor)
+        return {"goals": descriptor.goals}
 
 
 @documented
@@ -461,6 +492,9 @@ class RobotConfig:
     simulated: bool = not_a_key(False)
     """Whether `simulation` stands for `hardware` in this run."""
     source: Path = not_a_key(Path("<memory>"))
+    closed_ends: Mapping[str, float | None] = not_a_key(factory=dict, eq=False)
+    """Joint -> its lower limit [rad] where the hardware anchors it at its closed end, else None; without the joints of
+    hardware that is not installed. The hardware's, in a simulation too."""
     document: Mapping[str, Any] = not_a_key(factory=dict, repr=False)
     complete: Mapping[str, Any] = not_a_key(factory=dict, repr=False, eq=False)
     """`document` with its secrets, for other processes of the run only: never to be written or shown."""

@@ -189,7 +189,8 @@ class Structurer:
         if faults.found or descriptor is None:
             return None
         named = {} if name is None else {"name": name}
-        return Part(key, kind(**arguments, **named, options=options), descriptor)
+        described = kind.described(descriptor, options)
+        return Part(key, kind(**arguments, **named, **described, options=options), descriptor)
 
     def _find(self, kind: str, type_: str, needed: bool, faults: Faults) -> Descriptor[Any] | None:
         if not needed and (kind, type_) not in self.registry.entries:

@@ -37,15 +37,16 @@ class _Elements:
 class JointUnits:
     """Converts the joint positions of observations and actions; velocities, efforts and all else stay as they are.
 
-    `degrees` and `range_m100_100` are LeRobot's units of an arm's joints. A joint that is anchored at its closed end
-    (the hardware's option `anchored`, by default the gripper) is 0 to 100 in both, as LeRobot has it.
+    `degrees` and `range_m100_100` are LeRobot's units of an arm's joints. A joint that the hardware anchors at its
+    closed end is 0 to 100 in both, as LeRobot has it.
 
     Args:
         norm_mode: one of `units.NORM_MODES`.
         contract: which elements are joints' positions.
         calibration: joint -> fields of `JointCalibration`. Numbers of LeRobot alone have 0 rad at the pose, as
             recordings had that do not say where it is.
-        document: the robot YAML as plain values: which joints are anchored, and their lower limits.
+        document: the robot YAML as plain values: which joints are anchored where `calibration` does not have
+            `closed_at`, as in older recordings and where the hardware's plugin is not installed.
 
     Raises:
         CalibrationError: when a joint's calibration is needed and missing.
@@ -61,7 +62,7 @@ class JointUnits:
         self._elements: dict[str, list[_Elements]] = {}
         if norm_mode == "radians":
             return
-        closed = _closed_ends(document)
+        closed = _closed_ends(calibration, document)
         for key, joints in _position_joints(contract).items():
             modes: dict[str, dict[int, str]] = {}
             for index, joint in joints.items():
@@ -91,12 +92,24 @@ class JointUnits:
 def calibrations(config: RobotConfig) -> dict[str, dict[str, dict[str, Any]]]:
     """The calibrations of the hardware in use, by its name, as recordings keep them; nothing for a simulation.
 
+    Each joint has `closed_at`.
+
     Raises:
         CalibrationError: when one cannot be read.
     """
-    options = {name: component.options for name, component in config.hardware.items()}
-    names = {name: getattr(each, "calibration", None) for name, each in options.items()}
-    return {name: load_calibration(found).snapshot() for name, found in names.items() if found is not None}
+    return {
+        name: with_closed_ends(load_calibration(each.calibration).snapshot(), config)
+        for name, each in config.hardware.items()
+        if each.calibration is not None
+    }
+
+
+def with_closed_ends(calibration: Mapping[str, Mapping[str, Any]], config: RobotConfig) -> dict[str, dict[str, Any]]:
+    """A calibration, joint -> fields of `JointCalibration`, with `closed_at` as the robot's hardware has it."""
+    return {
+        joint: {**numbers, "closed_at": config.closed_ends[joint]} if joint in config.closed_ends else dict(numbers)
+        for joint, numbers in calibration.items()
+    }
 
 
 def _position_joints(contract: Contract) -> dict[str, dict[int, str]]:
@@ -131,10 +144,12 @@ def _elements(
     )
 
 
-def _closed_ends(document: Mapping[str, Any]) -> dict[str, float]:
+def _closed_ends(calibration: Mapping[str, Mapping[str, Any]], document: Mapping[str, Any]) -> dict[str, float]:
     """Joint -> its lower limit [rad], of the joints that are anchored at their closed end."""
     hardware = document.get("hardware") or {}
     components = [hardware] if "type" in hardware else list(hardware.values())
     anchored = {name for each in components for name in each.get("anchored", ("gripper",))}
     joints = (document.get("robot") or {}).get("joints", ())
-    return {joint["name"]: float(joint["lower"]) for joint in joints if joint["name"] in anchored}
+    ends = {joint["name"]: float(joint["lower"]) for joint in joints if joint["name"] in anchored}
+    ends |= {joint: numbers["closed_at"] for joint, numbers in calibration.items() if "closed_at" in numbers}
+    return {joint: end for joint, end in ends.items() if end is not None}

@@ -231,14 +231,14 @@ class Contract:
 
 def _observation(spec: ObservationSpec, config: RobotConfig) -> ObservationPart:
     """Fill in topic, type and paths of a spec, and find its shape."""
-    topic, type_, camera = spec.topic, spec.type or _KNOWN_TYPES.get(spec.topic, ""), None
+    topic, type_, size = spec.topic, spec.type or _KNOWN_TYPES.get(spec.topic, ""), None
     if spec.peripheral is not None:
         peripheral = config.peripherals.get(spec.peripheral)
         if peripheral is None:
             known = ", ".join(config.peripherals) or "none"
             raise ContractError(f"{spec.key}: no peripheral {spec.peripheral!r}; the peripherals are: {known}")
         if peripheral.kind == "camera":
-            camera = peripheral.options
+            size = peripheral.picture
             topic, type_ = topic or f"/camera/{peripheral.name}/image_raw", type_ or _CAMERA_TYPE
     if not topic or not type_:
         example = f"type: {_CAMERA_TYPE}" if topic else "topic: /imu"
@@ -255,7 +255,7 @@ def _observation(spec: ObservationSpec, config: RobotConfig) -> ObservationPart:
         image = spec.image or ImageSpec()
         if spec.select:
             raise ContractError(f"{spec.key}: select has no meaning for an image; leave it out")
-        return ObservationPart(spec.key, topic, type_, (), image, align, _image_feature(image, camera))
+        return ObservationPart(spec.key, topic, type_, (), image, align, _image_feature(image, size))
     if spec.image is not None:
         raise ContractError(f"{spec.key}: image has no meaning for {type_}; it belongs to {_CAMERA_TYPE}")
     try:
@@ -287,9 +287,8 @@ def _recorded_observation(key: str, part: Mapping[str, Any]) -> ObservationPart:
     return ObservationPart(key, part["topic"], part["type"], (), image, align, _image_feature(image, None))
 
 
-def _image_feature(image: ImageSpec, camera: Any) -> Feature:
-    size = getattr(camera, "height", None) or -1, getattr(camera, "width", None) or -1
-    height, width = image.resize or size
+def _image_feature(image: ImageSpec, size: tuple[int, int] | None) -> Feature:
+    height, width = image.resize or size or (-1, -1)
     channels = 3 if image.encoding in ("rgb8", "bgr8") else 1
     dtype = _IMAGE_DTYPES.get(image.encoding, "image")
     return Feature(dtype, (height, width, channels), ("height", "width", "channels"))

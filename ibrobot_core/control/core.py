@@ -384,7 +384,7 @@ class ControlCore:
         relax = False
         for owned in self._active:
             setpoints.append((owned.columns, owned.executor.update(owned.reading(self._measured, now_ns))))
-            relax = relax or bool(getattr(owned.executor, "wants_relax", False))
+            relax = relax or owned.executor.wants_relax
             self._report_goals(owned)
         if relax and not self._relaxed:
             self._relax("the setpoints are stale")

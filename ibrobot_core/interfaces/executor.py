@@ -62,6 +62,14 @@ class Executor(ABC):
     def update(self, measured: JointReading) -> Vector:
         """The setpoint [rad] for this tick, shape (J,); `measured.stamp_ns` is the tick's time."""
 
+    @property
+    def wants_relax(self) -> bool:
+        """Whether, from its last `update` on, torque should be off instead of following its setpoint.
+
+        False after `activate`. The loop puts torque back on when no active executor wants it off.
+        """
+        return False
+
     def deactivate(self) -> None:
         """Give the joints up; forget plans and goals."""
 

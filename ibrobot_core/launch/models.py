@@ -9,7 +9,7 @@ from ibrobot_core.calibration import load_calibration
 from ibrobot_core.config import RobotConfig
 from ibrobot_core.config.schema import ModelConfig
 from ibrobot_core.contract.check import check_policy
-from ibrobot_core.contract.joint_units import JointUnits, calibrations
+from ibrobot_core.contract.joint_units import JointUnits, calibrations, with_closed_ends
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.dispatch.dispatcher import check_strategy
 from ibrobot_core.errors import ConfigError, ContractError, IbrobotError, Problem
@@ -115,6 +115,6 @@ def _line(name: str, spec: PolicySpec) -> str:
 
 def _units(config: RobotConfig, model: ModelConfig, contract: Contract) -> JointUnits:
     name = model.calibration
-    each = {"model": load_calibration(name).numbers()} if name is not None else calibrations(config)
+    each = {"model": with_closed_ends(load_calibration(name).numbers(), config)} if name else calibrations(config)
     joined = {joint: numbers for joints in each.values() for joint, numbers in joints.items()}
     return JointUnits(model.norm_mode, contract, joined, config.document)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import attrs
 
+from ibrobot_core.contract.joint_units import with_closed_ends
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import CalibrationError, ContractError, RecorderError
 
@@ -44,9 +45,8 @@ def stated_by_robot(
         calibration: joint -> fields of `JointCalibration`, for a unit that needs them.
     """
     document = json.loads(json.dumps(config.document, default=str))
-    told = _described(
-        Contract.from_config(config).without_signals(), document, {"told": calibration} if calibration else {}
-    )
+    calibrations = {"told": with_closed_ends(calibration, config)} if calibration else {}
+    told = _described(Contract.from_config(config).without_signals(), document, calibrations)
     return told | ({"norm_mode": norm_mode} if norm_mode else {})
 
 

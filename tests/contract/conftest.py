@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -46,7 +45,7 @@ def make_config(
         "whole_position": ExecutorComponent("position", NoOptions(), "whole_position", "all", GRIPPER + ARM),
     }
     peripherals = {
-        "top": Peripheral("webcam", SimpleNamespace(width=6, height=4), "top", "camera"),
+        "top": Peripheral("webcam", NoOptions(), "top", "camera", picture=(4, 6)),
         "wrist": Peripheral("webcam", NoOptions(), "wrist", "camera"),
         "chest": Peripheral("gyro", NoOptions(), "chest", "imu"),
     }

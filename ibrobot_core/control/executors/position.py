@@ -104,6 +104,7 @@ class PositionExecutor(Executor):
         return self._setpoint.copy()
 
     @property
+    @override
     def wants_relax(self) -> bool:
         """Whether torque should be off: the plan is stale and `safety_behavior` is `relax`."""
         return self._stale and self._relaxes

@@ -119,7 +119,7 @@ class PlanningFeeder(Feeder):
             mine = [joint for joint in executor.joints if joint in goal]
             if not mine:
                 continue
-            if executor.type == "gripper":
+            if executor.goals == "position":
                 goals[name] = {"position": goal[mine[0]]}
                 continue
             assert self._planner is not None

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 from ibrobot_camera.device import realsense_stream, video_device
-from ibrobot_camera.options import OpenCvOptions, RealSenseOptions
+from ibrobot_camera.options import OpenCvOptions, RealSenseOptions, picture_size
 from ibrobot_core.api import Check, Command, DecoderDescriptor, SensorDescriptor, hookimpl
 
 if TYPE_CHECKING:
@@ -37,11 +37,12 @@ def _find_librealsense() -> None:
 def ibrobot_sensors() -> Iterable[SensorDescriptor]:
     """Cameras."""
     yield SensorDescriptor(
-        type="opencv", options=OpenCvOptions, make=_opencv, devices=video_device,
+        type="opencv", options=OpenCvOptions, make=_opencv, devices=video_device, picture=picture_size,
         summary="V4L2 device, RTSP or HTTP stream, or video file",
     )  # fmt: skip
     yield SensorDescriptor(
         type="realsense", options=RealSenseOptions, make=_realsense, check=_find_librealsense, devices=realsense_stream,
+        picture=picture_size,
         summary="Intel RealSense: colour, or aligned depth",
     )  # fmt: skip
 

@@ -62,3 +62,10 @@ class RealSenseOptions:
     encoding: str = ENCODING
     jpeg_quality: int = JPEG_QUALITY
     frame_id: str = option("", help="of the messages; NAME_optical_frame where it is empty")
+
+
+def picture_size(options: OpenCvOptions | RealSenseOptions) -> tuple[int, int] | None:
+    """Height and width of the pictures [px]; None where only the source knows them."""
+    if options.height is None or options.width is None:
+        return None
+    return options.height, options.width

@@ -17,7 +17,16 @@ import attrs
 import click
 from click.core import ParameterSource
 
-from ibrobot_core.api import NORM_MODES, Contract, DatasetDescriptor, DatasetError, Flag, echo, installed_plugins
+from ibrobot_core.api import (
+    NORM_MODES,
+    Contract,
+    DatasetDescriptor,
+    DatasetError,
+    Flag,
+    echo,
+    installed_plugins,
+    with_closed_ends,
+)
 from ibrobot_data.request import MISSING, OUTCOMES, EpisodeReport, Report, Request
 
 if TYPE_CHECKING:
@@ -106,8 +115,8 @@ def _to_dataset(
     type_ = type_ or installed_plugins().default("dataset")
     request = Request(
         out, _options("dataset", type_, (*overrides, *sets)), type_,
-        outcomes=outcomes or OUTCOMES, jobs=jobs or _jobs(), calibration=_calibration(calibration),
-        norm_mode=norm_mode or "radians", **_contract(config), **asked,
+        outcomes=outcomes or OUTCOMES, jobs=jobs or _jobs(), norm_mode=norm_mode or "radians",
+        **_told(config, calibration), **asked,
     )  # fmt: skip
     found = find_episodes(episodes)
     with _progress(len(found), as_json) as watch:
@@ -179,11 +188,17 @@ def _robot(config: str) -> RobotConfig:
     return load_contract(find_config(config, installed_plugins()))
 
 
-def _contract(config: str | None) -> dict[str, Any]:
+def _told(config: str | None, calibration: str | None) -> dict[str, Any]:
+    """What a robot YAML and a calibration say of the conversion."""
+    numbers = _calibration(calibration)
     if config is None:
-        return {}
+        return {"calibration": numbers}
     robot = _robot(config)
-    return {"contract": Contract.from_config(robot), "document": json.loads(json.dumps(robot.document, default=str))}
+    return {
+        "calibration": numbers and with_closed_ends(numbers, robot),
+        "contract": Contract.from_config(robot),
+        "document": json.loads(json.dumps(robot.document, default=str)),
+    }
 
 
 def _calibration(name: str | None) -> Mapping[str, Mapping[str, Any]] | None:

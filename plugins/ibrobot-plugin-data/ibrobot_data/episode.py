@@ -182,7 +182,8 @@ def _write(
     request = job.request
     contract = _contract(request, summary)
     document = request.document or _recorded(summary, "config")
-    calibration = request.calibration or _joined(_recorded(summary, "calibration"))
+    recorded = _joined(_recorded(summary, "calibration"))
+    calibration = recorded if request.calibration is None else _completed(request.calibration, recorded)
     units = JointUnits(request.norm_mode, contract, calibration, document)
     robot_type = (document.get("robot") or {}).get("robot_type") or summary.metadata.get("robot_type", "")
     if request.success and report.outcome == "unknown":
@@ -265,6 +266,14 @@ def _recorded(summary: EpisodeSummary, name: str) -> Mapping[str, Any]:
     except ValueError as error:
         raise RecorderError(f"its metadata {name!r} cannot be read: {error}") from None
     return document if isinstance(document, dict) else {}
+
+
+def _completed(
+    calibration: Mapping[str, Mapping[str, Any]], recorded: Mapping[str, Mapping[str, Any]]
+) -> dict[str, dict[str, Any]]:
+    """A calibration with the recorded joints' `closed_at` where it does not have its own."""
+    ends = {joint: {"closed_at": each["closed_at"]} for joint, each in recorded.items() if "closed_at" in each}
+    return {joint: {**ends.get(joint, {}), **numbers} for joint, numbers in calibration.items()}
 
 
 def _joined(calibrations: Mapping[str, Any]) -> dict[str, dict[str, Any]]:

@@ -10,6 +10,8 @@ from ibrobot_feetech.options import (
     EmulatedSignalOptions,
     FollowerOptions,
     LeaderOptions,
+    anchored_joints,
+    calibration_of,
     check_follower,
     check_leader,
     serial_port,
@@ -45,6 +47,7 @@ def ibrobot_hardware() -> Iterable[HardwareDescriptor]:
     yield HardwareDescriptor(
         type="feetech_so101", options=FollowerOptions, make=_follower, torque_off="ibrobot feetech torque off",
         summary="SO-101 arm: STS3215 servos on one bus", check_options=check_follower, devices=serial_port,
+        calibration=calibration_of, anchored=anchored_joints,
     )  # fmt: skip
 
 

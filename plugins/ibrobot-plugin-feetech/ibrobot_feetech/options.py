@@ -128,6 +128,16 @@ def check_leader(options: LeaderOptions, robot: Robot, joints: tuple[str, ...]) 
             yield from unknown_names(key, names, known, "joint of the leader")
 
 
+def calibration_of(options: FollowerOptions) -> str:
+    """The calibration of the arm."""
+    return options.calibration
+
+
+def anchored_joints(options: FollowerOptions) -> tuple[str, ...]:
+    """The joints whose closed end is their lower limit."""
+    return options.anchored
+
+
 def serial_port(options: FollowerOptions | LeaderOptions) -> Mapping[str, str]:
     """The port, by the name that all links to it lead to."""
     return {"port": os.path.realpath(options.port)}

@@ -14,7 +14,7 @@ from ibrobot_core.api import (
     hookimpl,
 )
 from ibrobot_mujoco.gl import check_asked, choose
-from ibrobot_mujoco.options import CameraOptions, MujocoOptions, check_world
+from ibrobot_mujoco.options import CameraOptions, MujocoOptions, check_world, picture_size
 from ibrobot_mujoco.policy_options import ScriptedPickOptions, check_pick
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ def ibrobot_hardware() -> Iterable[HardwareDescriptor]:
 def ibrobot_sensors() -> Iterable[SensorDescriptor]:
     """Cameras in the simulated scene."""
     yield SensorDescriptor(
-        type="mujoco", kind="camera", options=CameraOptions, make=_camera, check=_can_render,
+        type="mujoco", kind="camera", options=CameraOptions, make=_camera, check=_can_render, picture=picture_size,
         summary="a camera in the simulated scene",
     )  # fmt: skip
 

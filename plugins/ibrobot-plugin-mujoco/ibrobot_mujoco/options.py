@@ -112,3 +112,8 @@ def check_world(options: MujocoOptions, robot: Robot, joints: tuple[str, ...]) -
         if fault.joint is not None and fault.joint not in robot.joint_names:
             message = f"unknown joint {fault.joint!r}{did_you_mean(fault.joint, robot.joint_names, 'known')}"
             yield OptionFault(("faults", i, "joint"), message)
+
+
+def picture_size(options: CameraOptions) -> tuple[int, int]:
+    """Height and width of the pictures [px]."""
+    return options.height, options.width

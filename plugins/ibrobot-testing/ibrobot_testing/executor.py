@@ -78,6 +78,18 @@ class ExecutorSuite(Suite[Executor]):
                 np.testing.assert_allclose(setpoint, pose, atol=self.tolerance_rad)
             executor.deactivate()
 
+    def test_activation_wants_torque(self) -> None:
+        """`wants_relax` is False once activated, also after a life in which it was True."""
+        executor, ctx, start = self.active()
+        assert executor.wants_relax is False
+        if executor.accepts_plans:
+            executor.set_plan(plan_towards(ctx, start, self.poses(ctx)[1]))
+        for _ in range(200):
+            executor.update(tick(ctx, start))
+        executor.deactivate()
+        executor.activate(measure(ctx, start))
+        assert executor.wants_relax is False
+
     def test_setpoints_are_complete(self) -> None:
         """Every tick gives a finite number for each joint."""
         executor, ctx, start = self.active()

@@ -45,6 +45,20 @@ class FollowsTheSag(FakeExecutor):
         return super().update(measured)
 
 
+class StaysRelaxed(FakeExecutor):
+    """Once relaxed for want of setpoints, it stays so."""
+
+    _updates = 0
+
+    @property
+    def wants_relax(self):
+        return self._updates > 100
+
+    def update(self, measured):
+        self._updates += 1
+        return super().update(measured)
+
+
 class NotANumber(FakeExecutor):
     def update(self, measured):
         return super().update(measured) * np.nan
@@ -141,6 +155,7 @@ WRONG = {
     OtherJoints: "owns_the_joints_it_was_given",
     HoldsZero: "activation_holds_the_measured_position",
     FollowsTheSag: "activation_holds_the_measured_position",
+    StaysRelaxed: "activation_wants_torque",
     NotANumber: "setpoints_are_complete",
     WholeRobot: "setpoints_are_complete",
     KeepsTheReading: "keeps_no_hold_of_the_callers_arrays",
