@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from contextlib import suppress
 from typing import override
 
 from ibrobot_core.bugs import describe_bug
@@ -133,6 +135,8 @@ class Worker(Component):
             self.teardown()
 
     def _run(self) -> None:
+        # All workers: one that another program keeps waiting while it holds Python's lock keeps all others waiting.
+        raise_thread_priority()
         try:
             try:
                 self.setup()
@@ -163,3 +167,13 @@ def cause(error: BaseException) -> str:
 def exit_code(error: BaseException) -> int:
     """The exit status of a run that `error` ended."""
     return error.exit_code if isinstance(error, IbrobotError) else 1
+
+
+def raise_thread_priority() -> None:
+    """Give the calling thread the lowest real-time priority (SCHED_RR), where the machine permits it.
+
+    It and the threads that it starts then run before all ordinary programs, and after the control loop. For a thread
+    that works for a bounded time and then waits. What was refused is not reported: the control loop does that.
+    """
+    with suppress(AttributeError, OSError):
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(os.sched_get_priority_min(os.SCHED_RR)))

@@ -104,7 +104,7 @@ def serial_ports(patterns: tuple[str, ...] = ("/dev/ttyACM*", "/dev/ttyUSB*")) -
 
 
 def realtime() -> Check:
-    """Whether the control process and the sensors may ask for real-time priority."""
+    """Whether the control process and the run's workers may ask for real-time priority."""
     if os.geteuid() == 0:
         return Check("real-time priority", True, "permitted (root)")
     limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0] if hasattr(resource, "RLIMIT_RTPRIO") else 0

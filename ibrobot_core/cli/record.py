@@ -14,7 +14,7 @@ from ibrobot_core.cli.launch import Watcher, launch_options, run_robot
 from ibrobot_core.errors import DiskFull, IbrobotError
 from ibrobot_core.launch.runtime import Runtime
 from ibrobot_core.recording.desk import EpisodeDesk
-from ibrobot_core.units import seconds
+from ibrobot_core.units import plural, seconds
 
 _MIB = 1 << 20
 _START, _FAILURE, _DISCARD = "tab", "f11", "f12"
@@ -141,7 +141,8 @@ class Operator(Watcher):
     @override
     def told(self) -> list[tuple[str, str]]:
         """For the summary of the run."""
-        return [("recorded", f"{self._saved()} episodes into {self._desk.folder}")]
+        episodes = plural(self._desk.saved if self._count is None else self._count, "episode")
+        return [("recorded", f"{self._saved()} {episodes} into {self._desk.folder}")]
 
     def _state(self) -> str:
         desk = self._desk

@@ -54,7 +54,8 @@ def decode_image(message: Image | CompressedImage, spec: ImageSpec) -> NDArray[n
     """The array that the contract asks for: resized, then converted to its encoding.
 
     Returns:
-        Shape (H, W, C): uint8 for rgb8, bgr8 and mono8; uint16 for 16UC1 [mm]; float32 for 32FC1 [m].
+        Shape (H, W, C): uint8 for rgb8, bgr8 and mono8; uint16 for 16UC1 [mm]; float32 for 32FC1 [m]. Depth is 0 where
+        there is no reading: in 32FC1, REP 118 has NaN there, -inf too near and inf too far to measure.
 
     Raises:
         ContractError: for a malformed message, or an encoding that does not become the one asked for.
@@ -158,6 +159,8 @@ def _centres(old: int, new: int) -> NDArray[np.intp]:
 
 def _convert(array: NDArray[Any], given: str, wanted: str) -> NDArray[Any]:
     """Pixels of encoding `given` as `wanted`; colours are reordered, alpha goes, grey is BT.601 luma."""
+    if given == wanted == "32FC1":
+        return np.where(np.isfinite(array), array, np.float32(0))
     if given == wanted or (given, wanted) == ("mono16", "16UC1"):
         return array
     if array.dtype != np.uint8 or wanted not in ("rgb8", "bgr8", "mono8"):

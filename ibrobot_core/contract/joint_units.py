@@ -131,7 +131,8 @@ def _elements(
 ) -> _Elements:
     for joint in named.values():
         if joint not in calibration:
-            has = f"it has: {', '.join(calibration)}" if calibration else "there is none; name one by `calibration`"
+            remedy = "name one by `calibration` in the YAML or --calibration"
+            has = f"it has: {', '.join(calibration)}" if calibration else f"there is none; {remedy}"
             raise CalibrationError(f"{mode} needs the calibration of joint {joint!r}; {has}")
     each = {joint: JointCalibration(**calibration[joint]) for joint in named.values()}
     return _Elements(

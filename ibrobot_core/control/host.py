@@ -17,6 +17,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, override
 
 from ibrobot_core.clock import RealClock, SteppedClock
+from ibrobot_core.component import raise_thread_priority
 from ibrobot_core.config import RobotConfig
 from ibrobot_core.control.build import build_core
 from ibrobot_core.control.link import (
@@ -312,6 +313,7 @@ class ControlClient(ControlHost):
         return f"signal {-status}" if status < 0 else f"exit status {status}"
 
     def _receive(self) -> None:
+        raise_thread_priority()
         try:
             self._pass_on()
         except Exception as error:  # noqa: BLE001 - told to the run, which cannot go on without states

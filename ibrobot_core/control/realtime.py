@@ -1,4 +1,4 @@
-"""Real-time settings of processes and threads, where the machine permits them."""
+"""Real-time settings of this process, where the machine permits them, and what it did not permit."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import ctypes
 import gc
 import os
 import threading
-from contextlib import suppress
 
 _MCL_CURRENT_AND_FUTURE = 3
 
@@ -39,13 +38,3 @@ def go_real_time(priority: int) -> list[str]:
     except (AttributeError, OSError) as error:
         refused.append(f"memory is not locked ({error}): allow it with `memlock unlimited` in the same file")
     return refused
-
-
-def raise_thread_priority() -> None:
-    """Give the calling thread the lowest real-time priority (SCHED_RR), where the machine permits it.
-
-    It and the threads that it starts then run before all ordinary programs, and after the control loop. For a thread
-    that works for a bounded time and then waits. What was refused is not reported: the control loop does that.
-    """
-    with suppress(AttributeError, OSError):
-        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(os.sched_get_priority_min(os.SCHED_RR)))

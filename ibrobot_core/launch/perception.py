@@ -7,7 +7,6 @@ from typing import override
 
 from ibrobot_core.component import Worker
 from ibrobot_core.config.schema import Peripheral
-from ibrobot_core.control.realtime import raise_thread_priority
 from ibrobot_core.interfaces import Sensor
 from ibrobot_core.launch.session import Session
 from ibrobot_core.units import seconds
@@ -33,9 +32,6 @@ class SensorWorker(Worker):
     @override
     def setup(self) -> None:
         session, peripheral = self._session, self._peripheral
-        if not session.request.lockstep:
-            # A picture that comes late is missing in the frames, and other programs would delay it by 100 ms and more.
-            raise_thread_priority()
         descriptor = session.registry.find("sensor", peripheral.type)
         sensor = self._sensor = descriptor.make(peripheral.options, session.context(peripheral.name))
         sensor.open()

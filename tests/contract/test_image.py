@@ -131,6 +131,12 @@ def test_resizing_depth_picks_and_never_mixes(encoding: str) -> None:
     np.testing.assert_array_equal(found, depth[1::2, 1::3])
 
 
+def test_depth_without_a_reading_is_zero() -> None:
+    depth = np.array([[np.nan, -np.inf, np.inf, 1.5]], np.float32)
+    found = decode_image(encode_image(depth, "32FC1", HEADER), ImageSpec(encoding="32FC1"))
+    assert (found.dtype, found.ravel().tolist()) == (np.float32, [0, 0, 0, 1.5])
+
+
 @pytest.mark.parametrize(
     ("message", "wanted", "fault"),
     [

@@ -18,7 +18,17 @@ from rosbags.typesys import Stores, get_typestore
 
 from ibrobot_core.config.load import load_contract
 from ibrobot_core.errors import ConfigError
-from ibrobot_core.messages import Float64MultiArray, Header, Image, Imu, JointState
+from ibrobot_core.messages import (
+    Bool,
+    Float32MultiArray,
+    Float64MultiArray,
+    Header,
+    Image,
+    Imu,
+    JointState,
+    Message,
+    String,
+)
 
 pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("first_conversion")]
 
@@ -38,11 +48,21 @@ def ibrobot(folder: Path, *arguments: object) -> subprocess.CompletedProcess[str
         return run_here(*arguments)
 
 
+def write(bag: Path, events: list[tuple[int, str, Message]]) -> None:
+    """A bag as rosbags writes it, of times of receipt [ns], topics and messages."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    with Writer(bag, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        known = {}
+        for at_ns, topic, message in sorted(events, key=lambda event: event[0]):
+            if topic not in known:
+                known[topic] = writer.add_connection(topic, message.ros_type, typestore=store)
+            writer.write(known[topic], at_ns, bytes(encode(message)))
+
+
 @pytest.fixture
 def kitchen(tmp_path: Path) -> Path:
     """A clean folder with a bag of others: states at 100 Hz, commands of two parts at 30, a camera at 30, an IMU."""
-    store = get_typestore(Stores.ROS2_JAZZY)
-    events = []
+    events: list[tuple[int, str, Message]] = []
     for i in range(100):
         at_ns = START_NS + i * 10_000_000
         events.append((at_ns, "/joint_states", JointState(Header(at_ns), JOINTS, [i / 100, 0.0, 1.0])))
@@ -53,12 +73,7 @@ def kitchen(tmp_path: Path) -> Path:
         events.append((at_ns, "/gripper_controller/commands", Float64MultiArray([0.5])))
         picture = Image(Header(at_ns), *SIZE, "rgb8", SIZE[1] * 3, numbered(i).ravel())
         events.append((at_ns, "/camera/top/image_raw", picture))
-    with Writer(tmp_path / "kitchen", version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
-        known = {}
-        for at_ns, topic, message in sorted(events, key=lambda event: event[0]):
-            if topic not in known:
-                known[topic] = writer.add_connection(topic, message.ros_type, typestore=store)
-            writer.write(known[topic], at_ns, bytes(encode(message)))
+    write(tmp_path / "kitchen", events)
     return tmp_path
 
 
@@ -81,6 +96,52 @@ def test_a_drafted_contract_converts_the_bag_that_it_is_from(kitchen: Path) -> N
     assert actions == [actions[0] + i for i in range(len(actions))], "the next command after each picture"
     again = ibrobot(kitchen, "contract", "init", "kitchen", "-o", "kitchen.yaml")
     assert (again.returncode, "File exists" in again.stderr) == (1, True)
+
+
+SIGNALS = {
+    "/agent/reward": Float32MultiArray([0.5]),
+    "/episodeDone": Bool(data=False),
+    "/task/instruction": String("clear the table"),
+}
+
+
+def test_signals_are_drafted_as_comments_that_work_when_uncommented(tmp_path: Path) -> None:
+    stamps = [START_NS + i * 33_333_333 for i in range(30)]
+    events: list[tuple[int, str, Message]] = [(at_ns, t, each) for at_ns in stamps for t, each in SIGNALS.items()]
+    events += [(at_ns, "/joint_states", JointState(Header(at_ns), JOINTS, np.zeros(3))) for at_ns in stamps]
+    events += [(at_ns, COMMANDS, Float64MultiArray(np.zeros(3))) for at_ns in stamps]
+    events += [(at_ns, "/abandoned", Bool(data=True)) for at_ns in stamps]
+    write(tmp_path / "bag", events)
+    assert ibrobot(tmp_path, "contract", "init", "bag", "-o", "bag.yaml").returncode == 0
+    before = load_contract(tmp_path / "bag.yaml").contract
+    assert before.signals == ()
+    assert [each.topic for each in before.observations] == ["/abandoned", "/joint_states"]
+    text = (tmp_path / "bag.yaml").read_text()
+    (tmp_path / "bag.yaml").write_text(text.replace("\n  #  ", "\n   ").replace("\n  # signals", "\n  signals"))
+    found = [
+        (each.key, each.topic, *each.select, each.align)
+        for each in load_contract(tmp_path / "bag.yaml").contract.signals
+    ]
+    assert found == [
+        ("next.reward", "/agent/reward", "data.0", "next"),
+        ("next.done", "/episodeDone", "data", "hold"),
+        ("task", "/task/instruction", "data", "hold"),
+    ]
+    done = ibrobot(tmp_path, "convert", "bag", "--config", "bag.yaml", "--out", "set")
+    assert done.returncode == 0, done.stderr
+    table = pq.read_table(tmp_path / "set/data/chunk-000/file-000.parquet").to_pydict()
+    assert {row for row in table["next.reward"]} == {0.5}
+    assert {row for row in table["next.done"]} == {False}
+
+
+def test_two_topics_of_a_camera_are_drafted_with_names_of_their_own(tmp_path: Path) -> None:
+    picture = Image(Header(START_NS), *SIZE, "rgb8", SIZE[1] * 3, numbered(1).ravel())
+    topics = ("/camera/top/image_raw", "/camera/top/image_raw/compressed")
+    write(tmp_path / "bag", [(START_NS, topic, picture) for topic in topics])
+    assert ibrobot(tmp_path, "contract", "init", "bag", "-o", "bag.yaml").returncode == 0
+    assert (tmp_path / "bag.yaml").read_text().count("CHOOSE: another topic") == 2
+    keys = [each.key for each in load_contract(tmp_path / "bag.yaml").contract.observations]
+    assert keys == ["observation.images.camera_top_image_raw", "observation.images.camera_top_image_raw_compressed"]
 
 
 MISTAKES = {

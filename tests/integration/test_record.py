@@ -64,7 +64,7 @@ def test_an_operator_records_by_keys(tmp_path: Path):
         terminal.type("\x1b[24~")  # F12
         terminal.wait_for("episode 2: discarded")
         terminal.type("\x03")  # once: a second one ends it at once
-        terminal.wait_for("recorded   1 episodes")
+        terminal.wait_for("recorded   1 episode into")
         assert terminal.end() == 0
     (kept,) = outcomes(tmp_path / "desk")
     assert kept[:2] == ("success", "wave")

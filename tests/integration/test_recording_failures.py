@@ -326,7 +326,7 @@ class TestOtherContract:
         assert done.code == 1
         assert "left out mixed/episode_000002: its contract differs from that of mixed/episode_000001:" in done.err
         assert "this episode: 20.0" in done.err
-        assert "1 episodes, " in done.out
+        assert "1 episode, " in done.out
 
     def test_verify_tells(self, run: Run, other: Path):
         done = run("episodes", "verify", other)

@@ -25,6 +25,7 @@ from ibrobot_core.api import (
     Flag,
     echo,
     installed_plugins,
+    plural,
     with_closed_ends,
 )
 from ibrobot_data.request import MISSING, OUTCOMES, EpisodeReport, Report, Request
@@ -270,7 +271,8 @@ def _tell(report: Report) -> None:
         echo(f"nothing was added to {report.out}")
         return
     resumed = f", {report.resumed} of them by an earlier run" if report.resumed else ""
-    echo(f"{len(done)} episodes, {summary['frames']} frames{resumed} -> {report.out}")
+    episodes, frames = plural(len(done), "episode"), plural(summary["frames"], "frame")
+    echo(f"{len(done)} {episodes}, {summary['frames']} {frames}{resumed} -> {report.out}")
     echo(
         f"gaps {summary['gaps']} (ticks skipped {summary['skipped_ticks']}, held {summary['held_ticks']}), "
         f"messages lost in recording {summary['lost_messages']}"
@@ -279,7 +281,8 @@ def _tell(report: Report) -> None:
         if each.skipped > _MUCH * (each.frames + each.skipped):
             echo(f"cut {each.source}: {each.skipped} of {each.frames + each.skipped} ticks are left out", err=True)
     if cuts := [ticks for each in done for _, ticks in each.cuts]:
-        echo(f"left out where something was missing: {len(cuts)} times, at most {max(cuts)} ticks in a row")
+        times, ticks = plural(len(cuts), "time"), plural(max(cuts), "tick")
+        echo(f"left out where something was missing: {len(cuts)} {times}, at most {max(cuts)} {ticks} in a row")
     for what, of_each in (
         ("missing for a time", [each.gaps for each in done]), ("stamps that jumped", [each.resets for each in done]),
         ("lost in recording", [each.lost for each in done]), ("missing since", [each.missing for each in done]),
@@ -287,5 +290,5 @@ def _tell(report: Report) -> None:
         if counts := sum(map(Counter, of_each), Counter[str]()):
             echo(f"{what}: {', '.join(f'{name} {count}' for name, count in counts.most_common())}")
     if summary["without_prompt"]:
-        echo(f"{summary['without_prompt']} without a prompt: their task is empty; --prompt TEXT gives them one")
+        echo(f"without a prompt, so with an empty task: {summary['without_prompt']}; --prompt TEXT gives them one")
     echo(f"{summary['size_bytes'] / _MIB:.1f} MiB in {report.seconds:.1f} s")

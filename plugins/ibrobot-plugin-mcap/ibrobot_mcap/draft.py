@@ -4,19 +4,37 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import count, islice
 from typing import Any
 
 import attrs
 import numpy as np
 
-from ibrobot_core.api import MESSAGE_TYPES, NS_PER_S, Float64MultiArray, Image, JointState, Message, RecorderError
+from ibrobot_core.api import (
+    MESSAGE_TYPES,
+    NS_PER_S,
+    Float64MultiArray,
+    Image,
+    JointState,
+    Message,
+    RecorderError,
+    String,
+)
 from ibrobot_mcap.reader import Rosbag2Reader
 
 _COMMAND = re.compile(r"command|cmd|action|goal|target|leader|trajectory|desired")
 """In the names of topics that rather tell a robot something than what it is."""
-_COMMON = frozenset(("camera", "image", "image_raw", "image_rect", "compressed", "color", "rgb", "raw"))
+_COMMON = frozenset(
+    ("camera", "image", "image_raw", "image_rect", "compressed", "compresseddepth", "color", "rgb", "raw")
+)
+_SIGNALS = {
+    "next.reward": re.compile(r"reward|return|score"),
+    "next.done": re.compile(r"done|terminal|terminated|truncated|finished|success|succeeded"),
+    "task": re.compile(r"task|prompt|instruction|language"),
+}
+"""Key of a signal -> words in the names of topics that may have it."""
 _LOOKED_AT = 30
 """Messages of a topic that tell its rate."""
 _MOST = 64
@@ -33,8 +51,18 @@ class _Topic:
 
     name: str
     type: str
+    count: int
     rate_hz: float
     first: Message
+
+    @property
+    def signal(self) -> str:
+        """The key of the signal that it looks like; empty where it does not."""
+        words = re.split(r"[^a-z]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", self.name).lower())
+        if not isinstance(self.first, String) and len(_paths(self)) != 1:
+            return ""
+        keys = ["task"] if isinstance(self.first, String) else ["next.reward", "next.done"]
+        return next((key for key in keys if any(_SIGNALS[key].fullmatch(word) for word in words)), "")
 
     @property
     def is_command(self) -> bool:
@@ -49,7 +77,9 @@ def draft(reader: Rosbag2Reader) -> str:
         RecorderError: when the bag has nothing that a contract could have.
     """
     summary = reader.summary()
-    topics = [found for name in summary.topics if (found := _topic(reader, name))]
+    found = [topic for name, each in summary.topics.items() if (topic := _topic(reader, name, each.count))]
+    signals = [topic for topic in found if topic.signal]
+    topics = [topic for topic in found if topic not in signals]
     cameras = [topic for topic in topics if isinstance(topic.first, Image)]
     vectors = [topic for topic in topics if topic not in cameras and any(_numbers(topic.first))]
     if not cameras and not vectors:
@@ -62,16 +92,18 @@ def draft(reader: Rosbag2Reader) -> str:
     lines.append("  observations:")
     for topic in states:
         lines += _state(topic)
+    names = Counter(_name(topic.name) for topic in cameras)
     for topic in cameras:
-        lines += _camera(topic)
+        lines += _camera(topic, alone=names[_name(topic.name)] == 1)
     lines.append("  actions:" if actions else "  actions: []  # CHOOSE: no topic looks like commands; see above")
     unnamed = count()
     for topic in actions:
         lines += _action(topic, unnamed)
+    lines += _signals(signals)
     return "\n".join(lines) + "\n"
 
 
-def _topic(reader: Rosbag2Reader, name: str) -> _Topic | None:
+def _topic(reader: Rosbag2Reader, name: str, messages: int) -> _Topic | None:
     """What is known of a topic; None without a message that can be read."""
     try:
         found = list(islice(reader.messages({name}), _LOOKED_AT))
@@ -81,7 +113,7 @@ def _topic(reader: Rosbag2Reader, name: str) -> _Topic | None:
         return None
     periods = np.diff([item.received_ns for item in found])
     rate_hz = NS_PER_S / float(np.median(periods)) if periods.size and np.median(periods) > 0 else 0.0
-    return _Topic(name, found[0].message.ros_type, rate_hz, found[0].message)
+    return _Topic(name, found[0].message.ros_type, messages, rate_hz, found[0].message)
 
 
 def _state(topic: _Topic) -> list[str]:
@@ -100,10 +132,13 @@ def _state(topic: _Topic) -> list[str]:
     ]
 
 
-def _camera(topic: _Topic) -> list[str]:
+def _camera(topic: _Topic, *, alone: bool) -> list[str]:
+    """Of a camera's topic; `alone`: no other has the same short name."""
     picture: Any = topic.first
+    name = _name(topic.name) if alone else "_".join(topic.name.strip("/").split("/"))
+    remark = "" if alone else "  # CHOOSE: another topic has the same camera, it seems; keep one"
     tolerance_ms = round(3000 / max(topic.rate_hz, 1))
-    lines = [f"    - key: {_quoted(f'observation.images.{_name(topic.name)}')}", *_source(topic)]
+    lines = [f"    - key: {_quoted(f'observation.images.{name}')}{remark}", *_source(topic)]
     if picture.encoding in ("16UC1", "32FC1", "mono8"):
         lines.append(f"      image: {{encoding: {picture.encoding}}}")
     return [
@@ -130,8 +165,28 @@ def _action(topic: _Topic, unnamed: Iterator[int]) -> list[str]:
     ]
 
 
+def _signals(topics: Sequence[_Topic]) -> Iterator[str]:
+    """Commented out: rows begin with the first message of a signal, so a wrong one may cost all of them."""
+    if topics:
+        yield "  # CHOOSE: uncomment what each row of the dataset shall have; rows begin when every signal has come."
+        yield "  # hold is the newest message at a row; next is the first after it, as of a reward for each step."
+        yield "  # signals:"
+    for topic in sorted(topics, key=lambda topic: list(_SIGNALS).index(topic.signal)):
+        path = "data" if topic.signal == "task" else _paths(topic)[0]
+        yield f"  #   - key: {topic.signal}"
+        yield f"  #     topic: {_quoted(topic.name)}  # {_rate(topic)}"
+        yield f"  #     type: {topic.type}"
+        yield f"  #     select: [{_quoted(path)}]"
+        yield f"  #     align: {'next' if topic.signal == 'next.reward' else 'hold'}"
+
+
+def _rate(topic: _Topic) -> str:
+    """How often it speaks: a few messages have no rate."""
+    return f"{topic.rate_hz:.1f} Hz" if topic.count >= _LOOKED_AT else f"messages: {topic.count}"
+
+
 def _source(topic: _Topic) -> Iterator[str]:
-    yield f"      topic: {_quoted(topic.name)}  # {topic.rate_hz:.1f} Hz"
+    yield f"      topic: {_quoted(topic.name)}  # {_rate(topic)}"
     yield f"      type: {topic.type}"
     if topic.type not in MESSAGE_TYPES:
         yield "      foreign: true"

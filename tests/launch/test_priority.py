@@ -1,4 +1,4 @@
-"""The threads that read sensors: their priority beside other programs."""
+"""Workers' threads: their priority beside other programs."""
 
 from __future__ import annotations
 
