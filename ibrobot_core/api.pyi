@@ -168,7 +168,6 @@ from ibrobot_core.calibration import (
     save_calibration as save_calibration,
 )
 from ibrobot_core.contract.specs import (
-    TASK_KEY as TASK_KEY,
     ActionPart as ActionPart,
     Contract as Contract,
     ObservationPart as ObservationPart,
@@ -178,10 +177,10 @@ from ibrobot_core.contract.compose import Composer as Composer
 from ibrobot_core.contract.frames import FrameAssembler as FrameAssembler, assemble as assemble
 from ibrobot_core.contract.joint_units import JointUnits as JointUnits
 from ibrobot_core.contract.joint_units import with_closed_ends as with_closed_ends
-from ibrobot_core.contract.select import text_at as text_at
+from ibrobot_core.selection import text_at as text_at
 from ibrobot_core.config import RobotConfig as RobotConfig, find_config as find_config, load_config as load_config
 from ibrobot_core.config.load import load_contract as load_contract
-from ibrobot_core.config.schema import Align as Align
+from ibrobot_core.config.schema import TASK_KEY as TASK_KEY, Align as Align
 from ibrobot_core.config.expand import resolve_path as resolve_path
 from ibrobot_core.config.convert import Converter as Converter, Faults as Faults
 from ibrobot_core.config.overrides import apply_overrides as apply_overrides

@@ -43,13 +43,12 @@ def check(
 ) -> None:  # fmt: skip
     """Tell everything that is wrong with CONFIG; exit 2 if anything is."""
     from ibrobot_core.config import find_config, load_config
-    from ibrobot_core.launch.models import check_contract, check_models
+    from ibrobot_core.launch.models import check_models
     from ibrobot_core.plugins import installed_plugins
 
     try:
         path = find_config(config, installed_plugins())
         found = load_config(path, overrides=overrides, mode=mode, sim=sim)
-        check_contract(found)
         models = check_models(found, installed_plugins(), found.control_modes) if deep else []
     except ConfigError as error:
         if not as_json:

@@ -1,4 +1,4 @@
-"""The contract against the robot: what it names must exist, and what it may leave out is filled in."""
+"""The contract's rules: what it names must exist and fit together, and what it may leave out is filled in."""
 
 from __future__ import annotations
 
@@ -9,11 +9,20 @@ import attrs
 
 from ibrobot_core import messages
 from ibrobot_core.config.checks import streams
-from ibrobot_core.config.schema import ActionSpec, ContractConfig, ExecutorComponent, ObservationSpec, SignalSpec
+from ibrobot_core.config.schema import (
+    TASK_KEY,
+    ActionSpec,
+    ContractConfig,
+    ExecutorComponent,
+    ObservationSpec,
+    SignalSpec,
+)
 from ibrobot_core.config.structure import Part, Parts
 from ibrobot_core.config.yaml_nodes import Document, Key
+from ibrobot_core.errors import ContractError
 from ibrobot_core.executor_options import StreamOptions
 from ibrobot_core.options import did_you_mean
+from ibrobot_core.selection import Selection
 
 JOINT_STATES = "/joint_states"
 PERIPHERAL_TOPICS: Mapping[str, tuple[str, type[messages.Message]]] = {
@@ -22,7 +31,7 @@ PERIPHERAL_TOPICS: Mapping[str, tuple[str, type[messages.Message]]] = {
 """Peripheral kind -> where its messages go, and their type."""
 
 SIGNAL_TYPES: Mapping[str, str] = {
-    "task": messages.String.ros_type,
+    TASK_KEY: messages.String.ros_type,
     "next.reward": "std_msgs/msg/Float32",
     "next.done": messages.Bool.ros_type,
 }
@@ -34,10 +43,14 @@ _TYPE_NAME = re.compile(r"[A-Za-z]\w*/msg/[A-Za-z]\w*", re.ASCII)
 _JOINT_FIELDS = ("position", "velocity", "effort")
 
 
-def message_types() -> dict[str, type[messages.Message]]:
-    """ROS 2 name -> class, for every message that core knows."""
-    found = (value for value in vars(messages).values() if isinstance(value, type))
-    return {m.ros_type: m for m in found if issubclass(m, messages.Message) and m.ros_type}
+def completed(spec: ObservationSpec, kind: str = "") -> ObservationSpec:
+    """An observation with the topic and type that its peripheral, of this kind, or its topic implies."""
+    if spec.peripheral is not None and kind in PERIPHERAL_TOPICS:
+        topic, message_type = PERIPHERAL_TOPICS[kind]
+        return attrs.evolve(spec, topic=topic.format(name=spec.peripheral), type=message_type.ros_type)
+    if spec.topic == JOINT_STATES and not spec.type:
+        return attrs.evolve(spec, type=messages.JointState.ros_type)
+    return spec
 
 
 @attrs.frozen
@@ -63,6 +76,7 @@ class ContractChecks:
         given = contract.actions
         before = len(self.document.problems)
         actions = tuple(self._action((*key, "actions", i), spec, given[:i]) for i, spec in enumerate(given))
+        self._each_joint_once((*key, "actions"), actions)
         for mode_name, mode in (self.parts.plain.get("control_modes") or {}).items():
             if mode.inference is not None and len(self.document.problems) == before:
                 self._driven(("control_modes", mode_name), mode.executors, contract)
@@ -87,14 +101,13 @@ class ContractChecks:
             return spec
         if not spec.topic.startswith("/"):
             self.document.add((*key, "topic"), f"a topic starts with /, got {spec.topic!r}")
-        if not spec.type and spec.topic == JOINT_STATES:
-            spec = attrs.evolve(spec, type=messages.JointState.ros_type)
+        spec = completed(spec)
         if not spec.type:
             self.document.add(key, f"needs a type, since that of {spec.topic} is not known by itself")
         elif spec.foreign:
             self._foreign(key, spec)
-        elif spec.type not in message_types():
-            known = sorted(message_types())
+        elif spec.type not in messages.MESSAGE_TYPES:
+            known = sorted(messages.MESSAGE_TYPES)
             self.document.add(
                 (*key, "type"),
                 f"unknown message type {spec.type!r}{did_you_mean(spec.type, known, 'known')} "
@@ -108,7 +121,7 @@ class ContractChecks:
 
     def _foreign(self, key: Key, spec: ObservationSpec) -> None:
         """What can be known of a type whose definition only the bag to convert has."""
-        if spec.type in message_types():
+        if spec.type in messages.MESSAGE_TYPES:
             self.document.add((*key, "foreign"), f"{spec.type} is known here; leave foreign out")
         elif not _TYPE_NAME.fullmatch(spec.type):
             self.document.add((*key, "type"), f"expected PACKAGE/msg/NAME, got {spec.type!r}")
@@ -134,8 +147,7 @@ class ContractChecks:
             message = f"the topic of a peripheral of kind {kind!r} is not known by itself; give topic and type instead"
             self.document.add((*key, "peripheral"), message)
             return spec
-        topic, message_type = PERIPHERAL_TOPICS[kind]
-        spec = attrs.evolve(spec, topic=topic.format(name=spec.peripheral), type=message_type.ros_type)
+        spec = completed(spec, kind)
         self._fits(key, spec)
         return spec
 
@@ -146,31 +158,34 @@ class ContractChecks:
             self.document.add((*key, "image"), f"needs a camera; {spec.topic} carries {spec.type}")
         if spec.key.startswith(_IMAGE_KEYS) and not is_image:
             self.document.add((*key, "key"), f"{spec.key} needs a camera; {spec.topic} carries {spec.type}")
+        elif not spec.select and not is_image:
+            self._size(key, spec.type, ())
         for i, path in enumerate(spec.select):
             self._select((*key, "select", i), path, spec)
 
     def _select(self, key: Key, path: str, spec: ObservationSpec) -> None:
-        first, _, rest = path.partition(".")
         if spec.type in _IMAGES:
             self.document.add(key, "nothing can be selected from an image")
-        elif spec.type == messages.JointState.ros_type:
-            if first not in _JOINT_FIELDS or not rest:
+            return
+        if spec.type == messages.JointState.ros_type:
+            field, _, joint = path.partition(".")
+            if field not in _JOINT_FIELDS or not joint:
                 fields = " or ".join(f"{field}.JOINT" for field in _JOINT_FIELDS)
                 self.document.add(key, f"expected {fields}, got {path!r}")
                 return
             robot = self.parts.plain.get("robot")
-            joints = list(robot.joint_names) if robot is not None else [rest]
-            if spec.topic == JOINT_STATES and rest not in joints:
-                self.document.add(key, f"unknown joint {rest!r}{did_you_mean(rest, joints, 'known')}")
-        else:
-            self._field(key, path, spec.type)
+            joints = list(robot.joint_names) if robot is not None else [joint]
+            if spec.topic == JOINT_STATES and joint not in joints:
+                self.document.add(key, f"unknown joint {joint!r}{did_you_mean(joint, joints, 'known')}")
+        self._size(key, spec.type, (path,))
 
-    def _field(self, key: Key, path: str, type_: str) -> None:
-        """See that a known type has the field that a path begins with."""
-        first = path.partition(".")[0]
-        names = [field.name for field in attrs.fields(message_types()[type_])]
-        if first not in names:
-            self.document.add(key, f"{type_} has no field {first!r}{did_you_mean(first, names, 'its fields')}")
+    def _size(self, key: Key, type_: str, select: Sequence[str], *, foreign: bool = False) -> int | None:
+        """How many numbers paths lead to in messages of a type; None with the fault noted where they lead to none."""
+        try:
+            return Selection(type_, select, foreign=foreign).size
+        except ContractError as error:
+            self.document.add(key, str(error))
+            return None
 
     def _same_kind(self, key: Key, specs: Sequence[ObservationSpec], others: Sequence[ObservationSpec]) -> None:
         """Values under one key concatenate, which an image and a vector cannot."""
@@ -239,6 +254,31 @@ class ContractChecks:
             example = "points.0.positions.0" if spec.type.endswith("JointTrajectory") else "data.0"
             message = f"needs a select: paths to numbers of {spec.type}, one for each joint, e.g. {example}"
             self.document.add(key, message)
+        elif spec.select:
+            self._one_number_a_joint((*key, "select"), spec)
+
+    def _one_number_a_joint(self, key: Key, spec: ActionSpec) -> None:
+        size, joints = self._size(key, spec.type, spec.select, foreign=True), self._joints(spec)
+        if size is not None and joints and size != len(joints):
+            given = "a length that only messages know" if size < 0 else f"{size} numbers"
+            message = f"gives {given} for the {len(joints)} joints of {spec.executor!r}: {', '.join(joints)}"
+            self.document.add(key, message)
+
+    def _joints(self, spec: ActionSpec) -> tuple[str, ...]:
+        """The joints that an action's numbers are for; none where the faults of others keep them unknown."""
+        part, robot = self.parts.executors.get(spec.executor), self.parts.plain.get("robot")
+        if part is None or robot is None:
+            return spec.joints
+        return tuple(dict.fromkeys(robot.groups.get(part.component.group, ())))
+
+    def _each_joint_once(self, key: Key, actions: Sequence[ActionSpec]) -> None:
+        owners: dict[str, str] = {}
+        for i, spec in enumerate(actions):
+            joints = self._joints(spec)
+            twice = next((each for n, each in enumerate(joints) if each in owners or each in joints[:n]), None)
+            if twice is not None and owners.get(twice) != spec.executor:
+                self.document.add((*key, i), f"joint {twice!r} is in the action vector already; each is in it once")
+            owners |= dict.fromkeys(joints, spec.executor)
 
     def _signal(self, key: Key, spec: SignalSpec, earlier: Sequence[SignalSpec]) -> SignalSpec:
         spec = attrs.evolve(spec, type=spec.type or SIGNAL_TYPES[spec.key])
@@ -250,9 +290,20 @@ class ContractChecks:
             self.document.add((*key, "key"), f"{spec.key} is given twice; a row has one")
         if len(spec.select) != 1:
             self.document.add((*key, "select"), f"{spec.key} takes one path, e.g. [data]")
-        elif spec.type in message_types():
-            self._field((*key, "select", 0), spec.select[0], spec.type)
+        elif spec.key == TASK_KEY:
+            self._text((*key, "select", 0), spec)
+        elif self._size((*key, "select", 0), spec.type, spec.select, foreign=True) not in (1, None):
+            path = spec.select[0]
+            self.document.add((*key, "select", 0), f"{path!r} must lead to one number, e.g. {path}.0")
         return spec
+
+    def _text(self, key: Key, spec: SignalSpec) -> None:
+        """See that a known type has the field that the path to its text begins with."""
+        first = spec.select[0].partition(".")[0]
+        known = messages.MESSAGE_TYPES.get(spec.type)
+        names = [field.name for field in attrs.fields(known)] if known is not None else [first]
+        if first not in names:
+            self.document.add(key, f"{spec.type} has no field {first!r}{did_you_mean(first, names, 'its fields')}")
 
     def _safety(self, key: Key, spec: ActionSpec, part: Part[ExecutorComponent]) -> ActionSpec:
         """One answer to what follows stale setpoints, in both, whether the action or the executor gives it."""

@@ -237,13 +237,17 @@ class ActionSpec:
     joints: tuple[str, ...] = option((), help="in a file with a contract alone: names of its numbers, in order")
 
 
+TASK_KEY = "task"
+"""Key of the signal that is text: what a policy is asked to do."""
+
+
 @documented
 @attrs.frozen
 class SignalSpec:
     """One topic that says something of the rows of a dataset which no policy sees."""
 
     key: str = option(
-        choices=("task", "next.reward", "next.done"), help="task: text, in place of the prompt; the others: a number"
+        choices=(TASK_KEY, "next.reward", "next.done"), help="task: text, in place of the prompt; the others: a number"
     )
     topic: str = option(help="where the messages come from")
     type: str = option("", help="ROS 2 message type; of std_msgs, and String, Float32 or Bool, where it is not given")

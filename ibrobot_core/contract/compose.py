@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from ibrobot_core.contract.encode import action_messages
 from ibrobot_core.contract.image import encode_image
-from ibrobot_core.contract.select import Leaf, Selection
 from ibrobot_core.contract.specs import Contract, ObservationPart
 from ibrobot_core.errors import ContractError
 from ibrobot_core.messages import MESSAGE_TYPES, Header, JointState, Message
+from ibrobot_core.selection import Leaf, Selection
 
 _ACTION = "action"
 

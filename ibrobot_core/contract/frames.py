@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from ibrobot_core.bus import Bus, Received
 from ibrobot_core.contract.align import Sample, Stream
 from ibrobot_core.contract.image import decode_image
-from ibrobot_core.contract.select import Selection
 from ibrobot_core.contract.specs import Contract, ObservationPart
 from ibrobot_core.errors import ContractError
 from ibrobot_core.interfaces.policy import Frame
 from ibrobot_core.messages import MESSAGE_TYPES, CompressedImage, Message
+from ibrobot_core.selection import Selection
 
 _IMAGE_DEPTH = 32
 _VECTOR_DEPTH = 256

@@ -10,17 +10,15 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.config.schema import ActionSpec, Align, ImageSpec, ObservationSpec, RobotConfig, SignalSpec
-from ibrobot_core.contract.select import Selection
+from ibrobot_core.config.contract_checks import completed
+from ibrobot_core.config.schema import ActionSpec, Align, ImageSpec, ObservationSpec, RobotConfig
 from ibrobot_core.errors import ContractError
 from ibrobot_core.interfaces.dataset import Feature
 from ibrobot_core.messages import MESSAGE_TYPES
+from ibrobot_core.selection import Selection
 from ibrobot_core.units import NS_PER_S
 
-TASK_KEY = "task"
-"""Key of the signal that is text: what a policy is asked to do."""
 _JOINTS_TYPE = "sensor_msgs/msg/JointState"
-_KNOWN_TYPES = {"/joint_states": _JOINTS_TYPE}
 _CAMERA_TYPE = "sensor_msgs/msg/Image"
 _COMPRESSED_TYPE = "sensor_msgs/msg/CompressedImage"
 _IMAGE_DTYPES = {"16UC1": "uint16", "32FC1": "float32"}
@@ -93,26 +91,18 @@ class Contract:
 
     @classmethod
     def from_config(cls, config: RobotConfig, extra: Sequence[ObservationSpec] = ()) -> Contract:
-        """The contract of a robot YAML.
+        """The contract of a robot YAML, whose rules loading has checked.
 
         Args:
             config: the robot.
             extra: further observations, e.g. a model's `extra_observations`; under a key that exists they concatenate.
-
-        Raises:
-            ContractError: for a spec that cannot be met, e.g. a path that its message does not have.
         """
         parts = tuple(_observation(spec, config) for spec in (*config.contract.observations, *extra))
         actions = tuple(_action(spec, config) for spec in config.contract.actions)
-        signals = tuple(_signal(spec) for spec in config.contract.signals)
-        contract = cls(float(config.contract.rate_hz), parts, actions, signals)
-        twice = [joint for joint in contract.action_joints if contract.action_joints.count(joint) > 1]
-        if twice:
-            raise ContractError(f"joint {twice[0]!r} is in two parts of the action; each joint has one executor")
-        for key in contract.observations:
-            if len(pieces := contract.parts(key)) > 1 and any(part.image for part in pieces):
-                raise ContractError(f"{key} has several specs and one is an image; only vectors concatenate")
-        return contract
+        signals = tuple(
+            SignalPart(spec.key, spec.topic, spec.type, spec.select[0], spec.align) for spec in config.contract.signals
+        )
+        return cls(float(config.contract.rate_hz), parts, actions, signals)
 
     @classmethod
     def from_canonical(cls, canonical: Mapping[str, Any]) -> Contract:
@@ -141,7 +131,7 @@ class Contract:
                 for part in canonical["action"]
             ]
             signals = tuple(
-                _signal(SignalSpec(each["key"], each["topic"], each["type"], (each["path"],), each["align"]))
+                SignalPart(each["key"], each["topic"], each["type"], each["path"], each["align"])
                 for each in canonical.get("signals", ())
             )
             contract = cls(float(canonical["rate_hz"]), tuple(parts), tuple(actions), signals)
@@ -230,40 +220,21 @@ class Contract:
 
 
 def _observation(spec: ObservationSpec, config: RobotConfig) -> ObservationPart:
-    """Fill in topic, type and paths of a spec, and find its shape."""
-    topic, type_, size = spec.topic, spec.type or _KNOWN_TYPES.get(spec.topic, ""), None
-    if spec.peripheral is not None:
-        peripheral = config.peripherals.get(spec.peripheral)
-        if peripheral is None:
-            known = ", ".join(config.peripherals) or "none"
-            raise ContractError(f"{spec.key}: no peripheral {spec.peripheral!r}; the peripherals are: {known}")
-        if peripheral.kind == "camera":
-            size = peripheral.picture
-            topic, type_ = topic or f"/camera/{peripheral.name}/image_raw", type_ or _CAMERA_TYPE
-    if not topic or not type_:
-        example = f"type: {_CAMERA_TYPE}" if topic else "topic: /imu"
-        raise ContractError(f"{spec.key}: nothing says where it comes from, add for example {example}")
-    if type_ not in MESSAGE_TYPES and spec.foreign and spec.select:
-        return _foreign_observation(spec.key, topic, type_, spec.select, spec.align)
-    if type_ not in MESSAGE_TYPES:
-        raise ContractError(f"{spec.key}: unknown message type {type_!r}; known: {', '.join(MESSAGE_TYPES)}")
-    if type_ == _COMPRESSED_TYPE:
-        type_ = _CAMERA_TYPE  # a picture is a picture, however it is sent
+    """Find the paths and the shape of a spec."""
+    peripheral = config.peripherals[spec.peripheral] if spec.peripheral is not None else None
+    spec = completed(spec, peripheral.kind if peripheral is not None else "")
+    if spec.type not in MESSAGE_TYPES:
+        return _foreign_observation(spec.key, spec.topic, spec.type, spec.select, spec.align)
+    type_ = _CAMERA_TYPE if spec.type == _COMPRESSED_TYPE else spec.type  # a picture is a picture, however it is sent
     has_header = "header" in attrs.fields_dict(MESSAGE_TYPES[type_])
     align = spec.align if has_header else attrs.evolve(spec.align, stamp="receive")
     if type_ == _CAMERA_TYPE:
         image = spec.image or ImageSpec()
-        if spec.select:
-            raise ContractError(f"{spec.key}: select has no meaning for an image; leave it out")
-        return ObservationPart(spec.key, topic, type_, (), image, align, _image_feature(image, size))
-    if spec.image is not None:
-        raise ContractError(f"{spec.key}: image has no meaning for {type_}; it belongs to {_CAMERA_TYPE}")
-    try:
-        selection = Selection(type_, spec.select, config.robot.joint_names)
-    except ContractError as error:
-        raise ContractError(f"{spec.key}: {error}") from None
+        size = peripheral.picture if peripheral is not None else None
+        return ObservationPart(spec.key, spec.topic, type_, (), image, align, _image_feature(image, size))
+    selection = Selection(type_, spec.select, config.robot.joint_names)
     feature = Feature("float32", (selection.size,), selection.names)
-    return ObservationPart(spec.key, topic, type_, selection.paths, None, align, feature)
+    return ObservationPart(spec.key, spec.topic, type_, selection.paths, None, align, feature)
 
 
 def _foreign_observation(key: str, topic: str, type_: str, select: Sequence[str], align: Align) -> ObservationPart:
@@ -295,37 +266,11 @@ def _image_feature(image: ImageSpec, size: tuple[int, int] | None) -> Feature:
 
 
 def _action(spec: ActionSpec, config: RobotConfig) -> ActionPart:
-    executor = config.executors.get(spec.executor)
-    if executor is None:
-        known = ", ".join(config.executors) or "none"
-        raise ContractError(f"{spec.key}: no executor {spec.executor!r}; the executors are: {known}")
-    select = tuple(spec.select)
+    executor = config.executors[spec.executor]
+    select = spec.select
     if not select and spec.type == _JOINTS_TYPE:
         select = tuple(f"position.{joint}" for joint in executor.joints)
-    if select:
-        try:
-            size = Selection(spec.type, select, foreign=spec.foreign).size
-        except ContractError as error:
-            raise ContractError(f"{spec.key}: {spec.topic}: {error}") from None
-        if size != len(executor.joints):
-            told = "a length that only messages know" if size < 0 else f"{size} numbers"
-            raise ContractError(
-                f"{spec.key}: {spec.topic}: select gives {told}, executor {spec.executor!r} has "
-                f"{len(executor.joints)} joints: {', '.join(executor.joints)}"
-            )
     return ActionPart(executor.name, spec.topic, spec.type, spec.safety_behavior, executor.joints, select, spec.align)
-
-
-def _signal(spec: SignalSpec) -> SignalPart:
-    (path,) = spec.select
-    if spec.key != TASK_KEY:
-        try:
-            size = Selection(spec.type, spec.select, foreign=True).size
-        except ContractError as error:
-            raise ContractError(f"{spec.key}: {spec.topic}: {error}") from None
-        if size != 1:
-            raise ContractError(f"{spec.key}: {spec.topic}: {path!r} must lead to one number, e.g. {path}.0")
-    return SignalPart(spec.key, spec.topic, spec.type, path, spec.align)
 
 
 def _joined(features: list[Feature]) -> Feature:

@@ -18,20 +18,6 @@ from ibrobot_core.interfaces import Policy, PolicySpec
 from ibrobot_core.plugins import Registry
 
 
-def check_contract(config: RobotConfig) -> None:
-    """Whether the contract can be computed, of the robot and with what each model sees beyond it.
-
-    Raises:
-        ConfigError: where it cannot.
-    """
-    extras = {f"models.{name}.extra_observations": model.extra_observations for name, model in config.models.items()}
-    for path, extra in {"contract": (), **extras}.items():
-        try:
-            Contract.from_config(config, extra)
-        except ContractError as error:
-            raise ConfigError([Problem(config.source, 0, path, str(error))]) from None
-
-
 def check_model(config: RobotConfig, model: ModelConfig, spec: PolicySpec, log: logging.Logger) -> JointUnits | None:
     """Compare a policy with the contract, and with the modes that use it.
 

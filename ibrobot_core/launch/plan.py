@@ -13,7 +13,6 @@ from ibrobot_core.errors import ComponentFailed, NotSupported
 from ibrobot_core.launch.absence import describe, refuse
 from ibrobot_core.launch.control import NAME as CONTROL
 from ibrobot_core.launch.control import Control
-from ibrobot_core.launch.models import check_contract
 from ibrobot_core.launch.outputs.metrics import MetricsPort
 from ibrobot_core.launch.outputs.sharing import PublishedTopic, SubscribedTopics
 from ibrobot_core.launch.outputs.status import Status
@@ -111,11 +110,9 @@ def build_plan(session: Session) -> LaunchPlan:
 
     Raises:
         MissingDependency: when something needs a sensor that cannot run on this machine.
-        ConfigError: as `check_contract`.
         NotSupported: for a contract with topics that only bags of others have.
     """
     config = session.config
-    check_contract(config)
     modes = config.control_modes.values()
     distributed = any(mode.inference and mode.inference.execution_mode == "distributed" for mode in modes)
     share = config.transport.share if config.transport is not None else Share()

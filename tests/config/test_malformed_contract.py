@@ -142,9 +142,46 @@ CASES = {
         "topic: /joint_states, select: [position.pan, position.lift, position.grip]",
         "topic: /imu, type: sensor_msgs/msg/Imu, select: [linear_aceleration.x]",
         (
-            "robot.yaml:35: contract.observations.0.select.0: sensor_msgs/msg/Imu has no field "
+            "robot.yaml:35: contract.observations.0.select.0: 'linear_aceleration.x': Imu has no field "
             "'linear_aceleration', did you mean 'linear_acceleration'?"
         ),
+    ),
+    "contract_select_deep": (
+        "topic: /joint_states, select: [position.pan, position.lift, position.grip]",
+        "topic: /imu, type: sensor_msgs/msg/Imu, select: [orientation.x, orientation.q]",
+        (
+            "robot.yaml:35: contract.observations.0.select.1: 'orientation.q': Quaternion has no field 'q'; there "
+            "are: x, y, z, w"
+        ),
+    ),
+    "contract_select_nothing": (
+        "topic: /joint_states, select: [position.pan, position.lift, position.grip]",
+        "topic: /text, type: std_msgs/msg/String",
+        "robot.yaml:35: contract.observations.0: std_msgs/msg/String needs a select: paths to its numbers, e.g. data",
+    ),
+    "contract_action_size": (
+        "executor: grip_position, topic: /grip/commands",
+        (
+            "executor: grip_position, topic: /grip, type: std_msgs/msg/Float64MultiArray, foreign: true, "
+            "select: [data.0, data.1]"
+        ),
+        ("robot.yaml:39: contract.actions.1.select: gives 2 numbers for the 1 joints of 'grip_position': grip"),
+    ),
+    "contract_action_joint_twice": (
+        "gripper: [grip]",
+        "gripper: [grip, pan]",
+        (
+            "robot.yaml:25: control_modes.policy.executors.1: executors 'arm_position' and 'grip_position' both claim "
+            "joint 'pan'\n"
+            "robot.yaml:27: control_modes.teleop.executors.1: executors 'arm_position' and 'grip_position' both claim "
+            "joint 'pan'\n"
+            "robot.yaml:39: contract.actions.1: joint 'pan' is in the action vector already; each is in it once"
+        ),
+    ),
+    "contract_signal_size": (
+        "  actions:\n",
+        "  signals: [{key: next.done, topic: /done, type: std_msgs/msg/Float64MultiArray}]\n  actions:\n",
+        "robot.yaml:37: contract.signals.0.select.0: 'data' must lead to one number, e.g. data.0",
     ),
     "contract_image_of_joints": (
         "topic: /joint_states,",

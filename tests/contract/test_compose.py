@@ -12,10 +12,10 @@ from ibrobot_core.config.schema import Align, ImageSpec
 from ibrobot_core.contract.compose import Composer
 from ibrobot_core.contract.frames import frames
 from ibrobot_core.contract.image import ENCODINGS
-from ibrobot_core.contract.select import Selection
 from ibrobot_core.contract.specs import ActionPart, Contract, ObservationPart
 from ibrobot_core.errors import ContractError
 from ibrobot_core.interfaces import Feature
+from ibrobot_core.selection import Selection
 
 STAMP_NS = 5_000_000_000
 JOINTS = "sensor_msgs/msg/JointState"

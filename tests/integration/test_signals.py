@@ -156,7 +156,7 @@ def test_signal_that_the_bag_does_not_have_is_named(
         ("topic: /done", "topic: done", "signals.2.topic: a topic starts with /, got 'done'"),
         ("topic: /done", "topic: /done, type: Bool", "signals.2.type: expected PACKAGE/msg/NAME, got 'Bool'"),
         ("topic: /done", "topic: /done, select: [a, b]", "signals.2.select: next.done takes one path, e.g. [data]"),
-        ("topic: /done", "topic: /done, select: [on]", "signals.2.select.0: std_msgs/msg/Bool has no field 'on'"),
+        ("topic: /done", "topic: /done, select: [on]", "signals.2.select.0: 'on': Bool has no field 'on'"),
         ("align: next", "align: asof", "signals.1.align: 'asof' is not one of: hold, next"),
     ],
 )

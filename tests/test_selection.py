@@ -11,7 +11,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ibrobot_core.contract.select import Selection
 from ibrobot_core.errors import ContractError
 from ibrobot_core.messages import (
     Bool,
@@ -32,6 +31,7 @@ from ibrobot_core.messages import (
     Twist,
     Vector3,
 )
+from ibrobot_core.selection import Selection
 
 NAMES = ("shoulder_pan", "left.elbow", "gripper", "joint/4")
 QUATERNION = Quaternion(0.1, 0.2, 0.3, 0.9)
