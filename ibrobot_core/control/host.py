@@ -7,27 +7,17 @@ import logging
 import os
 import queue
 import select
-import socket
-import subprocess
-import sys
 import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from typing import Any, override
 
+from ibrobot_core.child import Child
 from ibrobot_core.clock import RealClock, SteppedClock
-from ibrobot_core.component import raise_thread_priority
 from ibrobot_core.config import RobotConfig
 from ibrobot_core.control.build import build_core
-from ibrobot_core.control.link import (
-    Channel,
-    ControlState,
-    Layout,
-    PlanRecord,
-    SharedMemory,
-    raise_error,
-)
+from ibrobot_core.control.link import ControlState, Layout, PlanRecord, SharedMemory, raise_error
 from ibrobot_core.control.timing import REPORT_TICKS, Punctuality
 from ibrobot_core.errors import ComponentFailed, HardwareError, IbrobotError
 from ibrobot_core.memory import create_memory
@@ -185,7 +175,7 @@ class ControlClient(ControlHost):
         self._config = config
         self._order = {
             "document": config.complete, "source": str(config.source), "sim": config.simulated, "seed": seed,
-            "mode": config.default_control_mode, "epoch_offset_ns": clock.epoch_offset_ns, "host": os.getpid(),
+            "mode": config.default_control_mode, "epoch_offset_ns": clock.epoch_offset_ns,
         }  # fmt: skip
         self._on_death = on_death
         self._given_up = given_up or threading.Event()
@@ -193,75 +183,66 @@ class ControlClient(ControlHost):
         self._replies: dict[int, queue.SimpleQueue[Mapping[str, Any]]] = {}
         self._ids = itertools.count(1)
         self._stopping = False
-        self._failure = ""
-        self._process: subprocess.Popen[bytes] | None = None
+        self._child: Child | None = None
+        self._memory: SharedMemory | None = None
         self._thread: threading.Thread | None = None
 
     @property
     def pid(self) -> int | None:
         """The process id of control, None before `start`."""
-        return self._process.pid if self._process is not None else None
+        return self._child.pid if self._child is not None else None
 
     @override
     def start(self) -> None:
-        ours, theirs = socket.socketpair()
         memory = create_memory()
         self._wake, wake = os.pipe()
-        command = [sys.executable, "-m", "ibrobot_core.control.process", str(theirs.fileno()), str(memory), str(wake)]
-        # A session of its own: Ctrl-C in the terminal is for the host, which then stops control in order.
-        self._process = subprocess.Popen(
-            command, pass_fds=(theirs.fileno(), memory, wake), stdin=subprocess.DEVNULL, start_new_session=True
-        )
-        theirs.close()
+        child = self._child = Child("ibrobot_core.control.process", self._order, memory, wake)
         os.close(wake)
-        self._channel = Channel(ours)
-        self._memory: SharedMemory | None = None
         self._descriptor = memory
-        self._channel.send(self._order)
         try:
-            self._await_ready()
+            self._await_ready(child)
         except IbrobotError:
-            self._channel.close()  # one that is not ready yet stops for it as soon as it is
-            self._end()
+            child.channel.close()  # one that is not ready yet stops for it as soon as it is
+            self._end(child)
             raise
-        self._thread = threading.Thread(target=self._receive, name="control link", daemon=True)
+        self._thread = threading.Thread(target=self._receive, args=(child,), name="control link", daemon=True)
         self._thread.start()
 
-    def _await_ready(self) -> None:
+    def _await_ready(self, child: Child) -> None:
         deadline_s = time.monotonic() + _START_TIMEOUT_S
         while self._memory is None:
             try:
-                messages = self._channel.wait(_GLANCE_S)
+                message = child.wait(_GLANCE_S)
             except ComponentFailed:
-                raise ComponentFailed(
-                    f"the control process died while starting ({self._exit()}){self._aftermath}"
-                ) from None
+                raise self._failure(child, "the control process died while starting") from None
             if self._given_up.is_set():
                 raise ComponentFailed("given up while control started")
             if time.monotonic() > deadline_s:
                 raise ComponentFailed(f"the control process was not ready after {_START_TIMEOUT_S:.0f} s")
-            for message in messages:
-                if message["event"] == "failed":
-                    self.holding = message["holding"]
-                    failure = HardwareError(message["error"])
-                    failure.exit_code = message["exit_code"]
-                    raise failure
-                if message["event"] == "ready":
-                    self.signals = [(topic, size) for topic, size in message["signals"]]
-                    self.refused = message["refused"]
-                    layout = Layout(len(self._config.robot.joints), sum(size for _, size in self.signals))
-                    self._memory = SharedMemory(self._descriptor, layout)
-                else:
-                    self._take(message)
+            if child.failed is not None:
+                self.holding = child.failed["holding"]
+                failure = HardwareError(child.failed["error"])
+                failure.exit_code = child.failed["exit_code"]
+                raise failure
+            if message is not None and message["event"] == "ready":
+                self.signals = [(topic, size) for topic, size in message["signals"]]
+                self.refused = message["refused"]
+                layout = Layout(len(self._config.robot.joints), sum(size for _, size in self.signals))
+                self._memory = SharedMemory(self._descriptor, layout)
+            elif message is not None:
+                self._take(message)
 
     @override
     def call(self, do: str, **arguments: Any) -> Mapping[str, Any]:
+        if self._child is None:
+            raise ComponentFailed(_GONE)
+        channel = self._child.channel
         number = next(self._ids)
         answer: queue.SimpleQueue[Mapping[str, Any]] = queue.SimpleQueue()
         self._replies[number] = answer
         try:
-            self._channel.send({"do": do, "id": number, **arguments})
-            if self._channel.closed:
+            channel.send({"do": do, "id": number, **arguments})
+            if channel.closed:
                 raise ComponentFailed(_GONE)
             reply = answer.get(timeout=_REPLY_TIMEOUT_S)
             if reply.get("error") == _GONE:
@@ -279,62 +260,55 @@ class ControlClient(ControlHost):
 
     @override
     def stop(self, *, unmoved: bool = False) -> None:
-        if self._process is None:
+        if self._child is None:
             return
         self._stopping = True
-        self._channel.send({"do": "stop", "id": 0, "unmoved": unmoved})
-        self._end()
+        self._child.channel.send({"do": "stop", "id": 0, "unmoved": unmoved})
+        self._end(self._child)
 
-    def _end(self) -> None:
+    def _end(self, child: Child) -> None:
         """Wait for the process, and let go of all that was shared with it."""
-        assert self._process is not None
-        try:
-            self._process.wait(_STOP_TIMEOUT_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        if child.end(_STOP_TIMEOUT_S):
             logging.getLogger("ibrobot").error(
                 "the control process did not end within %g s: killed%s", _STOP_TIMEOUT_S, self._aftermath
             )
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join()
-        self._channel.close()
+        child.channel.close()
         os.close(self._wake)
         if self._memory is not None:
             self._memory.close()
             self._memory = None
         else:
             os.close(self._descriptor)
-        self._process = None
+        self._child = None
 
-    def _exit(self) -> str:
-        assert self._process is not None
-        status = self._process.wait(_STOP_TIMEOUT_S)
-        return f"signal {-status}" if status < 0 else f"exit status {status}"
+    def _failure(self, child: Child, what: str) -> ComponentFailed:
+        return ComponentFailed(f"{what} ({child.cause(_STOP_TIMEOUT_S)}){self._aftermath}")
 
-    def _receive(self) -> None:
-        raise_thread_priority()
+    def _receive(self, child: Child) -> None:
         try:
-            self._pass_on()
+            self._pass_on(child)
         except Exception as error:  # noqa: BLE001 - told to the run, which cannot go on without states
             self._on_death(ComponentFailed(f"control's states cannot be passed on ({type(error).__name__}: {error})"))
             return
+        if child.failed is not None:
+            self.holding = child.failed["holding"]
         if not self._stopping:
-            why = self._failure or self._exit()
-            self._on_death(ComponentFailed(f"the control process died ({why}){self._aftermath}"))
+            self._on_death(self._failure(child, "the control process died"))
         # Only then those that wait for an answer, so that the cause is told and not its consequence.
         for number in list(self._replies):
             self._take({"reply": number, "error": _GONE})
 
-    def _pass_on(self) -> None:
+    def _pass_on(self, child: Child) -> None:
         """Pass on what control says, until it is gone."""
         assert self._memory is not None
-        while not self._channel.closed:
-            ready, _, _ = select.select([self._wake, self._channel.fileno()], [], [])
+        while not child.channel.closed:
+            ready, _, _ = select.select([self._wake, child.channel.fileno()], [], [])
             if self._wake in ready:
                 os.read(self._wake, 65536)
             # States after the socket: all that was measured before an answer is published before the answer is seen.
-            messages = self._channel.receive()
+            messages = child.receive()
             for state in self._memory.read_states():
                 self._on_state(state)
             for message in messages:
@@ -347,14 +321,9 @@ class ControlClient(ControlHost):
             waiting = self._replies.get(message["reply"])
             if waiting is not None:
                 waiting.put(message)
-        elif message["event"] == "log":
-            logging.getLogger(message["logger"]).log(message["level"], message["message"])
         elif message["event"] in ("report", "stopped"):
             self.report = {"loop": message["loop"], "counters": message["counters"]}
             self.holding = message.get("holding", [])
-        elif message["event"] == "failed":
-            self._failure = message["error"]
-            self.holding = message["holding"]
         else:
             self._on_event(message)
 

@@ -1,4 +1,4 @@
-"""Where host and control process meet: shared memory for states and plans, a socket for rare commands and events.
+"""Where host and control process meet: shared memory for states and plans. Rare commands and events go elsewhere.
 
 The memory is an unnamed file passed by descriptor, so that nothing is left behind however the two end, and there is no
 lock that a dead peer could hold: each record carries its sequence number and a checksum, and a torn one is passed over.
@@ -10,13 +10,8 @@ records, in whatever order its parts became visible, fails that but for 1 in 2^3
 
 from __future__ import annotations
 
-import json
 import mmap
 import os
-import select
-import socket
-import threading
-import time
 from collections.abc import Mapping
 from typing import Any
 from zlib import crc32
@@ -25,7 +20,7 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.errors import ComponentFailed, HardwareError
+from ibrobot_core.errors import HardwareError
 from ibrobot_core.robot import Vector
 
 STATE_SLOTS = 256
@@ -233,97 +228,6 @@ def _state(record: Any) -> ControlState:
         success=None if success < 0 else bool(success), position=record["position"], velocity=record["velocity"],
         effort=record["effort"], command=record["command"], signals=record["signals"],
     )  # fmt: skip
-
-
-class Channel:
-    """JSON objects, a line each, over a stream socket; a dead peer is no exception, it shows in `closed`.
-
-    Nothing here waits for a peer that does not read, so that a stopped host cannot stop the control loop.
-    """
-
-    def __init__(self, connection: socket.socket) -> None:
-        connection.setblocking(False)
-        self._socket = connection
-        self._partial = bytearray()
-        self._unsent = bytearray()
-        self._sending = threading.Lock()
-        self.closed = False
-        """Whether the peer is gone."""
-
-    def fileno(self) -> int:
-        """For `select`."""
-        return self._socket.fileno()
-
-    def send(self, message: Mapping[str, Any]) -> None:
-        """Send an object, at once or with a later call as the peer reads; `closed` shows where the peer is gone."""
-        line = json.dumps(message, separators=(",", ":")).encode() + b"\n"
-        with self._sending:
-            self._unsent += line
-            self._flush()
-
-    def flush(self, timeout_s: float) -> None:
-        """Wait up to `timeout_s` [s] for the peer to read what is yet unsent."""
-        deadline = time.monotonic() + timeout_s
-        while self.backlog and not self.closed and (left := deadline - time.monotonic()) > 0:
-            select.select([], [self._socket], [], left)
-            with self._sending:
-                self._flush()
-
-    @property
-    def backlog(self) -> int:
-        """Bytes that the peer was not ready to take yet."""
-        return len(self._unsent)
-
-    def _flush(self) -> None:
-        while self._unsent and not self.closed:
-            try:
-                del self._unsent[: self._socket.send(self._unsent)]
-            except BlockingIOError:
-                return
-            except OSError:
-                self.closed = True
-
-    def receive(self) -> list[dict[str, Any]]:
-        """The objects that have arrived whole."""
-        if self._unsent:
-            with self._sending:
-                self._flush()
-        while not self.closed:
-            try:
-                received = self._socket.recv(65536)
-            except BlockingIOError:
-                break
-            except OSError:
-                received = b""
-            if not received:
-                self.closed = True
-            self._partial += received
-        if b"\n" not in self._partial:
-            return []
-        *lines, rest = bytes(self._partial).split(b"\n")
-        self._partial = bytearray(rest)
-        return [json.loads(line) for line in lines]
-
-    def wait(self, timeout_s: float) -> list[dict[str, Any]]:
-        """The objects that arrive within `timeout_s`, as soon as there is one.
-
-        Raises:
-            ComponentFailed: when the peer is gone.
-        """
-        while True:
-            messages = self.receive()
-            if messages:
-                return messages
-            if self.closed:
-                raise ComponentFailed("the other end of the control link is gone")
-            unsent = [self._socket] if self._unsent else []
-            if not any(select.select([self._socket], unsent, [], timeout_s)):
-                return []
-
-    def close(self) -> None:
-        """Hang up."""
-        self.closed = True
-        self._socket.close()
 
 
 def raise_error(reply: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -1,7 +1,6 @@
 """The control process: owns the hardware and nothing else, and stops the robot when the host is gone.
 
-Started by `ibrobot_core.control.host` as `python -m ibrobot_core.control.process SOCKET MEMORY WAKE`, three inherited
-descriptors; the first line on the socket says which robot.
+Started by `ibrobot_core.control.host` as a `Child` with the descriptors MEMORY and WAKE; the order says which robot.
 """
 
 from __future__ import annotations
@@ -10,42 +9,25 @@ import contextlib
 import logging
 import os
 import signal
-import socket
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, override
+from typing import Any
 
-from ibrobot_core.bugs import describe_bug
+from ibrobot_core.child import FAREWELL_S, Channel, open_parent
 from ibrobot_core.clock import RealClock
+from ibrobot_core.component import exit_code, told
 from ibrobot_core.config import from_document
 from ibrobot_core.control.build import build_core
 from ibrobot_core.control.core import ControlCore
-from ibrobot_core.control.link import Channel, Layout, SharedMemory
+from ibrobot_core.control.link import Layout, SharedMemory
 from ibrobot_core.control.realtime import go_real_time
 from ibrobot_core.control.timing import REPORT_TICKS, Punctuality
-from ibrobot_core.errors import IbrobotError
 from ibrobot_core.outside import echo
 from ibrobot_core.plugins import installed_plugins
 
 _STARTUP_TIMEOUT_S = 30.0
-_FAREWELL_S = 1.0
-"""How long the last words wait for a host that does not read."""
 _TOLD = "told to stop"
-
-
-class _ToHost(logging.Handler):
-    """Sends log records to the host, which owns the terminal; a host that does not read misses them."""
-
-    def __init__(self, channel: Channel) -> None:
-        super().__init__()
-        self._channel = channel
-
-    @override
-    def emit(self, record: logging.LogRecord) -> None:
-        if not self._channel.backlog:
-            event = {"event": "log", "logger": record.name, "level": record.levelno, "message": record.getMessage()}
-            self._channel.send(event)
 
 
 class ControlProcess:
@@ -138,14 +120,9 @@ class ControlProcess:
         self._terminated = True
 
 
-def main(descriptors: list[int]) -> int:
-    """Run with the host's socket, memory and wake descriptors; returns the exit status."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    channel = Channel(socket.socket(fileno=descriptors[0]))
-    root = logging.getLogger("ibrobot")
-    root.setLevel(logging.INFO)
-    root.propagate = False
-    root.addHandler(_ToHost(channel))
+def main(parent: int, memory: int, wake: int) -> int:
+    """Run with the host's channel, memory and wake descriptors; returns the exit status."""
+    channel = open_parent(parent)
     core = None
     try:
         order = channel.wait(_STARTUP_TIMEOUT_S)[0]
@@ -153,17 +130,18 @@ def main(descriptors: list[int]) -> int:
         config = from_document(order["document"], source=Path(order["source"]), sim=order["sim"])
         core = build_core(config, installed_plugins(), clock, order["seed"])
         core.start(order["mode"])
-        memory = SharedMemory(descriptors[1], Layout(len(config.robot.joints), core.signal_size))
-        os.set_blocking(descriptors[2], False)
+        shared = SharedMemory(memory, Layout(len(config.robot.joints), core.signal_size))
+        os.set_blocking(wake, False)
         refused = go_real_time(config.control.priority)
         signals = [[signal.topic, signal.size] for signal in core.signals]
         ready = {"event": "ready", "signals": signals, "refused": refused}
-        ControlProcess(core, clock, channel, memory, descriptors[2], order["host"], ready).run()
-    except IbrobotError as error:
-        channel.send({**_failed(core, str(error)), "exit_code": error.exit_code})
-        return 1
+        ControlProcess(core, clock, channel, shared, wake, order["host"], ready).run()
     except Exception as error:  # noqa: BLE001 - a bug here must still stop the robot
-        channel.send({**_failed(core, describe_bug(error)), "exit_code": 1})
+        if core is not None:
+            core.abandon()
+        holding = core.holding() if core is not None else []
+        failed = {"event": "failed", "error": told(error), "exit_code": exit_code(error), "holding": holding}
+        channel.send(failed)
         return 1
     finally:
         if core is not None:
@@ -171,16 +149,9 @@ def main(descriptors: list[int]) -> int:
             if channel.closed:  # nobody else can say it
                 for line in core.holding():
                     echo(line, err=True)
-        channel.flush(_FAREWELL_S)
+        channel.flush(FAREWELL_S)
     return 0
 
 
-def _failed(core: ControlCore | None, error: str) -> dict[str, Any]:
-    """The last words of a core that can go on no more."""
-    if core is not None:
-        core.abandon()
-    return {"event": "failed", "error": error, "holding": core.holding() if core is not None else []}
-
-
 if __name__ == "__main__":
-    sys.exit(main([int(argument) for argument in sys.argv[1:]]))
+    sys.exit(main(*(int(argument) for argument in sys.argv[1:])))

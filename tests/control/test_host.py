@@ -201,7 +201,7 @@ class TestProcess:
         host.start()
         os.kill(host.pid, signal.SIGKILL)
 
-        assert str(told.deaths.get(timeout=PATIENCE_S)) == "the control process died (signal 9)"
+        assert str(told.deaths.get(timeout=PATIENCE_S)) == "the control process died (killed by SIGKILL)"
         with pytest.raises(ComponentFailed, match="control process is gone"):
             host.call("estop")
 

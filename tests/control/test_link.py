@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import os
-import socket
 from collections.abc import Iterator
 from zlib import crc32
 
@@ -19,14 +17,13 @@ from ibrobot_core.control import link
 from ibrobot_core.control.link import (
     PLAN_ROWS,
     STATE_SLOTS,
-    Channel,
     ControlState,
     Layout,
     PlanRecord,
     SharedMemory,
     raise_error,
 )
-from ibrobot_core.errors import ComponentFailed, HardwareError
+from ibrobot_core.errors import HardwareError
 from ibrobot_core.memory import create_memory
 
 LAYOUT = Layout(joints=3, signals=2)
@@ -230,77 +227,6 @@ class TestPlans:
         received = control.read_plan()
         assert received is not None
         assert received.epoch == 1
-
-
-@pytest.fixture
-def ends() -> Iterator[tuple[Channel, socket.socket]]:
-    """A channel, and the bare socket of its peer."""
-    ours, theirs = socket.socketpair()
-    channel = Channel(ours)
-    yield channel, theirs
-    channel.close()
-    theirs.close()
-
-
-class TestChannel:
-    @given(
-        messages=st.lists(st.dictionaries(st.text(), st.integers() | st.text() | st.none()), max_size=8),
-        cut=st.integers(1, 50),
-    )
-    def test_messages_survive_arriving_in_pieces(self, messages, cut):
-        ours, theirs = socket.socketpair()
-        channel = Channel(ours)
-        text = b"".join(json.dumps(m).encode() + b"\n" for m in messages)
-        received = []
-        for begin in range(0, len(text), cut):
-            theirs.sendall(text[begin : begin + cut])
-            received += channel.receive()
-        channel.close()
-        theirs.close()
-
-        assert received == messages
-
-    def test_half_a_message_is_none_yet(self, ends):
-        channel, peer = ends
-        peer.sendall(b'{"do": "st')
-        assert channel.receive() == []
-        assert channel.wait(0.0) == []
-
-        peer.sendall(b'op"}\n')
-        assert channel.wait(0.0) == [{"do": "stop"}]
-
-    def test_what_a_peer_said_before_it_died_is_heard(self, ends):
-        channel, peer = ends
-        peer.sendall(b'{"event": "failed"}\n{"ev')
-        peer.close()
-
-        assert channel.wait(0.0) == [{"event": "failed"}]
-        assert channel.closed
-        with pytest.raises(ComponentFailed, match="gone"):
-            channel.wait(0.0)
-
-    def test_sending_to_a_dead_peer_raises_nothing(self, ends):
-        channel, peer = ends
-        peer.close()
-        channel.send({"event": "ready"})
-
-        assert channel.closed
-
-    def test_a_peer_that_does_not_read_holds_nothing_up_and_misses_nothing(self, ends):
-        channel, peer = ends
-        reader = Channel(peer)
-        sent = [{"number": number, "text": "x" * 10_000} for number in range(100)]
-        for message in sent:
-            channel.send(message)
-        assert channel.backlog > 0
-
-        received = reader.receive()
-        while len(received) < len(sent):
-            channel.flush(0.0)
-            channel.receive()
-            received += reader.receive()
-        assert received == sent
-        assert channel.backlog == 0
 
 
 def test_an_answer_with_an_error_raises_it() -> None:

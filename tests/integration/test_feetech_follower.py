@@ -218,5 +218,5 @@ def test_a_killed_control_process_leaves_the_torque_on_and_the_host_says_what_ta
     os.kill(bench.control, signal.SIGKILL)
     _, err = bench.end()
     assert run.returncode == 1
-    assert "(signal 9); if joints still hold, `ibrobot feetech torque off` takes their torque off" in err
+    assert "(killed by SIGKILL); if joints still hold, `ibrobot feetech torque off` takes their torque off" in err
     assert bench.torque() == [True] * 6

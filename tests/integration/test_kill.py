@@ -271,7 +271,7 @@ class TestDeath:
         status, error = run.end()
 
         assert status == 1
-        assert told(error) == ["error: control: the control process died (signal 9)"]
+        assert told(error) == ["error: control: the control process died (killed by SIGKILL)"]
 
     def test_of_the_control_process_while_a_sensor_is_awaited_is_what_is_told(self, launch):
         run = launch(DARK, awaited=False)
@@ -280,7 +280,7 @@ class TestDeath:
         status, error = run.end()
 
         assert status == 1
-        assert told(error) == ["error: control: the control process died (signal 9)"]
+        assert told(error) == ["error: control: the control process died (killed by SIGKILL)"]
 
     def test_of_the_control_loop_by_a_bug_is_told_on_one_line(self, launch):
         run = launch("hardware.trouble=true", awaited=False)
