@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ibrobot_core.config.schema import ImageSpec
 from ibrobot_core.errors import ContractError
-from ibrobot_core.messages import CompressedImage, Header, Image
+from ibrobot_core.messages import CompressedImage, Image
 from ibrobot_core.plugins import installed_plugins
 
 ENCODINGS: dict[str, tuple[type[np.generic], int]] = {
@@ -66,33 +66,6 @@ def decode_image(message: Image | CompressedImage, spec: ImageSpec) -> NDArray[n
     if spec.resize is not None and spec.resize != array.shape[:2]:
         array = resize(array, *spec.resize)
     return np.ascontiguousarray(_convert(array, message.encoding, spec.encoding))
-
-
-def encode_image(array: NDArray[Any], encoding: str, header: Header, *, padding: int = 0) -> Image:
-    """An Image message of `array`, little-endian.
-
-    Args:
-        array: shape (H, W, C), or (H, W) for one channel, of the encoding's element type.
-        encoding: one of `ENCODINGS`.
-        header: stamp and frame.
-        padding: bytes after each row.
-
-    Raises:
-        ContractError: for an unknown encoding, or an array that is not of it.
-    """
-    if encoding not in ENCODINGS:
-        raise ContractError(f"image encoding {encoding!r} is not one of: {', '.join(ENCODINGS)}")
-    element, channels = ENCODINGS[encoding]
-    array = array[..., None] if array.ndim == 2 else array
-    if array.dtype != element or array.ndim != 3 or array.shape[2] != channels:
-        wanted = f"{np.dtype(element).name} of shape (H, W, {channels})"
-        raise ContractError(f"{encoding} is {wanted}, got {array.dtype.name} of shape {array.shape}")
-    height, width = array.shape[:2]
-    little = np.ascontiguousarray(array, dtype=np.dtype(element).newbyteorder("<"))
-    rows = little.view(np.uint8).reshape(height, width * channels * little.itemsize)
-    if padding:
-        rows = np.pad(rows, ((0, 0), (0, padding)))
-    return Image(header, height, width, encoding, rows.shape[1], rows.reshape(-1))
 
 
 def resize(array: NDArray[np.generic], height: int, width: int) -> NDArray[np.generic]:

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from ibrobot_testing.contexts import ARM, GRIPPER, START_NS
+from ibrobot_testing.images import encode_image
 
 from ibrobot_core.bus import Bus
 from ibrobot_core.clock import SteppedClock
@@ -19,7 +20,6 @@ from ibrobot_core.config.schema import Align, ImageSpec, ObservationSpec
 from ibrobot_core.contract import frames as frames_module
 from ibrobot_core.contract import image as image_module
 from ibrobot_core.contract.frames import FrameAssembler, FrameSampler, assemble, frames
-from ibrobot_core.contract.image import encode_image
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.descriptors import DecoderDescriptor
 from ibrobot_core.errors import ContractError

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from ibrobot_testing.images import encode_image
 
 from ibrobot_core.config.schema import ImageSpec
-from ibrobot_core.contract.image import ENCODINGS, decode_image, encode_image, pixels, resize
+from ibrobot_core.contract.image import ENCODINGS, decode_image, pixels, resize
 from ibrobot_core.errors import ContractError
 from ibrobot_core.messages import Header, Image
 
@@ -153,21 +154,3 @@ def test_depth_without_a_reading_is_zero() -> None:
 def test_what_cannot_be_decoded_is_refused(message: Image, wanted: str, fault: str) -> None:
     with pytest.raises(ContractError, match=fault):
         decode_image(message, ImageSpec(encoding=wanted))
-
-
-@pytest.mark.parametrize(
-    ("array", "encoding", "fault"),
-    [
-        (np.zeros((2, 2, 3), np.uint8), "rgb9", "'rgb9' is not one of"),
-        (np.zeros((2, 2, 4), np.uint8), "rgb8", r"uint8 of shape \(H, W, 3\), got uint8 of shape \(2, 2, 4\)"),
-        (np.zeros((2, 2), np.float64), "32FC1", r"float32 of shape \(H, W, 1\), got float64"),
-    ],
-)
-def test_what_cannot_be_encoded_is_refused(array: np.ndarray, encoding: str, fault: str) -> None:
-    with pytest.raises(ContractError, match=fault):
-        encode_image(array, encoding, HEADER)
-
-
-def test_one_channel_needs_no_axis_for_it() -> None:
-    depth = picture("16UC1", 3, 4)
-    assert encode_image(depth[..., 0], "16UC1", HEADER) == encode_image(depth, "16UC1", HEADER)

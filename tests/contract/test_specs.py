@@ -14,10 +14,8 @@ from ibrobot_testing.contexts import ARM, GRIPPER
 
 from ibrobot_core.config import load_config
 from ibrobot_core.config.schema import ActionSpec, Align, ImageSpec, ObservationSpec
-from ibrobot_core.contract.compose import Composer
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.descriptors import HardwareDescriptor
-from ibrobot_core.errors import ContractError
 from ibrobot_core.interfaces.dataset import Feature
 from ibrobot_core.plugins import Entry, discover
 
@@ -95,8 +93,6 @@ def test_a_foreign_type_is_read_back_as_it_was(make_config: Make) -> None:
     again = Contract.from_canonical(json.loads(json.dumps(contract.canonical())))
     assert again.fingerprint() == contract.fingerprint()
     assert again.parts("observation.touch") == contract.parts("observation.touch")
-    with pytest.raises(ContractError, match=r"observation\.touch: no lamp_msgs/msg/Touch can be made"):
-        Composer(contract)
 
 
 @pytest.mark.parametrize(
@@ -116,8 +112,6 @@ def test_commands_of_others_are_read_back_as_they_were(
     again = Contract.from_canonical(json.loads(json.dumps(contract.canonical())))
     assert again.fingerprint() == contract.fingerprint()
     assert again.action_parts[0].select == expected
-    with pytest.raises(ContractError, match=r"action: no .* can be made, which bags of others have on /told"):
-        Composer(contract)
 
 
 def test_steps_joints_and_topics(make_config: Make) -> None:

@@ -18,6 +18,7 @@ from ibrobot_mcap.reader import Rosbag2Reader
 from ibrobot_mcap.recorder import McapRecorder
 from ibrobot_ros2.jpeg import to_jpeg
 from ibrobot_testing.contexts import host_context
+from ibrobot_testing.images import encode_image
 from numpy.typing import NDArray
 from stream_server import StreamServer, number_of
 
@@ -26,7 +27,6 @@ from ibrobot_core.clock import RealClock, SteppedClock
 from ibrobot_core.config import find_config, load_config
 from ibrobot_core.config.schema import Align, ImageSpec
 from ibrobot_core.contract.frames import FrameSampler, frames
-from ibrobot_core.contract.image import encode_image
 from ibrobot_core.contract.specs import ActionPart, Contract, ObservationPart
 from ibrobot_core.interfaces import EpisodeEnd, EpisodeStart, Feature, Frame
 from ibrobot_core.launch.runtime import Runtime

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from ibrobot_core.api import (
     NS_PER_S,
-    Composer,
     Contract,
     ContractError,
     DatasetError,
@@ -27,6 +26,7 @@ from ibrobot_core.api import (
     episode_origin,
 )
 from ibrobot_lerobot import layout
+from ibrobot_lerobot.compose import Composer
 from ibrobot_lerobot.rows import EpisodeRows
 
 

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
+from ibrobot_lerobot.compose import Composer
 
 from ibrobot_core.config.schema import Align, ImageSpec
-from ibrobot_core.contract.compose import Composer
 from ibrobot_core.contract.frames import frames
 from ibrobot_core.contract.image import ENCODINGS
 from ibrobot_core.contract.specs import ActionPart, Contract, ObservationPart
@@ -95,6 +95,20 @@ def test_images(encoding: str):
     np.testing.assert_array_equal(again(Contract(30.0, (camera,), ()), {"top": picture})["top"], picture)
 
 
+@pytest.mark.parametrize(
+    ("array", "encoding", "fault"),
+    [
+        (np.zeros((2, 2, 4), np.uint8), "rgb8", r"uint8 of shape \(H, W, 3\), got uint8 of shape \(2, 2, 4\)"),
+        (np.zeros((2, 2, 1), np.float64), "32FC1", r"float32 of shape \(H, W, 1\), got float64"),
+    ],
+)
+def test_images_of_another_encoding_are_refused(array: np.ndarray, encoding: str, fault: str):
+    feature = Feature("image", (-1, -1, ENCODINGS[encoding][1]))
+    camera = ObservationPart("top", "/top", "sensor_msgs/msg/Image", (), ImageSpec(None, encoding), Align(), feature)
+    with pytest.raises(ContractError, match=fault):
+        Composer(Contract(30.0, (camera,), ()))({"top": array}, STAMP_NS)
+
+
 def test_actions_go_to_their_executors_topics():
     actions = tuple(
         ActionPart(name, f"/{name}", "std_msgs/msg/Float64MultiArray", "hold", joints)
@@ -102,6 +116,8 @@ def test_actions_go_to_their_executors_topics():
     )
     made = Composer(Contract(30.0, (), actions))({"action": np.array([1, 2, 3], np.float32)}, STAMP_NS)
     assert {topic: message.data.tolist() for topic, message in made.items()} == {"/arm": [1, 2], "/gripper": [3]}
+    with pytest.raises(ContractError, match=r"an action has 3 values \(a, b, c\), got the shape \(2,\)"):
+        Composer(Contract(30.0, (), actions))({"action": np.zeros(2)}, STAMP_NS)
 
 
 def test_only_topics_whose_keys_are_there_are_made():
@@ -132,3 +148,12 @@ def test_whole_arrays_that_cannot_be_told_apart_are_refused():
     arrays_ = [part("state", topic, "std_msgs/msg/Float32MultiArray", []) for topic in ("/a", "/b")]
     with pytest.raises(ContractError, match="lengths of 2 whole arrays cannot be told apart"):
         Composer(Contract(30.0, tuple(arrays_), ()))
+
+
+def test_messages_of_others_are_refused():
+    touch = ObservationPart("touch", "/touch", "lamp_msgs/msg/Touch", ("x",), None, Align(), Feature("float32", (1,)))
+    with pytest.raises(ContractError, match="touch: no lamp_msgs/msg/Touch can be made"):
+        Composer(Contract(30.0, (touch,), ()))
+    command = ActionPart("arm", "/told", "lamp_msgs/msg/Command", "hold", ("a",), ("joints.0.target",))
+    with pytest.raises(ContractError, match=r"action: no .* can be made, which bags of others have on /told"):
+        Composer(Contract(30.0, (), (command,)))

@@ -10,14 +10,23 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.contract.encode import action_messages
-from ibrobot_core.contract.image import encode_image
-from ibrobot_core.contract.specs import Contract, ObservationPart
-from ibrobot_core.errors import ContractError
-from ibrobot_core.messages import MESSAGE_TYPES, Header, JointState, Message
-from ibrobot_core.selection import Leaf, Selection
+from ibrobot_core.api import (
+    MESSAGE_TYPES,
+    Contract,
+    ContractError,
+    Float64MultiArray,
+    Header,
+    Image,
+    JointState,
+    Leaf,
+    Message,
+    ObservationPart,
+    Selection,
+)
 
 _ACTION = "action"
+_DEPTH: Mapping[str, type[np.generic]] = {"16UC1": np.uint16, "32FC1": np.float32}
+"""Encoding -> element type, of those that are not uint8."""
 
 
 class Composer:
@@ -68,13 +77,13 @@ class Composer:
             if all(part.key in values for part in parts):
                 messages[topic] = self._message(parts, values, header)
         if _ACTION in values:
-            messages |= action_messages(self._contract, values[_ACTION])
+            messages |= self._action(values[_ACTION])
         return messages
 
     def _message(self, parts: list[ObservationPart], values: Mapping[str, NDArray[Any]], header: Header) -> Message:
         first = parts[0]
         if first.image is not None:
-            return encode_image(values[first.key], first.image.encoding, header)
+            return _image(first, values[first.key], header)
         pairs: list[tuple[Leaf, Any]] = []
         for part in parts:
             leaves, vector = self._leaves[id(part)], self._slice(part, values[part.key])
@@ -84,6 +93,20 @@ class Composer:
             return _joint_state(pairs, header)
         message: Message = _build(message_type, "", _fields(pairs), header)
         return message
+
+    def _action(self, vector: NDArray[Any]) -> dict[str, Message]:
+        joints = self._contract.action_joints
+        if vector.shape != (len(joints),):
+            raise ContractError(
+                f"an action has {len(joints)} values ({', '.join(joints)}), got the shape {vector.shape}"
+            )
+        messages: dict[str, Message] = {}
+        begin = 0
+        for part in self._contract.action_parts:
+            end = begin + len(part.joints)
+            messages[part.topic] = Float64MultiArray(vector[begin:end].astype(np.float64))
+            begin = end
+        return messages
 
     def _slice(self, part: ObservationPart, vector: NDArray[Any]) -> NDArray[Any]:
         """The piece of a key's vector that is the part's."""
@@ -112,6 +135,18 @@ def _leaves(part: ObservationPart) -> tuple[Leaf, ...]:
     if len(leaves) > 1 and any(leaf.kind == "array" for leaf in leaves):
         raise ContractError(f"{part.key}: where {', '.join(part.select)} begin in a vector cannot be told")
     return leaves
+
+
+def _image(part: ObservationPart, array: NDArray[Any], header: Header) -> Image:
+    assert part.image is not None
+    encoding, channels = part.image.encoding, part.feature.shape[-1]
+    element = np.dtype(_DEPTH.get(encoding, np.uint8))
+    if array.dtype != element or array.ndim != 3 or array.shape[2] != channels:
+        wanted = f"{element.name} of shape (H, W, {channels})"
+        raise ContractError(f"{part.key}: {encoding} is {wanted}, got {array.dtype.name} of shape {array.shape}")
+    height, width, _ = array.shape
+    rows = np.ascontiguousarray(array, dtype=element.newbyteorder("<")).view(np.uint8).reshape(height, -1)
+    return Image(header, height, width, encoding, rows.shape[1], rows.reshape(-1))
 
 
 def _joint_state(pairs: list[tuple[Leaf, Any]], header: Header) -> JointState:
