@@ -26,6 +26,7 @@ from ibrobot_core.launch.runtime import Runtime
 from ibrobot_core.launch.session import Request, Session
 from ibrobot_core.outside import LogFormatter, echo
 from ibrobot_core.plugins import installed_plugins
+from ibrobot_core.run_hooks import RunHooks
 from ibrobot_core.terminal import KeyReader
 from ibrobot_core.workers import end_signals
 
@@ -36,38 +37,11 @@ _PANEL_HZ = 8
 _PLAIN_PERIOD_S = 2.0
 
 
-class Watcher:
-    """What looks after a run beside the mode: told of keys, asked what to show. This one does nothing."""
+MakeHooks = Callable[[Runtime], RunHooks]
 
-    def attach(self, runtime: Runtime) -> None:
-        """The run is made, and not started yet."""
 
-    def step(self) -> None:
-        """Do what is due; called a few times a second, and in lockstep at every tick."""
-
-    def key(self, key: str) -> bool:
-        """Obey a key; False for one that means nothing here."""
-        return False
-
-    def rows(self) -> list[tuple[str, str]]:
-        """Heading and text, for the panel."""
-        return []
-
-    def line(self) -> str:
-        """For a plain line of status."""
-        return ""
-
-    def help(self) -> str:
-        """The keys, for the panel."""
-        return ""
-
-    def told(self) -> list[tuple[str, str]]:
-        """Heading and text, for the summary of the run."""
-        return []
-
-    def facts(self) -> dict[str, Any]:
-        """What it adds to the summary as JSON."""
-        return {}
+def _no_hooks(runtime: Runtime) -> RunHooks:
+    return RunHooks()
 
 
 _OPTIONS: dict[str, Callable[..., Any]] = {
@@ -133,7 +107,7 @@ def launch(config: str | None, **options: Any) -> None:
 
 
 def run_robot(
-    config: str | None, options: dict[str, Any], *, watcher: Watcher | None = None,
+    config: str | None, options: dict[str, Any], *, hooks: MakeHooks = _no_hooks,
     recording: tuple[str, ...] | None = None, prompt: str = "",
 ) -> None:  # fmt: skip
     """Run a robot as a command line says, to the end of the process.
@@ -141,7 +115,7 @@ def run_robot(
     Args:
         config: the robot YAML, as `launch` takes it.
         options: those of `launch_options`.
-        watcher: what looks after the run.
+        hooks: makes those of the command, once the run is made and not started yet.
         recording: overrides of the `recording` section, which is made where the YAML has none; None: the run does what
             the mode does.
         prompt: what recorded episodes are recorded under.
@@ -164,7 +138,7 @@ def run_robot(
         options["lockstep"], options["seed"], options["duration"], options["episodes"], options["goals"],
         prompt=prompt, by_operator=recording is not None,
     )  # fmt: skip
-    run_loaded(robot, request, options, watcher or Watcher())
+    run_loaded(robot, request, options, hooks)
 
 
 def overrides_of(options: dict[str, Any]) -> tuple[str, ...]:
@@ -179,14 +153,14 @@ def overrides_of(options: dict[str, Any]) -> tuple[str, ...]:
     return (*options["overrides"], *window)
 
 
-def run_loaded(robot: RobotConfig, request: Request, options: dict[str, Any], watcher: Watcher) -> None:
+def run_loaded(robot: RobotConfig, request: Request, options: dict[str, Any], make_hooks: MakeHooks) -> None:
     """Run a robot whose YAML has been read, to the end of the process.
 
     Args:
         robot: the robot.
         request: what is asked of the run.
         options: `headless`, `dry_run` and `as_json` of `launch_options`.
-        watcher: what looks after the run.
+        make_hooks: makes those of the command, once the run is made and not started yet.
 
     Raises:
         IbrobotError: e.g. when a component fails.
@@ -206,21 +180,21 @@ def run_loaded(robot: RobotConfig, request: Request, options: dict[str, Any], wa
             plan = runtime.plan
             echo(json.dumps({**plan.facts(), "models": models}) if as_json else "\n".join([*plan.lines(), *models]))
             return
-        watcher.attach(runtime)
+        hooks = make_hooks(runtime)
         _stop_on_signals(runtime.session, keys)
         if keys is not None:  # only now: until here Ctrl-C ends the process, and could not put the terminal back
             stack.enter_context(keys)
         try:
-            status = _run(runtime, watcher, live=not options["headless"], as_json=as_json)
+            status = _run(runtime, hooks, live=not options["headless"], as_json=as_json)
         finally:
             for line in runtime.session.outcome.holding:
                 echo(line, err=True)
-    _tell(runtime, watcher, as_json)
+    _tell(runtime, hooks, as_json)
     runtime.raise_failure()
     sys.exit(status)
 
 
-def _run(runtime: Runtime, watcher: Watcher, *, live: bool, as_json: bool) -> int:
+def _run(runtime: Runtime, hooks: RunHooks, *, live: bool, as_json: bool) -> int:
     """Start, run and stop; returns the exit status of a run in which nothing failed.
 
     What it shows meanwhile is on standard output, or on standard error where that is for JSON.
@@ -229,18 +203,18 @@ def _run(runtime: Runtime, watcher: Watcher, *, live: bool, as_json: bool) -> in
     where = "simulation" if session.config.simulated else "hardware"
     with ExitStack() as stack:
         panel_fits = live and (sys.stderr if as_json else sys.stdout).isatty()
-        display = (_Panel if panel_fits else _Lines)(runtime, watcher, stack, err=as_json)
+        display = (_Panel if panel_fits else _Lines)(runtime, hooks, stack, err=as_json)
         robot = session.config
         session.log.info("%s from %s: %s, mode %s", robot.robot.name, robot.source, where, session.mode)
         runtime.start(display.starting)
         stack.callback(runtime.stop)
         if session.request.lockstep:
             while not runtime.step():
-                watcher.step()
+                hooks.step()
                 display.show()
         else:
             while not runtime.wait(1.0 / _PANEL_HZ):
-                watcher.step()
+                hooks.step()
                 display.show()
     outcome = session.outcome
     if any(fault != EMERGENCY_STOP for fault in outcome.faults):
@@ -283,9 +257,9 @@ def _discard(descriptors: list[int]) -> None:
 class _Lines:
     """Plain lines of status, where standard output is no terminal."""
 
-    def __init__(self, runtime: Runtime, watcher: Watcher, stack: ExitStack, *, err: bool) -> None:
+    def __init__(self, runtime: Runtime, hooks: RunHooks, stack: ExitStack, *, err: bool) -> None:
         self._session = runtime.session
-        self._watcher = watcher
+        self._hooks = hooks
         self._err = err
         self._rates = RecentRates()
         self._next_s = time.monotonic() + _PLAIN_PERIOD_S
@@ -302,19 +276,19 @@ class _Lines:
         if time.monotonic() >= self._next_s:
             self._next_s += _PLAIN_PERIOD_S
             line = plain_line(self._session, self._rates)
-            echo(f"{line} | {more}" if (more := self._watcher.line()) else line, err=self._err)
+            echo(f"{line} | {more}" if (more := self._hooks.line()) else line, err=self._err)
 
 
 class _Panel:
     """The live panel, and the runtime's own keys: F1..F9 modes, Esc emergency stop, F10 reset."""
 
-    def __init__(self, runtime: Runtime, watcher: Watcher, stack: ExitStack, *, err: bool) -> None:
+    def __init__(self, runtime: Runtime, hooks: RunHooks, stack: ExitStack, *, err: bool) -> None:
         from rich.live import Live
 
         from ibrobot_core.screen import Screen
 
         self._runtime = runtime
-        self._watcher = watcher
+        self._hooks = hooks
         self._log = RecentLog()
         self._rates = RecentRates()
         _log_to(self._log)
@@ -338,9 +312,9 @@ class _Panel:
             self._obey(self._pressed.get())
         session = self._runtime.session
         help_text = session.feeder.help() if session.feeder is not None else ""
-        help_text = "\n".join(text for text in (help_text, self._watcher.help()) if text)
+        help_text = "\n".join(text for text in (help_text, self._hooks.help()) if text)
         self._rates.sample(session)
-        self._display.update(panel(session, self._log, self._rates, help_text, self._watcher.rows()), refresh=True)
+        self._display.update(panel(session, self._log, self._rates, help_text, self._hooks.rows()), refresh=True)
 
     def _listen(self, keys: queue.SimpleQueue[str]) -> None:
         """In a thread of its own, so that the emergency stop waits for nothing, e.g. not for a mode that loads."""
@@ -352,7 +326,7 @@ class _Panel:
                 self._pressed.put(key)
 
     def _obey(self, key: str) -> None:
-        if self._watcher.key(key):
+        if self._hooks.key(key):
             return
         modes = self._runtime.session.mode_keys
         if key == "f10":
@@ -373,11 +347,11 @@ def _log_to(handler: logging.Handler) -> None:
     logging.getLogger("ibrobot").setLevel(logging.INFO)
 
 
-def _tell(runtime: Runtime, watcher: Watcher, as_json: bool) -> None:
+def _tell(runtime: Runtime, hooks: RunHooks, as_json: bool) -> None:
     """The summary of a run."""
     summary = runtime.summary()
     if as_json:
-        summary |= watcher.facts()
+        summary |= hooks.facts()
         echo(json.dumps(summary))
         return
     loop = summary["loop"]
@@ -391,7 +365,7 @@ def _tell(runtime: Runtime, watcher: Watcher, as_json: bool) -> None:
             f"loop       {loop['rate_hz']:.2f} Hz, lateness p50 {loop['lateness_p50_us']:.0f} us, "
             f"p99 {loop['lateness_p99_us']:.0f} us, missed {loop['missed']}"
         )
-    for heading, text in watcher.told():
+    for heading, text in hooks.summary_rows():
         echo(f"{heading:10} {text}")
     if runtime.plan.without:
         echo(f"without    {runtime.plan.without}")

@@ -10,7 +10,7 @@ import attrs
 import click
 
 from ibrobot_core.calibration import load_calibration
-from ibrobot_core.cli.launch import Watcher, overrides_of, run_loaded, run_options
+from ibrobot_core.cli.launch import overrides_of, run_loaded, run_options
 from ibrobot_core.config import RobotConfig, find_config, from_document, load_config
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import ContractError, RecorderError
@@ -22,20 +22,20 @@ from ibrobot_core.outside import echo
 from ibrobot_core.plugins import installed_plugins
 from ibrobot_core.recording.playback import read_playback
 from ibrobot_core.recording.provenance import stated_by_robot
+from ibrobot_core.run_hooks import RunHooks
 from ibrobot_core.units import NORM_MODES
 
 
-class _Comparison(Watcher):
+class _Comparison(RunHooks):
     """Tells how near the replay came."""
 
-    @override
-    def attach(self, runtime: Runtime) -> None:
+    def __init__(self, runtime: Runtime) -> None:
         feeder = runtime.plan.mode.feeder
         assert isinstance(feeder, ReplayFeeder)
         self._feeder = feeder
 
     @override
-    def told(self) -> list[tuple[str, str]]:
+    def summary_rows(self) -> list[tuple[str, str]]:
         report = self._feeder.report()
         rows = [("replayed", f"{report['source']}, {report['recorded_s']:.1f} s at speed {report['speed']:g}")]
         if report["success"] is not None:
@@ -97,7 +97,7 @@ def replay(
     request = Request(
         options["lockstep"], playback.seed or 0, replay=Replay(str(episode), playback, speed),
     )  # fmt: skip
-    run_loaded(_without_sensors(robot), request, options, _Comparison())
+    run_loaded(_without_sensors(robot), request, options, _Comparison)
 
 
 def _without_sensors(robot: RobotConfig) -> RobotConfig:

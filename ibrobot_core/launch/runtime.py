@@ -258,8 +258,7 @@ class Runtime:
         judged = worker is not None and worker in self._started
         if worker is not None and judged:
             worker.stop()
-        if session.feeder is not None:
-            session.feeder.end()
+        session.pause_feed()
         try:
             session.command("switch_mode", mode=mode)
         except BaseException:

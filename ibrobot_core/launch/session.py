@@ -223,6 +223,11 @@ class Session:
         if self.feeder is not None and not self.held:
             self.feeder.begin(self.request.seed)
 
+    def pause_feed(self) -> None:
+        """End the mode's feed, until `feed`."""
+        if self.feeder is not None:
+            self.feeder.end()
+
     @property
     def mode_keys(self) -> dict[str, str]:
         """Key -> the mode that it enters: `F1` to `F9`, in the order of the file."""

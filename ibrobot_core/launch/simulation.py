@@ -58,8 +58,7 @@ class SimulatedEpisodes(Worker):
 
     def _end_episode(self, outcome: str) -> None:
         session = self._session
-        if session.feeder is not None:
-            session.feeder.end()
+        session.pause_feed()
         self._begun_ns = None
         self._episodes.end(outcome)
         if self._wanted is not None and self._episodes.number >= self._wanted:

@@ -37,6 +37,9 @@ class EpisodeDesk:
         recording: what records them.
         by_mode: whether the mode begins and ends them itself, so that here they can only be watched.
 
+    Attributes:
+        by_mode: whether the mode begins and ends episodes itself.
+
     Raises:
         RecorderError: when the dataset has episodes of another contract or cannot be written, or an operator is to
             record and `recording.topics` leaves out a topic of the contract.
@@ -46,7 +49,7 @@ class EpisodeDesk:
         self._session = session
         self._episodes = episodes
         self._recording = recording
-        self._by_mode = by_mode
+        self.by_mode = by_mode
         self._lock = threading.Lock()
         config = session.config.recording
         assert config is not None
@@ -192,5 +195,5 @@ class EpisodeDesk:
             )
 
     def _check_mine(self) -> None:
-        if self._by_mode:
+        if self.by_mode:
             raise NotSupported(f"mode {self._session.mode} begins and ends its episodes itself")

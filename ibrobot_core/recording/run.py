@@ -82,6 +82,15 @@ class Run(Protocol):
     def context(self, name: str) -> Context:
         """What a plugin's component is given."""
 
+    def feed(self) -> None:
+        """Have the mode move the robot, again where it paused."""
+
+    def pause_feed(self) -> None:
+        """Have the mode no longer move the robot, until `feed`."""
+
+    def finish(self) -> None:
+        """End the run in good order."""
+
     def add_fault(self, fault: str) -> None:
         """Note a fault; the run goes on."""
 

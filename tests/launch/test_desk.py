@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING
 
-import click
 import pytest
 import yaml
 
-from ibrobot_core.cli.record import Operator
 from ibrobot_core.errors import DiskFull, NotSupported, RecorderError
 from ibrobot_core.recording.desk import DISCARD, START, STATUS, STOP
+from ibrobot_core.recording.operator import Operator
 
 if TYPE_CHECKING:
     from conftest import Runs
@@ -154,11 +153,11 @@ def test_a_dataset_of_another_contract_is_refused_before_anything_starts(run: Ru
 
 class TestOperator:
     def watch(self, run: Runtime, **asked: object) -> Operator:
-        operator = Operator(
-            **{"count": None, "reset_time_s": 0.0, "prompt": None, "auto": False, "keys": True, **asked}
-        )
-        operator.attach(run)
-        return operator
+        assert run.desk is not None
+        return Operator(
+            run.session, run.desk,
+            **{"count": None, "reset_time_s": 0.0, "prompt": None, "auto": False, "keys": True, **asked},
+        )  # fmt: skip
 
     def step(self, run: Runtime, operator: Operator, count: int) -> None:
         for _ in range(count):
@@ -199,7 +198,7 @@ class TestOperator:
         assert "set the scene up anew" in operator.line()
         self.step(run, operator, 200)
         assert run.session.finished.is_set()
-        assert operator.told()[0][1].startswith("2 of 2 episodes into")
+        assert operator.summary_rows()[0][1].startswith("2 of 2 episodes into")
         ended = [event for event in runs.parts.EVENTS if event[0] == "ended"]
         assert ended == [("ended", 1, "unknown"), ("ended", 2, "unknown")]
 
@@ -259,5 +258,11 @@ class TestOperator:
     def test_continuous_means_nothing_where_the_mode_has_episodes(self, runs: Runs, monkeypatch: pytest.MonkeyPatch):
         monkeypatch.chdir(runs.folder)
         runtime = runs.start(RECORDING, mode="policy", by_operator=True)
-        with pytest.raises(click.UsageError, match="mode policy begins and ends its episodes itself"):
+        with pytest.raises(NotSupported, match="mode policy begins and ends its episodes itself") as caught:
             self.watch(runtime, continuous=True)
+        assert caught.value.exit_code == 2
+
+    def test_nobody_can_begin_an_episode_without_keys_and_auto(self, run: Runtime):
+        with pytest.raises(NotSupported, match="add --auto") as caught:
+            self.watch(run, keys=False)
+        assert caught.value.exit_code == 2
