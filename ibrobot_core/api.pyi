@@ -83,6 +83,7 @@ from ibrobot_core.errors import (
     ConfigError as ConfigError,
     ContractError as ContractError,
     DatasetError as DatasetError,
+    Declined as Declined,
     DiskFull as DiskFull,
     GoalRejected as GoalRejected,
     HardwareError as HardwareError,
@@ -98,6 +99,7 @@ from ibrobot_core.errors import (
     TeleopError as TeleopError,
     TransportError as TransportError,
     WireError as WireError,
+    wrong_input as wrong_input,
 )
 from ibrobot_core.messages import (
     MESSAGE_TYPES as MESSAGE_TYPES,
@@ -212,7 +214,7 @@ from ibrobot_core.recording.provenance import (
 from ibrobot_core.metrics import Metrics as Metrics, MetricsProbes as MetricsProbes, MetricsServer as MetricsServer
 from ibrobot_core.control.realtime import go_real_time as go_real_time
 from ibrobot_core.memory import set_malloc as set_malloc
-from ibrobot_core.workers import Workers as Workers, on_signals as on_signals
+from ibrobot_core.workers import Workers as Workers, end_signals as end_signals, on_signals as on_signals
 from ibrobot_core.outside import LogFormatter as LogFormatter, echo as echo
 from ibrobot_core.screen import Screen as Screen, styled as styled
 from ibrobot_core.terminal import KeyReader as KeyReader

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import errno
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import attrs
@@ -51,6 +53,27 @@ class PluginError(IbrobotError):
     """A plugin that is asked for but is missing or broken, e.g. a `type` without its package."""
 
     exit_code = 2
+
+
+class PluginNotInstalled(PluginError):
+    """A type whose plugin is not installed, or is broken.
+
+    Args:
+        kind: e.g. `teleop`, or `command`.
+        type: as the YAML has it, or the command's name.
+        package: which offers it.
+        reason: why the plugin cannot be used, where it is installed.
+    """
+
+    def __init__(self, kind: str, type: str, package: str, reason: str = "") -> None:
+        self.kind = kind
+        self.type = type
+        self.package = package
+        self.reason = reason
+        what = f"ibrobot {type}" if kind == "command" else f"{kind} type {type!r}"
+        self.missing = reason or f"{what} needs a plugin that is not installed"
+        self.remedy = f"pip install {'--force-reinstall ' if reason else ''}{package}"
+        super().__init__(reason or f"{self.missing}: {self.remedy}")
 
 
 class MissingDependency(IbrobotError):
@@ -135,3 +158,35 @@ class NotSupported(IbrobotError):
     """Something that this implementation cannot do, e.g. `control.stop: relax` on hardware without torque control."""
 
     exit_code = 2
+
+
+class Declined(IbrobotError):
+    """A question that the user answered with no; what was done before stays done."""
+
+    def __init__(self) -> None:
+        super().__init__("stopped: the answer was no")
+
+
+_OF_THE_MACHINE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.ENOMEM, errno.EMFILE, errno.ENFILE})
+
+
+@contextmanager
+def wrong_input() -> Iterator[None]:
+    """Let commands exit with 2 for errors raised within: the user named something that cannot be used.
+
+    Errors of the machine, such as a full disk, and of components that died keep their code. Also a decorator.
+    """
+    try:
+        yield
+    except IbrobotError as error:
+        if not (isinstance(error, DiskFull | ComponentFailed | Declined) or _is_of_the_machine(error)):
+            error.exit_code = ConfigError.exit_code
+        raise
+
+
+def _is_of_the_machine(error: BaseException | None) -> bool:
+    while error is not None:
+        if isinstance(error, OSError) and error.errno in _OF_THE_MACHINE:
+            return True
+        error = error.__cause__ or error.__context__
+    return False

@@ -17,7 +17,7 @@ import pluggy
 
 from ibrobot_core import hookspecs
 from ibrobot_core.descriptors import Check, Command, ConfigFile, DecoderDescriptor, Descriptor, ReaderDescriptor
-from ibrobot_core.errors import ContractError, MissingDependency, PluginError, RecorderError
+from ibrobot_core.errors import ContractError, MissingDependency, PluginError, PluginNotInstalled, RecorderError
 
 if TYPE_CHECKING:
     from ibrobot_core.interfaces import EpisodeReader
@@ -100,7 +100,7 @@ class Registry:
         """
         entry = self.entries.get((kind, type_))
         if entry is None:
-            raise PluginError(self.why_missing(kind, type_))
+            raise self.not_found(kind, type_)
         return entry.descriptor
 
     def default(self, kind: str) -> str:
@@ -169,20 +169,19 @@ class Registry:
         formats = ", ".join(sorted({each for decoder in self.decoders for each in decoder.formats})) or "none"
         raise ContractError(f"no installed plugin decodes a {picture.format!r} picture; those decoded are: {formats}")
 
-    def why_missing(self, kind: str, type_: str) -> str:
+    def not_found(self, kind: str, type_: str) -> PluginError:
         """Why nothing offers a type, and what to install or mend; a command is of kind `command`."""
         package = next((name for name, offers in official_plugins().items() if type_ in offers.get(kind, ())), None)
         for failure in self.failures:
             if failure.package == package:
-                return f"{kind} type {type_!r} is not available: {failure}"
+                return PluginNotInstalled(kind, type_, package, f"{kind} type {type_!r} is not available: {failure}")
         if package is not None:
-            what = f"ibrobot {type_}" if kind == "command" else f"{kind} type {type_!r}"
-            return f"{what} needs a plugin that is not installed: pip install {package}"
+            return PluginNotInstalled(kind, type_, package)
         offered = self.types(kind)
         close = get_close_matches(type_, offered, 1)
         hint = f", did you mean {close[0]!r}?" if close else f"; installed: {', '.join(offered) or 'none'}"
         broken = "".join(f"; {failure}" for failure in self.failures)
-        return f"unknown {kind} type {type_!r}{hint}{broken}"
+        return PluginError(f"unknown {kind} type {type_!r}{hint}{broken}")
 
     def doctor(self) -> list[Check]:
         """The checks of all plugins; a plugin whose check raises is itself a failed check."""

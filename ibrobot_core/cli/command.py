@@ -1,25 +1,30 @@
 """The entry point of `ibrobot`: while it starts, Ctrl-C ends it in one line, whatever it was about to import or read.
 
-This module imports next to nothing, so that there is hardly a moment before it.
+SIGTERM and SIGHUP do the same. This module imports next to nothing, so that there is hardly a moment before it.
 """
 
 import os
 import signal
 from types import FrameType
 
+_ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
 
 def main() -> None:
     """Run the command line."""
-    signal.signal(signal.SIGINT, _end)
+    for number in _ENDING:
+        if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:  # nohup ignores SIGHUP
+            signal.signal(number, _end)
     from ibrobot_core.cli.main import main as run
 
     run()
 
 
 def let_interrupts_raise() -> None:
-    """From here on Ctrl-C raises KeyboardInterrupt: for commands that put things in order then."""
-    if signal.getsignal(signal.SIGINT) is _end:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+    """From here on Ctrl-C, SIGTERM and SIGHUP raise KeyboardInterrupt: for commands that put things in order then."""
+    for number in _ENDING:
+        if signal.getsignal(number) is _end:
+            signal.signal(number, signal.default_int_handler)
 
 
 def _end(number: int, frame: FrameType | None) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import attrs
 import click
 
-from ibrobot_core.errors import ConfigError
+from ibrobot_core.errors import ConfigError, PluginError
 from ibrobot_core.outside import echo
 
 
@@ -43,13 +43,16 @@ def check(
 ) -> None:  # fmt: skip
     """Tell everything that is wrong with CONFIG; exit 2 if anything is."""
     from ibrobot_core.config import find_config, load_config
+    from ibrobot_core.config.missing import unavailable_modes
+    from ibrobot_core.launch.absence import absent_sensors, describe
     from ibrobot_core.launch.models import check_models
     from ibrobot_core.plugins import installed_plugins
 
     try:
         path = find_config(config, installed_plugins())
         found = load_config(path, overrides=overrides, mode=mode, sim=sim)
-        models = check_models(found, installed_plugins(), found.control_modes) if deep else []
+        modes = [name for name in found.control_modes if name not in found.unavailable]
+        models = check_models(found, installed_plugins(), modes) if deep else []
     except ConfigError as error:
         if not as_json:
             raise
@@ -62,6 +65,10 @@ def check(
     body = "simulation" if found.simulated else "hardware"
     echo(f"{path}: ok ({found.robot.name}, {len(found.robot.joints)} joints, {body})")
     echo(f"modes: {', '.join(found.control_modes)}; starts in {found.default_control_mode}")
+    for line in unavailable_modes(found.unavailable):
+        echo(f"note: {line}")
+    if absent := describe(absent_sensors(found, installed_plugins())):
+        echo(f"note: a run is without {absent}")
     for line in models:
         echo(line)
 
@@ -71,10 +78,13 @@ def check(
 def show(config: str | None, sim: bool, overrides: tuple[str, ...], mode: str | None) -> None:
     """Print what a run of CONFIG would use, every default filled in, as a YAML that loads again."""
     from ibrobot_core.config import find_config, load_config
+    from ibrobot_core.config.missing import describe
     from ibrobot_core.config.show import to_yaml
     from ibrobot_core.plugins import installed_plugins
 
     found = load_config(find_config(config, installed_plugins()), overrides=overrides, mode=mode, sim=sim)
+    if found.missing:
+        raise PluginError(f"{found.source}: not all defaults are known: {describe(found.missing)}")
     echo(to_yaml(found), nl=False)
 
 

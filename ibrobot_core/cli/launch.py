@@ -369,4 +369,5 @@ def _tell(runtime: Runtime, hooks: RunHooks, as_json: bool) -> None:
         echo(f"{heading:10} {text}")
     if runtime.plan.without:
         echo(f"without    {runtime.plan.without}")
-    echo(f"faults     {'; '.join(summary['faults']) or 'none'}")
+    faults = summary["faults"]
+    echo(f"faults     {'; '.join(faults) + ' (all of the run, those that were reset too)' if faults else 'none'}")

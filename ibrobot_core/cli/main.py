@@ -13,7 +13,7 @@ import click
 from ibrobot_core import __version__
 from ibrobot_core.bugs import DEBUG, describe_bug
 from ibrobot_core.cli.command import let_interrupts_raise
-from ibrobot_core.errors import IbrobotError, PluginError
+from ibrobot_core.errors import IbrobotError
 from ibrobot_core.outside import echo
 
 _FAILED, _WRONG, _INTERRUPTED = 1, 2, 130
@@ -50,10 +50,11 @@ class LazyGroup(click.Group):
         contributed = installed_plugins().commands.get(cmd_name)
         if contributed is None:
             if any(cmd_name in offers.get("command", ()) for offers in official_plugins().values()):
-                raise PluginError(installed_plugins().why_missing("command", cmd_name))
+                raise installed_plugins().not_found("command", cmd_name)
             return None
+        command = contributed.load()
         let_interrupts_raise()
-        return contributed.load()
+        return command
 
     @override
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:

@@ -114,7 +114,10 @@ def panel(
     """The whole panel, with `more` rows of heading and text; in a small terminal its end is left out."""
     where = "in simulation" if session.config.simulated else "on hardware"
     modes = styled(f"{session.config.robot.name} {where}  ", "bold") + styled("  ").join(
-        styled(f"{key} ") + styled(name, "reverse" if name == session.mode else "")
+        styled(f"{key} ")
+        + styled(
+            name, "reverse" if name == session.mode else "dim strike" if name in session.config.unavailable else ""
+        )
         for key, name in session.mode_keys.items()
     )
     return Group(  # what does not fit below, `Live` leaves out

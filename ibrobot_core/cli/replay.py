@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import closing
 from pathlib import Path
 from typing import Any, override
 
@@ -13,7 +14,7 @@ from ibrobot_core.calibration import load_calibration
 from ibrobot_core.cli.launch import overrides_of, run_loaded, run_options
 from ibrobot_core.config import RobotConfig, find_config, from_document, load_config
 from ibrobot_core.contract.specs import Contract
-from ibrobot_core.errors import ContractError, RecorderError
+from ibrobot_core.errors import ContractError, RecorderError, wrong_input
 from ibrobot_core.interfaces import EpisodeSummary
 from ibrobot_core.launch.runtime import Runtime
 from ibrobot_core.launch.session import Request
@@ -81,17 +82,13 @@ def replay(
     changes, sim = overrides_of(options), options["sim"]
     robot = _named(config, changes, sim=sim) if config is not None else None
     numbers = load_calibration(calibration).snapshot() if calibration is not None else None
-    reader = installed_plugins().open_episode(
-        episode, stated_by_robot(robot, norm_mode, numbers) if robot is not None else None
-    )
-    try:
+    told = stated_by_robot(robot, norm_mode, numbers) if robot is not None else None
+    with wrong_input(), closing(installed_plugins().open_episode(episode, told)) as reader:
         summary = reader.summary()
         robot = robot or _recorded(summary, changes, sim=sim)
         contract = Contract.from_config(robot)
         _check(contract, summary, str(robot.source), force=force_contract)
         playback = read_playback(reader, contract)
-    finally:
-        reader.close()
     if not summary.finished:
         echo(f"{episode}: was never finished; {playback.duration:.2f} s of it could be read", err=True)
     request = Request(

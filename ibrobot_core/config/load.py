@@ -14,8 +14,9 @@ import ibrobot_core
 from ibrobot_core.config.checks import Checks
 from ibrobot_core.config.contract_checks import ContractChecks
 from ibrobot_core.config.convert import shown
+from ibrobot_core.config.missing import split
 from ibrobot_core.config.overrides import apply_overrides, put
-from ibrobot_core.config.schema import Component, ExecutorComponent, RobotConfig
+from ibrobot_core.config.schema import Component, ExecutorComponent, Peripheral, RobotConfig
 from ibrobot_core.config.secrets import check_known, expanded_again, public, warn_of_literals
 from ibrobot_core.config.structure import Part, Parts, Structurer
 from ibrobot_core.config.yaml_nodes import MAX_BYTES, Document, Place, parse_yaml
@@ -136,6 +137,7 @@ def _override(document: Document, overrides: Sequence[str], mode: str | None) ->
 def _build(document: Document, source: Path, sim: bool, registry: Registry, communicates: bool = False) -> RobotConfig:
     parts = Structurer(document, registry, source.absolute().parent, sim).parts()
     check_known(document)
+    unavailable = split(document, parts.plain, parts.missing, _entered(document, parts), everything=communicates)
     Checks(document, parts, communicates).run()
     contract_checks = ContractChecks(document, parts)
     contract = contract_checks.run()
@@ -156,7 +158,8 @@ def _build(document: Document, source: Path, sim: bool, registry: Registry, comm
             name: attrs.evolve(each, joints=each.joints or robot.joint_names) for name, each in hardware.items()
         },
         "simulation": _component(parts.simulation),
-        "peripherals": {name: attrs.evolve(part.component, sim={}) for name, part in parts.peripherals.items()},
+        "peripherals": {name: attrs.evolve(part.component, sim={}) for name, part in parts.peripherals.items()}
+        | _not_installed(document, parts),
         "models": {
             name: attrs.evolve(
                 each,
@@ -174,6 +177,8 @@ def _build(document: Document, source: Path, sim: bool, registry: Registry, comm
         **sections,
         simulated=parts.simulated,
         closed_ends=_closed_ends(robot, parts),
+        unavailable=unavailable,
+        missing=tuple(each.error for each in parts.missing),
         source=source,
         document=shown,
         complete=document.root,
@@ -197,6 +202,21 @@ def _component[C: Component](part: Part[C] | None) -> C | None:
 
 def _components[C: Component](parts: Mapping[str, Part[C]]) -> dict[str, C]:
     return {name: part.component for name, part in parts.items()}
+
+
+def _entered(document: Document, parts: Parts) -> Any:
+    """The mode in which the run begins, as the document says it."""
+    simulated = document.get("simulation", "default_control_mode") if parts.simulated else None
+    return simulated or parts.plain.get("default_control_mode")
+
+
+def _not_installed(document: Document, parts: Parts) -> dict[str, Peripheral]:
+    """The peripherals whose plugin is missing, without options."""
+    items = [(each.error.type, document.get(*each.key)) for each in parts.missing if each.key[0] == "peripherals"]
+    return {
+        item["name"]: Peripheral(type=type_, options=None, name=item["name"], kind=item["kind"])
+        for type_, item in items
+    }
 
 
 def _default_mode(parts: Parts) -> str:

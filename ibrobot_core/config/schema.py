@@ -13,6 +13,7 @@ from typing import Any, ClassVar, Literal, get_args, get_origin
 import attrs
 
 from ibrobot_core.descriptors import Descriptor, ExecutorDescriptor, HardwareDescriptor, SensorDescriptor
+from ibrobot_core.errors import PluginNotInstalled
 from ibrobot_core.options import documented, fields, not_a_key, option
 from ibrobot_core.robot import Robot
 from ibrobot_core.units import NORM_MODES
@@ -495,6 +496,10 @@ class RobotConfig:
     metrics: MetricsConfig | None = option(None, help="counts in Prometheus' text format, over HTTP on this machine")
     simulated: bool = not_a_key(False)
     """Whether `simulation` stands for `hardware` in this run."""
+    unavailable: Mapping[str, str] = not_a_key(factory=dict, repr=False, eq=False)
+    """Mode -> why it cannot be entered, and what to install for it."""
+    missing: tuple[PluginNotInstalled, ...] = not_a_key((), repr=False, eq=False)
+    """What the YAML names beside what the first mode needs, and no installed plugin offers."""
     source: Path = not_a_key(Path("<memory>"))
     closed_ends: Mapping[str, float | None] = not_a_key(factory=dict, eq=False)
     """Joint -> its lower limit [rad] where the hardware anchors it at its closed end, else None; without the joints of

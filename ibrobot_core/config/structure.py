@@ -11,6 +11,7 @@ from typing import Any
 import attrs
 
 from ibrobot_core.config.convert import Converter, Faults, said, unknown_key
+from ibrobot_core.config.missing import Missing
 from ibrobot_core.config.schema import (
     SECTIONS,
     Component,
@@ -30,7 +31,7 @@ from ibrobot_core.config.schema import (
 from ibrobot_core.config.secrets import note
 from ibrobot_core.config.yaml_nodes import Document, Key
 from ibrobot_core.descriptors import Descriptor, HardwareDescriptor, SensorDescriptor
-from ibrobot_core.errors import PluginError
+from ibrobot_core.errors import PluginError, PluginNotInstalled
 from ibrobot_core.options import fields
 from ibrobot_core.plugins import Registry, example_type
 
@@ -64,6 +65,8 @@ class Parts:
     recording: Part[Recording] | None = None
     transport: Part[TransportConfig] | None = None
     viewer: Part[Viewer] | None = None
+    missing: list[Missing] = attrs.field(factory=list)
+    """What could not be made for want of a plugin."""
 
     def active(self) -> Iterator[Part[Any]]:
         """The components that a run opens at its start."""
@@ -99,6 +102,7 @@ class Structurer:
     sim: bool
 
     _converter: Converter = attrs.field(init=False)
+    _missing: list[Missing] = attrs.field(init=False, factory=list)
 
     def __attrs_post_init__(self) -> None:
         self._converter = Converter(self.base)
@@ -107,7 +111,7 @@ class Structurer:
         """All sections."""
         given = set(self.document.root)
         simulated = self.sim or ("simulation" in given and "hardware" not in given)
-        parts = Parts(simulated)
+        parts = Parts(simulated, missing=self._missing)
         self._sections(parts)
         if simulated and "simulation" not in given:
             self.document.add(
@@ -181,7 +185,8 @@ class Structurer:
             return None
         arguments = self._converter.arguments(own, value, faults)
         options = None
-        descriptor = self._find(kind.plugin_kind, arguments["type"], needed, faults) if "type" in arguments else None
+        type_: str | None = arguments.get("type")
+        descriptor = self._find(key, kind.plugin_kind, type_, needed, faults) if type_ is not None else None
         if descriptor is not None:
             note(self.document, descriptor.options, value, key)
             options = self._options(descriptor, own, value, faults)
@@ -192,11 +197,14 @@ class Structurer:
         described = kind.described(descriptor, options)
         return Part(key, kind(**arguments, **named, **described, options=options), descriptor)
 
-    def _find(self, kind: str, type_: str, needed: bool, faults: Faults) -> Descriptor[Any] | None:
+    def _find(self, key: Key, kind: str, type_: str, needed: bool, faults: Faults) -> Descriptor[Any] | None:
         if not needed and (kind, type_) not in self.registry.entries:
             return None
         try:
             return self.registry.find(kind, type_)
+        except PluginNotInstalled as error:
+            self._missing.append(Missing(key, error))
+            return None
         except PluginError as error:
             faults.add(("type",), str(error))
             return None

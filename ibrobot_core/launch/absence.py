@@ -8,7 +8,7 @@ import attrs
 
 from ibrobot_core.config import RobotConfig
 from ibrobot_core.config.contract_checks import PERIPHERAL_TOPICS
-from ibrobot_core.errors import MissingDependency
+from ibrobot_core.errors import MissingDependency, PluginNotInstalled
 from ibrobot_core.plugins import Registry
 
 
@@ -32,7 +32,10 @@ def absent_sensors(config: RobotConfig, registry: Registry) -> tuple[AbsentSenso
     """
     absent = []
     for name, peripheral in config.peripherals.items():
-        missing = registry.missing("sensor", peripheral.type)
+        try:
+            missing = registry.missing("sensor", peripheral.type)
+        except PluginNotInstalled as error:
+            missing = MissingDependency(error.missing, remedy=error.remedy)
         if missing is None:
             continue
         if peripheral.kind not in PERIPHERAL_TOPICS:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import attrs
 
 from ibrobot_core.component import Component
+from ibrobot_core.config.missing import unavailable_modes
 from ibrobot_core.config.schema import ActionSpec, ObservationSpec, Peripheral, Share
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import ComponentFailed, NotSupported
@@ -58,11 +60,13 @@ class LaunchPlan:
     episodes_worker: SimulatedEpisodes | None
     without: str
     """The sensors that this machine cannot run, and why; empty where there are none."""
+    unavailable: Mapping[str, str]
+    """Mode -> why it cannot be entered."""
 
     def facts(self) -> dict[str, Any]:
         """The plan as `--dry-run --json` prints it."""
         components = [{"name": c.name, "summary": c.summary, "needs": list(c.needs)} for c in self.components]
-        return {"components": components, "without": self.without}
+        return {"components": components, "without": self.without, "unavailable": dict(self.unavailable)}
 
     def lines(self) -> list[str]:
         """The plan as `--dry-run` prints it."""
@@ -72,7 +76,7 @@ class LaunchPlan:
             for number, c in enumerate(self.components, 1)
         ]
         without = [f"without {self.without}"] if self.without else []
-        return [*lines, *without, "stops in reverse order"]
+        return [*lines, *without, *unavailable_modes(self.unavailable), "stops in reverse order"]
 
 
 def mode_parts(session: Session, name: str) -> ModeParts:
@@ -160,7 +164,9 @@ def build_plan(session: Session) -> LaunchPlan:
     if config.simulated and isinstance(parts.feeder, InferenceFeeder):
         worker = SimulatedEpisodes(session, episodes, (parts.feeder.name,))
         components.append(worker)
-    return LaunchPlan(tuple(_ordered(components)), parts, episodes, recording, worker, describe(session.absent))
+    return LaunchPlan(
+        tuple(_ordered(components)), parts, episodes, recording, worker, describe(session.absent), config.unavailable
+    )
 
 
 def _ordered(components: list[Component]) -> list[Component]:

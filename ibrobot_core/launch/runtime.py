@@ -7,7 +7,8 @@ from typing import Any
 
 from ibrobot_core.clock import SteppedClock
 from ibrobot_core.component import Component, Worker, cause, exit_code, told
-from ibrobot_core.errors import ComponentFailed, HardwareError, NotSupported
+from ibrobot_core.config.missing import unavailable_modes
+from ibrobot_core.errors import ComponentFailed, HardwareError, NotSupported, PluginError
 from ibrobot_core.launch.control import Control
 from ibrobot_core.launch.plan import LaunchPlan, build_plan, mode_parts
 from ibrobot_core.launch.session import Session
@@ -62,6 +63,8 @@ class Runtime:
         session = self.session
         if self.plan.without:
             session.log.warning("running without %s", self.plan.without)
+        for line in unavailable_modes(session.config.unavailable):
+            session.log.warning("%s", line)
         try:
             for component in self.plan.components:
                 on_start(component.name)
@@ -115,6 +118,8 @@ class Runtime:
         session = self.session
         if name not in session.config.control_modes:
             raise NotSupported(f"no mode {name!r}; the modes are: {', '.join(session.config.control_modes)}")
+        if (reason := session.config.unavailable.get(name)) is not None:
+            raise PluginError(f"mode {name} is unavailable: {reason}")
         if name == session.mode:
             if session.held:
                 self._go_on()

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from ibrobot_core.contract.specs import Contract
-from ibrobot_core.errors import DiskFull, NotSupported, RecorderError
+from ibrobot_core.errors import DiskFull, NotSupported, RecorderError, wrong_input
 from ibrobot_core.recording.dataset import EpisodeDataset
 from ibrobot_core.recording.episode import is_kept
 from ibrobot_core.recording.episodes import Episodes
@@ -56,8 +56,9 @@ class EpisodeDesk:
         self.folder = config.folder
         self._dataset = EpisodeDataset(self.folder)
         contract = Contract.from_config(session.config)
-        self._dataset.check_writable()
-        self._dataset.check(contract)
+        with wrong_input():  # `recording.root` or `recording.dataset` names what cannot be used
+            self._dataset.check_writable()
+            self._dataset.check(contract)
         left_out = [topic for topic in contract.topics if not is_kept(topic, config, contract)]
         if session.request.by_operator and left_out:
             raise RecorderError(

@@ -1,4 +1,4 @@
-"""Writes `ibrobot_core/official_plugins.json` from the descriptors of the plugins in this repository.
+"""Writes `official_plugins.json` and `official_extras.json` of core, from the plugins in this repository.
 
 python tests/house/official_plugins.py
 """
@@ -6,11 +6,16 @@ python tests/house/official_plugins.py
 from __future__ import annotations
 
 import json
+import re
+import tomllib
 from importlib.metadata import entry_points
+from pathlib import Path
 
+from ibrobot_core.packages import EXTRAS
 from ibrobot_core.plugins import KINDS, OFFICIAL, discover
 
 CORE = "ibrobot-core"
+DISTRIBUTION = Path(__file__).parents[2] / "plugins" / "ibrobot" / "pyproject.toml"
 
 
 def offers() -> dict[str, dict[str, list[str]]]:
@@ -39,5 +44,13 @@ def offers() -> dict[str, dict[str, list[str]]]:
     return dict(sorted(found.items()))
 
 
+def extras() -> dict[str, list[str]]:
+    """Extra of `ibrobot` -> the plugins that it installs; without those made of other extras."""
+    declared: dict[str, list[str]] = tomllib.loads(DISTRIBUTION.read_text())["project"]["optional-dependencies"]
+    names = {extra: [re.split(r"[\[<>=~! ;]", each)[0] for each in content] for extra, content in declared.items()}
+    return {extra: sorted(content) for extra, content in names.items() if "ibrobot" not in content}
+
+
 if __name__ == "__main__":
     OFFICIAL.write_text(json.dumps(offers(), indent=2) + "\n", encoding="utf-8")
+    EXTRAS.write_text(json.dumps(extras(), indent=2) + "\n", encoding="utf-8")

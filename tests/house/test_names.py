@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterator
 
 import pytest
 
+from ibrobot_core.packages import EXTRAS
 from ibrobot_core.plugins import KINDS, OFFICIAL, example_type, official_plugins
 
 CORE = OFFICIAL.parent
@@ -62,6 +64,7 @@ def test_examples_in_messages_are_default_types() -> None:
 
 @pytest.mark.integration
 def test_official_plugins_are_listed_as_they_are() -> None:
-    from official_plugins import offers
+    from official_plugins import extras, offers
 
     assert offers() == official_plugins(), "run python tests/house/official_plugins.py"
+    assert extras() == json.loads(EXTRAS.read_bytes()), "run python tests/house/official_plugins.py"

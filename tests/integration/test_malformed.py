@@ -62,3 +62,51 @@ def test_one_error_and_the_same_from_both(
     assert code == 2
     [line] = err.splitlines()
     assert line.startswith(f"error: robot.yaml:{case['told']}")
+
+
+MODEL = """\
+<mujoco>
+  <worldbody>
+    <body><joint name="pan" range="-60 60"/><geom size="0.1"/><site name="tip"/></body>
+  </worldbody>
+  <actuator><position joint="pan" kp="1"/></actuator>
+</mujoco>
+"""
+SIMULATED = """\
+robot:
+  name: mini
+  joints: [{name: pan, lower: -1.0, upper: 1.0, max_velocity: 2.0, max_acceleration: 10.0}]
+  groups: {arm: [pan]}
+  description: {mjcf: model.xml, tip: tip, poses: {rest: [0]}}
+simulation: {type: mujoco, scene: empty}
+executors: {arm: {type: position, group: arm}}
+control_modes: {idle: {executors: [arm]}}
+default_control_mode: idle
+"""
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ("", "", ""),
+        ('<position joint="pan" kp="1"/>', '<motor joint="pan"/>', "has no position actuator for joint 'pan'"),
+        ("<joint name", "<joint nick", "unrecognized attribute: 'nick'"),
+        ('<joint name="pan" range="-60 60"/>', "", "has no joint 'pan'; it has:"),
+        ("<geom size", "<gemo size", "unrecognized element"),
+    ],
+)
+def test_model_that_mujoco_refuses(
+    old: str, new: str, told: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("robot.yaml").write_text(SIMULATED)
+    Path("model.xml").write_text(MODEL.replace(old, new) if old else MODEL)
+
+    checked = run(monkeypatch, capsys, "config", "check", "robot.yaml")
+    launched = run(monkeypatch, capsys, "launch", "robot.yaml", "--dry-run")
+
+    assert checked == launched
+    code, err = checked
+    assert (code or 0) == (2 if told else 0), err
+    assert told in err
+    assert len(err.splitlines()) == bool(told)
+    assert err.startswith("error: robot.yaml:6: simulation: ") or not told

@@ -150,3 +150,28 @@ def test_a_held_episode_in_simulation_ends_and_the_next_one_waits_too(runs: Runs
     moves(runtime, 100)
     assert runtime.session.finished.is_set()
     assert runtime.summary()["successes"] == 1
+
+
+def test_status_has_a_fault_until_its_reset_and_the_summary_to_the_end(run: Runtime, runs: Runs) -> None:
+    status = run.session.bus.subscribe("/robot_status", 1)
+
+    def faults() -> tuple[str, ...]:
+        moves(run)
+        received = status.get()
+        assert received is not None
+        found: tuple[str, ...] = received.message.faults
+        return found
+
+    device = runs.parts.MADE["lever"]
+    read = device.read
+
+    def gone(measured: object) -> None:
+        raise TeleopError("the lever is gone")
+
+    device.read = gone
+    assert faults() == ("the lever is gone",)
+    device.read = read
+    run.reset()
+    assert faults() == ()
+    assert run.summary()["faults"] == ["the lever is gone"]
+    status.close()

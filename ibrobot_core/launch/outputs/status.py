@@ -56,7 +56,7 @@ class Status(Worker):
         return RobotStatus(
             Header(now_ns), session.config.robot.name, session.mode,
             active_executors=session.config.control_modes[session.mode].executors,
-            estop=session.state is not None and session.state.estop, faults=tuple(session.outcome.faults),
+            estop=session.state is not None and session.state.estop, faults=session.faults,
             episode=session.outcome.episodes + 1, **dispatch,
         )  # fmt: skip
 

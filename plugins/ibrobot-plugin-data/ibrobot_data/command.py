@@ -27,6 +27,7 @@ from ibrobot_core.api import (
     installed_plugins,
     plural,
     with_closed_ends,
+    wrong_input,
 )
 from ibrobot_data.request import MISSING, OUTCOMES, EpisodeReport, Report, Request
 
@@ -91,7 +92,8 @@ def convert(context: click.Context, /, to: str, as_json: bool, **asked: Any) -> 
         option = next(each.opts[0] for each in context.command.params if each.name == wrong[0])
         raise click.UsageError(f"{option} has no meaning for --to {to}")
     try:
-        report = (_to_bags if to == "bag" else _to_dataset)(as_json=as_json, **asked)
+        with wrong_input():
+            report = (_to_bags if to == "bag" else _to_dataset)(as_json=as_json, **asked)
     except KeyboardInterrupt:
         echo("interrupted; finished episodes are kept, and the same command goes on from there", err=True)
         sys.exit(130)

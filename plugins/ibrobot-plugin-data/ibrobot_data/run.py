@@ -29,6 +29,7 @@ from ibrobot_core.api import (
     DatasetSummary,
     EpisodeAddress,
     IbrobotError,
+    end_signals,
     installed_plugins,
     seconds,
     set_malloc,
@@ -301,20 +302,25 @@ def end_processes(processes: Sequence[BaseProcess]) -> None:
 
 @contextmanager
 def _deaf() -> Iterator[None]:
-    """Ctrl-C waits meanwhile, and never reaches the processes begun here: each would tell where it was just then."""
+    """Ctrl-C waits meanwhile, and never reaches the processes begun here: each would tell where it was just then.
+
+    SIGTERM and SIGHUP wait, too.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield  # where Ctrl-C does not come
         return
     came: list[int] = []
-    handler = signal.signal(signal.SIGINT, lambda number, _: came.append(number))  # any thread may get it
+    # Any thread may get them.
+    handlers = {number: signal.signal(number, lambda number, _: came.append(number)) for number in end_signals()}
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # what is begun inherits it
     try:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-        signal.signal(signal.SIGINT, handler)
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
     if came:
-        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(came[0])
 
 
 def _refuse_misfits(units: Sequence[Unit], old: DatasetSummary | None) -> dict[str, EpisodeReport]:

@@ -100,11 +100,31 @@ class CameraOptions:
     shadows: bool = option(False, help="whether to render shadows (three times the cost)")
 
 
+def _unusable(options: MujocoOptions, robot: Robot) -> Iterator[OptionFault]:
+    """What MuJoCo refuses: its own rules for MJCF, joints and actuators that are missing, cameras of the options."""
+    # The scene is built only to be checked, so MuJoCo is imported only where a run would simulate.
+    from ibrobot_core.api import HardwareError, MissingDependency
+    from ibrobot_mujoco.gl import check_asked
+
+    try:
+        check_asked()
+    except MissingDependency:
+        return  # MuJoCo cannot be imported; a run says why
+    from ibrobot_mujoco.model import build_spec
+
+    try:
+        build_spec(options, robot)
+    except HardwareError as error:
+        yield OptionFault((), " ".join(str(error).split()))
+
+
 def check_world(options: MujocoOptions, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:
     """There is a model to simulate, and the pose and joints that options name."""
     poses = list(robot.description.poses)
     if robot.description.mjcf is None:
         yield OptionFault((), f"robot {robot.name!r} has no MJCF to simulate: robot.description.mjcf must name one")
+    elif robot.description.mjcf.is_file():  # core has told of one that is not there
+        yield from _unusable(options, robot)
     if options.start_pose not in poses:
         message = f"unknown pose {options.start_pose!r}{did_you_mean(options.start_pose, poses, 'known')}"
         yield OptionFault(("start_pose",), message)

@@ -15,10 +15,12 @@ from typing import Any
 import click
 
 from ibrobot_core.api import (
+    ConfigError,
     Context,
     LogFormatter,
     MetricsServer,
     Policy,
+    Problem,
     RealClock,
     Registry,
     Robot,
@@ -34,6 +36,7 @@ from ibrobot_core.api import (
     on_signals,
     parse_yaml,
     single_options,
+    wrong_input,
 )
 from ibrobot_serve.metrics import probes
 from ibrobot_serve.service import InferenceService, ServiceOptions
@@ -89,9 +92,10 @@ def serve(what: str, **options: Any) -> None:
     handler.setFormatter(LogFormatter("%(levelname).1s %(message)s"))
     logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
     logging.getLogger("ibrobot").setLevel(logging.INFO)
-    name, policy, make_transport = (
-        _from_folder(Path(what), registry, options) if options["type_"] else _from_config(what, registry, options)
-    )
+    with wrong_input():
+        name, policy, make_transport = (
+            _from_folder(Path(what), registry, options) if options["type_"] else _from_config(what, registry, options)
+        )
     transport: Transport | None = None
     hung = threading.Event()
     try:
@@ -197,7 +201,11 @@ def _from_folder(
 
 def _transport_type(path: Path, overrides: Sequence[str]) -> str:
     """The type that the `transport` section names, before anything is checked; empty where there is none."""
-    document = parse_yaml(path.read_text(encoding="utf-8", errors="replace"), str(path))
+    try:
+        text = path.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise ConfigError([Problem(str(path), 0, "", f"cannot be read: {error.strerror}")]) from None
+    document = parse_yaml(text, str(path))
     if not isinstance(document.root, Mapping):
         return ""
     apply_overrides(document, overrides)

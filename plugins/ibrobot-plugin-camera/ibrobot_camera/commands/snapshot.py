@@ -10,7 +10,7 @@ from pathlib import Path
 import click
 import cv2
 
-from ibrobot_core.api import NS_PER_S, CompressedImage, Image, SensorError, echo
+from ibrobot_core.api import NS_PER_S, CompressedImage, Image, SensorError, echo, wrong_input
 
 _WAIT_S = 10.0
 
@@ -31,8 +31,9 @@ def snapshot(source: str, output: Path | None, seconds: float) -> None:
         pictures = {name: found.result() for name, found in watched.items()}
     for name, (image, rate_hz) in pictures.items():
         path = output if len(pictures) == 1 else output.with_stem(f"{output.stem}_{name}")
-        if not cv2.imwrite(str(path), pixels(image)):
-            raise SensorError(f"{path}: cannot be written")
+        with wrong_input():
+            if not cv2.imwrite(str(path), pixels(image)):
+                raise SensorError(f"{path}: cannot be written")
         echo(f"{path}: {name}, {image.width}x{image.height} {image.encoding}, {rate_hz:.1f} Hz")
 
 

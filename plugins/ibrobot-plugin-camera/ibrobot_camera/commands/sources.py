@@ -23,6 +23,7 @@ from ibrobot_core.api import (
     find_config,
     installed_plugins,
     load_config,
+    wrong_input,
 )
 
 _TO_BGR = {"bgr8": None, "rgb8": cv2.COLOR_RGB2BGR, "mono8": cv2.COLOR_GRAY2BGR}
@@ -42,7 +43,8 @@ def opened(source: str) -> Iterator[dict[str, OpenCvCamera]]:
         for name, options in _options(source).items():
             ctx = Context(name, clock, logging.getLogger(f"ibrobot.{name}"), Robot("camera", ()))
             camera = OpenCvCamera(options, ctx)
-            camera.open()
+            with wrong_input():
+                camera.open()
             stack.callback(camera.close)
             cameras[name] = camera
         yield cameras

@@ -12,6 +12,7 @@ from ibrobot_core.api import (
     ZERO_AT,
     ZERO_AT_POSE,
     Calibration,
+    Declined,
     HardwareError,
     IbrobotError,
     JointCalibration,
@@ -62,7 +63,7 @@ def calibrate(
     joints = joints_of(robot, name)
     path = calibration_path(name)
     if path.exists() and not yes and not agree(f"{path} is there already. Calibrate anew?", flag="--yes"):
-        raise click.Abort
+        raise Declined
     compared = [joint.name for joint in joints if not (leader and joint.name == "gripper")]
     answers = Answers(middle_now, range_seconds, accept_ranges, check_signs)
     with opened(port, joints=by_servo(joints)) as bus:
@@ -110,7 +111,7 @@ def _prepare(bus: FeetechBus, yes: bool) -> None:
     if any(bus.sync_read("torque_enable", servos).values()) and not yes:
         echo("The torque goes off, and the arm falls: hold it.")
         if not agree("Go on?", flag="--yes", default=True):
-            raise click.Abort
+            raise Declined
     relax(bus, servos)
 
 

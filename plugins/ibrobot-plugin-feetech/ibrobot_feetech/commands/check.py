@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import attrs
 import click
 
-from ibrobot_core.api import Calibration, echo, load_calibration
+from ibrobot_core.api import Calibration, Declined, echo, load_calibration
 from ibrobot_feetech.arm import write_eprom
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.commands.dialogue import agree, show, table
@@ -57,7 +57,7 @@ def check(port: str | None, name: str, robot: str | None, write: bool, yes: bool
             servos = sorted({each.servo for each in wrong})
             echo("The torque of these servos goes off, and the arm may fall: hold it.")
             if not (yes or agree(f"Write to servos {', '.join(map(str, servos))}?", flag="--yes")):
-                raise click.Abort
+                raise Declined
             for servo in servos:
                 write_eprom(bus, servo, {each.register: int(each.wanted) for each in wrong if each.servo == servo})
             found = list(differences(bus, calibration))

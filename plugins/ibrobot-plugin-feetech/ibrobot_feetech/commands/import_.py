@@ -5,7 +5,15 @@ from __future__ import annotations
 import attrs
 import click
 
-from ibrobot_core.api import ZERO_AT, HardwareError, calibration_path, echo, load_calibration, save_calibration
+from ibrobot_core.api import (
+    ZERO_AT,
+    Declined,
+    HardwareError,
+    calibration_path,
+    echo,
+    load_calibration,
+    save_calibration,
+)
 from ibrobot_feetech.commands.calibrate import backup
 from ibrobot_feetech.commands.dialogue import agree
 from ibrobot_feetech.commands.joints import joints_of
@@ -32,7 +40,7 @@ def import_calibration(
     path = calibration_path(name or file)
     found = load_calibration(file, [joint.name for joint in joints_of(robot, name)], zero_at=zero_at)
     if path.exists() and not yes and not agree(f"{path} is there already. Overwrite it?", flag="--yes"):
-        raise click.Abort
+        raise Declined
     adapter = found.adapter if port is None else _adapter(port)
     made = attrs.evolve(found, robot=arm or found.robot, adapter=adapter)
     backup(path)

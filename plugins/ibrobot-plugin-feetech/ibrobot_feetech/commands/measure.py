@@ -8,11 +8,10 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 
 import attrs
-import click
 from rich.live import Live
 from rich.table import Table
 
-from ibrobot_core.api import TICKS_PER_TURN, CalibrationError, JointCalibration, KeyReader, Screen, echo
+from ibrobot_core.api import TICKS_PER_TURN, CalibrationError, Declined, JointCalibration, KeyReader, Screen, echo
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.commands.dialogue import Unanswered, agree, interactive, table, wait_for_enter
 from ibrobot_feetech.commands.joints import Joint
@@ -111,7 +110,7 @@ class Measurement:
                 raise CalibrationError(refused)
             echo(refused, err=True)
             if not agree("Measure on?", flag="--range-seconds", default=True):
-                raise click.Abort
+                raise Declined
 
     def _accepted(self, ranges: Mapping[str, Range]) -> bool:
         compared = [joint for joint in self._measured if joint.name in self._compared]

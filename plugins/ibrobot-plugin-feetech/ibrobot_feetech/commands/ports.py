@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from ibrobot_core.api import HardwareError, echo
+from ibrobot_core.api import HardwareError, echo, wrong_input
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.usb import ADAPTER_VENDOR, usb_ports
 
@@ -50,8 +50,9 @@ def opened(
     Raises:
         HardwareError: when it cannot be opened.
     """
-    bus = FeetechBus(the_port(port), baud_rate=baud_rate, joints=joints, retries=_RETRIES)
-    bus.open()
+    with wrong_input():
+        bus = FeetechBus(the_port(port), baud_rate=baud_rate, joints=joints, retries=_RETRIES)
+        bus.open()
     try:
         yield bus
     finally:

@@ -6,7 +6,7 @@ from contextlib import suppress
 
 import click
 
-from ibrobot_core.api import HardwareError, echo
+from ibrobot_core.api import Declined, HardwareError, echo
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.commands.dialogue import agree, interactive, wait_for_enter
 from ibrobot_feetech.commands.joints import Joint, by_servo, chosen, joints_of
@@ -49,7 +49,7 @@ def _set_up(bus: FeetechBus, joint: Joint, rates: tuple[int, ...], yes: bool) ->
                 raise
             echo(f"error: {error}", err=True)
             if not agree("Try again?", flag="--yes", default=True):
-                raise click.Abort from None
+                raise Declined from None
         else:
             echo(f"{joint.name}: was id {servo} at {rate} baud, is id {joint.servo} at {_RATE} baud")
             return

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from ibrobot_core.api import echo
+from ibrobot_core.api import Declined, echo
 from ibrobot_feetech.arm import hold, relax
 from ibrobot_feetech.commands.dialogue import agree
 from ibrobot_feetech.commands.joints import Joint, by_servo, chosen, joints_of
@@ -33,6 +33,6 @@ def torque(
         else:
             echo("Without torque the arm falls: hold it, or see that it lies.")
             if not (yes or agree("Torque off?", flag="--yes")):
-                raise click.Abort
+                raise Declined
             relax(bus, [joint.servo for joint in joints])
     echo(f"torque {state}: {', '.join(joint.name for joint in joints)}")

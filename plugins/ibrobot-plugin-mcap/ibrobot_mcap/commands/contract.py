@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from ibrobot_core.api import RecorderError, echo
+from ibrobot_core.api import RecorderError, echo, wrong_input
 
 
 @click.group()
@@ -17,6 +17,7 @@ def contract() -> None:
 @contract.command()
 @click.argument("bag", type=click.Path(path_type=Path))
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="The new file; printed when left out.")
+@wrong_input()
 def init(bag: Path, output: Path | None) -> None:
     """Draft a contract for BAG, by its topics and their first messages.
 

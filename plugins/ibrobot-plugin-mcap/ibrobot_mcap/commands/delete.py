@@ -7,12 +7,13 @@ from pathlib import Path
 
 import click
 
-from ibrobot_core.api import RecorderError, echo
+from ibrobot_core.api import Declined, RecorderError, echo, wrong_input
 
 
 @click.command()
 @click.argument("episodes", type=click.Path(path_type=Path), nargs=-1, required=True)
 @click.option("--yes", is_flag=True, help="Do not ask.")
+@wrong_input()
 def delete(episodes: tuple[Path, ...], yes: bool) -> None:
     """Delete EPISODES, after asking. Only folders of episodes are deleted."""
     from ibrobot_mcap.commands.found import size_of, told_size
@@ -22,8 +23,8 @@ def delete(episodes: tuple[Path, ...], yes: bool) -> None:
         if not (episode.is_dir() and is_rosbag2(episode)):
             raise RecorderError(f"{episode}: is no episode; nothing was deleted")
     for episode in episodes:
-        if not yes:
-            click.confirm(f"delete {episode} ({told_size(size_of(episode))})?", abort=True)
+        if not (yes or click.confirm(f"delete {episode} ({told_size(size_of(episode))})?")):
+            raise Declined
         try:
             shutil.rmtree(episode)
         except OSError as error:

@@ -12,7 +12,7 @@ import attrs
 import click
 import numpy as np
 
-from ibrobot_core.api import Image, Message, RecorderError, echo
+from ibrobot_core.api import Image, Message, RecorderError, echo, wrong_input
 
 _TO_RGB = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2, 3), "bgra8": (2, 1, 0, 3)}
 """Encoding -> its channels in the order of a PNG."""
@@ -24,6 +24,7 @@ _TO_RGB = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2, 3), "bgra8":
 @click.option(
     "-o", "--output", type=click.Path(path_type=Path), required=True, help="A .csv, or a folder for pictures."
 )
+@wrong_input()
 def export(episode: Path, topic: str, output: Path) -> None:
     """Export one TOPIC of an EPISODE: numbers and texts to a CSV file, pictures to PNG files with their stamps."""
     from ibrobot_mcap.commands.found import opened

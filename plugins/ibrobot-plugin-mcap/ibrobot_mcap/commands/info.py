@@ -10,7 +10,7 @@ import attrs
 import click
 from rich.table import Table
 
-from ibrobot_core.api import Screen, echo
+from ibrobot_core.api import Screen, echo, wrong_input
 
 _LONG = 200
 """Metadata longer than this is only told the length of [characters]."""
@@ -19,6 +19,7 @@ _LONG = 200
 @click.command()
 @click.argument("episode", type=click.Path(path_type=Path))
 @click.option("--json", "as_json", is_flag=True, help="Print JSON, with all metadata.")
+@wrong_input()
 def info(episode: Path, as_json: bool) -> None:
     """Show what is in an EPISODE: topics, counts, losses and metadata. An unfinished one needs no repair for it."""
     from ibrobot_mcap.commands.found import date_of, duration_s, size_of, summary_of, told_size

@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 from rich.table import Table
 
-from ibrobot_core.api import RecorderError, Screen, echo, styled
+from ibrobot_core.api import RecorderError, Screen, echo, styled, wrong_input
 
 _WIDE = 100
 """Columns of a terminal in which prompts and years have room."""
@@ -18,6 +18,7 @@ _WIDE = 100
 @click.command("list")
 @click.argument("path", type=click.Path(path_type=Path), default=Path("episodes"))
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@wrong_input()
 def list_episodes(path: Path, as_json: bool) -> None:
     """List the episodes in PATH: a folder of datasets (`episodes` when left out), a dataset, or an episode."""
     from ibrobot_mcap.commands.found import date_of, duration_s, episodes_in, size_of, summary_of, told_size

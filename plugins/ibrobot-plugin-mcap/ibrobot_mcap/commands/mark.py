@@ -6,12 +6,13 @@ from pathlib import Path
 
 import click
 
-from ibrobot_core.api import RecorderError, echo
+from ibrobot_core.api import RecorderError, echo, wrong_input
 
 
 @click.command()
 @click.argument("episodes", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.argument("outcome", type=click.Choice(("success", "failure", "unknown")))
+@wrong_input()
 def mark(episodes: tuple[Path, ...], outcome: str) -> None:
     """Set the OUTCOME of EPISODES, e.g. after a repair: what you say counts, and that you said it is written down."""
     from ibrobot_mcap.facts import set_custom

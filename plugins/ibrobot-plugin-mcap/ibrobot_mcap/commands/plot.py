@@ -10,7 +10,7 @@ from typing import Any
 import click
 import numpy as np
 
-from ibrobot_core.api import NS_PER_S, Float64MultiArray, Image, JointState, RecorderError, echo
+from ibrobot_core.api import NS_PER_S, Float64MultiArray, Image, JointState, RecorderError, echo, wrong_input
 from ibrobot_mcap.checks import contract_of
 
 _THUMBNAILS = 8
@@ -19,6 +19,7 @@ _THUMBNAILS = 8
 @click.command()
 @click.argument("episode", type=click.Path(path_type=Path))
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="A .png; NAME.png when left out.")
+@wrong_input()
 def plot(episode: Path, output: Path | None) -> None:
     """Draw an EPISODE: joints and actions over time, rates and gaps of every topic, pictures along it."""
     try:
@@ -128,7 +129,7 @@ def _draw(facts: Facts, output: Path) -> None:
             axes.set_axis_off()
             axes.set_title(f"{topic}\n{at:.1f} s" if column == first else f"{at:.1f} s", fontsize="small", loc="left")
     try:
-        figure.savefig(output, dpi=80)
+        figure.savefig(output, dpi=80, format=output.suffix[1:] or "png")  # a name stays as it was given
     except (OSError, ValueError) as error:
         raise RecorderError(f"{output}: cannot be written: {error}") from error
     finally:

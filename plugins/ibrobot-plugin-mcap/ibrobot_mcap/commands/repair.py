@@ -6,11 +6,12 @@ from pathlib import Path
 
 import click
 
-from ibrobot_core.api import EpisodeSummary, RecorderError, echo
+from ibrobot_core.api import EpisodeSummary, RecorderError, echo, wrong_input
 
 
 @click.command()
 @click.argument("path", type=click.Path(path_type=Path))
+@wrong_input()
 def repair(path: Path) -> None:
     """Make episodes in PATH whole that are unfinished or lack messages: index and metadata.yaml, of all that is there.
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from ibrobot_core.api import RecorderError, echo
+from ibrobot_core.api import RecorderError, echo, wrong_input
 
 
 @click.command()
@@ -14,6 +14,7 @@ from ibrobot_core.api import RecorderError, echo
 @click.option("--from", "begin_s", type=click.FloatRange(min=0), default=0.0, show_default=True, help="[s]")
 @click.option("--to", "end_s", type=click.FloatRange(min=0), help="[s]; to the end when left out")
 @click.option("-o", "--output", type=click.Path(path_type=Path), required=True, help="The new episode.")
+@wrong_input()
 def trim(episode: Path, begin_s: float, end_s: float | None, output: Path) -> None:
     """Copy a part of an EPISODE into a new one, by seconds from its first message.
 

@@ -6,12 +6,13 @@ from pathlib import Path
 
 import click
 
-from ibrobot_core.api import echo
+from ibrobot_core.api import echo, wrong_input
 
 
 @click.command()
 @click.argument("path", type=click.Path(path_type=Path))
 @click.option("--gap", type=click.FloatRange(min=1), default=5.0, show_default=True, help="Longest pause, in periods.")
+@wrong_input()
 def verify(path: Path, gap: float) -> None:
     """Read every message of the episodes in PATH, and say what is wrong; exits with 1 if something is.
 

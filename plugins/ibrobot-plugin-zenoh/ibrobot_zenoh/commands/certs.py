@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from ibrobot_core.api import TransportError, echo
+from ibrobot_core.api import TransportError, echo, wrong_input
 from ibrobot_zenoh.certificates import CA, CERTIFICATE, KEY, ROBOTS, Authority
 from ibrobot_zenoh.options import check_robot_name
 
@@ -21,6 +21,7 @@ _FILES = {"ca": CA, "certificate": CERTIFICATE, "key": KEY}
 @click.option("--server", "servers", multiple=True, metavar="HOST[,IP…]", help="A server: what robots connect to.")
 @click.option("--robot", "robots", multiple=True, metavar="NAME", help="A robot, which only connects.")
 @click.option("--days", default=1825, show_default=True, type=click.IntRange(1, 7300), help="How long they are valid.")
+@wrong_input()
 def certs(out_dir: Path, servers: tuple[str, ...], robots: tuple[str, ...], days: int) -> None:
     """Make certificates for a lab in OUT_DIR: an authority of its own, and a folder to copy to each machine.
 

@@ -1,0 +1,103 @@
+"""Types whose plugins are not installed: what the entered mode needs is an error, other modes are unavailable."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import attrs
+
+from ibrobot_core.config.yaml_nodes import Document, Key
+from ibrobot_core.errors import PluginNotInstalled
+from ibrobot_core.packages import install_command
+
+_OPTIONAL_SENSORS = ("camera",)
+"""Kinds of sensors without which a run goes on, where nothing in it needs them."""
+
+
+@attrs.frozen
+class Missing:
+    """A component that cannot be made, since its plugin is not installed or is broken."""
+
+    key: Key
+    error: PluginNotInstalled
+
+
+def split(
+    document: Document, plain: Mapping[str, Any], missing: Sequence[Missing], entered: str | None, *, everything: bool
+) -> Mapping[str, str]:
+    """Note what the entered mode lacks as one problem of the document.
+
+    Args:
+        document: the robot YAML.
+        plain: its sections that need no plugin, structured.
+        missing: all that is missing.
+        entered: the mode in which the run begins.
+        everything: whether all of it is needed.
+
+    Returns:
+        Mode -> why it is unavailable, of the other modes.
+    """
+    modes: Mapping[str, Any] = plain.get("control_modes") or {}
+    used = {name: _used(name, mode) for name, mode in modes.items()}
+    observed = _observed(document, plain)
+    used = {name: keys | observed if modes[name].inference is not None else keys for name, keys in used.items()}
+    always = observed if "recording" in document.root else set[Key]()
+    now = always | used.get(entered or "", set())
+    needed = [each for each in missing if everything or each.key in now or not _may_wait(document, each.key)]
+    if needed:
+        document.add((*needed[0].key, "type"), describe(each.error for each in needed))
+    lacking = {name: [each.error for each in missing if each.key in keys] for name, keys in used.items()}
+    return {name: describe(errors) for name, errors in lacking.items() if errors and name != entered}
+
+
+def unavailable_modes(unavailable: Mapping[str, str]) -> list[str]:
+    """A line for each reason why modes cannot be entered."""
+    by_reason: dict[str, list[str]] = {}
+    for name, reason in unavailable.items():
+        by_reason.setdefault(reason, []).append(name)
+    return [
+        f"{f'mode {names[0]} is' if len(names) == 1 else f'modes {", ".join(names)} are'} unavailable: {reason}"
+        for reason, names in by_reason.items()
+    ]
+
+
+def describe(errors: Iterable[PluginNotInstalled]) -> str:
+    """What is missing, with one line that installs all of it; plugins that are broken are named with the reason."""
+    found = list(dict.fromkeys(errors))
+    absent = list(dict.fromkeys((error.kind, error.type) for error in found if not error.reason))
+    texts = [error.reason for error in found if error.reason]
+    if absent:
+        names = ", ".join(f"{kind} type {type_!r}" for kind, type_ in absent)
+        needs = "needs a plugin that is" if len(absent) == 1 else "need plugins that are"
+        command = install_command(error.package for error in found if not error.reason)
+        texts.append(f"{names} {needs} not installed: {command}")
+    return "; ".join(texts)
+
+
+def _used(name: str, mode: Any) -> set[Key]:
+    """What drives a mode."""
+    keys: set[Key] = {("control_modes", name, "planner")}
+    if mode.teleop is not None:
+        keys.add(("teleoperation", mode.teleop))
+    if mode.inference is not None:
+        keys.add(("models", mode.inference.model))
+    return keys
+
+
+def _observed(document: Document, plain: Mapping[str, Any]) -> set[Key]:
+    """The peripherals that the contract observes."""
+    contract = plain.get("contract")
+    names = {spec.peripheral for spec in contract.observations} if contract is not None else set()
+    peripherals = document.root.get("peripherals")
+    items = peripherals if isinstance(peripherals, list) else ()
+    return {
+        ("peripherals", i) for i, item in enumerate(items) if isinstance(item, Mapping) and item.get("name") in names
+    }
+
+
+def _may_wait(document: Document, key: Key) -> bool:
+    """Whether only some modes need what is at `key`."""
+    if key[0] == "peripherals":
+        return document.get(*key, "kind") in _OPTIONAL_SENSORS
+    return key[0] in ("models", "teleoperation", "control_modes")

@@ -1,0 +1,275 @@
+"""Every command of `ibrobot`, those of plugins included: wrong files, ASCII terminals, JSON, and the end by signals."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import attrs
+import click
+import pytest
+
+from ibrobot_core.cli.main import cli, main
+
+pytestmark = pytest.mark.integration
+
+BAD = "BAD"
+"""Stands for the wrong file in a command line."""
+WRONG_FILES = {
+    "replay BAD": (),
+    "replay EPISODE BAD": (),
+    "replay EPISODE so101_blind --sim --dry-run --calibration BAD": (),
+    "launch BAD --dry-run": (),
+    "record BAD --dry-run": (),
+    "record so101_blind --sim --dry-run --root BAD": ("missing", "folder"),
+    "convert BAD --out new": (),
+    "convert EPISODE --out BAD": ("missing", "folder"),
+    "convert EPISODE --out new --config BAD": (),
+    "convert EPISODE --out new --norm-mode range_m100_100 --calibration BAD": (),
+    "convert BAD --to bag --out new": (),
+    "serve BAD": (),
+    "serve BAD --type lerobot": (),
+    "config check BAD": (),
+    "config show BAD": (),
+    "camera preview BAD --seconds 1 --port 0": (),
+    "camera snapshot BAD": (),
+    "certs BAD --robot one": ("missing", "folder"),
+    "contract init BAD": (),
+    "contract init EPISODE -o BAD": ("missing",),
+    "episodes delete BAD --yes": (),
+    "episodes export BAD /joint_states -o new.csv": (),
+    "episodes export EPISODE /joint_states -o BAD": ("missing", "binary", "empty"),
+    "episodes info BAD": (),
+    "episodes list BAD": (),
+    "episodes mark BAD success": (),
+    "episodes plot BAD": (),
+    "episodes repair BAD": (),
+    "episodes trim BAD --begin 0.5 -o new": (),
+    "episodes trim EPISODE --begin 0.5 -o BAD": ("missing",),
+    "episodes verify BAD": (),
+    "feetech calibrate BAD --yes": (),
+    "feetech calibrate no_port --robot BAD --yes": (),
+    "feetech check BAD": (),
+    "feetech check no_port --name ./BAD.json": (),
+    "feetech check no_port --robot BAD": (),
+    "feetech emulate --physics BAD": (),
+    "feetech emulate --calibration ./BAD": ("missing",),
+    "feetech import ./BAD --yes": (),
+    "feetech import ./calibration.json --robot BAD --yes": (),
+    "feetech monitor BAD --once": (),
+    "feetech monitor no_port --robot BAD --once": (),
+    "feetech scan BAD": (),
+    "feetech setup-motors BAD --yes": (),
+    "feetech torque off BAD --yes": (),
+    "feetech torque off no_port --robot BAD --yes": (),
+    "topic echo /a --config BAD": (),
+    "topic hz /a --config BAD": (),
+    "topic list --config BAD": (),
+    "topic pub /a std_msgs/msg/Bool {data:true} --config BAD": (),
+}
+"""Command line -> the kinds of files that are right there."""
+WITHOUT_FILES = {"config schema", "plugins show", "doctor", "camera list", "feetech find-port"}
+KINDS = ("missing", "folder", "binary", "unreadable", "empty")
+
+
+def commands(command: click.Command = cli, names: tuple[str, ...] = ()) -> Iterator[str]:
+    """The full names of all commands."""
+    if not isinstance(command, click.Group):
+        yield " ".join(names)
+        return
+    context = click.Context(command)
+    for name in command.list_commands(context):
+        inner = command.get_command(context, name)
+        assert inner is not None
+        yield from commands(inner, (*names, name))
+
+
+@pytest.fixture(scope="module")
+def episode(tmp_path_factory: pytest.TempPathFactory, ibrobot: tuple[str, ...]) -> Path:
+    folder = tmp_path_factory.mktemp("recorded")
+    short = ("--lockstep", "--episodes", "1", "--set", "contract.max_duration_s=1")
+    subprocess.run([*ibrobot, "record", "so101_blind", "--sim", "--headless", *short], cwd=folder, check=False)
+    return folder / "episodes" / "default" / "episodes" / "episode_000001"
+
+
+@pytest.fixture
+def folder(tmp_path: Path, episode: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A working folder with an episode, and nothing else that a command could take."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    shutil.copytree(episode, "EPISODE")
+    return tmp_path
+
+
+def make(kind: str, path: Path) -> None:
+    """A file that no command can take."""
+    if kind == "folder":
+        path.mkdir()
+    elif kind == "binary":
+        path.write_bytes(bytes(range(256)) * 8)
+    elif kind == "unreadable":  # also for root, who may read everything
+        path.symlink_to("/proc/self/mem")
+    elif kind == "empty":
+        path.touch()
+
+
+@attrs.frozen
+class Terminal:
+    """Runs commands in this process, on an ASCII terminal."""
+
+    monkeypatch: pytest.MonkeyPatch
+
+    def run(self, *arguments: str) -> tuple[int, str, str]:
+        """Exit code, standard output and standard error."""
+        streams = [io.TextIOWrapper(io.BytesIO(), encoding="ascii", write_through=True) for _ in range(2)]
+        for name, stream in zip(("stdout", "stderr"), streams, strict=True):
+            self.monkeypatch.setattr(sys, name, stream)
+        self.monkeypatch.setattr(sys, "argv", ["ibrobot", *arguments])
+        code: object = 0
+        try:
+            main()
+        except SystemExit as end:
+            code = end.code or 0
+        finally:
+            self.monkeypatch.undo()
+        assert isinstance(code, int)
+        out, err = (
+            stream.buffer.getvalue().decode("ascii") for stream in streams if isinstance(stream.buffer, io.BytesIO)
+        )
+        return code, out, err
+
+
+@pytest.fixture
+def terminal() -> Iterator[Terminal]:
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        yield Terminal(monkeypatch)
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+def test_every_command_is_tested_with_wrong_files() -> None:
+    tested = {name for name in commands() if any(line.startswith(f"{name} ") for line in WRONG_FILES)}
+    assert set(commands()) - tested == WITHOUT_FILES
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("line", WRONG_FILES)
+def test_wrong_file_is_one_error_with_exit_code_2(line: str, kind: str, folder: Path, terminal: Terminal) -> None:
+    if kind in WRONG_FILES[line]:
+        pytest.skip("not wrong here")
+    make(kind, folder / ("BAD.json" if "BAD.json" in line else BAD))
+
+    code, _, err = terminal.run(*line.split())
+
+    errors = [text for text in err.splitlines() if text.startswith("error: ")]
+    assert errors, err
+    assert (code, [text for text in errors if " a bug at " in text]) == (2, []), err
+    assert "Traceback" not in err
+
+
+JSON = {
+    "launch so101_blind --sim --lockstep --duration 0.1 --json": 0,
+    "launch so101_blind --sim --dry-run --json": 0,
+    "launch BAD --json": 2,
+    "record so101_blind --sim --lockstep --duration 0.1 --root new --json": 0,
+    "record BAD --json": 2,
+    "replay EPISODE --sim --lockstep --json": 0,
+    "replay BAD --json": 2,
+    "convert EPISODE --out new --jobs 1 --json": 0,
+    "convert BAD --out new --json": 2,
+    "config check so101 --json": 0,
+    "config check BAD --json": 2,
+    "plugins --json": 0,
+    "plugins show camera --json": 2,
+    "plugins show opencv --json": 0,
+    "doctor --json": None,
+    "camera list --json": 0,
+    "episodes info EPISODE --json": 0,
+    "episodes info BAD --json": 2,
+    "episodes list . --json": 0,
+    "episodes list BAD --json": 2,
+    "feetech monitor BAD --json": 2,
+}
+"""Command line -> its exit code; None where it depends on the machine."""
+INTERRUPTED = """
+import os, signal, sys
+number, at = int(sys.argv.pop(1)), sys.argv.pop(1)
+sent = []
+def interrupt(event, arguments):
+    if event in ("import", "open") and at in str(arguments[0]) and not sent:
+        sent.append(at)
+        signal.raise_signal(number)
+sys.addaudithook(interrupt)
+from ibrobot_core.cli.command import main
+main()
+"""
+"""Sends itself a signal when it first imports or opens something whose name has a text."""
+
+
+def takes_json() -> set[str]:
+    """The commands with --json."""
+    found = set()
+    for name in (*commands(), "plugins"):
+        command: click.Command = cli
+        for word in name.split():
+            assert isinstance(command, click.Group)
+            command = command.get_command(click.Context(command), word) or command
+        found |= {name for parameter in command.params if "--json" in parameter.opts}
+    return found
+
+
+def test_every_command_with_json_is_tested() -> None:
+    assert takes_json() == {name for name in takes_json() if any(line.startswith(f"{name} ") for line in JSON)}
+
+
+@pytest.mark.parametrize("line", JSON)
+def test_json_is_alone_on_standard_output(
+    line: str, folder: Path, ibrobot: tuple[str, ...], terminal: Terminal
+) -> None:
+    if "EPISODE" in line or "lockstep" in line:  # it runs a robot or converts
+        ran = subprocess.run([*ibrobot, *line.split()], capture_output=True, text=True, timeout=120, check=False)
+        code, out, err = ran.returncode, ran.stdout, ran.stderr
+    else:
+        code, out, err = terminal.run(*line.split())
+
+    assert code == JSON[line] or JSON[line] is None, err
+    if code == 2 and not out:
+        assert err.startswith("error: ")
+    else:
+        json.loads(out)
+
+
+@pytest.mark.parametrize(
+    ("line", "at", "number"),
+    [
+        ("launch so101_blind --sim --json", "so101_blind.yaml", signal.SIGHUP),
+        ("replay EPISODE --sim --json", "metadata.yaml", signal.SIGINT),
+        ("convert EPISODE --out new --json", "ibrobot_data.run", signal.SIGTERM),
+        ("convert EPISODE --out new --json", "metadata.yaml", signal.SIGTERM),
+        ("config check so101 --json", "so101.yaml", signal.SIGINT),
+        ("plugins --json", "ibrobot_core.plugins", signal.SIGTERM),
+        ("doctor --json", "ibrobot_core.plugins", signal.SIGHUP),
+        ("camera list --json", "ibrobot_camera.commands", signal.SIGINT),
+        ("episodes info EPISODE --json", "ibrobot_mcap.commands", signal.SIGTERM),
+        ("episodes info EPISODE --json", "metadata.yaml", signal.SIGHUP),
+        ("feetech monitor BAD --json", "ibrobot_feetech.bus", signal.SIGINT),
+        ("certs new --robot one", "ibrobot_zenoh.certificates", signal.SIGTERM),
+        ("serve so101_blind", "so101_blind.yaml", signal.SIGHUP),
+    ],
+)
+def test_signal_while_a_command_starts_is_one_line(line: str, at: str, number: signal.Signals, folder: Path) -> None:
+    command = [sys.executable, "-c", INTERRUPTED, str(int(number)), at, *line.split()]
+
+    ran = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+
+    told = ran.stderr.strip()  # after the ^C of a terminal, an empty line
+    assert (ran.returncode, ran.stdout) == (130, ""), ran.stderr
+    assert told == "error: stopped" or told.startswith("interrupted; finished episodes are kept"), told
+    assert len(told.splitlines()) == 1

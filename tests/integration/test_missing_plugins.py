@@ -1,0 +1,147 @@
+"""Robots whose YAML names plugins that are not installed: only what the entered mode needs must be there."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Iterator
+from importlib.metadata import entry_points
+
+import pytest
+
+from ibrobot_core import plugins
+from ibrobot_core.cli.main import main
+from ibrobot_core.config import find_config, load_config
+from ibrobot_core.errors import PluginError
+from ibrobot_core.launch.runtime import Runtime
+from ibrobot_core.launch.session import Request, Session
+from ibrobot_core.plugins import installed_plugins
+
+pytestmark = pytest.mark.integration
+
+Only = Callable[..., None]
+
+
+@pytest.fixture
+def only(monkeypatch: pytest.MonkeyPatch) -> Iterator[Only]:
+    """Has some plugins installed, and no others."""
+
+    def choose(*names: str) -> None:
+        found = [entry for entry in entry_points(group="ibrobot") if entry.name in names]
+        monkeypatch.setattr(plugins, "entry_points", lambda group: found)
+        installed_plugins.cache_clear()
+
+    yield choose
+    installed_plugins.cache_clear()
+
+
+@pytest.fixture
+def ibrobot(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
+    def run(*arguments: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["ibrobot", *arguments])
+        code: object = 0
+        try:
+            main()
+        except SystemExit as end:
+            code = end.code or 0
+        assert isinstance(code, int)
+        out, err = capsys.readouterr()
+        return code, out, err
+
+    return run
+
+
+Run = Callable[..., tuple[int, str, str]]
+NOTES = [
+    "mode model_inference is unavailable: sensor type 'opencv', policy type 'scripted_pick' need plugins that are not "
+    'installed: pip install "ibrobot[so101]"',
+    "mode jog is unavailable: teleop type 'keyboard' needs a plugin that is not installed: "
+    "pip install ibrobot-plugin-keyboard",
+    "mode moveit_planning is unavailable: planner type 'joint' needs a plugin that is not installed: "
+    "pip install ibrobot-plugin-planning",
+]
+CAMERAS = (
+    "camera top, camera wrist: sensor type 'opencv' needs a plugin that is not installed; "
+    "pip install ibrobot-plugin-camera"
+)
+
+
+def test_config_check_notes_modes_that_cannot_be_entered(only: Only, ibrobot: Run) -> None:
+    only("feetech")
+
+    code, out, err = ibrobot("config", "check", "so101")
+
+    assert (code, err) == (0, "")
+    assert out.splitlines()[2:] == [*(f"note: {line}" for line in NOTES), f"note: a run is without {CAMERAS}"]
+    assert ibrobot("config", "check", "so101", "--json") == (0, "[]\n", "")
+
+
+def test_plan_says_what_is_not_there(only: Only, ibrobot: Run) -> None:
+    only("feetech")
+
+    code, out, err = ibrobot("launch", "so101", "--dry-run")
+
+    assert (code, err) == (0, "")
+    assert out.splitlines()[-5:-1] == [f"without {CAMERAS}", *NOTES]
+    plan = json.loads(ibrobot("launch", "so101", "--dry-run", "--json")[1])
+    assert list(plan["unavailable"]) == ["model_inference", "jog", "moveit_planning"]
+
+
+@pytest.mark.parametrize(
+    ("kept", "arguments", "told"),
+    [
+        ((), (), "hardware.type: hardware type 'feetech_so101', teleop type 'so101_leader' need plugins that are not "
+         "installed: pip install ibrobot-plugin-feetech"),
+        (("feetech",), ("--mode", "jog"),
+         "teleoperation.keyboard.type: teleop type 'keyboard' needs a plugin that is not installed: "
+         "pip install ibrobot-plugin-keyboard"),
+        (("feetech",), ("--sim",), "simulation.type: hardware type 'mujoco', policy type 'scripted_pick' need plugins "
+         "that are not installed: pip install ibrobot-plugin-mujoco"),
+        (("feetech",), ("--mode", "jog", "--set", "transport={type: zenoh, share: {publish: [/joint_states]}}"),
+         "teleop type 'keyboard', transport type 'zenoh' need plugins that are not installed: "
+         "pip install ibrobot-plugin-keyboard ibrobot-plugin-zenoh"),
+        (("feetech",), ("--mode", "jog", "--set", "recording={type: mcap}"),
+         "sensor type 'opencv', teleop type 'keyboard', recorder type 'mcap' need plugins that are not "
+         'installed: pip install "ibrobot[so101]"'),
+    ],
+)  # fmt: skip
+def test_entered_mode_is_one_error_with_one_command(
+    only: Only, ibrobot: Run, kept: tuple[str, ...], arguments: tuple[str, ...], told: str
+) -> None:
+    only(*kept)
+
+    checked = ibrobot("config", "check", "so101", *arguments)
+    launched = ibrobot("launch", "so101", "--dry-run", *arguments)
+
+    assert checked == launched
+    code, out, err = launched
+    assert (code, out) == (2, "")
+    [line] = err.splitlines()
+    assert line.startswith("error: ")
+    assert line.endswith(told)
+
+
+def test_unknown_type_stays_an_error_in_every_mode(only: Only, ibrobot: Run) -> None:
+    only("feetech")
+
+    code, _, err = ibrobot("config", "check", "so101", "--set", "teleoperation.keyboard.type=keybord")
+
+    assert code == 2
+    assert "unknown teleop type 'keybord'" in err
+
+
+def test_switch_to_an_unavailable_mode_is_refused_with_the_remedy(only: Only) -> None:
+    only("feetech")
+    runtime = Runtime(Session(load_config(find_config("so101", installed_plugins())), installed_plugins(), Request()))
+
+    with pytest.raises(PluginError, match=r"^mode jog is unavailable: .*: pip install ibrobot-plugin-keyboard$"):
+        runtime.switch_mode("jog")
+
+
+def test_show_needs_every_plugin(only: Only, ibrobot: Run) -> None:
+    only("feetech")
+
+    code, out, err = ibrobot("config", "show", "so101")
+
+    assert (code, out) == (2, "")
+    assert err.endswith(': pip install "ibrobot[so101]"\n')
