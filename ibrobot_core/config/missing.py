@@ -92,12 +92,14 @@ def _observed(document: Document, plain: Mapping[str, Any]) -> set[Key]:
     peripherals = document.root.get("peripherals")
     items = peripherals if isinstance(peripherals, list) else ()
     return {
-        ("peripherals", i) for i, item in enumerate(items) if isinstance(item, Mapping) and item.get("name") in names
+        ("peripherals", i)
+        for i, item in enumerate(items)
+        if isinstance(item, Mapping) and str(item.get("name")) in names
     }
 
 
 def _may_wait(document: Document, key: Key) -> bool:
     """Whether only some modes need what is at `key`."""
     if key[0] == "peripherals":
-        return document.get(*key, "kind") in _OPTIONAL_SENSORS
+        return str(document.get(*key, "kind")) in _OPTIONAL_SENSORS
     return key[0] in ("models", "teleoperation", "control_modes")

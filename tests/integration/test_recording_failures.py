@@ -243,24 +243,24 @@ class TestFullDisk:
 class TestReadOnlyFolder:
     def test_record(self, run: Run, read_only: Path):
         done = record_picks(run, read_only)
-        assert done.code == 1
+        assert done.code == 2
         assert f"recording.root: {read_only}/picks cannot be written: {read_only}: {ONLY_READ}; --root" in done.err
 
     def test_convert_and_the_way_back(self, run: Run, bags: Path, dataset: Path, read_only: Path):
         done = run("convert", bags, "--out", read_only / "set")
-        assert (done.code, done.err) == (1, f"error: {read_only}/set: cannot be written: {ONLY_READ}\n")
+        assert (done.code, done.err) == (2, f"error: {read_only}/set: cannot be written: {ONLY_READ}\n")
         done = run("convert", dataset, "--to", "bag", "--out", read_only / "back")
-        assert done.code == 1
+        assert done.code == 2
         assert ONLY_READ in done.err
 
     def test_a_file_where_a_folder_should_be(self, run: Run, bags: Path, dataset: Path, tmp_path: Path):
         (tmp_path / "file").write_text("in the way")
         for arguments in ((bags,), (dataset, "--to", "bag")):
             done = run("convert", *arguments, "--out", tmp_path / "file/set")
-            assert done.code == 1
+            assert done.code == 2
             assert "Not a directory" in done.err
         done = record_picks(run, tmp_path / "file")
-        assert done.code == 1
+        assert done.code == 2
         assert "Not a directory" in done.err
 
     def test_episodes_are_read_where_nothing_can_be_written(self, run: Run, bags: Path, mounted: Callable[[str], Path]):
@@ -335,7 +335,7 @@ class TestOtherContract:
 
     def test_record_into_a_dataset_of_another_contract(self, run: Run, picks: Path):
         done = record_picks(run, picks.parent, "--set", "contract.rate_hz=20")
-        assert done.code == 1
+        assert done.code == 2
         assert "dataset.yaml: its episodes have another contract; record into another dataset" in done.err
         assert "this run: 20" in done.err
         assert "the dataset: 30" in done.err
@@ -385,5 +385,5 @@ class TestMissingTopic:
         wanted = Contract.from_canonical(json.loads(metadata["contract"]))
         record(tmp_path / "unheard", 1, 0.5, contract=wanted, config=metadata["config"])
         done = run("replay", tmp_path / "unheard", "--sim", "--lockstep", "--headless")
-        assert done.code == 1
+        assert done.code == 2
         assert "no message of /arm_position_controller/commands, so nothing to replay; there are: /comm" in done.err

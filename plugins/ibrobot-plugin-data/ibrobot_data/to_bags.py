@@ -71,8 +71,13 @@ def convert_to_bags(request: BagRequest, watch: Watch = lambda done, total, repo
 
     Raises:
         PluginError: when the recorder is not installed.
+        RecorderError: when nothing can be written at `request.out`.
     """
     begin = time.monotonic()
+    try:
+        (request.out / _STAGING).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RecorderError(f"{request.out}: cannot be written: {error.strerror}") from error
     reports: list[EpisodeReport] = []
     done = 0
     for number in request.numbers:

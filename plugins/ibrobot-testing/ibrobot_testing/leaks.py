@@ -14,6 +14,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
 from pathlib import Path
+from sysconfig import get_path
 from typing import Literal, Self, get_args
 
 import attrs
@@ -22,8 +23,8 @@ import pytest
 type Kind = Literal["thread", "process", "file", "port"]
 """Kinds of leaks; a port is that of an open socket of the internet protocols."""
 
-_SHARED = ("/dev/dri", "/dev/nvidia", "/dev/urandom", "/dev/null", "anon_inode:[eventpoll]")
-"""Files that libraries open once and keep, such as a GPU's device."""
+_SHARED = ("/dev/dri", "/dev/nvidia", "/dev/urandom", "/dev/null", "anon_inode:[eventpoll]", get_path("platlib"))
+"""Files that libraries open once and keep, such as a GPU's device, or Matplotlib's fonts among its own files."""
 
 
 _KINDS: tuple[Kind, ...] = get_args(Kind.__value__)
