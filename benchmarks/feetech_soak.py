@@ -20,9 +20,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from ibrobot_feetech.calibration import save_calibration
 from ibrobot_feetech.emulator import Emulator
 
-from ibrobot_core.calibration import Calibration, JointCalibration, save_calibration
+from ibrobot_core.calibration import Calibration, JointCalibration
 from ibrobot_core.clock import SteppedClock
 from ibrobot_core.config import from_document
 from ibrobot_core.control.build import build_core

@@ -19,10 +19,11 @@ import time
 from pathlib import Path
 
 import numpy as np
+from ibrobot_feetech.calibration import save_calibration
 from ibrobot_feetech.emulator import Emulator
 from numpy.typing import NDArray
 
-from ibrobot_core.calibration import Calibration, JointCalibration, save_calibration
+from ibrobot_core.calibration import Calibration, JointCalibration
 
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
 RADIAN = 4096 / (2 * math.pi)

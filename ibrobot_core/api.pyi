@@ -166,8 +166,8 @@ from ibrobot_core.calibration import (
     Calibration as Calibration,
     JointCalibration as JointCalibration,
     calibration_path as calibration_path,
+    companion_path as companion_path,
     load_calibration as load_calibration,
-    save_calibration as save_calibration,
 )
 from ibrobot_core.contract.specs import (
     ActionPart as ActionPart,

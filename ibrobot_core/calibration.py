@@ -7,7 +7,6 @@ import json
 import math
 import os
 import re
-import tempfile
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -172,6 +171,11 @@ def calibration_path(name: str | Path) -> Path:
     return home / "ibrobot" / "calibration" / f"{name}.json"
 
 
+def companion_path(path: Path) -> Path:
+    """The file beside a calibration that says what it is of: arm, date, adapter, place of 0 rad, hash."""
+    return path.with_suffix(".meta.json")
+
+
 def load_calibration(
     name: str | Path, joints: Sequence[str] | None = None, *, zero_at: str | None = None, tool: str | None = None
 ) -> Calibration:
@@ -212,44 +216,6 @@ def load_calibration(
     calibration = calibration.with_zero_at(ZERO_AT_POSE if numbered else ZERO_AT_RANGE)
     loaded = _with_meta(calibration, path, tool, any_numbers=zero_at is not None)
     return loaded if zero_at is None else loaded.with_zero_at(zero_at)
-
-
-def save_calibration(
-    calibration: Calibration, name: str | Path, *, overwrite: bool = False, by_id: bool = False
-) -> Path:
-    """Save a calibration as LeRobot's JSON, and beside it `NAME.meta.json`: arm, date, adapter, place of 0 rad, hash.
-
-    Two files, since LeRobot's loader refuses keys that it does not know.
-
-    Args:
-        calibration: what to save.
-        name: a name or a path, see `calibration_path`.
-        overwrite: whether it may replace a file.
-        by_id: write IB-Robot's layout, servo id -> numbers.
-
-    Raises:
-        CalibrationError: when there is one already, or it cannot be written.
-    """
-    path = calibration_path(name)
-    if path.exists() and not overwrite:
-        raise CalibrationError(f"{path}: is there already; give another name, or say that it may be overwritten")
-    meta = {
-        "version": calibration.version,
-        "robot": calibration.robot,
-        "date": calibration.date,
-        "zero_at": calibration.zero_at,
-        "adapter": calibration.adapter,
-        "sha256": calibration.fingerprint(),
-    }
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        numbers = calibration.numbers()
-        by_key = {str(joint["id"]): joint for joint in numbers.values()} if by_id else numbers
-        # The companion comes first: numbers without it would be taken for LeRobot's, with 0 rad elsewhere.
-        _write_all({_meta_path(path): meta, path: by_key})
-    except OSError as error:
-        raise CalibrationError(f"{path}: cannot be written: {error.strerror}") from None
-    return path
 
 
 def _document(path: Path, tool: str | None = None) -> tuple[str, Any]:
@@ -309,7 +275,7 @@ def _by_name(document: dict[str, Any], path: Path, joints: Sequence[str] | None)
 
 
 def _with_meta(calibration: Calibration, path: Path, tool: str | None, *, any_numbers: bool) -> Calibration:
-    companion = _meta_path(path)
+    companion = companion_path(path)
     if not companion.exists():
         return calibration
     _, meta = _document(companion)
@@ -329,36 +295,3 @@ def _with_meta(calibration: Calibration, path: Path, tool: str | None, *, any_nu
         )
     robot, date, adapter = (str(meta.get(name, "")) for name in ("robot", "date", "adapter"))
     return attrs.evolve(calibration.with_zero_at(zero_at), robot=robot, date=date, adapter=adapter)
-
-
-def _meta_path(path: Path) -> Path:
-    return path.with_suffix(".meta.json")
-
-
-def _write_all(documents: Mapping[Path, Mapping[str, Any]]) -> None:
-    """Replace files in their order, once all of them are on the disk."""
-    prepared: dict[Path, Path] = {}
-    try:
-        for path, document in documents.items():
-            prepared[path] = _prepare(path, document)
-        for path, temporary in prepared.items():
-            temporary.replace(path)
-    finally:
-        for temporary in prepared.values():
-            temporary.unlink(missing_ok=True)
-
-
-def _prepare(path: Path, document: Mapping[str, Any]) -> Path:
-    """A file beside `path` with its new content."""
-    descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(descriptor, "w") as file:
-            json.dump(document, file, indent=4)
-            file.write("\n")
-            file.flush()
-            os.fsync(file.fileno())
-        Path(name).chmod(0o644)
-    except BaseException:
-        Path(name).unlink()
-        raise
-    return Path(name)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -53,18 +53,12 @@ def ticks_to_radians[T: (float, NDArray[Any])](ticks: T, *, zero: ArrayLike = 20
     return converted
 
 
-@overload
-def radians_to_ticks(radians: float, *, zero: float = 2048.0, inverted: bool = False) -> int: ...
-@overload
-def radians_to_ticks(
-    radians: NDArray[Any], *, zero: ArrayLike = 2048.0, inverted: ArrayLike = False
-) -> NDArray[np.intp]: ...
-def radians_to_ticks(
-    radians: float | NDArray[Any], *, zero: ArrayLike = 2048.0, inverted: ArrayLike = False
-) -> int | NDArray[np.intp]:
-    """Radians -> servo ticks, rounded to the nearest; the inverse of `ticks_to_radians`."""
-    ticks = np.rint(_ticks(radians, zero, inverted)).astype(np.intp)
-    return ticks if isinstance(radians, np.ndarray) else int(ticks)
+def radians_to_ticks[T: (float, NDArray[Any])](
+    radians: T, *, zero: ArrayLike = 2048.0, inverted: ArrayLike = False
+) -> T:
+    """Radians -> servo ticks, not rounded; the inverse of `ticks_to_radians`."""
+    ticks: T = radians * _sign(inverted) * (TICKS_PER_TURN / (2 * math.pi)) + np.asarray(zero)
+    return ticks
 
 
 def ticks_to_lerobot[T: (float, NDArray[Any])](
@@ -135,7 +129,7 @@ def radians_to_lerobot[T: (float, NDArray[Any])](
     Raises:
         ValueError: for an unknown mode or an empty range.
     """
-    ticks: T = _ticks(radians, zero, inverted)
+    ticks = radians_to_ticks(radians, zero=zero, inverted=inverted)
     return ticks_to_lerobot(ticks, mode, range_min=range_min, range_max=range_max, inverted=inverted)
 
 
@@ -155,10 +149,6 @@ def lerobot_to_radians[T: (float, NDArray[Any])](
     """
     ticks = lerobot_to_ticks(values, mode, range_min=range_min, range_max=range_max, inverted=inverted)
     return ticks_to_radians(ticks, zero=zero, inverted=inverted)
-
-
-def _ticks(radians: float | NDArray[Any], zero: ArrayLike, inverted: ArrayLike) -> Any:
-    return radians * _sign(inverted) * (TICKS_PER_TURN / (2 * math.pi)) + np.asarray(zero)
 
 
 def _sign(inverted: ArrayLike) -> Any:

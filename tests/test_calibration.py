@@ -11,6 +11,7 @@ import attrs
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from ibrobot_testing.calibration import write_calibration
 
 from ibrobot_core.calibration import (
     ZERO_AT,
@@ -18,7 +19,6 @@ from ibrobot_core.calibration import (
     JointCalibration,
     calibration_path,
     load_calibration,
-    save_calibration,
 )
 from ibrobot_core.errors import CalibrationError
 from ibrobot_core.units import ticks_to_lerobot, ticks_to_radians
@@ -39,35 +39,11 @@ def calibrations(draw: st.DrawFn) -> Calibration:
     return Calibration(joints, robot="left", date="2026-01-02T03:04:05+00:00")
 
 
-@given(calibrations(), st.booleans())
-def test_what_is_saved_is_loaded(tmp_path_factory: pytest.TempPathFactory, made: Calibration, by_id: bool) -> None:
-    path = tmp_path_factory.mktemp("c") / "arm.json"
-    save_calibration(made, path, by_id=by_id)
-    loaded = load_calibration(path, list(made.joints))
-    assert loaded.joints == made.joints
-    assert (loaded.robot, loaded.date, loaded.path) == (made.robot, made.date, path)
-
-
-def test_the_file_holds_lerobots_keys_and_nothing_else(tmp_path: Path) -> None:
-    made = Calibration({"pan": JointCalibration(**GOOD)}, robot="left", date="2026-01-02")
-    save_calibration(made, tmp_path / "arm.json")
-    assert json.loads((tmp_path / "arm.json").read_text()) == {"pan": GOOD}
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["arm.json", "arm.meta.json"]
-
-
 def test_a_name_lies_in_the_configuration_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
     assert calibration_path("left") == tmp_path / "ibrobot" / "calibration" / "left.json"
     assert calibration_path("here/left") == Path("here/left")
     assert calibration_path("left.json") == Path("left.json")
-
-
-def test_it_overwrites_only_when_told(tmp_path: Path) -> None:
-    made = Calibration({"pan": JointCalibration(**GOOD)})
-    path = save_calibration(made, tmp_path / "arm.json")
-    with pytest.raises(CalibrationError, match="is there already"):
-        save_calibration(made, path)
-    save_calibration(made, path, overwrite=True)
 
 
 @pytest.mark.parametrize(
@@ -110,46 +86,6 @@ def test_files_that_are_none_are_refused(tmp_path: Path, text: str, message: str
         load_calibration(tmp_path / "arm.json")
 
 
-def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(CalibrationError, match=r"file/arm\.json: cannot be written: "):
-        save_calibration(Calibration({"pan": JointCalibration(**GOOD)}), tmp_path / "file" / "arm.json")
-
-
-def test_a_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    made = Calibration({"pan": JointCalibration(**GOOD)})
-    path = save_calibration(made, tmp_path / "arm.json")
-
-    def full(descriptor: int) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("os.fsync", full)
-    with pytest.raises(CalibrationError, match="No space left on device"):
-        save_calibration(
-            attrs.evolve(made, joints={"pan": JointCalibration(**{**GOOD, "range_min": 1})}), path, overwrite=True
-        )
-    assert load_calibration(path).joints == made.joints
-    assert not list(tmp_path.glob(".*"))
-
-
-def test_a_second_file_that_cannot_be_written_leaves_both_old_ones(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    made = Calibration({"pan": JointCalibration(**GOOD)})
-    path = save_calibration(made, tmp_path / "arm.json")
-    left = iter([None, OSError(28, "No space left on device")])
-
-    def full(descriptor: int) -> None:
-        if (error := next(left)) is not None:
-            raise error
-
-    monkeypatch.setattr("os.fsync", full)
-    with pytest.raises(CalibrationError, match="No space left on device"):
-        save_calibration(made.with_zero_at("range"), path, overwrite=True)
-    assert load_calibration(path).zero_at == "pose"
-    assert not list(tmp_path.glob(".*"))
-
-
 def test_a_missing_file_says_how_to_make_one(tmp_path: Path) -> None:
     with pytest.raises(CalibrationError, match=r"no such calibration; `ibrobot arm calibrate` makes one"):
         load_calibration(tmp_path / "arm.json", tool="ibrobot arm")
@@ -160,14 +96,14 @@ def test_a_missing_file_says_how_to_make_one(tmp_path: Path) -> None:
 
 
 def test_a_missing_joint_is_named(tmp_path: Path) -> None:
-    path = save_calibration(Calibration({"pan": JointCalibration(**GOOD)}), tmp_path / "arm.json")
+    path = write_calibration(Calibration({"pan": JointCalibration(**GOOD)}), tmp_path / "arm.json")
     with pytest.raises(CalibrationError, match="has no joint 'lift'; it has: pan"):
         load_calibration(path, ["pan", "lift"])
 
 
 def test_numbers_changed_behind_the_companions_back_are_refused(tmp_path: Path) -> None:
     made = Calibration({"pan": JointCalibration(**GOOD)}, date="2026-01-02")
-    path = save_calibration(made, tmp_path / "arm.json")
+    path = write_calibration(made, tmp_path / "arm.json")
     path.write_text(json.dumps({"pan": {**GOOD, "range_min": 701}}))
     remedy = r"`ibrobot arm import .*arm\.json --zero-at pose --yes`"
     with pytest.raises(CalibrationError, match=f"changed 20.*, are not those calibrated 2026-01-02 .* {remedy}"):
@@ -198,7 +134,7 @@ def test_ib_robots_file_has_zero_at_the_pose(tmp_path: Path) -> None:
 
 def test_a_companion_that_does_not_say_it_means_the_pose(tmp_path: Path) -> None:
     made = Calibration({"pan": JointCalibration(**GOOD)})
-    path = save_calibration(made, tmp_path / "arm.json")
+    path = write_calibration(made, tmp_path / "arm.json")
     companion = tmp_path / "arm.meta.json"
     meta = json.loads(companion.read_text())
     assert (meta["version"], meta.pop("zero_at")) == (2, "pose")

@@ -32,10 +32,7 @@ def test_the_middle_tick_is_zero_and_a_quarter_turn_is_half_pi() -> None:
 @given(st.floats(-10, 10), st.floats(0, 4095), st.booleans())
 def test_radians_come_back(radians: float, zero: float, inverted: bool) -> None:
     ticks = radians_to_ticks(radians, zero=zero, inverted=inverted)
-    assert type(ticks) is int
-    half_a_tick = math.pi / 4096 + 1e-9
-    assert ticks_to_radians(ticks, zero=zero, inverted=inverted) == pytest.approx(radians, abs=half_a_tick)
-    assert radians_to_ticks(ticks_to_radians(ticks, zero=zero), zero=zero) == ticks
+    assert ticks_to_radians(ticks, zero=zero, inverted=inverted) == pytest.approx(radians, abs=1e-9)
 
 
 @given(st.sampled_from(LEROBOT_MODES), ranges, st.floats(0, 1), st.floats(0, 4095), st.booleans())
@@ -54,8 +51,7 @@ def test_arrays_are_converted_element_by_element() -> None:
     found = ticks_to_radians(ticks, zero=np.array([2048.0, 2048.0, 3072.0]), inverted=np.array([False, True, False]))
     np.testing.assert_allclose(found, [0.0, -math.pi / 2, 0.0])
     back = radians_to_ticks(found, zero=np.array([2048.0, 2048.0, 3072.0]), inverted=np.array([False, True, False]))
-    assert back.dtype == np.intp
-    np.testing.assert_array_equal(back, ticks)
+    np.testing.assert_allclose(back, ticks)
     values = ticks_to_lerobot(
         np.array([1500, 1500, 9999]),
         "range_0_100",

@@ -10,8 +10,9 @@ from typing import Any
 import attrs
 import numpy as np
 import pytest
+from ibrobot_testing.calibration import write_calibration
 
-from ibrobot_core.calibration import Calibration, JointCalibration, save_calibration
+from ibrobot_core.calibration import Calibration, JointCalibration
 from ibrobot_core.config import load_config
 from ibrobot_core.config.schema import RobotConfig
 from ibrobot_core.contract.joint_units import JointUnits, calibrations, with_closed_ends
@@ -66,7 +67,7 @@ def foreign(tmp_path: Path) -> Callable[[str], RobotConfig]:
     )  # fmt: skip
     for kind, descriptor in zip(("hardware", "teleop"), described, strict=True):
         registry.entries[kind, descriptor.type] = Entry(kind, descriptor, "test", "test", "0")
-    offsets = save_calibration(MADE, tmp_path / "offsets.json")
+    offsets = write_calibration(MADE, tmp_path / "offsets.json")
 
     def config(closes: str) -> RobotConfig:
         path = tmp_path / "robot.yaml"

@@ -14,10 +14,11 @@ from pathlib import Path
 
 import attrs
 import pytest
+from ibrobot_feetech.calibration import save_calibration
 from ibrobot_feetech.emulator import Emulator
 from noting import Noting
 
-from ibrobot_core.calibration import Calibration, JointCalibration, save_calibration
+from ibrobot_core.calibration import Calibration, JointCalibration
 
 pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("prompt_threads")]
 

@@ -13,10 +13,11 @@ import attrs
 import numpy as np
 import pytest
 from ibrobot_feetech import bus
+from ibrobot_feetech.calibration import save_calibration
 from ibrobot_feetech.emulator import Emulator
 from noting import Noting
 
-from ibrobot_core.calibration import Calibration, JointCalibration, save_calibration
+from ibrobot_core.calibration import Calibration, JointCalibration
 from ibrobot_core.config import load_config
 from ibrobot_core.contract.joint_units import calibrations
 from ibrobot_core.control import host

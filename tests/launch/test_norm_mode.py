@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from ibrobot_testing.calibration import write_calibration
 
-from ibrobot_core.calibration import Calibration, JointCalibration, save_calibration
+from ibrobot_core.calibration import Calibration, JointCalibration
 from ibrobot_core.errors import ComponentFailed
 from ibrobot_core.interfaces import Frame
 from ibrobot_core.units import radians_to_lerobot
@@ -22,7 +23,7 @@ RANGE = {"range_min": 1000, "range_max": 3000}
 @pytest.fixture
 def calibration(tmp_path: Path) -> str:
     joints = {joint: JointCalibration(i, 0, 0, **RANGE) for i, joint in enumerate(("pan", "grip"), 1)}
-    return str(save_calibration(Calibration(joints), tmp_path / "arm.json"))
+    return str(write_calibration(Calibration(joints), tmp_path / "arm.json"))
 
 
 def degrees(positions: Any) -> list[float]:

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import scservo_sdk as scs
 from ibrobot_feetech.bus import FeetechBus
+from ibrobot_feetech.calibration import save_calibration
 from ibrobot_feetech.emulator import EmulatedServo, Emulator
 from ibrobot_feetech.registers import BAUD_RATES
 from lerobot.motors import Motor, MotorCalibration, MotorNormMode
@@ -15,7 +16,7 @@ from lerobot.motors.feetech import FeetechMotorsBus
 from lerobot.robots.so_follower import SO101Follower, SO101FollowerConfig
 from lerobot.teleoperators.so_leader import SO101Leader, SO101LeaderConfig
 
-from ibrobot_core.calibration import Calibration, JointCalibration, load_calibration, save_calibration
+from ibrobot_core.calibration import Calibration, JointCalibration, load_calibration
 from ibrobot_core.clock import SteppedClock
 from ibrobot_core.units import ticks_to_lerobot
 

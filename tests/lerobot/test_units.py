@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from ibrobot_feetech.calibration import save_calibration
 from lerobot.motors import Motor, MotorCalibration, MotorNormMode
 from lerobot.motors.feetech import FeetechMotorsBus
 
-from ibrobot_core.calibration import Calibration, JointCalibration, load_calibration, save_calibration
+from ibrobot_core.calibration import Calibration, JointCalibration, load_calibration
 from ibrobot_core.units import LEROBOT_MODES, lerobot_to_ticks, ticks_to_lerobot, ticks_to_radians
 
 pytestmark = pytest.mark.lerobot

@@ -86,8 +86,7 @@ class Arm:
 
     def positions(self, radians: Vector) -> NDArray[np.intp]:
         """Joint positions [rad] -> reported positions [ticks], shape (J,), wherever they lie."""
-        ticks: NDArray[np.intp] = radians_to_ticks(radians, zero=self._zero, inverted=self._inverted)
-        return ticks
+        return np.rint(radians_to_ticks(radians, zero=self._zero, inverted=self._inverted)).astype(np.intp)
 
     def reach(self) -> tuple[Vector, Vector]:
         """Lower and upper ends of the calibrated ranges [rad], each shape (J,)."""

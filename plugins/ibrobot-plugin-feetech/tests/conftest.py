@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 from ibrobot_feetech import bus
+from ibrobot_feetech.calibration import save_calibration
 from ibrobot_feetech.emulator import Emulator
 from ibrobot_testing.contexts import ARM, GRIPPER
 
-from ibrobot_core.calibration import Calibration, JointCalibration, save_calibration
+from ibrobot_core.calibration import Calibration, JointCalibration
 
 from .line import lay
 

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from ibrobot_feetech.calibration import save_calibration
 from ibrobot_feetech.emulator import EmulatedServo, Emulator
 from ibrobot_feetech.errors import NoReply, PortError, ServoFault
 from ibrobot_feetech.follower import FeetechFollower
@@ -22,7 +23,7 @@ from ibrobot_feetech.protocol import OVERLOAD
 from ibrobot_testing.contexts import START_NS, control_context
 from ibrobot_testing.hardware import HardwareSuite
 
-from ibrobot_core.calibration import Calibration, load_calibration, save_calibration
+from ibrobot_core.calibration import Calibration, load_calibration
 from ibrobot_core.clock import SteppedClock
 from ibrobot_core.errors import CalibrationError, HardwareError
 from ibrobot_core.interfaces import Context, Hardware, Holding, Severity, Torque

@@ -9,6 +9,7 @@ import attrs
 import pytest
 from click.testing import CliRunner
 from ibrobot_feetech.bus import FeetechBus
+from ibrobot_feetech.calibration import save_calibration
 from ibrobot_feetech.commands import feetech
 from ibrobot_feetech.commands.check import differences
 from ibrobot_feetech.emulator import Emulator
@@ -21,7 +22,7 @@ from ibrobot_testing.contexts import control_context, host_context
 from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
-from ibrobot_core.calibration import load_calibration, save_calibration
+from ibrobot_core.calibration import load_calibration
 from ibrobot_core.errors import HardwareError, TeleopError
 
 from .conftest import arm_calibration, prepare

@@ -18,10 +18,10 @@ from ibrobot_core.api import (
     JointCalibration,
     calibration_path,
     echo,
-    save_calibration,
 )
 from ibrobot_feetech.arm import relax, write_eprom
 from ibrobot_feetech.bus import FeetechBus
+from ibrobot_feetech.calibration import save_calibration
 from ibrobot_feetech.commands.dialogue import agree
 from ibrobot_feetech.commands.joints import by_servo, joints_of
 from ibrobot_feetech.commands.measure import Answers, Measurement

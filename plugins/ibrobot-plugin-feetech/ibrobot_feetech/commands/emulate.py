@@ -22,8 +22,8 @@ from ibrobot_core.api import (
     echo,
     load_calibration,
     on_signals,
-    save_calibration,
 )
+from ibrobot_feetech.calibration import save_calibration
 from ibrobot_feetech.commands.joints import SO101
 
 if TYPE_CHECKING:

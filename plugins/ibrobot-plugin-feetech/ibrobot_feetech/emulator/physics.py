@@ -113,7 +113,7 @@ class PhysicsArm:
         reading = self._hardware.read()
         arm = self._arm
         ticks = arm.positions(reading.position)
-        speeds = radians_to_ticks(reading.velocity * arm.sign, zero=0.0)
+        speeds = np.rint(radians_to_ticks(reading.velocity * arm.sign, zero=0.0))
         with self._emulator.lock:
             for servo, tick, speed in zip(arm.servos, ticks, speeds, strict=True):
                 emulated = self._emulator.servos[servo]
