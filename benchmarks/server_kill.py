@@ -160,9 +160,8 @@ def kill_once(
     server: Server, folder: Path, endpoint: str, session: Session, motion: Motion, slack_s: float
 ) -> tuple[Server, float, float, float]:
     """Kill the server in the middle of a request; seconds until that is known, the arm holds, and the next goes on."""
-    stats, engine = session.stats, session.engine_stats
-    assert stats is not None
-    assert engine is not None
+    assert session.acting is not None
+    stats, engine = session.acting.dispatch, session.acting.engine
     chunks = stats.chunks
     until(lambda: stats.chunks > chunks, PATIENCE_S, "a chunk")
     until(lambda: stats.requests > stats.chunks + stats.failures + stats.timeouts, PATIENCE_S, "a request in flight")
@@ -205,7 +204,7 @@ def run(kills: int, slack_s: float, folder: Path) -> int:
     known, held, resumed, grown = [], [], [], []
     try:
         runtime.start()
-        until(lambda: session.stats is not None, PATIENCE_S, "the mode begins")
+        until(lambda: session.acting is not None, PATIENCE_S, "the mode begins")
         motion = Motion(session)
         for number in range(kills):
             server, known_s, held_s, resumed_s = kill_once(server, folder, endpoint, session, motion, slack_s)
@@ -219,8 +218,8 @@ def run(kills: int, slack_s: float, folder: Path) -> int:
                 f"went on {resumed_s:.2f} s after the restart",
                 flush=True,
             )
-        stats = session.stats
-        assert stats is not None
+        assert session.acting is not None
+        stats = session.acting.dispatch
         made = sys.modules["sways_parts"].MADE[0]
     finally:
         runtime.stop()

@@ -74,7 +74,6 @@ class Worker(Component):
         self.given_up = threading.Event()
         """Set when the run ends, so that `start` waits no longer."""
 
-    @abstractmethod
     def setup(self) -> None:
         """Make and open what is needed."""
 
@@ -82,7 +81,6 @@ class Worker(Component):
     def work(self, timeout_s: float) -> None:
         """Do one unit of work, waiting for it no longer than `timeout_s` [s]."""
 
-    @abstractmethod
     def teardown(self) -> None:
         """Close what `setup` opened; also called when it failed."""
 

@@ -58,7 +58,7 @@ class RecentRates:
         if self._samples and now_ns - self._samples[-1][0] < _SAMPLE_NS:
             return
         ticks = {LOOP: session.state.tick} if session.state is not None else {}
-        self._samples.append((now_ns, {**session.received, **ticks}))
+        self._samples.append((now_ns, {name: sensor.received for name, sensor in session.sensors.items()} | ticks))
         while len(self._samples) > 2 and now_ns - self._samples[1][0] >= _RECENT_NS:
             self._samples.popleft()
 
@@ -78,29 +78,33 @@ def _loop_text(session: Session, rates: RecentRates) -> str:
     )
 
 
-def _sensor_text(session: Session, rates: RecentRates, name: str) -> str:
-    age = f", {session.ages[name] * 1e3:.0f} ms old" if name in session.ages else ""
-    return f"{name} {rates[name]}{age}"
+def _sensor_texts(session: Session, rates: RecentRates) -> list[str]:
+    ages = {name: sensor.age_s for name, sensor in session.sensors.items()}
+    return [
+        f"{name} {rates[name]}" + (f", {age_s * 1e3:.0f} ms old" if age_s is not None else "")
+        for name, age_s in ages.items()
+    ]
 
 
 def _model_text(session: Session) -> str | None:
     """Where the model runs, unless it is in the host, and whether it answers."""
-    stats = session.engine_stats
-    if stats is None or stats.mode == "monolithic":
+    if session.acting is None or session.acting.engine.mode == "monolithic":
         return None
+    stats = session.acting.engine
     state = f"answers in {stats.infer_ms:.0f} ms" if stats.alive else "IS GONE"
     return f"{state} ({stats.mode}, {stats.failures} failures, {stats.restarts} restarts)"
 
 
 def plain_line(session: Session, rates: RecentRates) -> str:
     """One line of status."""
-    outcome, stats = session.outcome, session.stats
+    outcome = session.outcome
     pieces = [f"mode {session.mode}", f"loop {_loop_text(session, rates)}"]
-    if stats is not None:
+    if session.acting is not None:
+        stats = session.acting.dispatch
         pieces.append(f"plan {stats.plan_length}, latency {stats.latency_ms:.0f} ms")
     if (model := _model_text(session)) is not None:
         pieces.append(f"model {model}")
-    pieces += [_sensor_text(session, rates, name) for name in session.rates]
+    pieces += _sensor_texts(session, rates)
     pieces.append(f"episodes {outcome.episodes}, successes {outcome.successes}")
     pieces += [f"FAULT: {fault}" for fault in session.faults]
     if session.held:
@@ -145,10 +149,11 @@ def _faults(session: Session) -> list[Text]:
 
 def _facts(session: Session, rates: RecentRates) -> Iterator[tuple[str, str]]:
     """Heading and text, the most important first."""
-    outcome, stats = session.outcome, session.stats
-    if session.rates:
-        yield "sensors", "  ".join(_sensor_text(session, rates, name) for name in session.rates)
-    if stats is not None:
+    outcome = session.outcome
+    if session.sensors:
+        yield "sensors", "  ".join(_sensor_texts(session, rates))
+    if session.acting is not None:
+        stats = session.acting.dispatch
         yield (
             "plan", f"{stats.plan_length} actions by {stats.strategy}, latency p50 {stats.latency_p50_ms:.0f}, "
             f"p99 {stats.latency_p99_ms:.0f} ms, holds {stats.holds}, failures {stats.failures}",

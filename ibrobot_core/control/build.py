@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import logging
-
 from ibrobot_core.clock import Clock
 from ibrobot_core.config import RobotConfig
+from ibrobot_core.config.context import component_context
 from ibrobot_core.control.core import ControlCore
 from ibrobot_core.control.parts import HardwareParts
 from ibrobot_core.errors import ConfigError, Problem
 from ibrobot_core.interfaces import Context, Executor, Hardware
 from ibrobot_core.plugins import Registry
-from ibrobot_core.units import ns
 
 
 def build_core(config: RobotConfig, registry: Registry, clock: Clock, seed: int) -> ControlCore:
@@ -44,8 +42,5 @@ def _hardware(config: RobotConfig, registry: Registry, clock: Clock, seed: int) 
 
 
 def _context(config: RobotConfig, name: str, joints: tuple[str, ...], clock: Clock, seed: int) -> Context:
-    return Context(
-        name=name, clock=clock, log=logging.getLogger(f"ibrobot.{name}"), robot=config.robot, joints=joints,
-        period_ns=ns(1.0 / config.control.rate_hz), seed=seed,
-        simulation=config.simulation.options if config.simulated and config.simulation is not None else None,
-    )  # fmt: skip
+    simulation = config.simulation.options if config.simulated and config.simulation is not None else None
+    return component_context(config, name, clock, seed, joints=joints, simulation=simulation)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import logging
-
 from ibrobot_core.clock import RealClock
 from ibrobot_core.config import RobotConfig
-from ibrobot_core.interfaces import Context, Policy
+from ibrobot_core.config.context import component_context
+from ibrobot_core.interfaces import Policy
 from ibrobot_core.plugins import Registry
-from ibrobot_core.units import ns
 
 
 def build_policy(config: RobotConfig, registry: Registry, name: str, seed: int = 0) -> Policy:
@@ -19,10 +17,6 @@ def build_policy(config: RobotConfig, registry: Registry, name: str, seed: int =
         PolicyError: e.g. for a checkpoint without its statistics.
     """
     model = config.models[name]
-    simulation = config.simulation.options if config.simulation is not None else None
-    context = Context(
-        name=name, clock=RealClock(), log=logging.getLogger(f"ibrobot.{name}"), robot=config.robot,
-        joints=config.robot.joint_names, period_ns=ns(1.0 / config.control.rate_hz), seed=seed, simulation=simulation,
-    )  # fmt: skip
+    context = component_context(config, name, RealClock(), seed)
     policy: Policy = registry.find("policy", model.type).make(model.options, context)
     return policy

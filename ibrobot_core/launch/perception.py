@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections import deque
 from typing import override
 
-from ibrobot_core.component import Worker
 from ibrobot_core.config.schema import Peripheral
 from ibrobot_core.interfaces import Sensor
-from ibrobot_core.launch.session import Session
+from ibrobot_core.launch.session import SensorFigures, Session, SessionWorker
 from ibrobot_core.units import seconds
 
 _READY_TIMEOUT_S = 30.0
@@ -16,27 +15,25 @@ _RATE_WINDOW = 31
 """Messages that the measured rate looks back on."""
 
 
-class SensorWorker(Worker):
+class SensorWorker(SessionWorker):
     """Opens a sensor and publishes its messages; ready when the first has come."""
 
     def __init__(self, session: Session, peripheral: Peripheral, needs: tuple[str, ...]) -> None:
         super().__init__(
-            f"sensor:{peripheral.name}", f"{peripheral.kind} {peripheral.type}", needs,
-            on_failure=session.fail, lockstep=session.request.lockstep, ready_timeout_s=_READY_TIMEOUT_S,
+            session, f"sensor:{peripheral.name}", f"{peripheral.kind} {peripheral.type}", needs,
+            ready_timeout_s=_READY_TIMEOUT_S,
         )  # fmt: skip
-        self._session = session
         self._peripheral = peripheral
         self._sensor: Sensor | None = None
+        self._received = 0
         self._stamps: deque[int] = deque(maxlen=_RATE_WINDOW)
 
     @override
     def setup(self) -> None:
-        session, peripheral = self._session, self._peripheral
-        descriptor = session.registry.find("sensor", peripheral.type)
-        sensor = self._sensor = descriptor.make(peripheral.options, session.context(peripheral.name))
+        sensor = self._sensor = self.session.make("sensor", self._peripheral, self._peripheral.name)
         sensor.open()
         for topic, message in sensor.latched():
-            session.bus.publish(topic, message, latched=True)
+            self.session.bus.publish(topic, message, latched=True)
 
     @override
     def work(self, timeout_s: float) -> None:
@@ -44,15 +41,16 @@ class SensorWorker(Worker):
         message = self._sensor.read(timeout_s)
         if message is None:
             return
-        self._session.bus.publish(self._sensor.topic, message)
-        now_ns = self._session.clock.now_ns()
+        self.session.bus.publish(self._sensor.topic, message)
+        now_ns = self.session.clock.now_ns()
         self._stamps.append(now_ns)
-        self._session.received[self._peripheral.name] += 1
-        if (header := getattr(message, "header", None)) is not None:
-            self._session.ages[self._peripheral.name] = seconds(now_ns - header.stamp_ns)
+        self._received += 1
         elapsed_s = seconds(self._stamps[-1] - self._stamps[0])
         if elapsed_s > 0:
-            self._session.rates[self._peripheral.name] = (len(self._stamps) - 1) / elapsed_s
+            header = getattr(message, "header", None)
+            age_s = seconds(now_ns - header.stamp_ns) if header is not None else None
+            rate_hz = (len(self._stamps) - 1) / elapsed_s
+            self.session.sensors[self._peripheral.name] = SensorFigures(self._received, rate_hz, age_s)
 
     @override
     def teardown(self) -> None:

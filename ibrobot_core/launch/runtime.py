@@ -226,7 +226,7 @@ class Runtime:
             "holding": outcome.holding,
             "loop": report["loop"],
             "counters": report["counters"],
-            "rates_hz": {name: round(rate, 2) for name, rate in session.rates.items()},
+            "rates_hz": {name: round(sensor.rate_hz, 2) for name, sensor in session.sensors.items()},
             "drops": session.bus.dropped(),
             "absent": {sensor.name: str(sensor.missing) for sensor in session.absent},
         }

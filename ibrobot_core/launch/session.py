@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import threading
 from abc import ABC, abstractmethod
-from collections import Counter
 from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -15,14 +14,16 @@ import numpy as np
 
 from ibrobot_core.bus import Bus
 from ibrobot_core.clock import Clock, RealClock, SteppedClock
+from ibrobot_core.component import Worker
 from ibrobot_core.config import RobotConfig
+from ibrobot_core.config.context import component_context
+from ibrobot_core.config.schema import Component as ComponentConfig
 from ibrobot_core.control.link import ControlState, PlanRecord
 from ibrobot_core.errors import ComponentFailed
 from ibrobot_core.interfaces import Context, JointReading, Transport
 from ibrobot_core.launch.absence import AbsentSensor, absent_sensors
 from ibrobot_core.plugins import Registry
 from ibrobot_core.robot import Vector
-from ibrobot_core.units import ns
 
 if TYPE_CHECKING:
     from ibrobot_core.control.host import ControlHost
@@ -59,6 +60,27 @@ class Outcome:
     goals_failed: int = 0
     holding: list[str] = attrs.field(factory=list)
     """What holds torque after the run, and how to take it off, a line each."""
+
+
+@attrs.frozen
+class ActingPolicy:
+    """The policy that moves the robot in a mode with inference."""
+
+    dispatch: DispatchStats
+    engine: EngineStats
+    described: Callable[[], Mapping[str, str]]
+    """Which policy it is, and with which weights."""
+
+
+@attrs.define
+class SensorFigures:
+    """What is measured of a sensor."""
+
+    received: int
+    """Messages so far."""
+    rate_hz: float
+    age_s: float | None
+    """Age of the newest message when it was published, by its stamp; None for messages without one."""
 
 
 class Feed(ABC):
@@ -116,16 +138,10 @@ class Session:
         self.start_failed = False
         """Whether the run ended before all of it was there: nothing has moved the robot."""
         self.state: ControlState | None = None
-        self.stats: DispatchStats | None = None
-        self.engine_stats: EngineStats | None = None
-        self.policy: Callable[[], Mapping[str, str]] | None = None
-        """Says which policy acts, and with which weights; None in a mode without one."""
-        self.rates: dict[str, float] = {}
-        """Measured rate of each sensor [Hz]."""
-        self.received: Counter[str] = Counter()
-        """Messages of each sensor so far."""
-        self.ages: dict[str, float] = {}
-        """Age of each sensor's newest message when it was published [s], by its stamp."""
+        self.acting: ActingPolicy | None = None
+        """None in a mode without a policy."""
+        self.sensors: dict[str, SensorFigures] = {}
+        """Of each sensor that has given messages."""
         self.failure: tuple[str, Exception] | None = None
         self.finished = threading.Event()
         """Set when the run should stop."""
@@ -160,6 +176,11 @@ class Session:
         self._control = control
 
     @property
+    def policy(self) -> Callable[[], Mapping[str, str]] | None:
+        """Says which policy acts, and with which weights; None in a mode without one."""
+        return self.acting.described if self.acting is not None else None
+
+    @property
     def has_control(self) -> bool:
         """Whether control was made."""
         return self._control is not None
@@ -179,16 +200,14 @@ class Session:
     def transport(self, transport: Transport) -> None:
         self._transport = transport
 
-    def context(self, name: str, *, seed: int | None = None) -> Context:
+    def context(self, name: str) -> Context:
         """The context for a plugin's `make` in the host."""
-        config = self.config
-        simulation = config.simulation.options if config.simulation is not None else None
-        return Context(
-            name=name, clock=self.clock, log=logging.getLogger(f"ibrobot.{name}"), robot=config.robot,
-            joints=config.robot.joint_names, period_ns=ns(1.0 / config.control.rate_hz),
-            seed=self.request.seed if seed is None else seed, bus=self.bus, simulation=simulation,
-            keys=self.request.keys,
-        )  # fmt: skip
+        request = self.request
+        return component_context(self.config, name, self.clock, request.seed, bus=self.bus, keys=request.keys)
+
+    def make(self, kind: str, component: ComponentConfig, name: str) -> Any:
+        """What the plugin of a component of the YAML makes; `name` is that of its context."""
+        return self.registry.find(kind, component.type).make(component.options, self.context(name))
 
     def measured(self) -> JointReading:
         """The newest state.
@@ -257,3 +276,16 @@ class Session:
         if self.failure is None and not self.finished.is_set():
             self.failure = (component, error)
         self.finished.set()
+
+
+class SessionWorker(Worker):
+    """A worker of a run, whose failure ends it."""
+
+    def __init__(
+        self, session: Session, name: str, summary: str, needs: tuple[str, ...] = (), *, ready_timeout_s: float = 60.0
+    ) -> None:
+        super().__init__(
+            name, summary, needs,
+            on_failure=session.fail, lockstep=session.request.lockstep, ready_timeout_s=ready_timeout_s,
+        )  # fmt: skip
+        self.session = session

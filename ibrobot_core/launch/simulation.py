@@ -4,32 +4,26 @@ from __future__ import annotations
 
 from typing import override
 
-from ibrobot_core.component import Worker
-from ibrobot_core.launch.session import Session
+from ibrobot_core.launch.session import Session, SessionWorker
 from ibrobot_core.recording.episodes import Episodes
 from ibrobot_core.units import NS_PER_S, ns
 
 
-class SimulatedEpisodes(Worker):
+class SimulatedEpisodes(SessionWorker):
     """Episodes of a policy in a simulated scene; seeds count up from the run's."""
 
     def __init__(self, session: Session, episodes: Episodes, needs: tuple[str, ...]) -> None:
         wanted = session.request.episodes
         summary = f"{wanted if wanted is not None else 'endless'} episodes from seed {session.request.seed}"
-        super().__init__("episodes", summary, needs, on_failure=session.fail, lockstep=session.request.lockstep)
-        self._session = session
+        super().__init__(session, "episodes", summary, needs)
         self._episodes = episodes
         self._wanted = wanted
         self._longest_ns = ns(session.config.contract.max_duration_s)
         self._begun_ns: int | None = None
 
     @override
-    def setup(self) -> None:
-        pass
-
-    @override
     def work(self, timeout_s: float) -> None:
-        session = self._session
+        session = self.session
         if not session.finished.is_set():
             self._judge(session)
         if timeout_s > 0:
@@ -48,7 +42,7 @@ class SimulatedEpisodes(Worker):
             self._end_episode("failure")
 
     def _begin_episode(self) -> None:
-        session = self._session
+        session = self.session
         seed = session.request.seed + self._episodes.number
         session.command("reset_episode", seed=seed)
         self._begun_ns = session.clock.now_ns()
@@ -57,13 +51,9 @@ class SimulatedEpisodes(Worker):
             session.feeder.begin(seed)
 
     def _end_episode(self, outcome: str) -> None:
-        session = self._session
+        session = self.session
         session.pause_feed()
         self._begun_ns = None
         self._episodes.end(outcome)
         if self._wanted is not None and self._episodes.number >= self._wanted:
             session.finish()
-
-    @override
-    def teardown(self) -> None:
-        pass

@@ -23,9 +23,7 @@ class TransportLink(Component):
 
     @override
     def start(self) -> None:
-        session, section = self._session, self._section
-        descriptor = session.registry.find("transport", section.type)
-        self._transport = session.transport = descriptor.make(section.options, session.context(NAME))
+        self._transport = self._session.transport = self._session.make("transport", self._section, NAME)
 
     @override
     def stop(self) -> None:

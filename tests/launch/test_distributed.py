@@ -98,10 +98,10 @@ def test_the_arm_holds_while_the_server_is_gone_and_goes_on_when_it_is_back(runs
     runtime = runs.start(MODE.format("distributed"), NETWORK, "contract.max_duration_s=100", mode="policy", sim=True)
     runs.parts.Scene.success = lambda scene: False
     session = runtime.session
-    while not (session.stats and session.stats.chunks >= 2):
+    while not (session.acting and session.acting.dispatch.chunks >= 2):
         runtime.step()
     cloud.close()
-    stats = session.stats
+    stats = session.acting.dispatch
     chunks = stats.chunks
     while stats.failures < 2 or stats.plan_length:
         runtime.step()

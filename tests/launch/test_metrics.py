@@ -34,7 +34,7 @@ def get(runtime: Runtime, path: str) -> tuple[int, str]:
 @pytest.fixture
 def runtime(runs: Runs) -> Runtime:
     runtime = runs.start("metrics.port=0", episodes=2)
-    while runtime.session.stats is None or runtime.session.stats.chunks < 2:
+    while runtime.session.acting is None or runtime.session.acting.dispatch.chunks < 2:
         runtime.step()
     return runtime
 
@@ -43,7 +43,7 @@ def test_prometheus_learns_what_diagnostics_tell(runtime: Runtime):
     status, text = get(runtime, "/metrics")
     assert status == 200
     families = {family.name: family for family in text_string_to_metric_families(text)}
-    stats = runtime.session.stats
+    stats = runtime.session.acting.dispatch
     assert stats is not None
     for name, kind, value in (
         ("ibrobot_dispatch_chunks", "counter", stats.chunks),
@@ -63,7 +63,7 @@ def test_prometheus_learns_what_diagnostics_tell(runtime: Runtime):
 
 def test_a_robot_is_ready_unless_it_is_stopped_or_its_model_is_gone(runtime: Runtime):
     assert get(runtime, "/readyz") == (200, "ok\n")
-    stats = runtime.session.engine_stats
+    stats = runtime.session.acting.engine
     assert stats is not None
     stats.alive = False
     assert get(runtime, "/readyz") == (503, "the model is gone\n")

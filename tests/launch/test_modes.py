@@ -82,8 +82,8 @@ def test_what_runs_is_what_the_mode_needs(runs: Runs):
     runtime.switch_mode("policy")
     assert sorted(names(runtime)) == sorted([*fixed, "model:net", "mode:policy"])
     seconds(runtime, 1.0)
-    assert runtime.session.stats is not None
-    assert runtime.session.stats.chunks > 0
+    assert runtime.session.acting is not None
+    assert runtime.session.acting.dispatch.chunks > 0
 
 
 def test_a_planning_mode_takes_over_the_goal_service_of_another(runs: Runs):
@@ -149,10 +149,10 @@ def test_the_old_mode_goes_on_when_control_refuses_the_new_one(runs: Runs, monke
     monkeypatch.setattr(control, "call", call)
     with pytest.raises(HardwareError, match="not now"):
         runtime.switch_mode("teleop")
-    assert runtime.session.stats is not None
-    chunks = runtime.session.stats.chunks
+    assert runtime.session.acting is not None
+    chunks = runtime.session.acting.dispatch.chunks
     seconds(runtime, 0.2)
-    assert runtime.session.stats.chunks > chunks, "the policy goes on within the episode"
+    assert runtime.session.acting.dispatch.chunks > chunks, "the policy goes on within the episode"
     while not runtime.step():
         pass
     assert runtime.summary()["successes"] == 3

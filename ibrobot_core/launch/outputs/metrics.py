@@ -92,7 +92,6 @@ def unready(session: Session) -> str:
         return "the emergency stop is latched"
     if state.stale:
         return "the hardware gives no joint states"
-    engine = session.engine_stats
-    if engine is not None and not engine.alive:
+    if session.acting is not None and not session.acting.engine.alive:
         return "the model is gone"
     return ""

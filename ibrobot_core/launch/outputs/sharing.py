@@ -6,10 +6,10 @@ from collections.abc import Callable
 from typing import override
 
 from ibrobot_core.bus import Subscription
-from ibrobot_core.component import Component, Worker
+from ibrobot_core.component import Component
 from ibrobot_core.errors import IbrobotError, NotSupported
 from ibrobot_core.interfaces import TopicTransport
-from ibrobot_core.launch.session import Session
+from ibrobot_core.launch.session import Session, SessionWorker
 from ibrobot_core.launch.transport import NAME as TRANSPORT
 from ibrobot_core.messages import Message
 from ibrobot_core.options import did_you_mean
@@ -29,15 +29,11 @@ def _topics(session: Session) -> TopicTransport:
     return transport
 
 
-class PublishedTopic(Worker):
+class PublishedTopic(SessionWorker):
     """What is on one topic of the bus, to other machines. A message that cannot be sent is told once, and left out."""
 
     def __init__(self, session: Session, topic: str) -> None:
-        super().__init__(
-            f"share:{topic}", "to other machines", (TRANSPORT,), on_failure=session.fail,
-            lockstep=session.request.lockstep,
-        )  # fmt: skip
-        self._session = session
+        super().__init__(session, f"share:{topic}", "to other machines", (TRANSPORT,))
         self._topic = topic
         self._waiting: Subscription | None = None
         self._told = False
@@ -45,9 +41,9 @@ class PublishedTopic(Worker):
 
     @override
     def setup(self) -> None:
-        self._transport = _topics(self._session)
-        self._silent_from_ns = self._session.clock.now_ns()
-        self._waiting = self._session.bus.subscribe(self._topic, _DEPTH)
+        self._transport = _topics(self.session)
+        self._silent_from_ns = self.session.clock.now_ns()
+        self._waiting = self.session.bus.subscribe(self._topic, _DEPTH)
 
     @override
     def work(self, timeout_s: float) -> None:
@@ -55,21 +51,21 @@ class PublishedTopic(Worker):
         received = self._waiting.get(timeout_s)
         if received is not None:
             self._silent_from_ns = None
-        elif self._silent_from_ns is not None and self._session.clock.now_ns() - self._silent_from_ns > _SILENT_NS:
+        elif self._silent_from_ns is not None and self.session.clock.now_ns() - self._silent_from_ns > _SILENT_NS:
             self._silent_from_ns = None
-            known = did_you_mean(self._topic, list(self._session.bus.topics()), "topics here")
-            self._session.log.warning("%s is not shared: nothing publishes it so far%s", self._topic, known)
+            known = did_you_mean(self._topic, list(self.session.bus.topics()), "topics here")
+            self.session.log.warning("%s is not shared: nothing publishes it so far%s", self._topic, known)
         while received is not None:
             self._send(received.message)
             received = self._waiting.get()
 
     def _send(self, message: Message) -> None:
         try:
-            self._transport.publish_message(self._topic, message, latched=self._topic in self._session.bus.latched())
+            self._transport.publish_message(self._topic, message, latched=self._topic in self.session.bus.latched())
         except IbrobotError as error:
             if not self._told:
                 self._told = True
-                self._session.log.warning("%s is not shared: %s", self._topic, error)
+                self.session.log.warning("%s is not shared: %s", self._topic, error)
 
     @override
     def teardown(self) -> None:

@@ -7,9 +7,8 @@ from typing import Any, override
 
 import attrs
 
-from ibrobot_core.component import Worker
 from ibrobot_core.interfaces import Severity
-from ibrobot_core.launch.session import Session
+from ibrobot_core.launch.session import Session, SessionWorker
 from ibrobot_core.messages import DiagnosticArray, DiagnosticStatus, Header, KeyValue, RobotStatus
 from ibrobot_core.units import NS_PER_S
 
@@ -20,24 +19,20 @@ _OF_DISPATCH = (
 )  # fmt: skip
 
 
-class Status(Worker):
+class Status(SessionWorker):
     """Five times a second, from what control and the dispatcher report."""
 
     def __init__(self, session: Session, needs: tuple[str, ...]) -> None:
-        super().__init__(
-            "status", "/robot_status and /diagnostics", needs, on_failure=session.fail,
-            lockstep=session.request.lockstep,
-        )  # fmt: skip
-        self._session = session
+        super().__init__(session, "status", "/robot_status and /diagnostics", needs)
         self._next_ns = 0
 
     @override
     def setup(self) -> None:
-        self._next_ns = self._session.clock.now_ns()
+        self._next_ns = self.session.clock.now_ns()
 
     @override
     def work(self, timeout_s: float) -> None:
-        session = self._session
+        session = self.session
         now_ns = session.clock.now_ns()
         if now_ns >= self._next_ns:
             self._next_ns = now_ns + _PERIOD_NS
@@ -46,13 +41,9 @@ class Status(Worker):
         if timeout_s > 0:
             self.pause(timeout_s)
 
-    @override
-    def teardown(self) -> None:
-        pass
-
     def _status(self, now_ns: int) -> RobotStatus:
-        session, stats = self._session, self._session.stats
-        dispatch = {name: getattr(stats, name) for name in _OF_DISPATCH} if stats is not None else {}
+        session = self.session
+        dispatch = {name: getattr(session.acting.dispatch, name) for name in _OF_DISPATCH} if session.acting else {}
         return RobotStatus(
             Header(now_ns), session.config.robot.name, session.mode,
             active_executors=session.config.control_modes[session.mode].executors,
@@ -61,7 +52,7 @@ class Status(Worker):
         )  # fmt: skip
 
     def _diagnostics(self, now_ns: int) -> DiagnosticArray:
-        session = self._session
+        session = self.session
         groups = counts(session)
         level = DiagnosticStatus.ERROR if session.faults else DiagnosticStatus.OK
         robot = session.config.robot.name
@@ -82,14 +73,12 @@ def counts(session: Session) -> dict[str, Mapping[str, Any]]:
     groups["interventions"] = counters.get("joints", {})
     groups |= {f"executor {name}": values for name, values in counters.get("executors", {}).items()}
     groups |= {f"hardware {name}": values for name, values in counters.get("hardware", {}).items()}
-    if session.stats is not None:
-        groups["dispatch"] = attrs.asdict(session.stats)
-    if session.engine_stats is not None:
-        groups["inference"] = attrs.asdict(session.engine_stats)
-    for name, rate in session.rates.items():
-        age = {"age_ms": round(session.ages[name] * 1e3, 1)} if name in session.ages else {}
-        groups[f"sensor {name}"] = {"rate_hz": round(rate, 2), **age}
-    groups |= {f"sensor {sensor.name}": {"missing": str(sensor.missing)} for sensor in session.absent}
+    if session.acting is not None:
+        groups |= {"dispatch": attrs.asdict(session.acting.dispatch), "inference": attrs.asdict(session.acting.engine)}
+    for name, sensor in session.sensors.items():
+        age = {"age_ms": round(sensor.age_s * 1e3, 1)} if sensor.age_s is not None else {}
+        groups[f"sensor {name}"] = {"rate_hz": round(sensor.rate_hz, 2), **age}
+    groups |= {f"sensor {each.name}": {"missing": str(each.missing)} for each in session.absent}
     groups["bus drops"] = session.bus.dropped()
     return groups
 

@@ -11,9 +11,8 @@ import attrs
 import numpy as np
 
 from ibrobot_core.bus import Subscription
-from ibrobot_core.component import Worker
 from ibrobot_core.errors import ConfigError, Problem
-from ibrobot_core.launch.session import Session
+from ibrobot_core.launch.session import Session, SessionWorker
 from ibrobot_core.messages import Header, JointState, Quaternion, TFMessage, TransformStamped, Vector3
 
 _MOVING = ("revolute", "continuous", "prismatic")
@@ -104,20 +103,17 @@ def _rotate(q: Quaternion, vector: tuple[float, float, float]) -> tuple[float, f
     return turned.x, turned.y, turned.z
 
 
-class Transforms(Worker):
+class Transforms(SessionWorker):
     """Publishes the moving links with every joint state, and the fixed ones once, latched."""
 
     def __init__(self, session: Session, urdf: Path, needs: tuple[str, ...]) -> None:
-        super().__init__(
-            "transforms", f"/tf from {urdf.name}", needs, on_failure=session.fail, lockstep=session.request.lockstep
-        )
-        self._session = session
+        super().__init__(session, "transforms", f"/tf from {urdf.name}", needs)
         self._urdf = urdf
         self._states: Subscription | None = None
 
     @override
     def setup(self) -> None:
-        session = self._session
+        session = self.session
         links = read_urdf(self._urdf)
         known = {name: i for i, name in enumerate(session.config.robot.joint_names)}
         self._moving = [(link, known[link.joint]) for link in links if link.type in _MOVING and link.joint in known]
@@ -139,7 +135,7 @@ class Transforms(Worker):
         positions = state.position.tolist()
         stamp_ns = state.header.stamp_ns
         transforms = tuple(link.transform(positions[i], stamp_ns) for link, i in self._moving)
-        self._session.bus.publish("/tf", TFMessage(transforms))
+        self.session.bus.publish("/tf", TFMessage(transforms))
 
     @override
     def teardown(self) -> None:

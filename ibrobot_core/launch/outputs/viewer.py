@@ -5,40 +5,34 @@ from __future__ import annotations
 import time
 from typing import override
 
-from ibrobot_core.component import Worker
 from ibrobot_core.config.schema import Component as ConfigComponent
 from ibrobot_core.interfaces import Viewer
-from ibrobot_core.launch.session import Session
+from ibrobot_core.launch.session import Session, SessionWorker
 
 _RATE_HZ = 30.0
 
 
-class ViewerWorker(Worker):
+class ViewerWorker(SessionWorker):
     """Updates a viewer 30 times a second; closing the window ends the run."""
 
     def __init__(self, session: Session, component: ConfigComponent, needs: tuple[str, ...]) -> None:
-        super().__init__(
-            "viewer", component.type, needs, on_failure=session.fail, lockstep=session.request.lockstep
-        )  # fmt: skip
-        self._session = session
+        super().__init__(session, "viewer", component.type, needs)
         self._component = component
         self._viewer: Viewer | None = None
 
     @override
     def setup(self) -> None:
-        session = self._session
-        descriptor = session.registry.find("viewer", self._component.type)
-        self._viewer = descriptor.make(self._component.options, session.context("viewer"))
-        self._viewer.open()
-        if where := self._viewer.where():
-            session.log.info("viewer: %s", where)
+        viewer = self._viewer = self.session.make("viewer", self._component, "viewer")
+        viewer.open()
+        if where := viewer.where():
+            self.session.log.info("viewer: %s", where)
 
     @override
     def work(self, timeout_s: float) -> None:
         assert self._viewer is not None
         begun = time.monotonic()
         if not self._viewer.update():
-            self._session.finish()
+            self.session.finish()
         if timeout_s > 0:
             self.pause(max(0.0, 1.0 / _RATE_HZ - (time.monotonic() - begun)))
 

@@ -6,19 +6,15 @@ import threading
 from abc import abstractmethod
 from typing import override
 
-from ibrobot_core.component import Worker
 from ibrobot_core.config.schema import ControlMode
-from ibrobot_core.launch.session import Feed, Session
+from ibrobot_core.launch.session import Feed, Session, SessionWorker
 
 
-class Feeder(Worker, Feed):
+class Feeder(SessionWorker, Feed):
     """A feed that works in units, for one mode."""
 
     def __init__(self, session: Session, mode: ControlMode, summary: str, needs: tuple[str, ...]) -> None:
-        super().__init__(
-            f"mode:{mode.name}", summary, needs, on_failure=session.fail, lockstep=session.request.lockstep
-        )
-        self.session = session
+        super().__init__(session, f"mode:{mode.name}", summary, needs)
         self.mode = mode
         self.active = False
         self.lock = threading.RLock()

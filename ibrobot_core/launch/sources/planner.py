@@ -51,10 +51,8 @@ class PlanningFeeder(Feeder):
 
     @override
     def setup(self) -> None:
-        session = self.session
-        descriptor = session.registry.find("planner", self._component.type)
-        self._planner = descriptor.make(self._component.options, session.context(self._component.type))
-        self._planner.load()
+        planner = self._planner = self.session.make("planner", self._component, self._component.type)
+        planner.load()
 
     def go_to(self, goal: str) -> None:
         """Queue a goal: a pose's name, or `joint=radians,joint=radians`.

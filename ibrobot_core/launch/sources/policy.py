@@ -17,7 +17,7 @@ from ibrobot_core.inference.remote import RemoteEngine
 from ibrobot_core.interfaces import PictureCodec, Policy
 from ibrobot_core.launch.absence import refuse
 from ibrobot_core.launch.models import check_model
-from ibrobot_core.launch.session import Session
+from ibrobot_core.launch.session import ActingPolicy, Session
 from ibrobot_core.launch.sources.feeder import Feeder
 from ibrobot_core.launch.transport import NAME as TRANSPORT
 from ibrobot_core.robot import Vector
@@ -65,7 +65,7 @@ class Model(Component):
     @override
     def start(self) -> None:
         model, session = self._model, self._session
-        policy = session.registry.find("policy", model.type).make(model.options, session.context(model.name))
+        policy = session.make("policy", model, model.name)
         units = check_model(session.config, model, policy.spec, session.log)
         topics = {part.topic for key in policy.spec.observations for part in self.contract.parts(key)}
         refuse(session.absent, f"model {model.name!r}", topics.__contains__)
@@ -156,9 +156,8 @@ class InferenceFeeder(Feeder):
 
     @override
     def begin_feeding(self, seed: int) -> None:
-        self.session.stats = self.dispatcher.stats
-        self.session.engine_stats = self._model.engine.stats
-        self.session.policy = self._model.described
+        model = self._model
+        self.session.acting = ActingPolicy(self.dispatcher.stats, model.engine.stats, model.described)
         self._next_ns = self.session.bus.snapshot_ns() + self._step_ns
         self.dispatcher.begin(seed)
         self.session.bus.serve(TOGGLE_SMOOTHING, self.toggle_smoothing)
@@ -167,9 +166,7 @@ class InferenceFeeder(Feeder):
     def end_feeding(self) -> None:
         self.session.bus.unserve(TOGGLE_SMOOTHING)
         self.dispatcher.end()
-        self.session.stats = None
-        self.session.engine_stats = None
-        self.session.policy = None
+        self.session.acting = None
 
     @override
     def work(self, timeout_s: float) -> None:

@@ -31,11 +31,9 @@ class TeleopFeeder(Feeder):
 
     @override
     def setup(self) -> None:
-        session = self.session
-        descriptor = session.registry.find("teleop", self._component.type)
-        device = self._device = descriptor.make(self._component.options, session.context(self._device_name))
+        device = self._device = self.session.make("teleop", self._component, self._device_name)
         device.connect()
-        self._states = session.bus.subscribe("/joint_states", 1)
+        self._states = self.session.bus.subscribe("/joint_states", 1)
 
     @override
     def recover(self) -> None:
