@@ -175,13 +175,19 @@ from ibrobot_core.contract.specs import (
     ObservationPart as ObservationPart,
     SignalPart as SignalPart,
 )
+from ibrobot_core.contract.image import pixels as pixels
 from ibrobot_core.contract.frames import FrameAssembler as FrameAssembler, assemble as assemble
 from ibrobot_core.contract.joint_units import JointUnits as JointUnits
 from ibrobot_core.contract.joint_units import with_closed_ends as with_closed_ends
 from ibrobot_core.selection import Leaf as Leaf, Selection as Selection, text_at as text_at
 from ibrobot_core.config import RobotConfig as RobotConfig, find_config as find_config, load_config as load_config
 from ibrobot_core.config.load import load_contract as load_contract
-from ibrobot_core.config.schema import TASK_KEY as TASK_KEY, Align as Align
+from ibrobot_core.config.schema import (
+    TASK_KEY as TASK_KEY,
+    Align as Align,
+    ImageSpec as ImageSpec,
+    TransportConfig as TransportConfig,
+)
 from ibrobot_core.config.expand import resolve_path as resolve_path
 from ibrobot_core.config.convert import Converter as Converter, Faults as Faults
 from ibrobot_core.config.overrides import apply_overrides as apply_overrides
@@ -204,6 +210,7 @@ from ibrobot_core.inference.wire import (
     health_name as health_name,
     service_name as service_name,
 )
+from ibrobot_core.local_transport import LocalTransport as LocalTransport
 from ibrobot_core.recording.dataset import EpisodeDataset as EpisodeDataset
 from ibrobot_core.recording.episode import episode_folder as episode_folder
 from ibrobot_core.recording.provenance import (
@@ -218,5 +225,7 @@ from ibrobot_core.workers import Workers as Workers, end_signals as end_signals,
 from ibrobot_core.outside import LogFormatter as LogFormatter, echo as echo
 from ibrobot_core.screen import Screen as Screen, styled as styled
 from ibrobot_core.terminal import KeyReader as KeyReader
+
+__all__: list[str]
 
 def home_of(name: str) -> str: ...

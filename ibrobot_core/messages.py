@@ -11,16 +11,26 @@ from typing import Any, ClassVar
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+
+_EQUAL = attrs.cmp_using(eq=np.array_equal)
+_NOTHING: Any = ()
 
 
-def _array(dtype: Any, default: Any = attrs.NOTHING) -> Any:
-    def convert(value: Any) -> NDArray[Any]:
-        return np.asarray(value, dtype=dtype)
+def _float64s(value: ArrayLike) -> NDArray[np.float64]:
+    return np.asarray(value, dtype=np.float64)
 
-    if default is not attrs.NOTHING:
-        default = attrs.Factory(lambda: np.empty(0, dtype=dtype))
-    return attrs.field(default=default, converter=convert, eq=attrs.cmp_using(eq=np.array_equal))
+
+def _float32s(value: ArrayLike) -> NDArray[np.float32]:
+    return np.asarray(value, dtype=np.float32)
+
+
+def _int32s(value: ArrayLike) -> NDArray[np.int32]:
+    return np.asarray(value, dtype=np.int32)
+
+
+def _uint8s(value: ArrayLike) -> NDArray[np.uint8]:
+    return np.asarray(value, dtype=np.uint8)
 
 
 @attrs.frozen
@@ -84,7 +94,7 @@ class Float32MultiArray(Message):
     """std_msgs/msg/Float32MultiArray; `data` has shape (N,)."""
 
     ros_type: ClassVar[str] = "std_msgs/msg/Float32MultiArray"
-    data: NDArray[np.float32] = _array(np.float32)
+    data: NDArray[np.float32] = attrs.field(converter=_float32s, eq=_EQUAL)
     layout: MultiArrayLayout = MultiArrayLayout()
 
 
@@ -93,7 +103,7 @@ class Float64MultiArray(Message):
     """std_msgs/msg/Float64MultiArray; `data` has shape (N,)."""
 
     ros_type: ClassVar[str] = "std_msgs/msg/Float64MultiArray"
-    data: NDArray[np.float64] = _array(np.float64)
+    data: NDArray[np.float64] = attrs.field(converter=_float64s, eq=_EQUAL)
     layout: MultiArrayLayout = MultiArrayLayout()
 
 
@@ -102,7 +112,7 @@ class Int32MultiArray(Message):
     """std_msgs/msg/Int32MultiArray; `data` has shape (N,)."""
 
     ros_type: ClassVar[str] = "std_msgs/msg/Int32MultiArray"
-    data: NDArray[np.int32] = _array(np.int32)
+    data: NDArray[np.int32] = attrs.field(converter=_int32s, eq=_EQUAL)
     layout: MultiArrayLayout = MultiArrayLayout()
 
 
@@ -113,9 +123,9 @@ class JointState(Message):
     ros_type: ClassVar[str] = "sensor_msgs/msg/JointState"
     header: Header
     name: tuple[str, ...]
-    position: NDArray[np.float64] = _array(np.float64, None)
-    velocity: NDArray[np.float64] = _array(np.float64, None)
-    effort: NDArray[np.float64] = _array(np.float64, None)
+    position: NDArray[np.float64] = attrs.field(default=_NOTHING, converter=_float64s, eq=_EQUAL)
+    velocity: NDArray[np.float64] = attrs.field(default=_NOTHING, converter=_float64s, eq=_EQUAL)
+    effort: NDArray[np.float64] = attrs.field(default=_NOTHING, converter=_float64s, eq=_EQUAL)
 
 
 @attrs.frozen
@@ -128,7 +138,7 @@ class Image(Message):
     width: int
     encoding: str
     step: int
-    data: NDArray[np.uint8] = _array(np.uint8)
+    data: NDArray[np.uint8] = attrs.field(converter=_uint8s, eq=_EQUAL)
     is_bigendian: int = 0
 
 
@@ -139,7 +149,7 @@ class CompressedImage(Message):
     ros_type: ClassVar[str] = "sensor_msgs/msg/CompressedImage"
     header: Header
     format: str
-    data: NDArray[np.uint8] = _array(np.uint8)
+    data: NDArray[np.uint8] = attrs.field(converter=_uint8s, eq=_EQUAL)
 
 
 @attrs.frozen
@@ -151,10 +161,10 @@ class CameraInfo(Message):
     height: int
     width: int
     distortion_model: str = "plumb_bob"
-    d: NDArray[np.float64] = _array(np.float64, None)
-    k: NDArray[np.float64] = _array(np.float64, None)
-    r: NDArray[np.float64] = _array(np.float64, None)
-    p: NDArray[np.float64] = _array(np.float64, None)
+    d: NDArray[np.float64] = attrs.field(default=_NOTHING, converter=_float64s, eq=_EQUAL)
+    k: NDArray[np.float64] = attrs.field(default=_NOTHING, converter=_float64s, eq=_EQUAL)
+    r: NDArray[np.float64] = attrs.field(default=_NOTHING, converter=_float64s, eq=_EQUAL)
+    p: NDArray[np.float64] = attrs.field(default=_NOTHING, converter=_float64s, eq=_EQUAL)
 
 
 @attrs.frozen
@@ -185,9 +195,9 @@ class Imu(Message):
     orientation: Quaternion = Quaternion()
     angular_velocity: Vector3 = Vector3()
     linear_acceleration: Vector3 = Vector3()
-    orientation_covariance: NDArray[np.float64] = _array(np.float64, None)
-    angular_velocity_covariance: NDArray[np.float64] = _array(np.float64, None)
-    linear_acceleration_covariance: NDArray[np.float64] = _array(np.float64, None)
+    orientation_covariance: NDArray[np.float64] = attrs.field(default=_NOTHING, converter=_float64s, eq=_EQUAL)
+    angular_velocity_covariance: NDArray[np.float64] = attrs.field(default=_NOTHING, converter=_float64s, eq=_EQUAL)
+    linear_acceleration_covariance: NDArray[np.float64] = attrs.field(default=_NOTHING, converter=_float64s, eq=_EQUAL)
 
 
 @attrs.frozen
@@ -196,8 +206,8 @@ class Joy(Message):
 
     ros_type: ClassVar[str] = "sensor_msgs/msg/Joy"
     header: Header
-    axes: NDArray[np.float32] = _array(np.float32, None)
-    buttons: NDArray[np.int32] = _array(np.int32, None)
+    axes: NDArray[np.float32] = attrs.field(default=_NOTHING, converter=_float32s, eq=_EQUAL)
+    buttons: NDArray[np.int32] = attrs.field(default=_NOTHING, converter=_int32s, eq=_EQUAL)
 
 
 @attrs.frozen
@@ -222,7 +232,7 @@ class PointCloud2(Message):
     is_bigendian: bool
     point_step: int
     row_step: int
-    data: NDArray[np.uint8] = _array(np.uint8)
+    data: NDArray[np.uint8] = attrs.field(converter=_uint8s, eq=_EQUAL)
     is_dense: bool = True
 
 
@@ -277,10 +287,10 @@ class JointTrajectoryPoint:
     """trajectory_msgs/msg/JointTrajectoryPoint; arrays (J,), or (0,) where not given; time from the start [ns]."""
 
     time_from_start_ns: int
-    positions: NDArray[np.float64] = _array(np.float64, None)
-    velocities: NDArray[np.float64] = _array(np.float64, None)
-    accelerations: NDArray[np.float64] = _array(np.float64, None)
-    effort: NDArray[np.float64] = _array(np.float64, None)
+    positions: NDArray[np.float64] = attrs.field(default=_NOTHING, converter=_float64s, eq=_EQUAL)
+    velocities: NDArray[np.float64] = attrs.field(default=_NOTHING, converter=_float64s, eq=_EQUAL)
+    accelerations: NDArray[np.float64] = attrs.field(default=_NOTHING, converter=_float64s, eq=_EQUAL)
+    effort: NDArray[np.float64] = attrs.field(default=_NOTHING, converter=_float64s, eq=_EQUAL)
 
 
 @attrs.frozen
@@ -333,7 +343,7 @@ class Variant(Message):
     key: str
     dtype: str
     shape: tuple[int, ...]
-    data: NDArray[np.uint8] = _array(np.uint8)
+    data: NDArray[np.uint8] = attrs.field(converter=_uint8s, eq=_EQUAL)
 
 
 @attrs.frozen

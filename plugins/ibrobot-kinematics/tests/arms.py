@@ -9,7 +9,7 @@ import numpy as np
 from hypothesis import strategies as st
 from ibrobot_kinematics import KinematicModel, TipPose, read_mjcf
 
-from ibrobot_core.robot import Vector
+from ibrobot_core.api import Vector
 
 LINKS = {
     "pan": ("0 0 1", "0 0 0.05"), "lift": ("0 1 0", "0 0 0.05"), "elbow": ("0 1 0", "0.15 0 0"),

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from ibrobot_kinematics import KinematicModel, Target, UnreachableError, read_mjcf, solve
 
-from ibrobot_core.robot import Vector
+from ibrobot_core.api import Vector
 
 from .arms import FIVE, SIX, bent, write_arm
 

@@ -10,7 +10,7 @@ import pytest
 from ibrobot_kinematics import KinematicModel, jog, read_mjcf
 from ibrobot_kinematics.rotations import log
 
-from ibrobot_core.robot import Vector
+from ibrobot_core.api import Vector
 
 from .arms import FIVE, SIX, bent, write_arm
 

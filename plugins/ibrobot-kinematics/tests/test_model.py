@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from ibrobot_kinematics import KinematicModel, KinematicsError, read_mjcf, robot_model
 from ibrobot_kinematics.rotations import log
 
-from ibrobot_core.robot import Description, Joint, Robot, Vector
+from ibrobot_core.api import Description, Joint, Robot, Vector
 
 from .arms import FIVE, SIX, by_mujoco, chains, load, write_arm
 

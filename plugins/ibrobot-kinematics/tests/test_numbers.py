@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from ibrobot_kinematics.quadratic import bounded_minimum
 from ibrobot_kinematics.rotations import exp, log
 
-from ibrobot_core.robot import Vector
+from ibrobot_core.api import Vector
 
 seeds = st.integers(0, 2**32 - 1).map(np.random.default_rng)
 angles = st.floats(0, np.pi) | st.sampled_from([0.0, 1e-12, 1e-7, 1e-6, np.pi - 1e-6, np.pi - 1e-9, np.pi])

@@ -20,10 +20,17 @@ from ibrobot_testing import SensorSuite, host_context
 from ibrobot_testing.contexts import START_NS
 from stream_server import HEIGHT, WIDTH, StreamServer, number_of, numbered
 
-from ibrobot_core.clock import RealClock, SteppedClock
-from ibrobot_core.errors import SensorError
-from ibrobot_core.interfaces import Context, Sensor
-from ibrobot_core.messages import CameraInfo, CompressedImage, Header, Image
+from ibrobot_core.api import (
+    CameraInfo,
+    CompressedImage,
+    Context,
+    Header,
+    Image,
+    RealClock,
+    Sensor,
+    SensorError,
+    SteppedClock,
+)
 
 FRAMES, FPS = 12, 25.0
 PATIENCE_S = 30.0

@@ -13,7 +13,7 @@ from ibrobot_camera.device import Device
 from ibrobot_camera.options import OpenCvOptions
 from ibrobot_camera.v4l2 import Mode
 
-from ibrobot_core.messages import CompressedImage
+from ibrobot_core.api import CompressedImage
 
 
 class Scripted:

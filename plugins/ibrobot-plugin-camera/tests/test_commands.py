@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import subprocess
-import sys
 import urllib.error
 import urllib.request
 from pathlib import Path
@@ -13,9 +12,10 @@ import pytest
 from click.testing import CliRunner
 from ibrobot_camera import v4l2
 from ibrobot_camera.commands import camera
+from ibrobot_testing import ibrobot_command
 from stream_server import StreamServer
 
-from ibrobot_core.errors import SensorError
+from ibrobot_core.api import SensorError
 
 ROBOT = """
 robot: {{name: r, joints: [{{name: j, lower: -1, upper: 1, max_velocity: 1, max_acceleration: 1}}], groups: {{a: [j]}}}}
@@ -64,8 +64,8 @@ def test_snapshot_refuses_what_it_cannot_write() -> None:
 
 def test_preview_shows_the_stream_to_who_has_the_token() -> None:
     with StreamServer() as server:
-        command = [sys.executable, "-c", "from ibrobot_core.cli.main import main; main()", "camera", "preview"]
-        with subprocess.Popen([*command, server.url], stdout=subprocess.PIPE, text=True) as preview:
+        command = (*ibrobot_command(), "camera", "preview", server.url)
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as preview:
             assert preview.stdout is not None
             try:
                 url = preview.stdout.readline().strip()

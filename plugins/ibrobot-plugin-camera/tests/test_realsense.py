@@ -17,11 +17,17 @@ from ibrobot_camera.realsense import RealSenseCamera
 from ibrobot_ros2.jpeg import from_jpeg
 from ibrobot_testing import SensorSuite, host_context
 
-from ibrobot_core.clock import RealClock
-from ibrobot_core.errors import MissingDependency, SensorError
-from ibrobot_core.interfaces import Context, Sensor
-from ibrobot_core.messages import CameraInfo, CompressedImage, Image
-from ibrobot_core.plugins import installed_plugins
+from ibrobot_core.api import (
+    CameraInfo,
+    CompressedImage,
+    Context,
+    Image,
+    MissingDependency,
+    RealClock,
+    Sensor,
+    SensorError,
+    installed_plugins,
+)
 
 WIDTH, HEIGHT = 64, 48
 PATIENCE_S = 30.0

@@ -13,7 +13,7 @@ from ibrobot_feetech import bus, follower, sync
 from ibrobot_feetech.emulator import Emulator
 from ibrobot_feetech.port import SerialPort
 
-from ibrobot_core.units import seconds
+from ibrobot_core.api import seconds
 
 _REQUEST_S = 1e-4
 """What a request takes on its way."""

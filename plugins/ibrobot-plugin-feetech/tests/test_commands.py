@@ -16,7 +16,7 @@ from ibrobot_feetech.commands.ranges import Range, doubtful
 from ibrobot_feetech.emulator import EmulatedServo, Emulator
 from ibrobot_testing import terminal as terminal_module
 
-from ibrobot_core.calibration import load_calibration
+from ibrobot_core.api import load_calibration
 
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
 MIDDLES = {1: 2500, 2: 300, 3: 2048, 4: 3900, 5: 1000, 6: 100}

@@ -5,16 +5,14 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 from ibrobot_feetech import bus as bus_module
 from ibrobot_feetech.bus import FeetechBus
+from ibrobot_testing import ibrobot_command
 
-from ibrobot_core.calibration import load_calibration
-
-IBROBOT = (sys.executable, "-c", "from ibrobot_core.cli.main import main; main()")
+from ibrobot_core.api import load_calibration
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -23,7 +21,7 @@ def test_it_says_its_port_serves_and_ends_cleanly(
 ) -> None:
     monkeypatch.setattr(bus_module, "_ADAPTER_S", 2.0)  # so long does a scan take, whoever answers
     link = tmp_path / "arm"
-    command = (*IBROBOT, "feetech", "emulate", "--servos", "2", "--link", str(link), "--calibration", "two")
+    command = (*ibrobot_command(), "feetech", "emulate", "--servos", "2", "--link", str(link), "--calibration", "two")
     environment = {**os.environ, "XDG_CONFIG_HOME": str(tmp_path)}
     with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as ran:
         try:
@@ -50,7 +48,11 @@ def test_a_file_in_the_links_place_is_left_alone(tmp_path: Path) -> None:
     file = tmp_path / "notes"
     file.write_text("mine")
     ran = subprocess.run(
-        (*IBROBOT, "feetech", "emulate", "--link", str(file)), capture_output=True, text=True, timeout=60, check=False
+        (*ibrobot_command(), "feetech", "emulate", "--link", str(file)),
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
     )
     assert ran.returncode == 2
     assert f"{file} is there already and is no link" in ran.stderr

@@ -17,8 +17,7 @@ from ibrobot_feetech.emulator import EmulatedServo, Emulator
 from ibrobot_feetech.protocol import BROADCAST, Instruction, Packet, Scanner, pack
 from ibrobot_feetech.registers import BAUD_RATES, register
 
-from ibrobot_core.clock import SteppedClock
-from ibrobot_core.units import ns
+from ibrobot_core.api import SteppedClock, ns
 
 SERVOS = 3
 OVERLOAD = 0x20

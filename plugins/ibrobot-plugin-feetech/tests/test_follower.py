@@ -27,6 +27,19 @@ from ibrobot_core.calibration import Calibration, load_calibration
 from ibrobot_core.clock import SteppedClock
 from ibrobot_core.errors import CalibrationError, HardwareError
 from ibrobot_core.interfaces import Context, Hardware, Holding, Severity, Torque
+from ibrobot_core.api import (
+    Calibration,
+    CalibrationError,
+    Context,
+    Hardware,
+    HardwareError,
+    Holding,
+    Severity,
+    SteppedClock,
+    Torque,
+    load_calibration,
+    save_calibration,
+)
 
 from .conftest import JOINTS, arm_calibration, prepare
 from .line import Line

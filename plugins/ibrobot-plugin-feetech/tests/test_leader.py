@@ -16,10 +16,7 @@ from ibrobot_feetech.options import LeaderOptions
 from ibrobot_testing import TeleopSuite
 from ibrobot_testing.contexts import START_NS, host_context
 
-from ibrobot_core.clock import SteppedClock
-from ibrobot_core.errors import TeleopError
-from ibrobot_core.interfaces import Context, JointReading, Teleop, TeleopCommand
-from ibrobot_core.robot import Vector
+from ibrobot_core.api import Context, JointReading, SteppedClock, Teleop, TeleopCommand, TeleopError, Vector
 
 from .conftest import JOINTS, OFFSETS, arm_calibration, prepare
 from .line import Line

@@ -14,8 +14,7 @@ from ibrobot_jointlog.npz import NpzDatasetWriter, read_npz
 from ibrobot_testing import DatasetSuite, host_context
 from numpy.typing import NDArray
 
-from ibrobot_core.errors import DatasetError
-from ibrobot_core.interfaces import Context, Feature
+from ibrobot_core.api import Context, DatasetError, Feature
 
 STATE = {"state": Feature("float32", (2,), ("a", "b"))}
 

@@ -11,12 +11,8 @@ from ibrobot_jointlog import ibrobot_readers
 from ibrobot_jointlog.log import header, row
 from ibrobot_testing import make_robot
 
-from ibrobot_core.contract.specs import ActionPart, Contract
-from ibrobot_core.errors import RecorderError
-from ibrobot_core.interfaces import EpisodeAddress, EpisodeReader
-from ibrobot_core.messages import Float64MultiArray
+from ibrobot_core.api import ActionPart, Contract, EpisodeAddress, EpisodeReader, Float64MultiArray, RecorderError, ns
 from ibrobot_core.recording.playback import read_playback
-from ibrobot_core.units import ns
 
 JOINTS = make_robot().joint_names
 WAVE = np.array([[0.1 * i, -0.2 * i, 0.3, 0.0, 0.01 * i, 0.5] for i in range(5)])

@@ -16,10 +16,19 @@ from ibrobot_jointlog.recorder import JointLogRecorder
 from ibrobot_testing import RecorderSuite, host_context, make_robot
 from ibrobot_testing.contexts import START_NS
 
-from ibrobot_core.errors import RecorderError
-from ibrobot_core.interfaces import Context, EpisodeAddress, EpisodeEnd, EpisodeStart
-from ibrobot_core.messages import Header, JointState, Message, String
-from ibrobot_core.units import NS_PER_S, ns
+from ibrobot_core.api import (
+    NS_PER_S,
+    Context,
+    EpisodeAddress,
+    EpisodeEnd,
+    EpisodeStart,
+    Header,
+    JointState,
+    Message,
+    RecorderError,
+    String,
+    ns,
+)
 
 JOINTS = make_robot().joint_names
 TOPICS = {"/joint_states": JointState.ros_type}

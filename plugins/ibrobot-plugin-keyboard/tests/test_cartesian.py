@@ -13,10 +13,7 @@ from ibrobot_keyboard.options import KeyboardOptions
 from ibrobot_keyboard.teleop import KeyboardTeleop
 from ibrobot_testing import host_context
 
-from ibrobot_core.errors import TeleopError
-from ibrobot_core.interfaces import JointReading
-from ibrobot_core.robot import Description, Joint, Robot, Vector
-from ibrobot_core.units import ns
+from ibrobot_core.api import Description, Joint, JointReading, Robot, TeleopError, Vector, ns
 
 LINKS = {
     "pan": ("0 0 1", "0 0 0.05"), "lift": ("0 1 0", "0 0 0.05"), "elbow": ("0 1 0", "0.15 0 0"),

@@ -14,11 +14,18 @@ from ibrobot_keyboard.options import KeyboardOptions
 from ibrobot_keyboard.teleop import KeyboardTeleop
 from ibrobot_testing import TeleopSuite, host_context, make_robot
 
-from ibrobot_core.errors import TeleopError
-from ibrobot_core.interfaces import Context, JointReading, Teleop, TeleopCommand
-from ibrobot_core.robot import Description, Joint, Robot
-from ibrobot_core.terminal import KeyReader
-from ibrobot_core.units import ns
+from ibrobot_core.api import (
+    Context,
+    Description,
+    Joint,
+    JointReading,
+    KeyReader,
+    Robot,
+    Teleop,
+    TeleopCommand,
+    TeleopError,
+    ns,
+)
 
 JOINTS = make_robot().joint_names
 MIDDLE = np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])

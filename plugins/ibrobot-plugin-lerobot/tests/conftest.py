@@ -13,7 +13,7 @@ from ibrobot_lerobot.options import LeRobotOptions
 from ibrobot_lerobot.writer import LeRobotDatasetWriter
 from numpy.typing import NDArray
 
-from ibrobot_core.interfaces import Feature
+from ibrobot_core.api import Feature
 
 FPS = 30
 STATE = Feature("float32", (3,), ("a", "b", "c"))

@@ -70,7 +70,7 @@ def test_no_pandas(tmp_path):
     program = f"""
 import sys; sys.path.insert(0, {str(tmp_path)!r})
 import pathlib, numpy as np
-from ibrobot_core.interfaces import Feature
+from ibrobot_core.api import Feature
 from ibrobot_lerobot.options import LeRobotOptions
 from ibrobot_lerobot.writer import LeRobotDatasetWriter
 root = pathlib.Path({str(tmp_path)!r})

@@ -17,11 +17,17 @@ from ibrobot_lerobot.policy import LeRobotPolicy
 from ibrobot_testing.contexts import ARM, GRIPPER, START_NS, host_context
 from safetensors.numpy import save_file
 
-from ibrobot_core.config.schema import Align
-from ibrobot_core.contract.specs import ActionPart, Contract, ObservationPart
-from ibrobot_core.errors import PolicyError
-from ibrobot_core.interfaces import Feature, Frame
-from ibrobot_core.messages import Float64MultiArray, JointState
+from ibrobot_core.api import (
+    ActionPart,
+    Align,
+    Contract,
+    Feature,
+    Float64MultiArray,
+    Frame,
+    JointState,
+    ObservationPart,
+    PolicyError,
+)
 
 STATE, TOP = "observation.state", "observation.images.top"
 JOINTS = ARM + GRIPPER

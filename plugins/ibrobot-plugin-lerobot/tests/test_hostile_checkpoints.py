@@ -16,7 +16,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from hostile import ATTACKS, POST, PRE, pickled_weights
 from test_checkpoint import frame, make, step, write
 
-from ibrobot_core.errors import PolicyError
+from ibrobot_core.api import PolicyError
 
 TYPES = {
     "act": {}, "diffusion": {"horizon": 16, "n_obs_steps": 2}, "vqbet": {"action_chunk_size": 5},

@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from ibrobot_lerobot.jpeg import Jpeg
 
-from ibrobot_core.errors import WireError
-from ibrobot_core.inference.wire import WireKind, WireMessage, decode, encode
+from ibrobot_core.api import WireDecoder, WireEncoder, WireError, WireKind, WireMessage
 
 CODEC = Jpeg(90)
 
@@ -21,8 +20,8 @@ def picture(height: int, width: int, channels: int) -> np.ndarray:
 @given(st.integers(1, 70), st.integers(1, 70), st.sampled_from([1, 3]))
 def test_pictures_come_back_nearly_as_they_were(height: int, width: int, channels: int) -> None:
     sent = picture(height, width, channels)
-    frame = encode(WireMessage(WireKind.REQUEST, 1, {"top": sent}), codec=CODEC)
-    found = decode(frame, codec=CODEC).tensors["top"]
+    frame = WireEncoder(codec=CODEC).encode(WireMessage(WireKind.REQUEST, 1, {"top": sent}))
+    found = WireDecoder(codec=CODEC).decode(frame).tensors["top"]
     assert (found.shape, found.dtype) == (sent.shape, np.uint8)
     assert np.abs(found.astype(int) - sent).mean() < 30
 

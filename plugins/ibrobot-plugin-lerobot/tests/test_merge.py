@@ -13,8 +13,7 @@ from ibrobot_lerobot import merge as merging
 from ibrobot_lerobot.options import LeRobotOptions
 from ibrobot_lerobot.writer import LeRobotDatasetWriter
 
-from ibrobot_core.errors import DatasetError
-from ibrobot_core.interfaces import Feature
+from ibrobot_core.api import DatasetError, Feature
 
 from .conftest import CAMERA, FPS, STATE, check, episodes, values, write
 

@@ -14,14 +14,25 @@ from ibrobot_lerobot import layout
 from ibrobot_lerobot.pictures import PngEncoder, decode_picture, tiff
 from ibrobot_lerobot.reader import LeRobotReader
 
-from ibrobot_core.config.schema import Align, ImageSpec
-from ibrobot_core.contract.image import pixels
-from ibrobot_core.contract.specs import ActionPart, Contract, ObservationPart
-from ibrobot_core.errors import CalibrationError, ContractError, DatasetError, RecorderError
-from ibrobot_core.interfaces import EpisodeAddress, Feature
-from ibrobot_core.messages import Float64MultiArray, Image, JointState
-from ibrobot_core.plugins import installed_plugins
-from ibrobot_core.units import lerobot_to_radians
+from ibrobot_core.api import (
+    ActionPart,
+    Align,
+    CalibrationError,
+    Contract,
+    ContractError,
+    DatasetError,
+    EpisodeAddress,
+    Feature,
+    Float64MultiArray,
+    Image,
+    ImageSpec,
+    JointState,
+    ObservationPart,
+    RecorderError,
+    installed_plugins,
+    lerobot_to_radians,
+    pixels,
+)
 
 from .conftest import CAMERA, FPS, picture, values, write
 

@@ -19,8 +19,7 @@ from ibrobot_lerobot.stats import QUANTILES, DepthStats, PixelStats
 from ibrobot_lerobot.writer import LeRobotDatasetWriter
 from numpy.typing import NDArray
 
-from ibrobot_core.errors import DatasetError
-from ibrobot_core.interfaces import Feature
+from ibrobot_core.api import DatasetError, Feature
 
 from .conftest import CAMERA, FPS, rows
 

@@ -19,8 +19,7 @@ from ibrobot_lerobot.writer import LeRobotDatasetWriter
 from ibrobot_testing import DatasetSuite
 from numpy.typing import NDArray
 
-from ibrobot_core.errors import DatasetError
-from ibrobot_core.interfaces import Context, Feature
+from ibrobot_core.api import Context, DatasetError, Feature
 
 from .conftest import CAMERA, STATE, check, picture, rows, values, write
 

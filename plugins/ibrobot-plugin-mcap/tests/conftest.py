@@ -12,9 +12,7 @@ from ibrobot_mcap.reader import Rosbag2Reader
 from ibrobot_mcap.recorder import McapRecorder
 from ibrobot_testing.contexts import START_NS, host_context
 
-from ibrobot_core.clock import RealClock
-from ibrobot_core.interfaces import EpisodeEnd, EpisodeStart
-from ibrobot_core.messages import Header, Image, JointState
+from ibrobot_core.api import EpisodeEnd, EpisodeStart, Header, Image, JointState, RealClock
 
 STEP_NS = 10_000_000
 JOINTS = "/joint_states"

@@ -9,9 +9,7 @@ from ibrobot_mcap.options import McapOptions
 from ibrobot_mcap.recorder import McapRecorder
 from ibrobot_testing.contexts import host_context
 
-from ibrobot_core.clock import RealClock
-from ibrobot_core.interfaces import EpisodeStart
-from ibrobot_core.messages import Header, JointState
+from ibrobot_core.api import EpisodeStart, Header, JointState, RealClock
 
 
 def main(directory: Path, rate_hz: float, compression: str) -> None:

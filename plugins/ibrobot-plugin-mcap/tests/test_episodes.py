@@ -20,8 +20,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagsWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from ibrobot_core.errors import RecorderError
-from ibrobot_core.messages import JointState, String
+from ibrobot_core.api import JointState, RecorderError, String
 
 from .conftest import CAMERA, JOINTS, Bench, joints, picture, stamp
 

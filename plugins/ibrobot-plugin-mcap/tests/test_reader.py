@@ -21,14 +21,22 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagsWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from ibrobot_core.config.schema import Align
-from ibrobot_core.contract.frames import FrameAssembler, assemble
-from ibrobot_core.contract.image import pixels
-from ibrobot_core.contract.specs import Contract, ObservationPart
-from ibrobot_core.errors import IbrobotError, RecorderError
-from ibrobot_core.interfaces import Feature
-from ibrobot_core.messages import CompressedImage, Header, Image, JointState
-from ibrobot_core.plugins import installed_plugins
+from ibrobot_core.api import (
+    Align,
+    CompressedImage,
+    Contract,
+    Feature,
+    FrameAssembler,
+    Header,
+    IbrobotError,
+    Image,
+    JointState,
+    ObservationPart,
+    RecorderError,
+    assemble,
+    installed_plugins,
+    pixels,
+)
 
 from .conftest import CAMERA, JOINTS, Bench, joints, picture, read, reading, stamp, summary
 

@@ -19,9 +19,7 @@ from ibrobot_testing.contexts import START_NS, host_context
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
-from ibrobot_core.errors import RecorderError
-from ibrobot_core.messages import Image, JointState, String
-from ibrobot_core.units import NS_PER_S
+from ibrobot_core.api import NS_PER_S, Image, JointState, RecorderError, String
 
 from .conftest import CAMERA, JOINTS, joints, picture, read, stamp, summary
 

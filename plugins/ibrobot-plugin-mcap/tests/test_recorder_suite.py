@@ -8,7 +8,7 @@ from ibrobot_mcap.recorder import McapRecorder
 from ibrobot_testing import RecorderSuite
 from ibrobot_testing.contexts import START_NS, host_context
 
-from ibrobot_core.clock import RealClock
+from ibrobot_core.api import RealClock
 
 
 class McapSuite(RecorderSuite):

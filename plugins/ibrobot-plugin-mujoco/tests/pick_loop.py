@@ -16,14 +16,20 @@ from ibrobot_mujoco.scripted_pick import SCENE, STATE, ScriptedPick
 from ibrobot_mujoco.so101 import so101
 from ibrobot_mujoco.state import PHYSICS_TOPIC, SCENE_TOPIC, pose_scene
 
-from ibrobot_core.clock import SteppedClock
-from ibrobot_core.control.executors.position import PositionExecutor
+from ibrobot_core.api import (
+    NS_PER_S,
+    Context,
+    Episode,
+    Executor,
+    Frame,
+    Plan,
+    SteppedClock,
+    Vector,
+    installed_plugins,
+    seconds,
+)
 from ibrobot_core.control.safety import SafetyLayer
 from ibrobot_core.dispatch.smoother import TemporalSmoother
-from ibrobot_core.executor_options import PositionOptions
-from ibrobot_core.interfaces import Context, Episode, Frame, Plan
-from ibrobot_core.robot import Vector
-from ibrobot_core.units import NS_PER_S, seconds
 
 RATE_HZ = 30
 PERIOD_NS = 10_000_000
@@ -68,7 +74,8 @@ class PickLoop:
         self.hardware.reset(Episode(seed))
         self.policy.reset(seed)
         robot, outcome = self.ctx.robot, Outcome()
-        safety, executor = SafetyLayer(robot, PERIOD_NS), PositionExecutor(PositionOptions(), self.ctx)
+        position = installed_plugins().find("executor", "position")
+        safety, executor = SafetyLayer(robot, PERIOD_NS), position.make(position.options(), self.ctx)
         smoother = TemporalSmoother(round(NS_PER_S / RATE_HZ), len(robot.joints))
         reading = self.hardware.read()
         safety.activate(reading.position)
@@ -93,7 +100,7 @@ class PickLoop:
         return outcome
 
     def _dispatch(
-        self, position: Vector, smoother: TemporalSmoother, executor: PositionExecutor, outcome: Outcome, now_s: float
+        self, position: Vector, smoother: TemporalSmoother, executor: Executor, outcome: Outcome, now_s: float
     ) -> None:
         """Ask for a chunk where the plan has come down to the watermark."""
         now_ns = self.clock.now_ns()

@@ -19,11 +19,18 @@ from ibrobot_mujoco.state import PHYSICS_TOPIC, pose_scene
 from ibrobot_ros2.jpeg import to_jpeg
 from ibrobot_testing import SensorSuite, control_context, host_context
 
-from ibrobot_core.errors import SensorError
-from ibrobot_core.interfaces import Context, Episode, Sensor
-from ibrobot_core.messages import CameraInfo, CompressedImage, Float64MultiArray, Image
-from ibrobot_core.plugins import installed_plugins
-from ibrobot_core.robot import Vector
+from ibrobot_core.api import (
+    CameraInfo,
+    CompressedImage,
+    Context,
+    Episode,
+    Float64MultiArray,
+    Image,
+    Sensor,
+    SensorError,
+    Vector,
+    installed_plugins,
+)
 
 MISSING = installed_plugins().missing("sensor", "mujoco")
 pytestmark = pytest.mark.skipif(MISSING is not None, reason=str(MISSING))

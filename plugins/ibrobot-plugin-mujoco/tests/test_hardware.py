@@ -13,9 +13,7 @@ from ibrobot_mujoco.so101 import so101
 from ibrobot_mujoco.state import stamp_of
 from ibrobot_testing import SimulatedHardwareSuite, control_context
 
-from ibrobot_core.errors import HardwareError
-from ibrobot_core.interfaces import Context, Episode, Hardware, JointReading
-from ibrobot_core.robot import Vector
+from ibrobot_core.api import Context, Episode, Hardware, HardwareError, JointReading, Vector
 
 ROBOT = so101()
 REST = ROBOT.pose("rest")

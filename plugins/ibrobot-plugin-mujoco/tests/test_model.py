@@ -17,8 +17,7 @@ from ibrobot_mujoco.options import MujocoOptions, SceneCamera
 from ibrobot_mujoco.so101 import so101
 from ibrobot_mujoco.state import physics_size, pose_scene, stamp_of, write_physics
 
-from ibrobot_core.errors import HardwareError, SensorError
-from ibrobot_core.robot import Description, Joint, Robot
+from ibrobot_core.api import Description, HardwareError, Joint, Robot, SensorError
 
 ROBOT = so101()
 STAMP_NS = 1_700_000_000_123_456_789

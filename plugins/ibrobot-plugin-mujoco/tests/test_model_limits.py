@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from ibrobot_mujoco.so101 import MJCF
 
-from ibrobot_core.config.expand import resolve_path
+from ibrobot_core.api import resolve_path
 from ibrobot_core.config.models import read_mjcf
 
 CLASSES = ("main", "servo", "small")

@@ -14,8 +14,7 @@ from ibrobot_mujoco.options import MujocoOptions
 from ibrobot_mujoco.pick_cube import CLEARANCE, PickCube
 from ibrobot_mujoco.so101 import so101
 
-from ibrobot_core.errors import HardwareError
-from ibrobot_core.robot import Vector
+from ibrobot_core.api import HardwareError, Vector
 
 ROBOT = so101()
 REST = ROBOT.pose("rest")

@@ -16,10 +16,7 @@ from ibrobot_mujoco.scripted_pick import SCENE, STATE, ScriptedPick
 from ibrobot_mujoco.so101 import so101
 from ibrobot_testing import PolicySuite, host_context
 
-from ibrobot_core.errors import PolicyError
-from ibrobot_core.interfaces import Context, Frame
-from ibrobot_core.robot import Vector
-from ibrobot_core.units import ns, seconds
+from ibrobot_core.api import Context, Frame, PolicyError, Vector, ns, seconds
 
 from .pick_loop import PERIOD_NS, RATE_HZ, Outcome, PickLoop
 

@@ -20,9 +20,7 @@ from ibrobot_testing import ViewerSuite, host_context
 from ibrobot_testing.suite import Suite
 from mujoco import viewer as mujoco_viewer
 
-from ibrobot_core.errors import IbrobotError
-from ibrobot_core.interfaces import Context, Viewer
-from ibrobot_core.messages import Float64MultiArray, Message
+from ibrobot_core.api import Context, Float64MultiArray, IbrobotError, Message, Viewer
 
 ROBOT = so101()
 OPTIONS = MujocoOptions()

@@ -8,7 +8,7 @@ from ibrobot_planning.joint import JointPlanner
 from ibrobot_planning.options import JointPlannerOptions
 from ibrobot_testing import PlannerSuite
 
-from ibrobot_core.interfaces import Context
+from ibrobot_core.api import Context
 
 
 class TestJointPlanner(PlannerSuite):

@@ -13,11 +13,18 @@ from ibrobot_planning import ibrobot_planners
 from ibrobot_planning.joint import JointPlanner
 from ibrobot_planning.options import JointPlannerOptions
 
-from ibrobot_core.clock import SteppedClock
-from ibrobot_core.errors import PlanningError
-from ibrobot_core.interfaces import Context, JointGoal, PlanRequest, PoseGoal
-from ibrobot_core.messages import JointTrajectory, Pose
-from ibrobot_core.robot import Joint, Robot
+from ibrobot_core.api import (
+    Context,
+    Joint,
+    JointGoal,
+    JointTrajectory,
+    PlanningError,
+    PlanRequest,
+    Pose,
+    PoseGoal,
+    Robot,
+    SteppedClock,
+)
 
 ROBOT = Robot(
     name="three",

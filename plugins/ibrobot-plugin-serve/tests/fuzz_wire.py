@@ -30,11 +30,19 @@ from ibrobot_serve.service import InferenceService
 from ibrobot_testing import host_context
 from ibrobot_testing.fakes import FakePolicy
 
+from ibrobot_core.api import (
+    Handler,
+    LocalTransport,
+    Tensors,
+    Transport,
+    WireDecoder,
+    WireEncoder,
+    WireKind,
+    WireMessage,
+    installed_plugins,
+    service_name,
+)
 from ibrobot_core.inference.remote import RemoteEngine
-from ibrobot_core.inference.wire import WireKind, WireMessage, decode, encode, service_name
-from ibrobot_core.interfaces import Handler, Tensors, Transport
-from ibrobot_core.local_transport import LocalTransport
-from ibrobot_core.plugins import installed_plugins
 
 GROWTH_MIB = 64
 """What the process may grow by: threads' stacks and arenas, and the counts of 256 robots."""
@@ -106,7 +114,7 @@ def seeds(fingerprint: str) -> list[bytes]:
         deadline_ns=50_000_000,
     )  # fmt: skip
     return [
-        bytes(encode(m))
+        bytes(WireEncoder().encode(m))
         for m in (asked, picture, WireMessage(WireKind.FAILURE, 9, text="no"), WireMessage(WireKind.ANSWER, 1))
     ]
 
@@ -157,7 +165,7 @@ def fuzz_frames(count: int, seed: int) -> tuple[Counter[str], Robot, float]:
     for number in range(count):
         if number == min(count // 10, 100_000):
             before_mib = memory_mib()
-        answer = decode(handler(mutant(chance, frames), None))
+        answer = WireDecoder().decode(handler(mutant(chance, frames), None))
         ended["answered" if answer.kind is WireKind.ANSWER else "malformed" if answer.id == 0 else "failed"] += 1
     grown = memory_mib() - before_mib
     robot.stopped.set()

@@ -21,12 +21,22 @@ from ibrobot_testing import host_context
 from ibrobot_testing.fakes import FakePolicy
 from prometheus_client.parser import text_string_to_metric_families
 
-from ibrobot_core.errors import ContractError, PolicyError, TransportError
+from ibrobot_core.api import (
+    ContractError,
+    Handler,
+    LocalTransport,
+    Metrics,
+    PolicyError,
+    Tensors,
+    TransportError,
+    WireDecoder,
+    WireEncoder,
+    WireKind,
+    WireMessage,
+    health_name,
+    service_name,
+)
 from ibrobot_core.inference.remote import RemoteEngine
-from ibrobot_core.inference.wire import WireKind, WireMessage, decode, encode, health_name, service_name
-from ibrobot_core.interfaces import Handler, Tensors
-from ibrobot_core.local_transport import LocalTransport
-from ibrobot_core.metrics import Metrics
 
 PATIENCE_S = 30.0
 SOON_NS = round(PATIENCE_S * 1e9)
@@ -109,10 +119,12 @@ class Cloud:
             WireKind.REQUEST, 5, {"x": np.atleast_1d(np.asarray(x, np.float64))}, robot, self.policy.fingerprint(),
             deadline_ns=wait_ns,
         )  # fmt: skip
-        return self.send(bytes(encode(attrs.evolve(message, **changes))))
+        return self.send(bytes(WireEncoder().encode(attrs.evolve(message, **changes))))
 
     def send(self, payload: bytes) -> Future[WireMessage]:
-        return self.pool.submit(lambda: decode(self.transport.request(service_name("net"), payload, PATIENCE_S)))
+        return self.pool.submit(
+            lambda: WireDecoder().decode(self.transport.request(service_name("net"), payload, PATIENCE_S))
+        )
 
     def asked(self, robot: str, x: Any, **changes: Any) -> Future[WireMessage]:
         """As `ask`; returns once the request waits for its turn."""
@@ -293,7 +305,7 @@ def test_the_service_measures_who_asks_and_what_it_costs(monkeypatch: pytest.Mon
 def test_garbage_is_counted_told_and_harmless():
     with served() as cloud:
         cloud.policy.gate.release(10)
-        answer = encode(WireMessage(WireKind.ANSWER, 1))
+        answer = WireEncoder().encode(WireMessage(WireKind.ANSWER, 1))
         for payload, said in ((b"", "0 bytes"), (b"GET / HTTP/1.1" * 10, "no frame"), (answer, "kind ANSWER")):
             assert said in failure(cloud.send(bytes(payload)))
         assert outputs(cloud.ask("robot", 3)) == [6]
@@ -581,8 +593,11 @@ def test_server_that_comes_back_with_another_policy_is_refused_whatever_its_weig
     ("answer", "said"),
     [
         (b"nonsense", "8 bytes; a frame has"),
-        (encode(WireMessage(WireKind.ANSWER, 8)), "answered request 8"),
-        (encode(WireMessage(WireKind.FAILURE, 1, text="out of memory")), "the server of net: out of memory"),
+        (WireEncoder().encode(WireMessage(WireKind.ANSWER, 8)), "answered request 8"),
+        (
+            WireEncoder().encode(WireMessage(WireKind.FAILURE, 1, text="out of memory")),
+            "the server of net: out of memory",
+        ),
     ],
 )
 def test_the_engine_believes_no_answer_but_its_own(answer: bytes, said: str):
@@ -601,7 +616,9 @@ def test_the_engine_knows_waiting_from_work_and_the_pace():
         WireMessage(WireKind.ANSWER, 1, {}, fingerprint=Net().fingerprint(), latency_ms=50.0, queued_ns=30_000_000),
         WireMessage(WireKind.FAILURE, 2, text="full", pace_ns=750_000_000),
     ]
-    transport.serve(service_name("net"), lambda payload, sender: encode(replies[decode(payload).id - 1]))
+    transport.serve(
+        service_name("net"), lambda payload, sender: WireEncoder().encode(replies[WireDecoder().decode(payload).id - 1])
+    )
     remote = RemoteEngine(Net(), transport, "net", "so101")
     remote.infer({"x": np.zeros(1)}, 1, deadline())
     assert (remote.stats.model_ms, remote.stats.queue_ms, remote.stats.pace_ms) == (20.0, 30.0, 0.0)

@@ -12,7 +12,7 @@ from ibrobot_testing import host_context
 from ibrobot_zenoh.options import ZenohOptions
 from ibrobot_zenoh.transport import ZenohTransport
 
-from ibrobot_core.interfaces import Transport
+from ibrobot_core.api import Transport
 
 WAIT_S = 30.0
 """How long a test waits for what must come [s]."""

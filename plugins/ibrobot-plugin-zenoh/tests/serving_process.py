@@ -9,7 +9,7 @@ from ibrobot_testing import host_context
 from ibrobot_zenoh.options import ZenohOptions
 from ibrobot_zenoh.transport import ZenohTransport
 
-from ibrobot_core.interfaces import Payload
+from ibrobot_core.api import Payload
 
 
 def answer(payload: Payload, _: str | None) -> Payload:

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from ibrobot_zenoh import transport as transport_module
 
-from ibrobot_core.errors import TransportError
+from ibrobot_core.api import TransportError
 
 from .pair import WAIT_S, client, free_endpoint, router, settle, wait_for
 

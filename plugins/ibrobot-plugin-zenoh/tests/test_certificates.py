@@ -29,8 +29,7 @@ from ibrobot_zenoh.commands.certs import certs
 from ibrobot_zenoh.options import Tls
 from ibrobot_zenoh.reasons import why_not
 
-from ibrobot_core.errors import TransportError
-from ibrobot_core.messages import Int32, String
+from ibrobot_core.api import Int32, String, TransportError
 
 from .pair import WAIT_S, client, free_endpoint, router, settle, wait_for
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import queue
 import signal
 import subprocess
-import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,17 +15,27 @@ import numpy as np
 import pytest
 import yaml
 from click.testing import CliRunner
+from ibrobot_testing import ibrobot_command
 from ibrobot_zenoh.commands import network as network_module
 from ibrobot_zenoh.commands.text import message_from, shown
 from ibrobot_zenoh.commands.topic import topic
 from ibrobot_zenoh.options import ZenohOptions
 from ibrobot_zenoh.transport import ZenohTransport
 
-from ibrobot_core.config.schema import RobotConfig, TransportConfig
-from ibrobot_core.errors import ConfigError, IbrobotError, NotSupported
-from ibrobot_core.messages import Bool, Float64MultiArray, Header, JointState, Message
-from ibrobot_core.options import NoOptions
-from ibrobot_core.robot import Robot
+from ibrobot_core.api import (
+    Bool,
+    ConfigError,
+    Float64MultiArray,
+    Header,
+    IbrobotError,
+    JointState,
+    Message,
+    NoOptions,
+    NotSupported,
+    Robot,
+    RobotConfig,
+    TransportConfig,
+)
 
 from .pair import WAIT_S, free_endpoint, router, wait_for
 
@@ -34,8 +43,6 @@ PATIENT = """
 from importlib import import_module
 import_module("ibrobot_zenoh.commands.network")._CONNECT_S = 30.0
 import_module("ibrobot_zenoh.commands.topic")._LIST_S = 30.0
-from ibrobot_core.cli.main import main
-main()
 """
 STATE = JointState(Header(5, "base"), ("pan",), [0.5])
 
@@ -142,7 +149,7 @@ def test_pub_of_another_type_is_refused(robot: ZenohTransport, endpoint: str):
 @pytest.mark.parametrize("command", [["echo", "/joint_states"], ["hz", "/joint_states", "--period", "0.05"]])
 def test_ctrl_c_ends_it_cleanly(command: list[str], robot: ZenohTransport, endpoint: str):
     with subprocess.Popen(
-        [sys.executable, "-c", PATIENT, "topic", *command, "--endpoint", endpoint],
+        [*ibrobot_command(PATIENT), "topic", *command, "--endpoint", endpoint],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     ) as process:  # fmt: skip
         assert process.stdout is not None

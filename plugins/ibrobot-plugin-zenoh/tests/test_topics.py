@@ -15,9 +15,7 @@ from ibrobot_ros2 import encode
 from ibrobot_zenoh import topics as topics_module
 from ibrobot_zenoh.ros2 import Node, absolute, attachment, ros_type, topic_key, topics_of_tokens
 
-from ibrobot_core.errors import TransportError
-from ibrobot_core.interfaces import SharedTopic
-from ibrobot_core.messages import Header, Image, Int32, JointState, Message, String
+from ibrobot_core.api import Header, Image, Int32, JointState, Message, SharedTopic, String, TransportError
 
 from .pair import WAIT_S, client, free_endpoint, router, settle, wait_for
 

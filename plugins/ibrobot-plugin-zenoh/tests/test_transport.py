@@ -6,7 +6,7 @@ from typing import override
 
 from ibrobot_testing import TransportSuite
 
-from ibrobot_core.interfaces import Context, Transport
+from ibrobot_core.api import Context, Transport
 
 from .pair import client, free_endpoint, router, settle
 

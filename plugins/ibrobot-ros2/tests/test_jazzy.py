@@ -11,7 +11,7 @@ from ibrobot_ros2 import decode, encode, type_hash
 from ibrobot_ros2.convert import encoder
 from ibrobot_ros2.definitions import standard_types
 
-from ibrobot_core.messages import MESSAGE_TYPES
+from ibrobot_core.api import MESSAGE_TYPES
 
 JAZZY = json.loads((Path(__file__).parent / "jazzy.json").read_text())
 NOT_THERE = {"tf2_msgs/msg/TFMessage", "ibrobot_msgs/msg/Variant", "ibrobot_msgs/msg/VariantsList",

@@ -11,8 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from ibrobot_ros2.jpeg import from_jpeg, own_jpeg, to_jpeg
 
-from ibrobot_core.errors import ContractError
-from ibrobot_core.messages import CompressedImage, Header, Image
+from ibrobot_core.api import CompressedImage, ContractError, Header, Image
 
 HEADER = Header(7, "top")
 

@@ -13,9 +13,7 @@ from hypothesis.extra.numpy import array_shapes, arrays
 from ibrobot_ros2.png import from_png, is_png
 from PIL import Image as Pillow
 
-from ibrobot_core.contract.image import pixels
-from ibrobot_core.errors import ContractError
-from ibrobot_core.messages import CompressedImage, Header
+from ibrobot_core.api import CompressedImage, ContractError, Header, pixels
 
 SIZES = array_shapes(min_dims=2, max_dims=2, max_side=9)
 GREY = arrays(np.uint8, SIZES)

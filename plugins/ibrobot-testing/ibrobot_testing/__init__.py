@@ -7,6 +7,7 @@ import pytest
 # Before they are imported, and wherever they are installed: assertions in the suites say what they compared.
 pytest.register_assert_rewrite(*(f"{__name__}.{module.name}" for module in pkgutil.iter_modules(__path__)))
 
+from ibrobot_testing.command import ibrobot_command
 from ibrobot_testing.contexts import control_context, host_context, make_robot
 from ibrobot_testing.dataset import DatasetSuite
 from ibrobot_testing.executor import ExecutorSuite
@@ -39,6 +40,7 @@ __all__ = [
     "control_context",
     "failed_checks",
     "host_context",
+    "ibrobot_command",
     "make_robot",
     "run_checks",
 ]

@@ -5,18 +5,17 @@ from __future__ import annotations
 import codecs
 import os
 import subprocess
-import sys
 import threading
 from collections.abc import Mapping
 from types import TracebackType
 from typing import Self
 
+from ibrobot_testing.command import ibrobot_command
+
 _START = """
 import fcntl, sys, termios
 fcntl.ioctl(0, termios.TIOCSCTTY, 0)
 {before}
-from ibrobot_core.cli.main import main
-main()
 """
 _TIMEOUT_S = 120.0
 
@@ -37,7 +36,7 @@ class Terminal:
         self._master, slave = os.openpty()
         try:
             self._process = subprocess.Popen(
-                [sys.executable, "-c", _START.format(before=before), *arguments],
+                [*ibrobot_command(_START.format(before=before)), *arguments],
                 stdin=slave, stdout=slave, stderr=slave, start_new_session=True,
                 env={**os.environ, "TERM": "xterm", "COLUMNS": str(columns), "LINES": "40", **(environment or {})},
             )  # fmt: skip

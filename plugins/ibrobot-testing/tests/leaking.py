@@ -12,7 +12,7 @@ from typing import ClassVar, override
 from ibrobot_testing import LeakCheck, SensorSuite
 from ibrobot_testing.fakes import FakeSensor
 
-from ibrobot_core.interfaces import Context
+from ibrobot_core.api import Context
 
 kept: list[object] = []
 """What was left behind: without it, Python would close it."""

@@ -9,7 +9,7 @@ import pytest
 from ibrobot_testing import DatasetSuite, checks, failed_checks
 from ibrobot_testing.fakes import FakeDataset
 
-from ibrobot_core.errors import DatasetError
+from ibrobot_core.api import DatasetError
 
 
 class TestDataset(DatasetSuite):

@@ -9,8 +9,7 @@ import pytest
 from ibrobot_testing import ExecutorSuite, checks, failed_checks
 from ibrobot_testing.fakes import FakeExecutor
 
-from ibrobot_core.errors import GoalRejected
-from ibrobot_core.interfaces import GoalState, GoalStatus
+from ibrobot_core.api import GoalRejected, GoalState, GoalStatus
 
 
 class TestExecutor(ExecutorSuite):

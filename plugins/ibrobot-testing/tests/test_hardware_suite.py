@@ -9,8 +9,7 @@ import pytest
 from ibrobot_testing import HardwareSuite, SimulatedHardwareSuite, checks, failed_checks
 from ibrobot_testing.fakes import FakeHardware, FakeRealHardware
 
-from ibrobot_core.errors import HardwareError
-from ibrobot_core.interfaces import Condition, Episode, Holding, JointReading, Severity, Signal
+from ibrobot_core.api import Condition, Episode, HardwareError, Holding, JointReading, Severity, Signal
 
 
 class TestRealHardware(HardwareSuite):

@@ -13,7 +13,7 @@ import pytest
 from ibrobot_testing import LeakCheck, SensorSuite, Suite, failed_checks
 from ibrobot_testing.fakes import FakeSensor
 
-from ibrobot_core.interfaces import Context
+from ibrobot_core.api import Context
 
 CHECK = "test_refuses_reading_while_closed"
 """A check that opens its sensor."""

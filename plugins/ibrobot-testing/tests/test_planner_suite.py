@@ -10,8 +10,7 @@ import pytest
 from ibrobot_testing import PlannerSuite, checks, failed_checks
 from ibrobot_testing.fakes import FakePlanner
 
-from ibrobot_core.errors import PlanningError
-from ibrobot_core.interfaces import JointGoal
+from ibrobot_core.api import JointGoal, PlanningError
 
 
 class TestPlanner(PlannerSuite):

@@ -10,7 +10,7 @@ import pytest
 from ibrobot_testing import PolicySuite, checks, failed_checks
 from ibrobot_testing.fakes import FakePolicy
 
-from ibrobot_core.errors import PolicyError
+from ibrobot_core.api import PolicyError
 
 
 class TestPolicy(PolicySuite):

@@ -11,7 +11,7 @@ import pytest
 from ibrobot_testing import RecorderSuite, checks, failed_checks
 from ibrobot_testing.fakes import FakeRecorder
 
-from ibrobot_core.messages import Header, JointState
+from ibrobot_core.api import Header, JointState
 
 
 class TestRecorder(RecorderSuite):

@@ -10,8 +10,7 @@ import pytest
 from ibrobot_testing import SensorSuite, checks, failed_checks
 from ibrobot_testing.fakes import FakeSensor
 
-from ibrobot_core.errors import SensorError
-from ibrobot_core.messages import CameraInfo, CompressedImage, Header
+from ibrobot_core.api import CameraInfo, CompressedImage, Header, SensorError
 
 
 class TestSensor(SensorSuite):

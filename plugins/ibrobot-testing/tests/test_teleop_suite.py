@@ -10,7 +10,7 @@ import pytest
 from ibrobot_testing import TeleopSuite, checks, failed_checks
 from ibrobot_testing.fakes import FakeTeleop
 
-from ibrobot_core.errors import TeleopError
+from ibrobot_core.api import TeleopError
 
 
 class TestTeleop(TeleopSuite):

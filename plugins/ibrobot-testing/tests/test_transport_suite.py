@@ -9,8 +9,8 @@ from typing import override
 import pytest
 from ibrobot_testing import TransportSuite, checks, failed_checks
 
-from ibrobot_core.errors import TransportError
-from ibrobot_core.local_transport import LocalTransport, _Request
+from ibrobot_core.api import LocalTransport, TransportError
+from ibrobot_core.local_transport import _Request
 
 
 class ShortSuite(TransportSuite):

@@ -1,0 +1,69 @@
+"""Plugins' tests import core as plugins do, through `ibrobot_core.api`, and helpers from `ibrobot_testing`."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PLUGINS = Path(__file__).parents[2] / "plugins"
+LOOP = "a loop of a few lines with core's own smoother and safety layer, which plans of policies pass through"
+CLIENT = "the server against core's own client"
+ALLOWED = {
+    ("ibrobot-plugin-jointlog/tests/test_reader.py", "ibrobot_core.recording.playback"): "what `replay` makes of a log",
+    ("ibrobot-plugin-mujoco/tests/pick_loop.py", "ibrobot_core.control.safety"): LOOP,
+    ("ibrobot-plugin-mujoco/tests/pick_loop.py", "ibrobot_core.dispatch.smoother"): LOOP,
+    ("ibrobot-plugin-mujoco/tests/test_model_limits.py", "ibrobot_core.config.models"): (
+        "limits as core reads them, against those of MuJoCo"
+    ),
+    ("ibrobot-plugin-serve/tests/fuzz_wire.py", "ibrobot_core.inference.remote"): CLIENT,
+    ("ibrobot-plugin-serve/tests/test_service.py", "ibrobot_core.inference.remote"): CLIENT,
+    ("ibrobot-testing/tests/test_transport_suite.py", "ibrobot_core.local_transport"): (
+        "wrong transports are the local one, broken inside"
+    ),
+}
+"""File and module -> why its tests need it."""
+
+
+def named_of_core(tree: ast.AST) -> Iterator[str]:
+    """What a source text names of core: modules in imports, and dotted names in strings, as in programs and patches."""
+    for node in ast.walk(tree):
+        match node:
+            case ast.Import(names=names):
+                yield from (alias.name for alias in names if alias.name.split(".")[0] == "ibrobot_core")
+            case ast.ImportFrom(module="ibrobot_core", names=names):
+                yield from (f"ibrobot_core.{alias.name}" for alias in names)
+            case ast.ImportFrom(module=str(module)) if module.startswith("ibrobot_core."):
+                yield module
+            case ast.Constant(value=str(text)):
+                yield from re.findall(r"\bibrobot_core(?:\.\w+)+", text)
+
+
+def test_plugins_tests_use_the_public_interface() -> None:
+    files = sorted(PLUGINS.glob("ibrobot*/tests/**/*.py"))
+    assert len(files) > 80
+    found = {
+        (str(path.relative_to(PLUGINS)), module)
+        for path in files
+        for module in named_of_core(ast.parse(path.read_text(encoding="utf-8")))
+    }
+    internals = {(path, module) for path, module in found if not f"{module}.".startswith("ibrobot_core.api.")}
+    assert sorted(internals - set(ALLOWED)) == []
+    assert sorted(set(ALLOWED) - internals) == [], "allowed, but nowhere used"
+
+
+@pytest.mark.parametrize(
+    ("code", "name"),
+    [
+        ("import ibrobot_core.bus", "ibrobot_core.bus"),
+        ("from ibrobot_core import messages", "ibrobot_core.messages"),
+        ("def late():\n    from ibrobot_core.cli.main import main", "ibrobot_core.cli.main"),
+        ("run('from ibrobot_core.clock import RealClock')", "ibrobot_core.clock"),
+        ("patch('ibrobot_core.config.load', None)", "ibrobot_core.config.load"),
+    ],
+)
+def test_the_check_finds_modules_of_core(code: str, name: str) -> None:
+    assert list(named_of_core(ast.parse(code))) == [name]
