@@ -14,6 +14,10 @@ LOOP = "a loop of a few lines with core's own smoother and safety layer, which p
 CLIENT = "the server against core's own client"
 ALLOWED = {
     ("ibrobot-plugin-jointlog/tests/test_reader.py", "ibrobot_core.recording.playback"): "what `replay` makes of a log",
+    (
+        "ibrobot-plugin-lerobot/tests/test_compose.py",
+        "ibrobot_core.contract.image",
+    ): "every encoding that contracts know",
     ("ibrobot-plugin-mujoco/tests/pick_loop.py", "ibrobot_core.control.safety"): LOOP,
     ("ibrobot-plugin-mujoco/tests/pick_loop.py", "ibrobot_core.dispatch.smoother"): LOOP,
     ("ibrobot-plugin-mujoco/tests/test_model_limits.py", "ibrobot_core.config.models"): (

@@ -9,13 +9,19 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from ibrobot_lerobot.compose import Composer
 
-from ibrobot_core.config.schema import Align, ImageSpec
-from ibrobot_core.contract.frames import frames
+from ibrobot_core.api import (
+    ActionPart,
+    Align,
+    Contract,
+    ContractError,
+    Feature,
+    FrameAssembler,
+    ImageSpec,
+    ObservationPart,
+    Selection,
+    assemble,
+)
 from ibrobot_core.contract.image import ENCODINGS
-from ibrobot_core.contract.specs import ActionPart, Contract, ObservationPart
-from ibrobot_core.errors import ContractError
-from ibrobot_core.interfaces import Feature
-from ibrobot_core.selection import Selection
 
 STAMP_NS = 5_000_000_000
 JOINTS = "sensor_msgs/msg/JointState"
@@ -50,7 +56,7 @@ def again(contract: Contract, values: dict[str, np.ndarray]) -> dict[str, np.nda
     """The frame of the messages made of `values`."""
     made = Composer(contract)(values, STAMP_NS)
     received = [(topic, message, STAMP_NS) for topic, message in made.items()]
-    (frame,) = frames(contract, received, [STAMP_NS])
+    (frame,) = assemble(FrameAssembler(contract), received, [STAMP_NS])
     return dict(frame.values)
 
 
