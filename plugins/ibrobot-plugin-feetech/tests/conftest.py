@@ -11,7 +11,6 @@ from ibrobot_feetech.calibration import save_calibration
 from ibrobot_feetech.emulator import Emulator
 from ibrobot_testing.contexts import ARM, GRIPPER
 
-from ibrobot_core.calibration import Calibration, JointCalibration
 from ibrobot_core.api import Calibration, JointCalibration, save_calibration
 
 from .line import lay

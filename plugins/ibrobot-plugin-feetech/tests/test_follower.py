@@ -23,10 +23,6 @@ from ibrobot_feetech.protocol import OVERLOAD
 from ibrobot_testing.contexts import START_NS, control_context
 from ibrobot_testing.hardware import HardwareSuite
 
-from ibrobot_core.calibration import Calibration, load_calibration
-from ibrobot_core.clock import SteppedClock
-from ibrobot_core.errors import CalibrationError, HardwareError
-from ibrobot_core.interfaces import Context, Hardware, Holding, Severity, Torque
 from ibrobot_core.api import (
     Calibration,
     CalibrationError,

@@ -22,8 +22,6 @@ from ibrobot_testing.contexts import control_context, host_context
 from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
-from ibrobot_core.calibration import load_calibration
-from ibrobot_core.errors import HardwareError, TeleopError
 from ibrobot_core.api import HardwareError, TeleopError, load_calibration, save_calibration
 
 from .conftest import arm_calibration, prepare
