@@ -11,7 +11,7 @@ from ibrobot_feetech.calibration import save_calibration
 from ibrobot_feetech.emulator import Emulator
 from ibrobot_testing.contexts import ARM, GRIPPER
 
-from ibrobot_core.api import Calibration, JointCalibration, save_calibration
+from ibrobot_core.api import Calibration, JointCalibration
 
 from .line import lay
 

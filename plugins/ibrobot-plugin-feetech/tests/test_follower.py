@@ -34,7 +34,6 @@ from ibrobot_core.api import (
     SteppedClock,
     Torque,
     load_calibration,
-    save_calibration,
 )
 
 from .conftest import JOINTS, arm_calibration, prepare

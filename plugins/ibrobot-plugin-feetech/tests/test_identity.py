@@ -22,7 +22,7 @@ from ibrobot_testing.contexts import control_context, host_context
 from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
-from ibrobot_core.api import HardwareError, TeleopError, load_calibration, save_calibration
+from ibrobot_core.api import HardwareError, TeleopError, load_calibration
 
 from .conftest import arm_calibration, prepare
 from .line import Line
