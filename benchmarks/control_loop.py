@@ -25,7 +25,7 @@ from ibrobot_core.config import load_config
 from ibrobot_core.control.realtime import go_real_time
 from ibrobot_core.control.timing import Punctuality
 from ibrobot_core.launch.runtime import Runtime
-from ibrobot_core.launch.session import Request, Session
+from ibrobot_core.launch.session import LaunchRequest, Session
 from ibrobot_core.plugins import installed_plugins
 from ibrobot_core.units import ns
 
@@ -53,7 +53,7 @@ def bare(seconds: float, period_ns: int, priority: int) -> dict[str, Any]:
 
 def system(seconds: float, *, busy: bool) -> dict[str, Any]:
     """A run as `ibrobot launch` makes it."""
-    runtime = Runtime(Session(load_config(CONFIG, sim=True), installed_plugins(), Request(duration_s=seconds)))
+    runtime = Runtime(Session(load_config(CONFIG, sim=True), installed_plugins(), LaunchRequest(duration_s=seconds)))
     end = threading.Event()
     thread = threading.Thread(target=_count, args=(end,), daemon=True)
     runtime.start()

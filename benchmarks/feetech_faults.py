@@ -292,7 +292,7 @@ class Bench:
             return
         if command.positions:
             plan = np.array([[command.positions[joint] for joint in JOINTS]])
-            self.core.set_plan(PlanRecord(self.core.epoch, self.clock.now_ns(), 1, np.ones(6, dtype=bool), plan))
+            self.core.set_plan(PlanRecord(self.core.generation, self.clock.now_ns(), 1, np.ones(6, dtype=bool), plan))
 
     def _reset(self) -> bool:
         """As the host does: the device first, if it was lost, then control; False where either is refused."""

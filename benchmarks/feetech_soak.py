@@ -80,7 +80,7 @@ def main() -> int:
         for tick in range(ticks):
             clock.advance(core.period_ns)
             path = 0.8 * math.sin(tick / 100) * np.array([1, -1, 1, -1, 1, 0.5])
-            core.set_plan(PlanRecord(core.epoch, clock.now_ns(), 1, np.ones(6, dtype=bool), path[np.newaxis]))
+            core.set_plan(PlanRecord(core.generation, clock.now_ns(), 1, np.ones(6, dtype=bool), path[np.newaxis]))
             state = core.tick()
             with emulator.lock:
                 truth = np.array([(s.encoder - 2048) * 2 * math.pi / 4096 for s in emulator.servos.values()])

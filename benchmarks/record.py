@@ -29,7 +29,7 @@ import yaml
 from ibrobot_core.config import load_config
 from ibrobot_core.interfaces import Context, Sensor
 from ibrobot_core.launch.runtime import Runtime
-from ibrobot_core.launch.session import Request, Session
+from ibrobot_core.launch.session import LaunchRequest, Session
 from ibrobot_core.messages import Header, Image
 from ibrobot_core.plugins import Registry, discover
 
@@ -85,7 +85,9 @@ def run(seconds: float, root: Path | None) -> dict[str, Any]:
         path = Path(folder) / "so101.yaml"
         path.write_text(yaml.safe_dump(document, sort_keys=False))
         found = registry()
-        runtime = Runtime(Session(load_config(path, sim=True, registry=found), found, Request(duration_s=seconds)))
+        runtime = Runtime(
+            Session(load_config(path, sim=True, registry=found), found, LaunchRequest(duration_s=seconds))
+        )
         runtime.start()
         try:
             while not runtime.wait(0.2):

@@ -16,7 +16,7 @@ from time import perf_counter
 
 from ibrobot_core.config import load_config
 from ibrobot_core.launch.runtime import Runtime
-from ibrobot_core.launch.session import Request, Session
+from ibrobot_core.launch.session import LaunchRequest, Session
 from ibrobot_core.plugins import installed_plugins
 
 CONFIG = Path(__file__).parents[1] / "configs" / "so101_blind.yaml"
@@ -27,7 +27,7 @@ def main() -> int:
     parser.add_argument("--episodes", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0, help="of the first episode; later ones count up")
     arguments = parser.parse_args()
-    request = Request(lockstep=True, seed=arguments.seed, episodes=arguments.episodes)
+    request = LaunchRequest(lockstep=True, seed=arguments.seed, episodes=arguments.episodes)
     runtime = Runtime(Session(load_config(CONFIG, sim=True), installed_plugins(), request))
     begin = perf_counter()
     runtime.start()

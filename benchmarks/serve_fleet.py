@@ -38,8 +38,8 @@ from ibrobot_core.config.schema import (
     ActionSpec,
     ContractConfig,
     ControlMode,
-    Dispatch,
-    ExecutorComponent,
+    DispatchConfig,
+    ExecutorConfig,
     ObservationSpec,
     RobotConfig,
 )
@@ -124,7 +124,7 @@ class Robot:
         joints = robot.joint_names
         config = RobotConfig(
             robot=robot,
-            executors={"all": ExecutorComponent("position", NoOptions(), "all", "all", joints)},
+            executors={"all": ExecutorConfig("position", NoOptions(), "all", "all", joints)},
             control_modes={"idle": ControlMode(())},
             default_control_mode="idle",
             contract=ContractConfig(
@@ -140,7 +140,7 @@ class Robot:
         contract = Contract.from_config(config)
         self._step_ns = contract.step_ns
         self._dispatcher = Dispatcher(
-            contract, policy.spec, Dispatch(watermark), robot, self._bus, self._client, lambda *_: None, 5.0
+            contract, policy.spec, DispatchConfig(watermark), robot, self._bus, self._client, lambda *_: None, 5.0
         )
         self.chunks: list[tuple[float, float]] = []
         """When each came [s], and its latency [ms]."""

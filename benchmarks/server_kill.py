@@ -28,7 +28,7 @@ from made_up import plugin
 
 from ibrobot_core.config import load_config
 from ibrobot_core.launch.runtime import Runtime
-from ibrobot_core.launch.session import Request, Session
+from ibrobot_core.launch.session import LaunchRequest, Session
 from ibrobot_core.plugins import discover
 from ibrobot_core.units import seconds
 
@@ -199,7 +199,9 @@ def run(kills: int, slack_s: float, folder: Path) -> int:
     theirs = [entry for found in distributions() for entry in found.entry_points if entry.group == "ibrobot"]
     registry = discover([entry for entry in (*theirs, *mine)])
     server = Server(folder, endpoint)
-    runtime = Runtime(Session(load_config(folder / "mini.yaml", sim=True, registry=registry), registry, Request()))
+    runtime = Runtime(
+        Session(load_config(folder / "mini.yaml", sim=True, registry=registry), registry, LaunchRequest())
+    )
     session = runtime.session
     known, held, resumed, grown = [], [], [], []
     try:

@@ -25,7 +25,7 @@ from flow_policy import FlowPolicy
 from ibrobot_core.bus import Bus
 from ibrobot_core.clock import SteppedClock
 from ibrobot_core.config import RobotConfig, load_config
-from ibrobot_core.config.schema import Dispatch
+from ibrobot_core.config.schema import DispatchConfig
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.control.host import InlineControl
 from ibrobot_core.control.link import ControlState, PlanRecord
@@ -111,7 +111,7 @@ class Arm:
         self.dispatcher = Dispatcher(
             self.contract,
             policy.spec,
-            Dispatch(strategy=strategy),
+            DispatchConfig(strategy=strategy),
             config.robot,
             self.bus,
             self.client,
@@ -125,7 +125,7 @@ class Arm:
     def run(self, duration_s: float) -> None:
         """So many seconds."""
         self.control.start()
-        self._epoch = int(self.control.call("counters")["epoch"])
+        self._generation = int(self.control.call("counters")["generation"])
         self.dispatcher.begin(self._seed)
         period_ns = ns(1 / self.config.control.rate_hz)
         next_ns = begin_ns = self.clock.now_ns()
@@ -151,7 +151,7 @@ class Arm:
 
     def _send(self, start_ns: int, step_ns: int, positions: Vector) -> None:
         mask = np.ones(len(self.config.robot.joints), dtype=bool)
-        self.control.write_plan(PlanRecord(self._epoch, start_ns, step_ns, mask, positions))
+        self.control.write_plan(PlanRecord(self._generation, start_ns, step_ns, mask, positions))
 
 
 def measure(

@@ -32,8 +32,8 @@ from ibrobot_core.config.schema import (
     ActionSpec,
     ContractConfig,
     ControlMode,
-    Dispatch,
-    ExecutorComponent,
+    DispatchConfig,
+    ExecutorConfig,
     ObservationSpec,
     RobotConfig,
 )
@@ -149,7 +149,7 @@ class Robot(InferenceClient):
         robot = make_robot()
         config = RobotConfig(
             robot=robot,
-            executors={"all": ExecutorComponent("position", NoOptions(), "all", "all", robot.joint_names)},
+            executors={"all": ExecutorConfig("position", NoOptions(), "all", "all", robot.joint_names)},
             control_modes={"idle": ControlMode(())},
             default_control_mode="idle",
             contract=ContractConfig(RATE_HZ, observations=(state,), actions=(ActionSpec("all", "/commands"),)),
@@ -159,7 +159,7 @@ class Robot(InferenceClient):
         spec = PolicySpec({"observation.state": (len(self._joints),)}, self._joints, len(self._joints), CHUNK)
         self._step_ns = contract.step_ns
         self.dispatcher = Dispatcher(
-            contract, spec, Dispatch(watermark), robot, self._bus, self, lambda *_: None, REQUEST_TIMEOUT_S
+            contract, spec, DispatchConfig(watermark), robot, self._bus, self, lambda *_: None, REQUEST_TIMEOUT_S
         )
         self.dispatcher.begin(0)
         events.at(first_ns, self._tick)

@@ -10,7 +10,7 @@ import attrs
 
 from ibrobot_core.config.convert import is_mapping, is_sequence
 from ibrobot_core.config.describe import described
-from ibrobot_core.config.schema import SECTIONS, Component
+from ibrobot_core.config.schema import SECTIONS, ComponentConfig
 from ibrobot_core.options import fields
 from ibrobot_core.plugins import KINDS, installed_plugins
 
@@ -63,14 +63,14 @@ def _class_lines(path: str, kind: type[Any], shown: set[type]) -> Iterator[str]:
     yield f"## `{path}`\n"
     yield _first_line(kind) + "\n"
     yield from _table(kind)
-    if issubclass(kind, Component):
+    if issubclass(kind, ComponentConfig):
         yield from _types(kind)
     for name, field in fields(kind).items():
         for inner_path, inner in _classes(f"{path}.{name}", field.type):
             yield from _class_lines(inner_path, inner, shown)
 
 
-def _types(kind: type[Component]) -> Iterator[str]:
+def _types(kind: type[ComponentConfig]) -> Iterator[str]:
     registry = installed_plugins()
     found = [registry.find(kind.plugin_kind, type_) for type_ in registry.types(kind.plugin_kind)]
     links = [f"[`{each.type}`](#{_options_anchor(kind.plugin_kind, each.type)})" for each in found if kind.takes(each)]
@@ -113,7 +113,7 @@ def _classes(path: str, kind: Any) -> Iterator[tuple[str, type[Any]]]:
         yield path, kind
         return
     for member in get_args(kind):
-        alone = isinstance(member, type) and issubclass(member, Component) and member.may_be_alone
+        alone = isinstance(member, type) and issubclass(member, ComponentConfig) and member.may_be_alone
         if is_sequence(kind):
             yield from _classes(f"{path}[]", member)
         elif is_mapping(kind) and not alone:

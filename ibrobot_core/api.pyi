@@ -34,7 +34,7 @@ from ibrobot_core.interfaces import (
     Context as Context,
     DatasetSummary as DatasetSummary,
     DatasetWriter as DatasetWriter,
-    Episode as Episode,
+    EpisodeSetup as EpisodeSetup,
     EpisodeAddress as EpisodeAddress,
     EpisodeEnd as EpisodeEnd,
     EpisodeReader as EpisodeReader,
@@ -216,7 +216,7 @@ from ibrobot_core.recording.episode import episode_folder as episode_folder
 from ibrobot_core.recording.provenance import (
     episode_origin as episode_origin,
     recorded_contract as recorded_contract,
-    stated_by_robot as stated_by_robot,
+    metadata_from_config as metadata_from_config,
 )
 from ibrobot_core.metrics import Metrics as Metrics, MetricsProbes as MetricsProbes, MetricsServer as MetricsServer
 from ibrobot_core.control.realtime import go_real_time as go_real_time

@@ -152,14 +152,14 @@ class Worker(Component):
                 self._on_failure(self.name, error)
 
 
-def told(error: BaseException) -> str:
+def error_text(error: BaseException) -> str:
     """An error in words, in as many lines as it has."""
     return str(error).strip() if isinstance(error, IbrobotError) else describe_bug(error)
 
 
-def cause(error: BaseException) -> str:
+def error_line(error: BaseException) -> str:
     """An error on one line."""
-    return told(error).replace("\n", "; ")
+    return error_text(error).replace("\n", "; ")
 
 
 def exit_code(error: BaseException) -> int:

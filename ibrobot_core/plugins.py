@@ -134,19 +134,19 @@ class Registry:
             return MissingDependency(f"its check failed: {_reason(error)}", remedy=f"report it to {package}")
         return None
 
-    def open_episode(self, path: Path, told: Mapping[str, str] | None = None) -> EpisodeReader:
+    def open_episode(self, path: Path, given: Mapping[str, str] | None = None) -> EpisodeReader:
         """A reader of an episode.
 
         Args:
             path: where it is; `DATASET:N` is episode N, from 0, of a dataset.
-            told: what its metadata is, for one without; see `EpisodeAddress`.
+            given: what its metadata is, for one without; see `EpisodeAddress`.
 
         Raises:
             RecorderError: when nothing is there, no installed plugin reads it, or it cannot be read.
         """
         from ibrobot_core.interfaces import EpisodeAddress
 
-        address = EpisodeAddress.of(path, told)
+        address = EpisodeAddress.of(path, given)
         for reader in self.readers:
             if reader.reads(address.path):
                 if address.number is not None and not reader.numbered:

@@ -23,7 +23,7 @@ from ibrobot_core.control.core import EMERGENCY_STOP
 from ibrobot_core.errors import IbrobotError
 from ibrobot_core.launch.models import check_models
 from ibrobot_core.launch.runtime import Runtime
-from ibrobot_core.launch.session import Request, Session
+from ibrobot_core.launch.session import LaunchRequest, Session
 from ibrobot_core.outside import LogFormatter, echo
 from ibrobot_core.plugins import installed_plugins
 from ibrobot_core.run_hooks import RunHooks
@@ -134,7 +134,7 @@ def run_robot(
         if robot.recording is None:
             made = [f"recording={{type: {registry.default('recorder')}, root: episodes, topics: contract}}"]
         robot = load_config(path, overrides=(*made, *changes, *recording), **chosen)
-    request = Request(
+    request = LaunchRequest(
         options["lockstep"], options["seed"], options["duration"], options["episodes"], options["goals"],
         prompt=prompt, by_operator=recording is not None,
     )  # fmt: skip
@@ -153,7 +153,7 @@ def overrides_of(options: dict[str, Any]) -> tuple[str, ...]:
     return (*options["overrides"], *window)
 
 
-def run_loaded(robot: RobotConfig, request: Request, options: dict[str, Any], make_hooks: MakeHooks) -> None:
+def run_loaded(robot: RobotConfig, request: LaunchRequest, options: dict[str, Any], make_hooks: MakeHooks) -> None:
     """Run a robot whose YAML has been read, to the end of the process.
 
     Args:
@@ -309,9 +309,9 @@ class _Panel:
             return
         self._next_s = time.monotonic() + 1.0 / _PANEL_HZ
         while not self._pressed.empty():
-            self._obey(self._pressed.get())
+            self._handle_key(self._pressed.get())
         session = self._runtime.session
-        help_text = session.feeder.help() if session.feeder is not None else ""
+        help_text = session.command_source.help() if session.command_source is not None else ""
         help_text = "\n".join(text for text in (help_text, self._hooks.help()) if text)
         self._rates.sample(session)
         self._display.update(panel(session, self._log, self._rates, help_text, self._hooks.rows()), refresh=True)
@@ -325,7 +325,7 @@ class _Panel:
             else:
                 self._pressed.put(key)
 
-    def _obey(self, key: str) -> None:
+    def _handle_key(self, key: str) -> None:
         if self._hooks.key(key):
             return
         modes = self._runtime.session.mode_keys

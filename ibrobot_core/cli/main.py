@@ -84,13 +84,13 @@ def main() -> None:
     try:
         sys.exit(cli(prog_name="ibrobot", standalone_mode=False))
     except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - the end of the process: nothing else can tell it
-        lines, code = _told(error)
+        lines, code = _error_lines(error)
         for line in lines:
             echo(f"error: {line}", err=True)
         sys.exit(code)
 
 
-def _told(error: BaseException) -> tuple[list[str], int]:
+def _error_lines(error: BaseException) -> tuple[list[str], int]:
     """The lines that tell an error, and the exit code."""
     if isinstance(error, IbrobotError):
         return str(error).splitlines(), error.exit_code

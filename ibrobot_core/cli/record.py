@@ -41,9 +41,9 @@ def record(config: str | None, dataset: str | None, root: Path | None, **options
     live = sys.stdin.isatty() and sys.stdout.isatty() and not options["headless"]
 
     def operator(runtime: Runtime) -> Operator:
-        assert runtime.desk is not None
+        assert runtime.episode_service is not None
         return Operator(
-            runtime.session, runtime.desk, options["episodes"], reset_time, prompt,
+            runtime.session, runtime.episode_service, options["episodes"], reset_time, prompt,
             auto=auto, continuous=continuous, keys=live,
         )  # fmt: skip
 

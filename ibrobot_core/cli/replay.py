@@ -17,12 +17,12 @@ from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import ContractError, RecorderError, wrong_input
 from ibrobot_core.interfaces import EpisodeSummary
 from ibrobot_core.launch.runtime import Runtime
-from ibrobot_core.launch.session import Request
-from ibrobot_core.launch.sources.replay import MODE, Replay, ReplayFeeder
+from ibrobot_core.launch.session import LaunchRequest
+from ibrobot_core.launch.sources.replay import MODE, Replay, ReplaySource
 from ibrobot_core.outside import echo
 from ibrobot_core.plugins import installed_plugins
 from ibrobot_core.recording.playback import read_playback
-from ibrobot_core.recording.provenance import stated_by_robot
+from ibrobot_core.recording.provenance import metadata_from_config
 from ibrobot_core.run_hooks import RunHooks
 from ibrobot_core.units import NORM_MODES
 
@@ -31,13 +31,13 @@ class _Comparison(RunHooks):
     """Tells how near the replay came."""
 
     def __init__(self, runtime: Runtime) -> None:
-        feeder = runtime.plan.mode.feeder
-        assert isinstance(feeder, ReplayFeeder)
-        self._feeder = feeder
+        source = runtime.plan.mode.source
+        assert isinstance(source, ReplaySource)
+        self._source = source
 
     @override
     def summary_rows(self) -> list[tuple[str, str]]:
-        report = self._feeder.report()
+        report = self._source.report()
         rows = [("replayed", f"{report['source']}, {report['recorded_s']:.1f} s at speed {report['speed']:g}")]
         if report["success"] is not None:
             again = "success" if report["success"] else "no success"
@@ -51,7 +51,7 @@ class _Comparison(RunHooks):
 
     @override
     def facts(self) -> dict[str, Any]:
-        return {"replay": self._feeder.report()}
+        return {"replay": self._source.report()}
 
 
 @click.command()
@@ -82,7 +82,7 @@ def replay(
     changes, sim = overrides_of(options), options["sim"]
     robot = _named(config, changes, sim=sim) if config is not None else None
     numbers = load_calibration(calibration).snapshot() if calibration is not None else None
-    told = stated_by_robot(robot, norm_mode, numbers) if robot is not None else None
+    told = metadata_from_config(robot, norm_mode, numbers) if robot is not None else None
     with wrong_input(), closing(installed_plugins().open_episode(episode, told)) as reader:
         summary = reader.summary()
         robot = robot or _recorded(summary, changes, sim=sim)
@@ -91,7 +91,7 @@ def replay(
         playback = read_playback(reader, contract)
     if not summary.finished:
         echo(f"{episode}: was never finished; {playback.duration:.2f} s of it could be read", err=True)
-    request = Request(
+    request = LaunchRequest(
         options["lockstep"], playback.seed or 0, replay=Replay(str(episode), playback, speed),
     )  # fmt: skip
     run_loaded(_without_sensors(robot), request, options, _Comparison)

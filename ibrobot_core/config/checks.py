@@ -8,16 +8,16 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.config.models import READERS, Limits, Model, ModelError
+from ibrobot_core.config.models import READERS, DescriptionModel, Limits, ModelError
 from ibrobot_core.config.schema import (
-    Control,
+    ControlConfig,
     ControlMode,
-    ExecutorComponent,
-    HardwareComponent,
-    Inference,
+    ExecutorConfig,
+    HardwareConfig,
+    InferenceConfig,
     Share,
 )
-from ibrobot_core.config.structure import Part, Parts
+from ibrobot_core.config.structure import ParsedComponent, ParsedSections
 from ibrobot_core.config.yaml_nodes import Document, Key
 from ibrobot_core.descriptors import ExecutorDescriptor, TransportDescriptor
 from ibrobot_core.options import did_you_mean
@@ -34,20 +34,20 @@ class Checks:
     """Checks of one document; what does not hold is noted in it. Parts that failed are passed over."""
 
     document: Document
-    parts: Parts
+    sections: ParsedSections
     communicates: bool = False
     """Whether the caller uses the transport itself."""
 
     def run(self) -> None:
         """All checks."""
-        robot = self.parts.plain.get("robot")
+        robot = self.sections.plain.get("robot")
         if robot is not None:
             self._robot(robot)
             self._hardware(robot)
             self._executors(robot)
             self._behaviours(robot)
             self._options(robot)
-        for name, mode in (self.parts.plain.get("control_modes") or {}).items():
+        for name, mode in (self.sections.plain.get("control_modes") or {}).items():
             self._mode(name, mode, robot)
         self._default_mode()
         self._devices()
@@ -106,7 +106,7 @@ class Checks:
 
     def _models(self, robot: Robot) -> None:
         """The models can be read, the tip is in them, and no joint may go where none of them lets it."""
-        known: list[Model] = []
+        known: list[DescriptionModel] = []
         for model, path in (("mjcf", robot.description.mjcf), ("urdf", robot.description.urdf)):
             key: Key = ("robot", "description", model)
             if path is None:
@@ -152,8 +152,8 @@ class Checks:
 
     def _hardware(self, robot: Robot) -> None:
         owners: dict[str, str] = {}
-        several = len(self.parts.hardware) > 1
-        for name, part in self.parts.hardware.items():
+        several = len(self.sections.hardware) > 1
+        for name, part in self.sections.hardware.items():
             if several and not part.component.joints:
                 self.document.add((*part.key, "joints"), "required where there is more than one hardware component")
             for i, joint in enumerate(part.component.joints):
@@ -163,18 +163,18 @@ class Checks:
                     self.document.add(key, f"joint {joint!r} is owned by hardware {owners[joint]!r} already")
                 owners.setdefault(joint, name)
         written = self.document.root.get("hardware")
-        complete = isinstance(written, Mapping) and (len(self.parts.hardware) == len(written) or "type" in written)
+        complete = isinstance(written, Mapping) and (len(self.sections.hardware) == len(written) or "type" in written)
         missing = [joint for joint in robot.joint_names if joint not in owners]
-        if owners and missing and complete and all(part.component.joints for part in self.parts.hardware.values()):
+        if owners and missing and complete and all(part.component.joints for part in self.sections.hardware.values()):
             self.document.add(("hardware",), f"no hardware owns: {', '.join(missing)}")
 
     def _options(self, robot: Robot) -> None:
         """What plugins say of their options for this robot."""
-        for part in self.parts.all():
+        for part in self.sections.all():
             joints: tuple[str, ...] = robot.joint_names
-            if isinstance(part.component, HardwareComponent):
+            if isinstance(part.component, HardwareConfig):
                 joints = part.component.joints or joints
-            elif isinstance(part.component, ExecutorComponent):
+            elif isinstance(part.component, ExecutorConfig):
                 joints = robot.groups.get(part.component.group, ())
             for fault in part.descriptor.check_options(part.component.options, robot, joints):
                 self.document.add((*part.key, *fault.option), fault.message)
@@ -182,12 +182,12 @@ class Checks:
     def _devices(self) -> None:
         """No two components open one device. Of teleoperation one is open at a time."""
         users: dict[str, str] = {}
-        for part in self.parts.active():
+        for part in self.sections.active():
             users |= self._opened(part, users)
-        for part in self.parts.teleoperation.values():
+        for part in self.sections.teleoperation.values():
             self._opened(part, users)
 
-    def _opened(self, part: Part[Any], users: Mapping[str, str]) -> dict[str, str]:
+    def _opened(self, part: ParsedComponent[Any], users: Mapping[str, str]) -> dict[str, str]:
         """Device -> who opens it, of one component; those that others open too are faults."""
         devices = part.descriptor.devices(part.component.options)
         for option, device in devices.items():
@@ -196,11 +196,11 @@ class Checks:
         return {device: self.document.dotted(part.key) for device in devices.values() if device not in users}
 
     def _executors(self, robot: Robot) -> None:
-        for part in self.parts.executors.values():
+        for part in self.sections.executors.values():
             self._refer((*part.key, "group"), part.component.group, list(robot.groups), "group")
 
     def _behaviours(self, robot: Robot) -> None:
-        control: Control | None = self.parts.plain.get("control", Control())
+        control: ControlConfig | None = self.sections.plain.get("control", ControlConfig())
         if control is None:
             return
         if pose := control.load_shedding.pose:
@@ -240,7 +240,7 @@ class Checks:
         if mode.inference is None and self.document.get(*key, "dispatch") is not None:
             self.document.add((*key, "dispatch"), "has a meaning only beside inference")
 
-    def _execution(self, key: Key, inference: Inference) -> None:
+    def _execution(self, key: Key, inference: InferenceConfig) -> None:
         if inference.execution_mode == "distributed":
             transport = self.document.root.get("transport")
             if not isinstance(transport, Mapping) or transport.get("type") == "local":
@@ -256,7 +256,7 @@ class Checks:
     def _claims(self, key: Key, mode: ControlMode, robot: Robot) -> None:
         owners: dict[str, str] = {}
         for i, name in enumerate(mode.executors):
-            part = self.parts.executors.get(name)
+            part = self.sections.executors.get(name)
             if part is None or name in mode.executors[:i]:
                 continue
             for joint in dict.fromkeys(robot.groups.get(part.component.group, ())):
@@ -268,7 +268,7 @@ class Checks:
 
     def _drives(self, key: Key, mode: ControlMode, source: str) -> None:
         for i, name in enumerate(mode.executors):
-            part = self.parts.executors.get(name)
+            part = self.sections.executors.get(name)
             if part is None or streams(part) == (source != "planner"):
                 continue
             takes, sends, example = (
@@ -278,16 +278,16 @@ class Checks:
             self.document.add((*key, "executors", i), message)
 
     def _default_mode(self) -> None:
-        name = self.parts.plain.get("default_control_mode")
+        name = self.sections.plain.get("default_control_mode")
         if name is not None:
             self._refer(("default_control_mode",), name, self._known("control_modes"), "control mode")
-        simulation = self.parts.simulation
+        simulation = self.sections.simulation
         if simulation is not None and (name := simulation.component.default_control_mode) is not None:
             key = ("simulation", "default_control_mode")
             self._refer(key, name, self._known("control_modes"), "control mode")
 
     def _transport(self) -> None:
-        part = self.parts.transport
+        part = self.sections.transport
         if part is None:
             return
         if part.component.share == Share():
@@ -299,8 +299,8 @@ class Checks:
             message = f"transport {part.descriptor.type!r} carries no topics to other machines; {does} does"
             self.document.add(("transport", "share"), message)
 
-    def _used(self, part: Part[Any]) -> None:
-        modes = (self.parts.plain.get("control_modes") or {}).values()
+    def _used(self, part: ParsedComponent[Any]) -> None:
+        modes = (self.sections.plain.get("control_modes") or {}).values()
         distributed = any(mode.inference and mode.inference.execution_mode == "distributed" for mode in modes)
         if part.descriptor.type != "local" and not distributed:
             message = (
@@ -310,10 +310,10 @@ class Checks:
             self.document.add((*part.key, "type"), message)
 
     def _recording(self) -> None:
-        topics: Any = self.parts.recording.component.topics if self.parts.recording else ()
+        topics: Any = self.sections.recording.component.topics if self.sections.recording else ()
         if isinstance(topics, str) and topics not in ("contract", "all"):
             self.document.add(("recording", "topics"), f"{topics!r} is not one of: contract, all, or a list of topics")
-        elif not topics and self.parts.recording:
+        elif not topics and self.sections.recording:
             self.document.add(
                 ("recording", "topics"), "names no topic; contract takes those of the contract, all every one"
             )
@@ -323,6 +323,6 @@ class Checks:
                 self.document.add(("recording", "topics", i), message)
 
 
-def streams(part: Part[Any]) -> bool:
+def streams(part: ParsedComponent[Any]) -> bool:
     """Whether an executor follows setpoints rather than goals."""
     return isinstance(part.descriptor, ExecutorDescriptor) and part.descriptor.streams

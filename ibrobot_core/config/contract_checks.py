@@ -13,11 +13,11 @@ from ibrobot_core.config.schema import (
     TASK_KEY,
     ActionSpec,
     ContractConfig,
-    ExecutorComponent,
+    ExecutorConfig,
     ObservationSpec,
     SignalSpec,
 )
-from ibrobot_core.config.structure import Part, Parts
+from ibrobot_core.config.structure import ParsedComponent, ParsedSections
 from ibrobot_core.config.yaml_nodes import Document, Key
 from ibrobot_core.errors import ContractError
 from ibrobot_core.executor_options import StreamOptions
@@ -58,18 +58,18 @@ class ContractChecks:
     """Checks and completes the contract; what does not hold is noted in the document."""
 
     document: Document
-    parts: Parts
+    sections: ParsedSections
     alone: bool = False
     """Whether there is no robot: actions have no executor, and say themselves what their numbers are."""
 
     def run(self) -> ContractConfig:
         """The contract, complete."""
-        contract: ContractConfig = self.parts.plain.get("contract", ContractConfig())
-        if "contract" in self.document.root and "contract" not in self.parts.plain:
+        contract: ContractConfig = self.sections.plain.get("contract", ContractConfig())
+        if "contract" in self.document.root and "contract" not in self.sections.plain:
             return contract
         key: Key = ("contract",)
         observations = self.observations((*key, "observations"), contract.observations)
-        for name, part in self.parts.models.items():
+        for name, part in self.sections.models.items():
             extra: Key = ("models", name, "extra_observations")
             self._same_kind(extra, self.observations(extra, part.component.extra_observations), observations)
         self._same_kind((*key, "observations"), observations, ())
@@ -77,10 +77,10 @@ class ContractChecks:
         before = len(self.document.problems)
         actions = tuple(self._action((*key, "actions", i), spec, given[:i]) for i, spec in enumerate(given))
         self._each_joint_once((*key, "actions"), actions)
-        for mode_name, mode in (self.parts.plain.get("control_modes") or {}).items():
+        for mode_name, mode in (self.sections.plain.get("control_modes") or {}).items():
             if mode.inference is not None and len(self.document.problems) == before:
                 self._driven(("control_modes", mode_name), mode.executors, contract)
-        control = self.parts.plain.get("control")
+        control = self.sections.plain.get("control")
         if control is not None and contract.rate_hz > control.rate_hz:
             message = f"{contract.rate_hz} Hz is faster than the control loop, {control.rate_hz} Hz"
             self.document.add((*key, "rate_hz"), message)
@@ -173,7 +173,7 @@ class ContractChecks:
                 fields = " or ".join(f"{field}.JOINT" for field in _JOINT_FIELDS)
                 self.document.add(key, f"expected {fields}, got {path!r}")
                 return
-            robot = self.parts.plain.get("robot")
+            robot = self.sections.plain.get("robot")
             joints = list(robot.joint_names) if robot is not None else [joint]
             if spec.topic == JOINT_STATES and joint not in joints:
                 self.document.add(key, f"unknown joint {joint!r}{did_you_mean(joint, joints, 'known')}")
@@ -227,7 +227,7 @@ class ContractChecks:
                 message = f"executor {other.executor!r} has its commands on {spec.topic}; give each a topic of its own"
                 self.document.add((*key, "topic"), message)
                 break
-        part = self.parts.executors.get(spec.executor)
+        part = self.sections.executors.get(spec.executor)
         if part is None:
             return spec
         if not streams(part):
@@ -266,7 +266,7 @@ class ContractChecks:
 
     def _joints(self, spec: ActionSpec) -> tuple[str, ...]:
         """The joints that an action's numbers are for; none where the faults of others keep them unknown."""
-        part, robot = self.parts.executors.get(spec.executor), self.parts.plain.get("robot")
+        part, robot = self.sections.executors.get(spec.executor), self.sections.plain.get("robot")
         if part is None or robot is None:
             return spec.joints
         return tuple(dict.fromkeys(robot.groups.get(part.component.group, ())))
@@ -305,7 +305,7 @@ class ContractChecks:
         if first not in names:
             self.document.add(key, f"{spec.type} has no field {first!r}{did_you_mean(first, names, 'its fields')}")
 
-    def _safety(self, key: Key, spec: ActionSpec, part: Part[ExecutorComponent]) -> ActionSpec:
+    def _safety(self, key: Key, spec: ActionSpec, part: ParsedComponent[ExecutorConfig]) -> ActionSpec:
         """One answer to what follows stale setpoints, in both, whether the action or the executor gives it."""
         executor = part.component.options
         if not isinstance(executor, StreamOptions):
@@ -314,7 +314,7 @@ class ContractChecks:
         if self.document.get(*part.key, "safety_behavior") is None:
             options = attrs.evolve(executor, safety_behavior=spec.safety_behavior)
             component = attrs.evolve(part.component, options=options)
-            self.parts.executors[spec.executor] = attrs.evolve(part, component=component)
+            self.sections.executors[spec.executor] = attrs.evolve(part, component=component)
         elif self.document.get(*key, "safety_behavior") is None:
             spec = attrs.evolve(spec, safety_behavior=there)
         elif there != spec.safety_behavior:
@@ -326,10 +326,10 @@ class ContractChecks:
         """A policy's action vector and the executors of its mode must be the same thing."""
         acted = [action.executor for action in contract.actions]
         for i, name in enumerate(executors):
-            if name in self.parts.executors and name not in acted:
+            if name in self.sections.executors and name not in acted:
                 message = f"no action of the contract drives executor {name!r}; add one under contract.actions"
                 self.document.add((*key, "executors", i), message)
         for name in acted:
-            if name in self.parts.executors and name not in executors:
+            if name in self.sections.executors and name not in executors:
                 message = f"lacks executor {name!r}, which an action of the contract drives; add it to this mode"
                 self.document.add((*key, "executors"), message)

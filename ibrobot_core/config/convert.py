@@ -26,7 +26,7 @@ _SCALARS: Mapping[Any, tuple[type | tuple[type, ...], str]] = {
 """Type -> the Python types of the values that it takes, and what a message calls them."""
 
 
-def said(error: Exception) -> str:
+def error_message(error: Exception) -> str:
     """An error's message; attrs' own validators put more than it into their errors."""
     return str(error.args[0]) if error.args else str(error)
 
@@ -49,7 +49,7 @@ class Faults(ValueError):
         except Faults as inner:
             self.found += [((part, *key), message) for key, message in inner.found]
         except (ValueError, TypeError) as error:
-            self.found.append(((part,), said(error)))
+            self.found.append(((part,), error_message(error)))
 
     def raise_any(self) -> None:
         """Raise this if anything was noted."""

@@ -9,7 +9,7 @@ from typing import Any, get_args
 import attrs
 
 from ibrobot_core.config.convert import is_literal, is_mapping, is_sequence, is_union
-from ibrobot_core.config.schema import SECTIONS, Component, component_of
+from ibrobot_core.config.schema import SECTIONS, ComponentConfig, component_of
 from ibrobot_core.config.show import plain
 from ibrobot_core.options import default_of, fields
 from ibrobot_core.plugins import Registry
@@ -85,7 +85,7 @@ class _Schemas:
             return {"if": {"required": ["type"]}, "then": one, "else": several}
         return several
 
-    def _of_component(self, kind: type[Component]) -> Schema:
+    def _of_component(self, kind: type[ComponentConfig]) -> Schema:
         """A section with a `type`: which further keys it takes follows from it."""
         found = [self.registry.find(kind.plugin_kind, type_) for type_ in self.registry.types(kind.plugin_kind)]
         offered = [descriptor for descriptor in found if kind.takes(descriptor)]
@@ -124,4 +124,4 @@ class _Schemas:
 
 
 def _is_component(kind: Any) -> bool:
-    return isinstance(kind, type) and issubclass(kind, Component)
+    return isinstance(kind, type) and issubclass(kind, ComponentConfig)

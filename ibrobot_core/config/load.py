@@ -16,9 +16,9 @@ from ibrobot_core.config.contract_checks import ContractChecks
 from ibrobot_core.config.convert import shown
 from ibrobot_core.config.missing import split
 from ibrobot_core.config.overrides import apply_overrides, put
-from ibrobot_core.config.schema import Component, ExecutorComponent, Peripheral, RobotConfig
+from ibrobot_core.config.schema import ComponentConfig, ExecutorConfig, PeripheralConfig, RobotConfig
 from ibrobot_core.config.secrets import check_known, expanded_again, public, warn_of_literals
-from ibrobot_core.config.structure import Part, Parts, Structurer
+from ibrobot_core.config.structure import ParsedComponent, ParsedSections, SectionParser
 from ibrobot_core.config.yaml_nodes import MAX_BYTES, Document, Place, parse_yaml
 from ibrobot_core.errors import ConfigError, Problem
 from ibrobot_core.plugins import Registry, installed_plugins
@@ -76,11 +76,11 @@ def load_contract(path: str | Path, registry: Registry | None = None) -> RobotCo
             for key, value in (("executor", str(action.get("topic", ""))), ("foreign", True)):
                 if action.setdefault(key, value) != value:
                     document.add(("contract", "actions"), f"{key} has no meaning in a contract alone; leave it out")
-    parts = Structurer(document, registry, Path(path).absolute().parent, sim=False).contract()
-    contract = ContractChecks(document, parts, alone=True).run()
+    sections = SectionParser(document, registry, Path(path).absolute().parent, sim=False).contract()
+    contract = ContractChecks(document, sections, alone=True).run()
     document.raise_problems()
     parts_of = {spec.executor: spec.joints for spec in contract.actions}
-    executors = {name: ExecutorComponent("", None, name, "", joints) for name, joints in parts_of.items()}
+    executors = {name: ExecutorConfig("", None, name, "", joints) for name, joints in parts_of.items()}
     return RobotConfig(
         robot=Robot("", ()),
         executors=executors,
@@ -135,50 +135,52 @@ def _override(document: Document, overrides: Sequence[str], mode: str | None) ->
 
 
 def _build(document: Document, source: Path, sim: bool, registry: Registry, communicates: bool = False) -> RobotConfig:
-    parts = Structurer(document, registry, source.absolute().parent, sim).parts()
+    sections = SectionParser(document, registry, source.absolute().parent, sim).sections()
     check_known(document)
-    unavailable = split(document, parts.plain, parts.missing, _entered(document, parts), everything=communicates)
-    Checks(document, parts, communicates).run()
-    contract_checks = ContractChecks(document, parts)
+    unavailable = split(
+        document, sections.plain, sections.missing, _entered(document, sections), everything=communicates
+    )
+    Checks(document, sections, communicates).run()
+    contract_checks = ContractChecks(document, sections)
     contract = contract_checks.run()
     document.raise_problems()
     shown, secrets = public(document)
-    robot = parts.plain["robot"]
-    executors, models = _components(parts.executors), _components(parts.models)
-    hardware = {} if parts.simulated else _components(parts.hardware)
-    sections = {
-        **parts.plain,
+    robot = sections.plain["robot"]
+    executors, models = _components(sections.executors), _components(sections.models)
+    hardware = {} if sections.simulated else _components(sections.hardware)
+    arguments = {
+        **sections.plain,
         "executors": {name: attrs.evolve(each, joints=robot.groups[each.group]) for name, each in executors.items()},
         "control_modes": {
-            name: attrs.evolve(mode, name=name, planner=_component(parts.planners.get(name)))
-            for name, mode in parts.plain["control_modes"].items()
+            name: attrs.evolve(mode, name=name, planner=_component(sections.planners.get(name)))
+            for name, mode in sections.plain["control_modes"].items()
         },
-        "default_control_mode": _default_mode(parts),
+        "default_control_mode": _default_mode(sections),
         "hardware": {
             name: attrs.evolve(each, joints=each.joints or robot.joint_names) for name, each in hardware.items()
         },
-        "simulation": _component(parts.simulation),
-        "peripherals": {name: attrs.evolve(part.component, sim={}) for name, part in parts.peripherals.items()}
-        | _not_installed(document, parts),
+        "simulation": _component(sections.simulation),
+        "peripherals": {name: attrs.evolve(part.component, sim={}) for name, part in sections.peripherals.items()}
+        | _not_installed(document, sections),
         "models": {
             name: attrs.evolve(
                 each,
-                extra_observations=contract_checks.observations(parts.models[name].key, each.extra_observations),
+                extra_observations=contract_checks.observations(sections.models[name].key, each.extra_observations),
             )
             for name, each in models.items()
         },
-        "teleoperation": _components(parts.teleoperation),
+        "teleoperation": _components(sections.teleoperation),
         "contract": contract,
-        "recording": _component(parts.recording),
-        "transport": _component(parts.transport),
-        "viewer": _component(parts.viewer),
+        "recording": _component(sections.recording),
+        "transport": _component(sections.transport),
+        "viewer": _component(sections.viewer),
     }
     return RobotConfig(
-        **sections,
-        simulated=parts.simulated,
-        closed_ends=_closed_ends(robot, parts),
+        **arguments,
+        simulated=sections.simulated,
+        closed_ends=_closed_ends(robot, sections),
         unavailable=unavailable,
-        missing=tuple(each.error for each in parts.missing),
+        missing=tuple(each.error for each in sections.missing),
         source=source,
         document=shown,
         complete=document.root,
@@ -186,9 +188,9 @@ def _build(document: Document, source: Path, sim: bool, registry: Registry, comm
     )
 
 
-def _closed_ends(robot: Robot, parts: Parts) -> dict[str, float | None]:
+def _closed_ends(robot: Robot, sections: ParsedSections) -> dict[str, float | None]:
     lower = dict(zip(robot.joint_names, robot.lower.tolist(), strict=True))
-    components = [part.component for part in parts.hardware.values()]
+    components = [part.component for part in sections.hardware.values()]
     return {
         joint: lower[joint] if joint in each.anchored else None
         for each in components
@@ -196,32 +198,34 @@ def _closed_ends(robot: Robot, parts: Parts) -> dict[str, float | None]:
     }
 
 
-def _component[C: Component](part: Part[C] | None) -> C | None:
+def _component[C: ComponentConfig](part: ParsedComponent[C] | None) -> C | None:
     return part.component if part is not None else None
 
 
-def _components[C: Component](parts: Mapping[str, Part[C]]) -> dict[str, C]:
-    return {name: part.component for name, part in parts.items()}
+def _components[C: ComponentConfig](sections: Mapping[str, ParsedComponent[C]]) -> dict[str, C]:
+    return {name: part.component for name, part in sections.items()}
 
 
-def _entered(document: Document, parts: Parts) -> Any:
+def _entered(document: Document, sections: ParsedSections) -> Any:
     """The mode in which the run begins, as the document says it."""
-    simulated = document.get("simulation", "default_control_mode") if parts.simulated else None
-    return simulated or parts.plain.get("default_control_mode")
+    simulated = document.get("simulation", "default_control_mode") if sections.simulated else None
+    return simulated or sections.plain.get("default_control_mode")
 
 
-def _not_installed(document: Document, parts: Parts) -> dict[str, Peripheral]:
+def _not_installed(document: Document, sections: ParsedSections) -> dict[str, PeripheralConfig]:
     """The peripherals whose plugin is missing, without options."""
-    items = [(each.error.type, document.get(*each.key)) for each in parts.missing if each.key[0] == "peripherals"]
+    items = [(each.error.type, document.get(*each.key)) for each in sections.missing if each.key[0] == "peripherals"]
     return {
-        item["name"]: Peripheral(type=type_, options=None, name=item["name"], kind=item["kind"])
+        item["name"]: PeripheralConfig(type=type_, options=None, name=item["name"], kind=item["kind"])
         for type_, item in items
     }
 
 
-def _default_mode(parts: Parts) -> str:
-    simulated = parts.simulation.component.default_control_mode if parts.simulated and parts.simulation else None
-    mode: str = simulated or parts.plain["default_control_mode"]
+def _default_mode(sections: ParsedSections) -> str:
+    simulated = (
+        sections.simulation.component.default_control_mode if sections.simulated and sections.simulation else None
+    )
+    mode: str = simulated or sections.plain["default_control_mode"]
     return mode
 
 

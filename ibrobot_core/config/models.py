@@ -29,7 +29,7 @@ class Limits:
 
 
 @attrs.frozen
-class Model:
+class DescriptionModel:
     """What a robot YAML refers to in a model."""
 
     limits: Mapping[str, Limits]
@@ -96,7 +96,7 @@ def read_xml(path: Path) -> Element:
     return top.children[0]
 
 
-def read_urdf(path: Path) -> Model:
+def read_urdf(path: Path) -> DescriptionModel:
     """What a URDF says.
 
     Raises:
@@ -110,10 +110,10 @@ def read_urdf(path: Path) -> Model:
                 if limit.tag == "limit":
                     lower, upper = (_numbers(limit, name, "0", 1)[0] for name in ("lower", "upper"))
                     found[joint.attributes.get("name", "")] = Limits(lower, upper, f"{path.name}:{limit.line}")
-    return Model(found, _names(root.children, "link"), "link")
+    return DescriptionModel(found, _names(root.children, "link"), "link")
 
 
-def read_mjcf(path: Path) -> Model:
+def read_mjcf(path: Path) -> DescriptionModel:
     """What an MJCF says, with what it includes; a joint's limits are its own, or those of its default class.
 
     Raises:
@@ -140,10 +140,10 @@ def read_mjcf(path: Path) -> Model:
             lower, upper = _numbers(attrs.evolve(joint, attributes=given), "range", "0 0", 2)
             turn = math.pi / 180 if kind == "hinge" and compiler.get("angle", "degree") == "degree" else 1.0
             found[name] = Limits(lower * turn, upper * turn, f"{joint.file.name}:{joint.line}")
-    return Model(found, _names(root.below(), "site"), "site")
+    return DescriptionModel(found, _names(root.below(), "site"), "site")
 
 
-READERS: Mapping[str, Callable[[Path], Model]] = {"mjcf": read_mjcf, "urdf": read_urdf}
+READERS: Mapping[str, Callable[[Path], DescriptionModel]] = {"mjcf": read_mjcf, "urdf": read_urdf}
 """Key under `robot.description` -> what reads that model."""
 
 

@@ -21,7 +21,7 @@ from ibrobot_core.units import NORM_MODES
 
 @documented
 @attrs.frozen
-class Component:
+class ComponentConfig:
     """A section with a `type`: which plugin, and that plugin's own options."""
 
     plugin_kind: ClassVar[str] = ""
@@ -45,21 +45,21 @@ class Component:
 
 
 @attrs.frozen
-class NamedComponent(Component):
+class NamedComponentConfig(ComponentConfig):
     """One of several components that the file has by name."""
 
     name: str = not_a_key()
 
 
-def component_of(kind: Any) -> type[Component] | None:
+def component_of(kind: Any) -> type[ComponentConfig] | None:
     """The component class in a type annotation: that of a section, or of each of its items."""
     members = (kind, *get_args(kind))
-    return next((each for each in members if isinstance(each, type) and issubclass(each, Component)), None)
+    return next((each for each in members if isinstance(each, type) and issubclass(each, ComponentConfig)), None)
 
 
 @documented
 @attrs.frozen
-class HardwareComponent(NamedComponent):
+class HardwareConfig(NamedComponentConfig):
     """Hardware, and the joints that it owns."""
 
     plugin_kind = "hardware"
@@ -76,7 +76,7 @@ class HardwareComponent(NamedComponent):
     @classmethod
     def takes(cls, descriptor: Descriptor[Any]) -> bool:
         """Whether it is real hardware."""
-        return not Simulation.takes(descriptor)
+        return not SimulationConfig.takes(descriptor)
 
     @classmethod
     def described(cls, descriptor: Descriptor[Any], options: Any) -> Mapping[str, Any]:
@@ -87,7 +87,7 @@ class HardwareComponent(NamedComponent):
 
 @documented
 @attrs.frozen
-class Simulation(Component):
+class SimulationConfig(ComponentConfig):
     """What stands for the hardware with `--sim`, or where there is none."""
 
     plugin_kind = "hardware"
@@ -102,7 +102,7 @@ class Simulation(Component):
 
 @documented
 @attrs.frozen
-class Peripheral(Component):
+class PeripheralConfig(ComponentConfig):
     """A sensor. Under `--sim` the simulation's own sensor of the same kind stands for it."""
 
     plugin_kind = "sensor"
@@ -122,7 +122,7 @@ class Peripheral(Component):
 
 @documented
 @attrs.frozen
-class ExecutorComponent(NamedComponent):
+class ExecutorConfig(NamedComponentConfig):
     """An executor, which moves the joints of a group."""
 
     plugin_kind = "executor"
@@ -142,7 +142,7 @@ class ExecutorComponent(NamedComponent):
 
 @documented
 @attrs.frozen
-class Teleop(NamedComponent):
+class TeleopConfig(NamedComponentConfig):
     """A teleoperation device."""
 
     plugin_kind = "teleop"
@@ -150,7 +150,7 @@ class Teleop(NamedComponent):
 
 @documented
 @attrs.frozen
-class Planner(Component):
+class PlannerConfig(ComponentConfig):
     """The planner of a mode."""
 
     plugin_kind = "planner"
@@ -158,7 +158,7 @@ class Planner(Component):
 
 @documented
 @attrs.frozen
-class Viewer(Component):
+class ViewerConfig(ComponentConfig):
     """What shows the robot to a person."""
 
     plugin_kind = "viewer"
@@ -274,7 +274,7 @@ class ContractConfig:
 
 @documented
 @attrs.frozen
-class ModelConfig(NamedComponent):
+class ModelConfig(NamedComponentConfig):
     """A policy, the unit of its vectors, and what it sees beyond the contract."""
 
     plugin_kind = "policy"
@@ -300,7 +300,7 @@ def _check_watermark(_: object, __: object, value: int | str) -> None:
 
 @documented
 @attrs.frozen
-class Dispatch:
+class DispatchConfig:
     """How the plan is kept filled."""
 
     watermark: int | Literal["auto"] = option(
@@ -330,7 +330,7 @@ class Dispatch:
 
 @documented
 @attrs.frozen
-class Inference:
+class InferenceConfig:
     """Which model a mode runs, and where."""
 
     model: str = option(help="a name under models")
@@ -366,9 +366,9 @@ class ControlMode:
 
     executors: tuple[str, ...] = option(help="the executors that are active in it")
     teleop: str | None = option(None, help="the device under teleoperation that drives it")
-    inference: Inference | None = option(None, help="the model that drives it")
-    dispatch: Dispatch = option(factory=Dispatch, help="how a model's plan is kept filled")
-    planner: Planner | None = option(None, help="the planner that drives it, with its options")
+    inference: InferenceConfig | None = option(None, help="the model that drives it")
+    dispatch: DispatchConfig = option(factory=DispatchConfig, help="how a model's plan is kept filled")
+    planner: PlannerConfig | None = option(None, help="the planner that drives it, with its options")
     name: str = not_a_key("")
 
 
@@ -380,7 +380,7 @@ def _check_dataset(_: object, __: object, value: str) -> None:
 
 @documented
 @attrs.frozen
-class Recording(Component):
+class RecordingConfig(ComponentConfig):
     """How episodes are recorded."""
 
     plugin_kind = "recorder"
@@ -422,7 +422,7 @@ class Share:
 
 @documented
 @attrs.frozen
-class TransportConfig(Component):
+class TransportConfig(ComponentConfig):
     """How processes and machines talk."""
 
     plugin_kind = "transport"
@@ -452,7 +452,7 @@ class Shedding:
 
 @documented
 @attrs.frozen
-class Control:
+class ControlConfig:
     """The `control:` section."""
 
     rate_hz: float = option(100.0, unit="Hz", gt=0, le=1000, help="rate of the control loop")
@@ -478,21 +478,23 @@ class RobotConfig:
     """A whole robot YAML, checked. `source` names the file; `document` is its plain data without secrets."""
 
     robot: Robot = option(help="joints, groups, models and poses")
-    hardware: Mapping[str, HardwareComponent] = option(
+    hardware: Mapping[str, HardwareConfig] = option(
         factory=dict, help="one component, or several by name, each with its joints"
     )
-    simulation: Simulation | None = option(None, help="stands for the hardware with --sim, or where there is none")
-    peripherals: Mapping[str, Peripheral] = option(factory=dict, help="cameras and other sensors")
-    executors: Mapping[str, ExecutorComponent] = option(help="what moves the joints: name -> type, group, options")
+    simulation: SimulationConfig | None = option(
+        None, help="stands for the hardware with --sim, or where there is none"
+    )
+    peripherals: Mapping[str, PeripheralConfig] = option(factory=dict, help="cameras and other sensors")
+    executors: Mapping[str, ExecutorConfig] = option(help="what moves the joints: name -> type, group, options")
     models: Mapping[str, ModelConfig] = option(factory=dict, help="policies by name")
     control_modes: Mapping[str, ControlMode] = option(help="name -> the executors active in it, and what feeds them")
     default_control_mode: str = option(help="the mode to start in")
-    teleoperation: Mapping[str, Teleop] = option(factory=dict, help="devices by name")
+    teleoperation: Mapping[str, TeleopConfig] = option(factory=dict, help="devices by name")
     contract: ContractConfig = option(factory=ContractConfig, help="how topics become observations and actions")
-    recording: Recording | None = option(None, help="how episodes are recorded")
+    recording: RecordingConfig | None = option(None, help="how episodes are recorded")
     transport: TransportConfig | None = option(None, help="how processes and machines talk")
-    viewer: Viewer | None = option(None, help="what shows the robot to a person")
-    control: Control = option(factory=Control, help="the control loop")
+    viewer: ViewerConfig | None = option(None, help="what shows the robot to a person")
+    control: ControlConfig = option(factory=ControlConfig, help="the control loop")
     metrics: MetricsConfig | None = option(None, help="counts in Prometheus' text format, over HTTP on this machine")
     simulated: bool = not_a_key(False)
     """Whether `simulation` stands for `hardware` in this run."""

@@ -12,13 +12,13 @@ import yaml
 
 from ibrobot_core.config.schema import (
     SECTIONS,
-    Component,
+    ComponentConfig,
     ContractConfig,
     ControlMode,
     ObservationSpec,
-    Peripheral,
+    PeripheralConfig,
     RobotConfig,
-    Simulation,
+    SimulationConfig,
 )
 from ibrobot_core.config.yaml_nodes import is_text
 from ibrobot_core.options import HIDDEN, fields
@@ -59,12 +59,12 @@ def _(value: ObservationSpec) -> dict[str, Any]:
     return {name: item for name, item in _fields(value).items() if name not in left_out}
 
 
-_RESOLVED: Mapping[type, str] = {Peripheral: "sim", Simulation: "default_control_mode"}
+_RESOLVED: Mapping[type, str] = {PeripheralConfig: "sim", SimulationConfig: "default_control_mode"}
 """Component -> a key that loading has resolved: a simulated sensor's options, the mode that a simulation begins in."""
 
 
 @plain.register
-def _(value: Component) -> dict[str, Any]:
+def _(value: ComponentConfig) -> dict[str, Any]:
     own = {name: item for name, item in _fields(value).items() if name != _RESOLVED.get(type(value))}
     return {**own, **plain(value.options)}
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from ibrobot_core.config.convert import Converter, Faults, said
+from ibrobot_core.config.convert import Converter, Faults, error_message
 from ibrobot_core.config.overrides import apply_overrides
 from ibrobot_core.config.yaml_nodes import Document
 
@@ -31,7 +31,7 @@ def single_options[T](kind: type[T], overrides: Sequence[str], name: str, flag: 
         for key, message in faults.found:
             document.add(key, message)
     except (ValueError, TypeError) as error:  # options that do not go together
-        document.add((), said(error))
+        document.add((), error_message(error))
     else:
         return options
     document.raise_problems()

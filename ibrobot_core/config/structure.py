@@ -10,22 +10,22 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.config.convert import Converter, Faults, said, unknown_key
+from ibrobot_core.config.convert import Converter, Faults, error_message, unknown_key
 from ibrobot_core.config.missing import Missing
 from ibrobot_core.config.schema import (
     SECTIONS,
-    Component,
-    ExecutorComponent,
-    HardwareComponent,
+    ComponentConfig,
+    ExecutorConfig,
+    HardwareConfig,
     ModelConfig,
-    NamedComponent,
-    Peripheral,
-    Planner,
-    Recording,
-    Simulation,
-    Teleop,
+    NamedComponentConfig,
+    PeripheralConfig,
+    PlannerConfig,
+    RecordingConfig,
+    SimulationConfig,
+    TeleopConfig,
     TransportConfig,
-    Viewer,
+    ViewerConfig,
     component_of,
 )
 from ibrobot_core.config.secrets import note
@@ -39,7 +39,7 @@ _NAME = re.compile(r"[A-Za-z0-9_-]+")
 
 
 @attrs.frozen
-class Part[C: Component]:
+class ParsedComponent[C: ComponentConfig]:
     """A structured component with its place and its plugin's descriptor."""
 
     key: Key
@@ -48,33 +48,33 @@ class Part[C: Component]:
 
 
 @attrs.define
-class Parts:
+class ParsedSections:
     """All sections; what could not be structured is None or left out, with its faults in the document."""
 
     simulated: bool
     plain: dict[str, Any] = attrs.field(factory=dict)
     """Sections that are attrs classes by themselves."""
-    hardware: dict[str, Part[HardwareComponent]] = attrs.field(factory=dict)
-    simulation: Part[Simulation] | None = None
-    peripherals: dict[str, Part[Peripheral]] = attrs.field(factory=dict)
-    executors: dict[str, Part[ExecutorComponent]] = attrs.field(factory=dict)
-    models: dict[str, Part[ModelConfig]] = attrs.field(factory=dict)
-    teleoperation: dict[str, Part[Teleop]] = attrs.field(factory=dict)
-    planners: dict[str, Part[Planner]] = attrs.field(factory=dict)
+    hardware: dict[str, ParsedComponent[HardwareConfig]] = attrs.field(factory=dict)
+    simulation: ParsedComponent[SimulationConfig] | None = None
+    peripherals: dict[str, ParsedComponent[PeripheralConfig]] = attrs.field(factory=dict)
+    executors: dict[str, ParsedComponent[ExecutorConfig]] = attrs.field(factory=dict)
+    models: dict[str, ParsedComponent[ModelConfig]] = attrs.field(factory=dict)
+    teleoperation: dict[str, ParsedComponent[TeleopConfig]] = attrs.field(factory=dict)
+    planners: dict[str, ParsedComponent[PlannerConfig]] = attrs.field(factory=dict)
     """By control mode."""
-    recording: Part[Recording] | None = None
-    transport: Part[TransportConfig] | None = None
-    viewer: Part[Viewer] | None = None
+    recording: ParsedComponent[RecordingConfig] | None = None
+    transport: ParsedComponent[TransportConfig] | None = None
+    viewer: ParsedComponent[ViewerConfig] | None = None
     missing: list[Missing] = attrs.field(factory=list)
     """What could not be made for want of a plugin."""
 
-    def active(self) -> Iterator[Part[Any]]:
+    def active(self) -> Iterator[ParsedComponent[Any]]:
         """The components that a run opens at its start."""
         yield from () if self.simulated else self.hardware.values()
         yield from self.peripherals.values()
         yield from (part for part in (self.simulation, self.recording, self.transport, self.viewer) if part is not None)
 
-    def all(self) -> Iterator[Part[Any]]:
+    def all(self) -> Iterator[ParsedComponent[Any]]:
         """Every component."""
         yield from self.active()
         yield from self.hardware.values() if self.simulated else ()
@@ -93,7 +93,7 @@ class _Outline(Converter):
 
 
 @attrs.define
-class Structurer:
+class SectionParser:
     """Structures one document. Faults are noted in it; nothing is raised."""
 
     document: Document
@@ -107,47 +107,47 @@ class Structurer:
     def __attrs_post_init__(self) -> None:
         self._converter = Converter(self.base)
 
-    def parts(self) -> Parts:
+    def sections(self) -> ParsedSections:
         """All sections."""
         given = set(self.document.root)
         simulated = self.sim or ("simulation" in given and "hardware" not in given)
-        parts = Parts(simulated, missing=self._missing)
-        self._sections(parts)
+        sections = ParsedSections(simulated, missing=self._missing)
+        self._sections(sections)
         if simulated and "simulation" not in given:
             self.document.add(
                 (), f"--sim needs a simulation section, e.g. simulation: {{type: {example_type('hardware')}}}"
             )
         elif not simulated and "hardware" not in given:
             self.document.add((), "needs a hardware section, a simulation section, or both")
-        self._simulation(parts)
-        self._hardware(parts)
-        self._peripherals(parts)
-        parts.executors = self._named("executors", ExecutorComponent)
-        parts.models = self._named("models", ModelConfig)
-        parts.teleoperation = self._named("teleoperation", Teleop)
-        for name, mode in (parts.plain.get("control_modes") or {}).items():
+        self._simulation(sections)
+        self._hardware(sections)
+        self._peripherals(sections)
+        sections.executors = self._named("executors", ExecutorConfig)
+        sections.models = self._named("models", ModelConfig)
+        sections.teleoperation = self._named("teleoperation", TeleopConfig)
+        for name, mode in (sections.plain.get("control_modes") or {}).items():
             if mode.planner is not None:
-                planner = self._component(("control_modes", name, "planner"), Planner)
-                parts.planners |= {name: planner} if planner is not None else {}
-        parts.transport = self._component(("transport",), TransportConfig)
-        parts.viewer = self._component(("viewer",), Viewer)
-        parts.recording = self._component(("recording",), Recording)
-        return parts
+                planner = self._component(("control_modes", name, "planner"), PlannerConfig)
+                sections.planners |= {name: planner} if planner is not None else {}
+        sections.transport = self._component(("transport",), TransportConfig)
+        sections.viewer = self._component(("viewer",), ViewerConfig)
+        sections.recording = self._component(("recording",), RecordingConfig)
+        return sections
 
-    def contract(self) -> Parts:
+    def contract(self) -> ParsedSections:
         """The `contract` section of a file that has no other."""
-        parts = Parts(simulated=False)
-        self._sections(parts, ("contract",))
-        return parts
+        sections = ParsedSections(simulated=False)
+        self._sections(sections, ("contract",))
+        return sections
 
-    def _sections(self, parts: Parts, names: Collection[str] = tuple(SECTIONS)) -> None:
+    def _sections(self, sections: ParsedSections, names: Collection[str] = tuple(SECTIONS)) -> None:
         """The file's own level: unknown and missing sections, and those that need no plugin."""
         known = {name: field for name, field in SECTIONS.items() if name in names}
         faults = Faults()
         for name in self.document.root:
             if name not in known:
                 faults.add((name,), unknown_key(name, list(known)))
-        parts.plain = _Outline(self.base).arguments(known, self.document.root, faults)
+        sections.plain = _Outline(self.base).arguments(known, self.document.root, faults)
         self._report((), faults)
 
     def _report(self, key: Key, faults: Faults, below_sim: Collection[str] = ()) -> None:
@@ -155,7 +155,7 @@ class Structurer:
             middle = ("sim",) if inner and inner[0] in below_sim else ()
             self.document.add((*key, *middle, *inner), message)
 
-    def _component[C: Component](
+    def _component[C: ComponentConfig](
         self,
         key: Key,
         kind: type[C],
@@ -164,7 +164,7 @@ class Structurer:
         name: str | None = None,
         needed: bool = True,
         below_sim: Collection[str] = (),
-    ) -> Part[C] | None:
+    ) -> ParsedComponent[C] | None:
         """The component at `key` (or `value` in its place); None with its faults noted, or where there is none.
 
         Args:
@@ -195,7 +195,7 @@ class Structurer:
             return None
         named = {} if name is None else {"name": name}
         described = kind.described(descriptor, options)
-        return Part(key, kind(**arguments, **named, **described, options=options), descriptor)
+        return ParsedComponent(key, kind(**arguments, **named, **described, options=options), descriptor)
 
     def _find(self, key: Key, kind: str, type_: str, needed: bool, faults: Faults) -> Descriptor[Any] | None:
         if not needed and (kind, type_) not in self.registry.entries:
@@ -223,10 +223,10 @@ class Structurer:
         try:
             return descriptor.options(**arguments)
         except (ValueError, TypeError) as error:
-            faults.add((), said(error))
+            faults.add((), error_message(error))
             return None
 
-    def _named[C: NamedComponent](self, section: str, kind: type[C]) -> dict[str, Part[C]]:
+    def _named[C: NamedComponentConfig](self, section: str, kind: type[C]) -> dict[str, ParsedComponent[C]]:
         value = self.document.root.get(section)
         found = {}
         for name in value if isinstance(value, Mapping) else ():
@@ -240,17 +240,17 @@ class Structurer:
         if not _NAME.fullmatch(name):
             self.document.add(key, f"a name has letters, digits, _ and - only, got {name!r}")
 
-    def _simulation(self, parts: Parts) -> None:
+    def _simulation(self, sections: ParsedSections) -> None:
         if "simulation" not in self.document.root:
             return
-        part = self._component(("simulation",), Simulation, needed=parts.simulated or self._elsewhere)
+        part = self._component(("simulation",), SimulationConfig, needed=sections.simulated or self._elsewhere)
         if part is None:
             return
-        if not Simulation.takes(part.descriptor):
+        if not SimulationConfig.takes(part.descriptor):
             message = f"{part.descriptor.type!r} is no simulation; it belongs in the hardware section"
             self.document.add(("simulation", "type"), message)
-        elif parts.simulated or self._elsewhere:
-            parts.simulation = part
+        elif sections.simulated or self._elsewhere:
+            sections.simulation = part
 
     @property
     def _elsewhere(self) -> bool:
@@ -259,7 +259,7 @@ class Structurer:
         items = peripherals if isinstance(peripherals, list) else ()
         return any(isinstance(item, Mapping) and item.get("kind") == "simulation" for item in items)
 
-    def _hardware(self, parts: Parts) -> None:
+    def _hardware(self, sections: ParsedSections) -> None:
         value = self.document.root.get("hardware")
         if not isinstance(value, Mapping):
             return
@@ -267,16 +267,16 @@ class Structurer:
         for name in value if several else ("hardware",):
             key: Key = ("hardware", name) if several else ("hardware",)
             self._check_name(key, name)
-            part = self._component(key, HardwareComponent, name=name, needed=not parts.simulated)
+            part = self._component(key, HardwareConfig, name=name, needed=not sections.simulated)
             if part is None:
                 continue
-            if not HardwareComponent.takes(part.descriptor):
+            if not HardwareConfig.takes(part.descriptor):
                 message = f"{part.descriptor.type!r} is a simulation; it belongs in the simulation section"
                 self.document.add((*key, "type"), message)
-            parts.hardware[name] = part
+            sections.hardware[name] = part
 
-    def _peripherals(self, parts: Parts) -> None:
-        descriptor = parts.simulation.descriptor if parts.simulation and parts.simulated else None
+    def _peripherals(self, sections: ParsedSections) -> None:
+        descriptor = sections.simulation.descriptor if sections.simulation and sections.simulated else None
         stand_ins = descriptor.sensors if isinstance(descriptor, HardwareDescriptor) else {}
         lines: dict[str, int] = {}
         value = self.document.root.get("peripherals")
@@ -292,17 +292,17 @@ class Structurer:
                     self.document.add((*key, "name"), message)
                 lines.setdefault(name, self.document.place((*key, "name")).line)
             stand_in = stand_ins.get(str(item.get("kind")))
-            needed = not parts.simulated or (parts.simulation is not None and stand_in is None)
-            part = self._peripheral(key, item, stand_in, needed=needed, simulated=parts.simulated)
+            needed = not sections.simulated or (sections.simulation is not None and stand_in is None)
+            part = self._peripheral(key, item, stand_in, needed=needed, simulated=sections.simulated)
             if part is not None:
-                parts.peripherals[part.component.name] = part
+                sections.peripherals[part.component.name] = part
 
     def _peripheral(
         self, key: Key, item: Mapping[str, Any], stand_in: str | None, *, needed: bool, simulated: bool
-    ) -> Part[Peripheral] | None:
+    ) -> ParsedComponent[PeripheralConfig] | None:
         """The sensor as it is, or the simulation's of its kind with the options that both have."""
         before = len(self.document.problems)
-        as_is = self._component(key, Peripheral, needed=needed)
+        as_is = self._component(key, PeripheralConfig, needed=needed)
         if as_is is not None and isinstance(as_is.descriptor, SensorDescriptor):
             kind, type_ = as_is.component.kind, as_is.component.type
             if as_is.descriptor.kind != kind:
@@ -314,10 +314,10 @@ class Structurer:
         if stand_in is None or len(self.document.problems) > before:
             return as_is
         entry = self.registry.entries.get(("sensor", stand_in))
-        shared = [*fields(Peripheral), *(fields(entry.descriptor.options) if entry else ())]
+        shared = [*fields(PeripheralConfig), *(fields(entry.descriptor.options) if entry else ())]
         kept = {name: value for name, value in item.items() if name in shared}
         added = item.get("sim", {})
-        return self._component(key, Peripheral, {**kept, **added, "type": stand_in}, below_sim=added)
+        return self._component(key, PeripheralConfig, {**kept, **added, "type": stand_in}, below_sim=added)
 
     def _only_simulated(self, kind: str, type_: str) -> bool:
         descriptors = (entry.descriptor for entry in self.registry.entries.values())

@@ -6,7 +6,7 @@ from ibrobot_core.clock import Clock
 from ibrobot_core.config import RobotConfig
 from ibrobot_core.config.context import component_context
 from ibrobot_core.control.core import ControlCore
-from ibrobot_core.control.parts import HardwareParts
+from ibrobot_core.control.hardware_group import HardwareGroup
 from ibrobot_core.errors import ConfigError, Problem
 from ibrobot_core.interfaces import Context, Executor, Hardware
 from ibrobot_core.plugins import Registry
@@ -23,7 +23,7 @@ def build_core(config: RobotConfig, registry: Registry, clock: Clock, seed: int)
     for component in config.executors.values():
         ctx = _context(config, component.name, component.joints, clock, seed)
         executors[component.name] = registry.find("executor", component.type).make(component.options, ctx)
-    return ControlCore(config, HardwareParts(config.robot, _hardware(config, registry, clock, seed)), executors, clock)
+    return ControlCore(config, HardwareGroup(config.robot, _hardware(config, registry, clock, seed)), executors, clock)
 
 
 def _hardware(config: RobotConfig, registry: Registry, clock: Clock, seed: int) -> dict[str, Hardware]:

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from ibrobot_core.clock import Clock
 from ibrobot_core.config import RobotConfig
 from ibrobot_core.control.following import FollowingError
+from ibrobot_core.control.hardware_group import HardwareGroup
 from ibrobot_core.control.health import Health
 from ibrobot_core.control.link import ControlState, PlanRecord
-from ibrobot_core.control.parts import HardwareParts
 from ibrobot_core.control.safety import SafetyLayer
 from ibrobot_core.errors import GoalRejected, HardwareError, IbrobotError, NotSupported
-from ibrobot_core.interfaces import Episode, Executor, JointReading, Plan, Signal, Torque
+from ibrobot_core.interfaces import EpisodeSetup, Executor, JointReading, Plan, Signal, Torque
 from ibrobot_core.robot import Vector
 from ibrobot_core.units import ns
 
@@ -62,7 +62,7 @@ class ControlCore:
     """
 
     def __init__(
-        self, config: RobotConfig, hardware: HardwareParts, executors: Mapping[str, Executor], clock: Clock
+        self, config: RobotConfig, hardware: HardwareGroup, executors: Mapping[str, Executor], clock: Clock
     ) -> None:
         self._log = logging.getLogger("ibrobot.control")
         self._config = config
@@ -99,7 +99,7 @@ class ControlCore:
             "counters": self.counters,
         }
         self.mode = ""
-        self.epoch = 0
+        self.generation = 0
         self.fault = ""
         self.events: deque[dict[str, Any]] = deque()
         """What the host is to be told: `goal` and `fault` events."""
@@ -174,7 +174,7 @@ class ControlCore:
         self._tick += 1
         measured = self._measured
         self.state = ControlState(
-            tick=self._tick, stamp_ns=measured.stamp_ns, late_ns=late_ns, epoch=self.epoch,
+            tick=self._tick, stamp_ns=measured.stamp_ns, late_ns=late_ns, generation=self.generation,
             estop=self._safety.estopped, stale=measured.stale, success=success, position=measured.position,
             velocity=measured.velocity, effort=measured.effort, command=command, signals=signals,
         )  # fmt: skip
@@ -182,7 +182,7 @@ class ControlCore:
 
     def set_plan(self, plan: PlanRecord) -> None:
         """Give a plan to the active executors of its joints; one from before a mode switch or reset is counted."""
-        if plan.epoch != self.epoch or self.fault:
+        if plan.generation != self.generation or self.fault:
             self._counts["old_plans"] += 1
             return
         for owned in self._active:
@@ -198,7 +198,7 @@ class ControlCore:
             result = self._commands[command["do"]](**arguments) or {}
         except IbrobotError as error:
             return {"reply": command["id"], "error": str(error)}
-        return {"reply": command["id"], "epoch": self.epoch, **result}
+        return {"reply": command["id"], "generation": self.generation, **result}
 
     def counters(self) -> dict[str, Any]:
         """Every intervention and refusal so far: of the safety layer, of the executors, of the loop."""
@@ -388,7 +388,7 @@ class ControlCore:
             self._report_goals(owned)
         if relax and not self._relaxed:
             self._relax("the setpoints are stale")
-        elif self._relaxed and not relax and not self._retake():
+        elif self._relaxed and not relax and not self._restore_torque():
             return None
         desired = self._safety.current
         for columns, setpoint in setpoints:
@@ -418,7 +418,7 @@ class ControlCore:
             elif outcome is not Torque.OFF:
                 self._announce(f"torque of {name} cannot be taken off: {outcome}", "holds")
 
-    def _retake(self) -> bool:
+    def _restore_torque(self) -> bool:
         """Torque comes back: start from where the joints lie. False where that is not known: a fault."""
         try:
             if self._measured.stale:
@@ -427,12 +427,12 @@ class ControlCore:
         except HardwareError as error:
             self._raise_fault(f"torque stays off: {error}")
             return False
-        self._take_back()
+        self._after_relax()
         return True
 
-    def _take_back(self) -> None:
+    def _after_relax(self) -> None:
         self._relaxed = False
-        self._hardware.retake()
+        self._hardware.resume()
         self._health.restart()
         if self._shedding:
             self._target = None
@@ -453,8 +453,10 @@ class ControlCore:
             self.fault = fault
             self._leave()
             self._target = None
-        # With the epoch, the host knows which faults a later reset cleared.
-        self.events.append({"event": "fault", "fault": fault, "then": then, "stamp_ns": stamp_ns, "epoch": self.epoch})
+        # With the generation, the host knows which faults a later reset cleared.
+        self.events.append(
+            {"event": "fault", "fault": fault, "then": then, "stamp_ns": stamp_ns, "generation": self.generation}
+        )
 
     def _leave(self) -> None:
         """Deactivate all executors; without one, every joint brakes and holds."""
@@ -463,13 +465,13 @@ class ControlCore:
             self._report_goals(owned)
             owned.executor.deactivate()
         self._active = []
-        self.epoch += 1
+        self.generation += 1
 
     def _enter(self) -> None:
         self._active = [self._owned[name] for name in self._config.control_modes[self.mode].executors]
         for owned in self._active:
             owned.executor.activate(owned.reading(self._measured))
-        self.epoch += 1
+        self.generation += 1
 
     def _switch_mode(self, mode: str) -> None:
         if mode not in self._config.control_modes:
@@ -482,8 +484,8 @@ class ControlCore:
 
     def _reset_episode(self, seed: int) -> None:
         self._leave()
-        self._hardware.reset_episode(Episode(seed))
-        self._begin_anew()
+        self._hardware.reset_episode(EpisodeSetup(seed))
+        self._restart_executors()
 
     def _estop(self) -> None:
         self._safety.estop()
@@ -501,14 +503,14 @@ class ControlCore:
             # It moves as it was told: only the executors begin anew, and the commands go on within the limits.
             self._switch_mode(self.mode)
         else:
-            self._begin_anew()
+            self._restart_executors()
         return {"cleared": cleared}
 
-    def _begin_anew(self) -> None:
+    def _restart_executors(self) -> None:
         self._hardware.reset_faults()
         self._measured = self._first_reading()
         self._leave()
-        self._take_back()
+        self._after_relax()
         self._safety.reset(self._measured.position)
         self._yielded = None
         self.fault = self._unwell = ""

@@ -17,7 +17,7 @@ from ibrobot_core.child import Child
 from ibrobot_core.clock import RealClock, SteppedClock
 from ibrobot_core.config import RobotConfig
 from ibrobot_core.control.build import build_core
-from ibrobot_core.control.link import ControlState, Layout, PlanRecord, SharedMemory, raise_error
+from ibrobot_core.control.link import ControlState, LinkLayout, PlanRecord, SharedMemory, raise_error
 from ibrobot_core.control.timing import REPORT_TICKS, Punctuality
 from ibrobot_core.errors import ComponentFailed, HardwareError, IbrobotError
 from ibrobot_core.memory import create_memory
@@ -63,7 +63,7 @@ class ControlHost(ABC):
 
     @abstractmethod
     def call(self, do: str, **arguments: Any) -> Mapping[str, Any]:
-        """Have a command carried out; returns its answer, with the `epoch` that holds from now on.
+        """Have a command carried out; returns its answer, with the `generation` that holds from now on.
 
         Raises:
             HardwareError: when it is refused.
@@ -227,7 +227,7 @@ class ControlClient(ControlHost):
             if message is not None and message["event"] == "ready":
                 self.signals = [(topic, size) for topic, size in message["signals"]]
                 self.refused = message["refused"]
-                layout = Layout(len(self._config.robot.joints), sum(size for _, size in self.signals))
+                layout = LinkLayout(len(self._config.robot.joints), sum(size for _, size in self.signals))
                 self._memory = SharedMemory(self._descriptor, layout)
             elif message is not None:
                 self._take(message)

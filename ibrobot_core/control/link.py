@@ -40,7 +40,7 @@ class ControlState:
     stamp_ns: int
     late_ns: int
     """How late the tick began [ns]."""
-    epoch: int
+    generation: int
     """Counts mode switches and resets; a plan made before one is not followed after it."""
     estop: bool
     stale: bool
@@ -59,7 +59,7 @@ class ControlState:
 class PlanRecord:
     """Setpoints for the joints in `mask`, by time."""
 
-    epoch: int
+    generation: int
     start_ns: int
     step_ns: int
     mask: NDArray[np.bool_]
@@ -69,7 +69,7 @@ class PlanRecord:
 
 
 @attrs.frozen
-class Layout:
+class LinkLayout:
     """The sizes that both sides agree on."""
 
     joints: int
@@ -79,14 +79,14 @@ class Layout:
     def state(self) -> np.dtype[Any]:
         """One slot of the ring of states."""
         vector = ("f8", (self.joints,))
-        integers = [(name, "i8") for name in ("tick", "stamp", "late", "epoch", "estop", "stale", "success")]
+        integers = [(name, "i8") for name in ("tick", "stamp", "late", "generation", "estop", "stale", "success")]
         arrays = [(name, *vector) for name in ("position", "velocity", "effort", "command")]
         return np.dtype([("seq", "i8"), *integers, *arrays, ("signals", "f8", (self.signals,)), ("crc", "i8")])
 
     @property
     def plan(self) -> np.dtype[Any]:
         """One of the two plan slots."""
-        integers = [(name, "i8") for name in ("seq", "crc", "epoch", "start", "step", "rows")]
+        integers = [(name, "i8") for name in ("seq", "crc", "generation", "start", "step", "rows")]
         arrays = [("mask", "i8", (self.joints,)), ("positions", "f8", (PLAN_ROWS, self.joints))]
         return np.dtype([*integers, *arrays])
 
@@ -104,7 +104,7 @@ class SharedMemory:
         layout: the sizes that both sides agree on.
     """
 
-    def __init__(self, descriptor: int, layout: Layout) -> None:
+    def __init__(self, descriptor: int, layout: LinkLayout) -> None:
         os.ftruncate(descriptor, layout.size)
         self._map = mmap.mmap(descriptor, layout.size)
         self._descriptor = descriptor
@@ -132,8 +132,8 @@ class SharedMemory:
         body = self._body
         success = -1 if state.success is None else int(state.success)
         body[0] = (
-            self._written, state.tick, state.stamp_ns, state.late_ns, state.epoch, state.estop, state.stale, success,
-            state.position, state.velocity, state.effort, state.command, state.signals, 0,
+            self._written, state.tick, state.stamp_ns, state.late_ns, state.generation, state.estop, state.stale,
+            success, state.position, state.velocity, state.effort, state.command, state.signals, 0,
         )  # fmt: skip
         raw = body.view(np.uint8)
         body["crc"][0] = crc32(raw[: self._state_size - _SEQUENCE_BYTES])
@@ -176,7 +176,12 @@ class SharedMemory:
         self._plan_seq += 1
         slot = self._plans[self._plan_seq % 2]
         slot["seq"] = -1
-        slot["epoch"], slot["start"], slot["step"], slot["rows"] = plan.epoch, plan.start_ns, plan.step_ns, rows
+        slot["generation"], slot["start"], slot["step"], slot["rows"] = (
+            plan.generation,
+            plan.start_ns,
+            plan.step_ns,
+            rows,
+        )
         slot["mask"] = plan.mask
         slot["positions"][:rows] = plan.positions
         slot["crc"] = _plan_checksum(self._plan_bytes(self._plan_seq % 2, rows), self._plan_seq)
@@ -195,11 +200,11 @@ class SharedMemory:
             self.torn += 1
             return None
         self._seen_plan = seq
-        _, _, epoch, start_ns, step_ns, rows = head
+        _, _, generation, start_ns, step_ns, rows = head
         body = copy[_PLAN_HEAD_BYTES:]
         mask = np.frombuffer(body[: self._row_bytes], np.int64).astype(bool)
         positions = np.frombuffer(body[self._row_bytes :]).reshape(rows, -1)
-        return PlanRecord(epoch, start_ns, step_ns, mask, positions)
+        return PlanRecord(generation, start_ns, step_ns, mask, positions)
 
     def _plan_bytes(self, index: int, rows: int) -> memoryview:
         """A plan's slot, as far as `rows` setpoints use it."""
@@ -224,7 +229,7 @@ def _state(record: Any) -> ControlState:
     success = int(record["success"])
     return ControlState(
         tick=int(record["tick"]), stamp_ns=int(record["stamp"]), late_ns=int(record["late"]),
-        epoch=int(record["epoch"]), estop=bool(record["estop"]), stale=bool(record["stale"]),
+        generation=int(record["generation"]), estop=bool(record["estop"]), stale=bool(record["stale"]),
         success=None if success < 0 else bool(success), position=record["position"], velocity=record["velocity"],
         effort=record["effort"], command=record["command"], signals=record["signals"],
     )  # fmt: skip

@@ -16,18 +16,18 @@ from typing import Any
 
 from ibrobot_core.child import FAREWELL_S, Channel, open_parent
 from ibrobot_core.clock import RealClock
-from ibrobot_core.component import exit_code, told
+from ibrobot_core.component import error_text, exit_code
 from ibrobot_core.config import from_document
 from ibrobot_core.control.build import build_core
 from ibrobot_core.control.core import ControlCore
-from ibrobot_core.control.link import Layout, SharedMemory
+from ibrobot_core.control.link import LinkLayout, SharedMemory
 from ibrobot_core.control.realtime import go_real_time
 from ibrobot_core.control.timing import REPORT_TICKS, Punctuality
 from ibrobot_core.outside import echo
 from ibrobot_core.plugins import installed_plugins
 
 _STARTUP_TIMEOUT_S = 30.0
-_TOLD = "told to stop"
+_COMMANDED = "told to stop"
 
 
 class ControlProcess:
@@ -59,7 +59,7 @@ class ControlProcess:
             self._clock.sleep_until(deadline)
             late = self._clock.now_ns() - deadline
             self._cycle(deadline, late, periods)
-            if self._obey():
+            if self._handle_commands():
                 # It was waited for, e.g. hardware that is set up anew after a fault: no tick was missed.
                 deadline, periods = self._clock.now_ns() + period, 1
                 continue
@@ -82,15 +82,15 @@ class ControlProcess:
         elif self._terminated:
             self._begin_stop("terminated")
         elif self._ready is not None and not self._stopping and self._core.arrived():
-            self._channel.send({**self._ready, "epoch": self._core.epoch})
+            self._channel.send({**self._ready, "generation": self._core.generation})
             self._ready = None
 
-    def _obey(self) -> bool:
+    def _handle_commands(self) -> bool:
         """Carry out the host's commands; whether that took longer than a period."""
         begun_ns = self._clock.now_ns()
         for command in self._channel.receive():
             if command["do"] == "stop":
-                self._begin_stop(_TOLD, unmoved=command["unmoved"])
+                self._begin_stop(_COMMANDED, unmoved=command["unmoved"])
             else:
                 self._channel.send(self._core.handle(command))
         return self._clock.now_ns() - begun_ns > self._core.period_ns
@@ -112,7 +112,7 @@ class ControlProcess:
         if not self._stopping:
             self._stopping = True
             logging.getLogger("ibrobot.control").log(
-                logging.DEBUG if why == _TOLD else logging.WARNING, "stopping: %s", why
+                logging.DEBUG if why == _COMMANDED else logging.WARNING, "stopping: %s", why
             )
             self._core.begin_stop(unmoved=unmoved)
 
@@ -130,7 +130,7 @@ def main(parent: int, memory: int, wake: int) -> int:
         config = from_document(order["document"], source=Path(order["source"]), sim=order["sim"])
         core = build_core(config, installed_plugins(), clock, order["seed"])
         core.start(order["mode"])
-        shared = SharedMemory(memory, Layout(len(config.robot.joints), core.signal_size))
+        shared = SharedMemory(memory, LinkLayout(len(config.robot.joints), core.signal_size))
         os.set_blocking(wake, False)
         refused = go_real_time(config.control.priority)
         signals = [[signal.topic, signal.size] for signal in core.signals]
@@ -140,7 +140,7 @@ def main(parent: int, memory: int, wake: int) -> int:
         if core is not None:
             core.abandon()
         holding = core.holding() if core is not None else []
-        failed = {"event": "failed", "error": told(error), "exit_code": exit_code(error), "holding": holding}
+        failed = {"event": "failed", "error": error_text(error), "exit_code": exit_code(error), "holding": holding}
         channel.send(failed)
         return 1
     finally:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import attrs
 
 from ibrobot_core.bus import Bus
-from ibrobot_core.config.schema import Dispatch
+from ibrobot_core.config.schema import DispatchConfig
 from ibrobot_core.contract.frames import FrameSampler
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.dispatch.latency import LatencyEstimate
@@ -67,7 +67,7 @@ class DispatchStats:
     """Times the plan ran dry."""
 
 
-def check_strategy(options: Dispatch, spec: PolicySpec) -> None:
+def check_strategy(options: DispatchConfig, spec: PolicySpec) -> None:
     """Whether the policy can do what `dispatch` asks.
 
     Raises:
@@ -105,9 +105,17 @@ class Dispatcher:
     """
 
     def __init__(
-        self, contract: Contract, spec: PolicySpec, options: Dispatch, robot: Robot, bus: Bus, client: InferenceClient,
-        send: SendPlan, request_timeout_s: float, prompt: str = "",
-    ) -> None:  # fmt: skip
+        self,
+        contract: Contract,
+        spec: PolicySpec,
+        options: DispatchConfig,
+        robot: Robot,
+        bus: Bus,
+        client: InferenceClient,
+        send: SendPlan,
+        request_timeout_s: float,
+        prompt: str = "",
+    ) -> None:
         check_strategy(options, spec)
         self._contract = contract
         self._spec = spec

@@ -16,7 +16,7 @@ from pathlib import Path
 import attrs
 
 from ibrobot_core.child import FAREWELL_S, Channel, open_parent
-from ibrobot_core.component import told
+from ibrobot_core.component import error_text
 from ibrobot_core.config import from_document
 from ibrobot_core.errors import ComponentFailed
 from ibrobot_core.inference.build import build_policy
@@ -64,7 +64,7 @@ class ModelLoop:
             latency_ms = (time.monotonic_ns() - begun_ns) / 1e6
             return self._put(WireMessage(WireKind.ANSWER, request_id, outputs, latency_ms=latency_ms))
         except Exception as error:  # noqa: BLE001 - contained: one request's fault is its own answer
-            return self._put(WireMessage(WireKind.FAILURE, request_id, text=told(error)))
+            return self._put(WireMessage(WireKind.FAILURE, request_id, text=error_text(error)))
 
     def _put(self, message: WireMessage) -> int:
         return len(self.encoder.encode(message, lambda size: self.answer[:size]))
@@ -92,7 +92,7 @@ def main(parent: int, request: int, answer: int) -> int:
         frames = [memoryview(mmap.mmap(descriptor, WIRE_LIMITS.size)) for descriptor in (request, answer)]
         ModelLoop(policy, channel, frames[0], frames[1]).run()
     except Exception as error:  # noqa: BLE001 - the host tells it
-        channel.send({"event": "failed", "error": told(error)})
+        channel.send({"event": "failed", "error": error_text(error)})
         return 1
     finally:
         if policy is not None:

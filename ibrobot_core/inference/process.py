@@ -80,7 +80,7 @@ class ProcessEngine(Engine):
             try:
                 self._await("ready", self._spawn(), time.monotonic() + _START_TIMEOUT_S)
             except PolicyError:
-                self._bury()
+                self._reap()
                 raise
 
     @override
@@ -118,10 +118,10 @@ class ProcessEngine(Engine):
         if child is not None:
             child.kill()
         with self._lock:
-            self._bury()
+            self._reap()
 
     def _spawn(self) -> Child:
-        self._bury()
+        self._reap()
         if self._closed.is_set():
             raise PolicyError("the model was closed")
         memories = [create_memory() for _ in range(2)]
@@ -169,7 +169,7 @@ class ProcessEngine(Engine):
                 )
             check_weights(self.stats.weights, weights, "the model's process", accept=self._accept_new_weights)
         except PolicyError:
-            self._bury()
+            self._reap()
             self._start_again_s = time.monotonic() + _LONGEST_PAUSE_S
             raise
         self.stats.weights = weights
@@ -190,7 +190,7 @@ class ProcessEngine(Engine):
     def _died(self, child: Child, why: str = "") -> PolicyError:
         """What is known of the death of the process, which is set to start again."""
         how = why or child.cause(self._patience_s)
-        self._bury()
+        self._reap()
         pause_s = min(_LONGEST_PAUSE_S, 2.0 ** (self._deaths - 1)) if self._deaths else 0.0
         self._deaths += 1
         self._start_again_s = time.monotonic() + pause_s
@@ -198,7 +198,7 @@ class ProcessEngine(Engine):
             self._log.error("the model's process %d died: %s; it starts again in %g s", child.pid, how, pause_s)
         return PolicyError(f"the model's process {child.pid} died: {how}")
 
-    def _bury(self) -> None:
+    def _reap(self) -> None:
         """End and forget the process."""
         self.stats.alive = False
         self._at_work_s = None

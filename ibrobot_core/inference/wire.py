@@ -138,7 +138,7 @@ class _Place:
 
 
 @attrs.frozen(eq=False)
-class _Layout:
+class _MessageLayout:
     """All of a frame but its numbers and its tensors' values: as a rule the same from one request to the next."""
 
     robot: str
@@ -155,17 +155,17 @@ class _Layouts[K: Hashable]:
     """The layouts that were used last. May be used by several threads."""
 
     def __init__(self) -> None:
-        self._kept: OrderedDict[K, _Layout] = OrderedDict()
+        self._kept: OrderedDict[K, _MessageLayout] = OrderedDict()
         self._lock = threading.Lock()
 
-    def get(self, key: K) -> _Layout | None:
+    def get(self, key: K) -> _MessageLayout | None:
         with self._lock:
             layout = self._kept.get(key)
             if layout is not None:
                 self._kept.move_to_end(key)
             return layout
 
-    def keep(self, key: K, layout: _Layout) -> None:
+    def keep(self, key: K, layout: _MessageLayout) -> None:
         with self._lock:
             self._kept[key] = layout
             if len(self._kept) > _LAYOUTS_KEPT:
@@ -187,7 +187,7 @@ def _jpegs(tensors: Tensors, codec: PictureCodec) -> Mapping[str, bytes]:
     return jpegs
 
 
-def _lay_out(message: WireMessage, jpegs: Mapping[str, bytes], limits: WireLimits) -> _Layout:
+def _lay_out(message: WireMessage, jpegs: Mapping[str, bytes], limits: WireLimits) -> _MessageLayout:
     texts = [_text(text, limits.name) for text in (message.robot, message.fingerprint)]
     texts.append(_text(message.text, limits.text))
     if len(message.tensors) > limits.tensors:
@@ -214,10 +214,10 @@ def _lay_out(message: WireMessage, jpegs: Mapping[str, bytes], limits: WireLimit
     head = b"".join((_SIZES.pack(cursor, text, len(places), robot, fingerprint, _ZEROS), *texts, table))
     if places:
         head = head.ljust(places[0].offset - _NUMBERS.size, b"\0")
-    return _Layout(message.robot, message.fingerprint, message.text, places, head, cursor)
+    return _MessageLayout(message.robot, message.fingerprint, message.text, places, head, cursor)
 
 
-def _fill(frame: memoryview, layout: _Layout, message: WireMessage, jpegs: Mapping[str, bytes]) -> memoryview:
+def _fill(frame: memoryview, layout: _MessageLayout, message: WireMessage, jpegs: Mapping[str, bytes]) -> memoryview:
     asks = message.kind is WireKind.REQUEST
     times = (message.deadline_ns, message.episode) if asks else (message.queued_ns, message.pace_ns)
     try:
@@ -363,7 +363,7 @@ class WireDecoder:
             episode, seed, latency_ms, queued_ns, pace_ns,
         )  # fmt: skip
 
-    def _laid_out(self, frame: memoryview, reserved: int) -> _Layout:
+    def _laid_out(self, frame: memoryview, reserved: int) -> _MessageLayout:
         limits = self._limits
         size, text_size, count, robot_size, fingerprint_size, zeros = _SIZES.unpack_from(frame, _NUMBERS.size)
         if reserved or zeros != _ZEROS:
@@ -385,7 +385,7 @@ class WireDecoder:
             reader = _Reader(frame, _HEAD_SIZE)
             robot, fingerprint, text = (reader.text(n) for n in (robot_size, fingerprint_size, text_size))
             places = _places(reader, count, limits)
-            layout = _Layout(robot, fingerprint, text, places, head, size)
+            layout = _MessageLayout(robot, fingerprint, text, places, head, size)
             if not (text or any(place.jpeg for place in places)):  # those do not come again
                 self._layouts.keep(head, layout)
         return layout

@@ -5,7 +5,7 @@ from ibrobot_core.interfaces.dataset import DatasetSummary, DatasetWriter, Featu
 from ibrobot_core.interfaces.executor import Executor, GoalState, GoalStatus, Plan
 from ibrobot_core.interfaces.hardware import (
     Condition,
-    Episode,
+    EpisodeSetup,
     Hardware,
     Holding,
     JointReading,
@@ -29,10 +29,10 @@ __all__ = [
     "Context",
     "DatasetSummary",
     "DatasetWriter",
-    "Episode",
     "EpisodeAddress",
     "EpisodeEnd",
     "EpisodeReader",
+    "EpisodeSetup",
     "EpisodeStart",
     "EpisodeSummary",
     "Executor",

@@ -180,7 +180,7 @@ class Hardware(ABC):
 
 
 @attrs.frozen
-class Episode:
+class EpisodeSetup:
     """What a simulation is set up for: the seed of its random poses."""
 
     seed: int
@@ -194,7 +194,7 @@ class SimulatedHardware(Hardware):
         """Advance physics by `step_ns` [ns] under the last command."""
 
     @abstractmethod
-    def reset(self, episode: Episode) -> None:
+    def reset(self, episode: EpisodeSetup) -> None:
         """Set the scene up anew; equal seeds give equal scenes, bit by bit."""
 
     def success(self) -> bool | None:

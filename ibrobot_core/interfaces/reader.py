@@ -51,7 +51,7 @@ class EpisodeSummary:
     """Receipt of the first and the last message [ns]; both 0 for an episode without messages."""
     topics: Mapping[str, TopicSummary]
     metadata: Mapping[str, str]
-    """What the recorder was told: prompt, contract, fingerprint, calibration, versions; empty in foreign bags."""
+    """What the recorder was given: prompt, contract, fingerprint, calibration, versions; empty in foreign bags."""
     outcome: str = "unknown"
     """`unknown` where the episode is unfinished or lacks messages, whatever was stated: its end may be missing."""
     stated_outcome: str = "unknown"
@@ -65,12 +65,12 @@ class EpisodeAddress:
     path: Path
     number: int | None = None
     """From 0, in a dataset of many; None where none is said."""
-    told: Mapping[str, str] = attrs.field(factory=dict)
+    given: Mapping[str, str] = attrs.field(factory=dict)
     """What the metadata of an episode is that has none, by the recorder's names: `contract`, `config`, `calibration`;
     and `norm_mode`, the unit of its joints."""
 
     @classmethod
-    def of(cls, path: Path, told: Mapping[str, str] | None = None) -> EpisodeAddress:
+    def of(cls, path: Path, given: Mapping[str, str] | None = None) -> EpisodeAddress:
         """The address of what a user calls `path`: an episode, or `DATASET:N`.
 
         Raises:
@@ -78,10 +78,10 @@ class EpisodeAddress:
         """
         named = re.fullmatch(r"(.+):(\d+)", path.name)
         if path.exists():
-            return cls(path, None, told or {})
+            return cls(path, None, given or {})
         if named is None or not (dataset := path.with_name(named[1])).exists():
             raise RecorderError(f"{path}: there is no such episode")
-        return cls(dataset, int(named[2]), told or {})
+        return cls(dataset, int(named[2]), given or {})
 
 
 class EpisodeReader(ABC):

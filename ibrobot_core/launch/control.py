@@ -19,7 +19,7 @@ from ibrobot_core.messages import Float64MultiArray, Header, JointState
 NAME = "control"
 
 
-class Control(Component):
+class ControlComponent(Component):
     """Starts control and publishes what it tells: joint states, what the joints were told, and signals."""
 
     def __init__(self, session: Session, needs: tuple[str, ...]) -> None:
@@ -88,11 +88,11 @@ class Control(Component):
     def _take(self, event: Mapping[str, Any]) -> None:
         session = self._session
         if event["event"] == "goal":
-            if session.feeder is not None:
-                session.feeder.take_goal(event)
+            if session.command_source is not None:
+                session.command_source.take_goal(event)
         elif event["event"] == "fault":
             fault = str(event["fault"])
-            session.add_fault(fault, int(event["epoch"]))
+            session.add_fault(fault, int(event["generation"]))
             session.log.error("fault: %s; the robot %s", fault, event["then"])
             session.registry.emit(
                 "ibrobot_fault_raised", robot=session.config.robot.name, fault=fault, stamp_ns=int(event["stamp_ns"])

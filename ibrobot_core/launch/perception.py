@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from typing import override
 
-from ibrobot_core.config.schema import Peripheral
+from ibrobot_core.config.schema import PeripheralConfig
 from ibrobot_core.interfaces import Sensor
 from ibrobot_core.launch.session import SensorFigures, Session, SessionWorker
 from ibrobot_core.units import seconds
@@ -18,7 +18,7 @@ _RATE_WINDOW = 31
 class SensorWorker(SessionWorker):
     """Opens a sensor and publishes its messages; ready when the first has come."""
 
-    def __init__(self, session: Session, peripheral: Peripheral, needs: tuple[str, ...]) -> None:
+    def __init__(self, session: Session, peripheral: PeripheralConfig, needs: tuple[str, ...]) -> None:
         super().__init__(
             session, f"sensor:{peripheral.name}", f"{peripheral.kind} {peripheral.type}", needs,
             ready_timeout_s=_READY_TIMEOUT_S,

@@ -9,12 +9,12 @@ import attrs
 
 from ibrobot_core.component import Component
 from ibrobot_core.config.missing import unavailable_modes
-from ibrobot_core.config.schema import ActionSpec, ObservationSpec, Peripheral, Share
+from ibrobot_core.config.schema import ActionSpec, ObservationSpec, PeripheralConfig, Share
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import ComponentFailed, NotSupported
 from ibrobot_core.launch.absence import describe, refuse
 from ibrobot_core.launch.control import NAME as CONTROL
-from ibrobot_core.launch.control import Control
+from ibrobot_core.launch.control import ControlComponent
 from ibrobot_core.launch.outputs.metrics import MetricsPort
 from ibrobot_core.launch.outputs.sharing import PublishedTopic, SubscribedTopics
 from ibrobot_core.launch.outputs.status import Status
@@ -23,29 +23,29 @@ from ibrobot_core.launch.outputs.viewer import ViewerWorker
 from ibrobot_core.launch.perception import SensorWorker
 from ibrobot_core.launch.session import Session
 from ibrobot_core.launch.simulation import SimulatedEpisodes
-from ibrobot_core.launch.sources.feeder import Feeder
-from ibrobot_core.launch.sources.planner import PlanningFeeder
-from ibrobot_core.launch.sources.policy import InferenceFeeder, Model
+from ibrobot_core.launch.sources.planner import PlannerSource
+from ibrobot_core.launch.sources.policy import LoadedModel, PolicySource
 from ibrobot_core.launch.sources.replay import MODE as REPLAY
-from ibrobot_core.launch.sources.replay import ReplayFeeder
-from ibrobot_core.launch.sources.teleop import TeleopFeeder
+from ibrobot_core.launch.sources.replay import ReplaySource
+from ibrobot_core.launch.sources.source_worker import SourceWorker
+from ibrobot_core.launch.sources.teleop import TeleopSource
 from ibrobot_core.launch.transport import TransportLink
 from ibrobot_core.messages import MESSAGE_TYPES
 from ibrobot_core.recording.episode import is_kept
 from ibrobot_core.recording.episodes import Episodes
-from ibrobot_core.recording.worker import Recording
+from ibrobot_core.recording.worker import RecordingWorker
 
 
 @attrs.frozen
-class ModeParts:
+class ModeComponents:
     """What a mode adds to a run."""
 
-    models: tuple[Model, ...]
-    feeder: Feeder | None
+    models: tuple[LoadedModel, ...]
+    source: SourceWorker | None
 
     def components(self) -> list[Component]:
         """In starting order."""
-        return [*self.models, *([self.feeder] if self.feeder is not None else [])]
+        return [*self.models, *([self.source] if self.source is not None else [])]
 
 
 @attrs.frozen
@@ -53,10 +53,10 @@ class LaunchPlan:
     """Components in starting order."""
 
     components: tuple[Component, ...]
-    mode: ModeParts
+    mode: ModeComponents
     """What the first mode brings; among `components` too."""
     episodes: Episodes
-    recording: Recording | None
+    recording: RecordingWorker | None
     episodes_worker: SimulatedEpisodes | None
     without: str
     """The sensors that this machine cannot run, and why; empty where there are none."""
@@ -79,23 +79,23 @@ class LaunchPlan:
         return [*lines, *without, *unavailable_modes(self.unavailable), "stops in reverse order"]
 
 
-def mode_parts(session: Session, name: str) -> ModeParts:
+def mode_components(session: Session, name: str) -> ModeComponents:
     """The components of a mode; nothing is loaded yet."""
     mode = session.config.control_modes[name]
     needs = (CONTROL, *(f"sensor:{sensor.name}" for sensor in _sensors(session)))
     if session.request.replay is not None and name == REPLAY:
-        return ModeParts((), ReplayFeeder(session, mode, session.request.replay, (CONTROL,)))
+        return ModeComponents((), ReplaySource(session, mode, session.request.replay, (CONTROL,)))
     if mode.inference is not None:
-        model = Model(session, mode.inference)
-        return ModeParts((model,), InferenceFeeder(session, mode, mode.inference, model, needs))
+        model = LoadedModel(session, mode.inference)
+        return ModeComponents((model,), PolicySource(session, mode, mode.inference, model, needs))
     if mode.teleop is not None:
-        return ModeParts((), TeleopFeeder(session, mode, mode.teleop, (CONTROL,)))
+        return ModeComponents((), TeleopSource(session, mode, mode.teleop, (CONTROL,)))
     if mode.planner is not None:
-        return ModeParts((), PlanningFeeder(session, mode, mode.planner, (CONTROL,)))
-    return ModeParts((), None)
+        return ModeComponents((), PlannerSource(session, mode, mode.planner, (CONTROL,)))
+    return ModeComponents((), None)
 
 
-def _sensors(session: Session) -> list[Peripheral]:
+def _sensors(session: Session) -> list[PeripheralConfig]:
     """The peripherals that can run here."""
     absent = {sensor.name for sensor in session.absent}
     return [peripheral for name, peripheral in session.config.peripherals.items() if name not in absent]
@@ -137,19 +137,19 @@ def build_plan(session: Session) -> LaunchPlan:
     if session.request.lockstep and share.subscribe:
         raise NotSupported("transport.share.subscribe: in lockstep nothing may come from other machines, at any time")
     _refuse_absent(session, share)
-    parts = mode_parts(session, session.mode)
+    added = mode_components(session, session.mode)
     components: list[Component] = []
     if config.transport is not None and used:
         components.append(TransportLink(session, config.transport))
-    components += parts.models
-    components.append(Control(session, tuple(model.name for model in parts.models)))
+    components += added.models
+    components.append(ControlComponent(session, tuple(model.name for model in added.models)))
     components += [SensorWorker(session, peripheral, (CONTROL,)) for peripheral in _sensors(session)]
-    recording = Recording(session, config.recording) if config.recording is not None else None
+    recording = RecordingWorker(session, config.recording) if config.recording is not None else None
     if recording is not None:
         components.append(recording)
     episodes = Episodes(session, recording)
-    if parts.feeder is not None:
-        components.append(parts.feeder)
+    if added.source is not None:
+        components.append(added.source)
     components.append(Status(session, (CONTROL,)))
     if config.metrics is not None:
         components.append(MetricsPort(session, config.metrics, (CONTROL,)))
@@ -161,11 +161,11 @@ def build_plan(session: Session) -> LaunchPlan:
     if share.subscribe:
         components.append(SubscribedTopics(session, share.subscribe))
     worker = None
-    if config.simulated and isinstance(parts.feeder, InferenceFeeder):
-        worker = SimulatedEpisodes(session, episodes, (parts.feeder.name,))
+    if config.simulated and isinstance(added.source, PolicySource):
+        worker = SimulatedEpisodes(session, episodes, (added.source.name,))
         components.append(worker)
     return LaunchPlan(
-        tuple(_ordered(components)), parts, episodes, recording, worker, describe(session.absent), config.unavailable
+        tuple(_ordered(components)), added, episodes, recording, worker, describe(session.absent), config.unavailable
     )
 
 

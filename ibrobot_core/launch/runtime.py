@@ -6,14 +6,14 @@ from collections.abc import Callable
 from typing import Any
 
 from ibrobot_core.clock import SteppedClock
-from ibrobot_core.component import Component, Worker, cause, exit_code, told
+from ibrobot_core.component import Component, Worker, error_line, error_text, exit_code
 from ibrobot_core.config.missing import unavailable_modes
 from ibrobot_core.errors import ComponentFailed, HardwareError, NotSupported, PluginError
-from ibrobot_core.launch.control import Control
-from ibrobot_core.launch.plan import LaunchPlan, build_plan, mode_parts
+from ibrobot_core.launch.control import ControlComponent
+from ibrobot_core.launch.plan import LaunchPlan, build_plan, mode_components
 from ibrobot_core.launch.session import Session
 from ibrobot_core.launch.sources.planner import check_goals
-from ibrobot_core.recording.desk import EpisodeDesk
+from ibrobot_core.recording.service import EpisodeService
 from ibrobot_core.units import ns
 
 SET_MODE = "/set_mode"
@@ -39,13 +39,13 @@ class Runtime:
                 "--episodes counts a policy's episodes in simulation: it needs --sim and a mode with inference; "
                 f"mode {session.mode} ends with --duration, --goal or Ctrl-C"
             )
-        self.desk: EpisodeDesk | None = None
+        self.episode_service: EpisodeService | None = None
         """Where an operator begins and ends episodes; None in a run that records nothing."""
         if self.plan.recording is not None:
             by_mode = self.plan.episodes_worker is not None or not session.request.by_operator
-            self.desk = EpisodeDesk(session, self.plan.episodes, self.plan.recording, by_mode=by_mode)
-        self._mode_parts = self.plan.mode
-        session.feeder = self.plan.mode.feeder
+            self.episode_service = EpisodeService(session, self.plan.episodes, self.plan.recording, by_mode=by_mode)
+        self._mode_components = self.plan.mode
+        session.command_source = self.plan.mode.source
         self._started: list[Component] = []
         self._begun_ns = session.clock.now_ns()
 
@@ -84,8 +84,8 @@ class Runtime:
         session.bus.serve(SET_MODE, self.switch_mode)
         session.bus.serve(RESET, lambda _: self.reset())
         session.bus.serve(ESTOP, lambda _: session.control.call("estop"))
-        if self.desk is not None:
-            self.desk.serve()
+        if self.episode_service is not None:
+            self.episode_service.serve()
 
     def wait(self, timeout_s: float) -> bool:
         """Wait up to `timeout_s` [s] for the end of the run; True when it has come."""
@@ -108,12 +108,12 @@ class Runtime:
         return self.wait(0.0)
 
     def switch_mode(self, name: str) -> None:
-        """Enter another mode: its parts become ready first, then ownership of the joints changes within one tick.
+        """Enter another mode: its components become ready first, then ownership of the joints changes within one tick.
 
         The present mode goes on where a reset made the robot hold, and is left alone otherwise.
 
         Raises:
-            IbrobotError: when there is no such mode or its parts do not start; the present mode goes on.
+            IbrobotError: when there is no such mode or its components do not start; the present mode goes on.
         """
         session = self.session
         if name not in session.config.control_modes:
@@ -124,8 +124,8 @@ class Runtime:
             if session.held:
                 self._go_on()
             return
-        parts = mode_parts(session, name)
-        new = parts.components()
+        added = mode_components(session, name)
+        new = added.components()
         try:
             for component in new:
                 self._start(component)
@@ -135,9 +135,9 @@ class Runtime:
             raise
         self.plan.episodes.end("unknown")
         previous = session.mode
-        session.mode, session.feeder, session.held = name, parts.feeder, False
-        session.feed()
-        old, self._mode_parts = self._mode_parts.components(), parts
+        session.mode, session.command_source, session.held = name, added.source, False
+        session.begin_source()
+        old, self._mode_components = self._mode_components.components(), added
         self._started = [component for component in self._started if component not in old] + new
         self._stop_all(old)
         session.registry.emit(
@@ -159,12 +159,14 @@ class Runtime:
             IbrobotError: when the hardware, or what the mode needs, does not answer yet.
         """
         session = self.session
-        if session.feeder is not None:
-            session.feeder.recover()
-            session.feeder.end()
+        if session.command_source is not None:
+            session.command_source.recover()
+            session.command_source.end()
         stopped = bool(session.command("reset")["cleared"])
-        session.held = session.feeder is not None and session.feeder.autonomous and (stopped or session.held)
-        session.feed()
+        session.held = (
+            session.command_source is not None and session.command_source.autonomous and (stopped or session.held)
+        )
+        session.begin_source()
         then = f"holding: {session.to_go_on()}" if session.held else f"mode {session.mode} starts over"
         session.log.info("reset; %s", then)
         return f"reset; {then}"
@@ -176,7 +178,7 @@ class Runtime:
         session.held = False
         between_episodes = self.plan.episodes_worker in self._started and not self.plan.episodes.running
         if not between_episodes:
-            session.feed()
+            session.begin_source()
         session.log.info("mode %s goes on", session.mode)
 
     def stop(self) -> None:
@@ -186,8 +188,8 @@ class Runtime:
         session.bus.unserve(SET_MODE)
         session.bus.unserve(RESET)
         session.bus.unserve(ESTOP)
-        if self.desk is not None:
-            self.desk.unserve()
+        if self.episode_service is not None:
+            self.episode_service.unserve()
         started, self._started = self._started, []
         if (worker := self.plan.episodes_worker) in started:
             started.remove(worker)
@@ -203,7 +205,7 @@ class Runtime:
         """
         if self.session.failure is not None:
             component, error = self.session.failure
-            failure = ComponentFailed(f"{component}: {cause(error)}")
+            failure = ComponentFailed(f"{component}: {error_line(error)}")
             failure.exit_code = exit_code(error)
             raise failure
 
@@ -236,10 +238,10 @@ class Runtime:
             if isinstance(component, Worker):
                 component.given_up = self.session.finished
             component.start()
-            if isinstance(component, Control) and self.session.request.lockstep:
+            if isinstance(component, ControlComponent) and self.session.request.lockstep:
                 component.step(self.session.clock.now_ns())
         except Exception as error:
-            failure = ComponentFailed(f"{component.name}: {told(error)}")
+            failure = ComponentFailed(f"{component.name}: {error_text(error)}")
             failure.exit_code = exit_code(error)
             raise failure from error
 
@@ -249,8 +251,8 @@ class Runtime:
             try:
                 component.stop()
             except Exception as error:  # noqa: BLE001 - contained: the others must be stopped all the same
-                self.session.log.error("%s did not stop well: %s", component.name, cause(error))
-                if isinstance(component, Control) and self.session.failure is None:
+                self.session.log.error("%s did not stop well: %s", component.name, error_line(error))
+                if isinstance(component, ControlComponent) and self.session.failure is None:
                     self.session.failure = component.name, error
 
     def _change_owner(self, mode: str) -> None:
@@ -267,7 +269,7 @@ class Runtime:
         try:
             session.command("switch_mode", mode=mode)
         except BaseException:
-            session.feed()
+            session.begin_source()
             if worker is not None and judged:
                 worker.start()
             raise
@@ -292,7 +294,7 @@ class Runtime:
         session = self.session
         self._await_state()
         assert session.state is not None
-        session.epoch = session.state.epoch
-        session.feed()
+        session.generation = session.state.generation
+        session.begin_source()
         if not session.request.by_operator:
             self.plan.episodes.begin()

@@ -17,7 +17,7 @@ from ibrobot_core.clock import Clock, RealClock, SteppedClock
 from ibrobot_core.component import Worker
 from ibrobot_core.config import RobotConfig
 from ibrobot_core.config.context import component_context
-from ibrobot_core.config.schema import Component as ComponentConfig
+from ibrobot_core.config.schema import ComponentConfig
 from ibrobot_core.control.link import ControlState, PlanRecord
 from ibrobot_core.errors import ComponentFailed
 from ibrobot_core.interfaces import Context, JointReading, Transport
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 @attrs.frozen
-class Request:
+class LaunchRequest:
     """What a user asks of a run; the options of `ibrobot launch`."""
 
     lockstep: bool = False
@@ -83,46 +83,47 @@ class SensorFigures:
     """Age of the newest message when it was published, by its stamp; None for messages without one."""
 
 
-class Feed(ABC):
+class CommandSource(ABC):
     """What gives the active executors something to do in a mode. It is quiet until `begin`, and after `end`.
 
     Attributes:
-        autonomous: whether it moves the robot with nobody at a control, so that a reset alone must not begin it.
+        autonomous: whether it moves the robot without an operator. Such a source does not start again after a reset
+            until the operator enters the mode.
     """
 
     autonomous = False
 
     @abstractmethod
     def begin(self, seed: int) -> None:
-        """The mode was entered, or control was reset: start afresh."""
+        """Start; called when the mode is entered and after a reset."""
 
     @abstractmethod
     def end(self) -> None:
-        """The mode is left."""
+        """Stop; called when the mode is left."""
 
     @abstractmethod
     def stop(self) -> None:
-        """Release what it took."""
+        """Release all resources."""
 
     def recover(self) -> None:
-        """A reset is to come: make ready again what failed.
+        """Recover from a failure; called before a reset.
 
         Raises:
-            IbrobotError: when that cannot be; the fault stays.
+            IbrobotError: when it cannot; the fault stays.
         """
 
     def take_goal(self, event: Mapping[str, Any]) -> None:
-        """A goal of an executor changed its state."""
+        """Handle a change of state of an executor's goal."""
 
     def help(self) -> str:
-        """What an operator must know in this mode."""
+        """Instructions for the operator in this mode."""
         return ""
 
 
 class Session:
     """What the components of a run share. Everything here is safe to read from any thread."""
 
-    def __init__(self, config: RobotConfig, registry: Registry, request: Request) -> None:
+    def __init__(self, config: RobotConfig, registry: Registry, request: LaunchRequest) -> None:
         self.config = config
         self.registry = registry
         self.request = request
@@ -131,8 +132,8 @@ class Session:
         self.bus = Bus(self.clock)
         self.outcome = Outcome()
         self.mode = config.default_control_mode
-        self.epoch = 0
-        self.feeder: Feed | None = None
+        self.generation = 0
+        self.command_source: CommandSource | None = None
         self.held = False
         """Whether the robot holds after the reset of a fault, until the operator enters the mode again."""
         self.start_failed = False
@@ -228,24 +229,24 @@ class Session:
         mask[columns] = True
         full = np.zeros((len(positions), len(robot.joints)))
         full[:, columns] = positions
-        self.control.write_plan(PlanRecord(self.epoch, start_ns, step_ns, mask, full))
+        self.control.write_plan(PlanRecord(self.generation, start_ns, step_ns, mask, full))
 
     def command(self, do: str, **arguments: Any) -> Mapping[str, Any]:
-        """Have control carry out a command that begins a new epoch: a mode switch, a reset. Returns its answer."""
-        with self._commanding:  # the epoch of the last command must be the one that stays
+        """Have control carry out a command that begins a new generation: a mode switch, a reset. Returns its answer."""
+        with self._commanding:  # the generation of the last command must be the one that stays
             answer = self.control.call(do, **arguments)
-            self.epoch = int(answer["epoch"])
+            self.generation = int(answer["generation"])
             return answer
 
-    def feed(self) -> None:
-        """Begin the mode's feed, unless the robot is `held`."""
-        if self.feeder is not None and not self.held:
-            self.feeder.begin(self.request.seed)
+    def begin_source(self) -> None:
+        """Begin the command source of the mode, unless the robot is `held`."""
+        if self.command_source is not None and not self.held:
+            self.command_source.begin(self.request.seed)
 
     def pause_feed(self) -> None:
         """End the mode's feed, until `feed`."""
-        if self.feeder is not None:
-            self.feeder.end()
+        if self.command_source is not None:
+            self.command_source.end()
 
     @property
     def mode_keys(self) -> dict[str, str]:
@@ -257,15 +258,15 @@ class Session:
         keys = [key for key, mode in self.mode_keys.items() if mode == self.mode]
         return f"{f'press {keys[0]}' if keys else 'call /set_mode'} to go on with {self.mode}"
 
-    def add_fault(self, fault: str, epoch: int | None = None) -> None:
-        """Note a fault that was raised in `epoch`, the present one when None."""
+    def add_fault(self, fault: str, generation: int | None = None) -> None:
+        """Note a fault that was raised in `generation`, the present one when None."""
         self.outcome.faults.append(fault)
-        self._faults.append((self.epoch if epoch is None else epoch, fault))
+        self._faults.append((self.generation if generation is None else generation, fault))
 
     @property
     def faults(self) -> tuple[str, ...]:
         """Faults that no reset has cleared yet; `outcome.faults` has all of the run."""
-        return tuple(fault for epoch, fault in self._faults if epoch >= self.epoch)
+        return tuple(fault for generation, fault in self._faults if generation >= self.generation)
 
     def finish(self) -> None:
         """End the run in good order."""

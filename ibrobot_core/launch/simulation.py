@@ -35,7 +35,7 @@ class SimulatedEpisodes(SessionWorker):
             # Setting the scene up anew would clear an emergency stop, and move on: both are for a person to do.
             if not (session.held or (state is not None and state.estop)):
                 self._begin_episode()
-        elif state is not None and state.epoch == session.epoch and state.success:
+        elif state is not None and state.generation == session.generation and state.success:
             self._end_episode("success")
         elif (age_ns := session.clock.now_ns() - self._begun_ns) > self._longest_ns:
             session.log.info("episode %d: no success within %.1f s", self._episodes.number, age_ns / NS_PER_S)
@@ -47,8 +47,8 @@ class SimulatedEpisodes(SessionWorker):
         session.command("reset_episode", seed=seed)
         self._begun_ns = session.clock.now_ns()
         self._episodes.begin()
-        if session.feeder is not None:
-            session.feeder.begin(seed)
+        if session.command_source is not None:
+            session.command_source.begin(seed)
 
     def _end_episode(self, outcome: str) -> None:
         session = self.session

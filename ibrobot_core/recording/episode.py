@@ -9,7 +9,7 @@ from uuid import NAMESPACE_OID, uuid4, uuid5
 
 import ibrobot_core
 from ibrobot_core.config import RobotConfig
-from ibrobot_core.config.schema import Recording
+from ibrobot_core.config.schema import RecordingConfig
 from ibrobot_core.contract.joint_units import calibrations
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import RecorderError
@@ -25,7 +25,7 @@ def episode_folder(dataset: Path, number: int) -> Path:
 
 
 def episode_start(
-    config: RobotConfig, recording: Recording, topics: Mapping[str, str], *, mode: str, seed: int, stamp_ns: int,
+    config: RobotConfig, recording: RecordingConfig, topics: Mapping[str, str], *, mode: str, seed: int, stamp_ns: int,
     lockstep: bool, prompt: str = "", plugins: Mapping[str, str] | None = None,
     policy: Mapping[str, str] | None = None,
 ) -> EpisodeStart:  # fmt: skip
@@ -73,7 +73,7 @@ def episode_start(
     return EpisodeStart(directory, stamp_ns, kept, metadata, any_topic=recording.topics != "contract")
 
 
-def is_kept(topic: str, recording: Recording, contract: Contract) -> bool:
+def is_kept(topic: str, recording: RecordingConfig, contract: Contract) -> bool:
     """Whether the `recording` section asks for `topic`."""
     if recording.topics == "contract":
         return topic in contract.topics

@@ -8,13 +8,13 @@ from ibrobot_core.errors import RecorderError
 from ibrobot_core.recording.run import Run
 
 if TYPE_CHECKING:
-    from ibrobot_core.recording.worker import Recording
+    from ibrobot_core.recording.worker import RecordingWorker
 
 
 class Episodes:
     """Begins and ends episodes. One thread at a time uses it."""
 
-    def __init__(self, session: Run, recording: Recording | None) -> None:
+    def __init__(self, session: Run, recording: RecordingWorker | None) -> None:
         self._session = session
         self._recording = recording
         self.number = 0

@@ -7,8 +7,8 @@ from math import inf
 from typing import override
 
 from ibrobot_core.errors import DiskFull, IbrobotError, NotSupported
-from ibrobot_core.recording.desk import EpisodeDesk
 from ibrobot_core.recording.run import Run
+from ibrobot_core.recording.service import EpisodeService
 from ibrobot_core.run_hooks import RunHooks
 from ibrobot_core.units import plural, seconds
 
@@ -22,7 +22,7 @@ class Operator(RunHooks):
 
     Args:
         run: the run.
-        desk: begins and ends its episodes.
+        service: begins and ends its episodes.
         count: episodes to record; None: until Ctrl-C.
         reset_time_s: pause after an episode, for setting the scene up again [s].
         prompt: of all episodes; None asks for it, with Enter for the last one.
@@ -36,15 +36,15 @@ class Operator(RunHooks):
     """
 
     def __init__(
-        self, run: Run, desk: EpisodeDesk, count: int | None, reset_time_s: float, prompt: str | None, *, auto: bool,
-        keys: bool, continuous: bool = False,
+        self, run: Run, service: EpisodeService, count: int | None, reset_time_s: float, prompt: str | None, *,
+        auto: bool, keys: bool, continuous: bool = False,
     ) -> None:  # fmt: skip
-        if desk.by_mode and continuous:
+        if service.by_mode and continuous:
             raise NotSupported(f"--continuous: mode {run.mode} begins and ends its episodes itself")
-        if not (desk.by_mode or auto or continuous or keys):
+        if not (service.by_mode or auto or continuous or keys):
             raise NotSupported("without a terminal nobody can begin an episode: add --auto")
         self._run = run
-        self._desk = desk
+        self._service = service
         self._count = count
         self._reset_time_s = reset_time_s
         self._prompt = prompt
@@ -62,19 +62,19 @@ class Operator(RunHooks):
     @override
     def step(self) -> None:
         """Do what is due; called a few times a second."""
-        if self._desk.by_mode:
+        if self._service.by_mode:
             return
-        desk = self._desk
-        if desk.recording:
-            if desk.failure is not None:
-                self._end(lambda: desk.stop("unknown"))
-                self._refuse(f"recording ended: {desk.failure}")
+        service = self._service
+        if service.recording:
+            if service.failure is not None:
+                self._end(lambda: service.stop("unknown"))
+                self._refuse(f"recording ended: {service.failure}")
                 if self._auto:  # nobody is there to put it right
                     self._run.finish()
-            elif desk.elapsed_s() >= self._longest_s:
+            elif service.elapsed_s() >= self._longest_s:
                 self._run.log.info("the episode is %g s long (contract.max_duration_s): ended", self._longest_s)
-                self._end(lambda: desk.stop("unknown"))
-        elif self._count is not None and desk.saved >= self._count:
+                self._end(lambda: service.stop("unknown"))
+        elif self._count is not None and service.saved >= self._count:
             self._run.finish()
         elif self._auto and self._clock_s() >= self._not_before_s:
             self._begin(self._prompt)
@@ -82,18 +82,18 @@ class Operator(RunHooks):
     @override
     def key(self, key: str) -> bool:
         """Act on a key; False for one that has no meaning here."""
-        if self._desk.by_mode or self._continuous:
+        if self._service.by_mode or self._continuous:
             return False
         if self._typed is not None:
             self._type(key)
-        elif key == _START and self._desk.recording:
-            self._end(lambda: self._desk.stop("success"))
+        elif key == _START and self._service.recording:
+            self._end(lambda: self._service.stop("success"))
         elif key == _START:
             self._ask()
-        elif key == _FAILURE and self._desk.recording:
-            self._end(lambda: self._desk.stop("failure"))
-        elif key == _DISCARD and self._desk.recording:
-            self._end(self._desk.discard)
+        elif key == _FAILURE and self._service.recording:
+            self._end(lambda: self._service.stop("failure"))
+        elif key == _DISCARD and self._service.recording:
+            self._end(self._service.discard)
         else:
             return False
         return True
@@ -101,12 +101,12 @@ class Operator(RunHooks):
     @override
     def rows(self) -> list[tuple[str, str]]:
         """Heading and text, for the panel."""
-        status = self._desk.status()
+        status = self._service.status()
         lost = sum(status["lost"].values())
         rates = "  ".join(f"{topic} {rate:g} Hz" for topic, rate in status["rates_hz"].items())
         rows = [
             ("record", self._state()),
-            ("saved", f"{self._saved()} into {self._desk.folder}"),
+            ("saved", f"{self._saved()} into {self._service.folder}"),
             ("topics", rates or "none yet"),
             ("lost", f"{lost} messages"),
             (
@@ -127,32 +127,32 @@ class Operator(RunHooks):
     @override
     def help(self) -> str:
         """The keys."""
-        if self._desk.by_mode or self._continuous:
+        if self._service.by_mode or self._continuous:
             return ""
         return "Tab start, and end as success   F11 end as failure   F12 discard"
 
     @override
     def summary_rows(self) -> list[tuple[str, str]]:
         """For the summary of the run."""
-        episodes = plural(self._desk.saved if self._count is None else self._count, "episode")
-        return [("recorded", f"{self._saved()} {episodes} into {self._desk.folder}")]
+        episodes = plural(self._service.saved if self._count is None else self._count, "episode")
+        return [("recorded", f"{self._saved()} {episodes} into {self._service.folder}")]
 
     def _state(self) -> str:
-        desk = self._desk
+        service = self._service
         if self._typed is not None:
-            enter = f"takes “{desk.last_prompt}”" if desk.last_prompt else "leaves it empty"
+            enter = f"takes “{service.last_prompt}”" if service.last_prompt else "leaves it empty"
             return f"prompt (Enter alone {enter}, Tab goes back): {self._typed}_"
-        if desk.recording:
-            prompt = f" “{desk.last_prompt}”" if desk.last_prompt else ""
-            left = "" if self._continuous else f", {max(0.0, self._longest_s - desk.elapsed_s()):.0f} s left"
-            return f"recording{prompt}, {desk.elapsed_s():.0f} s{left}"
+        if service.recording:
+            prompt = f" “{service.last_prompt}”" if service.last_prompt else ""
+            left = "" if self._continuous else f", {max(0.0, self._longest_s - service.elapsed_s()):.0f} s left"
+            return f"recording{prompt}, {service.elapsed_s():.0f} s{left}"
         pause_s = self._not_before_s - self._clock_s()
         if pause_s > 0:
             return f"set the scene up anew, {pause_s:.0f} s"
-        return "waiting" if self._auto or self._desk.by_mode else "waiting: Tab starts"
+        return "waiting" if self._auto or self._service.by_mode else "waiting: Tab starts"
 
     def _saved(self) -> str:
-        saved = self._desk.saved
+        saved = self._service.saved
         return f"{saved} of {self._count}" if self._count is not None else str(saved)
 
     def _ask(self) -> None:
@@ -167,11 +167,11 @@ class Operator(RunHooks):
         assert self._typed is not None
         if key == "enter":
             typed, self._typed = self._typed, None
-            self._run.feed()
+            self._run.begin_source()
             self._begin(typed or None)
         elif key == _START:
             self._typed = None
-            self._run.feed()
+            self._run.begin_source()
         elif key == "backspace":
             self._typed = self._typed[:-1]
         elif key == "space":
@@ -183,7 +183,7 @@ class Operator(RunHooks):
         if self._clock_s() < self._not_before_s:
             self._not_before_s = 0.0  # the operator is ready sooner
         try:
-            self._desk.start(prompt)
+            self._service.start(prompt)
         except IbrobotError as error:
             if str(error) != self._complaint:
                 self._run.log.error("%s", error)

@@ -34,10 +34,10 @@ def recorded_contract(metadata: Mapping[str, str]) -> Contract | None:
     return contract
 
 
-def stated_by_robot(
+def metadata_from_config(
     config: RobotConfig, norm_mode: str | None = None, calibration: Mapping[str, Mapping[str, Any]] | None = None
 ) -> dict[str, str]:
-    """What a robot YAML tells of a dataset that keeps nothing itself; see `EpisodeAddress.told`.
+    """What a robot YAML tells of a dataset that keeps nothing itself; see `EpisodeAddress.given`.
 
     Args:
         config: the robot YAML.
@@ -45,9 +45,9 @@ def stated_by_robot(
         calibration: joint -> fields of `JointCalibration`, for a unit that needs them.
     """
     document = json.loads(json.dumps(config.document, default=str))
-    calibrations = {"told": with_closed_ends(calibration, config)} if calibration else {}
-    told = _described(Contract.from_config(config).without_signals(), document, calibrations)
-    return told | ({"norm_mode": norm_mode} if norm_mode else {})
+    calibrations = {"given": with_closed_ends(calibration, config)} if calibration else {}
+    given = _described(Contract.from_config(config).without_signals(), document, calibrations)
+    return given | ({"norm_mode": norm_mode} if norm_mode else {})
 
 
 @attrs.frozen
@@ -55,7 +55,7 @@ class Origin:
     """Where an episode of a dataset comes from."""
 
     metadata: Mapping[str, str]
-    """As the recorder was told: contract, fingerprint, config, calibration, prompt, seed, …"""
+    """As the recorder was given: contract, fingerprint, config, calibration, prompt, seed, …"""
     contract: Contract
     document: Mapping[str, Any]
     """The robot YAML as plain values; empty where it is not known."""
@@ -68,21 +68,21 @@ class Origin:
     """Receipt of the first message of the recording [ns]."""
 
 
-def episode_origin(root: Path, metadata: Mapping[str, Any], number: int, told: Mapping[str, str]) -> Origin:
+def episode_origin(root: Path, metadata: Mapping[str, Any], number: int, given: Mapping[str, str]) -> Origin:
     """Where episode `number` of a dataset comes from.
 
     Args:
         root: the dataset, for errors.
-        metadata: what the dataset keeps; empty for one that `convert` did not make, which goes by `told`.
+        metadata: what the dataset keeps; empty for one that `convert` did not make, which goes by `given`.
         number: from 0.
-        told: as in `EpisodeAddress`.
+        given: as in `EpisodeAddress`.
 
     Raises:
         ContractError: when neither says what the vectors are.
         RecorderError: for metadata that cannot be read.
     """
     if "conversion" not in metadata:
-        return _told(root, told)
+        return _origin_as_given(root, given)
     try:
         episode = metadata["episodes"][number]
         calibration = metadata["calibrations"][episode["calibration"]] if episode["calibration"] else {}
@@ -98,23 +98,23 @@ def episode_origin(root: Path, metadata: Mapping[str, Any], number: int, told: M
     return Origin(recorded, contract, document, calibration, norm_mode, outcome, start_ns)
 
 
-def _told(root: Path, told: Mapping[str, str]) -> Origin:
-    if "contract" not in told:
+def _origin_as_given(root: Path, given: Mapping[str, str]) -> Origin:
+    if "contract" not in given:
         raise ContractError(
             f"{root}: was not made by ibrobot, so it does not say which robot its vectors are of; "
             "name a robot YAML whose contract fits it"
         )
-    if "norm_mode" not in told:
+    if "norm_mode" not in given:
         raise CalibrationError(
             f"{root}: was not made by ibrobot, so it does not say the unit of its joints; "
             "--norm-mode does: radians, degrees or range_m100_100"
         )
-    contract = Contract.from_canonical(json.loads(told["contract"]))
-    calibrations = json.loads(told.get("calibration", "{}"))
-    document = json.loads(told.get("config", "{}"))
+    contract = Contract.from_canonical(json.loads(given["contract"]))
+    calibrations = json.loads(given.get("calibration", "{}"))
+    document = json.loads(given.get("config", "{}"))
     joined = {joint: numbers for each in calibrations.values() for joint, numbers in each.items()}
     return Origin(
-        _described(contract, document, calibrations), contract, document, joined, told["norm_mode"]
+        _described(contract, document, calibrations), contract, document, joined, given["norm_mode"]
     )  # fmt: skip
 
 

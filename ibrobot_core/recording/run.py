@@ -82,7 +82,7 @@ class Run(Protocol):
     def context(self, name: str) -> Context:
         """What a plugin's component is given."""
 
-    def feed(self) -> None:
+    def begin_source(self) -> None:
         """Have the mode move the robot, again where it paused."""
 
     def pause_feed(self) -> None:

@@ -11,8 +11,8 @@ from typing import override
 import attrs
 
 from ibrobot_core.bus import Received, Subscription
-from ibrobot_core.component import Worker, cause
-from ibrobot_core.config.schema import Recording as RecordingConfig
+from ibrobot_core.component import Worker, error_line
+from ibrobot_core.config.schema import RecordingConfig
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import RecorderError
 from ibrobot_core.interfaces import EpisodeEnd, EpisodeStart, Recorder
@@ -44,17 +44,17 @@ class _Begin:
 
 @attrs.frozen
 class _End:
-    """An episode ends; `hoped`: nothing has gone wrong with it so far, and it is to be kept."""
+    """An episode ends; `provisional`: nothing has gone wrong with it so far, and it is to be kept."""
 
     end: EpisodeEnd
-    hoped: bool
+    provisional: bool
 
     @property
     def stamp_ns(self) -> int:
         return self.end.stamp_ns
 
 
-class Recording(Worker):
+class RecordingWorker(Worker):
     """Writes what is on the bus while an episode is on.
 
     A recorder that fails, e.g. on a full disk, ends its episode's recording and is told as a fault; the robot goes on,
@@ -83,9 +83,9 @@ class Recording(Worker):
         """Topic -> size of a message of it [bytes], measured once an episode, since pictures may have to be encoded."""
         self._lost: Mapping[str, int] = {}
         """Topic -> messages lost on the way here, before the present episode."""
-        self._told_absent = False
+        self._reported_absent = False
         self._whole = 0
-        self._hoped = 0
+        self._provisional = 0
         """Episodes kept whole, and those that have ended and are not written to their ends yet."""
         self.failure: RecorderError | None = None
         """Why the recording of the present or last episode ended before it; None where it did not."""
@@ -120,15 +120,15 @@ class Recording(Worker):
     def end(self, outcome: str) -> None:
         """Messages up to here belong to the episode."""
         with self._order:
-            hoped = outcome != "discarded" and self.failure is None
-            self._hoped += hoped
-            self._orders.append(_End(EpisodeEnd(self._session.bus.snapshot_ns(), outcome), hoped))
+            provisional = outcome != "discarded" and self.failure is None
+            self._provisional += provisional
+            self._orders.append(_End(EpisodeEnd(self._session.bus.snapshot_ns(), outcome), provisional))
 
     @property
     def saved(self) -> int:
         """Episodes that have ended and are kept; one that turns out not to be written to its end is taken back."""
         with self._order:
-            return self._whole + self._hoped
+            return self._whole + self._provisional
 
     @override
     def work(self, timeout_s: float) -> None:
@@ -141,10 +141,10 @@ class Recording(Worker):
         for item in items:
             self._note(item)
             while orders and orders[0].stamp_ns < item.received_ns:
-                self._obey(self._recorder, orders.popleft())
+                self._carry_out(self._recorder, orders.popleft())
             self._write(self._recorder, item, item.received_ns)
         for order in orders:
-            self._obey(self._recorder, order)
+            self._carry_out(self._recorder, order)
 
     def rates(self) -> dict[str, float]:
         """Measured rate of each topic that is recorded [Hz]; 0 for one that came once."""
@@ -195,7 +195,7 @@ class Recording(Worker):
             self._newest[item.topic] = item.message
             self._seen.setdefault(item.topic, deque(maxlen=_RATE_WINDOW)).append(item.received_ns)
 
-    def _obey(self, recorder: Recorder, order: _Begin | _End) -> None:
+    def _carry_out(self, recorder: Recorder, order: _Begin | _End) -> None:
         if isinstance(order, _Begin):
             self.failure = None
             self._lost = order.lost
@@ -207,9 +207,9 @@ class Recording(Worker):
         else:
             whole = self._finish(recorder, order.end)
             with self._order:
-                self._hoped -= order.hoped
-                self._whole += order.hoped and whole
-            self._tell_absent()
+                self._provisional -= order.provisional
+                self._whole += order.provisional and whole
+            self._report_absent()
 
     def _finish(self, recorder: Recorder, end: EpisodeEnd) -> bool:
         """End the open episode, if any; whether it is whole."""
@@ -235,7 +235,7 @@ class Recording(Worker):
             self._fail(error)
         except Exception as error:  # a plugin's bug must neither end the run nor go untold
             self._session.log.debug("the recorder failed", exc_info=error)
-            self._fail(RecorderError(f"the recorder {self._config.type!r} failed: {cause(error)}"))
+            self._fail(RecorderError(f"the recorder {self._config.type!r} failed: {error_line(error)}"))
         else:
             return True
         return False
@@ -245,19 +245,19 @@ class Recording(Worker):
         if self.failure is not None:
             return  # what follows from the first is no news
         self.failure = error
-        fault = f"recording ended: {cause(error)}"
+        fault = f"recording ended: {error_line(error)}"
         session.add_fault(fault)
         session.log.error("%s; the robot goes on", fault)
         session.registry.emit(
             "ibrobot_fault_raised", robot=session.config.robot.name, fault=fault, stamp_ns=session.clock.now_ns()
         )
 
-    def _tell_absent(self) -> None:
+    def _report_absent(self) -> None:
         """Say once, after the first episode, which listed topics never came: a misspelt one never will."""
         listed = self._config.topics if isinstance(self._config.topics, tuple) else ()
         absent = [topic for topic in listed if topic not in self._seen]
-        if absent and not self._told_absent:
-            self._told_absent = True
+        if absent and not self._reported_absent:
+            self._reported_absent = True
             there = ", ".join(self._session.bus.topics())
             self._session.log.warning(
                 "recording.topics: nothing of %s has come so far, nor was recorded; there are: %s",

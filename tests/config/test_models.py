@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ibrobot_core.config.models import Model, ModelError, read_mjcf, read_urdf
+from ibrobot_core.config.models import DescriptionModel, ModelError, read_mjcf, read_urdf
 from ibrobot_core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ MJCF = """<mujoco>
 """
 
 
-def limits_of(model: Model) -> dict[str, tuple[float, float]]:
+def limits_of(model: DescriptionModel) -> dict[str, tuple[float, float]]:
     return {name: (limits.lower, limits.upper) for name, limits in model.limits.items()}
 
 

@@ -13,10 +13,10 @@ from ibrobot_core.config.schema import (
     Align,
     ContractConfig,
     ControlMode,
-    ExecutorComponent,
+    ExecutorConfig,
     ImageSpec,
     ObservationSpec,
-    Peripheral,
+    PeripheralConfig,
     RobotConfig,
 )
 from ibrobot_core.options import NoOptions
@@ -40,14 +40,14 @@ def make_config(
     rate_hz: float = 30.0,
 ) -> RobotConfig:
     executors = {
-        "arm_position": ExecutorComponent("position", NoOptions(), "arm_position", "arm", ARM),
-        "gripper_position": ExecutorComponent("position", NoOptions(), "gripper_position", "gripper", GRIPPER),
-        "whole_position": ExecutorComponent("position", NoOptions(), "whole_position", "all", GRIPPER + ARM),
+        "arm_position": ExecutorConfig("position", NoOptions(), "arm_position", "arm", ARM),
+        "gripper_position": ExecutorConfig("position", NoOptions(), "gripper_position", "gripper", GRIPPER),
+        "whole_position": ExecutorConfig("position", NoOptions(), "whole_position", "all", GRIPPER + ARM),
     }
     peripherals = {
-        "top": Peripheral("webcam", NoOptions(), "top", "camera", picture=(4, 6)),
-        "wrist": Peripheral("webcam", NoOptions(), "wrist", "camera"),
-        "chest": Peripheral("gyro", NoOptions(), "chest", "imu"),
+        "top": PeripheralConfig("webcam", NoOptions(), "top", "camera", picture=(4, 6)),
+        "wrist": PeripheralConfig("webcam", NoOptions(), "wrist", "camera"),
+        "chest": PeripheralConfig("gyro", NoOptions(), "chest", "imu"),
     }
     return RobotConfig(
         robot=make_robot(),

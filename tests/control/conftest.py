@@ -175,7 +175,7 @@ class Rig:
         rows = round(seconds * 100) + 1
         positions = np.linspace(self.core.state.command, end, rows)
         now_ns = self.clock.now_ns()
-        record = PlanRecord(self.core.epoch, now_ns, self.core.period_ns, np.array(joints), positions)
+        record = PlanRecord(self.core.generation, now_ns, self.core.period_ns, np.array(joints), positions)
         self.core.set_plan(record)
 
     def call(self, do: str, **arguments: Any) -> dict[str, Any]:

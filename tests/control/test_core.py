@@ -57,7 +57,7 @@ class TestModes:
         rig.tick()
         answer = rig.call("switch_mode", mode="plan")
 
-        assert answer["epoch"] == rig.core.epoch
+        assert answer["generation"] == rig.core.generation
         rig.tick(60)
         sagged = rig.hardware._position[1]
         np.testing.assert_allclose(rig.core.state.command[1], 0.45, atol=0.01)
@@ -76,10 +76,10 @@ class TestModes:
     def test_plans_from_before_a_switch_are_counted_and_not_followed(self, make_rig):
         rig = make_rig({}).start()
         before = rig.tick().command
-        epoch = rig.core.epoch
+        generation = rig.core.generation
         rig.call("switch_mode", mode="plan")
         rig.call("switch_mode", mode="stream")
-        old = PlanRecord(epoch, rig.clock.now_ns(), rig.core.period_ns, np.ones(3, bool), np.full((50, 3), 0.9))
+        old = PlanRecord(generation, rig.clock.now_ns(), rig.core.period_ns, np.ones(3, bool), np.full((50, 3), 0.9))
         rig.core.set_plan(old)
 
         np.testing.assert_allclose(rig.tick(30).command, before, atol=1e-6)

@@ -288,8 +288,8 @@ class TestSimulation:
         rig.tick(20)
         starts = []
         for seed in (3, 4, 3):
-            epoch = rig.core.epoch
-            assert rig.call("reset_episode", seed=seed)["epoch"] > epoch
+            generation = rig.core.generation
+            assert rig.call("reset_episode", seed=seed)["generation"] > generation
             starts.append(rig.tick().command)
 
         np.testing.assert_array_equal(starts[0], starts[2])

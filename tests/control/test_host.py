@@ -135,17 +135,19 @@ class TestBoth:
     def test_the_mode_begins_at_the_startup_pose(self, make, kind, told):
         host = make(kind, startup="pose out")
         host.start()
-        epoch = host.call("counters")["epoch"]
+        generation = host.call("counters")["generation"]
         if isinstance(host, InlineControl):
             host.step()
-        np.testing.assert_allclose(told.state(lambda state: state.epoch == epoch).command, [0.4, 0.8], atol=0.01)
+        np.testing.assert_allclose(
+            told.state(lambda state: state.generation == generation).command, [0.4, 0.8], atol=0.01
+        )
 
-    def test_commands_are_answered_with_the_epoch_and_refused_with_the_reason(self, make, kind):
+    def test_commands_are_answered_with_the_generation_and_refused_with_the_reason(self, make, kind):
         host = make(kind)
         host.start()
-        first = host.call("switch_mode", mode="plan")["epoch"]
+        first = host.call("switch_mode", mode="plan")["generation"]
 
-        assert host.call("switch_mode", mode="stream")["epoch"] > first
+        assert host.call("switch_mode", mode="stream")["generation"] > first
         with pytest.raises(HardwareError, match="no mode 'dance'; the modes are: stream, plan"):
             host.call("switch_mode", mode="dance")
 
@@ -159,7 +161,7 @@ class TestProcess:
         end = np.array([0.3, 0.9])
         # It ends with seconds at rest, so that it is no matter when it comes.
         positions = np.vstack([np.linspace(first.command, end, 50), np.full((1500, 2), end)])
-        host.write_plan(PlanRecord(first.epoch, first.stamp_ns, 10_000_000, np.ones(2, dtype=bool), positions))
+        host.write_plan(PlanRecord(first.generation, first.stamp_ns, 10_000_000, np.ones(2, dtype=bool), positions))
 
         ticks = [first.tick]
         told.state(lambda state: ticks.append(state.tick) or np.allclose(state.command, end))
@@ -184,7 +186,7 @@ class TestProcess:
         assert told.state(lambda state: state.estop)
 
         resting = told.state(lambda state: state.estop)
-        assert host.call("reset")["epoch"] > resting.epoch
+        assert host.call("reset")["generation"] > resting.generation
         assert told.state(lambda state: not state.estop)
 
     def test_its_report_has_the_whole_run_at_the_end(self, make, told):
@@ -251,7 +253,7 @@ class TestInline:
         host.step()
         state = told.states.get_nowait()
         far = np.linspace(state.command, state.command + 0.5, 20)
-        host.write_plan(PlanRecord(state.epoch, 0, 10_000_000, np.ones(2, dtype=bool), far))
+        host.write_plan(PlanRecord(state.generation, 0, 10_000_000, np.ones(2, dtype=bool), far))
         for _ in range(10):
             host._clock.advance(10_000_000)
             host.step()

@@ -18,7 +18,7 @@ from ibrobot_core.control.link import (
     PLAN_ROWS,
     STATE_SLOTS,
     ControlState,
-    Layout,
+    LinkLayout,
     PlanRecord,
     SharedMemory,
     raise_error,
@@ -26,7 +26,7 @@ from ibrobot_core.control.link import (
 from ibrobot_core.errors import HardwareError
 from ibrobot_core.memory import create_memory
 
-LAYOUT = Layout(joints=3, signals=2)
+LAYOUT = LinkLayout(joints=3, signals=2)
 FLOATS = st.floats(width=64)
 VECTOR = arrays(np.float64, 3, elements=FLOATS)
 
@@ -38,8 +38,8 @@ def state(tick: int, success: bool | None = None, vectors: np.ndarray | None = N
     )
 
 
-def plan(epoch: int = 1, rows: int = 4) -> PlanRecord:
-    return PlanRecord(epoch, 100, 10, np.array([True, False, True]), np.arange(3.0 * rows).reshape(rows, 3))
+def plan(generation: int = 1, rows: int = 4) -> PlanRecord:
+    return PlanRecord(generation, 100, 10, np.array([True, False, True]), np.arange(3.0 * rows).reshape(rows, 3))
 
 
 def assert_same(one: object, other: object) -> None:
@@ -130,8 +130,8 @@ class TestPlans:
     def test_one_torn_between_its_copy_and_its_check_is_refused(self, sides, monkeypatch, reached):
         """The writer had reached this byte of the rows when they were copied, and ends before they are checked."""
         host, control = sides
-        for epoch in (1, 2, 3):
-            host.write_plan(attrs.evolve(plan(epoch, rows=5), positions=np.full((5, 3), float(epoch))))
+        for generation in (1, 2, 3):
+            host.write_plan(attrs.evolve(plan(generation, rows=5), positions=np.full((5, 3), float(generation))))
         slot = control._plans[1]  # of the first and the third
         complete = slot.copy()
         rows = slot["positions"][:5].reshape(-1).view(np.uint8)
@@ -165,13 +165,13 @@ class TestPlans:
         host._plans[1] = new
         received = control.read_plan()
         assert received is not None
-        assert received.epoch == 3
+        assert received.generation == 3
 
     def test_the_newest_comes_once(self, sides):
         host, control = sides
         assert control.read_plan() is None
-        for epoch in (1, 2, 3):
-            host.write_plan(plan(epoch))
+        for generation in (1, 2, 3):
+            host.write_plan(plan(generation))
 
         received = control.read_plan()
         assert received is not None
@@ -205,7 +205,7 @@ class TestPlans:
         with pytest.raises(ValueError, match=f"1 to {PLAN_ROWS} setpoints, got {rows}"):
             sides[0].write_plan(plan(rows=rows))
 
-    @pytest.mark.parametrize("field", ["epoch", "start", "step", "rows", "mask", "positions", "crc"])
+    @pytest.mark.parametrize("field", ["generation", "start", "step", "rows", "mask", "positions", "crc"])
     def test_torn_ones_are_counted_and_never_given_out(self, sides, field):
         host, control = sides
         host.write_plan(plan())
@@ -226,10 +226,10 @@ class TestPlans:
 
         received = control.read_plan()
         assert received is not None
-        assert received.epoch == 1
+        assert received.generation == 1
 
 
 def test_an_answer_with_an_error_raises_it() -> None:
-    assert raise_error({"reply": 1, "epoch": 2}) == {"reply": 1, "epoch": 2}
+    assert raise_error({"reply": 1, "generation": 2}) == {"reply": 1, "generation": 2}
     with pytest.raises(HardwareError, match="no servo 3"):
         raise_error({"reply": 1, "error": "no servo 3"})

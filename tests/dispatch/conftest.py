@@ -16,8 +16,8 @@ from ibrobot_core.config.schema import (
     Align,
     ContractConfig,
     ControlMode,
-    Dispatch,
-    ExecutorComponent,
+    DispatchConfig,
+    ExecutorConfig,
     ObservationSpec,
     RobotConfig,
     Smoothing,
@@ -63,7 +63,7 @@ def make_contract(safety_behavior: str) -> Contract:
     action = ActionSpec(executor="all", topic="/commands", safety_behavior=safety_behavior)
     config = RobotConfig(
         robot=ROBOT,
-        executors={"all": ExecutorComponent("position", NoOptions(), "all", "all", ROBOT.joint_names)},
+        executors={"all": ExecutorConfig("position", NoOptions(), "all", "all", ROBOT.joint_names)},
         control_modes={"idle": ControlMode(())},
         default_control_mode="idle",
         contract=ContractConfig(rate_hz=10.0, observations=(state,), actions=(action,)),
@@ -88,7 +88,7 @@ class Rig:
         names = ROBOT.joint_names
         spec = PolicySpec({"observation.state": (SIZE,)}, names, SIZE, chunk_size, rate_hz, prefix=prefix)
         self.dispatcher = Dispatcher(
-            make_contract(safety_behavior), spec, Dispatch(watermark, strategy, Smoothing(enabled, coeff)), ROBOT,
+            make_contract(safety_behavior), spec, DispatchConfig(watermark, strategy, Smoothing(enabled, coeff)), ROBOT,
             self.bus, self.client, self._take, timeout_s, "pick the cube",
         )  # fmt: skip
         self.dispatcher.begin(7)

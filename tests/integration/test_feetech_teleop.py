@@ -23,7 +23,7 @@ from ibrobot_core.contract.joint_units import calibrations
 from ibrobot_core.control import host
 from ibrobot_core.errors import IbrobotError
 from ibrobot_core.launch.runtime import ESTOP, RESET, Runtime
-from ibrobot_core.launch.session import Request, Session
+from ibrobot_core.launch.session import LaunchRequest, Session
 from ibrobot_core.plugins import installed_plugins
 
 pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("prompt_threads")]
@@ -139,7 +139,7 @@ def station(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callabl
         )
         config = load_config(CONFIG, overrides=(*sections, *overrides), mode="teleop")
         typed = queue.SimpleQueue[str]()
-        session = Session(config, installed_plugins(), Request(keys=lambda: typed))
+        session = Session(config, installed_plugins(), LaunchRequest(keys=lambda: typed))
         station = Station(leader, follower, Runtime(session), typed)
         made.append(station)
         follower.on_request = station.count

@@ -14,7 +14,7 @@ from ibrobot_core.cli.main import main
 from ibrobot_core.config import find_config, load_config
 from ibrobot_core.errors import PluginError
 from ibrobot_core.launch.runtime import Runtime
-from ibrobot_core.launch.session import Request, Session
+from ibrobot_core.launch.session import LaunchRequest, Session
 from ibrobot_core.plugins import installed_plugins
 
 pytestmark = pytest.mark.integration
@@ -132,7 +132,9 @@ def test_unknown_type_stays_an_error_in_every_mode(only: Only, ibrobot: Run) -> 
 
 def test_switch_to_an_unavailable_mode_is_refused_with_the_remedy(only: Only) -> None:
     only("feetech")
-    runtime = Runtime(Session(load_config(find_config("so101", installed_plugins())), installed_plugins(), Request()))
+    runtime = Runtime(
+        Session(load_config(find_config("so101", installed_plugins())), installed_plugins(), LaunchRequest())
+    )
 
     with pytest.raises(PluginError, match=r"^mode jog is unavailable: .*: pip install ibrobot-plugin-keyboard$"):
         runtime.switch_mode("jog")

@@ -30,7 +30,7 @@ from ibrobot_core.contract.frames import FrameSampler, frames
 from ibrobot_core.contract.specs import ActionPart, Contract, ObservationPart
 from ibrobot_core.interfaces import EpisodeEnd, EpisodeStart, Feature, Frame
 from ibrobot_core.launch.runtime import Runtime
-from ibrobot_core.launch.session import Request, Session
+from ibrobot_core.launch.session import LaunchRequest, Session
 from ibrobot_core.messages import CompressedImage, Float64MultiArray, Header, Imu, JointState, Message, Vector3
 from ibrobot_core.plugins import installed_plugins
 
@@ -256,7 +256,7 @@ def test_a_whole_run_in_simulation(site: Any, tmp_path: Path, rendering: None) -
         f"recording={{type: mcap, root: {tmp_path}}}",
     )  # fmt: skip
     config = load_config(robot, overrides=overrides, mode="model_inference", sim=True)
-    runtime = Runtime(Session(config, registry, Request(lockstep=True, duration_s=1.5)))
+    runtime = Runtime(Session(config, registry, LaunchRequest(lockstep=True, duration_s=1.5)))
     runtime.start()
     try:
         while not runtime.step():

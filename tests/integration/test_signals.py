@@ -11,7 +11,7 @@ from typing import Any
 import pyarrow.parquet as pq
 import pytest
 from ibrobot_data.episode import DATASET, Job, convert_episode
-from ibrobot_data.request import EpisodeReport, Request
+from ibrobot_data.request import ConversionRequest, EpisodeReport
 from ibrobot_lerobot.options import LeRobotOptions
 from ibrobot_ros2 import encode
 from recordings import JOINTS, START_NS
@@ -80,7 +80,9 @@ def contract(folder: Path, text: str) -> Contract:
 
 def converted(bag: Path, folder: Path, text: str) -> tuple[dict[str, list[Any]], EpisodeReport]:
     """The columns of the dataset of a bag, its task as text, and what the conversion reports."""
-    request = Request(folder / "set", LeRobotOptions(), "lerobot", contract=contract(folder, text), prompt="by hand")
+    request = ConversionRequest(
+        folder / "set", LeRobotOptions(), "lerobot", contract=contract(folder, text), prompt="by hand"
+    )
     report = convert_episode(Job(request, bag, "bag", folder / "unit"), lambda frames: None)
     if report.error:
         return {}, report

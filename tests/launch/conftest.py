@@ -14,7 +14,7 @@ import pytest
 
 from ibrobot_core.config import load_config
 from ibrobot_core.launch.runtime import Runtime
-from ibrobot_core.launch.session import Request, Session
+from ibrobot_core.launch.session import LaunchRequest, Session
 from ibrobot_core.plugins import discover
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ class Runs:
         path.write_text(ROBOT)
         registry = discover(self.site.entry_points())
         config = load_config(path, overrides=overrides, mode=mode, sim=sim, registry=registry)
-        runtime = Runtime(Session(config, registry, Request(**{"lockstep": True, **asked})))
+        runtime = Runtime(Session(config, registry, LaunchRequest(**{"lockstep": True, **asked})))
         self.made.append(runtime)
         return runtime
 

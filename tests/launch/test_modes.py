@@ -205,8 +205,8 @@ def test_an_emergency_stop_fails_the_goal_under_way(runs: Runs):
 def test_what_an_executor_tells_of_an_earlier_goal_does_not_end_the_present_one(runs: Runs):
     runtime = runs.start(mode="plan", goals=("up",))
     seconds(runtime, 0.1)
-    assert runtime.session.feeder is not None
-    runtime.session.feeder.take_goal(
+    assert runtime.session.command_source is not None
+    runtime.session.command_source.take_goal(
         {"executor": "arm_trajectory", "goal": "0:arm_trajectory", "state": "canceled", "message": "", "result": {}}
     )
     while not runtime.step():

@@ -46,8 +46,8 @@ class Terminal:
             for _ in range(draws):
                 self.run.step()
                 self.rates.sample(self.run.session)
-                feeder = self.run.session.feeder
-                help_text = feeder.help() if feeder is not None else ""
+                source = self.run.session.command_source
+                help_text = source.help() if source is not None else ""
                 live.update(panel(self.run.session, self.log, self.rates, help_text), refresh=True)
             drawn = sent.getvalue()  # before the display ends, which adds a line
         screen = pyte.Screen(self.width, self.height)
@@ -62,7 +62,7 @@ class Terminal:
 @pytest.fixture(params=SIZES, ids=lambda size: "x".join(map(str, size)))
 def terminal(runs: Runs, request: pytest.FixtureRequest) -> Terminal:
     runtime = runs.start("contract.max_duration_s=100", mode="policy", seed=13)  # a scene that never succeeds
-    for _ in range(5):  # the episode begins, and with it the epoch
+    for _ in range(5):  # the episode begins, and with it the generation
         runtime.step()
     return Terminal(runtime, *request.param)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ibrobot_core.launch.runtime import ESTOP, Runtime
-from ibrobot_core.launch.sources.replay import MODE, Replay, ReplayFeeder
+from ibrobot_core.launch.sources.replay import MODE, Replay, ReplaySource
 from ibrobot_core.recording.playback import Playback, Track
 
 if TYPE_CHECKING:
@@ -40,9 +40,9 @@ def commands(runtime: Runtime) -> np.ndarray:
 
 
 def report(runtime: Runtime) -> dict[str, Any]:
-    feeder = runtime.plan.mode.feeder
-    assert isinstance(feeder, ReplayFeeder)
-    return feeder.report()
+    source = runtime.plan.mode.source
+    assert isinstance(source, ReplaySource)
+    return source.report()
 
 
 def test_the_commands_are_those_of_the_episode_after_a_slow_way_to_the_first(runs: Runs):
@@ -85,9 +85,9 @@ def test_a_scene_that_does_not_succeed_again_is_told(runs: Runs):
 def test_tracking_is_the_difference_to_the_recorded_states(runs: Runs):
     first = replay(runs)
     commands(first)
-    feeder = first.plan.mode.feeder
-    assert isinstance(feeder, ReplayFeeder)
-    stamps, positions = zip(*feeder._measured, strict=True)
+    source = first.plan.mode.source
+    assert isinstance(source, ReplaySource)
+    stamps, positions = zip(*source._measured, strict=True)
     states = Track(np.array(stamps) * 1e-9, np.array(positions))
     again = replay(runs, attrs.evolve(WAVE, states=states))
     commands(again)
@@ -113,14 +113,14 @@ def test_a_fault_ends_it(runs: Runs):
 
 def test_a_host_that_is_held_up_cuts_nothing_out(runs: Runs, monkeypatch: pytest.MonkeyPatch):
     runtime = replay(runs, attrs.evolve(WAVE, commands=Track(TIMES * 4, WAVE.commands.positions)))
-    feeder = runtime.plan.mode.feeder
-    work, units = feeder.work, iter(range(1000))
+    source = runtime.plan.mode.source
+    work, units = source.work, iter(range(1000))
 
     def held_up(timeout_s: float) -> None:
         if not 100 <= next(units) < 250:
             work(timeout_s)
 
-    monkeypatch.setattr(feeder, "work", held_up)
+    monkeypatch.setattr(source, "work", held_up)
     told = commands(runtime)
     first = next(i for i, command in enumerate(told) if np.allclose(command, WAVE.commands.positions[0], atol=1e-9))
     assert first < 100

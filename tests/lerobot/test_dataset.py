@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from ibrobot_data.request import Request
+from ibrobot_data.request import ConversionRequest
 from ibrobot_data.run import convert, find_episodes
 from ibrobot_lerobot.options import LeRobotOptions
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -62,14 +62,14 @@ def bags(tmp_path_factory: pytest.TempPathFactory) -> Path:
         record(root / f"episode_{number:06d}", number, seconds, "sort the blocks" if number == 2 else "pick the cube")
     # The first conversion starts a process, and opens memory, that live as long as the interpreter.
     convert(
-        Request(tmp_path_factory.mktemp("first") / "set", LeRobotOptions(videos=False), "lerobot"),
+        ConversionRequest(tmp_path_factory.mktemp("first") / "set", LeRobotOptions(videos=False), "lerobot"),
         find_episodes([root])[:1],
     )
     return root
 
 
 def converted(bags: Path, out: Path, **options: Any) -> LeRobotDataset:
-    report = convert(Request(out, LeRobotOptions(**options), "lerobot"), find_episodes([bags]))
+    report = convert(ConversionRequest(out, LeRobotOptions(**options), "lerobot"), find_episodes([bags]))
     assert not report.failed
     return LeRobotDataset("local/converted", root=out)
 
@@ -104,8 +104,10 @@ def test_codecs_that_reorder_pictures_keep_step(bags: Path, tmp_path: Path) -> N
 
 
 def test_small_files_keep_step(bags: Path, tmp_path: Path) -> None:
-    first = convert(Request(tmp_path / "set", LeRobotOptions(), "lerobot"), find_episodes([bags / "episode_000001"]))
-    rest = convert(Request(tmp_path / "set", LeRobotOptions(), "lerobot", append=True), find_episodes([bags]))
+    first = convert(
+        ConversionRequest(tmp_path / "set", LeRobotOptions(), "lerobot"), find_episodes([bags / "episode_000001"])
+    )
+    rest = convert(ConversionRequest(tmp_path / "set", LeRobotOptions(), "lerobot", append=True), find_episodes([bags]))
     assert (len(first.converted), len(rest.converted)) == (1, 2)
     check_frames(LeRobotDataset("local/converted", root=tmp_path / "set"), bags, LOSSY)
 

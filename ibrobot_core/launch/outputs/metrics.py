@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, override
 
-from ibrobot_core.component import Component, cause
+from ibrobot_core.component import Component, error_line
 from ibrobot_core.config.schema import MetricsConfig
 from ibrobot_core.launch.outputs.status import counts
 from ibrobot_core.launch.session import Session
@@ -79,7 +79,7 @@ def unhealthy(session: Session) -> str:
     """Why the run should be started again; empty where it should not."""
     if session.failure is not None:
         component, error = session.failure
-        return f"{component}: {cause(error)}"
+        return f"{component}: {error_line(error)}"
     return "the run is over" if session.finished.is_set() else ""
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from typing import override
 
-from ibrobot_core.config.schema import Component as ConfigComponent
+from ibrobot_core.config.schema import ComponentConfig
 from ibrobot_core.interfaces import Viewer
 from ibrobot_core.launch.session import Session, SessionWorker
 
@@ -15,7 +15,7 @@ _RATE_HZ = 30.0
 class ViewerWorker(SessionWorker):
     """Updates a viewer 30 times a second; closing the window ends the run."""
 
-    def __init__(self, session: Session, component: ConfigComponent, needs: tuple[str, ...]) -> None:
+    def __init__(self, session: Session, component: ComponentConfig, needs: tuple[str, ...]) -> None:
         super().__init__(session, "viewer", component.type, needs)
         self._component = component
         self._viewer: Viewer | None = None

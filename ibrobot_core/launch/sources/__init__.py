@@ -1,1 +1,1 @@
-"""What gives the executors of a mode something to do: a policy, a teleoperation device, a planner, a replay."""
+"""Command sources: a policy, a teleoperation device, a planner or a replay commands the executors of a mode."""

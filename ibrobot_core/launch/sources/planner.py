@@ -11,13 +11,12 @@ from typing import Any, override
 import attrs
 import numpy as np
 
-from ibrobot_core.config.schema import Component as ConfigComponent
-from ibrobot_core.config.schema import ControlMode
+from ibrobot_core.config.schema import ComponentConfig, ControlMode
 from ibrobot_core.control.executors.trajectory_goal import goal_from_message
 from ibrobot_core.errors import HardwareError, PlanningError
 from ibrobot_core.interfaces import JointGoal, Planner, PlanRequest
 from ibrobot_core.launch.session import Session
-from ibrobot_core.launch.sources.feeder import Feeder
+from ibrobot_core.launch.sources.source_worker import SourceWorker
 from ibrobot_core.robot import Robot
 
 GO_TO = "/planning/go_to"
@@ -33,10 +32,10 @@ class _Motion:
     failures: list[str] = attrs.field(factory=list)
 
 
-class PlanningFeeder(Feeder):
+class PlannerSource(SourceWorker):
     """Plans from where the robot is to each goal in turn; service `/planning/go_to` takes goals too."""
 
-    def __init__(self, session: Session, mode: ControlMode, planner: ConfigComponent, needs: tuple[str, ...]) -> None:
+    def __init__(self, session: Session, mode: ControlMode, planner: ComponentConfig, needs: tuple[str, ...]) -> None:
         super().__init__(session, mode, f"planner {planner.type}", needs)
         self._component = planner
         self._planner: Planner | None = None
@@ -64,13 +63,13 @@ class PlanningFeeder(Feeder):
         self._goals.put(goal)
 
     @override
-    def begin_feeding(self, seed: int) -> None:
+    def begin_mode(self, seed: int) -> None:
         if self._motion is not None:
             self._finish(self._motion.text, ["control was reset"])
         self.session.bus.serve(GO_TO, self.go_to)
 
     @override
-    def end_feeding(self) -> None:
+    def end_mode(self) -> None:
         self.session.bus.unserve(GO_TO)
 
     @override

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import override
 
 from ibrobot_core.component import Component
-from ibrobot_core.config.schema import ControlMode, Inference
+from ibrobot_core.config.schema import ControlMode, InferenceConfig
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.dispatch.dispatcher import Dispatcher
 from ibrobot_core.errors import PolicyError
@@ -18,7 +18,7 @@ from ibrobot_core.interfaces import PictureCodec, Policy
 from ibrobot_core.launch.absence import refuse
 from ibrobot_core.launch.models import check_model
 from ibrobot_core.launch.session import ActingPolicy, Session
-from ibrobot_core.launch.sources.feeder import Feeder
+from ibrobot_core.launch.sources.source_worker import SourceWorker
 from ibrobot_core.launch.transport import NAME as TRANSPORT
 from ibrobot_core.robot import Vector
 from ibrobot_core.units import NS_PER_S
@@ -26,10 +26,10 @@ from ibrobot_core.units import NS_PER_S
 TOGGLE_SMOOTHING = "/action_dispatcher/toggle_smoothing"
 
 
-class Model(Component):
+class LoadedModel(Component):
     """Makes a policy, compares it with the contract, and has it loaded where it runs, before anything is powered."""
 
-    def __init__(self, session: Session, inference: Inference) -> None:
+    def __init__(self, session: Session, inference: InferenceConfig) -> None:
         model = session.config.models[inference.model]
         distributed = inference.execution_mode == "distributed"
         where = {"monolithic": "", "process": ", in a process of its own", "distributed": ", on a server"}
@@ -116,13 +116,18 @@ class Model(Component):
             self._policy = None
 
 
-class InferenceFeeder(Feeder):
+class PolicySource(SourceWorker):
     """The dispatcher on the contract's ticks, fed by a model."""
 
     autonomous = True
 
     def __init__(
-        self, session: Session, mode: ControlMode, inference: Inference, model: Model, needs: tuple[str, ...]
+        self,
+        session: Session,
+        mode: ControlMode,
+        inference: InferenceConfig,
+        model: LoadedModel,
+        needs: tuple[str, ...],
     ) -> None:
         summary = f"{inference.model} through the dispatcher at {session.config.contract.rate_hz:g} Hz"
         super().__init__(session, mode, summary, (*needs, model.name))
@@ -155,7 +160,7 @@ class InferenceFeeder(Feeder):
             self.dispatcher.toggle_smoothing(enabled)
 
     @override
-    def begin_feeding(self, seed: int) -> None:
+    def begin_mode(self, seed: int) -> None:
         model = self._model
         self.session.acting = ActingPolicy(self.dispatcher.stats, model.engine.stats, model.described)
         self._next_ns = self.session.bus.snapshot_ns() + self._step_ns
@@ -163,7 +168,7 @@ class InferenceFeeder(Feeder):
         self.session.bus.serve(TOGGLE_SMOOTHING, self.toggle_smoothing)
 
     @override
-    def end_feeding(self) -> None:
+    def end_mode(self) -> None:
         self.session.bus.unserve(TOGGLE_SMOOTHING)
         self.dispatcher.end()
         self.session.acting = None

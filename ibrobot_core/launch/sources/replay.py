@@ -11,7 +11,7 @@ from ibrobot_core.bus import Subscription
 from ibrobot_core.config.schema import ControlMode
 from ibrobot_core.control.link import ControlState
 from ibrobot_core.launch.session import Session
-from ibrobot_core.launch.sources.feeder import Feeder
+from ibrobot_core.launch.sources.source_worker import SourceWorker
 from ibrobot_core.recording.playback import Playback, Track
 from ibrobot_core.robot import Vector
 from ibrobot_core.units import NS_PER_S, ns, seconds
@@ -39,7 +39,7 @@ class Replay:
     """Seconds of the recording in a second."""
 
 
-class ReplayFeeder(Feeder):
+class ReplaySource(SourceWorker):
     """Plays an episode once, and ends the run. The commands go the way of a teleop's, through executors and safety.
 
     In simulation the scene is set up by the recorded seed first. A fault ends the replay.
@@ -68,7 +68,7 @@ class ReplayFeeder(Feeder):
         self._states = self.session.bus.subscribe("/joint_states", 1)
 
     @override
-    def begin_feeding(self, seed: int) -> None:
+    def begin_mode(self, seed: int) -> None:
         self._begun_ns, self._measured, self._success = None, [], None
         recorded = self._replay.playback.seed
         if self.session.config.simulated and recorded is not None:
@@ -86,7 +86,7 @@ class ReplayFeeder(Feeder):
             if session.outcome.faults:
                 self.active = False
                 session.finish()
-            elif state.epoch == session.epoch:
+            elif state.generation == session.generation:
                 self._follow(state)
 
     def _follow(self, state: ControlState) -> None:
@@ -132,8 +132,8 @@ class ReplayFeeder(Feeder):
     def _end_when_done(self, late_ns: int) -> None:
         """End the run, `late_ns` [ns] after the last setpoint was due."""
         session = self.session
-        hoped = session.config.simulated and self._replay.playback.outcome == "success" and self._success is False
-        if late_ns < (_SETTLE_NS if hoped else 0):
+        provisional = session.config.simulated and self._replay.playback.outcome == "success" and self._success is False
+        if late_ns < (_SETTLE_NS if provisional else 0):
             return
         self.active = False
         if self._success is not None and self._replay.playback.outcome == "success":

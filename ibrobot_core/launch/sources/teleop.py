@@ -11,10 +11,10 @@ from ibrobot_core.config.schema import ControlMode
 from ibrobot_core.errors import TeleopError
 from ibrobot_core.interfaces import Teleop
 from ibrobot_core.launch.session import Session
-from ibrobot_core.launch.sources.feeder import Feeder
+from ibrobot_core.launch.sources.source_worker import SourceWorker
 
 
-class TeleopFeeder(Feeder):
+class TeleopSource(SourceWorker):
     """A teleoperation device. It joins at the plan: there is one way to the motors.
 
     A device that fails while the robot follows is a fault; a reset connects it anew.
@@ -44,7 +44,7 @@ class TeleopFeeder(Feeder):
                 self._lost = False
 
     @override
-    def begin_feeding(self, seed: int) -> None:
+    def begin_mode(self, seed: int) -> None:
         assert self._device is not None
         self._device.activate(self.session.measured())
 

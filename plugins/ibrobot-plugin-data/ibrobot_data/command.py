@@ -29,7 +29,7 @@ from ibrobot_core.api import (
     with_closed_ends,
     wrong_input,
 )
-from ibrobot_data.request import MISSING, OUTCOMES, EpisodeReport, Report, Request
+from ibrobot_data.request import MISSING, OUTCOMES, ConversionRequest, EpisodeReport, Report
 
 if TYPE_CHECKING:
     from ibrobot_core.api import RobotConfig
@@ -39,7 +39,7 @@ _ONLY_TO_BAG = ("numbers",)
 _ONLY_TO_DATASET = ("append", "type_", "force_contract", "missing", "outcomes", "success", "jobs")
 _MUCH = 0.1
 """An episode that lost more of its ticks is named."""
-_MISSING = attrs.fields(Request).missing.default
+_MISSING = attrs.fields(ConversionRequest).missing.default
 
 
 def _flags() -> dict[str, Flag]:
@@ -116,7 +116,7 @@ def _to_dataset(
     given = [(flag, asked.pop(name)) for name, flag in _flags().items()]
     overrides = [f"{flag.option}={flag.value or value}" for flag, value in given if value]
     type_ = type_ or installed_plugins().default("dataset")
-    request = Request(
+    request = ConversionRequest(
         out, _options("dataset", type_, (*overrides, *sets)), type_,
         outcomes=outcomes or OUTCOMES, jobs=jobs or _jobs(), norm_mode=norm_mode or "radians",
         **_told(config, calibration), **asked,
@@ -130,7 +130,7 @@ def _to_bags(
     *, episodes: tuple[Path, ...], out: Path, config: str | None, calibration: str | None, as_json: bool,
     sets: tuple[str, ...], norm_mode: str | None, numbers: str | None, prompt: str, **_: Any,
 ) -> Report:  # fmt: skip
-    from ibrobot_core.api import EpisodeAddress, stated_by_robot
+    from ibrobot_core.api import EpisodeAddress, metadata_from_config
     from ibrobot_data.episode import make_writer
     from ibrobot_data.to_bags import BagRequest, convert_to_bags
 
@@ -138,7 +138,7 @@ def _to_bags(
         raise click.UsageError("--to bag takes one dataset at a time")
     address = EpisodeAddress.of(episodes[0])
     dataset, recorder = installed_plugins().default("dataset"), installed_plugins().default("recorder")
-    writer = make_writer(Request(address.path, _options("dataset", dataset, ()), dataset))
+    writer = make_writer(ConversionRequest(address.path, _options("dataset", dataset, ()), dataset))
     if (summary := writer.summary(address.path)) is None:
         raise DatasetError(f"{address.path}: there is no dataset of type {dataset}")
     chosen = (address.number,) if address.number is not None else _numbers(numbers, summary.episodes)
@@ -146,7 +146,7 @@ def _to_bags(
     request = BagRequest(
         address.path, chosen, out, _options("recorder", recorder, sets), recorder, prompt=prompt,
         contract=Contract.from_config(robot) if robot is not None else None,
-        told=stated_by_robot(robot, norm_mode, _calibration(calibration)) if robot is not None else {},
+        given=metadata_from_config(robot, norm_mode, _calibration(calibration)) if robot is not None else {},
     )  # fmt: skip
     with _progress(len(chosen), as_json) as watch:
         return convert_to_bags(request, watch)

@@ -38,7 +38,7 @@ from ibrobot_core.api import (
     recorded_contract,
 )
 from ibrobot_data.identity import identity
-from ibrobot_data.request import EpisodeReport, Request
+from ibrobot_data.request import ConversionRequest, EpisodeReport
 from ibrobot_data.ticks import Ticks
 
 SUCCESS = "next.success"
@@ -55,7 +55,7 @@ _VERSION = 3
 class Job:
     """One episode to convert, and the unit that it becomes: a folder that is there whole or not at all."""
 
-    request: Request
+    request: ConversionRequest
     episode: Path
     source: str
     unit: Path
@@ -85,7 +85,7 @@ class Unit:
         return self.path / DATASET
 
 
-def make_writer(request: Request) -> DatasetWriter:
+def make_writer(request: ConversionRequest) -> DatasetWriter:
     """The dataset writer that is asked for.
 
     Raises:
@@ -165,7 +165,7 @@ def unexpected(error: Exception) -> str:
     return f"{type(error).__name__}: {error} (at {where}): a fault in ibrobot or a plugin; please report it"
 
 
-def _described(report: EpisodeReport, summary: EpisodeSummary, request: Request) -> EpisodeReport:
+def _described(report: EpisodeReport, summary: EpisodeSummary, request: ConversionRequest) -> EpisodeReport:
     return attrs.evolve(
         report, finished=summary.finished, outcome=summary.outcome,
         prompt=summary.metadata.get("prompt") or request.prompt, start_ns=summary.start_ns,
@@ -231,7 +231,7 @@ def _labelled(values: dict[str, NDArray[Any]], contract: Contract, tasks: Sequen
     return rest | signals, prompt if number is None else tasks[int(number[0])]
 
 
-def _add(writer: DatasetWriter, row: _Row, request: Request, report: EpisodeReport, *, last: bool) -> None:
+def _add(writer: DatasetWriter, row: _Row, request: ConversionRequest, report: EpisodeReport, *, last: bool) -> None:
     values, task = row
     if request.success:
         values = values | {SUCCESS: np.array([last and report.outcome == "success"])}
@@ -245,7 +245,7 @@ def _features(contract: Contract, values: Mapping[str, NDArray[Any]], success: b
     return features | ({SUCCESS: Feature("bool", (1,))} if success else {})
 
 
-def _contract(request: Request, summary: EpisodeSummary) -> Contract:
+def _contract(request: ConversionRequest, summary: EpisodeSummary) -> Contract:
     recorded = recorded_contract(summary.metadata)
     if request.contract is None:
         if recorded is None:

@@ -11,19 +11,19 @@ import attrs
 
 from ibrobot_core.api import Contract, DatasetSummary
 from ibrobot_data.episode import Unit
-from ibrobot_data.request import Request
+from ibrobot_data.request import ConversionRequest
 
 _KEPT_ONCE = ("contract", "fingerprint", "config", "calibration", "prompt")
 """What an episode's metadata says that lies elsewhere in the dataset's."""
 
 
-def conversion(request: Request) -> dict[str, Any]:
+def conversion(request: ConversionRequest) -> dict[str, Any]:
     """What all episodes of a dataset must have been asked for alike."""
     options = attrs.asdict(request.options)
     return {"writer": request.type, "options": options, "norm_mode": request.norm_mode, "success": request.success}
 
 
-def provenance(request: Request, old: DatasetSummary | None, units: Sequence[Unit]) -> dict[str, Any]:
+def provenance(request: ConversionRequest, old: DatasetSummary | None, units: Sequence[Unit]) -> dict[str, Any]:
     """What the dataset keeps of its making: contract, robots, calibrations, and where each episode comes from."""
     before: Mapping[str, Any] = old.metadata if old is not None else {}
     calibrations, configs = dict(before.get("calibrations", {})), dict(before.get("configs", {}))

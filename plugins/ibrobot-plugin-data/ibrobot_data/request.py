@@ -16,7 +16,7 @@ OUTCOMES = ("success", "failure", "unknown")
 
 @documented
 @attrs.frozen
-class Request:
+class ConversionRequest:
     """One conversion. Equal requests over equal episodes give equal bytes, whatever the number of jobs."""
 
     out: Path

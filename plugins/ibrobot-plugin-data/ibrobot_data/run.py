@@ -45,7 +45,7 @@ from ibrobot_data.episode import (
 )
 from ibrobot_data.identity import KnownEpisodes
 from ibrobot_data.provenance import conversion, provenance
-from ibrobot_data.request import EpisodeReport, Report, Request
+from ibrobot_data.request import ConversionRequest, EpisodeReport, Report
 
 STAGING = ".staging"
 """Where converted episodes wait within the dataset's folder."""
@@ -85,7 +85,9 @@ def find_episodes(paths: Sequence[Path]) -> list[Path]:
     return list(found.values())
 
 
-def convert(request: Request, episodes: Sequence[Path], watch: Watch = lambda done, total, report: None) -> Report:
+def convert(
+    request: ConversionRequest, episodes: Sequence[Path], watch: Watch = lambda done, total, report: None
+) -> Report:
     """Convert episodes into the dataset at `request.out`, in the order given.
 
     An episode that cannot be converted is told in the report and left out. Converted episodes are kept until all are
@@ -114,7 +116,7 @@ def convert(request: Request, episodes: Sequence[Path], watch: Watch = lambda do
 
 
 @contextmanager
-def _staging(request: Request) -> Iterator[tuple[Path, DatasetSummary | None]]:
+def _staging(request: ConversionRequest) -> Iterator[tuple[Path, DatasetSummary | None]]:
     """The staging folder, for this conversion alone, and the dataset that is there already."""
     out = request.out
     try:
@@ -148,7 +150,7 @@ def _tidy(out: Path) -> None:
         out.rmdir()
 
 
-def _check_old(request: Request, old: DatasetSummary) -> None:
+def _check_old(request: ConversionRequest, old: DatasetSummary) -> None:
     if not request.append:
         raise DatasetError(f"{request.out}: there is a dataset already; --append adds to it")
     known = old.metadata.get("conversion")
@@ -163,7 +165,9 @@ def _check_old(request: Request, old: DatasetSummary) -> None:
 class _Plan:
     """Which episodes there are, and what is still to be done for each."""
 
-    def __init__(self, request: Request, staging: Path, old: DatasetSummary | None, episodes: Sequence[Path]) -> None:
+    def __init__(
+        self, request: ConversionRequest, staging: Path, old: DatasetSummary | None, episodes: Sequence[Path]
+    ) -> None:
         self._request = request
         self._reports: dict[str, EpisodeReport] = {}
         self._jobs: dict[str, Job] = {}

@@ -58,7 +58,7 @@ class BagRequest:
     """Of the recorder."""
     contract: Contract | None = None
     """What the dataset's contract must be; None takes it as it is."""
-    told: Mapping[str, str] = attrs.field(factory=dict)
+    given: Mapping[str, str] = attrs.field(factory=dict)
     """Of a dataset that says nothing of itself; see `EpisodeAddress`."""
     prompt: str = ""
     """Task of episodes without one."""
@@ -112,7 +112,7 @@ class _Job:
         report = EpisodeReport(self._path.name)
         reader: EpisodeReader | None = None
         try:
-            reader = installed_plugins().open_episode(self._path, self._request.told)
+            reader = installed_plugins().open_episode(self._path, self._request.given)
             summary = reader.summary()
             prompt = summary.metadata.get("prompt") or self._request.prompt
             report = attrs.evolve(report, outcome=summary.outcome, prompt=prompt, start_ns=summary.start_ns)

@@ -124,7 +124,7 @@ class LeaderTeleop(Teleop):
         if self._options.estop_key in (typed := self._typed()):
             self._release()
             return TeleopCommand(None, estop=True)
-        self._obey(typed.count("space"), now_ns)
+        self._handle_presses(typed.count("space"), now_ns)
         self._receive(self._reader, now_ns)
         if not self._engaged(now_ns):
             self._setpoint = None
@@ -248,7 +248,7 @@ class LeaderTeleop(Teleop):
             typed.append(self._keys.get_nowait())
         return typed
 
-    def _obey(self, presses: int, now_ns: int) -> None:
+    def _handle_presses(self, presses: int, now_ns: int) -> None:
         """Take in presses of the deadman.
 
         A terminal tells of no release, but repeats a held key: it is held while presses come close together.

@@ -112,7 +112,7 @@ class TestHold(LeaderSuite):
         return host_context(clock=self.clock, keys=lambda: self.typed)
 
 
-class Desk:
+class TeleopRig:
     """A leader and a robot that is where it was told to be."""
 
     def __init__(self, emulator: Emulator, file: Path, link: Path | None = None, **options: Any) -> None:
@@ -153,50 +153,50 @@ class Desk:
 
 
 @pytest.fixture
-def desk(emulator: Emulator, calibration_file: Path, request: pytest.FixtureRequest) -> Iterator[Desk]:
+def rig(emulator: Emulator, calibration_file: Path, request: pytest.FixtureRequest) -> Iterator[TeleopRig]:
     given = getattr(request, "param", {})
-    desk = Desk(emulator, calibration_file, **given)
-    desk.leader.connect()
-    desk.leader.activate(desk.measured())
+    rig = TeleopRig(emulator, calibration_file, **given)
+    rig.leader.connect()
+    rig.leader.activate(rig.measured())
     if "deadman" not in given:
-        desk.typed.put("space")
-    yield desk
-    desk.leader.disconnect()
+        rig.typed.put("space")
+    yield rig
+    rig.leader.disconnect()
 
 
 def options(**given: Any) -> Any:
-    return pytest.mark.parametrize("desk", [given], indirect=True)
+    return pytest.mark.parametrize("rig", [given], indirect=True)
 
 
 class TestMapping:
-    def test_angles_are_the_robots(self, desk: Desk):
-        desk.turn("shoulder_pan", 2048 + 0.5 * RADIAN)
-        desk.turn("elbow_flex", 2048 + 0.4 * RADIAN)  # drive_mode 1
-        position = desk.follow()
+    def test_angles_are_the_robots(self, rig: TeleopRig):
+        rig.turn("shoulder_pan", 2048 + 0.5 * RADIAN)
+        rig.turn("elbow_flex", 2048 + 0.4 * RADIAN)  # drive_mode 1
+        position = rig.follow()
         assert position[JOINTS.index("shoulder_pan")] == pytest.approx(0.5, abs=1e-3)
         assert position[JOINTS.index("elbow_flex")] == pytest.approx(-0.4, abs=1e-3)
 
-    @pytest.mark.parametrize("desk", [{}, {"inverted": ("gripper",)}], indirect=True, ids=["", "inverted"])
+    @pytest.mark.parametrize("rig", [{}, {"inverted": ("gripper",)}], indirect=True, ids=["", "inverted"])
     @pytest.mark.parametrize("share", [-0.1, 0.0, 0.25, 0.8, 1.0, 1.1])
-    def test_the_triggers_range_is_the_grippers(self, desk: Desk, share: float, request: pytest.FixtureRequest):
-        desk.turn("gripper", 1500 + share * 1500)
+    def test_the_triggers_range_is_the_grippers(self, rig: TeleopRig, share: float, request: pytest.FixtureRequest):
+        rig.turn("gripper", 1500 + share * 1500)
         opened = 1 - share if "inverted" in request.node.callspec.id else share
-        assert desk.follow()[5] == pytest.approx(-0.2 + np.clip(opened, 0, 1) * 1.9, abs=1e-9)
+        assert rig.follow()[5] == pytest.approx(-0.2 + np.clip(opened, 0, 1) * 1.9, abs=1e-9)
 
     @options(inverted=("shoulder_pan",))
-    def test_an_inverted_joint_turns_the_other_way(self, desk: Desk):
-        desk.turn("shoulder_pan", 2048 + 0.5 * RADIAN)
-        assert desk.follow()[0] == pytest.approx(-0.5, abs=1e-3)
+    def test_an_inverted_joint_turns_the_other_way(self, rig: TeleopRig):
+        rig.turn("shoulder_pan", 2048 + 0.5 * RADIAN)
+        assert rig.follow()[0] == pytest.approx(-0.5, abs=1e-3)
 
     @options(joints={"wrist_roll": "shoulder_pan"})
-    def test_only_mapped_joints_are_commanded(self, desk: Desk):
-        desk.turn("wrist_roll", 2048 + 0.5 * RADIAN)
-        desk.follow()
-        assert desk.read().positions == {"shoulder_pan": pytest.approx(0.5, abs=1e-3)}
+    def test_only_mapped_joints_are_commanded(self, rig: TeleopRig):
+        rig.turn("wrist_roll", 2048 + 0.5 * RADIAN)
+        rig.follow()
+        assert rig.read().positions == {"shoulder_pan": pytest.approx(0.5, abs=1e-3)}
 
-    def test_the_robots_limits_hold(self, desk: Desk):
-        desk.turn("wrist_flex", 600)
-        assert desk.follow()[3] == -1.5
+    def test_the_robots_limits_hold(self, rig: TeleopRig):
+        rig.turn("wrist_flex", 600)
+        assert rig.follow()[3] == -1.5
 
     @pytest.mark.parametrize(
         ("given", "told"),
@@ -208,18 +208,18 @@ class TestMapping:
     )
     def test_unknown_joints_are_told(self, emulator: Emulator, calibration_file: Path, given: Any, told: str):
         with pytest.raises(TeleopError, match=told):
-            Desk(emulator, calibration_file, **given)
+            TeleopRig(emulator, calibration_file, **given)
 
 
 class TestApproach:
     @options(ramp_velocity=1.0)
-    def test_is_bounded_in_proportion_and_ends_in_following(self, desk: Desk):
-        desk.turn("shoulder_pan", 2048 + 0.8 * RADIAN)
-        desk.turn("wrist_roll", 2048 - 0.4 * RADIAN)
-        path = [desk.position.copy()]
+    def test_is_bounded_in_proportion_and_ends_in_following(self, rig: TeleopRig):
+        rig.turn("shoulder_pan", 2048 + 0.8 * RADIAN)
+        rig.turn("wrist_roll", 2048 - 0.4 * RADIAN)
+        path = [rig.position.copy()]
         for _ in range(200):
-            desk.read()
-            path.append(desk.position.copy())
+            rig.read()
+            path.append(rig.position.copy())
         steps = np.diff(path, axis=0)
         assert np.abs(steps).max() <= 0.021, "10 ms at 1 rad/s, or the tolerance at the end"
         # On the way the two joints have gone the same share of theirs.
@@ -227,83 +227,83 @@ class TestApproach:
         assert middle[0] / 0.8 == pytest.approx(middle[4] / -0.4, abs=1e-3)
         assert 0.3 < middle[0] < 0.5
         assert path[-1][0] == pytest.approx(0.8, abs=1e-3)
-        desk.turn("shoulder_pan", 2048 + 0.9 * RADIAN)
-        desk.read()
-        assert desk.position[0] == pytest.approx(0.9, abs=1e-3), "it follows directly"
+        rig.turn("shoulder_pan", 2048 + 0.9 * RADIAN)
+        rig.read()
+        assert rig.position[0] == pytest.approx(0.9, abs=1e-3), "it follows directly"
 
-    def test_after_a_host_that_stood_still_leaps_no_further_than_a_tenth_of_a_second(self, desk: Desk):
-        desk.turn("shoulder_pan", 2048 + 1.5 * RADIAN)
-        desk.follow(3)
-        before = desk.position[0]
-        desk.clock.advance(5_000_000_000)
-        desk.read()
-        assert desk.position[0] - before == pytest.approx(0.1, abs=1e-3)
+    def test_after_a_host_that_stood_still_leaps_no_further_than_a_tenth_of_a_second(self, rig: TeleopRig):
+        rig.turn("shoulder_pan", 2048 + 1.5 * RADIAN)
+        rig.follow(3)
+        before = rig.position[0]
+        rig.clock.advance(5_000_000_000)
+        rig.read()
+        assert rig.position[0] - before == pytest.approx(0.1, abs=1e-3)
 
 
 class TestDeadman:
     def test_without_a_word_in_the_yaml_it_waits_for_space(self, emulator: Emulator, calibration_file: Path):
-        desk = Desk(emulator, calibration_file)
-        desk.leader.connect()
-        desk.leader.activate(desk.measured())
-        desk.turn("shoulder_pan", 2500)
-        assert [desk.read().positions for _ in range(50)] == [None] * 50
-        assert desk.leader.help().startswith("PAUSED: press space to follow")
-        assert desk.read("space").positions is not None
-        assert desk.leader.help().startswith("following the leader arm: space pauses")
-        desk.leader.disconnect()
+        rig = TeleopRig(emulator, calibration_file)
+        rig.leader.connect()
+        rig.leader.activate(rig.measured())
+        rig.turn("shoulder_pan", 2500)
+        assert [rig.read().positions for _ in range(50)] == [None] * 50
+        assert rig.leader.help().startswith("PAUSED: press space to follow")
+        assert rig.read("space").positions is not None
+        assert rig.leader.help().startswith("following the leader arm: space pauses")
+        rig.leader.disconnect()
 
     @options(deadman="none")
-    def test_none_follows_once_the_leader_is_taken_up(self, desk: Desk):
-        desk.turn("shoulder_pan", 2500)  # while nobody read
-        assert [desk.read().positions for _ in range(50)] == [None] * 50
-        assert desk.leader.help().startswith("PAUSED: move the leader arm")
-        desk.turn("shoulder_pan", 2510)
-        assert desk.read().positions is None, "it trembles"
-        desk.turn("shoulder_pan", 2600)
-        assert desk.follow()[0] == pytest.approx(552 / RADIAN, abs=1e-3)
-        desk.leader.activate(desk.measured())
-        assert desk.read().positions is None, "a reset waits again"
+    def test_none_follows_once_the_leader_is_taken_up(self, rig: TeleopRig):
+        rig.turn("shoulder_pan", 2500)  # while nobody read
+        assert [rig.read().positions for _ in range(50)] == [None] * 50
+        assert rig.leader.help().startswith("PAUSED: move the leader arm")
+        rig.turn("shoulder_pan", 2510)
+        assert rig.read().positions is None, "it trembles"
+        rig.turn("shoulder_pan", 2600)
+        assert rig.follow()[0] == pytest.approx(552 / RADIAN, abs=1e-3)
+        rig.leader.activate(rig.measured())
+        assert rig.read().positions is None, "a reset waits again"
 
     @options(deadman="none")
-    def test_a_lost_reply_at_the_start_is_no_motion(self, desk: Desk):
-        desk.turn("shoulder_pan", 2500)
-        desk.emulator.faults.silent.add(1)
-        assert desk.read().positions is None
-        desk.emulator.faults.silent.clear()
-        assert [desk.read().positions for _ in range(50)] == [None] * 50
+    def test_a_lost_reply_at_the_start_is_no_motion(self, rig: TeleopRig):
+        rig.turn("shoulder_pan", 2500)
+        rig.emulator.faults.silent.add(1)
+        assert rig.read().positions is None
+        rig.emulator.faults.silent.clear()
+        assert [rig.read().positions for _ in range(50)] == [None] * 50
 
     @options(deadman="toggle", ramp_velocity=1.0)
-    def test_a_pause_ends_in_the_same_approach(self, desk: Desk):
-        assert desk.read().positions is None
-        desk.read("space")
-        desk.follow(200)
-        desk.read("space")
-        desk.turn("shoulder_pan", 2048 + 1.0 * RADIAN)
-        before = desk.position.copy()
-        assert [desk.read().positions for _ in range(50)] == [None] * 50
-        desk.read("space")
-        np.testing.assert_array_equal(desk.position, before)
-        desk.read()
-        assert desk.position[0] - before[0] == pytest.approx(0.01, abs=1e-6)
+    def test_a_pause_ends_in_the_same_approach(self, rig: TeleopRig):
+        assert rig.read().positions is None
+        rig.read("space")
+        rig.follow(200)
+        rig.read("space")
+        rig.turn("shoulder_pan", 2048 + 1.0 * RADIAN)
+        before = rig.position.copy()
+        assert [rig.read().positions for _ in range(50)] == [None] * 50
+        rig.read("space")
+        np.testing.assert_array_equal(rig.position, before)
+        rig.read()
+        assert rig.position[0] - before[0] == pytest.approx(0.01, abs=1e-6)
 
     @options(deadman="hold")
-    def test_held_follows_while_the_key_repeats_and_a_single_press_does_nothing(self, desk: Desk):
-        assert desk.read("space").positions is None
-        assert [desk.read().positions for _ in range(50)] == [None] * 50
-        desk.read("space")
-        assert all(desk.read(*["space"] * (i % 3 == 0)).positions is not None for i in range(30))
-        paused = [desk.read().positions is None for _ in range(25)]
+    def test_held_follows_while_the_key_repeats_and_a_single_press_does_nothing(self, rig: TeleopRig):
+        assert rig.read("space").positions is None
+        assert [rig.read().positions for _ in range(50)] == [None] * 50
+        rig.read("space")
+        assert all(rig.read(*["space"] * (i % 3 == 0)).positions is not None for i in range(30))
+        paused = [rig.read().positions is None for _ in range(25)]
         assert paused == sorted(paused)
         assert paused[-1]
 
-    def test_the_emergency_stop_key(self, desk: Desk):
-        assert desk.read("esc") == TeleopCommand(None, estop=True)
+    def test_the_emergency_stop_key(self, rig: TeleopRig):
+        assert rig.read("esc") == TeleopCommand(None, estop=True)
 
     @options(deadman="toggle")
-    def test_what_was_typed_before_the_mode_began_does_not_count(self, desk: Desk):
-        desk.typed.put("space")
-        desk.leader.activate(desk.measured())
-        assert desk.read().positions is None
+    def test_what_was_typed_before_the_mode_began_does_not_count(self, rig: TeleopRig):
+        rig.typed.put("space")
+        rig.leader.activate(rig.measured())
+        assert rig.read().positions is None
 
     def test_without_a_terminal_it_is_refused(self, emulator: Emulator, calibration_file: Path):
         given = LeaderOptions(emulator.port, str(calibration_file), deadman="hold")
@@ -315,62 +315,62 @@ class TestBus:
     def test_torque_is_off_and_answers_come_without_delay(self, emulator: Emulator, calibration_file: Path):
         for servo in emulator.servos.values():
             servo.set("torque_enable", 1)
-        desk = Desk(emulator, calibration_file)
-        desk.leader.connect()
-        desk.leader.disconnect()
-        assert desk.register("torque_enable") == [0] * 6
-        assert desk.register("return_delay") == [0] * 6
-        assert desk.register("lock") == [1] * 6
+        rig = TeleopRig(emulator, calibration_file)
+        rig.leader.connect()
+        rig.leader.disconnect()
+        assert rig.register("torque_enable") == [0] * 6
+        assert rig.register("return_delay") == [0] * 6
+        assert rig.register("lock") == [1] * 6
 
     def test_another_calibration_is_refused(self, emulator: Emulator, calibration_file: Path):
         emulator.servos[4].set("homing_offset", 12)
         with pytest.raises(TeleopError, match=r"servo 4 \(wrist_flex\), homing_offset: the servo has 12, .* says 900"):
-            Desk(emulator, calibration_file).leader.connect()
+            TeleopRig(emulator, calibration_file).leader.connect()
 
     def test_missing_servos_are_named_together(self, emulator: Emulator, calibration_file: Path):
         emulator.faults.silent |= {2, 5}
         with pytest.raises(TeleopError, match=r"leader: .*2 \(shoulder_lift\), 5 \(wrist_roll\)"):
-            Desk(emulator, calibration_file).leader.connect()
+            TeleopRig(emulator, calibration_file).leader.connect()
 
-    def test_single_lost_replies_hold_the_position_and_many_are_an_error_with_a_name(self, desk: Desk):
-        desk.follow()
-        desk.emulator.faults.silent.add(3)
+    def test_single_lost_replies_hold_the_position_and_many_are_an_error_with_a_name(self, rig: TeleopRig):
+        rig.follow()
+        rig.emulator.faults.silent.add(3)
         for _ in range(3):
-            assert desk.read().positions is not None
-        desk.emulator.faults.silent.clear()
-        desk.read()
-        desk.emulator.faults.silent.add(3)
-        before = desk.position.copy()
-        desk.follow(3)
-        np.testing.assert_array_equal(desk.position, before)
+            assert rig.read().positions is not None
+        rig.emulator.faults.silent.clear()
+        rig.read()
+        rig.emulator.faults.silent.add(3)
+        before = rig.position.copy()
+        rig.follow(3)
+        np.testing.assert_array_equal(rig.position, before)
         with pytest.raises(TeleopError, match=r"servo 3 \(elbow_flex\): no reply, 4 times in a row"):
-            desk.read()
+            rig.read()
 
-    def test_a_position_that_no_hand_can_reach_is_not_followed(self, desk: Desk):
-        desk.turn("shoulder_pan", 3000)
-        before = desk.follow().copy()
-        desk.turn("shoulder_pan", 100, in_ns=0)
-        desk.follow(3)
-        np.testing.assert_array_equal(desk.position, before)
+    def test_a_position_that_no_hand_can_reach_is_not_followed(self, rig: TeleopRig):
+        rig.turn("shoulder_pan", 3000)
+        before = rig.follow().copy()
+        rig.turn("shoulder_pan", 100, in_ns=0)
+        rig.follow(3)
+        np.testing.assert_array_equal(rig.position, before)
         with pytest.raises(TeleopError, match=r"servo 1 \(shoulder_pan\): position 100 right after 3000"):
-            desk.read()
+            rig.read()
 
     def test_unplugged_it_says_so_and_replugged_it_connects(self, ports: None, tmp_path: Path, calibration_file: Path):
         link = tmp_path / "port"
         with Emulator(6, link=link) as emulator:
             prepare(emulator, arm_calibration())
-            desk = Desk(emulator, calibration_file, link)
-            desk.leader.connect()
-            desk.read("space")
+            rig = TeleopRig(emulator, calibration_file, link)
+            rig.leader.connect()
+            rig.read("space")
             emulator.unplug()
             with pytest.raises(TeleopError, match=r"leader: .*port: the port is"):
-                desk.read()
-            desk.leader.disconnect()
+                rig.read()
+            rig.leader.disconnect()
             with pytest.raises(TeleopError, match=r"leader: .*port: there is no such port"):
-                desk.leader.connect()
+                rig.leader.connect()
             emulator.replug()
-            desk.leader.connect()
-            desk.leader.activate(desk.measured())
-            assert desk.read().positions is None, "it waits to be started again"
-            assert desk.read("space").positions is not None
-            desk.leader.disconnect()
+            rig.leader.connect()
+            rig.leader.activate(rig.measured())
+            assert rig.read().positions is None, "it waits to be started again"
+            assert rig.read("space").positions is not None
+            rig.leader.disconnect()

@@ -52,7 +52,7 @@ class JointLogReader(EpisodeReader):
         self._file = self._path / LOG if self._path.is_dir() else self._path
         self._facts = _facts(self._path / METADATA) if self._path.is_dir() else {}
         self._log = read_log(self._file)
-        told = address.told.get("contract")
+        told = address.given.get("contract")
         parts = Contract.from_canonical(json.loads(told)).action_parts if told is not None else ()
         for part in parts:
             if missing := [joint for joint in part.joints if joint not in self._log.joints]:

@@ -33,7 +33,7 @@ TICK_S = 0.01
 
 
 @attrs.define
-class Desk:
+class TeleopRig:
     """An operator at a keyboard, and a robot that goes where it is told."""
 
     robot: Robot = attrs.field(factory=make_robot)
@@ -106,150 +106,150 @@ PAIRS = [("w", "s"), ("e", "d"), ("r", "f"), ("t", "g"), ("y", "h")]
 @pytest.mark.parametrize(("joint", "keys"), list(zip(JOINTS, PAIRS, strict=False)))
 def test_each_joint_has_a_key_up_and_a_key_down(joint, keys):
     for key, sign in zip(keys, (1, -1), strict=True):
-        desk = Desk()
-        desk.hold(key, 0.4)
-        assert desk.moved() == pytest.approx({joint: sign * 0.5 * 0.4})
+        rig = TeleopRig()
+        rig.hold(key, 0.4)
+        assert rig.moved() == pytest.approx({joint: sign * 0.5 * 0.4})
 
 
 def test_a_tap_moves_for_the_hold_time_and_not_longer():
-    desk = Desk()
-    commands = [desk.tick("w"), *(desk.tick() for _ in range(30))]
+    rig = TeleopRig()
+    commands = [rig.tick("w"), *(rig.tick() for _ in range(30))]
     moving = [c.positions is not None for c in commands]
     assert moving == [True] * 15 + [False] * 16
-    assert desk.moved() == pytest.approx({"shoulder_pan": 0.5 * 0.14})
+    assert rig.moved() == pytest.approx({"shoulder_pan": 0.5 * 0.14})
 
 
 def test_a_held_key_moves_without_a_break():
-    desk = Desk()
+    rig = TeleopRig()
     for i in range(100):
-        assert desk.tick(*(["w"] if i % 9 == 0 else [])).positions is not None
+        assert rig.tick(*(["w"] if i % 9 == 0 else [])).positions is not None
 
 
 def test_without_keys_there_are_no_positions():
-    assert Desk().tick() == TeleopCommand(None)
+    assert TeleopRig().tick() == TeleopCommand(None)
 
 
 def test_motion_goes_on_from_the_last_setpoint_and_not_from_where_the_arm_sags():
-    desk = Desk()
-    desk.hold("w", 0.2)
-    desk.rest()
-    reached = desk.position[0]
-    desk.position[0] -= 0.05
-    assert desk.tick("w").positions["shoulder_pan"] == reached
+    rig = TeleopRig()
+    rig.hold("w", 0.2)
+    rig.rest()
+    reached = rig.position[0]
+    rig.position[0] -= 0.05
+    assert rig.tick("w").positions["shoulder_pan"] == reached
 
 
 def test_activation_begins_where_the_robot_is_and_forgets_what_was_typed():
-    desk = Desk()
-    desk.tick("w")
-    desk.position = np.zeros(6)
+    rig = TeleopRig()
+    rig.tick("w")
+    rig.position = np.zeros(6)
     for key in ("w", "space"):
-        desk.typed.put(key)
-    desk.teleop.activate(desk.measured())
-    assert desk.tick() == TeleopCommand(None)
-    assert desk.tick("e").positions == dict.fromkeys(JOINTS, 0.0)
+        rig.typed.put(key)
+    rig.teleop.activate(rig.measured())
+    assert rig.tick() == TeleopCommand(None)
+    assert rig.tick("e").positions == dict.fromkeys(JOINTS, 0.0)
 
 
 def test_two_keys_move_two_joints_and_the_newer_of_opposite_keys_wins():
-    desk = Desk()
-    desk.tick("w", "e")
-    desk.tick(seconds=0.1)
-    assert desk.moved() == pytest.approx({"shoulder_pan": 0.05, "shoulder_lift": 0.05})
-    desk.tick("s")
-    desk.tick(seconds=0.1)
-    assert desk.moved()["shoulder_pan"] < 0.05
+    rig = TeleopRig()
+    rig.tick("w", "e")
+    rig.tick(seconds=0.1)
+    assert rig.moved() == pytest.approx({"shoulder_pan": 0.05, "shoulder_lift": 0.05})
+    rig.tick("s")
+    rig.tick(seconds=0.1)
+    assert rig.moved()["shoulder_pan"] < 0.05
 
 
 def test_no_key_drives_a_joint_out_of_its_limits():
-    desk = Desk()
-    desk.hold("w", 10)
-    assert desk.position[0] == 1.8
-    desk.hold("s", 10)
-    assert desk.position[0] == -1.9
+    rig = TeleopRig()
+    rig.hold("w", 10)
+    assert rig.position[0] == 1.8
+    rig.hold("s", 10)
+    assert rig.position[0] == -1.9
 
 
 def test_a_joint_outside_its_limits_may_only_come_in():
-    desk = Desk(position=np.array([2.0, 0, 0, 0, 0, 0]))
-    desk.hold("w", 0.3)
-    assert desk.position[0] == 2.0
-    desk.rest()
-    desk.hold("s", 0.3)
-    assert desk.position[0] == pytest.approx(2.0 - 0.15)
+    rig = TeleopRig(position=np.array([2.0, 0, 0, 0, 0, 0]))
+    rig.hold("w", 0.3)
+    assert rig.position[0] == 2.0
+    rig.rest()
+    rig.hold("s", 0.3)
+    assert rig.position[0] == pytest.approx(2.0 - 0.15)
 
 
 def test_gripper_keys_open_and_close_it():
-    desk = Desk()
-    desk.hold("o", 0.3)
-    assert desk.moved() == pytest.approx({"gripper": 0.3})
-    desk.hold("c", 3)
-    assert desk.position[5] == -0.2
+    rig = TeleopRig()
+    rig.hold("o", 0.3)
+    assert rig.moved() == pytest.approx({"gripper": 0.3})
+    rig.hold("c", 3)
+    assert rig.position[5] == -0.2
 
 
 def test_the_home_key_goes_straight_home_at_joint_speed_while_it_is_held():
-    desk = Desk()
-    desk.hold("0", 0.4)
-    np.testing.assert_allclose(desk.position, MIDDLE * (1 - 0.5 * 0.4 / 0.6))
-    desk.tick("w")
-    before = desk.position.copy()
-    desk.tick(seconds=0.1)
-    np.testing.assert_allclose(desk.position - before, [0.05, 0, 0, 0, 0, 0], atol=1e-12)
-    desk.hold("0", 2)
-    np.testing.assert_array_equal(desk.position, np.zeros(6))
+    rig = TeleopRig()
+    rig.hold("0", 0.4)
+    np.testing.assert_allclose(rig.position, MIDDLE * (1 - 0.5 * 0.4 / 0.6))
+    rig.tick("w")
+    before = rig.position.copy()
+    rig.tick(seconds=0.1)
+    np.testing.assert_allclose(rig.position - before, [0.05, 0, 0, 0, 0, 0], atol=1e-12)
+    rig.hold("0", 2)
+    np.testing.assert_array_equal(rig.position, np.zeros(6))
 
 
 def test_speed_keys_change_the_speed_within_bounds():
-    desk = Desk()
-    desk.tick("+", "+")
-    desk.hold("w", 0.2)
-    assert desk.moved() == pytest.approx({"shoulder_pan": 0.5 * 1.25**2 * 0.2})
-    slow = Desk()
+    rig = TeleopRig()
+    rig.tick("+", "+")
+    rig.hold("w", 0.2)
+    assert rig.moved() == pytest.approx({"shoulder_pan": 0.5 * 1.25**2 * 0.2})
+    slow = TeleopRig()
     slow.tick(*["-"] * 50)
     slow.hold("w", 0.2)
     assert slow.moved() == pytest.approx({"shoulder_pan": 0.5 * 0.1 * 0.2})
 
 
 def test_no_joint_goes_faster_than_its_own_limit():
-    desk = Desk(options=KeyboardOptions(cartesian=False, joint_speed=50.0, gripper_speed=50.0))
+    rig = TeleopRig(options=KeyboardOptions(cartesian=False, joint_speed=50.0, gripper_speed=50.0))
     path = []
     for _ in range(20):
-        desk.tick("w", "o")
-        path.append(desk.position.copy())
+        rig.tick("w", "o")
+        path.append(rig.position.copy())
     speeds = np.diff(path, axis=0).max(axis=0) / TICK_S
     assert speeds[0] == pytest.approx(2.0)
     assert speeds[5] == pytest.approx(3.25)
 
 
 def test_a_host_that_stood_still_makes_no_leap():
-    desk = Desk()
-    desk.tick("w")
-    desk.tick("w", seconds=5.0)
-    assert desk.moved() == {}
-    desk.tick("w", seconds=0.14)
-    assert desk.moved() == pytest.approx({"shoulder_pan": 0.5 * 0.14})
+    rig = TeleopRig()
+    rig.tick("w")
+    rig.tick("w", seconds=5.0)
+    assert rig.moved() == {}
+    rig.tick("w", seconds=0.14)
+    assert rig.moved() == pytest.approx({"shoulder_pan": 0.5 * 0.14})
 
 
 def test_the_emergency_key_asks_for_a_stop_once_and_ends_all_motion():
-    desk = Desk()
-    desk.tick("w")
-    assert desk.tick("space", "e") == TeleopCommand(None, estop=True)
-    desk.teleop.activate(desk.measured())
-    assert desk.tick() == TeleopCommand(None)
+    rig = TeleopRig()
+    rig.tick("w")
+    assert rig.tick("space", "e") == TeleopCommand(None, estop=True)
+    rig.teleop.activate(rig.measured())
+    assert rig.tick() == TeleopCommand(None)
 
 
 def test_keys_of_the_runtime_and_unknown_ones_do_nothing():
-    desk = Desk()
+    rig = TeleopRig()
     for key in ("q", "esc", "tab", "f1", "f10", "ü", "m"):
-        assert desk.tick(key) == TeleopCommand(None)
+        assert rig.tick(key) == TeleopCommand(None)
 
 
 def test_keys_can_be_given_other_actions():
     keys = {"shoulder_pan+": "right", "shoulder_pan-": "left", "gripper_open": "w", "estop": "x"}
-    desk = Desk(options=KeyboardOptions(cartesian=False, keys=keys))
-    desk.hold("left", 0.2)
-    desk.hold("w", 0.2)
+    rig = TeleopRig(options=KeyboardOptions(cartesian=False, keys=keys))
+    rig.hold("left", 0.2)
+    rig.hold("w", 0.2)
     # The hold time of the first key runs on for a while beside the second.
-    assert set(desk.moved()) == {"shoulder_pan", "gripper"}
-    assert desk.moved()["shoulder_pan"] < 0 < desk.moved()["gripper"]
-    assert desk.tick("x").estop
+    assert set(rig.moved()) == {"shoulder_pan", "gripper"}
+    assert rig.moved()["shoulder_pan"] < 0 < rig.moved()["gripper"]
+    assert rig.tick("x").estop
 
 
 WRONG_KEYS = {
@@ -265,7 +265,7 @@ WRONG_KEYS = {
 @pytest.mark.parametrize(("keys", "message"), WRONG_KEYS.values(), ids=WRONG_KEYS.keys())
 def test_keys_that_make_no_sense_are_refused(keys, message):
     with pytest.raises(TeleopError) as refused:
-        Desk(options=KeyboardOptions(cartesian=False, keys=keys))
+        TeleopRig(options=KeyboardOptions(cartesian=False, keys=keys))
     assert str(refused.value).startswith(message)
 
 
@@ -283,12 +283,12 @@ def test_more_joints_than_keys_need_keys_of_their_own():
 
 
 def test_help_is_a_table_of_the_keys_that_there_are():
-    assert Desk().teleop.help().splitlines() == [
+    assert TeleopRig().teleop.help().splitlines() == [
         "joints     w/s shoulder_pan  e/d shoulder_lift  r/f elbow_flex  t/g wrist_flex  y/h wrist_roll",
         "always     o gripper_open  c gripper_close  0 home  + faster  - slower  space estop",
     ]
     bare = attrs.evolve(make_robot(), groups={}, description=Description())
-    assert Desk(robot=bare).teleop.help().splitlines() == [
+    assert TeleopRig(robot=bare).teleop.help().splitlines() == [
         "joints     w/s shoulder_pan  e/d shoulder_lift  r/f elbow_flex  t/g wrist_flex  y/h wrist_roll  u/j gripper",
         "always     + faster  - slower  space estop",
     ]

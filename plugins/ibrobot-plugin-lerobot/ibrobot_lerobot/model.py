@@ -27,7 +27,7 @@ _OWN = ("seed", "task", "prefix", "delay_steps")
 """Tensors that are not the network's own inputs."""
 
 
-class Model:
+class PolicyModel:
     """A loaded network.
 
     Args:

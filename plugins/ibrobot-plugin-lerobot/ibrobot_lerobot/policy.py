@@ -16,7 +16,7 @@ from ibrobot_lerobot.options import LeRobotPolicyOptions
 from ibrobot_lerobot.steps import read_steps
 
 if TYPE_CHECKING:
-    from ibrobot_lerobot.model import Model
+    from ibrobot_lerobot.model import PolicyModel
     from ibrobot_lerobot.pipeline import LeRobotSteps
 
 SEED = "seed"
@@ -60,7 +60,7 @@ class LeRobotPolicy(Policy):
             self._lerobot = _import("pipeline").LeRobotSteps(checkpoint)
         self._pictures: tuple[str, ...] = () if self._pre.others else _pictures(self.spec)
         """Observations that `infer` normalises."""
-        self._model: Model | None = None
+        self._model: PolicyModel | None = None
         self._taken: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {}
         """Tensors of a request without a prefix: their dtypes and shapes; -1 stands for any size."""
         self._seed = ctx.seed

@@ -54,7 +54,7 @@ class LeRobotReader(EpisodeReader):
         except DatasetError as error:
             raise RecorderError(str(error)) from error
         self._path = root.with_name(f"{root.name}:{address.number}")
-        self._origin = found = episode_origin(root, dataset.metadata, address.number, address.told)
+        self._origin = found = episode_origin(root, dataset.metadata, address.number, address.given)
         self._contract = found.contract
         _check_features(root, dataset.features, found.contract)
         self._units = JointUnits(found.norm_mode, found.contract, found.calibration, found.document)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ibrobot_core.api import (
     Context,
-    Episode,
+    EpisodeSetup,
     HardwareError,
     JointReading,
     Signal,
@@ -69,14 +69,14 @@ class MujocoHardware(SimulatedHardware):
     @override
     def connect(self) -> None:
         self._physics = mujoco.MjData(self._model)
-        self.reset(Episode(self._ctx.seed))
+        self.reset(EpisodeSetup(self._ctx.seed))
 
     @override
     def disconnect(self) -> None:
         self._physics = None
 
     @override
-    def reset(self, episode: Episode) -> None:
+    def reset(self, episode: EpisodeSetup) -> None:
         model, physics = self._model, self._connected()
         model.opt.disableflags &= ~_RELAXED
         mujoco.mj_resetData(model, physics)

@@ -19,7 +19,7 @@ from ibrobot_mujoco.state import PHYSICS_TOPIC, SCENE_TOPIC, pose_scene
 from ibrobot_core.api import (
     NS_PER_S,
     Context,
-    Episode,
+    EpisodeSetup,
     Executor,
     Frame,
     Plan,
@@ -71,7 +71,7 @@ class PickLoop:
 
     def run(self, seed: int, duration_s: float = 6.5) -> Outcome:
         """One episode."""
-        self.hardware.reset(Episode(seed))
+        self.hardware.reset(EpisodeSetup(seed))
         self.policy.reset(seed)
         robot, outcome = self.ctx.robot, Outcome()
         position = installed_plugins().find("executor", "position")

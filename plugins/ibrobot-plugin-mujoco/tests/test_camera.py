@@ -23,7 +23,7 @@ from ibrobot_core.api import (
     CameraInfo,
     CompressedImage,
     Context,
-    Episode,
+    EpisodeSetup,
     Float64MultiArray,
     Image,
     Sensor,
@@ -48,7 +48,7 @@ def scene_state(stamp_ns: int, cube: tuple[float, float] | None = None) -> Vecto
     ctx.clock.sleep_until(stamp_ns)
     hardware = MujocoHardware(OPTIONS, ctx)
     hardware.connect()
-    hardware.reset(Episode(0))
+    hardware.reset(EpisodeSetup(0))
     out = np.empty(hardware.signals[0].size)
     hardware.read_signal(0, out)
     out[:2] = divmod(stamp_ns, 1_000_000_000)

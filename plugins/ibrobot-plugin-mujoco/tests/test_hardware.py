@@ -13,7 +13,7 @@ from ibrobot_mujoco.so101 import so101
 from ibrobot_mujoco.state import stamp_of
 from ibrobot_testing import SimulatedHardwareSuite, control_context
 
-from ibrobot_core.api import Context, Episode, Hardware, HardwareError, JointReading, Vector
+from ibrobot_core.api import Context, EpisodeSetup, Hardware, HardwareError, JointReading, Vector
 
 ROBOT = so101()
 REST = ROBOT.pose("rest")
@@ -54,7 +54,7 @@ class TestConformanceOfSomeJoints(TestConformance):
 
 def connected(options: MujocoOptions, seed: int = 0, period_ns: int = TICK_NS) -> Rig:
     rig = Rig(options, period_ns)
-    rig.hardware.reset(Episode(seed))
+    rig.hardware.reset(EpisodeSetup(seed))
     return rig
 
 
@@ -175,7 +175,7 @@ def test_relaxing_ends_with_the_episode() -> None:
     rig = connected(MujocoOptions())
     rig.hardware.relax()
     rig.run(0.1)
-    rig.hardware.reset(Episode(0))
+    rig.hardware.reset(EpisodeSetup(0))
     np.testing.assert_allclose(rig.run(0.5)[-1].position, REST, atol=0.01)
 
 
@@ -225,7 +225,7 @@ def test_read_errors_last_until_faults_are_reset() -> None:
             rig.run(0.01)
     rig.hardware.reset_faults()
     assert not rig.run(1.0)[-1].stale
-    rig.hardware.reset(Episode(0))
+    rig.hardware.reset(EpisodeSetup(0))
     with pytest.raises(HardwareError, match="injected"):
         rig.run(0.1)
 

@@ -11,7 +11,7 @@ import pytest
 
 from ibrobot_core.api import (
     Context,
-    Episode,
+    EpisodeSetup,
     Hardware,
     HardwareError,
     JointReading,
@@ -275,7 +275,7 @@ class SimulatedHardwareSuite(HardwareSuite):
     """What every `SimulatedHardware` must do, beyond `HardwareSuite`."""
 
     def _run(self, hardware: SimulatedHardware, ctx: Context, seed: int) -> list[JointReading]:
-        hardware.reset(Episode(seed))
+        hardware.reset(EpisodeSetup(seed))
         readings = [hardware.read()]
         hardware.write(self._target(hardware, ctx))
         for _ in range(20):
@@ -325,7 +325,7 @@ class SimulatedHardwareSuite(HardwareSuite):
         """After `reset` nothing moves: an old command is forgotten."""
         with self.simulated() as (hardware, ctx):
             self.moved(hardware, ctx)
-            hardware.reset(Episode(1))
+            hardware.reset(EpisodeSetup(1))
             before = hardware.read().position.copy()
             self.elapse(hardware, ctx, self.settle_s)
             np.testing.assert_allclose(hardware.read().position, before, atol=self.tolerance_rad)
@@ -333,7 +333,7 @@ class SimulatedHardwareSuite(HardwareSuite):
     def test_success_is_a_verdict(self) -> None:
         """`success` is True, False or None, and never True right after a reset."""
         with self.simulated() as (hardware, _):
-            hardware.reset(Episode(1))
+            hardware.reset(EpisodeSetup(1))
             assert hardware.success() in (False, None)
 
     @staticmethod

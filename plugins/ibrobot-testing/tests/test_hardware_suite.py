@@ -9,7 +9,7 @@ import pytest
 from ibrobot_testing import HardwareSuite, SimulatedHardwareSuite, checks, failed_checks
 from ibrobot_testing.fakes import FakeHardware, FakeRealHardware
 
-from ibrobot_core.api import Condition, Episode, HardwareError, Holding, JointReading, Severity, Signal
+from ibrobot_core.api import Condition, EpisodeSetup, HardwareError, Holding, JointReading, Severity, Signal
 
 
 class TestRealHardware(HardwareSuite):
@@ -202,7 +202,7 @@ class RandomFriction(FakeHardware):
 
 class SeedFromTheObject(FakeHardware):
     def reset(self, episode):
-        super().reset(Episode(episode.seed + id(self)))
+        super().reset(EpisodeSetup(episode.seed + id(self)))
 
 
 class RemembersTheCommand(FakeHardware):

@@ -10,7 +10,7 @@ import numpy as np
 
 from ibrobot_core.api import (
     Context,
-    Episode,
+    EpisodeSetup,
     IbrobotError,
     RealClock,
     Registry,
@@ -66,7 +66,7 @@ class PhysicsArm:
     def start(self) -> None:
         """Set the scene up, and the servos where its joints are."""
         self._hardware.connect()
-        self._hardware.reset(Episode(self._seed))
+        self._hardware.reset(EpisodeSetup(self._seed))
         self._place()
         for servo in self._emulator.servos.values():
             servo.set("goal_position", servo.get("present_position"))

@@ -9,7 +9,7 @@ import numpy as np
 
 from ibrobot_core.api import (
     Context,
-    Episode,
+    EpisodeSetup,
     Executor,
     GoalRejected,
     GoalState,
@@ -44,7 +44,7 @@ class FakeHardware(SimulatedHardware):
         self._open = False
         self.relaxed = False
         self._position: Vector = np.zeros(len(ctx.joints))
-        self.reset(Episode(ctx.seed))
+        self.reset(EpisodeSetup(ctx.seed))
 
     @override
     def connect(self) -> None:
@@ -87,7 +87,7 @@ class FakeHardware(SimulatedHardware):
         self._velocity = (self._position - before) / seconds(step_ns)
 
     @override
-    def reset(self, episode: Episode) -> None:
+    def reset(self, episode: EpisodeSetup) -> None:
         order = self._ctx.robot.indices(self.joints)
         lower, upper = self._ctx.robot.lower[order], self._ctx.robot.upper[order]
         share = np.random.default_rng(episode.seed).uniform(0.4, 0.6, len(self.joints))

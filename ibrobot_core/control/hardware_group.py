@@ -13,7 +13,7 @@ import numpy as np
 from ibrobot_core.errors import HardwareError, IbrobotError, NotSupported
 from ibrobot_core.interfaces import (
     Condition,
-    Episode,
+    EpisodeSetup,
     Hardware,
     Holding,
     JointReading,
@@ -26,7 +26,7 @@ from ibrobot_core.robot import Robot, Vector
 _LOG = logging.getLogger("ibrobot.control")
 
 
-class HardwareParts:
+class HardwareGroup:
     """All the hardware of a robot, in robot order.
 
     Args:
@@ -114,13 +114,13 @@ class HardwareParts:
     def relax(self) -> dict[str, Torque | IbrobotError]:
         """Take torque off; for each part what became of it, or why its torque stays on.
 
-        From then on only parts whose torque stays on are written, until `retake`.
+        From then on only parts whose torque stays on are written, until `resume`.
         """
         outcomes: dict[str, Torque | IbrobotError] = dict(zip(self._parts, self._each(_relaxed), strict=True))
         self._off = {name for name, outcome in outcomes.items() if isinstance(outcome, Torque)}
         return outcomes
 
-    def retake(self) -> None:
+    def resume(self) -> None:
         """Write all parts again: the next `write` puts torque back on."""
         self._off.clear()
 
@@ -162,7 +162,7 @@ class HardwareParts:
             if isinstance(part, SimulatedHardware):
                 part.advance(step_ns)
 
-    def reset_episode(self, episode: Episode) -> None:
+    def reset_episode(self, episode: EpisodeSetup) -> None:
         """Set simulated scenes up anew.
 
         Raises:

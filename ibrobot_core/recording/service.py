@@ -1,4 +1,4 @@
-"""The operator's desk: begins and ends recorded episodes, for the command line and, as services, for others."""
+"""Starts and ends recorded episodes, for the command line and through services on the bus."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ibrobot_core.recording.dataset import EpisodeDataset
 from ibrobot_core.recording.episode import is_kept
 from ibrobot_core.recording.episodes import Episodes
 from ibrobot_core.recording.run import Run
-from ibrobot_core.recording.worker import Recording
+from ibrobot_core.recording.worker import RecordingWorker
 from ibrobot_core.units import seconds
 
 START = "/record_episode/start"
@@ -23,12 +23,12 @@ STOP = "/record_episode/stop"
 DISCARD = "/record_episode/discard"
 """Request: None. Ends it, and nothing is left of it."""
 STATUS = "/record_episode/status"
-"""Request: None. Returns what `EpisodeDesk.status` says."""
+"""Request: None. Returns what `EpisodeService.status` says."""
 OUTCOMES = ("success", "failure", "unknown")
 _MIB = 1 << 20
 
 
-class EpisodeDesk:
+class EpisodeService:
     """Episodes that an operator begins and ends. Safe to use from any thread.
 
     Args:
@@ -45,7 +45,7 @@ class EpisodeDesk:
             record and `recording.topics` leaves out a topic of the contract.
     """
 
-    def __init__(self, session: Run, episodes: Episodes, recording: Recording, *, by_mode: bool) -> None:
+    def __init__(self, session: Run, episodes: Episodes, recording: RecordingWorker, *, by_mode: bool) -> None:
         self._session = session
         self._episodes = episodes
         self._recording = recording

@@ -1,4 +1,4 @@
-"""The operator's desk: episodes by services, what keeps one from beginning, and the dataset's own file."""
+"""Episodes through services: what prevents a start, and the file `dataset.yaml`."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import pytest
 import yaml
 
 from ibrobot_core.errors import DiskFull, NotSupported, RecorderError
-from ibrobot_core.recording.desk import DISCARD, START, STATUS, STOP
 from ibrobot_core.recording.operator import Operator
+from ibrobot_core.recording.service import DISCARD, START, STATUS, STOP
 
 if TYPE_CHECKING:
     from conftest import Runs
@@ -68,8 +68,8 @@ def test_services_begin_end_and_discard_episodes(run: Runtime, runs: Runs):
     run.stop()
     assert ("ended", 1, "failure") in runs.parts.EVENTS
     assert ("ended", 2, "discarded") in runs.parts.EVENTS
-    assert run.desk is not None
-    assert run.desk.saved == 1
+    assert run.episode_service is not None
+    assert run.episode_service.saved == 1
     assert folders(runs) == ["episode_000001"]
 
 
@@ -115,19 +115,19 @@ def test_a_disk_too_small_for_an_episode_is_refused_with_the_figures(
 ):
     flow = run.session.bus.call(STATUS, None)["bytes_per_s"]
     assert flow > 50 * (2 * 8 + 2 * 2 * 8), "joint states and commands alone"
-    desk, kept = run.desk, runs.parts.MADE["recording"]
-    assert desk is not None
+    service, kept = run.episode_service, runs.parts.MADE["recording"]
+    assert service is not None
     monkeypatch.setattr(kept, "min_free", 3 << 20)
-    monkeypatch.setattr(desk, "free_bytes", lambda: (3 << 20) + flow - 2)
+    monkeypatch.setattr(service, "free_bytes", lambda: (3 << 20) + flow - 2)
     told = (
         r"has 3 MiB left; an episode of 1 s \(contract.max_duration_s\) takes 0 MiB at 0.\d MiB/s, and 3 MiB stay free"
     )
     with pytest.raises(DiskFull, match=told):
-        desk.start("")
+        service.start("")
     assert folders(runs) == []
-    monkeypatch.setattr(desk, "free_bytes", lambda: (3 << 20) + flow + 2)
-    desk.start("")
-    assert desk.recording
+    monkeypatch.setattr(service, "free_bytes", lambda: (3 << 20) + flow + 2)
+    service.start("")
+    assert service.recording
 
 
 def test_a_mode_that_begins_its_own_episodes_keeps_them(runs: Runs, monkeypatch: pytest.MonkeyPatch):
@@ -153,9 +153,9 @@ def test_a_dataset_of_another_contract_is_refused_before_anything_starts(run: Ru
 
 class TestOperator:
     def watch(self, run: Runtime, **asked: object) -> Operator:
-        assert run.desk is not None
+        assert run.episode_service is not None
         return Operator(
-            run.session, run.desk,
+            run.session, run.episode_service,
             **{"count": None, "reset_time_s": 0.0, "prompt": None, "auto": False, "keys": True, **asked},
         )  # fmt: skip
 
@@ -170,15 +170,15 @@ class TestOperator:
         for key in ("tab", "h", "o", "p", "backspace", "space", "!"):
             assert operator.key(key)
         assert "ho !_" in operator.rows()[0][1]
-        assert not run.desk.recording
+        assert not run.episode_service.recording
         operator.key("enter")
-        assert run.desk.recording
+        assert run.episode_service.recording
         assert "recording “ho !”" in operator.line()
         operator.key("tab")
-        assert (run.desk.recording, run.desk.saved) == (False, 1)
+        assert (run.episode_service.recording, run.episode_service.saved) == (False, 1)
         operator.key("tab")
         operator.key("tab")
-        assert not run.desk.recording, "a second Tab goes back"
+        assert not run.episode_service.recording, "a second Tab goes back"
         assert not operator.key("a"), "letters belong to the mode again"
 
     def test_failure_and_discard(self, run: Runtime, runs: Runs):
@@ -189,12 +189,12 @@ class TestOperator:
             operator.key(end)
             self.step(run, operator, 2)
         assert [event[2] for event in runs.parts.EVENTS if event[0] == "ended"] == ["failure", "discarded"]
-        assert run.desk.saved == 1
+        assert run.episode_service.saved == 1
 
     def test_unattended_episodes_pause_and_end_with_the_count(self, run: Runtime, runs: Runs):
         operator = self.watch(run, auto=True, count=2, reset_time_s=0.5, prompt="pick")
         self.step(run, operator, 50 + 2)
-        assert run.desk.saved == 1
+        assert run.episode_service.saved == 1
         assert "set the scene up anew" in operator.line()
         self.step(run, operator, 200)
         assert run.session.finished.is_set()
@@ -221,17 +221,17 @@ class TestOperator:
         if not auto:
             operator.key("tab")
         self.step(run, operator, 3)
-        assert run.desk.recording
+        assert run.episode_service.recording
         with monkeypatch.context() as patch:
             patch.setattr(runs.parts.MADE["recording"], "write", full)
             self.step(run, operator, 3)
-        assert (run.desk.recording, run.desk.saved) == (False, 0)
+        assert (run.episode_service.recording, run.episode_service.saved) == (False, 0)
         assert ("", "recording ended: its disk has 1 MiB left") in operator.rows()
         assert run.session.finished.is_set() == auto, "the robot goes on where somebody is there"
         if not auto:
             operator.key("tab")
             self.step(run, operator, 3)
-            assert run.desk.recording, "there is room again"
+            assert run.episode_service.recording, "there is room again"
             assert operator.rows()[-1][0] != ""
 
     def test_unattended_the_run_ends_where_there_is_no_room_for_another_episode(
@@ -239,21 +239,21 @@ class TestOperator:
     ):
         operator = self.watch(run, auto=True, prompt="pick")
         self.step(run, operator, 40)
-        monkeypatch.setattr(run.desk, "free_bytes", lambda: 1)
+        monkeypatch.setattr(run.episode_service, "free_bytes", lambda: 1)
         self.step(run, operator, 40)
         assert run.session.finished.is_set()
-        assert (run.desk.saved, len(run.session.outcome.faults)) == (1, 1)
+        assert (run.episode_service.saved, len(run.session.outcome.faults)) == (1, 1)
         assert "0 MiB left" in run.session.outcome.faults[0]
 
     def test_continuous_is_one_episode_to_the_end_of_the_run(self, run: Runtime, runs: Runs):
         operator = self.watch(run, continuous=True, keys=False, prompt="watch")
         self.step(run, operator, 120)
-        assert run.desk.elapsed_s() > 2 * run.session.config.contract.max_duration_s
+        assert run.episode_service.elapsed_s() > 2 * run.session.config.contract.max_duration_s
         assert operator.line().startswith("recording “watch”, 2 s, saved")
         assert not operator.key("tab")
         run.stop()
         assert [event for event in runs.parts.EVENTS if event[0] == "ended"] == [("ended", 1, "unknown")]
-        assert (run.desk.saved, folders(runs)) == (1, ["episode_000001"])
+        assert (run.episode_service.saved, folders(runs)) == (1, ["episode_000001"])
 
     def test_continuous_means_nothing_where_the_mode_has_episodes(self, runs: Runs, monkeypatch: pytest.MonkeyPatch):
         monkeypatch.chdir(runs.folder)

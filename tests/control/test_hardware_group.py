@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from ibrobot_testing.contexts import make_robot
 
-from ibrobot_core.control.parts import HardwareParts
+from ibrobot_core.api import EpisodeSetup
+from ibrobot_core.control.hardware_group import HardwareGroup
 from ibrobot_core.errors import HardwareError, NotSupported
-from ibrobot_core.interfaces import Episode, Hardware, JointReading, Signal, nan_vector
+from ibrobot_core.interfaces import Hardware, JointReading, Signal, nan_vector
 from ibrobot_core.robot import Vector
 
 ROBOT = make_robot()
@@ -69,7 +70,7 @@ class Part(Hardware):
 @pytest.fixture
 def two():
     left, right = Part(LEFT, 100), Part(RIGHT, 90)
-    parts = HardwareParts(ROBOT, {"left": left, "right": right})
+    parts = HardwareGroup(ROBOT, {"left": left, "right": right})
     yield parts, left, right
     parts.disconnect()
 
@@ -99,7 +100,7 @@ def test_each_part_is_told_of_its_own_joints_in_its_own_order(two) -> None:
 
 def test_one_part_in_another_order_is_permuted() -> None:
     part = Part(tuple(reversed(ROBOT.joint_names)))
-    parts = HardwareParts(ROBOT, {"arm": part})
+    parts = HardwareGroup(ROBOT, {"arm": part})
     parts.write(np.arange(6.0))
 
     np.testing.assert_array_equal(parts.read().position, np.arange(6.0))
@@ -165,5 +166,5 @@ def test_what_cannot_relax_is_named(two) -> None:
 
 def test_only_a_simulation_is_set_up_anew(two) -> None:
     with pytest.raises(NotSupported, match="only a simulation"):
-        two[0].reset_episode(Episode(1))
+        two[0].reset_episode(EpisodeSetup(1))
     assert two[0].success() is None

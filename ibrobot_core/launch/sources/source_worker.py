@@ -1,4 +1,4 @@
-"""Feeders: what gives the active executors something to do in a mode: a policy, a teleop device, a planner."""
+"""The base of command sources that work in steps: a policy, a teleoperation device, a planner, a replay."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from abc import abstractmethod
 from typing import override
 
 from ibrobot_core.config.schema import ControlMode
-from ibrobot_core.launch.session import Feed, Session, SessionWorker
+from ibrobot_core.launch.session import CommandSource, Session, SessionWorker
 
 
-class Feeder(SessionWorker, Feed):
-    """A feed that works in units, for one mode."""
+class SourceWorker(SessionWorker, CommandSource):
+    """A command source with its own thread (in lockstep: its own step), for one mode."""
 
     def __init__(self, session: Session, mode: ControlMode, summary: str, needs: tuple[str, ...]) -> None:
         super().__init__(session, f"mode:{mode.name}", summary, needs)
@@ -24,7 +24,7 @@ class Feeder(SessionWorker, Feed):
     def begin(self, seed: int) -> None:
         with self.lock:
             self.end()
-            self.begin_feeding(seed)
+            self.begin_mode(seed)
             self.active = True
 
     @override
@@ -32,11 +32,11 @@ class Feeder(SessionWorker, Feed):
         with self.lock:
             if self.active:
                 self.active = False
-                self.end_feeding()
+                self.end_mode()
 
     @abstractmethod
-    def begin_feeding(self, seed: int) -> None:
-        """Start afresh from the measured state, with the lock held."""
+    def begin_mode(self, seed: int) -> None:
+        """Start from the measured state; called with the lock held."""
 
-    def end_feeding(self) -> None:
-        """Stop, with the lock held."""
+    def end_mode(self) -> None:
+        """Stop; called with the lock held."""
