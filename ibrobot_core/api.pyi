@@ -189,11 +189,10 @@ from ibrobot_core.config.schema import (
     TransportConfig as TransportConfig,
 )
 from ibrobot_core.config.expand import resolve_path as resolve_path
-from ibrobot_core.config.convert import Converter as Converter, Faults as Faults
 from ibrobot_core.config.overrides import apply_overrides as apply_overrides
 from ibrobot_core.config.show import dump_yaml as dump_yaml
 from ibrobot_core.config.yaml_nodes import parse_yaml as parse_yaml
-from ibrobot_core.config.single import single_options as single_options
+from ibrobot_core.config.single import from_yaml as from_yaml, single_options as single_options
 from ibrobot_core.plugins import (
     Registry as Registry,
     example_type as example_type,

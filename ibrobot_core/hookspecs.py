@@ -22,100 +22,84 @@ from typing import TYPE_CHECKING
 import pluggy
 
 if TYPE_CHECKING:
-    from ibrobot_core.descriptors import (
-        Check,
-        Command,
-        ConfigFile,
-        DatasetDescriptor,
-        DecoderDescriptor,
-        ExecutorDescriptor,
-        HardwareDescriptor,
-        PlannerDescriptor,
-        PolicyDescriptor,
-        ReaderDescriptor,
-        RecorderDescriptor,
-        SensorDescriptor,
-        TeleopDescriptor,
-        TransportDescriptor,
-        ViewerDescriptor,
-    )
+    from ibrobot_core import descriptors
 
 hookspec = pluggy.HookspecMarker("ibrobot")
 hookimpl = pluggy.HookimplMarker("ibrobot")
 
 
 @hookspec
-def ibrobot_hardware() -> Iterable[HardwareDescriptor]:  # type: ignore[empty-body]
+def ibrobot_hardware() -> Iterable[descriptors.HardwareDescriptor]:  # type: ignore[empty-body]
     """Hardware that this plugin drives or simulates."""
 
 
 @hookspec
-def ibrobot_sensors() -> Iterable[SensorDescriptor]:  # type: ignore[empty-body]
+def ibrobot_sensors() -> Iterable[descriptors.SensorDescriptor]:  # type: ignore[empty-body]
     """Cameras and other sensors."""
 
 
 @hookspec
-def ibrobot_teleop() -> Iterable[TeleopDescriptor]:  # type: ignore[empty-body]
+def ibrobot_teleop() -> Iterable[descriptors.TeleopDescriptor]:  # type: ignore[empty-body]
     """Teleoperation devices."""
 
 
 @hookspec
-def ibrobot_policies() -> Iterable[PolicyDescriptor]:  # type: ignore[empty-body]
+def ibrobot_policies() -> Iterable[descriptors.PolicyDescriptor]:  # type: ignore[empty-body]
     """Policies."""
 
 
 @hookspec
-def ibrobot_executors() -> Iterable[ExecutorDescriptor]:  # type: ignore[empty-body]
+def ibrobot_executors() -> Iterable[descriptors.ExecutorDescriptor]:  # type: ignore[empty-body]
     """Executors, ahead of the safety layer in the control process."""
 
 
 @hookspec
-def ibrobot_planners() -> Iterable[PlannerDescriptor]:  # type: ignore[empty-body]
+def ibrobot_planners() -> Iterable[descriptors.PlannerDescriptor]:  # type: ignore[empty-body]
     """Motion planners."""
 
 
 @hookspec
-def ibrobot_transports() -> Iterable[TransportDescriptor]:  # type: ignore[empty-body]
+def ibrobot_transports() -> Iterable[descriptors.TransportDescriptor]:  # type: ignore[empty-body]
     """Transports between processes and machines."""
 
 
 @hookspec
-def ibrobot_recorders() -> Iterable[RecorderDescriptor]:  # type: ignore[empty-body]
+def ibrobot_recorders() -> Iterable[descriptors.RecorderDescriptor]:  # type: ignore[empty-body]
     """Episode recorders."""
 
 
 @hookspec
-def ibrobot_readers() -> Iterable[ReaderDescriptor]:  # type: ignore[empty-body]
+def ibrobot_readers() -> Iterable[descriptors.ReaderDescriptor]:  # type: ignore[empty-body]
     """Formats of recorded episodes that this plugin reads."""
 
 
 @hookspec
-def ibrobot_decoders() -> Iterable[DecoderDescriptor]:  # type: ignore[empty-body]
+def ibrobot_decoders() -> Iterable[descriptors.DecoderDescriptor]:  # type: ignore[empty-body]
     """Formats of compressed pictures that this plugin decodes."""
 
 
 @hookspec
-def ibrobot_datasets() -> Iterable[DatasetDescriptor]:  # type: ignore[empty-body]
+def ibrobot_datasets() -> Iterable[descriptors.DatasetDescriptor]:  # type: ignore[empty-body]
     """Dataset writers."""
 
 
 @hookspec
-def ibrobot_viewers() -> Iterable[ViewerDescriptor]:  # type: ignore[empty-body]
+def ibrobot_viewers() -> Iterable[descriptors.ViewerDescriptor]:  # type: ignore[empty-body]
     """Viewers."""
 
 
 @hookspec
-def ibrobot_configs() -> Iterable[ConfigFile]:  # type: ignore[empty-body]
+def ibrobot_configs() -> Iterable[descriptors.ConfigFile]:  # type: ignore[empty-body]
     """Robot YAMLs that this plugin ships."""
 
 
 @hookspec
-def ibrobot_commands() -> Iterable[Command]:  # type: ignore[empty-body]
+def ibrobot_commands() -> Iterable[descriptors.Command]:  # type: ignore[empty-body]
     """Commands that this plugin adds to `ibrobot`."""
 
 
 @hookspec
-def ibrobot_doctor() -> Iterable[Check]:  # type: ignore[empty-body]
+def ibrobot_doctor() -> Iterable[descriptors.Check]:  # type: ignore[empty-body]
     """Checks that `ibrobot doctor` runs."""
 
 

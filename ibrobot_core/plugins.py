@@ -38,6 +38,8 @@ KINDS: Mapping[str, str] = {
     "viewer": "ibrobot_viewers",
 }
 """Plugin kind -> the hook that registers it."""
+_UNTYPED = ("ibrobot_readers", "ibrobot_decoders", "ibrobot_configs", "ibrobot_commands")
+"""Hooks that register what no section of a YAML names by `type`."""
 
 OFFICIAL = Path(__file__).with_name("official_plugins.json")
 """What this project's own packages offer: package -> kind -> types; kind `default` has the kinds whose default type the
@@ -238,36 +240,27 @@ def _check_names(plugin: Any) -> None:
 
 def _collect(registry: Registry, plugin: str, package: str, version: str, manager: pluggy.PluginManager) -> None:
     """Call the registering hooks; a plugin that raises in one offers nothing."""
-    found: list[tuple[str, Descriptor[Any]]] = []
+    offers: dict[str, list[Any]] = {}
     stage = ""
     try:
-        for kind, stage in KINDS.items():
-            for descriptor in (d for result in getattr(manager.hook, stage)() for d in result):
-                if not isinstance(descriptor, Descriptor):
-                    raise TypeError(f"expected a Descriptor, got {descriptor!r}")
-                found.append((kind, descriptor))
-        stage = "ibrobot_readers"
-        readers = [r for result in manager.hook.ibrobot_readers() for r in result]
-        stage = "ibrobot_decoders"
-        decoders = [d for result in manager.hook.ibrobot_decoders() for d in result]
-        stage = "ibrobot_configs"
-        configs = [c for result in manager.hook.ibrobot_configs() for c in result]
-        stage = "ibrobot_commands"
-        commands = [c for result in manager.hook.ibrobot_commands() for c in result]
+        for stage in (*KINDS.values(), *_UNTYPED):
+            offers[stage] = [each for result in getattr(manager.hook, stage)() for each in result]
+            if stage in KINDS.values() and (wrong := [d for d in offers[stage] if not isinstance(d, Descriptor)]):
+                raise TypeError(f"expected a Descriptor, got {wrong[0]!r}")
     except Exception as error:  # noqa: BLE001 - contained: reported where the plugin is asked for
         registry.failures.append(Failure(plugin, package, stage, _reason(error)))
         return
-    for kind, descriptor in found:
+    for kind, descriptor in ((kind, each) for kind, hook in KINDS.items() for each in offers[hook]):
         other = registry.entries.get((kind, descriptor.type))
         if other is not None:
             reason = f"{kind} type {descriptor.type!r} is offered by {other.package} already"
             registry.failures.append(Failure(plugin, package, KINDS[kind], reason))
             continue
         registry.entries[kind, descriptor.type] = Entry(kind, descriptor, plugin, package, version)
-    registry.readers += readers
-    registry.decoders += decoders
-    registry.configs += configs
-    registry.commands.update({command.name: command for command in commands})
+    registry.readers += offers["ibrobot_readers"]
+    registry.decoders += offers["ibrobot_decoders"]
+    registry.configs += offers["ibrobot_configs"]
+    registry.commands.update({command.name: command for command in offers["ibrobot_commands"]})
     registry.managers[plugin] = manager
 
 

@@ -57,23 +57,22 @@ class Selection:
     `data.0` is an element, `data` the whole array, `orientation` all of its numbers. Without any path it is
     the numbers of the whole message, or for a JointState the positions of the robot's joints in their order.
 
+    Bags of others define types that core does not know: there every path, e.g. `wrench.force.x` or `tags.0.id`, is
+    looked up in the messages, and leads to one number. So is a path into a list of parts of a known type, e.g.
+    `points.0.positions.2`.
+
     Args:
         type_name: the ROS 2 message type, e.g. `sensor_msgs/msg/JointState`.
         select: the paths, in the order of the vector.
         joints: the robot's joints.
-        foreign: a type that core does not know is one that bags of others define; then every path, e.g.
-            `wrench.force.x` or `tags.0.id`, is looked up in the messages, and leads to one number. So is one into
-            a list of parts of a known type, e.g. `points.0.positions.2`.
 
     Raises:
-        ContractError: for an unknown type, or a path that leads to no number of it.
+        ContractError: for an unknown type without paths, or a path that leads to no number of a known one.
     """
 
-    def __init__(
-        self, type_name: str, select: Sequence[str] = (), joints: Sequence[str] = (), *, foreign: bool = False
-    ) -> None:
+    def __init__(self, type_name: str, select: Sequence[str] = (), joints: Sequence[str] = ()) -> None:
         message_type = MESSAGE_TYPES.get(type_name)
-        if message_type is None and foreign and select:
+        if message_type is None and select:
             self.paths = tuple(select)
             leaves = [Leaf(path, "foreign") for path in select]
         elif message_type is None:

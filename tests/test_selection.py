@@ -167,7 +167,7 @@ class Touch(Message):
 )
 def test_paths_lead_into_messages_of_foreign_types(pressure: list[float], numbers: list[int], hot: bool) -> None:
     paths = [f"pressure.{i}" for i in range(len(pressure))] + [f"tags.{i}.number" for i in range(len(numbers))]
-    selection = Selection(TOUCH, [*paths, "hot"], foreign=True)
+    selection = Selection(TOUCH, [*paths, "hot"])
     assert (selection.size, selection.names) == (len(paths) + 1, (*paths, "hot"))
     message = Touch(Header(), np.array(pressure, np.float32), tuple(Tag(n, "x") for n in numbers), hot)
     vector = selection(message)
@@ -191,12 +191,12 @@ def test_paths_lead_into_messages_of_foreign_types(pressure: list[float], number
 def test_paths_that_lead_to_no_number_of_a_foreign_message(path: str, message: str) -> None:
     touch = Touch(Header(), np.zeros(2), (Tag(1, "x"),))
     with pytest.raises(ContractError, match=re.escape(message)):
-        Selection(TOUCH, [path], foreign=True)(touch)
+        Selection(TOUCH, [path])(touch)
 
 
-def test_a_type_that_nobody_called_foreign_is_unknown() -> None:
+def test_unknown_type_needs_paths() -> None:
     with pytest.raises(ContractError, match="unknown message type 'lamp_msgs/msg/Touch'"):
-        Selection(TOUCH, ["pressure.0"])
+        Selection(TOUCH)
 
 
 def test_paths_lead_into_lists_of_parts_of_known_types() -> None:

@@ -179,10 +179,10 @@ class ContractChecks:
                 self.document.add(key, f"unknown joint {joint!r}{did_you_mean(joint, joints, 'known')}")
         self._size(key, spec.type, (path,))
 
-    def _size(self, key: Key, type_: str, select: Sequence[str], *, foreign: bool = False) -> int | None:
+    def _size(self, key: Key, type_: str, select: Sequence[str]) -> int | None:
         """How many numbers paths lead to in messages of a type; None with the fault noted where they lead to none."""
         try:
-            return Selection(type_, select, foreign=foreign).size
+            return Selection(type_, select).size
         except ContractError as error:
             self.document.add(key, str(error))
             return None
@@ -258,7 +258,7 @@ class ContractChecks:
             self._one_number_a_joint((*key, "select"), spec)
 
     def _one_number_a_joint(self, key: Key, spec: ActionSpec) -> None:
-        size, joints = self._size(key, spec.type, spec.select, foreign=True), self._joints(spec)
+        size, joints = self._size(key, spec.type, spec.select), self._joints(spec)
         if size is not None and joints and size != len(joints):
             given = "a length that only messages know" if size < 0 else f"{size} numbers"
             message = f"gives {given} for the {len(joints)} joints of {spec.executor!r}: {', '.join(joints)}"
@@ -292,7 +292,7 @@ class ContractChecks:
             self.document.add((*key, "select"), f"{spec.key} takes one path, e.g. [data]")
         elif spec.key == TASK_KEY:
             self._text((*key, "select", 0), spec)
-        elif self._size((*key, "select", 0), spec.type, spec.select, foreign=True) not in (1, None):
+        elif self._size((*key, "select", 0), spec.type, spec.select) not in (1, None):
             path = spec.select[0]
             self.document.add((*key, "select", 0), f"{path!r} must lead to one number, e.g. {path}.0")
         return spec

@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin
 
 import attrs
+import numpy as np
+from numpy.typing import NDArray
 
 from ibrobot_core.config.expand import resolve_path
 from ibrobot_core.config.yaml_nodes import Key
@@ -128,7 +130,7 @@ class Converter:
             ValueError: for what is wrong with it as a whole.
             TypeError: for a kind that is not supported, which is a mistake in an options class.
         """
-        if kind is Any:
+        if kind is Any or get_origin(kind) in (np.ndarray, NDArray):  # an array's class converts it
             return value
         if kind in _SCALARS:
             return _scalar(value, kind)

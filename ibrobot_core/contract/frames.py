@@ -33,9 +33,7 @@ class _Part:
         self.part = part
         self.stream: Stream[Message] = Stream(part.align, step_ns)
         self._read: Callable[[Any], _Array] = (
-            Selection(part.type, part.select, foreign=True)
-            if part.image is None
-            else partial(decode_image, spec=part.image)
+            Selection(part.type, part.select) if part.image is None else partial(decode_image, spec=part.image)
         )
         self._sample: Sample[Message] | None = None
         self._value: _Array | None = None

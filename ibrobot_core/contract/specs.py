@@ -223,23 +223,18 @@ def _observation(spec: ObservationSpec, config: RobotConfig) -> ObservationPart:
     """Find the paths and the shape of a spec."""
     peripheral = config.peripherals[spec.peripheral] if spec.peripheral is not None else None
     spec = completed(spec, peripheral.kind if peripheral is not None else "")
-    if spec.type not in MESSAGE_TYPES:
-        return _foreign_observation(spec.key, spec.topic, spec.type, spec.select, spec.align)
     type_ = _CAMERA_TYPE if spec.type == _COMPRESSED_TYPE else spec.type  # a picture is a picture, however it is sent
-    has_header = "header" in attrs.fields_dict(MESSAGE_TYPES[type_])
+    known = MESSAGE_TYPES.get(type_)
+    has_header = known is None or "header" in attrs.fields_dict(known)
     align = spec.align if has_header else attrs.evolve(spec.align, stamp="receive")
     if type_ == _CAMERA_TYPE:
         image = spec.image or ImageSpec()
         size = peripheral.picture if peripheral is not None else None
         return ObservationPart(spec.key, spec.topic, type_, (), image, align, _image_feature(image, size))
-    selection = Selection(type_, spec.select, config.robot.joint_names)
-    feature = Feature("float32", (selection.size,), selection.names)
-    return ObservationPart(spec.key, spec.topic, type_, selection.paths, None, align, feature)
+    return _vector(spec.key, spec.topic, type_, Selection(type_, spec.select, config.robot.joint_names), align)
 
 
-def _foreign_observation(key: str, topic: str, type_: str, select: Sequence[str], align: Align) -> ObservationPart:
-    """Of a type that only bags of others define."""
-    selection = Selection(type_, select, foreign=True)
+def _vector(key: str, topic: str, type_: str, selection: Selection, align: Align) -> ObservationPart:
     feature = Feature("float32", (selection.size,), selection.names)
     return ObservationPart(key, topic, type_, selection.paths, None, align, feature)
 
@@ -247,12 +242,8 @@ def _foreign_observation(key: str, topic: str, type_: str, select: Sequence[str]
 def _recorded_observation(key: str, part: Mapping[str, Any]) -> ObservationPart:
     """A part as `_canonical` gives it."""
     align = Align(**part["align"])
-    if part["type"] not in MESSAGE_TYPES and part["select"]:
-        return _foreign_observation(key, part["topic"], part["type"], part["select"], align)
     if part["encoding"] is None:
-        selection = Selection(part["type"], part["select"])
-        feature = Feature("float32", (selection.size,), selection.names)
-        return ObservationPart(key, part["topic"], part["type"], selection.paths, None, align, feature)
+        return _vector(key, part["topic"], part["type"], Selection(part["type"], part["select"]), align)
     height, width, _ = part["shape"]
     image = ImageSpec((height, width) if min(height, width) > 0 else None, part["encoding"])
     return ObservationPart(key, part["topic"], part["type"], (), image, align, _image_feature(image, None))

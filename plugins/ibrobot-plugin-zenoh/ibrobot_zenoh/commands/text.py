@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from difflib import get_close_matches
-from pathlib import Path
-from typing import Any, get_origin
+from typing import Any
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
 
-from ibrobot_core.api import MESSAGE_TYPES, Converter, Faults, Message, NotSupported, dump_yaml, parse_yaml
+from ibrobot_core.api import MESSAGE_TYPES, Message, NotSupported, dump_yaml, from_yaml
 
 _SHOWN = 16
 """Elements of an array that are shown."""
@@ -33,13 +31,6 @@ def _plain(value: Any, full: bool) -> Any:
     return value
 
 
-class _Messages(Converter):
-    """Leaves arrays to the message classes."""
-
-    def structure(self, value: Any, kind: Any) -> Any:
-        return value if get_origin(kind) in (np.ndarray, NDArray) else super().structure(value, kind)
-
-
 def message_from(type_name: str, text: str) -> Message:
     """The message that a YAML text says, e.g. `{data: true}`.
 
@@ -52,16 +43,4 @@ def message_from(type_name: str, text: str) -> Message:
         close = get_close_matches(type_name, MESSAGE_TYPES, 1)
         hint = f"did you mean {close[0]!r}?" if close else f"one of: {', '.join(sorted(MESSAGE_TYPES))}"
         raise NotSupported(f"{type_name!r} is no type that can be published, {hint}")
-    document = parse_yaml(text, "MESSAGE")
-    document.raise_problems()
-    try:
-        message: Message = _Messages(Path.cwd()).structure(document.root, kind)
-    except Faults as faults:
-        for key, told in faults.found:
-            document.add(key, told)
-    except (ValueError, TypeError) as error:
-        document.add((), str(error))
-    else:
-        return message
-    document.raise_problems()
-    raise AssertionError("not reached: there was a fault")
+    return from_yaml(text, kind, "MESSAGE")
