@@ -10,17 +10,17 @@ from typing import Any
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
 
 from ibrobot_core.clock import Clock
 from ibrobot_core.config import RobotConfig
+from ibrobot_core.control.active import ActiveExecutors
 from ibrobot_core.control.following import FollowingError
 from ibrobot_core.control.hardware_group import HardwareGroup
 from ibrobot_core.control.health import Health
 from ibrobot_core.control.link import ControlState, PlanRecord
 from ibrobot_core.control.safety import SafetyLayer
-from ibrobot_core.errors import GoalRejected, HardwareError, IbrobotError, NotSupported
-from ibrobot_core.interfaces import EpisodeSetup, Executor, JointReading, Plan, Signal, Torque
+from ibrobot_core.errors import HardwareError, IbrobotError, NotSupported
+from ibrobot_core.interfaces import EpisodeSetup, Executor, JointReading, Signal, Torque
 from ibrobot_core.robot import Vector
 from ibrobot_core.units import ns
 
@@ -33,22 +33,6 @@ _POSE_SPEED = 0.25
 _POSE_TIMEOUT_S = 10.0
 _POSE_TOLERANCE = 0.2
 """How far a joint may hang from a startup pose that it was told [rad]."""
-
-
-@attrs.frozen(eq=False)
-class _Owned:
-    """An executor and the robot's columns that it owns."""
-
-    name: str
-    executor: Executor
-    columns: NDArray[np.intp]
-
-    def reading(self, measured: JointReading, now_ns: int | None = None) -> JointReading:
-        columns = self.columns
-        return JointReading(
-            measured.stamp_ns if now_ns is None else now_ns, measured.position[columns],
-            measured.velocity[columns], measured.effort[columns], measured.stale,
-        )  # fmt: skip
 
 
 class ControlCore:
@@ -71,8 +55,6 @@ class ControlCore:
         self._clock = clock
         self.period_ns = ns(1.0 / config.control.rate_hz)
         self._safety = SafetyLayer(config.robot, self.period_ns)
-        self._owned = {n: _Owned(n, e, self._robot.indices(e.joints)) for n, e in executors.items()}
-        self._active: list[_Owned] = []
         self._state_timeout_ns = ns(config.control.state_timeout)
         self._counts = {"read_errors": 0, "write_errors": 0, "signal_errors": 0, "stale_states": 0, "old_plans": 0}
         self._counts["following_errors"] = 0
@@ -101,8 +83,9 @@ class ControlCore:
         self.mode = ""
         self.generation = 0
         self.fault = ""
-        self.events: deque[dict[str, Any]] = deque()
+        self.events: deque[Mapping[str, Any]] = deque()
         """What the host is to be told: `goal` and `fault` events."""
+        self._executors = ActiveExecutors(config.robot, executors, self.events.append)
         self.state: ControlState | None = None
         """After a tick, what it found and did."""
 
@@ -185,9 +168,7 @@ class ControlCore:
         if plan.generation != self.generation or self.fault:
             self._counts["old_plans"] += 1
             return
-        for owned in self._active:
-            if owned.executor.accepts_plans and plan.mask[owned.columns].all():
-                owned.executor.set_plan(Plan(plan.start_ns, plan.step_ns, plan.positions[:, owned.columns]))
+        self._executors.set_plan(plan)
 
     def handle(self, command: Mapping[str, Any]) -> dict[str, Any]:
         """Carry out a command of the host and answer it; a refused one is answered with `error`."""
@@ -205,7 +186,7 @@ class ControlCore:
         return {
             "safety": dict(self._safety.counters()),
             "joints": dict(self._safety.interventions),
-            "executors": {name: dict(owned.executor.counters()) for name, owned in self._owned.items()},
+            "executors": self._executors.counters(),
             "hardware": self._hardware.counters(),
             "loop": dict(self._counts),
             "conditions": [attrs.asdict(each, value_serializer=_plain) for each in self._health.conditions],
@@ -376,16 +357,12 @@ class ControlCore:
         """What is asked for in this tick; None to brake and hold."""
         if self._target is not None:
             return None if self._late_to_pose else self._safety.towards(self._target, _POSE_SPEED)
-        if not self._active:
+        if not self._executors:
             return self._yield()
         # A plan goes on by time where a single reply was lost.
         now_ns = self._clock.now_ns() if self._measured.stale else None
-        setpoints = []
-        relax = False
-        for owned in self._active:
-            setpoints.append((owned.columns, owned.executor.update(owned.reading(self._measured, now_ns))))
-            relax = relax or owned.executor.wants_relax
-            self._report_goals(owned)
+        setpoints = self._executors.update(self._measured, now_ns)
+        relax = self._executors.want_relax
         if relax and not self._relaxed:
             self._relax("the setpoints are stale")
         elif self._relaxed and not relax and not self._restore_torque():
@@ -394,15 +371,6 @@ class ControlCore:
         for columns, setpoint in setpoints:
             desired[columns] = setpoint
         return desired
-
-    def _report_goals(self, owned: _Owned) -> None:
-        while (status := owned.executor.pop_status()) is not None:
-            self.events.append(
-                {
-                    "event": "goal", "executor": owned.name, "goal": status.goal_id, "state": str(status.state),
-                    "message": status.message, "result": dict(status.result),
-                }
-            )  # fmt: skip
 
     def _relax(self, why: str) -> None:
         """Take torque off, and say for each part whether that is so, whatever fault is set already."""
@@ -460,17 +428,11 @@ class ControlCore:
 
     def _leave(self) -> None:
         """Deactivate all executors; without one, every joint brakes and holds."""
-        for owned in self._active:
-            owned.executor.cancel(owned.reading(self._measured))
-            self._report_goals(owned)
-            owned.executor.deactivate()
-        self._active = []
+        self._executors.leave(self._measured)
         self.generation += 1
 
     def _enter(self) -> None:
-        self._active = [self._owned[name] for name in self._config.control_modes[self.mode].executors]
-        for owned in self._active:
-            owned.executor.activate(owned.reading(self._measured))
+        self._executors.enter(self._config.control_modes[self.mode].executors, self._measured)
         self.generation += 1
 
     def _switch_mode(self, mode: str) -> None:
@@ -517,14 +479,10 @@ class ControlCore:
         self._enter()
 
     def _goal(self, executor: str, goal_id: str, goal: Mapping[str, Any]) -> None:
-        active = {owned.name: owned for owned in self._active}
-        if executor not in active:
-            raise GoalRejected(f"executor {executor!r} is not active; active: {', '.join(active) or 'none'}")
-        active[executor].executor.set_goal(goal_id, goal, active[executor].reading(self._measured))
+        self._executors.set_goal(executor, goal_id, goal, self._measured)
 
     def _cancel(self) -> None:
-        for owned in self._active:
-            owned.executor.cancel(owned.reading(self._measured))
+        self._executors.cancel(self._measured)
 
 
 def _plain(_: object, __: object, value: Any) -> Any:

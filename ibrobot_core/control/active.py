@@ -1,0 +1,119 @@
+"""The executors of a mode and the joints that each owns: they take plans and goals, and give setpoints."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+import attrs
+import numpy as np
+from numpy.typing import NDArray
+
+from ibrobot_core.control.link import PlanRecord
+from ibrobot_core.errors import GoalRejected
+from ibrobot_core.interfaces import Executor, JointReading, Plan
+from ibrobot_core.robot import Robot, Vector
+
+
+@attrs.frozen(eq=False)
+class _Owned:
+    """An executor and the robot's columns that it owns."""
+
+    name: str
+    executor: Executor
+    columns: NDArray[np.intp]
+
+    def reading(self, measured: JointReading, now_ns: int | None = None) -> JointReading:
+        columns = self.columns
+        return JointReading(
+            measured.stamp_ns if now_ns is None else now_ns, measured.position[columns],
+            measured.velocity[columns], measured.effort[columns], measured.stale,
+        )  # fmt: skip
+
+
+class ActiveExecutors:
+    """The executors that are active, among all of a robot; without one, nothing moves the joints.
+
+    Args:
+        robot: the robot.
+        executors: name -> executor.
+        report: given a `goal` event whenever a goal changes its state.
+
+    Attributes:
+        want_relax: whether one asked for torque off at the last `update`.
+    """
+
+    def __init__(
+        self, robot: Robot, executors: Mapping[str, Executor], report: Callable[[Mapping[str, Any]], None]
+    ) -> None:
+        self._all = {name: _Owned(name, each, robot.indices(each.joints)) for name, each in executors.items()}
+        self._active: list[_Owned] = []
+        self._report = report
+        self.want_relax = False
+
+    def __bool__(self) -> bool:
+        return bool(self._active)
+
+    def enter(self, names: Iterable[str], measured: JointReading) -> None:
+        """Activate the executors of a mode where the joints are."""
+        self._active = [self._all[name] for name in names]
+        for owned in self._active:
+            owned.executor.activate(owned.reading(measured))
+
+    def leave(self, measured: JointReading) -> None:
+        """Deactivate all; their goals are cancelled."""
+        for owned in self._active:
+            owned.executor.cancel(owned.reading(measured))
+            self._report_goals(owned)
+            owned.executor.deactivate()
+        self._active = []
+
+    def set_plan(self, plan: PlanRecord) -> None:
+        """Give a plan to those that accept one and whose joints it has."""
+        for owned in self._active:
+            if owned.executor.accepts_plans and plan.mask[owned.columns].all():
+                owned.executor.set_plan(Plan(plan.start_ns, plan.step_ns, plan.positions[:, owned.columns]))
+
+    def update(self, measured: JointReading, now_ns: int | None) -> list[tuple[NDArray[np.intp], Vector]]:
+        """The robot's columns that each owns, and its setpoints for them [rad].
+
+        Args:
+            measured: all joints.
+            now_ns: the time, where that of the reading is too old [ns].
+        """
+        setpoints = []
+        self.want_relax = False
+        for owned in self._active:
+            setpoints.append((owned.columns, owned.executor.update(owned.reading(measured, now_ns))))
+            self.want_relax = self.want_relax or owned.executor.wants_relax
+            self._report_goals(owned)
+        return setpoints
+
+    def set_goal(self, executor: str, goal_id: str, goal: Mapping[str, Any], measured: JointReading) -> None:
+        """Give a goal to an executor.
+
+        Raises:
+            GoalRejected: for one that is not active, or that refuses it.
+        """
+        active = {owned.name: owned for owned in self._active}
+        if executor not in active:
+            raise GoalRejected(f"executor {executor!r} is not active; active: {', '.join(active) or 'none'}")
+        active[executor].executor.set_goal(goal_id, goal, active[executor].reading(measured))
+
+    def cancel(self, measured: JointReading) -> None:
+        """Cancel all goals; the executors hold."""
+        for owned in self._active:
+            owned.executor.cancel(owned.reading(measured))
+
+    def counters(self) -> dict[str, dict[str, int]]:
+        """What each executor counts, those that are not active too."""
+        return {name: dict(owned.executor.counters()) for name, owned in self._all.items()}
+
+    def _report_goals(self, owned: _Owned) -> None:
+        while (status := owned.executor.pop_status()) is not None:
+            self._report(
+                {
+                    "event": "goal", "executor": owned.name, "goal": status.goal_id, "state": str(status.state),
+                    "message": status.message, "result": dict(status.result),
+                }
+            )  # fmt: skip
