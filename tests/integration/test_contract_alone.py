@@ -95,7 +95,7 @@ def test_a_drafted_contract_converts_the_bag_that_it_is_from(kitchen: Path) -> N
     actions = [row[0] for row in table["action"]]
     assert actions == [actions[0] + i for i in range(len(actions))], "the next command after each picture"
     again = ibrobot(kitchen, "contract", "init", "kitchen", "-o", "kitchen.yaml")
-    assert (again.returncode, "File exists" in again.stderr) == (1, True)
+    assert (again.returncode, "File exists" in again.stderr) == (2, True)
 
 
 SIGNALS = {
