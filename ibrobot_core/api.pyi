@@ -179,7 +179,7 @@ from ibrobot_core.contract.image import pixels as pixels
 from ibrobot_core.contract.frames import FrameAssembler as FrameAssembler, assemble as assemble
 from ibrobot_core.contract.joint_units import JointUnits as JointUnits
 from ibrobot_core.contract.joint_units import with_closed_ends as with_closed_ends
-from ibrobot_core.selection import Leaf as Leaf, Selection as Selection, text_at as text_at
+from ibrobot_core.selection import Leaf as Leaf, Selection as Selection, value_at as value_at
 from ibrobot_core.config import RobotConfig as RobotConfig, find_config as find_config, load_config as load_config
 from ibrobot_core.config.load import load_contract as load_contract
 from ibrobot_core.config.schema import (

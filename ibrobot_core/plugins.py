@@ -18,6 +18,7 @@ import pluggy
 from ibrobot_core import hookspecs
 from ibrobot_core.descriptors import Check, Command, ConfigFile, DecoderDescriptor, Descriptor, ReaderDescriptor
 from ibrobot_core.errors import ContractError, MissingDependency, PluginError, PluginNotInstalled, RecorderError
+from ibrobot_core.options import did_you_mean
 
 if TYPE_CHECKING:
     from ibrobot_core.interfaces import EpisodeReader
@@ -180,10 +181,8 @@ class Registry:
         if package is not None:
             return PluginNotInstalled(kind, type_, package)
         offered = self.types(kind)
-        close = get_close_matches(type_, offered, 1)
-        hint = f", did you mean {close[0]!r}?" if close else f"; installed: {', '.join(offered) or 'none'}"
         broken = "".join(f"; {failure}" for failure in self.failures)
-        return PluginError(f"unknown {kind} type {type_!r}{hint}{broken}")
+        return PluginError(f"unknown {kind} type {type_!r}{did_you_mean(type_, offered, 'installed')}{broken}")
 
     def doctor(self) -> list[Check]:
         """The checks of all plugins; a plugin whose check raises is itself a failed check."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import typing
 from collections.abc import Callable, Sequence
-from difflib import get_close_matches
 from functools import lru_cache
 from itertools import groupby
 from operator import attrgetter
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 
 from ibrobot_core.errors import ContractError
 from ibrobot_core.messages import MESSAGE_TYPES, JointState, Message
+from ibrobot_core.options import did_you_mean
 
 _WHOLE: dict[str, tuple[str, ...]] = {
     "sensor_msgs/msg/Imu": ("orientation", "angular_velocity", "linear_acceleration"),
@@ -76,7 +76,9 @@ class Selection:
             self.paths = tuple(select)
             leaves = [Leaf(path, "foreign") for path in select]
         elif message_type is None:
-            raise ContractError(f"unknown message type {type_name!r}{_close(type_name, MESSAGE_TYPES)}")
+            raise ContractError(
+                f"unknown message type {type_name!r}{did_you_mean(type_name, list(MESSAGE_TYPES), 'there are')}"
+            )
         else:
             self.paths = tuple(select) or _default(message_type, joints)
             leaves = [leaf for path in self.paths for leaf in _resolve(message_type, path)]
@@ -117,7 +119,9 @@ def _resolve(message_type: type[Any], path: str) -> list[Leaf]:
     for depth, token in enumerate(tokens):
         kinds = {k: v for k, v in typing.get_type_hints(owner).items() if typing.get_origin(v) is not typing.ClassVar}
         if token not in kinds:
-            raise ContractError(f"{path!r}: {owner.__name__} has no field {token!r}{_close(token, kinds)}")
+            raise ContractError(
+                f"{path!r}: {owner.__name__} has no field {token!r}{did_you_mean(token, list(kinds), 'there are')}"
+            )
         kind, field, rest = kinds[token], ".".join(tokens[: depth + 1]), ".".join(tokens[depth + 1 :])
         if attrs.has(kind):
             owner = kind
@@ -208,21 +212,9 @@ def _foreign_reader(paths: list[list[str]]) -> _Read:
     return lambda message: np.array([_number_at(message, path) for path in paths], dtype=np.float64)
 
 
-def text_at(message: Message, path: str) -> str:
-    """The text that a path leads to.
-
-    Raises:
-        ContractError: when it leads to none.
-    """
-    value = _value_at(message, path.split("."))
-    if not isinstance(value, str):
-        raise ContractError(f"{path!r} leads to no text in a {message.ros_type}{_fields_of(value)}")
-    return value
-
-
 def _number_at(message: Any, path: Sequence[str]) -> float:
     """The number that a path leads to in a message whose class nobody knew before."""
-    value = _value_at(message, path)
+    value = value_at(message, path)
     if isinstance(value, int | float | np.number | np.bool_):
         return float(value)
     if isinstance(value, tuple | list | np.ndarray):
@@ -230,8 +222,16 @@ def _number_at(message: Any, path: Sequence[str]) -> float:
     raise ContractError(f"{'.'.join(path)!r} leads to no number{_fields_of(value)}")
 
 
-def _value_at(message: Any, path: Sequence[str]) -> Any:
-    """What a path leads to in a message; None where it leads on from a number or text."""
+def value_at(message: Any, path: Sequence[str]) -> Any:
+    """What a path leads to in a message; None where it leads on from a number or text.
+
+    Args:
+        message: any message, also of a type that only bags define.
+        path: names of fields, and numbers of elements.
+
+    Raises:
+        ContractError: for a field or an element that is not there.
+    """
     value: Any = message
     for depth, token in enumerate(path):
         before = ".".join(path[:depth]) or "the message"
@@ -251,9 +251,3 @@ def _value_at(message: Any, path: Sequence[str]) -> Any:
 
 def _fields_of(value: Any) -> str:
     return f"; there are: {', '.join(attrs.fields_dict(type(value)))}" if attrs.has(type(value)) else ""
-
-
-def _close(name: str, known: typing.Iterable[str]) -> str:
-    known = [k for k in known if k != "ros_type"]
-    close = get_close_matches(name, known, 1)
-    return f", did you mean {close[0]!r}?" if close else f"; there are: {', '.join(known)}"

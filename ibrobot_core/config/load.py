@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ from ibrobot_core.config.secrets import check_known, expanded_again, public, war
 from ibrobot_core.config.structure import ParsedComponent, ParsedSections, SectionParser
 from ibrobot_core.config.yaml_nodes import MAX_BYTES, Document, Place, parse_yaml
 from ibrobot_core.errors import ConfigError, Problem
+from ibrobot_core.options import did_you_mean
 from ibrobot_core.plugins import Registry, installed_plugins
 from ibrobot_core.robot import Robot
 
@@ -255,6 +255,5 @@ def find_config(name: str | None, registry: Registry) -> Path:
         return known[stem]
     if Path(name).name != name:
         raise ConfigError([Problem(name, 0, "", "no such file")])
-    close = get_close_matches(stem, known, 1)
-    remark = f", did you mean {close[0]!r}?" if close else f"; the configs are: {', '.join(known) or 'none'}"
+    remark = did_you_mean(stem, list(known), "the configs are")
     raise ConfigError([Problem(name, 0, "", f"no such file, and no config of this name{remark}")])

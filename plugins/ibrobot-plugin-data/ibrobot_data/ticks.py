@@ -16,6 +16,7 @@ from ibrobot_core.api import (
     ActionPart,
     Align,
     Contract,
+    ContractError,
     EpisodeReader,
     Feature,
     FrameAssembler,
@@ -27,7 +28,7 @@ from ibrobot_core.api import (
     SignalPart,
     assemble,
     seconds,
-    text_at,
+    value_at,
 )
 
 ACTION = "action"
@@ -102,7 +103,7 @@ class _Tasks:
 
     def __iter__(self) -> Iterator[Recorded]:
         for item in self._messages:
-            text = text_at(item.message, self._part.path)
+            text = _text_at(item.message, self._part.path)
             if text not in self._texts:
                 self._texts.append(text)
             yield attrs.evolve(item, topic=_source_of(self._part), message=Int32(self._texts.index(text)))
@@ -249,3 +250,12 @@ class Ticks:
             return False
         self.held += 1
         return True
+
+
+def _text_at(message: Message, path: str) -> str:
+    """The text that a path leads to."""
+    value = value_at(message, path.split("."))
+    if isinstance(value, str):
+        return value
+    there = f"; there are: {', '.join(attrs.fields_dict(type(value)))}" if attrs.has(type(value)) else ""
+    raise ContractError(f"{path!r} leads to no text in a {message.ros_type}{there}")
