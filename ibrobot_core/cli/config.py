@@ -4,26 +4,16 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable
 from typing import Any
 
 import attrs
 import click
 
+from ibrobot_core.cli.options import run_options
 from ibrobot_core.errors import ConfigError, PluginError
 from ibrobot_core.outside import echo
 
-
-def config_options(command: Callable[..., None]) -> Callable[..., None]:
-    """The argument and the options that say which config, and what to change in it."""
-    for decorate in (
-        click.option("--mode", metavar="MODE", help="Start in this control mode."),
-        click.option("--set", "overrides", multiple=True, metavar="PATH=VALUE", help="E.g. control.rate_hz=50."),
-        click.option("--sim", is_flag=True, help="Use the simulation section in place of the hardware."),
-        click.argument("config", metavar="[CONFIG]", required=False),
-    ):
-        command = decorate(command)
-    return command
+config_options = run_options("config", "sim", "overrides", "mode")
 
 
 @click.group()

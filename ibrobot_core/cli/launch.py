@@ -17,6 +17,7 @@ from typing import Any
 import attrs
 import click
 
+from ibrobot_core.cli.options import launch_options
 from ibrobot_core.cli.panel import RecentLog, RecentRates, panel, plain_line
 from ibrobot_core.config import RobotConfig, find_config, load_config
 from ibrobot_core.control.core import EMERGENCY_STOP
@@ -42,54 +43,6 @@ MakeHooks = Callable[[Runtime], RunHooks]
 
 def _no_hooks(runtime: Runtime) -> RunHooks:
     return RunHooks()
-
-
-_OPTIONS: dict[str, Callable[..., Any]] = {
-    "sim": click.option("--sim", is_flag=True, help="Use the simulation section in place of hardware."),
-    "lockstep": click.option(
-        "--lockstep", is_flag=True, help="Simulated time, as fast as the machine goes; equal seeds, equal runs."
-    ),
-    "seed": click.option(
-        "--seed", type=int, default=0, show_default=True, help="Of the first episode; later ones count up."
-    ),
-    "mode": click.option("--mode", help="In place of default_control_mode."),
-    "overrides": click.option(
-        "--set", "overrides", multiple=True, metavar="PATH=VALUE", help="Override a key, e.g. control.rate_hz=50."
-    ),
-    "duration": click.option(
-        "--duration", type=click.FloatRange(min=0), metavar="S", help="Stop after so many seconds."
-    ),
-    "episodes": click.option(
-        "--episodes", type=click.IntRange(min=1), metavar="N", help="Stop after so many episodes."
-    ),
-    "goals": click.option(
-        "--goal", "goals", multiple=True, metavar="GOAL", help="For planning modes: a pose, or joint=rad,…"
-    ),
-    "window": click.option("--window", is_flag=True, help="Show the simulation in a desktop window."),
-    "headless": click.option("--headless", is_flag=True, help="No window, no viewer, no panel: plain lines."),
-    "dry_run": click.option(
-        "--dry-run", is_flag=True, help="Print the plan, compare the model with the contract, and start nothing."
-    ),
-    "as_json": click.option(
-        "--json", "as_json", is_flag=True, help="Print JSON alone on standard output: the summary, or the plan."
-    ),
-}
-
-
-def launch_options[C: Callable[..., Any]](command: C) -> C:
-    """The argument and the options that every command has which runs a robot."""
-    return click.argument("config", required=False)(run_options(*_OPTIONS)(command))
-
-
-def run_options[C: Callable[..., Any]](*names: str) -> Callable[[C], C]:
-    """Some of the options of `launch_options`."""
-
-    def add(command: C) -> C:
-        for name in reversed(names):
-            command = _OPTIONS[name](command)
-        return command
-
-    return add
 
 
 @click.command()

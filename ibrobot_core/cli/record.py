@@ -8,7 +8,8 @@ from typing import Any
 
 import click
 
-from ibrobot_core.cli.launch import launch_options, run_robot
+from ibrobot_core.cli.launch import run_robot
+from ibrobot_core.cli.options import launch_options
 from ibrobot_core.launch.runtime import Runtime
 from ibrobot_core.recording.operator import Operator
 

@@ -11,7 +11,8 @@ import attrs
 import click
 
 from ibrobot_core.calibration import load_calibration
-from ibrobot_core.cli.launch import overrides_of, run_loaded, run_options
+from ibrobot_core.cli.launch import overrides_of, run_loaded
+from ibrobot_core.cli.options import run_options
 from ibrobot_core.config import RobotConfig, find_config, from_document, load_config
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import ContractError, RecorderError, wrong_input
@@ -56,8 +57,7 @@ class _Comparison(RunHooks):
 
 @click.command()
 @click.argument("episode", type=click.Path(path_type=Path))
-@click.argument("config", required=False)
-@run_options("sim", "lockstep")
+@run_options("config", "sim", "lockstep")
 @click.option(
     "--speed", type=click.FloatRange(min=0, min_open=True), default=1.0, show_default=True, metavar="X",
     help="Seconds of the recording in a second.",

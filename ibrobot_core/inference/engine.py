@@ -43,8 +43,10 @@ class Engine(ABC):
 
     parallel = 1
 
-    def __init__(self, mode: str) -> None:
+    def __init__(self, mode: str, seed: int = 0) -> None:
         self.stats = EngineStats(mode)
+        self._episode, self._seed = 0, seed
+        """What a model elsewhere must know with each request: it may have been started since the last."""
         self._counting = threading.Lock()
         self._failed_ns = 0
 
@@ -87,6 +89,8 @@ class Engine(ABC):
 
     def reset(self, seed: int) -> None:
         """A new episode begins: a policy that remembers forgets the last before the next request."""
+        self._episode += 1
+        self._seed = seed
 
     def close(self) -> None:
         """Release what it took; a request that goes on fails soon. Safe to call twice."""

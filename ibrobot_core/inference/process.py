@@ -46,7 +46,7 @@ class ProcessEngine(Engine):
         self, config: RobotConfig, model: str, fingerprint: str, seed: int = 0,
         given_up: threading.Event | None = None, hang_timeout_s: float = 30.0, *, accept_new_weights: bool = False,
     ) -> None:  # fmt: skip
-        super().__init__("process")
+        super().__init__("process", seed)
         self._order = {
             "document": config.complete, "source": str(config.source), "sim": config.simulated, "model": model,
             "seed": seed,
@@ -67,7 +67,6 @@ class ProcessEngine(Engine):
         """Since when the process is at work on one request [s]; None while it has none."""
         self._deaths = 0
         self._start_again_s = 0.0
-        self._episode, self._seed = 0, seed
 
     @property
     def pid(self) -> int | None:
@@ -105,11 +104,6 @@ class ProcessEngine(Engine):
         if answer.kind is WireKind.FAILURE:
             raise PolicyError(answer.text)
         return answer.tensors
-
-    @override
-    def reset(self, seed: int) -> None:
-        self._episode += 1
-        self._seed = seed
 
     @override
     def close(self) -> None:

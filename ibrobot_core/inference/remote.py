@@ -72,7 +72,7 @@ class RemoteEngine(Engine):
         self._encoder, self._decoder = WireEncoder(limits, codec), WireDecoder(limits)
         self._buffers = [Buffer() for _ in range(self.parallel)]
         """Those that are free."""
-        self._episode, self._seed = time.time_ns(), 0
+        self._episode = time.time_ns()
         """An episode's number does not come again after a restart under the same certificate."""
         self._end_watch: Callable[[], None] | None = None
 
@@ -124,11 +124,6 @@ class RemoteEngine(Engine):
         self.stats.queue_ms = min(answer.queued_ns / 1e6, answer.latency_ms)
         self.stats.model_ms = answer.latency_ms - self.stats.queue_ms
         return answer.tensors
-
-    @override
-    def reset(self, seed: int) -> None:
-        self._episode += 1
-        self._seed = seed
 
     @override
     def close(self) -> None:

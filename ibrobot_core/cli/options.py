@@ -1,0 +1,56 @@
+"""The options that commands share which read a robot YAML or run a robot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import click
+
+_OPTIONS: dict[str, Callable[..., Any]] = {
+    "config": click.argument("config", required=False),
+    "sim": click.option("--sim", is_flag=True, help="Use the simulation section in place of hardware."),
+    "lockstep": click.option(
+        "--lockstep", is_flag=True, help="Simulated time, as fast as the machine goes; equal seeds, equal runs."
+    ),
+    "seed": click.option(
+        "--seed", type=int, default=0, show_default=True, help="Of the first episode; later ones count up."
+    ),
+    "mode": click.option("--mode", metavar="MODE", help="Start in this control mode, not in default_control_mode."),
+    "overrides": click.option(
+        "--set", "overrides", multiple=True, metavar="PATH=VALUE", help="Override a key, e.g. control.rate_hz=50."
+    ),
+    "duration": click.option(
+        "--duration", type=click.FloatRange(min=0), metavar="S", help="Stop after so many seconds."
+    ),
+    "episodes": click.option(
+        "--episodes", type=click.IntRange(min=1), metavar="N", help="Stop after so many episodes."
+    ),
+    "goals": click.option(
+        "--goal", "goals", multiple=True, metavar="GOAL", help="For planning modes: a pose, or joint=rad,…"
+    ),
+    "window": click.option("--window", is_flag=True, help="Show the simulation in a desktop window."),
+    "headless": click.option("--headless", is_flag=True, help="No window, no viewer, no panel: plain lines."),
+    "dry_run": click.option(
+        "--dry-run", is_flag=True, help="Print the plan, compare the model with the contract, and start nothing."
+    ),
+    "as_json": click.option(
+        "--json", "as_json", is_flag=True, help="Print JSON alone on standard output: the summary, or the plan."
+    ),
+}
+
+
+def launch_options[C: Callable[..., Any]](command: C) -> C:
+    """The argument and the options of every command that runs a robot."""
+    return run_options(*_OPTIONS)(command)
+
+
+def run_options[C: Callable[..., Any]](*names: str) -> Callable[[C], C]:
+    """Some of the options of `launch_options`."""
+
+    def add(command: C) -> C:
+        for name in reversed(names):
+            command = _OPTIONS[name](command)
+        return command
+
+    return add
