@@ -17,7 +17,8 @@ DOCS = Path(__file__).parents[2] / "docs"
 
 def _signatures() -> dict[str, str]:
     functions = (node for node in ast.parse(inspect.getsource(hookspecs)).body if isinstance(node, ast.FunctionDef))
-    return {f.name: f"def {f.name}({ast.unparse(f.args)}) -> {ast.unparse(f.returns)}" for f in functions if f.returns}
+    found = {f.name: f"def {f.name}({ast.unparse(f.args)}) -> {ast.unparse(f.returns)}" for f in functions if f.returns}
+    return {name: signature.replace("descriptors.", "") for name, signature in found.items()}
 
 
 @pytest.mark.parametrize(("name", "signature"), _signatures().items())
