@@ -10,6 +10,7 @@ pytest.register_assert_rewrite(*(f"{__name__}.{module.name}" for module in pkgut
 from ibrobot_testing.command import ibrobot_command
 from ibrobot_testing.contexts import control_context, host_context, make_robot
 from ibrobot_testing.dataset import DatasetSuite
+from ibrobot_testing.descriptor import check_descriptor
 from ibrobot_testing.executor import ExecutorSuite
 from ibrobot_testing.hardware import HardwareSuite, SimulatedHardwareSuite
 from ibrobot_testing.leaks import LeakCheck
@@ -36,6 +37,7 @@ __all__ = [
     "TeleopSuite",
     "TransportSuite",
     "ViewerSuite",
+    "check_descriptor",
     "checks",
     "control_context",
     "failed_checks",

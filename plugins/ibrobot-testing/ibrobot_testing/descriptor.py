@@ -1,0 +1,43 @@
+"""What every descriptor must say, for tests of plugins."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ibrobot_core.api import Descriptor, ExecutorDescriptor, HardwareDescriptor, SensorDescriptor, StreamOptions
+
+
+def check_descriptor(descriptor: Descriptor[Any], options: Any) -> None:
+    """Check what a descriptor says for some options: what core asks of it before anything is made.
+
+    Args:
+        descriptor: as the plugin's hook gives it.
+        options: of its class, e.g. with a calibration, or with the size of pictures.
+
+    Raises:
+        AssertionError: for the first member that is wrong.
+    """
+    name = descriptor.type
+    assert name, "type is empty"
+    assert descriptor.summary, f"{name}: summary is empty"
+    assert isinstance(options, descriptor.options), f"{name}: {options!r} are no {descriptor.options.__name__}"
+    devices = descriptor.devices(options)
+    assert all(isinstance(text, str) for pair in devices.items() for text in pair), f"{name}: devices: {devices!r}"
+    match descriptor:
+        case HardwareDescriptor():
+            calibration, anchored = descriptor.calibration(options), descriptor.anchored(options)
+            assert calibration is None or (isinstance(calibration, str) and calibration), (
+                f"{name}: calibration must be a name, a path or None, got {calibration!r}"
+            )
+            joints = isinstance(anchored, tuple) and all(isinstance(joint, str) for joint in anchored)
+            assert joints, f"{name}: anchored must be a tuple of joints, got {anchored!r}"
+            assert len(set(anchored)) == len(anchored), f"{name}: anchored names a joint twice: {anchored!r}"
+        case SensorDescriptor():
+            picture = descriptor.picture(options)
+            assert picture is None or (
+                isinstance(picture, tuple) and len(picture) == 2 and all(type(n) is int and n > 0 for n in picture)
+            ), f"{name}: picture must be height and width [px] or None, got {picture!r}"
+        case ExecutorDescriptor():
+            assert descriptor.goals in {"trajectory", "position"}, f"{name}: goals is {descriptor.goals!r}"
+            streams = issubclass(descriptor.options, StreamOptions)
+            assert streams or not descriptor.streams, f"{name} streams: its options must derive from StreamOptions"

@@ -1,0 +1,39 @@
+"""Executors of somebody else's plugin are driven by what their descriptor says."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+if TYPE_CHECKING:
+    from launch.conftest import Runs
+
+    from conftest import Site
+
+
+@pytest.fixture(autouse=True)
+def plugin(site: Site) -> None:
+    site.add("foreign-executors", "foreign_executors.py")
+
+
+def test_a_goal_of_a_planner_reaches_an_executor_of_positions(runs: Runs) -> None:
+    runtime = runs.start("executors.arm_trajectory.type=approach", mode="plan", goals=("pan=0.3",))
+    while not runtime.step():
+        pass
+    assert runtime.summary()["goals_failed"] == 0
+    assert runtime.session.state is not None
+    assert runtime.session.state.command[0] == pytest.approx(0.3, abs=0.03)
+
+
+@pytest.mark.parametrize("behavior", ["hold", "relax"])
+def test_setpoints_reach_a_streaming_executor_with_options_of_its_own(runs: Runs, behavior: str) -> None:
+    runtime = runs.start(
+        "executors.arm_position.type=nearest", "executors.arm_position.stiffness=2.0",
+        f"contract.actions.0.safety_behavior={behavior}", mode="policy", episodes=1,
+    )  # fmt: skip
+    before = runtime.session.measured().position[0]
+    for _ in range(25):
+        runtime.step()
+    assert abs(runtime.session.measured().position[0] - before) > 0.01
+    assert runtime.session.config.executors["arm_position"].options.stiffness == 2.0
