@@ -137,9 +137,8 @@ def _override(document: Document, overrides: Sequence[str], mode: str | None) ->
 def _build(document: Document, source: Path, sim: bool, registry: Registry, communicates: bool = False) -> RobotConfig:
     sections = SectionParser(document, registry, source.absolute().parent, sim).sections()
     check_known(document)
-    unavailable = split(
-        document, sections.plain, sections.missing, _entered(document, sections), everything=communicates
-    )
+    entered = _entered(document, sections)
+    unavailable = split(document, sections.plain, sections.missing, entered, everything=communicates)
     Checks(document, sections, communicates).run()
     contract_checks = ContractChecks(document, sections)
     contract = contract_checks.run()
@@ -155,7 +154,7 @@ def _build(document: Document, source: Path, sim: bool, registry: Registry, comm
             name: attrs.evolve(mode, name=name, planner=_component(sections.planners.get(name)))
             for name, mode in sections.plain["control_modes"].items()
         },
-        "default_control_mode": _default_mode(sections),
+        "default_control_mode": entered,
         "hardware": {
             name: attrs.evolve(each, joints=each.joints or robot.joint_names) for name, each in hardware.items()
         },
@@ -219,14 +218,6 @@ def _not_installed(document: Document, sections: ParsedSections) -> dict[str, Pe
         item["name"]: PeripheralConfig(type=type_, options=None, name=item["name"], kind=item["kind"])
         for type_, item in items
     }
-
-
-def _default_mode(sections: ParsedSections) -> str:
-    simulated = (
-        sections.simulation.component.default_control_mode if sections.simulated and sections.simulation else None
-    )
-    mode: str = simulated or sections.plain["default_control_mode"]
-    return mode
 
 
 def shipped_configs(registry: Registry) -> dict[str, Path]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ibrobot_core.errors import RecorderError
 from ibrobot_core.recording.run import Run
 
 if TYPE_CHECKING:
@@ -29,11 +28,6 @@ class Episodes:
     def saved(self) -> int:
         """Episodes that ended, were kept, and whose recording did not end before them."""
         return 0 if self._recording is None else self._recording.saved
-
-    @property
-    def recording_failure(self) -> RecorderError | None:
-        """Why the recording of the present or last episode ended before it did; None where it did not."""
-        return None if self._recording is None else self._recording.failure
 
     def begin(self) -> None:
         """The next episode begins."""
