@@ -30,7 +30,7 @@ def config() -> None:
 @click.option("--deep", is_flag=True, help="Compare the models of all modes with the contract, too; loads no weights.")
 def check(
     config: str | None, sim: bool, overrides: tuple[str, ...], mode: str | None, as_json: bool, deep: bool
-) -> None:  # fmt: skip
+) -> None:
     """Tell everything that is wrong with CONFIG; exit 2 if anything is."""
     from ibrobot_core.config import find_config, load_config
     from ibrobot_core.config.missing import unavailable_modes

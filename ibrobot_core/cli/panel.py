@@ -155,9 +155,10 @@ def _facts(session: Session, rates: RecentRates) -> Iterator[tuple[str, str]]:
     if session.acting is not None:
         stats = session.acting.dispatch
         yield (
-            "plan", f"{stats.plan_length} actions by {stats.strategy}, latency p50 {stats.latency_p50_ms:.0f}, "
+            "plan",
+            f"{stats.plan_length} actions by {stats.strategy}, latency p50 {stats.latency_p50_ms:.0f}, "
             f"p99 {stats.latency_p99_ms:.0f} ms, holds {stats.holds}, failures {stats.failures}",
-        )  # fmt: skip
+        )
     if (model := _model_text(session)) is not None:
         yield "model", model
     yield "loop", _loop_text(session, rates)

@@ -91,9 +91,7 @@ def replay(
         playback = read_playback(reader, contract)
     if not summary.finished:
         echo(f"{episode}: was never finished; {playback.duration:.2f} s of it could be read", err=True)
-    request = LaunchRequest(
-        options["lockstep"], playback.seed or 0, replay=Replay(str(episode), playback, speed),
-    )  # fmt: skip
+    request = LaunchRequest(options["lockstep"], playback.seed or 0, replay=Replay(str(episode), playback, speed))
     run_loaded(_without_sensors(robot), request, options, _Comparison)
 
 

@@ -152,9 +152,7 @@ class RemoteEngine(Engine):
         fingerprint = whole_fingerprint(self._policy.fingerprint(), weights)
         if health.get("fingerprint") != fingerprint:
             raise ContractError(self._differences(health, fingerprint))
-        check_weights(
-            self.stats.weights, weights, f"the server of {self._model}", accept=self._accept_new_weights
-        )  # fmt: skip
+        check_weights(self.stats.weights, weights, f"the server of {self._model}", accept=self._accept_new_weights)
         self._fingerprint, self.stats.weights = fingerprint, weights
 
     def _served(self, alive: bool) -> None:

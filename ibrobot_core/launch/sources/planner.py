@@ -121,9 +121,10 @@ class PlannerSource(SourceWorker):
                 continue
             assert self._planner is not None
             request = PlanRequest(
-                executor.joints, told[robot.indices(executor.joints)],
+                executor.joints,
+                told[robot.indices(executor.joints)],
                 JointGoal(tuple(mine), np.array([goal[joint] for joint in mine])),
-            )  # fmt: skip
+            )
             goals[name] = goal_from_message(self._planner.plan(request))
         if not goals:
             raise PlanningError(f"goal {text!r}: no executor of mode {self.mode.name} has these joints")
