@@ -66,7 +66,7 @@ class TestPictures:
         raw = depth.view(np.uint8).reshape(1, -1)
         picture = self.capture(monkeypatch, [raw[:, :10], raw], fourcc="Z16 ").read()
         assert picture is not None
-        np.testing.assert_array_equal(picture.content, depth)  # type: ignore[arg-type]
+        np.testing.assert_array_equal(picture.content, depth)
 
 
 MJPG = float(cv2.VideoWriter.fourcc(*"MJPG"))
@@ -95,7 +95,8 @@ class TestMotionJpeg:
     ) -> tuple[Capture, Scripted]:
         device = Scripted(pictures, formats)
         offered = tuple(
-            Mode(each, *size, (mjpg_hz if each == "MJPG" else 30.0,)) for each, size in zip(formats, sizes, strict=True)
+            Mode(each, width, height, (mjpg_hz if each == "MJPG" else 30.0,))
+            for each, (width, height) in zip(formats, sizes, strict=True)
         )
         self.patch.setattr(capture_module.Capture, "_open", lambda self: device)
         self.patch.setattr(capture_module, "modes", lambda path: offered)

@@ -51,7 +51,9 @@ def test_snapshot_saves_the_picture_and_says_its_rate(tmp_path: Path) -> None:
         arguments = ["snapshot", server.url, "-o", str(tmp_path / "a.png"), "--seconds", "0.5"]
         result = CliRunner().invoke(camera, arguments, catch_exceptions=False)
     assert result.output.startswith(f"{tmp_path / 'a.png'}: camera, 64x48 rgb8, ")
-    assert cv2.imread(str(tmp_path / "a.png")).shape == (48, 64, 3)
+    saved = cv2.imread(str(tmp_path / "a.png"))
+    assert saved is not None
+    assert saved.shape == (48, 64, 3)
 
 
 def test_snapshot_refuses_what_it_cannot_write() -> None:

@@ -192,7 +192,7 @@ class TestMapping:
     def test_only_mapped_joints_are_commanded(self, rig: TeleopRig):
         rig.turn("wrist_roll", 2048 + 0.5 * RADIAN)
         rig.follow()
-        assert rig.read().positions == {"shoulder_pan": pytest.approx(0.5, abs=1e-3)}
+        assert rig.read().positions == pytest.approx({"shoulder_pan": 0.5}, abs=1e-3)
 
     def test_the_robots_limits_hold(self, rig: TeleopRig):
         rig.turn("wrist_flex", 600)

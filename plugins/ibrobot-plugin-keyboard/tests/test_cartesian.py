@@ -71,16 +71,19 @@ def test_the_toggle_key_changes_between_joints_and_tool(robot):
     teleop.connect()
     position = bent(robot)
 
+    time_s = 0.0
+
     def hold(*keys: str) -> Vector:
         """Press keys, and look 0.1 s later."""
-        hold.time_s += 1
+        nonlocal time_s
+        time_s += 1
         for key in keys:
             typed.put(key)
-        for time in np.arange(hold.time_s, hold.time_s + 0.105, DT):
+        for time in np.arange(time_s, time_s + 0.105, DT):
             command = teleop.read(JointReading(ns(time), position, position, position))
+        assert command.positions is not None
         return np.array([command.positions[joint] for joint in robot.joint_names])
 
-    hold.time_s = 0.0
     joint = hold("w")
     assert np.count_nonzero(joint - position) == 1
     jogged_tool = hold("m", "w", "o")

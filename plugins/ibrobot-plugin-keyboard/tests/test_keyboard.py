@@ -135,7 +135,9 @@ def test_motion_goes_on_from_the_last_setpoint_and_not_from_where_the_arm_sags()
     rig.rest()
     reached = rig.position[0]
     rig.position[0] -= 0.05
-    assert rig.tick("w").positions["shoulder_pan"] == reached
+    positions = rig.tick("w").positions
+    assert positions is not None
+    assert positions["shoulder_pan"] == reached
 
 
 def test_activation_begins_where_the_robot_is_and_forgets_what_was_typed():
@@ -316,6 +318,8 @@ def test_typing_in_a_terminal_moves_a_joint():
     finally:
         os.close(person)
         os.close(program)
+    assert first.positions is not None
+    assert second.positions is not None
     assert first.positions["shoulder_pan"] == 0.1
     assert second.positions["shoulder_pan"] == pytest.approx(0.15)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import attrs
 import mujoco
 import numpy as np
@@ -114,7 +116,7 @@ def test_a_lean_is_refused_unless_tolerated() -> None:
         ({"tip": "nose"}, r"robot\.description: .*has no site 'nose'; it has: .*gripperframe"),
     ],
 )
-def test_a_description_that_does_not_fit_is_refused(change: dict[str, object], message: str) -> None:
+def test_a_description_that_does_not_fit_is_refused(change: dict[str, Any], message: str) -> None:
     robot = attrs.evolve(ROBOT, description=attrs.evolve(ROBOT.description, **change))
     with pytest.raises(KinematicsError, match=message):
         robot_model(robot)

@@ -58,7 +58,7 @@ class Adds(FakePolicy):
 
     @override
     def infer(self, tensors: Tensors) -> Tensors:
-        return {"sum": tensors["state"] + tensors["one"]}
+        return {"sum": np.add(tensors["state"], tensors["one"])}
 
 
 class Tapped(LocalTransport):

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from ibrobot_serve import service as module
 from ibrobot_serve.metrics import probes
+from ibrobot_serve.pacing import Pacing
 from ibrobot_serve.service import InferenceService, ServiceOptions
 from ibrobot_testing import host_context
 from ibrobot_testing.fakes import FakePolicy
@@ -276,7 +277,7 @@ def test_a_full_queue_turns_away_what_comes():
 
 
 def test_an_answer_says_how_long_it_waited_for_others_and_how_often_to_ask(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(module.Pacing, "pace_ns", lambda pacing, now_ns: 750_000_000)
+    monkeypatch.setattr(Pacing, "pace_ns", lambda pacing, now_ns: 750_000_000)
     with served(batch=1, queue=1) as cloud:
         first = cloud.busy()
         second = cloud.asked("robot", 1)
@@ -293,8 +294,8 @@ def test_an_answer_says_how_long_it_waited_for_others_and_how_often_to_ask(monke
 
 def test_the_service_measures_who_asks_and_what_it_costs(monkeypatch: pytest.MonkeyPatch):
     noted = []
-    monkeypatch.setattr(module.Pacing, "ask", lambda pacing, robot, now_ns: noted.append(robot))
-    monkeypatch.setattr(module.Pacing, "work", lambda pacing, size, took_ns: noted.append((size, took_ns > 0)))
+    monkeypatch.setattr(Pacing, "ask", lambda pacing, robot, now_ns: noted.append(robot))
+    monkeypatch.setattr(Pacing, "work", lambda pacing, size, took_ns: noted.append((size, took_ns > 0)))
     with served() as cloud:
         cloud.policy.gate.release(10)
         outputs(cloud.ask("robot", 1))

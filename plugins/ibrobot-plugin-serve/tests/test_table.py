@@ -24,7 +24,7 @@ UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\ud800-\udfff
 @given(st.dictionaries(HOSTILE, st.just(None), max_size=3), HOSTILE)
 def test_the_server_s_table_takes_any_robot_s_name(robots: dict[str, None], model: str):
     """A robot that called itself [/x] ended the server of all."""
-    counts = dict.fromkeys(("requests", "answered", "expired", "malformed", "waiting", "failed"), 0)
+    counts: dict[str, float] = dict.fromkeys(("requests", "answered", "expired", "malformed", "waiting", "failed"), 0)
     counts |= dict.fromkeys(("latency_p50_ms", "latency_p99_ms"), 0.0)
     statistics = {**counts, "model": model, "robots": dict.fromkeys(robots, counts)}
     screen = Screen(file=io.StringIO(), width=1000)

@@ -48,8 +48,8 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def tls(folder: Path, name: str) -> Tls:
     robots = folder / name / "robots.txt"
-    files = (folder / name / file for file in ("ca.pem", "certificate.pem", "key.pem"))
-    return Tls(*files, robots if robots.exists() else None)
+    ca, certificate, key = (folder / name / file for file in ("ca.pem", "certificate.pem", "key.pem"))
+    return Tls(ca, certificate, key, robots if robots.exists() else None)
 
 
 def test_requests_pass_with_certificates(lab: Path):
@@ -272,9 +272,10 @@ def test_the_readme_s_access_control(lab: Path, tmp_path: Path):
     server.serve("secret", lambda payload, _: payload)
     first, second = (client(endpoint, tls=tls(lab, name)) for name in ("robot1", "robot2"))
     for robot in (first, second):
-        served = threading.Event()
-        robot.watch("infer/net", lambda state, served=served: state and served.set())
-        assert served.wait(WAIT_S)
+        states: queue.SimpleQueue[bool] = queue.SimpleQueue()
+        robot.watch("infer/net", states.put)
+        while not states.get(timeout=WAIT_S):
+            pass
         with pytest.raises(TransportError, match="nobody serves secret"):
             robot.request("secret", b"x", WAIT_S)
     assert first.request("infer/net", b"x", WAIT_S) == b"None"  # who asks is not proved by a list of somebody else's

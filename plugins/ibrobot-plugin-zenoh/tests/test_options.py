@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import queue
 from pathlib import Path
+from typing import Any
 
 import pytest
 from ibrobot_testing import host_context
@@ -33,7 +34,7 @@ TLS = Tls(Path("ca.pem"), Path("certificate.pem"), Path("key.pem"))
         ({"connect": ("tcp/a:1",), "user": "a/b", "password": "x"}, "'a/b' cannot be a robot's name"),
     ],
 )
-def test_refused(options: dict[str, object], message: str):
+def test_refused(options: dict[str, Any], message: str):
     with pytest.raises(ValueError, match=message):
         ZenohOptions(**options)
 
@@ -48,7 +49,7 @@ def test_refused(options: dict[str, object], message: str):
         {"mode": "peer", "connect": ("tcp/gpu.lab:7447#iface=eth0",)},
     ],
 )
-def test_accepted(options: dict[str, object]):
+def test_accepted(options: dict[str, Any]):
     ZenohOptions(**options)
 
 
@@ -62,7 +63,7 @@ def test_the_yaml_s_type():
 @pytest.mark.parametrize(
     "options", [{"tls": TLS, "listen": ("tls/127.0.0.1:1",)}, {"users": Path("none.txt")}, {"settings": Path("none")}]
 )
-def test_files_that_are_not_there(options: dict[str, object]):
+def test_files_that_are_not_there(options: dict[str, Any]):
     with pytest.raises(TransportError, match=r"ca\.pem: cannot be read|none"):
         make(mode="router", **options)
 

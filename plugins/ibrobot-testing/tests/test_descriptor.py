@@ -22,6 +22,10 @@ def make(options: Any, ctx: Any) -> Never:
     raise NotImplementedError("nothing is made")
 
 
+def wrong(descriptor: Descriptor[Any], **members: Any) -> Descriptor[Any]:
+    return attrs.evolve(descriptor, **members)
+
+
 ARM = HardwareDescriptor("arm", make, "an arm")
 EYE = SensorDescriptor("eye", make, "an eye")
 FOLLOWS = ExecutorDescriptor("follows", make, "follows", StreamOptions, streams=True)
@@ -45,17 +49,17 @@ def test_right_descriptors_pass(descriptor: Descriptor[Any]) -> None:
 @pytest.mark.parametrize(
     ("descriptor", "what"),
     [
-        (attrs.evolve(ARM, summary=""), "summary is empty"),
-        (attrs.evolve(ARM, options=StreamOptions), "are no StreamOptions"),
-        (attrs.evolve(ARM, devices=lambda options: {"port": 1}), "devices: "),
-        (attrs.evolve(ARM, calibration=lambda options: ""), "calibration must be a name"),
-        (attrs.evolve(ARM, anchored=lambda options: "gripper"), "must be a tuple of joints, got 'gripper'"),
-        (attrs.evolve(ARM, anchored=lambda options: ("a", "a")), "names a joint twice"),
-        (attrs.evolve(EYE, picture=lambda options: (480, 640, 3)), "picture must be height and width"),
-        (attrs.evolve(EYE, picture=lambda options: (480.0, 640)), "picture must be height and width"),
-        (attrs.evolve(EYE, picture=lambda options: (0, 640)), "picture must be height and width"),
-        (attrs.evolve(FOLLOWS, options=NoOptions), "must derive from StreamOptions"),
-        (attrs.evolve(FOLLOWS, options=NoOptions, streams=False, goals="pose"), "goals is 'pose'"),
+        (wrong(ARM, summary=""), "summary is empty"),
+        (wrong(ARM, options=StreamOptions), "are no StreamOptions"),
+        (wrong(ARM, devices=lambda options: {"port": 1}), "devices: "),
+        (wrong(ARM, calibration=lambda options: ""), "calibration must be a name"),
+        (wrong(ARM, anchored=lambda options: "gripper"), "must be a tuple of joints, got 'gripper'"),
+        (wrong(ARM, anchored=lambda options: ("a", "a")), "names a joint twice"),
+        (wrong(EYE, picture=lambda options: (480, 640, 3)), "picture must be height and width"),
+        (wrong(EYE, picture=lambda options: (480.0, 640)), "picture must be height and width"),
+        (wrong(EYE, picture=lambda options: (0, 640)), "picture must be height and width"),
+        (wrong(FOLLOWS, options=NoOptions), "must derive from StreamOptions"),
+        (wrong(FOLLOWS, options=NoOptions, streams=False, goals="pose"), "goals is 'pose'"),
     ],
 )  # fmt: skip
 def test_a_wrong_member_is_found(descriptor: Descriptor[Any], what: str) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import override
+from typing import Any, override
 
 import attrs
 import numpy as np
@@ -22,7 +22,7 @@ class TestPolicy(PolicySuite):
 class MiscountsItsActions(FakePolicy):
     def __init__(self, ctx):
         super().__init__(ctx)
-        self.spec = attrs.evolve(self.spec, actions=self.spec.actions[1:])
+        self.spec = attrs.evolve(self.spec, actions=(self.spec.actions or ())[1:])
 
 
 class LongChunks(FakePolicy):
@@ -109,13 +109,13 @@ class TrustsThePrefixsLength(FakePolicy):
 
     def preprocess(self, frame):
         prefix = frame.prefix
-        return super().preprocess(frame) | ({} if prefix is None else {"pace": prefix[-1] - prefix[-2:][0]})
+        return {**super().preprocess(frame), **({} if prefix is None else {"pace": prefix[-1] - prefix[-2:][0]})}
 
     def postprocess(self, tensors):
         return super().postprocess(tensors) / tensors.get("pace", 1.0)
 
     def infer(self, tensors):
-        return super().infer(tensors) | {key: tensors[key] for key in ("pace",) if key in tensors}
+        return {**super().infer(tensors), **{key: tensors[key] for key in ("pace",) if key in tensors}}
 
 
 class CountsRequests(FakePolicy):
@@ -170,13 +170,13 @@ class HashesTheObject(FakePolicy):
 
 
 class NeedsWeightsAtTheEdge(FakePolicy):
-    scale = None
+    scale: Any = None
 
     def load(self):
         self.scale = 1.0
 
     def preprocess(self, frame):
-        return {key: value * self.scale for key, value in super().preprocess(frame).items()}
+        return {key: np.multiply(value, self.scale) for key, value in super().preprocess(frame).items()}
 
 
 WRONG = {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from typing import override
+from typing import Any, override
 
 import attrs
 import numpy as np
@@ -21,7 +21,7 @@ class TestRecorder(RecorderSuite):
 
     @override
     def read_back(self, path):
-        kept = {}
+        kept: dict[str, list[Any]] = {}
         for text in (path / "records.jsonl").read_text().splitlines():
             line = json.loads(text)
             arrays = (np.array(line[name]) for name in ("position", "velocity", "effort"))
@@ -78,6 +78,7 @@ class RecordsEverything(FakeRecorder):
     def write(self, topic, message, received_ns):
         if not isinstance(message, JointState):
             message, topic = JointState(Header(received_ns), ()), self._open().directory.name
+            assert self._episode is not None
             self._episode = attrs.evolve(self._episode, topics={**self._episode.topics, topic: ""})
         super().write(topic, message, received_ns)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import queue
 import threading
-from typing import override
+from typing import Any, override
 
 import pytest
 from ibrobot_testing import TransportSuite, checks, failed_checks
@@ -89,7 +89,7 @@ class SharesAnswers(LocalTransport):
 
     def __init__(self):
         super().__init__()
-        self.answers = queue.SimpleQueue()
+        self.answers: queue.SimpleQueue[Any] = queue.SimpleQueue()
 
     def request(self, name, payload, timeout_s):
         server = self._servers.get(name)

@@ -8,6 +8,8 @@ import pytest
 from ibrobot_testing import ViewerSuite, checks, failed_checks
 from ibrobot_testing.fakes import FakeViewer
 
+from ibrobot_core.api import JointState
+
 
 class TestViewer(ViewerSuite):
     @override
@@ -51,7 +53,10 @@ class WantsJointStates(FakeViewer):
 
     def update(self):
         received = self._others.get()
-        return super().update() and (received is None or len(received.message.name) > 0)
+        if received is not None:
+            assert isinstance(received.message, JointState)
+            return super().update() and len(received.message.name) > 0
+        return super().update()
 
 
 class NowhereToLook(FakeViewer):
@@ -66,6 +71,7 @@ class StaysOnTheBus(FakeViewer):
 
 class ClosesOnce(FakeViewer):
     def close(self):
+        assert self._subscription is not None
         self._subscription.close()
         self._subscription = None
 

@@ -40,7 +40,7 @@ from ibrobot_core.api import (
 class FakeSensor(Sensor):
     """A camera that captures an image whenever the clock has moved since the last."""
 
-    message_type = Image
+    message_type: type[Message] = Image
 
     def __init__(self, ctx: Context, width: int = 8, height: int = 6) -> None:
         self.topic = f"/camera/{ctx.name}/image_raw"
@@ -54,7 +54,7 @@ class FakeSensor(Sensor):
         self._open = True
 
     @override
-    def read(self, timeout_s: float) -> Message | None:
+    def read(self, timeout_s: float) -> Image | None:
         if not self._open:
             raise SensorError(f"{self._ctx.name} is not open")
         stamp_ns = self._ctx.clock.now_ns()
