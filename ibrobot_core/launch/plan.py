@@ -53,6 +53,8 @@ class LaunchPlan:
     """Components in starting order."""
 
     components: tuple[Component, ...]
+    link: TransportLink | None
+    """To other machines; None where nothing in the run needs one."""
     mode: ModeComponents
     """What the first mode brings; among `components` too."""
     episodes: Episodes
@@ -79,14 +81,14 @@ class LaunchPlan:
         return [*lines, *without, *unavailable_modes(self.unavailable), "stops in reverse order"]
 
 
-def mode_components(session: Session, name: str) -> ModeComponents:
+def mode_components(session: Session, name: str, link: TransportLink | None) -> ModeComponents:
     """The components of a mode; nothing is loaded yet."""
     mode = session.config.control_modes[name]
     needs = (CONTROL, *(f"sensor:{sensor.name}" for sensor in _sensors(session)))
     if session.request.replay is not None and name == REPLAY:
         return ModeComponents((), ReplaySource(session, mode, session.request.replay, (CONTROL,)))
     if mode.inference is not None:
-        model = LoadedModel(session, mode.inference)
+        model = LoadedModel(session, mode.inference, link)
         return ModeComponents((model,), PolicySource(session, mode, mode.inference, model, needs))
     if mode.teleop is not None:
         return ModeComponents((), TeleopSource(session, mode, mode.teleop, (CONTROL,)))
@@ -137,10 +139,9 @@ def build_plan(session: Session) -> LaunchPlan:
     if session.request.lockstep and share.subscribe:
         raise NotSupported("transport.share.subscribe: in lockstep nothing may come from other machines, at any time")
     _refuse_absent(session, share)
-    added = mode_components(session, session.mode)
-    components: list[Component] = []
-    if config.transport is not None and used:
-        components.append(TransportLink(session, config.transport))
+    link = TransportLink(session, config.transport) if config.transport is not None and used else None
+    added = mode_components(session, session.mode, link)
+    components: list[Component] = [link] if link is not None else []
     components += added.models
     components.append(ControlComponent(session, tuple(model.name for model in added.models)))
     components += [SensorWorker(session, peripheral, (CONTROL,)) for peripheral in _sensors(session)]
@@ -157,16 +158,17 @@ def build_plan(session: Session) -> LaunchPlan:
         components.append(Transforms(session, urdf, (CONTROL,)))
     if config.viewer is not None:
         components.append(ViewerWorker(session, config.viewer, (CONTROL,)))
-    components += [PublishedTopic(session, topic) for topic in share.publish]
-    if share.subscribe:
-        components.append(SubscribedTopics(session, share.subscribe))
+    if link is not None:
+        components += [PublishedTopic(session, link, topic) for topic in share.publish]
+        components += [SubscribedTopics(session, link, share.subscribe)] if share.subscribe else []
     worker = None
     if config.simulated and isinstance(added.source, PolicySource):
         worker = SimulatedEpisodes(session, episodes, (added.source.name,))
         components.append(worker)
     return LaunchPlan(
-        tuple(_ordered(components)), added, episodes, recording, worker, describe(session.absent), config.unavailable
-    )
+        tuple(_ordered(components)), link, added, episodes, recording, worker, describe(session.absent),
+        config.unavailable,
+    )  # fmt: skip
 
 
 def _ordered(components: list[Component]) -> list[Component]:

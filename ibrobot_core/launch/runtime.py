@@ -124,7 +124,7 @@ class Runtime:
             if session.held:
                 self._go_on()
             return
-        added = mode_components(session, name)
+        added = mode_components(session, name, self.plan.link)
         new = added.components()
         try:
             for component in new:

@@ -20,7 +20,7 @@ from ibrobot_core.config.context import component_context
 from ibrobot_core.config.schema import ComponentConfig
 from ibrobot_core.control.link import ControlState, PlanRecord
 from ibrobot_core.errors import ComponentFailed
-from ibrobot_core.interfaces import Context, JointReading, Transport
+from ibrobot_core.interfaces import Context, JointReading
 from ibrobot_core.launch.absence import AbsentSensor, absent_sensors
 from ibrobot_core.plugins import Registry
 from ibrobot_core.robot import Vector
@@ -149,7 +149,6 @@ class Session:
         self.log = logging.getLogger("ibrobot")
         self._faults: list[tuple[int, str]] = []
         self._control: ControlHost | None = None
-        self._transport: Transport | None = None
         self._commanding = threading.Lock()
 
     @cached_property
@@ -185,21 +184,6 @@ class Session:
     def has_control(self) -> bool:
         """Whether control was made."""
         return self._control is not None
-
-    @property
-    def transport(self) -> Transport:
-        """The way to other machines.
-
-        Raises:
-            ComponentFailed: before it was opened.
-        """
-        if self._transport is None:
-            raise ComponentFailed("the transport is not there yet")
-        return self._transport
-
-    @transport.setter
-    def transport(self, transport: Transport) -> None:
-        self._transport = transport
 
     def context(self, name: str) -> Context:
         """The context for a plugin's `make` in the host."""

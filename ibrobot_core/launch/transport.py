@@ -6,6 +6,7 @@ from typing import override
 
 from ibrobot_core.component import Component
 from ibrobot_core.config.schema import ComponentConfig as Section
+from ibrobot_core.errors import ComponentFailed
 from ibrobot_core.interfaces import Transport
 from ibrobot_core.launch.session import Session
 
@@ -21,9 +22,20 @@ class TransportLink(Component):
         self._section = section
         self._transport: Transport | None = None
 
+    @property
+    def transport(self) -> Transport:
+        """The transport.
+
+        Raises:
+            ComponentFailed: before it is opened.
+        """
+        if self._transport is None:
+            raise ComponentFailed("the transport is not there yet")
+        return self._transport
+
     @override
     def start(self) -> None:
-        self._transport = self._session.transport = self._session.make("transport", self._section, NAME)
+        self._transport = self._session.make("transport", self._section, NAME)
 
     @override
     def stop(self) -> None:

@@ -111,7 +111,8 @@ def test_the_arm_holds_while_the_server_is_gone_and_goes_on_when_it_is_back(runs
     for _ in range(20):
         runtime.step()
         np.testing.assert_array_equal(session.state.command, held)
-    again = InferenceService(runs.parts.Net(host_context(robot=session.config.robot)), session.transport, "net")
+    transport = runtime.plan.link.transport
+    again = InferenceService(runs.parts.Net(host_context(robot=session.config.robot)), transport, "net")
     again.start()
     try:
         while stats.chunks == chunks:

@@ -10,7 +10,7 @@ from ibrobot_core.component import Component
 from ibrobot_core.errors import IbrobotError, NotSupported
 from ibrobot_core.interfaces import TopicTransport
 from ibrobot_core.launch.session import Session, SessionWorker
-from ibrobot_core.launch.transport import NAME as TRANSPORT
+from ibrobot_core.launch.transport import TransportLink
 from ibrobot_core.messages import Message
 from ibrobot_core.options import did_you_mean
 from ibrobot_core.units import NS_PER_S
@@ -22,8 +22,8 @@ _SILENT_NS = 5 * NS_PER_S
 """A topic without any message for so long after the start is told of, once [ns]."""
 
 
-def _topics(session: Session) -> TopicTransport:
-    transport = session.transport
+def _topics(link: TransportLink) -> TopicTransport:
+    transport = link.transport
     if not isinstance(transport, TopicTransport):
         raise NotSupported(f"transport.share: {type(transport).__name__} carries no topics")
     return transport
@@ -32,8 +32,9 @@ def _topics(session: Session) -> TopicTransport:
 class PublishedTopic(SessionWorker):
     """What is on one topic of the bus, to other machines. A message that cannot be sent is told once, and left out."""
 
-    def __init__(self, session: Session, topic: str) -> None:
-        super().__init__(session, f"share:{topic}", "to other machines", (TRANSPORT,))
+    def __init__(self, session: Session, link: TransportLink, topic: str) -> None:
+        super().__init__(session, f"share:{topic}", "to other machines", (link.name,))
+        self._link = link
         self._topic = topic
         self._waiting: Subscription | None = None
         self._told = False
@@ -41,7 +42,7 @@ class PublishedTopic(SessionWorker):
 
     @override
     def setup(self) -> None:
-        self._transport = _topics(self.session)
+        self._transport = _topics(self._link)
         self._silent_from_ns = self.session.clock.now_ns()
         self._waiting = self.session.bus.subscribe(self._topic, _DEPTH)
 
@@ -76,15 +77,16 @@ class PublishedTopic(SessionWorker):
 class SubscribedTopics(Component):
     """What other machines publish on some topics, to the bus."""
 
-    def __init__(self, session: Session, topics: tuple[str, ...]) -> None:
-        super().__init__("share", f"{', '.join(topics)} from other machines", (TRANSPORT,))
+    def __init__(self, session: Session, link: TransportLink, topics: tuple[str, ...]) -> None:
+        super().__init__("share", f"{', '.join(topics)} from other machines", (link.name,))
+        self._link = link
         self._session = session
         self._topics = topics
         self._ends: list[Callable[[], None]] = []
 
     @override
     def start(self) -> None:
-        transport = _topics(self._session)
+        transport = _topics(self._link)
         for topic in self._topics:
             self._ends.append(transport.subscribe_messages(topic, self._to_bus(topic)))
 

@@ -19,7 +19,7 @@ from ibrobot_core.launch.absence import refuse
 from ibrobot_core.launch.models import check_model
 from ibrobot_core.launch.session import ActingPolicy, Session
 from ibrobot_core.launch.sources.source_worker import SourceWorker
-from ibrobot_core.launch.transport import NAME as TRANSPORT
+from ibrobot_core.launch.transport import TransportLink
 from ibrobot_core.robot import Vector
 from ibrobot_core.units import NS_PER_S
 
@@ -29,12 +29,13 @@ TOGGLE_SMOOTHING = "/action_dispatcher/toggle_smoothing"
 class LoadedModel(Component):
     """Makes a policy, compares it with the contract, and has it loaded where it runs, before anything is powered."""
 
-    def __init__(self, session: Session, inference: InferenceConfig) -> None:
+    def __init__(self, session: Session, inference: InferenceConfig, link: TransportLink | None) -> None:
         model = session.config.models[inference.model]
         distributed = inference.execution_mode == "distributed"
         where = {"monolithic": "", "process": ", in a process of its own", "distributed": ", on a server"}
         summary = f"policy {model.type}{where[inference.execution_mode]}"
-        super().__init__(f"model:{model.name}", summary, (TRANSPORT,) if distributed else ())
+        super().__init__(f"model:{model.name}", summary, (link.name,) if distributed and link is not None else ())
+        self._link = link
         self._session = session
         self._inference = inference
         self._model = model
@@ -84,8 +85,9 @@ class LoadedModel(Component):
                     inference.hang_timeout, accept_new_weights=inference.accept_new_weights,
                 )  # fmt: skip
             case "distributed":
+                assert self._link is not None, "the YAML's checks require a transport"
                 return RemoteEngine(
-                    policy, session.transport, inference.server_model or inference.model, session.config.robot.name,
+                    policy, self._link.transport, inference.server_model or inference.model, session.config.robot.name,
                     start_timeout_s=inference.request_timeout, codec=self._codec(policy),
                     accept_new_weights=inference.accept_new_weights,
                 )  # fmt: skip
