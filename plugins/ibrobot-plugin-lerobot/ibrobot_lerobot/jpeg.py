@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import override
 
 import numpy as np
-import simplejpeg  # type: ignore[import-untyped]
+import simplejpeg
 from numpy.typing import NDArray
 
 from ibrobot_core.api import PictureCodec, WireError
