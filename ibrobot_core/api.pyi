@@ -176,7 +176,7 @@ from ibrobot_core.contract.specs import (
     SignalPart as SignalPart,
 )
 from ibrobot_core.contract.image import pixels as pixels
-from ibrobot_core.contract.frames import FrameAssembler as FrameAssembler, assemble as assemble
+from ibrobot_core.contract.frames import FrameAssembler as FrameAssembler
 from ibrobot_core.contract.joint_units import JointUnits as JointUnits
 from ibrobot_core.contract.joint_units import with_closed_ends as with_closed_ends
 from ibrobot_core.selection import Leaf as Leaf, Selection as Selection, value_at as value_at

@@ -19,7 +19,7 @@ from ibrobot_core.clock import SteppedClock
 from ibrobot_core.config.schema import Align, ImageSpec, ObservationSpec
 from ibrobot_core.contract import frames as frames_module
 from ibrobot_core.contract import image as image_module
-from ibrobot_core.contract.frames import FrameAssembler, FrameSampler, assemble, frames
+from ibrobot_core.contract.frames import FrameAssembler, FrameSampler
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.descriptors import DecoderDescriptor
 from ibrobot_core.errors import ContractError
@@ -112,17 +112,17 @@ def test_live_and_offline_are_equal_bit_by_bit(contract: Contract, events: list[
         clock.advance(1)
     assert bus.dropped() == {}
     ticks = [frame.stamp_ns for frame in live]
-    offline = list(frames(contract, bag, ticks))
+    offline = list(FrameAssembler(contract).frames(bag, ticks))
     assert len(offline) == len(live)
     assert all(equal(a, b) for a, b in zip(live, offline, strict=True))
     # Which other ticks there are makes no difference either.
     between = sorted({*ticks, *range(START_NS, clock.now_ns(), 7 * MS)})
-    denser = {frame.stamp_ns: frame for frame in frames(contract, bag, between)}
+    denser = {frame.stamp_ns: frame for frame in FrameAssembler(contract).frames(bag, between)}
     assert all(equal(denser[frame.stamp_ns], frame) for frame in live)
 
 
 def offline(contract: Contract, messages: Iterable[tuple[str, Message, int]], *ticks: int) -> list[Frame]:
-    return list(frames(contract, messages, ticks))
+    return list(FrameAssembler(contract).frames(messages, ticks))
 
 
 def test_a_frame_has_what_is_there_and_names_what_is_not(contract: Contract) -> None:
@@ -264,7 +264,7 @@ def test_jumps_are_counted_per_topic(contract: Contract) -> None:
     ]
     assembler = FrameAssembler(contract)
     assert assembler.resets() == {}
-    list(assemble(assembler, bag, [20_000 * MS]))
+    list(assembler.frames(bag, [20_000 * MS]))
     assert assembler.resets() == {"/joint_states": 1}
 
 
@@ -291,7 +291,9 @@ def test_offline_messages_must_be_in_the_order_of_receipt(contract: Contract) ->
 
 
 def test_ticks_may_go_on_for_ever(contract: Contract) -> None:
-    endless = frames(contract, [("/joint_states", joint_state(0, 1.0), 0)], itertools.count(0, contract.step_ns))
+    endless = FrameAssembler(contract).frames(
+        [("/joint_states", joint_state(0, 1.0), 0)], itertools.count(0, contract.step_ns)
+    )
     assert [len(frame.values) for frame in itertools.islice(endless, 3)] == [1, 1, 1]
 
 
@@ -361,7 +363,7 @@ def test_a_foreign_message_without_a_header_needs_to_go_by_receipt(make_config: 
         return Contract.from_config(make_config((spec,)))
 
     received = [("/touch", Touch(0.5), 7)]
-    (frame,) = frames(contract("receive"), received, [8])
+    (frame,) = FrameAssembler(contract("receive")).frames(received, [8])
     np.testing.assert_array_equal(frame.values["observation.touch"], np.array([0.5], np.float32))
     with pytest.raises(ContractError, match=r"a lamp_msgs/msg/Touch has no header; give `align: \{stamp: receive\}`"):
-        list(frames(contract("header"), received, [8]))
+        list(FrameAssembler(contract("header")).frames(received, [8]))

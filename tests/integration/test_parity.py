@@ -26,7 +26,7 @@ from ibrobot_core.bus import Bus
 from ibrobot_core.clock import RealClock, SteppedClock
 from ibrobot_core.config import find_config, load_config
 from ibrobot_core.config.schema import Align, ImageSpec
-from ibrobot_core.contract.frames import FrameSampler, frames
+from ibrobot_core.contract.frames import FrameAssembler, FrameSampler
 from ibrobot_core.contract.specs import ActionPart, Contract, ObservationPart
 from ibrobot_core.interfaces import EpisodeEnd, EpisodeStart, Feature, Frame
 from ibrobot_core.launch.runtime import Runtime
@@ -174,7 +174,7 @@ def test_frames_from_the_bag_are_those_of_the_run(tmp_path: Path, block: int) ->
         seen = record(tmp_path / f"bag_{seed}", spec, sent)
         reader = installed_plugins().open_episode(tmp_path / f"bag_{seed}")
         messages = ((each.topic, each.message, each.received_ns) for each in reader.messages(spec.topics))
-        converted = list(frames(spec, messages, [frame.stamp_ns for frame in seen]))
+        converted = list(FrameAssembler(spec).frames(messages, [frame.stamp_ns for frame in seen]))
         assert len(converted) == len(seen)
         for live, later in zip(seen, converted, strict=True):
             assert_equal(live, later)
@@ -232,7 +232,9 @@ def test_pictures_of_a_motion_jpeg_camera(tmp_path: Path) -> None:
     reader = Rosbag2Reader(tmp_path / "bag")
     assert [bytes(raw.data).endswith(one) for raw, one in zip(reader.raw(), sent, strict=True)] == [True] * 20
     messages = ((each.topic, each.message, each.received_ns) for each in reader.messages(spec.topics))
-    for live, later in zip(seen, frames(spec, messages, [frame.stamp_ns for frame in seen]), strict=True):
+    for live, later in zip(
+        seen, FrameAssembler(spec).frames(messages, [frame.stamp_ns for frame in seen]), strict=True
+    ):
         assert not live.missing
         assert_equal(live, later)
     reader.close()
@@ -269,6 +271,8 @@ def test_a_whole_run_in_simulation(site: Any, tmp_path: Path, rendering: None) -
     spec = Contract.from_config(config)
     reader = registry.open_episode(path)
     messages = ((each.topic, each.message, each.received_ns) for each in reader.messages(spec.topics))
-    for live, later in zip(kept, frames(spec, messages, [frame.stamp_ns for frame in kept]), strict=True):
+    for live, later in zip(
+        kept, FrameAssembler(spec).frames(messages, [frame.stamp_ns for frame in kept]), strict=True
+    ):
         assert_equal(live, later)
     reader.close()

@@ -26,7 +26,6 @@ from ibrobot_core.api import (
     Recorded,
     RecorderError,
     SignalPart,
-    assemble,
     seconds,
     value_at,
 )
@@ -217,7 +216,7 @@ class Ticks:
         source, before, rows = self._source, frozenset[str](), 0
         last: dict[str, NDArray[Any]] = {}
         absent = frozenset(self._contract.observations)
-        for frame in assemble(self._assembler, source, source.ticks(self._contract.step_ns)):
+        for frame in self._assembler.frames(source, source.ticks(self._contract.step_ns)):
             if source.is_over(frame.stamp_ns):
                 break
             if not last:

@@ -19,7 +19,6 @@ from ibrobot_core.api import (
     ImageSpec,
     ObservationPart,
     Selection,
-    assemble,
 )
 from ibrobot_core.contract.image import ENCODINGS
 
@@ -56,7 +55,7 @@ def again(contract: Contract, values: dict[str, np.ndarray]) -> dict[str, np.nda
     """The frame of the messages made of `values`."""
     made = Composer(contract)(values, STAMP_NS)
     received = [(topic, message, STAMP_NS) for topic, message in made.items()]
-    (frame,) = assemble(FrameAssembler(contract), received, [STAMP_NS])
+    (frame,) = FrameAssembler(contract).frames(received, [STAMP_NS])
     return dict(frame.values)
 
 

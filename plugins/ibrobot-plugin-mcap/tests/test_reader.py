@@ -33,7 +33,6 @@ from ibrobot_core.api import (
     JointState,
     ObservationPart,
     RecorderError,
-    assemble,
     installed_plugins,
     pixels,
 )
@@ -285,7 +284,7 @@ def test_standard_type_that_a_bag_defines_otherwise_gives_no_rows(tmp_path, old,
     with reading(file) as reader:
         stream = ((each.topic, each.message, each.received_ns) for each in reader.messages({"/it"}))
         with pytest.raises(IbrobotError, match="/it"):
-            list(assemble(FrameAssembler(Contract(100.0, (part,), ())), stream, [stamp(1)]))
+            list(FrameAssembler(Contract(100.0, (part,), ())).frames(stream, [stamp(1)]))
     problems_of(file, longest_gap=10.0)  # raises nothing
 
 
