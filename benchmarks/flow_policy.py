@@ -1,9 +1,9 @@
 """A flow-matching policy without a network, for `smoothness.py`: its velocity field is known in closed form.
 
-It is no trained model. Its "demonstrations" are a distribution written down here: the arm follows a slow wave along one
+Nothing is trained. Its "demonstrations" are a distribution written down here: the arm follows a slow wave along one
 of two ways, equally likely, with smooth noise of about a degree. For that mixture of Gaussians the field that flow
 matching learns is exact, so what differs between consecutive chunks (the other way, other noise) is what a perfectly
-trained policy of two minds would say, drawn anew each time: harder than one that sees where it is going.
+trained policy of two minds would say, drawn again each time: harder than one that sees where it is going.
 
 The guidance is that of real-time chunking (Black et al. 2025, "Real-Time Execution of Action Chunking Flow Policies"):
 at each step of the integration the chunk to be expected is drawn towards the prefix, fully for the actions that will be

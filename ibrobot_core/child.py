@@ -26,7 +26,7 @@ FAREWELL_S = 1.0
 
 
 class Channel:
-    """JSON objects, a line each, over a stream socket; a dead peer is no exception, it shows in `closed`.
+    """JSON objects, a line each, over a stream socket; a dead peer raises nothing, it shows in `closed`.
 
     Nothing here waits for a peer that does not read, so that a stopped host cannot stop the control loop.
     """

@@ -43,7 +43,7 @@ class RealClock(Clock):
 
 
 class SteppedClock(Clock):
-    """Time that moves only when told to: lockstep runs and tests."""
+    """Time that moves only by `advance`: for lockstep runs and tests."""
 
     def __init__(self, start_ns: int = 0) -> None:
         self._now_ns = start_ns

@@ -53,7 +53,7 @@ class Worker(Component):
     """A component that repeats one unit of work: in a thread of its own, or once a tick in lockstep.
 
     Args:
-        on_failure: told of an exception in the thread, which ends it.
+        on_failure: called with the exception that ended the thread.
         lockstep: no thread; `step` works.
         ready_timeout_s: how long `start` waits to be ready.
     """
@@ -144,7 +144,7 @@ class Worker(Component):
                     self.work(_POLL_S)
             finally:
                 self.teardown()
-        except Exception as error:  # noqa: BLE001 - told to the run, which ends with it as the cause
+        except Exception as error:  # noqa: BLE001 - reported to the run, which ends with it as the cause
             was_ready = self._ready.is_set()
             self._failure = error
             self._ready.set()

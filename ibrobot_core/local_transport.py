@@ -92,7 +92,7 @@ class LocalTransport(Transport):
 
     @override
     def watch(self, name: str, changed: Callable[[bool], object]) -> Callable[[], None]:
-        turn = threading.Lock()  # held until the present state was told, which comes first
+        turn = threading.Lock()  # held until the present state was delivered, which comes first
 
         def tell(served: bool) -> None:
             with turn:

@@ -188,7 +188,7 @@ class _Handler(BaseHTTPRequestHandler):
             case "/readyz":
                 return _verdict(self.probes.unhealthy() or self.probes.unready())
             case _:
-                return 404, "there are /metrics, /healthz and /readyz\n", _TEXT
+                return 404, "available: /metrics, /healthz and /readyz\n", _TEXT
 
     def _refuse(self) -> None:
         self._say(405, "GET only\n")

@@ -122,7 +122,7 @@ class Registry:
         raise PluginError(f"no {kind} is named, and no installed plugin offers a default one: pip install {package}")
 
     def missing(self, kind: str, type_: str) -> MissingDependency | None:
-        """What this machine lacks for `type_`; None where it lacks nothing. A check that fails otherwise is told so.
+        """What this machine lacks for `type_`; None where it lacks nothing. A check that fails is reported too.
 
         Raises:
             PluginError: as `find`.
@@ -195,7 +195,7 @@ class Registry:
         return checks
 
     def emit(self, event: str, **facts: Any) -> None:
-        """Tell every plugin of an event. One that raises is logged; the others are told all the same."""
+        """Call every plugin with an event. One that raises is logged; the others are called all the same."""
         for name, manager in self.managers.items():
             try:
                 getattr(manager.hook, event)(**facts)

@@ -114,7 +114,7 @@ class Robot:
         """Positions of `names` in joint order, shape (len(names),).
 
         Raises:
-            KeyError: for a name that is no joint of this robot.
+            KeyError: for a name that is not a joint of this robot.
         """
         order = {name: i for i, name in enumerate(self.joint_names)}
         missing = [n for n in names if n not in order]

@@ -57,7 +57,7 @@ class Selection:
     `data.0` is an element, `data` the whole array, `orientation` all of its numbers. Without any path it is
     the numbers of the whole message, or for a JointState the positions of the robot's joints in their order.
 
-    Bags of others define types that core does not know: there every path, e.g. `wrench.force.x` or `tags.0.id`, is
+    foreign bags define types that core does not know: there every path, e.g. `wrench.force.x` or `tags.0.id`, is
     looked up in the messages, and leads to one number. So is a path into a list of parts of a known type, e.g.
     `points.0.positions.2`.
 
@@ -77,7 +77,7 @@ class Selection:
             leaves = [Leaf(path, "foreign") for path in select]
         elif message_type is None:
             raise ContractError(
-                f"unknown message type {type_name!r}{did_you_mean(type_name, list(MESSAGE_TYPES), 'there are')}"
+                f"unknown message type {type_name!r}{did_you_mean(type_name, list(MESSAGE_TYPES), 'available')}"
             )
         else:
             self.paths = tuple(select) or _default(message_type, joints)
@@ -120,7 +120,7 @@ def _resolve(message_type: type[Any], path: str) -> list[Leaf]:
         kinds = {k: v for k, v in typing.get_type_hints(owner).items() if typing.get_origin(v) is not typing.ClassVar}
         if token not in kinds:
             raise ContractError(
-                f"{path!r}: {owner.__name__} has no field {token!r}{did_you_mean(token, list(kinds), 'there are')}"
+                f"{path!r}: {owner.__name__} has no field {token!r}{did_you_mean(token, list(kinds), 'available')}"
             )
         kind, field, rest = kinds[token], ".".join(tokens[: depth + 1]), ".".join(tokens[depth + 1 :])
         if attrs.has(kind):
@@ -238,7 +238,7 @@ def value_at(message: Any, path: Sequence[str]) -> Any:
         if attrs.has(type(value)):
             if token not in attrs.fields_dict(type(value)):
                 fields = ", ".join(attrs.fields_dict(type(value)))
-                raise ContractError(f"{'.'.join(path)!r}: {before} has no field {token!r}; there are: {fields}")
+                raise ContractError(f"{'.'.join(path)!r}: {before} has no field {token!r}; available: {fields}")
             value = getattr(value, token)
         elif isinstance(value, tuple | list | np.ndarray) and token.isascii() and token.isdigit():
             if int(token) >= len(value):
@@ -250,4 +250,4 @@ def value_at(message: Any, path: Sequence[str]) -> Any:
 
 
 def _fields_of(value: Any) -> str:
-    return f"; there are: {', '.join(attrs.fields_dict(type(value)))}" if attrs.has(type(value)) else ""
+    return f"; available: {', '.join(attrs.fields_dict(type(value)))}" if attrs.has(type(value)) else ""

@@ -43,7 +43,7 @@ def decode(typed: bytes, *, final: bool) -> tuple[list[str], bytes]:
 
     Keys are printable characters as they are, and `space`, `enter`, `tab`, `backspace`, `esc`, `up`, `down`, `left`,
     `right`, `home`, `end`, `insert`, `delete`, `page_up`, `page_down`, `f1` to `f12`; modifiers of the named ones are
-    ignored. Unknown sequences, control characters and what is no UTF-8 are passed over. An escape is never lost: where
+    ignored. Unknown sequences, control characters and invalid UTF-8 are ignored. An escape is never lost: where
     it begins no sequence it is `esc`.
 
     Args:
@@ -143,7 +143,7 @@ class KeyReader:
                 os.close(end)
 
     def subscribe(self) -> queue.SimpleQueue[str]:
-        """A new queue of the keys typed from now on; it is fed as long as somebody keeps it."""
+        """A new queue of the keys typed from now on; it is fed as long as a reference to it exists."""
         subscriber: queue.SimpleQueue[str] = queue.SimpleQueue()
         with self._lock:
             self._subscribers.add(subscriber)

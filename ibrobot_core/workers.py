@@ -97,4 +97,4 @@ class Workers[T]:
                 self._work(item)
             except Exception:  # noqa: BLE001 - contained: one item's fault must not reach the others
                 _log.exception("%s failed", self._name)
-            del item  # it may hold memory, or somebody who waits for its end
+            del item  # it may hold memory, or a caller may wait for its end

@@ -47,7 +47,7 @@ class Site:
         (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {distribution}\nVersion: 1.0\n")
         (metadata / "entry_points.txt").write_text(f"[ibrobot]\n{module} = {module}\n")
         self.modules.append(module)
-        # Python lists a folder anew when its time stamp has changed, which it has not within some milliseconds.
+        # Python lists a folder again when its time stamp has changed, which it has not within some milliseconds.
         invalidate_caches()
 
     def entry_points(self) -> list[EntryPoint]:

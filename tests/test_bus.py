@@ -148,7 +148,7 @@ def test_what_was_received_by_the_snapshot_is_in_the_queues() -> None:
         assert bisect_right(stamps, now_ns) <= queued
 
 
-def test_services_answer_and_their_absence_is_told(bus: Bus) -> None:
+def test_services_answer_and_their_absence_is_reported(bus: Bus) -> None:
     bus.serve("/add", lambda request: request + 1)
 
     assert bus.call("/add", 2) == 3

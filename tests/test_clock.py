@@ -38,7 +38,7 @@ def test_real_sleep_ends_at_the_deadline_and_not_before() -> None:
 
 
 @given(st.lists(st.integers(0, 10**12)))
-def test_stepped_time_moves_by_what_it_is_told(steps: list[int]) -> None:
+def test_stepped_time_moves_only_by_advance(steps: list[int]) -> None:
     clock = SteppedClock(5)
 
     for step in steps:

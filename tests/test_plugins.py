@@ -53,7 +53,7 @@ def test_a_good_plugin_works_beside_broken_ones(registry: Registry) -> None:
     assert registry.types("executor") == ["gripper", "position", "trajectory"]
 
 
-def test_every_failure_is_told_with_its_cause(registry: Registry) -> None:
+def test_every_failure_is_reported_with_its_cause(registry: Registry) -> None:
     assert [str(failure) for failure in registry.failures] == [
         "plugin 'fake_exits' (fake-exits) failed to import: SystemExit: 3",
         "plugin 'fake_import' (fake-import) failed to import: "

@@ -109,7 +109,7 @@ def test_joint_states_without_a_select_are_the_robots_positions() -> None:
         ("sensor_msgs/msg/JointState", ["positon.pan"], "JointState has no field 'positon', did you mean 'position'"),
         ("sensor_msgs/msg/JointState", ["position"], "name them, e.g. position.shoulder_pan"),
         ("sensor_msgs/msg/JointState", ["name"], "'name' leads to no number of JointState"),
-        ("sensor_msgs/msg/Imu", ["orientation.q"], "Quaternion has no field 'q'; there are: x, y, z, w"),
+        ("sensor_msgs/msg/Imu", ["orientation.q"], "Quaternion has no field 'q'; available: x, y, z, w"),
         ("sensor_msgs/msg/Imu", ["orientation.x.y"], "leads to no number"),
         ("sensor_msgs/msg/Joy", ["axes.first"], "its elements go by number, e.g. axes.0"),
         ("sensor_msgs/msg/Joy", ["axes.-1"], "its elements go by number, e.g. axes.0"),
@@ -178,14 +178,14 @@ def test_paths_lead_into_messages_of_foreign_types(pressure: list[float], number
 @pytest.mark.parametrize(
     ("path", "message"),
     [
-        ("presure.0", "'presure.0': the message has no field 'presure'; there are: header, pressure, tags, hot"),
+        ("presure.0", "'presure.0': the message has no field 'presure'; available: header, pressure, tags, hot"),
         ("pressure", "'pressure' leads to 2 elements; they go by number"),
         ("pressure.2", "pressure has 2 elements, element 2 is asked for"),
         ("pressure.x", "'pressure.x' leads to 2 elements; they go by number"),
         ("pressure.0.x", "'pressure.0.x' leads to no number"),
-        ("tags.0", "'tags.0' leads to no number; there are: number, name"),
+        ("tags.0", "'tags.0' leads to no number; available: number, name"),
         ("tags.0.name", "'tags.0.name' leads to no number"),
-        ("tags.0.nmae", "'tags.0.nmae': tags.0 has no field 'nmae'; there are: number, name"),
+        ("tags.0.nmae", "'tags.0.nmae': tags.0 has no field 'nmae'; available: number, name"),
     ],
 )
 def test_paths_that_lead_to_no_number_of_a_foreign_message(path: str, message: str) -> None:

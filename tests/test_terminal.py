@@ -37,7 +37,7 @@ def test_a_key_is_known_by_what_terminals_send(typed, key):
 
 
 @pytest.mark.parametrize("typed", PASSED_OVER)
-def test_what_is_no_key_is_passed_over(typed):
+def test_bytes_without_a_key_are_ignored(typed):
     assert decode(typed + b"a", final=True) == (["a"], b"")
 
 

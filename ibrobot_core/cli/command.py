@@ -1,6 +1,6 @@
 """The entry point of `ibrobot`: while it starts, Ctrl-C ends it in one line, whatever it was about to import or read.
 
-SIGTERM and SIGHUP do the same. This module imports next to nothing, so that there is hardly a moment before it.
+SIGTERM and SIGHUP do the same. This module imports next to nothing, so that it takes effect at once.
 """
 
 import os
@@ -28,6 +28,6 @@ def let_interrupts_raise() -> None:
 
 
 def _end(number: int, frame: FrameType | None) -> None:
-    """Nothing has begun that would have to be stopped; an exception could be swallowed, or told in many lines."""
+    """Nothing has begun that would have to be stopped; an exception could be swallowed, or printed in many lines."""
     os.write(2, b"error: stopped\n")
     os._exit(130)

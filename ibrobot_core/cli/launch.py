@@ -208,7 +208,7 @@ def _discard(descriptors: list[int]) -> None:
 
 
 class _Lines:
-    """Plain lines of status, where standard output is no terminal."""
+    """Plain lines of status, where standard output is not a terminal."""
 
     def __init__(self, runtime: Runtime, hooks: RunHooks, stack: ExitStack, *, err: bool) -> None:
         self._session = runtime.session
@@ -253,11 +253,11 @@ class _Panel:
             threading.Thread(target=self._listen, args=(keys(),), name="runtime keys", daemon=True).start()
 
     def starting(self, component: str) -> None:
-        """Say which component starts."""
+        """Show which component starts."""
         self._display.update(f"starting {component} …", refresh=True)
 
     def show(self) -> None:
-        """Obey the keys pressed, and draw the panel anew."""
+        """Handle the keys pressed, and redraw the panel."""
         if time.monotonic() < self._next_s:
             return
         self._next_s = time.monotonic() + 1.0 / _PANEL_HZ

@@ -77,7 +77,7 @@ def cli(debug: bool) -> None:
 
 
 def main() -> None:
-    """Run the command line. Errors are told in one line each and set the exit code: docs/reference/exit-codes.md."""
+    """Run the command line. Every error is one line and sets the exit code: docs/reference/exit-codes.md."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # an ASCII terminal shows \u2026, and does not end the run
             stream.reconfigure(errors="backslashreplace")

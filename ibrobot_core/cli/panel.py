@@ -185,7 +185,7 @@ class _Newest:
 
 
 class _Joints:
-    """Where each joint is and what it was told; where there is room, also within its limits."""
+    """Position and command of each joint; where there is room, also within its limits."""
 
     def __init__(self, session: Session) -> None:
         self._session = session

@@ -131,7 +131,7 @@ def _mode(robot: RobotConfig) -> str:
 
 
 def _check(contract: Contract, summary: EpisodeSummary, name: str, *, force: bool) -> None:
-    """See that the episode was recorded with this contract; one without its own goes by CONFIG's."""
+    """Check that the episode was recorded with this contract; one without its own goes by CONFIG's."""
     text = summary.metadata.get("contract")
     if text is None:
         return

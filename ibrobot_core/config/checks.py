@@ -55,7 +55,7 @@ class Checks:
         self._transport()
 
     def _known(self, section: str) -> list[str]:
-        """The names that a section gives, faulty or not, so that one fault is told once."""
+        """The names that a section gives, faulty or not, so that a fault is reported once."""
         value = self.document.root.get(section)
         return list(value) if isinstance(value, Mapping) else []
 
@@ -319,7 +319,7 @@ class Checks:
             )
         for i, topic in enumerate(topics if isinstance(topics, tuple) else ()):
             if not topic.startswith("/"):
-                message = f"{topic!r} is no full name of a topic, did you mean '/{topic}'?"
+                message = f"{topic!r} is not a full topic name, did you mean '/{topic}'?"
                 self.document.add(("recording", "topics", i), message)
 
 

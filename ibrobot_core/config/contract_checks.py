@@ -197,7 +197,7 @@ class ContractChecks:
                 self.document.add((*key, i, "key"), message)
             pictures |= {spec.key} if spec.type in _IMAGES else set()
             if spec.key.startswith(_IMAGE_KEYS) and spec.type not in _IMAGES:
-                continue  # told already
+                continue  # reported already
             if spec.type and kinds.setdefault(spec.key, spec.type in _IMAGES) != (spec.type in _IMAGES):
                 message = f"{spec.key} is an image in one observation and a vector in another; give them different keys"
                 self.document.add((*key, i, "key"), message)
@@ -236,17 +236,17 @@ class ContractChecks:
         return self._safety(key, spec, part)
 
     def _commands(self, key: Key, spec: ActionSpec) -> None:
-        """Whether the messages are a robot's own, or said to be of others, and where their numbers are."""
+        """Whether the messages are a robot's own, or marked as foreign, and where their numbers are."""
         own = messages.Float64MultiArray.ros_type
         if not spec.foreign:
             if spec.type != own:
                 message = (
-                    f"this robot publishes {own}, not {spec.type!r}; foreign: true takes the commands of bags of others"
+                    f"this robot publishes {own}, not {spec.type!r}; foreign: true takes the commands of foreign bags"
                 )
                 self.document.add((*key, "type"), message)
             elif spec.select:
                 self.document.add(
-                    (*key, "select"), "has a meaning for the commands of bags of others only, with foreign: true"
+                    (*key, "select"), "has a meaning for the commands of foreign bags only, with foreign: true"
                 )
         elif not _TYPE_NAME.fullmatch(spec.type):
             self.document.add((*key, "type"), f"expected PACKAGE/msg/NAME, got {spec.type!r}")
@@ -298,7 +298,7 @@ class ContractChecks:
         return spec
 
     def _text(self, key: Key, spec: SignalSpec) -> None:
-        """See that a known type has the field that the path to its text begins with."""
+        """Check that a known type has the field that the path to its text begins with."""
         first = spec.select[0].partition(".")[0]
         known = messages.MESSAGE_TYPES.get(spec.type)
         names = [field.name for field in attrs.fields(known)] if known is not None else [first]

@@ -1,4 +1,4 @@
-"""Robot YAML -> `RobotConfig`, with every fault told at once."""
+"""Robot YAML -> `RobotConfig`, with all faults reported at once."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def load_config(
 def load_contract(path: str | Path, registry: Registry | None = None) -> RobotConfig:
     """Read and check a robot YAML for its contract, or a file that has a `contract` section alone.
 
-    Such a file is for converting bags of others: its actions have `joints` in place of an executor. Its config is of a
+    Such a file is for converting foreign bags: its actions have `joints` in place of an executor. Its config is of a
     robot without a name or joints.
 
     Raises:

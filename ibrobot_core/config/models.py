@@ -67,7 +67,7 @@ def read_xml(path: Path) -> Element:
     """The root element of an XML file. Document types, and with them entities, are refused.
 
     Raises:
-        ModelError: when it cannot be read, or is no such XML.
+        ModelError: when it cannot be read, or is not such XML.
     """
     parser = expat.ParserCreate()
     top = Element("", {}, path, 0)
@@ -100,7 +100,7 @@ def read_urdf(path: Path) -> DescriptionModel:
     """What a URDF says.
 
     Raises:
-        ModelError: when it is no URDF.
+        ModelError: when it is not a URDF.
     """
     root = _root(path, "robot")
     found = {}
@@ -117,7 +117,7 @@ def read_mjcf(path: Path) -> DescriptionModel:
     """What an MJCF says, with what it includes; a joint's limits are its own, or those of its default class.
 
     Raises:
-        ModelError: when it is no MJCF.
+        ModelError: when it is not an MJCF.
     """
     root = _root(path, "mujoco")
     _include(root, path.parent)

@@ -50,7 +50,7 @@ def put(document: Document, path: str, value: Document, place: Place) -> None:
             holder[part] = {}
             document.places[key] = place
         holder = holder[part]
-    # What lies below has no place of its own any more, so that its faults are told as the override's.
+    # What lies below has no place of its own any more, so that its faults are reported as the override's.
     for known in [k for k in document.places if k[: len(key)] == key]:
         del document.places[known]
     document.places[key] = place

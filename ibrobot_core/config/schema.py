@@ -189,7 +189,7 @@ _LARGEST_PX = 8192
 
 def _check_size(instance: Any, attribute: attrs.Attribute[Any], value: tuple[int, int] | None) -> None:
     if value is not None and not all(1 <= size <= _LARGEST_PX for size in value):
-        raise ValueError(f"{list(value)} is no size, must be [height, width] of 1 to {_LARGEST_PX} px each")
+        raise ValueError(f"{list(value)} is not a valid size: [height, width] of 1 to {_LARGEST_PX} px each")
 
 
 @documented
@@ -211,7 +211,7 @@ class ObservationSpec:
     key: str = option(help="e.g. observation.state, observation.images.top")
     topic: str = option("", help="where the messages come from; a peripheral's own topic where it names one")
     type: str = option("", help="ROS 2 message type; known by itself for /joint_states and peripherals")
-    foreign: bool = option(False, help="the type is one that only bags of others have, each with its definition")
+    foreign: bool = option(False, help="a type that only foreign bags have; each bag brings its definition")
     peripheral: str | None = option(None, help="the peripheral that publishes it")
     select: tuple[str, ...] = option((), help="dotted paths into the message, e.g. position.shoulder_pan")
     image: ImageSpec | None = option(None, help="for images")
@@ -224,10 +224,10 @@ class ActionSpec:
     """One part of the action vector, for one executor. Several under one key split it in file order."""
 
     executor: str = option(help="the executor that takes it")
-    topic: str = option(help="where what the robot was told is published")
+    topic: str = option(help="where the commands after the safety layer are published")
     key: str = option("action", choices=("action",), help="the key of the action vector, as in datasets")
     type: str = option("std_msgs/msg/Float64MultiArray", help="message type; another one needs foreign")
-    foreign: bool = option(False, help="the commands are those in bags of others, not what this robot publishes")
+    foreign: bool = option(False, help="the commands come from foreign bags; this robot does not publish them")
     select: tuple[str, ...] = option((), help="with foreign: where the numbers are, one for each joint")
     safety_behavior: str = option("hold", choices=("hold", "relax"), help="what follows when the setpoints go stale")
     align: str = option(
@@ -398,7 +398,7 @@ class RecordingConfig(ComponentConfig):
 def _check_topics(instance: Any, attribute: attrs.Attribute[tuple[str, ...]], value: tuple[str, ...]) -> None:
     for topic in value:
         if not topic.startswith("/"):
-            raise ValueError(f"{topic!r} is no full name of a topic, did you mean '/{topic}'?")
+            raise ValueError(f"{topic!r} is not a full topic name, did you mean '/{topic}'?")
         if value.count(topic) > 1:
             raise ValueError(f"{topic} is given twice")
 
@@ -412,7 +412,7 @@ class Share:
         (), validator=_check_topics, help="topics of this robot for others, e.g. /joint_states"
     )
     subscribe: tuple[str, ...] = option(
-        (), validator=_check_topics, help="topics of others for this robot's bus, e.g. /force_torque"
+        (), validator=_check_topics, help="topics of other machines for this robot's bus, e.g. /force_torque"
     )
 
     def __attrs_post_init__(self) -> None:

@@ -177,7 +177,7 @@ class SectionParser:
         """
         value = self.document.get(*key) if value is None else value
         if not isinstance(value, Mapping):
-            return None  # told already, with the sections
+            return None  # reported already, with the sections
         own = fields(kind)
         faults = Faults()
         if "type" not in value and (close := get_close_matches("type", [k for k in value if k not in own], 1)):
@@ -247,7 +247,7 @@ class SectionParser:
         if part is None:
             return
         if not SimulationConfig.takes(part.descriptor):
-            message = f"{part.descriptor.type!r} is no simulation; it belongs in the hardware section"
+            message = f"{part.descriptor.type!r} is not a simulation; it belongs in the hardware section"
             self.document.add(("simulation", "type"), message)
         elif sections.simulated or self._elsewhere:
             sections.simulation = part

@@ -63,7 +63,7 @@ class Document:
     problems: list[tuple[Place, Problem]]
     file: str
     unread: set[Key] = attrs.field(factory=set)
-    """Keys whose values could not be read; what stands there is no value."""
+    """Keys whose values could not be read; they have no value."""
     references: dict[Key, str] = attrs.field(factory=dict)
     """Text with `${…}` as it was written, where a value was made of it."""
     secrets: set[Key] = attrs.field(factory=set)

@@ -223,7 +223,7 @@ class FrameSampler:
             subscription.close()
 
     def _remember(self, t_ns: int) -> Frame:
-        """The frame at `t_ns` with those before it; what comes before a gap is not history of what comes after."""
+        """The frame at `t_ns` and its history; frames before a gap are not history of those after it."""
         self._drain(t_ns)
         frame = self._assembler.frame(t_ns)
         if self._recent and self._recent[-1].stamp_ns == t_ns:

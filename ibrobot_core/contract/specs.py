@@ -50,7 +50,7 @@ class ActionPart:
     safety_behavior: str
     joints: tuple[str, ...]
     select: tuple[str, ...] = ()
-    """Paths to the joints' numbers in messages of others; none where `data` has them, in order."""
+    """Paths to the joints' numbers in foreign messages; none where `data` has them, in order."""
     align: str = "hold"
     """Which command a tick's action is: `hold`, the newest sent by then; `next`, the first sent after it."""
 

@@ -32,11 +32,11 @@ _POSE_SPEED = 0.25
 """Fraction of the velocity limits at which start and stop move to a pose."""
 _POSE_TIMEOUT_S = 10.0
 _POSE_TOLERANCE = 0.2
-"""How far a joint may hang from a startup pose that it was told [rad]."""
+"""How far a joint may hang from a commanded startup pose [rad]."""
 
 
 class ControlCore:
-    """The control loop's work, without its timing: `tick` once a period, `handle` for commands, `events` to be told.
+    """The control loop's work, without its timing: `tick` once a period, `handle` for commands, `events` for the host.
 
     Args:
         config: the robot YAML.
@@ -84,7 +84,7 @@ class ControlCore:
         self.generation = 0
         self.fault = ""
         self.events: deque[Mapping[str, Any]] = deque()
-        """What the host is to be told: `goal` and `fault` events."""
+        """Events for the host: `goal` and `fault`."""
         self._executors = ActiveExecutors(config.robot, executors, self.events.append)
         self.state: ControlState | None = None
         """After a tick, what it found and did."""
@@ -95,7 +95,7 @@ class ControlCore:
         Where that fails, the torque that it put on is off again.
 
         Raises:
-            HardwareError: when the hardware does not connect or its first reading is no position.
+            HardwareError: when the hardware does not connect or its first reading is not a valid position.
             NotSupported: where the stop behaviour is `relax` and a part has no such thing.
         """
         if self._config.control.stop == "relax":
@@ -454,7 +454,7 @@ class ControlCore:
         self._raise_fault(EMERGENCY_STOP)
 
     def _reset(self) -> dict[str, Any]:
-        """Clear faults and the emergency stop, and enter the mode anew from where the joints are.
+        """Clear faults and the emergency stop, and enter the mode again from where the joints are.
 
         Answers with the fault that was `cleared`, empty where none was set.
         """
@@ -462,7 +462,7 @@ class ControlCore:
         if not self._safety.at_rest and not self._relaxed:
             if cleared:
                 raise HardwareError("the robot still brakes: reset it when it stands")
-            # It moves as it was told: only the executors begin anew, and the commands go on within the limits.
+            # It moves as commanded: only the executors begin again, and the commands go on within the limits.
             self._switch_mode(self.mode)
         else:
             self._restart_executors()

@@ -40,7 +40,7 @@ class FollowingError:
         """Take one tick's figures, all of shape (J,).
 
         Args:
-            setpoint: what the joints were told [rad].
+            setpoint: the command of the joints [rad].
             velocity: how fast that moves [rad/s].
             measured: where they are [rad].
 

@@ -163,14 +163,14 @@ class HardwareGroup:
                 part.advance(step_ns)
 
     def reset_episode(self, episode: EpisodeSetup) -> None:
-        """Set simulated scenes up anew.
+        """Set up simulated scenes again.
 
         Raises:
             NotSupported: where no part is simulated.
         """
         simulated = [part for part in self._parts.values() if isinstance(part, SimulatedHardware)]
         if not simulated:
-            raise NotSupported("only a simulation can be set up anew")
+            raise NotSupported("only a simulation can be set up again")
         for part in simulated:
             part.reset(episode)
 

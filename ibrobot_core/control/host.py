@@ -162,7 +162,7 @@ class ControlClient(ControlHost):
         seed: for simulated hardware.
         on_state: given each state, in that thread.
         on_event: given each event, in that thread.
-        on_death: told when it dies.
+        on_death: called when it dies.
         given_up: set when a start is no longer wanted: the robot then stops, wherever it is on its way.
         aftermath: what to say beside its death.
     """
@@ -289,14 +289,14 @@ class ControlClient(ControlHost):
     def _receive(self, child: Child) -> None:
         try:
             self._pass_on(child)
-        except Exception as error:  # noqa: BLE001 - told to the run, which cannot go on without states
+        except Exception as error:  # noqa: BLE001 - reported to the run, which cannot go on without states
             self._on_death(ComponentFailed(f"control's states cannot be passed on ({type(error).__name__}: {error})"))
             return
         if child.failed is not None:
             self.holding = child.failed["holding"]
         if not self._stopping:
             self._on_death(self._failure(child, "the control process died"))
-        # Only then those that wait for an answer, so that the cause is told and not its consequence.
+        # Only then those that wait for an answer, so that the cause is reported and not its consequence.
         for number in list(self._replies):
             self._take({"reply": number, "error": _GONE})
 

@@ -50,7 +50,7 @@ class ControlState:
     velocity: Vector
     effort: Vector
     command: Vector
-    """What the hardware was told [rad], shape (J,)."""
+    """Command written to the hardware [rad], shape (J,)."""
     signals: Vector
     """All signals of the hardware, one after the other, shape (S,)."""
 

@@ -27,11 +27,11 @@ from ibrobot_core.outside import echo
 from ibrobot_core.plugins import installed_plugins
 
 _STARTUP_TIMEOUT_S = 30.0
-_COMMANDED = "told to stop"
+_COMMANDED = "the host asked for it"
 
 
 class ControlProcess:
-    """The loop on its absolute deadlines, and the link to the host: told `ready` once the robot has arrived."""
+    """Runs the loop on absolute deadlines and sends the host `ready` once the robot has arrived."""
 
     def __init__(
         self, core: ControlCore, clock: RealClock, channel: Channel, memory: SharedMemory, wake: int, host: int,
@@ -60,7 +60,7 @@ class ControlProcess:
             late = self._clock.now_ns() - deadline
             self._cycle(deadline, late, periods)
             if self._handle_commands():
-                # It was waited for, e.g. hardware that is set up anew after a fault: no tick was missed.
+                # It was waited for, e.g. hardware that is set up again after a fault: no tick was missed.
                 deadline, periods = self._clock.now_ns() + period, 1
                 continue
             deadline += period

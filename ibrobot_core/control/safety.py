@@ -16,7 +16,7 @@ KINDS = ("estop", "nonfinite", "unmeasured", "first_command", "position", "lead"
 
 
 class SafetyLayer:
-    """Turns what is asked for into what the hardware is told, one tick at a time.
+    """Turns desired setpoints into the commands for the hardware, one tick at a time.
 
     From `activate` on, at every tick and for every joint, whatever is asked for:
     `lower <= p <= upper`, `|p - m| <= max_lead`, `|p - p'| <= max_velocity * dt` and
@@ -25,7 +25,7 @@ class SafetyLayer:
     from where the joint is now, a step is taken only if braking from it at max_acceleration stops in time.
 
     The order is that of precedence. The first two always hold, the first before the second. The last two yield where a
-    joint's measured position moves away from the command so that no braking stops in time, e.g. because somebody pushes
+    joint's measured position moves away from the command so that no braking stops in time, e.g. because a person pushes
     it; where p' itself is too far from m, p starts at rest at max_lead from it.
 
     What can be had within these limits passes unchanged, bit by bit. After something that could not, the command
@@ -74,7 +74,9 @@ class SafetyLayer:
             raise HardwareError(f"measured positions must be {len(self._names)} numbers, got {measured!r}")
         if not np.isfinite(position).all():
             joint = int(np.argmin(np.isfinite(position)))
-            raise HardwareError(f"joint {self._names[joint]} is measured at {position[joint]}, which is no position")
+            raise HardwareError(
+                f"joint {self._names[joint]} is measured at {position[joint]}, which is not a valid position"
+            )
         self._position = position.copy()
         self._step = np.zeros_like(position)
         self._target = self._nothing

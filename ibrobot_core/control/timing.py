@@ -9,7 +9,7 @@ import numpy as np
 REPORT_TICKS = 20
 """Ticks between two reports of punctuality and counters to the host."""
 _BINS = 20_001
-"""Microseconds of lateness told apart; what is later counts as 20 ms."""
+"""Resolution of lateness in microseconds; more than 20 ms counts as 20 ms."""
 
 
 class Punctuality:

@@ -23,11 +23,11 @@ from ibrobot_core.units import ns, seconds
 _FIRST_PAUSE_NS = 100_000_000
 """Pause after a failed request; it doubles with each one that fails next."""
 _LONGEST_PAUSE_NS = 1_000_000_000
-"""Also between requests that are not answered: so soon is a model used again that was away."""
+"""Also between requests that are not answered: upper bound on how long a recovered model stays unused."""
 _UNKNOWN = 4
 """Requests within a chunk's time before any was answered, where the way to the model may be a long one."""
 _SILENCE_NS = 2_000_000_000
-"""After which missing observations are told."""
+"""After this time missing observations are reported."""
 
 SendPlan = Callable[[int, int, Vector], None]
 
@@ -253,7 +253,7 @@ class Dispatcher:
         return True
 
     def _continued(self, t_ns: int) -> tuple[Vector | None, int]:
-        """For real-time chunking, what the arm will be told from `t_ns` on, and how much of it before a chunk comes."""
+        """For real-time chunking, the commands of the arm from `t_ns` on, and how much of it before a chunk comes."""
         if self._options.joins_by != "rtc":
             return None, 0
         size = self._spec.chunk_size

@@ -34,9 +34,9 @@ class LeadIn:
         half of the limits of the joint with the furthest to go. A chunk shorter than that ends on the way.
 
         Args:
-            before: what the arm would be told otherwise: at the first of the actions, and at the next, shape (2, A); or
+            before: the commands of the arm otherwise: at the first of the actions, and at the next, shape (2, A); or
                 where it is held, shape (1, A).
-            actions: what it is told from now on.
+            actions: the commands from now on.
         """
         gap = before[0] - actions[0]
         if not gap.any():

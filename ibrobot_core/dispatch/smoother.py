@@ -30,7 +30,7 @@ class TemporalSmoother:
     whose start falls between two steps of the plan goes to the nearest: observations are stamped on the contract's
     ticks, so this is jitter, the error is at most half a step and does not add up, and every action stays as the
     policy gave it, where interpolation would low-pass each chunk once more. A chunk that nothing of the plan touches
-    starts afresh at its own exact times.
+    starts at its own exact times.
 
     Not thread-safe: one thread owns it. Arrays that `plan` returned never change afterwards.
 
@@ -86,9 +86,9 @@ class TemporalSmoother:
         return min(max(len(self._positions) - begun, 0), len(self._positions))
 
     def ahead(self, t_ns: int, held: int) -> Vector | None:
-        """What the arm will be told from `t_ns` on: the plan's actions, shape (K, A), the first that nearest to `t_ns`.
+        """The commands of the arm from `t_ns` on: the plan's actions, shape (K, A), the first that nearest to `t_ns`.
 
-        Where the plan ran dry it is told the last action, which stands there `held` times, K = held. None before the
+        Where the plan ran dry the last action stands there `held` times, K = held. None before the
         first plan, where the last action is not held, and where the plan begins later.
         """
         offset = (t_ns - self._start_ns + self.step_ns // 2) // self.step_ns

@@ -97,7 +97,7 @@ class Engine(ABC):
 
 
 def check_weights(before: str, now: str, whose: str, *, accept: bool) -> None:
-    """Compare the weights of a model that was started again with those that acted before.
+    """Compare the weights of a restarted model to the weights before.
 
     Args:
         before: hash of those that acted; empty at the first start.

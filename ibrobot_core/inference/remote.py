@@ -166,7 +166,9 @@ class RemoteEngine(Engine):
         except ValueError:
             health = None
         if not isinstance(health, dict):
-            raise PolicyError(f"what serves {health_name(self._model)} is no server of ibrobot: {bytes(reply)[:40]!r}…")
+            raise PolicyError(
+                f"what serves {health_name(self._model)} is not an ibrobot server: {bytes(reply)[:40]!r}…"
+            )
         return health
 
     def _differences(self, health: Mapping[str, Any], fingerprint: str) -> str:

@@ -263,7 +263,7 @@ class Buffer:
                 del self._memory[size:]
             else:
                 self._memory.extend(bytes(size - len(self._memory)))
-        except BufferError:  # somebody still looks at the last frame
+        except BufferError:  # a reader still holds the last frame
             self._memory = bytearray(size)
         return memoryview(self._memory)
 

@@ -31,7 +31,7 @@ class DatasetSummary:
     fps: float
     features: Mapping[str, Feature]
     metadata: Mapping[str, Any]
-    """What `create` or `merge` was told; empty for a dataset that was not written by this writer."""
+    """The metadata given to `create` or `merge`; empty for a dataset that was not written by this writer."""
     episodes: int
     frames: int
 
@@ -82,7 +82,7 @@ class DatasetWriter(ABC):
     def merge(self, root: Path, parts: Sequence[Path], metadata: Mapping[str, Any]) -> None:
         """Append finished datasets of this writer to the one at `root`, or make it of them where there is none.
 
-        Nothing is encoded anew, equal parts give equal bytes, and a crash leaves the old dataset or the new one: a
+        Nothing is re-encoded, equal parts give equal bytes, and a crash leaves the old dataset or the new one: a
         merge that was interrupted once it was certain is completed by the next call of `merge` or `summary`.
 
         Args:

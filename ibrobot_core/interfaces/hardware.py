@@ -195,7 +195,7 @@ class SimulatedHardware(Hardware):
 
     @abstractmethod
     def reset(self, episode: EpisodeSetup) -> None:
-        """Set the scene up anew; equal seeds give equal scenes, bit by bit."""
+        """Set up the scene again; equal seeds give equal scenes, bit by bit."""
 
     def success(self) -> bool | None:
         """Whether the scene's task is done; None for a scene without one."""

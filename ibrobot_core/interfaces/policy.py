@@ -29,7 +29,7 @@ class Frame:
     missing: frozenset[str] = frozenset()
     prompt: str = ""
     prefix: Vector | None = None
-    """What the arm will be told from this tick on, shape (K, A) with 1 <= K <= `chunk_size`, in the contract's units
+    """The commands of the arm from this tick on, shape (K, A) with 1 <= K <= `chunk_size`, in the contract's units
     and order; row i is for the same time as action i of the chunk. It is the actions still in the plan, never padded;
     where the plan ran dry, the last one, which is held meanwhile. None at the beginning, and for a policy that does
     not want it."""
@@ -119,7 +119,7 @@ class Policy(ABC):
         """
 
     def check(self, tensors: Tensors) -> None:
-        """See that a request, which may come from anywhere, has what `preprocess` makes; does nothing by default.
+        """Check that a request, which may come from anywhere, has what `preprocess` makes; does nothing by default.
 
         A server asks before it resets a policy that remembers for another robot.
 

@@ -10,14 +10,14 @@ import attrs
 from ibrobot_core.messages import Message
 
 type Payload = bytes | bytearray | memoryview
-"""Bytes, flat. What was received is not to be written to, and lives as long as somebody holds it."""
+"""Bytes, flat. What was received is not to be written to, and lives as long as a reference to it exists."""
 
 type Handler = Callable[[Payload, str | None], Payload]
 """Makes the answer to a request. It is called with the request and the sender's name, as a certificate or password has
-proved it to the transport; None where nothing proves it. What a request says of itself is no proof."""
+proved it to the transport; None where nothing proves it. What a request says of itself is not a proof."""
 
 HANDLER_THREADS = 16
-"""How many calls of a handler go on at the same time, where `serve` is not told otherwise."""
+"""How many calls of a handler go on at the same time, where `serve` has no `workers`."""
 
 
 class Transport(ABC):
@@ -82,7 +82,7 @@ class Transport(ABC):
 
 @attrs.frozen
 class SharedTopic:
-    """A topic that somebody shares: its name and message type, and how many publish it and listen."""
+    """A shared topic: its name and message type, and how many publish it and listen."""
 
     name: str
     type: str

@@ -20,7 +20,7 @@ NAME = "control"
 
 
 class ControlComponent(Component):
-    """Starts control and publishes what it tells: joint states, what the joints were told, and signals."""
+    """Starts control and publishes joint states, commands and signals."""
 
     def __init__(self, session: Session, needs: tuple[str, ...]) -> None:
         config = session.config

@@ -49,7 +49,7 @@ def check_model(config: RobotConfig, model: ModelConfig, spec: PolicySpec, log: 
             raise ContractError(f"{where}.{error}") from None
         if spec.prompt and not mode.inference.prompt:
             raise ContractError(
-                f"{where}.inference.prompt: is missing; model {model.name!r} wants to be told what to do, "
+                f"{where}.inference.prompt: is missing; model {model.name!r} needs a prompt, "
                 "e.g. prompt: put the cube into the bin"
             )
         if mode.inference.prompt and not spec.prompt:

@@ -116,7 +116,7 @@ def build_plan(session: Session) -> LaunchPlan:
 
     Raises:
         MissingDependency: when something needs a sensor that cannot run on this machine.
-        NotSupported: for a contract with topics that only bags of others have.
+        NotSupported: for a contract with topics that only foreign bags have.
     """
     config = session.config
     modes = config.control_modes.values()

@@ -55,7 +55,7 @@ class Runtime:
         When the run is ended meanwhile, by Ctrl-C, what was started is stopped again and nothing is raised.
 
         Args:
-            on_start: told the name of each component before it starts.
+            on_start: called with the name of each component before it starts.
 
         Raises:
             IbrobotError: the cause, with the component's name.
@@ -103,7 +103,7 @@ class Runtime:
         for component in self._started:
             try:
                 component.step(now_ns)
-            except Exception as error:  # noqa: BLE001 - a component that dies ends the run, with its cause told
+            except Exception as error:  # noqa: BLE001 - a component that dies ends the run, with its cause
                 session.fail(component.name, error)
         return self.wait(0.0)
 
@@ -148,7 +148,7 @@ class Runtime:
             self.plan.episodes.begin()
 
     def reset(self) -> str:
-        """Clear faults and the emergency stop; the mode begins anew from where the joints are.
+        """Clear faults and the emergency stop; the mode begins again from where the joints are.
 
         A mode that moves the robot by itself does not: after a fault the robot holds until the mode is entered again.
 

@@ -257,7 +257,7 @@ class Session:
         self.finished.set()
 
     def fail(self, component: str, error: Exception) -> None:
-        """End the run because `component` died; the first cause is the one that is told."""
+        """End the run because `component` died; only the first cause is reported."""
         if self.failure is None and not self.finished.is_set():
             self.failure = (component, error)
         self.finished.set()

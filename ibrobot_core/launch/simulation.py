@@ -32,7 +32,7 @@ class SimulatedEpisodes(SessionWorker):
     def _judge(self, session: Session) -> None:
         state = session.state
         if self._begun_ns is None:
-            # Setting the scene up anew would clear an emergency stop, and move on: both are for a person to do.
+            # Setting up the scene again would clear an emergency stop, and move on: both are for a person to do.
             if not (session.held or (state is not None and state.estop)):
                 self._begin_episode()
         elif state is not None and state.generation == session.generation and state.success:

@@ -37,7 +37,7 @@ class EpisodeDataset:
         self._write({**self._read(), "prompt": prompt})
 
     def join(self, contract: Contract, robot: str, robot_type: str) -> None:
-        """See that an episode of this contract may join the others, and make the dataset for the first.
+        """Check that an episode of this contract may join the others, and make the dataset for the first.
 
         Args:
             contract: of the episode.
@@ -54,7 +54,7 @@ class EpisodeDataset:
             self._write({**facts, "fingerprint": contract.fingerprint(), "contract": contract.canonical(), **known})
 
     def check(self, contract: Contract) -> None:
-        """See that an episode of this contract may join the others.
+        """Check that an episode of this contract may join the others.
 
         Raises:
             RecorderError: when they have another contract; shows both.
@@ -68,7 +68,7 @@ class EpisodeDataset:
             )
 
     def check_writable(self) -> None:
-        """See that files can be made where the dataset is or shall be; nothing is left there.
+        """Check that the dataset's folder is writable; leaves no files.
 
         Raises:
             RecorderError: when they cannot.

@@ -1,4 +1,4 @@
-"""The life of episodes: numbered, counted, told to plugins, and recorded where a recorder is there."""
+"""The life of episodes: numbered, counted, announced to plugins, and recorded where there is a recorder."""
 
 from __future__ import annotations
 

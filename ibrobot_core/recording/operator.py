@@ -148,7 +148,7 @@ class Operator(RunHooks):
             return f"recording{prompt}, {service.elapsed_s():.0f} s{left}"
         pause_s = self._not_before_s - self._clock_s()
         if pause_s > 0:
-            return f"set the scene up anew, {pause_s:.0f} s"
+            return f"set up the scene again, {pause_s:.0f} s"
         return "waiting" if self._auto or self._service.by_mode else "waiting: Tab starts"
 
     def _saved(self) -> str:

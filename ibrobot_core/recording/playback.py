@@ -1,4 +1,4 @@
-"""The motion in an episode: what the joints were told and where they were, by time; how near a replay came."""
+"""The motion in an episode: commanded and measured positions, by time; how near a replay came."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Playback:
 
     joints: tuple[str, ...]
     commands: Track
-    """What the joints were told."""
+    """Commanded positions."""
     states: Track | None
     """Where they were; None where the episode has no joint states."""
     outcome: str
@@ -85,7 +85,7 @@ def read_playback(reader: EpisodeReader, contract: Contract) -> Playback:
     for part in contract.action_parts:
         if part.topic not in present:
             told = ", ".join(sorted(present)) or "none"
-            raise RecorderError(f"{summary.path}: no message of {part.topic}, so nothing to replay; there are: {told}")
+            raise RecorderError(f"{summary.path}: no message of {part.topic}, so nothing to replay; available: {told}")
     if not contract.action_parts:
         raise RecorderError(f"{summary.path}: its contract has no action, so there is nothing to replay")
     states = next((topic for topic, each in present.items() if each.type == JointState.ros_type), None)

@@ -121,7 +121,7 @@ class EpisodeService:
         """End the episode.
 
         Raises:
-            RecorderError: when none is on, or for an outcome that there is not.
+            RecorderError: when none is on, or for an unknown outcome.
             NotSupported: where the mode ends episodes itself.
         """
         if outcome not in OUTCOMES:

@@ -57,7 +57,7 @@ class _End:
 class RecordingWorker(Worker):
     """Writes what is on the bus while an episode is on.
 
-    A recorder that fails, e.g. on a full disk, ends its episode's recording and is told as a fault; the robot goes on,
+    A recorder that fails, e.g. on a full disk, ends its episode's recording with a fault; the robot goes on,
     and the next episode is recorded again.
     """
 
@@ -233,7 +233,7 @@ class RecordingWorker(Worker):
             act()
         except RecorderError as error:
             self._fail(error)
-        except Exception as error:  # a plugin's bug must neither end the run nor go untold
+        except Exception as error:  # a plugin's bug must neither end the run nor go unreported
             self._session.log.debug("the recorder failed", exc_info=error)
             self._fail(RecorderError(f"the recorder {self._config.type!r} failed: {error_line(error)}"))
         else:
@@ -260,7 +260,7 @@ class RecordingWorker(Worker):
             self._reported_absent = True
             there = ", ".join(self._session.bus.topics())
             self._session.log.warning(
-                "recording.topics: nothing of %s has come so far, nor was recorded; there are: %s",
+                "recording.topics: nothing of %s has come so far, nor was recorded; available: %s",
                 ", ".join(absent), there,
             )  # fmt: skip
 

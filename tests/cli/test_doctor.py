@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 Ibrobot = Callable[..., "Ran"]
 
 
-def test_a_failing_check_of_a_plugin_is_told_with_its_remedy(ibrobot: Ibrobot, site: Site) -> None:
+def test_a_failing_check_of_a_plugin_is_reported_with_its_remedy(ibrobot: Ibrobot, site: Site) -> None:
     site.add("fake-gl", "failing_check.py")
 
     ran = ibrobot("doctor")

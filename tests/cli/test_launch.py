@@ -149,7 +149,7 @@ def test_a_device_that_is_lost_is_a_fault_and_the_run_goes_on(launch: Callable[.
     assert summary.items() >= {"faults": ["the stick is gone"], "duration_s": 2.0}.items()
 
 
-def test_what_died_is_told_after_the_summary(launch: Callable[..., Ran]):
+def test_what_died_is_reported_after_the_summary(launch: Callable[..., Ran]):
     ran = launch(*LOCKSTEP, "--mode", "bug", "--json")
     assert ran.err.splitlines()[-1].startswith("error: mode:bug: ZeroDivisionError: one over nothing (a bug at ")
     assert json.loads(ran.out)["mode"] == "bug"

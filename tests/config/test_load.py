@@ -69,7 +69,7 @@ def test_a_simulation_may_begin_in_a_mode_of_its_own(
     assert load_text(text, sim=sim, mode=mode).default_control_mode == begins
 
 
-def test_an_unknown_mode_of_the_simulation_is_told(faults_of_edit: Faults) -> None:
+def test_an_unknown_mode_of_the_simulation_is_reported(faults_of_edit: Faults) -> None:
     told = faults_of_edit("{type: world}", "{type: world, default_control_mode: polcy}", sim=True)
     assert "simulation.default_control_mode: unknown control mode 'polcy', did you mean 'policy'?" in told
 
@@ -101,13 +101,13 @@ def test_sim_without_simulation_is_refused(faults_of_edit: Faults) -> None:
     assert told == "robot.yaml: --sim needs a simulation section, e.g. simulation: {type: mujoco}"
 
 
-def test_faults_of_real_sensors_are_told_in_simulation_too(faults_of_edit: Faults) -> None:
+def test_faults_of_real_sensors_are_reported_in_simulation_too(faults_of_edit: Faults) -> None:
     told = faults_of_edit("type: webcam, fps: 30", "type: webcam, fsp: 30", sim=True)
 
     assert told == "robot.yaml:15: peripherals.top.fsp: unknown key, did you mean 'fps'?"
 
 
-def test_faults_of_sim_options_are_told_where_they_are(faults_of_edit: Faults) -> None:
+def test_faults_of_sim_options_are_reported_where_they_are(faults_of_edit: Faults) -> None:
     told = faults_of_edit("type: webcam, fps: 30", "type: webcam, sim: {\n      fps: 300, shadow: true}", sim=True)
 
     assert told == (
@@ -242,6 +242,6 @@ def test_a_file_that_cannot_be_read(registry: Registry, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("text", "found"), [("", "nothing"), ("- a", "a list"), ("5", "5")])
-def test_a_file_that_is_no_mapping(load_text: Load, text: str, found: str) -> None:
+def test_a_file_without_a_mapping_is_refused(load_text: Load, text: str, found: str) -> None:
     with pytest.raises(ConfigError, match=f"^robot.yaml: expected a mapping of sections, got {found}$"):
         load_text(text)

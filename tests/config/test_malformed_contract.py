@@ -12,7 +12,7 @@ CASES = {
         "peripheral: top, align",
         "peripheral: top, image: {resize: [-240, 320]}, align",
         (
-            "robot.yaml:36: contract.observations.1.image.resize: [-240, 320] is no size, must be [height, width] of "
+            "robot.yaml:36: contract.observations.1.image.resize: [-240, 320] is not a valid size: [height, width] of "
             "1 to 8192 px each"
         ),
     ),
@@ -20,8 +20,8 @@ CASES = {
         "peripheral: top, align",
         "peripheral: top, image: {resize: [240, 320000]}, align",
         (
-            "robot.yaml:36: contract.observations.1.image.resize: [240, 320000] is no size, must be [height, width] of "
-            "1 to 8192 px each"
+            "robot.yaml:36: contract.observations.1.image.resize: [240, 320000] is not a valid size: [height, width] "
+            "of 1 to 8192 px each"
         ),
     ),
     "two_images_under_one_key": (
@@ -150,8 +150,8 @@ CASES = {
         "topic: /joint_states, select: [position.pan, position.lift, position.grip]",
         "topic: /imu, type: sensor_msgs/msg/Imu, select: [orientation.x, orientation.q]",
         (
-            "robot.yaml:35: contract.observations.0.select.1: 'orientation.q': Quaternion has no field 'q'; there "
-            "are: x, y, z, w"
+            "robot.yaml:35: contract.observations.0.select.1: 'orientation.q': Quaternion has no field 'q'; "
+            "available: x, y, z, w"
         ),
     ),
     "contract_select_nothing": (
@@ -240,14 +240,14 @@ CASES = {
         "executor: arm_position, type: sensor_msgs/msg/JointState, topic",
         (
             "robot.yaml:38: contract.actions.0.type: this robot publishes std_msgs/msg/Float64MultiArray, not "
-            "'sensor_msgs/msg/JointState'; foreign: true takes the commands of bags of others"
+            "'sensor_msgs/msg/JointState'; foreign: true takes the commands of foreign bags"
         ),
     ),
     "contract_action_select": (
         "executor: arm_position, topic",
         "executor: arm_position, select: [data.1, data.0], topic",
         (
-            "robot.yaml:38: contract.actions.0.select: has a meaning for the commands of bags of others only, with "
+            "robot.yaml:38: contract.actions.0.select: has a meaning for the commands of foreign bags only, with "
             "foreign: true"
         ),
     ),

@@ -250,7 +250,7 @@ CASES = {
     "hardware_in_simulation": (
         "simulation: {type: world}",
         "simulation: {type: bus, port: /dev/null}",
-        "robot.yaml:13: simulation.type: 'bus' is no simulation; it belongs in the hardware section",
+        "robot.yaml:13: simulation.type: 'bus' is not a simulation; it belongs in the hardware section",
     ),
     "hardware_joint_unowned": (
         "port: /dev/null}",
@@ -301,7 +301,7 @@ CASES = {
     "recording_topic_name": (
         "recording: {type: log}",
         "recording: {type: log, topics: [/tf, joint_states]}",
-        ("robot.yaml:40: recording.topics.1: 'joint_states' is no full name of a topic, did you mean '/joint_states'?"),
+        ("robot.yaml:40: recording.topics.1: 'joint_states' is not a full topic name, did you mean '/joint_states'?"),
     ),
     "recording_dataset_outside": (
         "recording: {type: log}",

@@ -101,12 +101,12 @@ def test_an_included_file_is_read_in_its_place(tmp_path: Path) -> None:
         ("<mujoco>" + " " * (16 << 20) + "</mujoco>", r"arm\.xml: is larger than 16 MiB"),
     ],
 )
-def test_what_is_no_model_is_refused_with_its_line(tmp_path: Path, text: str, message: str) -> None:
+def test_other_files_are_refused_as_models_with_its_line(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(ModelError, match=message):
         read_mjcf(write(tmp_path, text))
 
 
-def test_depth_is_no_trouble(tmp_path: Path) -> None:
+def test_deep_nesting_is_read(tmp_path: Path) -> None:
     deep = "<body>" * 20_000 + '<joint name="a" range="0 1"/>' + "</body>" * 20_000
     path = write(tmp_path, f'<mujoco><compiler angle="radian"/><worldbody>{deep}</worldbody></mujoco>')
     assert limits_of(read_mjcf(path)) == {"a": (0.0, 1.0)}

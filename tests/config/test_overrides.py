@@ -46,7 +46,7 @@ def test_the_last_override_of_a_key_counts(load_text: Load, base: str) -> None:
     assert load_text(base, overrides=["control.rate_hz=50", "control.rate_hz=60"]).control.rate_hz == 60.0
 
 
-def test_a_fault_below_an_override_is_told_as_the_overrides(load_text: Load, base: str) -> None:
+def test_a_fault_below_an_override_is_reported_as_the_overrides(load_text: Load, base: str) -> None:
     with pytest.raises(ConfigError) as told:
         load_text(base, overrides=["contract.observations.1.align={strategy: asof, tol_ms: soon}"])
 
@@ -161,7 +161,7 @@ def _paths(value: Any) -> list[list[str]]:
 
 @settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(change=st.tuples(st.integers(0, 10_000), values), sim=st.booleans())
-def test_any_value_anywhere_is_taken_or_told(
+def test_any_value_anywhere_is_taken_or_reported(
     load_text: Load, base: str, registry: Registry, change: tuple[int, Any], sim: bool
 ) -> None:
     choice, value = change

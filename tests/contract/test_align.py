@@ -1,4 +1,4 @@
-"""Alignment against a brute-force oracle that looks at every sample anew at every tick."""
+"""Alignment against a brute-force oracle that looks at every sample again at every tick."""
 
 from __future__ import annotations
 

@@ -74,7 +74,9 @@ def test_fits(contract: Contract, spec: PolicySpec) -> None:
         ),
     ],
 )
-def test_every_difference_is_told_with_both_sides(contract: Contract, changes: dict[str, Any], message: str) -> None:
+def test_every_difference_is_reported_with_both_sides(
+    contract: Contract, changes: dict[str, Any], message: str
+) -> None:
     with pytest.raises(ContractError) as caught:
         check_policy(contract, attrs.evolve(FITS, **changes))
     assert str(caught.value) == f"the policy does not fit the contract:\n{message}"

@@ -103,7 +103,7 @@ def test_a_foreign_type_is_read_back_as_it_was(make_config: Make) -> None:
         ("lamp_msgs/msg/Command", ("joints.0.target",), ("joints.0.target",)),
     ],
 )
-def test_commands_of_others_are_read_back_as_they_were(
+def test_foreign_commands_are_read_back_as_they_were(
     make_config: Make, type_: str, select: tuple[str, ...], expected: tuple[str, ...]
 ) -> None:
     action = ActionSpec(executor="gripper_position", topic="/told", type=type_, foreign=True, select=select)

@@ -144,7 +144,7 @@ class Rig:
         registry = discover([])
         for descriptor in (
             HardwareDescriptor("scripted", scripted, "fails as told"),
-            HardwareDescriptor("scene", scripted, "fails as told, and can be set up anew", simulated=True),
+            HardwareDescriptor("scene", scripted, "fails as scripted, and can be set up again", simulated=True),
             HardwareDescriptor("stiff", lambda _, ctx: FakeRealHardware(ctx), "cannot relax"),
         ):
             registry.entries["hardware", descriptor.type] = Entry("hardware", descriptor, "fake", "fake", "1.0")

@@ -27,7 +27,7 @@ class TestStart:
         with pytest.raises(HardwareError, match="joint lift is measured at nan"):
             rig.core.start("stream")
 
-    def test_refuses_a_reading_that_is_no_measurement(self, make_rig):
+    def test_refuses_an_invalid_reading(self, make_rig):
         rig = make_rig({})
         rig.hardware.connect()
         rig.hardware.read()
@@ -36,7 +36,7 @@ class TestStart:
         with pytest.raises(HardwareError, match="do not answer"):
             rig.core.start("stream")
 
-    def test_refuses_to_promise_torque_off_where_there_is_no_such_thing(self, make_rig):
+    def test_refuses_to_promise_torque_off_on_hardware_without_it(self, make_rig):
         rig = make_rig({"hardware": {"type": "stiff"}, "control": {"stop": "relax"}})
 
         with pytest.raises(NotSupported, match=r"control.stop: relax: hardware 'hardware' cannot take torque off"):

@@ -96,7 +96,7 @@ def test_a_joint_that_hangs_too_far_from_the_pose_is_named(rig):
         arrive(rig)
 
 
-def test_a_fault_on_the_way_is_told(rig):
+def test_a_fault_on_the_way_is_reported(rig):
     rig.tick(20)
     rig.hardware.silent = True
     rig.tick()

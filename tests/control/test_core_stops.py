@@ -261,7 +261,7 @@ class TestStop:
 
 
 class TestStaleSetpoints:
-    def test_relax_when_told_so_and_begin_again_from_where_the_arm_lies(self, make_rig):
+    def test_relax_when_configured_and_begin_again_from_where_the_arm_lies(self, make_rig):
         relaxing = {
             "arm_position": {"type": "position", "group": "arm", "safety_behavior": "relax"},
             "gripper_position": {"type": "position", "group": "gripper", "safety_behavior": "relax"},

@@ -90,7 +90,7 @@ def test_one_stale_part_makes_a_stale_reading(two) -> None:
     assert two[0].read().stale
 
 
-def test_each_part_is_told_of_its_own_joints_in_its_own_order(two) -> None:
+def test_each_part_receives_its_own_joints_in_its_own_order(two) -> None:
     parts, left, right = two
     parts.write(np.arange(6.0))
 
@@ -164,7 +164,7 @@ def test_what_cannot_relax_is_named(two) -> None:
         two[0].require_relax()
 
 
-def test_only_a_simulation_is_set_up_anew(two) -> None:
+def test_only_a_simulation_is_set_up_again(two) -> None:
     with pytest.raises(NotSupported, match="only a simulation"):
         two[0].reset_episode(EpisodeSetup(1))
     assert two[0].success() is None

@@ -53,7 +53,7 @@ class TestWarnings:
         rig.tick()
         assert rig.core.counters()["conditions"] == []
 
-    def test_of_all_parts_are_told(self, make_rig):
+    def test_of_all_parts_are_reported(self, make_rig):
         hardware = {
             "hand": {"type": "scripted", "joints": ["grip", "lift"]}, "base": {"type": "scripted", "joints": ["pan"]},
         }  # fmt: skip
@@ -201,7 +201,7 @@ class TestHolding:
         "base": {"type": "scripted", "joints": ["pan"]},
     }
 
-    def test_is_told_with_what_takes_it_off(self, make_rig):
+    def test_is_reported_with_what_takes_it_off(self, make_rig):
         rig = make_rig({}).start()
         rig.stop()
         rig.core.close()

@@ -110,14 +110,14 @@ class TestBoth:
         host.stop()
 
     @pytest.mark.parametrize(("unmoved", "lines"), [(False, 1), (True, 0)])
-    def test_what_holds_torque_after_a_stop_is_told(self, make, kind, unmoved, lines):
+    def test_what_holds_torque_after_a_stop_is_reported(self, make, kind, unmoved, lines):
         host = make(kind, holds=True)
         host.start()
         host.stop(unmoved=unmoved)
 
         assert host.holding == ["/dev/ttyARM holds torque; to take it off: arm torque off"] * lines
 
-    def test_what_holds_torque_after_a_failed_start_is_told(self, make, kind):
+    def test_what_holds_torque_after_a_failed_start_is_reported(self, make, kind):
         host = make(kind, holds=True, trouble="connect")
         with pytest.raises(HardwareError):
             host.start()
@@ -125,7 +125,7 @@ class TestBoth:
         assert host.holding == ["/dev/ttyARM holds torque; to take it off: arm torque off"]
 
     @pytest.mark.parametrize("trouble", ["connect", "read"])
-    def test_hardware_that_does_not_answer_is_told_and_released(self, make, kind, tmp_path, trouble):
+    def test_hardware_that_does_not_answer_is_reported_and_released(self, make, kind, tmp_path, trouble):
         host = make(kind, trouble=trouble, closed=str(tmp_path / "closed"))
         with pytest.raises(HardwareError, match="servo 3 does not answer: check its cable"):
             host.start()
@@ -178,7 +178,7 @@ class TestProcess:
 
         assert (tmp_path / "closed").exists()
 
-    def test_a_fault_is_told_and_reset(self, make, told):
+    def test_a_fault_is_reported_and_reset(self, make, told):
         host = make()
         host.start()
         host.call("estop")
@@ -198,7 +198,7 @@ class TestProcess:
         assert host.report["loop"]["ticks"] >= 5
         assert host.report["counters"]["loop"]["read_errors"] == 0
 
-    def test_its_death_is_told_and_commands_fail_from_then_on(self, make, told):
+    def test_its_death_is_reported_and_commands_fail_from_then_on(self, make, told):
         host = make()
         host.start()
         os.kill(host.pid, signal.SIGKILL)
@@ -207,7 +207,7 @@ class TestProcess:
         with pytest.raises(ComponentFailed, match="control process is gone"):
             host.call("estop")
 
-    def test_one_that_ignores_its_end_is_killed_and_told(self, make, told, monkeypatch, caplog):
+    def test_one_that_ignores_its_end_is_killed_and_reported(self, make, told, monkeypatch, caplog):
         monkeypatch.setattr("ibrobot_core.control.host._STOP_TIMEOUT_S", 0.2)
         host = make()
         host.start()
@@ -227,7 +227,7 @@ class TestProcess:
         assert str(told.deaths.get(timeout=PATIENCE_S)) == "the control process died (exit status 0)"
         assert (tmp_path / "closed").exists()
 
-    def test_a_host_that_cannot_take_states_is_told_so(self, make, told):
+    def test_a_host_that_cannot_take_states_is_reported(self, make, told):
         host = make()
         host._on_state = lambda state: 1 / 0
         host.start()

@@ -290,7 +290,7 @@ def test_a_stationary_target_is_reached_exactly_and_never_overshot(
 
 @settings(max_examples=40, deadline=None)
 @given(streams(), st.floats(0, 1))
-def test_after_any_stream_a_stop_ends_at_a_target_that_there_is_room_to_stop_at(
+def test_after_any_stream_a_stop_ends_at_a_target_within_the_stopping_distance(
     stream: tuple[Robot, int, Vector, list[tuple[str, Any, int]]], end: float
 ) -> None:
     robot, period_ns, start, events = stream
@@ -422,7 +422,7 @@ def test_a_smooth_stream_is_caught_up_with_after_a_gap() -> None:
     assert late[-1] < 350
 
 
-def test_the_kinds_of_intervention_are_told_apart() -> None:
+def test_the_kinds_of_intervention_are_distinguished() -> None:
     def counted(desired: Any, *, ticks: int = 1, settle: bool = True, measured: Vector | None = None) -> dict[str, int]:
         watched = Watched(one_joint(), PERIOD_NS)
         watched.start(ZERO)

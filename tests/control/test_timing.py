@@ -40,7 +40,7 @@ def test_missed_ticks_lower_the_rate_and_are_counted() -> None:
     assert punctuality.summary()["rate_hz"] == 25.0
 
 
-def test_later_than_can_be_told_apart_counts_as_latest_and_early_as_punctual() -> None:
+def test_later_than_can_be_distinguished_counts_as_latest_and_early_as_punctual() -> None:
     punctuality = Punctuality()
     for index, late_ns in enumerate((-5_000, 10**12)):
         punctuality.tick(index * PERIOD_NS, late_ns, 0)

@@ -241,7 +241,7 @@ def test_goal_tolerances_and_goal_time_of_a_goal(more: Any, after_end_s: float, 
     assert arm.statuses()[-1].state is ends
 
 
-def test_an_unmeasured_joint_is_within_no_tolerance_and_is_held_where_it_was_told_to_be() -> None:
+def test_an_unmeasured_joint_is_within_no_tolerance_and_is_held_where_it_was_commanded_to_be() -> None:
     arm = Arm(path_tolerance=0.1)
     arm.go(goal(point(1.0, (1.0, 1.0))))
     arm.off = np.array([np.nan, 0.0])
@@ -328,7 +328,7 @@ BAD = {
     "goal_time is 'soon'; it must be above 0, or 0 for the default, or -1 for none": goal(
         point(1, AT_REST), goal_time="soon"
     ),
-    "goal_tolerance names 'lift', which is no joint here; the joints are pan, roll": goal(
+    "goal_tolerance names 'lift', which is not a joint here; the joints are pan, roll": goal(
         point(1, AT_REST), goal_tolerance={"lift": 1}
     ),
 }

@@ -111,7 +111,7 @@ def test_the_plan_running_dry_is_a_hold_and_the_next_chunk_joins_by_time(make_ri
     assert positions.shape == (20 - past, SIZE)
 
 
-def test_the_first_request_of_an_episode_is_no_hold(make_rig: type[Rig]):
+def test_the_first_request_of_an_episode_does_not_count_as_hold(make_rig: type[Rig]):
     rig = make_rig(timeout_s=60.0)
     rig.tick(10)
     assert rig.stats.holds == 0
@@ -190,7 +190,7 @@ def test_a_policy_that_raises_is_a_failure_and_asked_again(make_rig: type[Rig], 
     assert (rig.stats.failures, rig.stats.chunks, len(rig.plans)) == (1, 1, 1)
 
 
-def test_nothing_is_asked_while_an_observation_is_missing_and_its_topic_is_told(
+def test_nothing_is_asked_while_an_observation_is_missing_and_its_topic_is_reported(
     make_rig: type[Rig], caplog: pytest.LogCaptureFixture
 ):
     rig = make_rig()

@@ -117,7 +117,7 @@ def test_a_chunk_that_comes_after_the_plan_ran_dry_begins_at_the_action_of_now()
 
 
 @pytest.mark.parametrize("begin", [11 * STEP, 12 * STEP + 7, 10**15])
-def test_a_chunk_observed_after_the_end_of_an_untrimmed_plan_starts_afresh(begin: int) -> None:
+def test_a_chunk_observed_after_the_end_of_an_untrimmed_plan_starts_at_its_own_times(begin: int) -> None:
     smoother = TemporalSmoother(STEP, 3)
     smoother.update(chunk(1, 10), T0)
     smoother.update(chunk(2, 5), T0 + begin)

@@ -278,7 +278,7 @@ def test_requests_that_time_out_one_after_the_other_are_one_failure(make_rig: ty
     assert rig.stats.failures == 1
 
 
-def test_a_request_that_a_newer_one_follows_is_no_failure(make_rig: type[Rig]) -> None:
+def test_a_request_that_a_newer_one_follows_does_not_count_as_failure(make_rig: type[Rig]) -> None:
     """As a server turns it away when the newer one comes."""
     rig = make_rig(watermark="auto", timeout_s=60.0, chunk_size=20)
     rig.client.parallel = 8

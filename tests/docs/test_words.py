@@ -1,8 +1,11 @@
-"""Pages are in plain technical English: words and phrases that readers have to read twice are out."""
+"""Pages, code and test names are in plain technical English: words that readers have to read twice are out."""
 
 from __future__ import annotations
 
+import ast
 import re
+import tokenize
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -15,6 +18,11 @@ PAGES = sorted({
     *(ROOT / "plugins").glob("*/README.md"),
 } - {ROOT / f"docs/reference/{name}.md" for name in ("cli", "config", "options", "plugins")})  # fmt: skip
 """Written pages; the generated ones take their words from the code."""
+CODE = sorted({
+    *(ROOT / "ibrobot_core").rglob("*.py"),
+    *(path for package in (ROOT / "plugins").glob("*/ibrobot_*") for path in package.rglob("*.py")),
+})  # fmt: skip
+TESTS = sorted({*(ROOT / "tests").rglob("test_*.py"), *(ROOT / "plugins").glob("*/tests/**/test_*.py"), *CODE})
 
 OUT = {
     r"\b(?:is|are|was|were|be|been|being) told\b": "reports, prints, names, receives",
@@ -23,13 +31,19 @@ OUT = {
     r"\bthat there (?:is|are)\b": "available, installed",
     r"\bthere (?:is|are):": "available:",
     r"\bwith those\b": "together with the",
-    r"\bepochs?\b": "generation; epoch means a pass over a dataset",
+    r"(?<!Unix\x20)\bepochs?\b(?! time)": "generation; epoch means a pass over a dataset",
     r"\bFeeders?\b|\bWatchers?\b|\bDesks?\b": "the name that the code has now",
     r"\blooks? after\b": "manages, inspects",
-    r"\bbags? of others\b": "bags from other software",
+    r"\b(?:bags?|datasets?|messages|commands) of others\b": "foreign bags",
+    r"\bsomebody\b": "a person, a peer, an operator",
     r"\bcomes? to be\b": "is made, becomes",
     r"\bso soon\b": "as soon as",
-    r"\bseen to\b|\bsees? to it\b": "ensures",
+    r"\bseen to\b|\b[Ss]ees? to it\b": "ensures",
+    r"\bSee that\b": "Check that",
+    r"\bafresh\b": "again",
+    r"\buntold\b|\b[Tt]old (?:so|apart)\b": "reported; distinguished",
+    r"\bthat there (?:is|are) not\b": "unknown, missing",
+    r"(?<![Tt]here\x20)\bis no (?:URDF|MJCF|MCAP|file|folder|joint|number|episode|certificate)\b": "is not a",
     r"\bwhich that is\b|\bwho that is\b": "name it",
 }
 """Pattern -> what to write."""
@@ -62,3 +76,45 @@ def test_words_that_are_out_are_found(text: str) -> None:
 
 def test_code_may_use_any_word() -> None:
     assert "told" not in _prose("Run `is told`:\n\n```text\nis told\n```\n\n    is told\n")
+
+
+def _texts(path: Path) -> Iterator[tuple[int, str]]:
+    """Line and text of each docstring, comment and string of a file."""
+    with path.open("rb") as file:
+        for token in tokenize.tokenize(file.readline):
+            if token.type in (tokenize.STRING, tokenize.COMMENT, tokenize.FSTRING_MIDDLE):
+                yield token.start[0], re.sub(r"`[^`\n]*`", lambda code: " " * len(code[0]), token.string)
+
+
+def _test_names(path: Path) -> Iterator[tuple[int, str]]:
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.FunctionDef) and node.name.startswith("test_"):
+            yield node.lineno, node.name.replace("_", " ")
+
+
+def _faults(path: Path, texts: Iterator[tuple[int, str]]) -> list[str]:
+    found = []
+    for start, text in texts:
+        for pattern, instead in OUT.items():
+            for match in re.finditer(pattern.replace(" ", r"\s+"), text):
+                line = start + text.count("\n", 0, match.start())
+                found.append(f"{path.relative_to(ROOT)}:{line}: {match[0]!r}: write {instead}")
+    return found
+
+
+def test_code_uses_plain_words_in_docstrings_comments_and_messages() -> None:
+    assert [fault for path in CODE for fault in _faults(path, _texts(path))] == []
+
+
+def test_test_names_use_plain_words() -> None:
+    assert [fault for path in TESTS for fault in _faults(path, _test_names(path))] == []
+
+
+def test_words_in_code_are_found_with_their_lines(tmp_path: Path) -> None:
+    path = tmp_path / "test_one.py"
+    path.write_text(
+        '"""Fine.\n\nErrors are told."""\nx = f"drawn {1} anew"  # somebody\n\n\ndef test_it_is_told(): ...\n'
+    )
+    lines = [line + text.count("\n") for line, text in _texts(path) for p in OUT if re.search(p, text)]
+    assert lines == [3, 4, 4]
+    assert list(_test_names(path)) == [(7, "test it is told")]

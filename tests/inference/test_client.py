@@ -207,7 +207,7 @@ def test_what_waits_at_the_model_gains_nothing_by_company(
     client.close()
 
 
-def test_the_model_that_came_back_is_told(policy: GatedPolicy):
+def test_the_model_that_came_back_is_reported(policy: GatedPolicy):
     engine = FarEngine(policy, 0.0)
     client = EngineClient(policy, engine)
     engine.stats.restarts += 1
@@ -231,7 +231,7 @@ def test_closing_returns_while_the_policy_hangs(policy: GatedPolicy, monkeypatch
     assert policy.calls == ["infer 1"], "what waited behind is never run"
 
 
-def test_a_reset_that_fails_is_told_at_the_next_poll(policy: GatedPolicy, monolithic: EngineClient, caplog):
+def test_a_reset_that_fails_is_reported_at_the_next_poll(policy: GatedPolicy, monolithic: EngineClient, caplog):
     with caplog.at_level(logging.CRITICAL):
         monolithic.reset(-1)
         with pytest.raises(PolicyError, match="reset failed: ValueError: seed must not be negative"):

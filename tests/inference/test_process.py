@@ -98,7 +98,7 @@ def test_a_policy_that_raises_fails_its_request_only(do: str, said: str, ask: Ca
 
 
 @pytest.mark.parametrize(("do", "how"), [("die", "killed by SIGKILL"), ("exit", "exit status 3")])
-def test_a_process_that_dies_is_told_and_starts_again(
+def test_a_process_that_dies_is_reported_and_starts_again(
     do: str, how: str, engine: ProcessEngine, ask: Callable[..., Any], caplog: pytest.LogCaptureFixture
 ):
     engine.reset(5)

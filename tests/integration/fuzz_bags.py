@@ -6,7 +6,7 @@
 Every mutant of every container is read, and its rows are made as `ibrobot convert` makes them. It must hold that
 
 - nothing but ibrobot's own errors is raised, and nothing hangs;
-- an episode that lacks a row is no success, unless it has every message at its time, and only their contents differ;
+- an episode that lacks a row is not a success, unless it has every message at its time, and only their contents differ;
 - rows are those of the undamaged bag, from the first on. This can only be asked of containers with checksums, which
   all have that ibrobot records; a sqlite3 file, or an MCAP file whose writer leaves them out as that of `rosbags` does,
   cannot tell a flipped bit within a message.

@@ -1,4 +1,4 @@
-"""A bag of others by a contract alone: drafted from the bag, chosen by a person, converted without a robot."""
+"""A foreign bag by a contract alone: drafted from the bag, chosen by a person, converted without a robot."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def write(bag: Path, events: list[tuple[int, str, Message]]) -> None:
 
 @pytest.fixture
 def kitchen(tmp_path: Path) -> Path:
-    """A clean folder with a bag of others: states at 100 Hz, commands of two parts at 30, a camera at 30, an IMU."""
+    """A clean folder with a foreign bag: states at 100 Hz, commands of two parts at 30, a camera at 30, an IMU."""
     events: list[tuple[int, str, Message]] = []
     for i in range(100):
         at_ns = START_NS + i * 10_000_000

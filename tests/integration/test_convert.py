@@ -1,4 +1,4 @@
-"""`ibrobot convert`: many episodes, some of them bad, interrupted and gone on with; bags of others."""
+"""`ibrobot convert`: many episodes, some of them bad, interrupted and gone on with; foreign bags."""
 
 from __future__ import annotations
 
@@ -178,7 +178,7 @@ def test_interrupted_by_the_keyboard_it_says_what_is_kept(bags: Path, tmp_path: 
     assert digest(out) == digest(whole)
 
 
-def test_many_with_the_same_fault_are_told_together(tmp_path: Path) -> None:
+def test_many_with_the_same_fault_are_reported_together(tmp_path: Path) -> None:
     for number in (1, 2, 3):
         record(tmp_path / f"bags/episode_{number:06d}", number, 0.2, contract=None)
     result = run(tmp_path / "bags", "--out", tmp_path / "set")
@@ -187,7 +187,7 @@ def test_many_with_the_same_fault_are_told_together(tmp_path: Path) -> None:
     assert told.count("brings no contract") == 1
 
 
-def test_a_bad_episode_is_told_and_left_out(bags: Path, tmp_path: Path) -> None:
+def test_a_bad_episode_is_reported_and_left_out(bags: Path, tmp_path: Path) -> None:
     episodes = tmp_path / "mixed/episodes"
     for number in (1, 3):
         record(episodes / f"episode_{number:06d}", number, 0.5, "sort the blocks")
@@ -203,7 +203,7 @@ def test_a_bad_episode_is_told_and_left_out(bags: Path, tmp_path: Path) -> None:
     file.write_bytes(content.replace(b"sensor_msgs/msg/JointState", b"sensor_msgs/msg/Joint\xff\xff\xff\xff\xff"))
     result = run(episodes, "--out", tmp_path / "set")
     assert result.code == 1
-    assert "left out mixed/episode_000002: no message of /wrist, which the contract has; there are: " in result.err
+    assert "left out mixed/episode_000002: no message of /wrist, which the contract has; available: " in result.err
     assert "left out mixed/episode_000004: its contract differs from that of mixed/episode_000001:" in result.err
     assert "left out mixed/episode_000005: " in result.err
     assert "left out mixed/episode_000006: " in result.err
@@ -224,7 +224,7 @@ def test_a_cut_episode_is_converted_as_unknown_and_never_as_a_success(tmp_path: 
     assert report["missing"]["/joint_states"] > 20
     result = run(tmp_path / "bags", "--out", tmp_path / "judged", "--success")
     assert result.code == 1
-    assert "next.success cannot be told: the episode's outcome is unknown" in result.err
+    assert "next.success cannot be determined: the episode's outcome is unknown" in result.err
 
 
 def test_a_contract_that_differs_from_the_recorded_one_is_refused(bags: Path, tmp_path: Path) -> None:
@@ -346,7 +346,7 @@ def test_joints_in_lerobots_units(bags: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("storage", list(StoragePlugin))
 @pytest.mark.parametrize("compression", [None, CompressionMode.MESSAGE, CompressionMode.FILE])
-def test_bags_of_others_by_the_contract_alone(
+def test_foreign_bags_by_the_contract_alone(
     tmp_path: Path, storage: StoragePlugin, compression: CompressionMode | None
 ) -> None:
     store = get_typestore(Stores.ROS2_JAZZY)
@@ -397,7 +397,7 @@ def test_bags_of_others_by_the_contract_alone(
     ],
     ids=["leader", "trajectory"],
 )
-def test_commands_of_others_come_as_what_they_are(tmp_path: Path, told: Callable[[int], Message], more: str) -> None:
+def test_foreign_commands_come_as_what_they_are(tmp_path: Path, told: Callable[[int], Message], more: str) -> None:
     type_ = told(0).ros_type
     store = get_typestore(Stores.ROS2_JAZZY)
     with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
@@ -416,7 +416,7 @@ def test_commands_of_others_come_as_what_they_are(tmp_path: Path, told: Callable
     np.testing.assert_array_equal(rows(tmp_path / "set")["action"], [[i + 0.5, 1.0, 2.0] for i in range(30)])
     again = run(tmp_path / "set", "--to", "bag", "--out", tmp_path / "again")
     assert again.code == 1
-    assert f"action: no {type_} can be made, which bags of others have on /commands" in again.err
+    assert f"action: no {type_} can be made, which foreign bags have on /commands" in again.err
     assert not (tmp_path / "again").exists()
 
 
@@ -458,4 +458,4 @@ def test_only_episodes_of_an_outcome(tmp_path: Path) -> None:
     assert found[-1]
     assert not found[:-1].any()
     result = run(tmp_path / "bags", "--out", tmp_path / "all", "--success")
-    assert "cannot be told: the episode's outcome is unknown" in result.err
+    assert "cannot be determined: the episode's outcome is unknown" in result.err

@@ -157,7 +157,7 @@ def test_another_episode_of_the_same_number_is_not_overwritten(exact: Path, bags
         (["--to", "bag", "--append"], "--append has no meaning for --to bag"),
         (["--episodes", "0"], "--episodes has no meaning for --to dataset"),
         (["--to", "bag", "--episodes", "0,7"], "0,7: the dataset's episodes are 0 to 2"),
-        (["--to", "bag", "--episodes", "all"], "'all' is no number, nor two with a dash"),
+        (["--to", "bag", "--episodes", "all"], "'all' is not a number, nor two with a dash"),
     ],
 )
 def test_options_that_cannot_be_meant(
@@ -169,7 +169,7 @@ def test_options_that_cannot_be_meant(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_dataset_of_others_is_told_by_a_robot_yaml(exact: Path, convert: Convert, tmp_path: Path):
+def test_a_foreign_dataset_is_described_by_a_robot_yaml(exact: Path, convert: Convert, tmp_path: Path):
     (tmp_path / "theirs").mkdir()
     subprocess.run(["cp", "-r", f"{exact}/.", str(tmp_path / "theirs")], check=True)
     (tmp_path / "theirs/meta/ibrobot.json").unlink()

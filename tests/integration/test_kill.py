@@ -265,7 +265,7 @@ class TestInterrupt:
 
 
 class TestDeath:
-    def test_of_the_control_process_is_told_on_one_line(self, launch):
+    def test_of_the_control_process_is_reported_on_one_line(self, launch):
         run = launch()
         os.kill(run.control, signal.SIGKILL)
         status, error = run.end()
@@ -273,7 +273,7 @@ class TestDeath:
         assert status == 1
         assert told(error) == ["error: control: the control process died (killed by SIGKILL)"]
 
-    def test_of_the_control_process_while_a_sensor_is_awaited_is_what_is_told(self, launch):
+    def test_of_the_control_process_while_a_sensor_is_awaited_is_reported(self, launch):
         run = launch(DARK, awaited=False)
         run.find_control()
         os.kill(run.control, signal.SIGKILL)
@@ -282,7 +282,7 @@ class TestDeath:
         assert status == 1
         assert told(error) == ["error: control: the control process died (killed by SIGKILL)"]
 
-    def test_of_the_control_loop_by_a_bug_is_told_on_one_line(self, launch):
+    def test_of_the_control_loop_by_a_bug_is_reported_on_one_line(self, launch):
         run = launch("hardware.trouble=true", awaited=False)
         status, error = run.end()
 

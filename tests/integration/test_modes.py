@@ -52,7 +52,9 @@ def test_a_goal_joint_by_joint_moves_these_and_no_others(recorded: Callable[...,
 
 
 @pytest.mark.parametrize("goal", ["wrist_flex=3.0", "gripper=9"])
-def test_a_goal_outside_the_limits_is_told_and_exit_code_3(recorded: Callable[..., tuple[Ran, list[Log]]], goal: str):
+def test_a_goal_outside_the_limits_is_reported_and_exit_code_3(
+    recorded: Callable[..., tuple[Ran, list[Log]]], goal: str
+):
     ran, (log,) = recorded(*PLANNING, "--goal", goal, "--goal", "shoulder_pan=0.3")
     assert ran.code == 3, ran.err
     assert ran.summary["goals_failed"] == 1

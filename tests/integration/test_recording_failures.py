@@ -370,7 +370,7 @@ class TestMissingTopic:
     def test_convert_names_it(self, run: Run, silent: Path, tmp_path: Path):
         done = run("convert", silent, "--out", tmp_path / "set")
         assert done.code == 1
-        assert "no message of /top, /commands, which the contract has; there are: /joint_states, /wrist" in done.err
+        assert "no message of /top, /commands, which the contract has; available: /joint_states, /wrist" in done.err
         assert not (tmp_path / "set").exists()
 
     def test_verify_names_it(self, run: Run, silent: Path):
@@ -386,4 +386,4 @@ class TestMissingTopic:
         record(tmp_path / "unheard", 1, 0.5, contract=wanted, config=metadata["config"])
         done = run("replay", tmp_path / "unheard", "--sim", "--lockstep", "--headless")
         assert done.code == 2
-        assert "no message of /arm_position_controller/commands, so nothing to replay; there are: /comm" in done.err
+        assert "no message of /arm_position_controller/commands, so nothing to replay; available: /comm" in done.err

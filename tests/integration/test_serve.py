@@ -177,7 +177,9 @@ def test_a_server_whose_model_hangs_starts_again(
         ((".",), ". is a folder: give the plugin of the model in it"),
     ],
 )
-def test_a_wrong_command_line_is_told(ibrobot: tuple[str, ...], arguments: tuple[str, ...], said: str, tmp_path: Path):
+def test_a_wrong_command_line_is_reported(
+    ibrobot: tuple[str, ...], arguments: tuple[str, ...], said: str, tmp_path: Path
+):
     done = subprocess.run([*ibrobot, "serve", *arguments], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert said in done.stderr.replace("\n", " ")

@@ -77,7 +77,7 @@ def test_start_returns_when_it_is_ready(probe: Probe):
     assert probe.failures == []
 
 
-def test_one_that_does_not_become_ready_is_told():
+def test_one_that_does_not_become_ready_is_reported():
     probe = Probe(ready_after=1, ready_timeout_s=0.01)
     with pytest.raises(ComponentFailed, match=r"^no sign of life after 0\.01 s$"):
         probe.start()
@@ -93,7 +93,7 @@ def test_what_fails_before_it_is_ready_is_raised_by_start_alone(probe: Probe):
     assert probe.failures == []
 
 
-def test_one_that_dies_later_is_told_to_the_run(probe: Probe):
+def test_one_that_dies_later_is_reported_to_the_run(probe: Probe):
     probe.start()
     probe.work_error = SensorError("unplugged")
     probe.let.release()

@@ -94,7 +94,7 @@ def silence_the_hardware(run: Runtime, runs: Runs) -> None:
 
 @pytest.fixture
 def policy(runs: Runs) -> Runtime:
-    """A policy that never succeeds, on a robot that somebody looks after."""
+    """A policy that never succeeds, on a robot with an operator."""
     runtime = runs.start("contract.max_duration_s=100", by_operator=True)
     runs.parts.Scene.success = lambda scene: False
     assert moves(runtime)

@@ -128,7 +128,7 @@ def test_a_run_without_its_server_does_not_start(runs: Runs, cloud: InferenceSer
     assert not runs.made[-1].session.has_control, "nothing is powered"
 
 
-def test_another_policy_on_the_server_is_told_with_both_sides(runs: Runs, cloud: InferenceService):
+def test_another_policy_on_the_server_is_reported_with_both_sides(runs: Runs, cloud: InferenceService):
     made = runs.make(MODE.format("distributed"), NETWORK, "control_modes.policy.inference.server_model=other")
     other = runs.parts.Net(host_context())
     service = InferenceService(other, sys.modules["shared_network"].NETWORK, "other")

@@ -195,7 +195,7 @@ class TestOperator:
         operator = self.watch(run, auto=True, count=2, reset_time_s=0.5, prompt="pick")
         self.step(run, operator, 50 + 2)
         assert run.episode_service.saved == 1
-        assert "set the scene up anew" in operator.line()
+        assert "set up the scene again" in operator.line()
         self.step(run, operator, 200)
         assert run.session.finished.is_set()
         assert operator.summary_rows()[0][1].startswith("2 of 2 episodes into")
@@ -227,14 +227,14 @@ class TestOperator:
             self.step(run, operator, 3)
         assert (run.episode_service.recording, run.episode_service.saved) == (False, 0)
         assert ("", "recording ended: its disk has 1 MiB left") in operator.rows()
-        assert run.session.finished.is_set() == auto, "the robot goes on where somebody is there"
+        assert run.session.finished.is_set() == auto, "the robot goes on where an operator is there"
         if not auto:
             operator.key("tab")
             self.step(run, operator, 3)
             assert run.episode_service.recording, "there is room again"
             assert operator.rows()[-1][0] != ""
 
-    def test_unattended_the_run_ends_where_there_is_no_room_for_another_episode(
+    def test_unattended_the_run_ends_without_room_for_another_episode(
         self, run: Runtime, runs: Runs, monkeypatch: pytest.MonkeyPatch
     ):
         operator = self.watch(run, auto=True, prompt="pick")

@@ -32,7 +32,7 @@ def records(folder: Path) -> list[dict]:
     return [json.loads(line) for line in (folder / "records.jsonl").read_text().splitlines()]
 
 
-def test_episodes_count_up_their_seeds_and_are_told_to_plugins(runs: Runs):
+def test_episodes_count_up_their_seeds_and_are_announced_to_plugins(runs: Runs):
     runtime = runs.start(episodes=3, seed=5)
     finish(runtime)
     summary = runtime.summary()

@@ -29,7 +29,7 @@ def test_a_prompt_is_there_where_the_policy_wants_one(
 
     monkeypatch.setattr(runs.parts.Net, "__init__", wants_a_prompt)
     with pytest.raises(
-        ComponentFailed, match=r"control_modes\.policy\.inference\.prompt: is missing; model 'net' wants"
+        ComponentFailed, match=r"control_modes\.policy\.inference\.prompt: is missing; model 'net' needs"
     ):
         runs.start()
     caplog.clear()

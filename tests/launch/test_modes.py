@@ -159,7 +159,7 @@ def test_the_old_mode_goes_on_when_control_refuses_the_new_one(runs: Runs, monke
     assert runs.parts.CALLS[-1] == "disconnect stick"
 
 
-def test_an_unknown_mode_is_refused_with_those_that_there_are(runs: Runs):
+def test_an_unknown_mode_is_refused_with_the_available_ones(runs: Runs):
     runtime = runs.start(mode="teleop")
     with pytest.raises(NotSupported, match="no mode 'tele'; the modes are: policy, lost, teleop, plan, replan, idle"):
         runtime.switch_mode("tele")

@@ -186,7 +186,7 @@ def test_an_episode_knows_its_contract(runs: Runs, monkeypatch: pytest.MonkeyPat
     assert contract.difference(json.loads(kept["contract"])) == ""
 
 
-def test_messages_that_were_lost_on_the_way_are_told_by_topic(runs: Runs, monkeypatch: pytest.MonkeyPatch):
+def test_messages_that_were_lost_on_the_way_are_reported_by_topic(runs: Runs, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(recording, "_DEPTH", 50)
     runtime, notes = note(runs, monkeypatch, "[/many, /few]")
     ticks(runtime, 1)
@@ -210,7 +210,7 @@ def test_messages_that_were_lost_on_the_way_are_told_by_topic(runs: Runs, monkey
     assert lost.keys() <= {"/few", "/many"}
 
 
-def test_a_listed_topic_that_nobody_publishes_is_told_once(
+def test_a_listed_topic_that_nobody_publishes_is_reported_once(
     runs: Runs, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ):
     runtime, _ = note(runs, monkeypatch, "[/joint_states, /joint_stats]")
@@ -219,7 +219,7 @@ def test_a_listed_topic_that_nobody_publishes_is_told_once(
         ticks(runtime, 3)
         runtime.plan.episodes.end("success")
         ticks(runtime, 1)
-    told = "recording.topics: nothing of /joint_stats has come so far, nor was recorded; there are: "
+    told = "recording.topics: nothing of /joint_stats has come so far, nor was recorded; available: "
     assert caplog.text.count(told) == 1
     assert "/joint_states" in caplog.text.partition(told)[2]
 

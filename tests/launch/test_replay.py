@@ -75,7 +75,7 @@ def test_the_scene_is_set_up_by_the_recorded_seed_and_judged(runs: Runs):
     assert (report(runtime)["success"], runtime.summary()["successes"]) == (True, 1)
 
 
-def test_a_scene_that_does_not_succeed_again_is_told(runs: Runs):
+def test_a_scene_that_does_not_succeed_again_is_reported(runs: Runs):
     runtime = replay(runs, attrs.evolve(WAVE, seed=13))
     commands(runtime)
     summary = runtime.summary()

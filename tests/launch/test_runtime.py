@@ -132,7 +132,7 @@ def test_what_holds_torque_after_a_run_is_in_its_summary(runs: Runs):
     assert runtime.summary()["holding"] == ["the scene holds torque; to take it off: scene torque off"]
 
 
-def test_a_missing_model_is_told_before_anything_is_powered(runs: Runs, monkeypatch: pytest.MonkeyPatch):
+def test_a_missing_model_is_reported_before_anything_is_powered(runs: Runs, monkeypatch: pytest.MonkeyPatch):
     runtime = runs.make(mode="lost")
     happened = watch(runtime, monkeypatch)
     with pytest.raises(ComponentFailed, match=r"^model:lost: no such checkpoint$"):
@@ -153,7 +153,7 @@ def test_one_that_dies_ends_the_run_with_its_cause(runs: Runs):
     assert "disconnect stick" in runs.parts.CALLS
 
 
-def test_only_the_first_cause_is_told(runs: Runs):
+def test_only_the_first_cause_is_reported(runs: Runs):
     runtime = runs.start(mode="teleop")
     runtime.session.fail("sensor:top", ComponentFailed("first\nand foremost"))
     runtime.session.fail("sensor:side", ComponentFailed("second"))
@@ -221,7 +221,7 @@ def test_hardware_that_falls_silent_is_a_fault_and_a_reset_goes_on(runs: Runs):
     assert runtime.summary()["faults"] == [fault], "what happened is not forgotten"
 
 
-def test_a_teleop_device_that_is_lost_is_a_fault_and_a_reset_connects_it_anew(
+def test_a_teleop_device_that_is_lost_is_a_fault_and_a_reset_connects_it_again(
     runs: Runs, monkeypatch: pytest.MonkeyPatch
 ):
     runtime = runs.start(mode="teleop")
@@ -263,8 +263,8 @@ def test_services_end_with_the_run(runs: Runs):
         ("teleop", "home", "--goal needs a mode with a planner: --mode plan or --mode replan"),
         ("plan", "hom", "goal 'hom': no pose 'hom'; the poses are: home, up; or give joints, e.g. wrist_flex=0.5"),
         ("plan", "tilt=1", "goal 'tilt=1': no joint 'tilt'; the joints are: pan, grip"),
-        ("plan", "pan=1,grip=wide", "goal 'pan=1,grip=wide': 'wide' is no angle in radians"),
-        ("plan", "pan=nan", "goal 'pan=nan': 'nan' is no angle in radians"),
+        ("plan", "pan=1,grip=wide", "goal 'pan=1,grip=wide': 'wide' is not an angle in radians"),
+        ("plan", "pan=nan", "goal 'pan=nan': 'nan' is not an angle in radians"),
     ],
 )
 def test_a_goal_that_cannot_be_meant_is_refused_before_anything_starts(runs: Runs, mode: str, goal: str, told: str):

@@ -48,7 +48,7 @@ def test_pictures_of_a_camera_that_cannot_run_here_are_refused(runs: Runs, netwo
         runs.make("transport={type: network, share: {publish: [/camera/side/image_raw]}}", mode="teleop")
 
 
-def test_a_topic_that_nothing_publishes_is_told_once(runs: Runs, network: None, caplog: pytest.LogCaptureFixture):
+def test_a_topic_that_nothing_publishes_is_reported_once(runs: Runs, network: None, caplog: pytest.LogCaptureFixture):
     runtime = runs.start("transport={type: network, share: {publish: [/joint_state, /joint_states]}}")
     while runtime.session.clock.now_ns() < 4 * NS_PER_S:
         runtime.step()
@@ -60,7 +60,7 @@ def test_a_topic_that_nothing_publishes_is_told_once(runs: Runs, network: None, 
     assert [said] == [record.message for record in caplog.records if "is not shared" in record.message]
 
 
-def test_a_network_that_refuses_is_told_once(runs: Runs, network: None, caplog: pytest.LogCaptureFixture):
+def test_a_network_that_refuses_is_reported_once(runs: Runs, network: None, caplog: pytest.LogCaptureFixture):
     runtime = runs.start("transport={type: network, share: {publish: [/joint_states]}}")
     made().refuses = True
     for _ in range(5):
@@ -108,7 +108,7 @@ def test_nothing_comes_in_in_lockstep(runs: Runs, network: None):
     ("transport", "told"),
     [
         ("{type: local, share: {publish: [/a]}}", "transport 'local' carries no topics to other machines"),
-        ("{type: network, share: {publish: [a]}}", "'a' is no full name of a topic, did you mean '/a'?"),
+        ("{type: network, share: {publish: [a]}}", "'a' is not a full topic name, did you mean '/a'?"),
         ("{type: network, share: {publish: [/a, /a]}}", "/a is given twice"),
         ("{type: network, share: {publish: [/a], subscribe: [/a]}}", "/a is both published and subscribed"),
         ("{type: network, share: {publishes: [/a]}}", "did you mean 'publish'?"),

@@ -54,11 +54,11 @@ def test_a_fixed_joint_ignores_the_position(urdf: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "why"),
     [
-        ("<robot><joint", "is no URDF"),
+        ("<robot><joint", "is not a URDF"),
         ('<robot><joint name="j" type="fixed"><child link="a"/></joint></robot>', "joint 'j' has no parent"),
     ],
 )
-def test_what_is_no_urdf_is_named(tmp_path: Path, text: str, why: str) -> None:
+def test_other_files_are_refused_as_urdf(tmp_path: Path, text: str, why: str) -> None:
     path = tmp_path / "broken.urdf"
     path.write_text(text)
     with pytest.raises(ConfigError, match=why) as caught:

@@ -66,8 +66,8 @@ def test_lerobot_itself_runs_the_shell_step(tmp_path: Path, originals: dict[str,
 @pytest.mark.parametrize(
     ("name", "refusal"),
     [
-        ("lerobot.processor.pipeline.Path", "is no processor step of LeRobot's"),
-        ("lerobot.processor.pipeline.json", "is no processor step of LeRobot's"),
+        ("lerobot.processor.pipeline.Path", "is not a processor step of LeRobot"),
+        ("lerobot.processor.pipeline.json", "is not a processor step of LeRobot"),
         ("lerobot.processor.nothing.Step", "cannot be imported"),
         ("lerobot.processor.tokenizer_processor.ActionTokenizerProcessorStep", "action_tokenizer_processor' runs code"),
     ],

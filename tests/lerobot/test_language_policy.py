@@ -105,7 +105,7 @@ def test_the_plan_is_continued_as_lerobot_does(path: Path, policy: LeRobotPolicy
         (np.zeros((1, CHUNK + 1, SIZE), np.float32), 1, "0 <= delay_steps <= 9 <= 8 must hold"),
     ],
 )
-def test_a_plan_that_is_none_is_told(policy: LeRobotPolicy, prefix: Any, delay: int | None, said: str) -> None:
+def test_an_invalid_plan_is_reported(policy: LeRobotPolicy, prefix: Any, delay: int | None, said: str) -> None:
     tensors = {**policy.preprocess(frame()), "prefix": prefix}
     if delay is not None:
         tensors["delay_steps"] = np.array([delay])

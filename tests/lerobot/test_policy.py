@@ -235,13 +235,13 @@ def test_half_precision_is_near(folders: dict[str, Path]) -> None:
     assert 0 < np.abs(a - b).max() < 0.1
 
 
-def test_a_first_run_that_overflows_is_told(folders: dict[str, Path], caplog: pytest.LogCaptureFixture) -> None:
+def test_a_first_run_that_overflows_is_reported(folders: dict[str, Path], caplog: pytest.LogCaptureFixture) -> None:
     """One joint did not move in the dataset, so that its normalised zero is beyond float16."""
     loaded(folders["act"], dtype="float16")
     assert "act overflows torch.float16 in a run on zeros; bfloat16 and float32" in caplog.text
 
 
-def test_a_first_run_that_fails_is_told(folders: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_first_run_that_fails_is_reported(folders: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ibrobot_lerobot.model.Model.predict", lambda self, batch: 1 / 0)
     with pytest.raises(PolicyError, match=r"act: its first run failed: ZeroDivisionError: division by zero"):
         make(folders["act"]).load()
@@ -258,7 +258,7 @@ def test_a_first_run_that_fails_is_told(folders: dict[str, Path], monkeypatch: p
         ({SEED: None, "sed": np.zeros(1)}, "seed is missing, must be int64 (1,); sed is not known"),
     ],
 )
-def test_a_request_that_another_client_got_wrong_is_told(
+def test_a_request_that_another_client_got_wrong_is_reported(
     folders: dict[str, Path], changes: dict[str, Any], said: str
 ) -> None:
     policy = loaded(folders["act"])

@@ -150,7 +150,7 @@ def _tolerance(goal: Mapping[str, Any], name: str, default: float, joints: Seque
     by_joint = value if isinstance(value, Mapping) else dict.fromkeys(joints, value)
     for joint in by_joint:
         if joint not in joints:
-            raise GoalRejected(f"{name} names {joint!r}, which is no joint here; the joints are {', '.join(joints)}")
+            raise GoalRejected(f"{name} names {joint!r}, which is not a joint here; the joints are {', '.join(joints)}")
     return np.array([_setting(by_joint.get(joint, 0), default, name) for joint in joints], dtype=np.float64)
 
 

@@ -19,7 +19,7 @@ _DEPTH = 10
 """Messages of a topic that may wait for the network; beyond, the oldest is dropped and counted by the bus."""
 
 _SILENT_NS = 5 * NS_PER_S
-"""A topic without any message for so long after the start is told of, once [ns]."""
+"""A topic without any message for so long after the start is reported, once [ns]."""
 
 
 def _topics(link: TransportLink) -> TopicTransport:
@@ -30,7 +30,7 @@ def _topics(link: TransportLink) -> TopicTransport:
 
 
 class PublishedTopic(SessionWorker):
-    """What is on one topic of the bus, to other machines. A message that cannot be sent is told once, and left out."""
+    """Sends one topic of the bus to other machines. A message that cannot be sent is reported once and left out."""
 
     def __init__(self, session: Session, link: TransportLink, topic: str) -> None:
         super().__init__(session, f"share:{topic}", "to other machines", (link.name,))

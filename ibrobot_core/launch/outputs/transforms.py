@@ -49,13 +49,13 @@ def read_urdf(path: Path) -> list[Link]:
     """The joints of a URDF, in file order.
 
     Raises:
-        ConfigError: when it cannot be read, or is no URDF.
+        ConfigError: when it cannot be read, or is not a URDF.
     """
     try:
         root = ElementTree.parse(path).getroot()
         return [_link(element) for element in root.iterfind("joint")]
     except (OSError, ElementTree.ParseError, ValueError, AttributeError) as error:
-        raise ConfigError([Problem(str(path), 0, "", f"is no URDF: {error}")]) from None
+        raise ConfigError([Problem(str(path), 0, "", f"is not a URDF: {error}")]) from None
 
 
 def _link(joint: ElementTree.Element) -> Link:

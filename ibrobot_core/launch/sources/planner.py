@@ -108,7 +108,7 @@ class PlannerSource(SourceWorker):
         session = self.session
         robot, measured = session.config.robot, session.measured()
         goal = parse_goal(text, robot)
-        # From what the joints were told, not from where they sag to: the setpoint makes no step.
+        # From the commanded positions, not from where the joints sag to: the setpoint makes no step.
         told = session.state.command if session.state is not None else measured.position
         goals: dict[str, Mapping[str, Any]] = {}
         for name in self.mode.executors:
@@ -178,7 +178,7 @@ def parse_goal(text: str, robot: Robot) -> dict[str, float]:
         except ValueError:
             goal[joint] = math.nan
         if not math.isfinite(goal[joint]):
-            raise PlanningError(f"goal {text!r}: {value!r} is no angle in radians") from None
+            raise PlanningError(f"goal {text!r}: {value!r} is not an angle in radians") from None
     return goal
 
 

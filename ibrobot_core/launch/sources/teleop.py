@@ -17,7 +17,7 @@ from ibrobot_core.launch.sources.source_worker import SourceWorker
 class TeleopSource(SourceWorker):
     """A teleoperation device. It joins at the plan: there is one way to the motors.
 
-    A device that fails while the robot follows is a fault; a reset connects it anew.
+    A device that fails while the robot follows is a fault; a reset connects it again.
     """
 
     def __init__(self, session: Session, mode: ControlMode, device: str, needs: tuple[str, ...]) -> None:

@@ -32,7 +32,7 @@ class Target:
     """Where to bring the tip: a position, alone or with an orientation or the direction of one axis.
 
     Raises:
-        ValueError: when a value has another shape, is not finite, is no rotation matrix or unit vector, or when both
+        ValueError: when a value has another shape, is not finite, is not a rotation matrix or unit vector, or when both
             `rotation` and `axis` are given.
     """
 

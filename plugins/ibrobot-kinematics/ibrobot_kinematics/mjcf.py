@@ -29,7 +29,7 @@ def robot_model(robot: Robot, joints: Sequence[str] | None = None) -> KinematicM
 
     Raises:
         KinematicsError: when there is no MJCF, or it cannot be read, or it lacks the tip or one of the joints.
-        KeyError: for a name in `joints` that is no joint of the robot.
+        KeyError: for a name in `joints` that is not a joint of the robot.
     """
     if robot.description.mjcf is None:
         raise KinematicsError(f"robot {robot.name!r} has no robot.description.mjcf; kinematics needs a MuJoCo model")

@@ -78,4 +78,4 @@ def ibrobot_doctor() -> Iterable[Check]:
 
     for camera in cameras():
         found = camera.problem or camera.name
-        yield Check(f"camera {camera.path}", not camera.problem, found, "sudo usermod -aG video $USER, log in anew")
+        yield Check(f"camera {camera.path}", not camera.problem, found, "sudo usermod -aG video $USER, log in again")

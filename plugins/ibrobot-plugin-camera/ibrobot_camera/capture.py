@@ -37,7 +37,7 @@ _MANUAL_EXPOSURE, _AUTO_EXPOSURE = 1, 3
 _ROTATIONS: Mapping[int, int] = {
     90: cv2.ROTATE_90_CLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_90_COUNTERCLOCKWISE,
 }  # fmt: skip
-# What goes wrong is told in this package's own errors.
+# Failures are raised as this package's own errors.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 _SILENT = 0
 _set_log_level = getattr(cv2, "setLogLevel", None) or cv2.utils.logging.setLogLevel  # OpenCV 4, OpenCV 5
@@ -138,7 +138,7 @@ class Capture:
             if not os.path.exists(device.target):
                 raise self._error("there is no such device; `ibrobot camera list` shows those that are there")
             if not os.access(device.target, os.R_OK | os.W_OK):
-                raise self._error("no permission: add yourself to the group `video`, log in anew")
+                raise self._error("no permission: add yourself to the group `video`, log in again")
             capture = cv2.VideoCapture(device.target, cv2.CAP_V4L2)
             why = "cannot be opened; another program may hold it"
         elif device.kind == "stream":
@@ -148,7 +148,7 @@ class Capture:
             why = f"cannot be opened within {_TIMEOUT_MS / 1e3:.0f} s; check the address and that the server runs"
         else:
             capture = cv2.VideoCapture(device.target, cv2.CAP_FFMPEG)
-            why = "is no video that can be decoded"
+            why = "is not a video that can be decoded"
         if not capture.isOpened():
             capture.release()
             raise self._error(why)

@@ -37,10 +37,10 @@ def find_device(serial: str) -> Any:
     there = ", ".join(devices) or "none"
     if serial:
         if serial not in devices:
-            raise SensorError(f"no RealSense with serial number {serial}; there are: {there}")
+            raise SensorError(f"no RealSense with serial number {serial}; available: {there}")
         return devices[serial]
     if len(devices) != 1:
-        raise SensorError(f"serial must say which RealSense is meant; there are: {there}")
+        raise SensorError(f"serial must say which RealSense is meant; available: {there}")
     return next(iter(devices.values()))
 
 

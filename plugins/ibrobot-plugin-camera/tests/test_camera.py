@@ -140,7 +140,7 @@ class TestFile:
         assert (number(image), image.header.stamp_ns) == (6, START_NS + 200_000_000)
 
     @pytest.mark.parametrize(("loop", "expected"), [(True, [12, 1, 2]), (False, [12])])
-    def test_at_its_end_it_begins_anew_or_falls_silent(self, video: Path, loop: bool, expected: list[int]) -> None:
+    def test_at_its_end_it_begins_again_or_falls_silent(self, video: Path, loop: bool, expected: list[int]) -> None:
         ctx = host_context("top", clock=SteppedClock(START_NS))
         top = camera(ctx, str(video), loop=loop)
         top.open()
@@ -260,7 +260,7 @@ class TestStream:
                 top.read(5.0)
         top.close()
 
-    def test_no_server_is_told_without_the_password(self) -> None:
+    def test_no_server_is_reported_without_the_password(self) -> None:
         ctx = host_context("top", clock=RealClock())
         with pytest.raises(SensorError, match=r"camera top: rtsp://127\.0\.0\.1:9/live: cannot be opened") as caught:
             camera(ctx, "rtsp://arm:secret@127.0.0.1:9/live").open()
@@ -300,7 +300,9 @@ class TestWhatWasAsked:
             top.open()
             top.close()
 
-    def test_a_driver_that_does_not_take_a_control_is_told(self, video: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_a_driver_that_does_not_take_a_control_is_reported(
+        self, video: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
         monkeypatch.setattr(capture_module.Capture, "_open", lambda self: cv2.VideoCapture(str(video)))
         with pytest.raises(SensorError, match=r"camera top: /dev/video7: does not take exposure: 40"):
             Capture(Device("v4l2", "/dev/video7"), OpenCvOptions(device=7, exposure=40.0, strict=False), "top")
@@ -331,13 +333,13 @@ class TestDevices:
     def test_what_a_device_means(self, device: int | str, kind: str, target: str) -> None:
         assert find_device(device, "top") == Device(kind, target)
 
-    def test_nothing_that_is_there_is_told(self, tmp_path: Path) -> None:
+    def test_nothing_that_is_there_is_reported(self, tmp_path: Path) -> None:
         with pytest.raises(SensorError, match=r"camera top: no file, URL or device 'usb-cam'"):
             find_device("usb-cam", "top")
         with pytest.raises(SensorError, match=r"/dev/video77: there is no such device; `ibrobot camera list`"):
             camera(host_context("top", clock=RealClock()), 77).open()
         (tmp_path / "no.mp4").write_text("no video")
-        with pytest.raises(SensorError, match="is no video that can be decoded"):
+        with pytest.raises(SensorError, match="is not a video that can be decoded"):
             camera(host_context("top"), str(tmp_path / "no.mp4")).open()
 
 
@@ -365,7 +367,7 @@ class TestCalibration:
         assert isinstance(info, CameraInfo)
         assert (info.width, info.k[2], info.d[0]) == (64, 32.0, 0.1)
 
-    def test_one_for_other_pictures_is_told(self, video: Path, tmp_path: Path) -> None:
+    def test_one_for_other_pictures_is_reported(self, video: Path, tmp_path: Path) -> None:
         three = "{data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}"
         (tmp_path / "top.yaml").write_text(
             f"image_width: 640\nimage_height: 480\ncamera_matrix: {three}\nrectification_matrix: {three}\n"
@@ -387,7 +389,9 @@ class TestCalibration:
             ("a: [", "cannot be read"),
         ],
     )
-    def test_a_file_that_is_none_is_told(self, video: Path, tmp_path: Path, text: str, message: str) -> None:
+    def test_a_file_without_a_calibration_is_reported(
+        self, video: Path, tmp_path: Path, text: str, message: str
+    ) -> None:
         (tmp_path / "top.yaml").write_text(text)
         with pytest.raises(SensorError, match=message):
             camera(host_context("top"), str(video), info=tmp_path / "top.yaml").open()

@@ -216,7 +216,7 @@ def test_sizes_that_it_does_not_give_or_that_differ_are_refused(soft: SoftwareCa
 
 
 def test_no_device_says_which_there_are(library: Any) -> None:
-    with pytest.raises(SensorError, match=r"no RealSense with serial number 42; there are: none"):
+    with pytest.raises(SensorError, match=r"no RealSense with serial number 42; available: none"):
         realsense.find_device("42")
-    with pytest.raises(SensorError, match=r"serial must say which RealSense is meant; there are: none"):
+    with pytest.raises(SensorError, match=r"serial must say which RealSense is meant; available: none"):
         realsense.find_device("")

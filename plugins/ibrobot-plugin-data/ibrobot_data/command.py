@@ -65,7 +65,7 @@ def _flags_of_writers(command: Callable[..., Any]) -> Callable[..., Any]:
 @click.option("--type", "type_", help="Dataset writer; by default the one that an installed plugin offers as such.")
 @_flags_of_writers
 @click.option("--set", "sets", multiple=True, metavar="OPTION=VALUE", help="Any other option of the dataset writer.")
-@click.option("--config", metavar="CONFIG", help="Robot YAML, or one with a contract alone; for bags of others.")
+@click.option("--config", metavar="CONFIG", help="Robot YAML, or one with a contract alone; for foreign bags.")
 @click.option("--force-contract", is_flag=True, help="Take --config's contract where the recorded one differs.")
 @click.option("--norm-mode", type=click.Choice(NORM_MODES), help="Unit of the dataset's joints, else radians.")
 @click.option("--calibration", metavar="NAME", help="In place of the recorded one, for --norm-mode.")
@@ -83,8 +83,8 @@ def convert(context: click.Context, /, to: str, as_json: bool, **asked: Any) -> 
     """Make a dataset for training from recorded episodes, or with --to bag the way back.
 
     EPISODES are episodes, folders of them such as episodes/default, or DATASET:N; with --to bag it is one dataset.
-    Interrupted, the same command goes on where it was. An episode that cannot be converted is told and left out; the
-    command then exits with 1.
+    Interrupted, the same command goes on where it was. An episode that cannot be converted is reported and left out;
+    the command then exits with 1.
     """
     given = [name for name in asked if context.get_parameter_source(name) is ParameterSource.COMMANDLINE]
     only_other = _ONLY_TO_BAG if to == "dataset" else (*_ONLY_TO_DATASET, *_flags())
@@ -165,7 +165,7 @@ def _numbers(text: str | None, total: int) -> tuple[int, ...]:
         ends = re.fullmatch(r"\s*(\d+)\s*(?:-\s*(\d+)\s*)?", piece)
         if ends is None:
             raise click.BadParameter(
-                f"{piece!r} is no number, nor two with a dash, e.g. 0,3-5", param_hint="--episodes"
+                f"{piece!r} is not a number, nor two with a dash, e.g. 0,3-5", param_hint="--episodes"
             )
         found |= set(range(int(ends[1]), int(ends[2] or ends[1]) + 1))
     if not found or max(found) >= total:

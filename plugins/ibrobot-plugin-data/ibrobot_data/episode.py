@@ -48,7 +48,7 @@ _RECORD = "episode.json"
 type _Row = tuple[dict[str, NDArray[Any]], str]
 """Key -> value, and the task."""
 _VERSION = 3
-"""Of what a unit is made of; older ones are made anew."""
+"""Of what a unit is made of; older ones are made again."""
 
 
 @attrs.frozen
@@ -127,7 +127,7 @@ def read_unit(path: Path) -> Unit | None:
 
 
 def convert_episode(job: Job, progress: Callable[[int], None]) -> EpisodeReport:
-    """Convert an episode into its unit; a fault is told in the report and leaves nothing.
+    """Convert an episode into its unit; a fault is named in the report and leaves no files.
 
     Args:
         job: what to convert.
@@ -187,7 +187,7 @@ def _write(
     units = JointUnits(request.norm_mode, contract, calibration, document)
     robot_type = (document.get("robot") or {}).get("robot_type") or summary.metadata.get("robot_type", "")
     if request.success and report.outcome == "unknown":
-        raise DatasetError(f"{SUCCESS} cannot be told: the episode's outcome is unknown")
+        raise DatasetError(f"{SUCCESS} cannot be determined: the episode's outcome is unknown")
     ticks = Ticks(reader, contract, request.missing)
     writer = make_writer(request)
     features: dict[str, Feature] = {}
@@ -288,7 +288,7 @@ def _joined(calibrations: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def _sync(folder: Path) -> None:
-    """See that every file is on the disk."""
+    """Flush every file to the disk."""
     for path in folder.rglob("*"):
         if path.is_file():
             descriptor = os.open(path, os.O_RDONLY)

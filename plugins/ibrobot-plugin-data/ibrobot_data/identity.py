@@ -17,7 +17,7 @@ UUID_KEY = "uuid"
 def identity(reader: EpisodeReader, summary: EpisodeSummary) -> str:
     """What tells an episode, as it is now, from every other: equal for copies, other for another part of it.
 
-    A random UUID with counts and stamps tells it without reading the messages; all others are told by their content.
+    A random UUID with counts and stamps identifies it without reading the messages; otherwise their content does.
 
     Raises:
         RecorderError: when the messages have to be read and cannot be.

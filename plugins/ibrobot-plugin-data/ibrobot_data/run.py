@@ -90,7 +90,7 @@ def convert(
 ) -> Report:
     """Convert episodes into the dataset at `request.out`, in the order given.
 
-    An episode that cannot be converted is told in the report and left out. Converted episodes are kept until all are
+    An episode that cannot be converted is named in the report and left out. Converted episodes are kept until all are
     done: after an interruption, the same call goes on from there.
 
     Raises:

@@ -38,7 +38,7 @@ _COMMAND = Align("hold", "receive")
 
 
 def with_action(contract: Contract) -> Contract:
-    """The contract whose observations include the action: what the executors were told, read back from their topics.
+    """The contract whose observations include the action: the commands of the executors, read back from their topics.
 
     With `align: hold` a row has the command in effect at its tick: what the robot was following when it saw the
     observation, the safety layer's limits included. At the control rate that is one control period old at most; of
@@ -182,7 +182,7 @@ class Ticks:
         absent = [topic for topic in contract.topics if topic not in present]
         if absent:
             has = ", ".join(sorted(present)) or "none"
-            raise RecorderError(f"no message of {', '.join(absent)}, which the contract has; there are: {has}")
+            raise RecorderError(f"no message of {', '.join(absent)}, which the contract has; available: {has}")
         self._contract = with_action(contract)
         self._signals = frozenset(_source_of(part) for part in contract.signal_parts)
         self._missing = missing
@@ -256,5 +256,5 @@ def _text_at(message: Message, path: str) -> str:
     value = value_at(message, path.split("."))
     if isinstance(value, str):
         return value
-    there = f"; there are: {', '.join(attrs.fields_dict(type(value)))}" if attrs.has(type(value)) else ""
+    there = f"; available: {', '.join(attrs.fields_dict(type(value)))}" if attrs.has(type(value)) else ""
     raise ContractError(f"{path!r} leads to no text in a {message.ros_type}{there}")

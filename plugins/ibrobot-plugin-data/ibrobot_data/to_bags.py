@@ -108,7 +108,7 @@ class _Job:
         self._making = request.out / _STAGING / self._target.name
 
     def run(self, progress: Callable[[int], None]) -> EpisodeReport:
-        """Convert it; a fault is told in the report and leaves nothing."""
+        """Convert it; a fault is named in the report and leaves no files."""
         report = EpisodeReport(self._path.name)
         reader: EpisodeReader | None = None
         try:

@@ -108,7 +108,7 @@ class Tuning:
 
 
 def find_servos(bus: FeetechBus, arm: Arm) -> None:
-    """See that every servo is there and of the right model, with one firmware.
+    """Check that every servo answers, has the right model, and that all have one firmware.
 
     Raises:
         FeetechError: names all servos that are missing, or the one that is another model.

@@ -25,7 +25,7 @@ from ibrobot_feetech.protocol import BROADCAST, OVERHEAD, Packet
 from ibrobot_feetech.registers import STS3215, Register, register, writable
 
 LATE_S = 0.5
-"""Longer than a reply can be late [s]: adapters were seen to hold one back for 0.08 s."""
+"""Longer than a reply can be late [s]: adapters held one back for 0.08 s."""
 _ADAPTER_S = 0.004
 """Time for the USB adapter and the kernel beside the time on the wire [s]."""
 _TRAIL_S = 0.001

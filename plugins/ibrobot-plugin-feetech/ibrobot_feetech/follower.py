@@ -238,7 +238,7 @@ class FeetechFollower(Hardware):
         return bool(code) or self._bus.read_faulty(servo, "torque_enable") != 1
 
     def _start(self) -> None:
-        """Begin to read anew: from where the joints stand, which every servo must say."""
+        """Begin to read again: from where the joints stand, which every servo must say."""
         bus, ids = self._bus, self._arm.servos
         bus.return_delay_s = 0.0
         self._reader = SyncReader(bus, ids, "present_position", "present_load")

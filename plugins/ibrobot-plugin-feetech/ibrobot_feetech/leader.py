@@ -37,7 +37,7 @@ _FASTEST_HAND = 13_000
 _SLACK = 64
 """What a position may differ from the last one at any rate [ticks]."""
 _TAKEN_UP = 40
-"""A leader whose joint turned by more is in somebody's hand [ticks]: 3.5 degrees."""
+"""A leader whose joint turned by more is in a hand [ticks]: 3.5 degrees."""
 
 
 class LeaderTeleop(Teleop):
@@ -156,7 +156,7 @@ class LeaderTeleop(Teleop):
                 raise TeleopError(f"{self._ctx.name}: {option}: no joint {name!r}; the joints are: {', '.join(known)}")
 
     def _prepare(self, bus: FeetechBus) -> None:
-        """Torque off and seen to be, answers without delay, the calibration's numbers in the servos.
+        """Torque off and confirmed, answers without delay, the calibration's numbers in the servos.
 
         Raises:
             HardwareError: e.g. naming a servo that does not answer.

@@ -139,7 +139,7 @@ def register(name: str) -> Register:
     if name in STS3215:
         return STS3215[name]
     close = get_close_matches(name, STS3215, 1)
-    hint = f"did you mean {close[0]!r}?" if close else f"there are: {', '.join(STS3215)}"
+    hint = f"did you mean {close[0]!r}?" if close else f"available: {', '.join(STS3215)}"
     raise KeyError(f"the STS3215 has no register {name!r}, {hint}")
 
 

@@ -47,7 +47,7 @@ def supply(bus: FeetechBus, servo: int) -> Supply:
 
 
 def check_supply(bus: FeetechBus, servo: int) -> None:
-    """See that a servo's supply is within its limits.
+    """Check that a servo's supply is within its limits.
 
     Raises:
         HardwareError: with the measured voltage and the limits.

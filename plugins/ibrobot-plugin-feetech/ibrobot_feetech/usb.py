@@ -59,7 +59,7 @@ def usb_port(path: str) -> UsbPort | None:
 
 
 def check_adapter(calibration: Calibration, port: str) -> None:
-    """See that the adapter at a port is the one that the calibration was made at, where both are known.
+    """Check that the adapter at a port is the one that the calibration was made at, where both are known.
 
     Raises:
         HardwareError: for another one, e.g. when the ports of leader and follower are swapped.

@@ -126,14 +126,14 @@ class TestErrors:
         bus.open()
         assert bus.read(1, "id") == 1
 
-    def test_a_port_that_vanishes_is_told_at_once(self, bus: FeetechBus, emulator: Emulator) -> None:
+    def test_a_port_that_vanishes_is_reported_at_once(self, bus: FeetechBus, emulator: Emulator) -> None:
         reader = SyncReader(bus, SERVOS, "present_position")
         emulator.unplug()
         for act in (reader.read, lambda: bus.read(1, "id"), lambda: bus.write(1, "lock", 0)):
             with pytest.raises(PortError, match="the port is gone"):
                 act()
 
-    def test_a_folder_is_no_port(self, tmp_path: Path) -> None:
+    def test_a_folder_is_refused_as_port(self, tmp_path: Path) -> None:
         with pytest.raises(PortError, match=r"cannot be opened|no permission"):
             FeetechBus(str(tmp_path)).open()
 
@@ -148,7 +148,7 @@ class TestSilence(OnALine):
         with pytest.raises(NoReply, match=r"servo 9, model_number: no reply within .* ms; check its power"):
             bus.ping(9)
 
-    def test_a_damaged_reply_is_told_from_none(self, bus: FeetechBus, emulator: Emulator) -> None:
+    def test_a_damaged_reply_differs_from_none(self, bus: FeetechBus, emulator: Emulator) -> None:
         emulator.faults.corrupt = 1.0
         with pytest.raises((PacketError, NoReply)):
             bus.read(1, "present_position")
@@ -234,7 +234,7 @@ class TestLateReplies(OnALine):
         bus.write(2, "goal_position", 1500)
         assert bus.counters["timeouts"] == 1
 
-    def test_a_register_that_does_not_keep_its_value_is_told(self, bus: FeetechBus, emulator: Emulator) -> None:
+    def test_a_register_that_does_not_keep_its_value_is_reported(self, bus: FeetechBus, emulator: Emulator) -> None:
         def overwrite() -> None:
             emulator.faults.drop = 0.0
             emulator.servos[2].set("acceleration", 5)

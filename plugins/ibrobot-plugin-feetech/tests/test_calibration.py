@@ -46,7 +46,7 @@ def test_the_file_holds_lerobots_keys_and_nothing_else(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["arm.json", "arm.meta.json"]
 
 
-def test_it_overwrites_only_when_told(tmp_path: Path) -> None:
+def test_it_overwrites_only_on_request(tmp_path: Path) -> None:
     made = Calibration({"pan": JointCalibration(**GOOD)})
     path = save_calibration(made, tmp_path / "arm.json")
     with pytest.raises(CalibrationError, match="is there already"):

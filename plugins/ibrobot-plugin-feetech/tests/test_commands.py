@@ -118,7 +118,7 @@ def test_an_arm_is_calibrated_in_the_dialogue_and_the_former_file_is_kept(emulat
     before = former.read_text()
     adapter = ADAPTER.format(port=emulator.port)
     with Terminal("feetech", "calibrate", emulator.port, "--arm", "left", before=adapter) as terminal:
-        terminal.wait_for("Calibrate anew? [y/N]")
+        terminal.wait_for("Calibrate again? [y/N]")
         terminal.type("y\r")
         terminal.wait_for("middle of its range. Then press Enter")
         terminal.type("\r")
@@ -148,7 +148,7 @@ def test_an_arm_is_calibrated_in_the_dialogue_and_the_former_file_is_kept(emulat
     assert "this is another arm: its adapter has the USB serial number 5A99" in screen.replace("\r\n", " ")
 
 
-QUESTIONS = ("Calibrate anew?", "Go on?", "Then press Enter", "(Enter ends it)")
+QUESTIONS = ("Calibrate again?", "Go on?", "Then press Enter", "(Enter ends it)")
 
 
 @pytest.mark.parametrize("question", QUESTIONS)
@@ -178,7 +178,7 @@ def test_an_existing_file_is_not_overwritten_against_the_answer(emulator, home):
     home.mkdir(parents=True)
     (home / "so101_leader.json").write_text("{}")
     with Terminal("feetech", "calibrate", emulator.port, "--leader") as terminal:
-        terminal.wait_for("Calibrate anew? [y/N]")
+        terminal.wait_for("Calibrate again? [y/N]")
         terminal.type("n\r")
         assert terminal.end() == 1
     assert (home / "so101_leader.json").read_text() == "{}"
@@ -429,7 +429,7 @@ def test_torque_of_servos_by_their_ids(emulator):
     assert "give one or the other" in screen
 
 
-def test_a_port_that_is_missing_forbidden_or_not_said_is_told(tmp_path):
+def test_a_port_that_is_missing_forbidden_or_not_said_is_reported(tmp_path):
     code, screen = ran("scan", str(tmp_path / "ttyACM9"))
     assert code == 2
     assert "there is no such port" in screen

@@ -321,7 +321,7 @@ class TestTorque:
         rig.run(2, rig.run(2)[-1].position)
         assert rig.register("torque_enable") == [1] * 6
 
-    def test_an_overload_is_no_reason_to_leave_torque_on(self, rig: Rig) -> None:
+    def test_an_overload_still_takes_torque_off(self, rig: Rig) -> None:
         rig.emulator.faults.overloaded |= {2, 6}
         rig.run(210)
         assert [code & OVERLOAD for code in rig.register("status")] == [0, OVERLOAD, 0, 0, 0, OVERLOAD]
@@ -526,7 +526,7 @@ class TestHealth:
         rig.run(103)
         assert not rig.follower.health()
 
-    def test_torque_that_was_taken_off_is_no_brown_out(self, rig: Rig) -> None:
+    def test_torque_that_was_taken_off_does_not_count_as_brown_out(self, rig: Rig) -> None:
         rig.tick()
         rig.follower.relax()
         for _ in range(103):

@@ -206,7 +206,7 @@ class TestMapping:
             ({"scaled": ("grip",)}, "scaled: no joint 'grip'; the joints are: shoulder_pan, shoulder_lift"),
         ],
     )
-    def test_unknown_joints_are_told(self, emulator: Emulator, calibration_file: Path, given: Any, told: str):
+    def test_unknown_joints_are_reported(self, emulator: Emulator, calibration_file: Path, given: Any, told: str):
         with pytest.raises(TeleopError, match=told):
             TeleopRig(emulator, calibration_file, **given)
 
@@ -265,7 +265,7 @@ class TestDeadman:
         assert rig.read().positions is None, "a reset waits again"
 
     @options(deadman="none")
-    def test_a_lost_reply_at_the_start_is_no_motion(self, rig: TeleopRig):
+    def test_a_lost_reply_at_the_start_causes_no_motion(self, rig: TeleopRig):
         rig.turn("shoulder_pan", 2500)
         rig.emulator.faults.silent.add(1)
         assert rig.read().positions is None

@@ -86,7 +86,7 @@ def test_the_answer_of_another_servo_is_not_taken() -> None:
     assert bus.counters["late_replies"] == 1
 
 
-def test_a_damaged_answer_is_told_from_none() -> None:
+def test_a_damaged_answer_differs_from_none() -> None:
     good = bytearray(protocol.pack(Packet(2, 0, b"\x10\x08")))
     assert answering(bytes(good)).read(2, "present_position") == 0x0810
     good[5] ^= 1

@@ -134,7 +134,7 @@ class NpzDataset:
         """Episode `index`: key -> its frames, shape (frames, *feature shape), and `task`, shape (frames,).
 
         Raises:
-            DatasetError: for an index that there is not, or a file that is no episode of this dataset.
+            DatasetError: for an index out of range, or a file that is not an episode of this dataset.
         """
         if not 0 <= index < len(self.episodes):
             raise DatasetError(f"no episode {index} in {self.root}; it has {len(self.episodes)}, counted from 0")

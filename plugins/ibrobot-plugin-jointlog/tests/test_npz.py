@@ -94,7 +94,7 @@ def test_features_that_cannot_be_stored_are_refused(tmp_path, key, dtype, messag
     assert not (tmp_path / "set").exists()
 
 
-def test_metadata_that_is_no_json_is_refused(tmp_path):
+def test_metadata_without_json_is_refused(tmp_path):
     with pytest.raises(DatasetError, match="metadata cannot be written as JSON"):
         NpzDatasetWriter().create(tmp_path / "set", 30.0, STATE, {"path": tmp_path})
     assert not (tmp_path / "set").exists()
@@ -123,7 +123,7 @@ def test_nothing_is_taken_after_finalize(tmp_path):
         writer.add_frame({"state": np.zeros(2)}, "wave")
 
 
-def test_an_episode_that_there_is_not_is_named(tmp_path):
+def test_missing_episode_is_named_in_error(tmp_path):
     saved(tmp_path)
     for index in (1, -1):
         with pytest.raises(DatasetError, match=f"no episode {index} in .*; it has 1"):

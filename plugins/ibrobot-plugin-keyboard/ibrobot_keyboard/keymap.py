@@ -65,7 +65,7 @@ def make_keymap(
         overrides: action -> key, in place of the default.
 
     Raises:
-        TeleopError: for an action that there is not, a joint left without keys, or a key that does two things at once.
+        TeleopError: for an unknown action, a joint left without keys, or a key that does two things at once.
     """
     defaults = dict(zip(joints, _JOINT_KEYS, strict=False))
     motions: dict[str, str] = {}

@@ -284,7 +284,7 @@ def test_more_joints_than_keys_need_keys_of_their_own():
     assert "1/2 j7" in KeyboardTeleop(options, host_context(robot=robot)).help()
 
 
-def test_help_is_a_table_of_the_keys_that_there_are():
+def test_help_is_a_table_of_the_available_keys():
     assert TeleopRig().teleop.help().splitlines() == [
         "joints     w/s shoulder_pan  e/d shoulder_lift  r/f elbow_flex  t/g wrist_flex  y/h wrist_roll",
         "always     o gripper_open  c gripper_close  0 home  + faster  - slower  space estop",

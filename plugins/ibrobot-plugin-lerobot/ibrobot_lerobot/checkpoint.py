@@ -98,7 +98,9 @@ class Checkpoint:
             contract = Contract.from_canonical(self.trained_on["contract"])
             return contract, str(self.trained_on["conversion"]["norm_mode"])
         except (KeyError, TypeError, ValueError, AttributeError, ContractError) as error:
-            raise PolicyError(f"{self.trained_on_path}: is no meta/{NOTE} of `ibrobot convert`'s: {error!r}") from None
+            raise PolicyError(
+                f"{self.trained_on_path}: is not the meta/{NOTE} of `ibrobot convert`'s: {error!r}"
+            ) from None
 
     def fingerprint(self) -> str:
         """SHA-256, the first 32 hexadecimal digits, of configuration, processors and statistics."""
@@ -121,13 +123,13 @@ def read_checkpoint(path: Path, base_models: Collection[str] = ()) -> Checkpoint
         base_models: what it may have LeRobot load besides, in addition to what LeRobot's own configurations name.
 
     Raises:
-        PolicyError: when it is no checkpoint of LeRobot 0.6's, one that needs something beside it, or one that would
+        PolicyError: when it is not a checkpoint of LeRobot 0.6's, one that needs something beside it, or one that would
             run or read what it must not.
     """
     if not (path / "config.json").exists():
         inner = [each for each in ("pretrained_model", "checkpoints/last/pretrained_model") if (path / each).is_dir()]
         hint = f"did you mean {path / inner[0]}?" if inner else "lerobot-train writes it to …/pretrained_model"
-        raise PolicyError(f"{path} is no folder with a checkpoint: it has no config.json; {hint}")
+        raise PolicyError(f"{path} is not a folder with a checkpoint: it has no config.json; {hint}")
     file = path / "config.json"
     config = read_json(path, file.name)
     check_values(file, config, base_models)
@@ -145,7 +147,7 @@ def read_checkpoint(path: Path, base_models: Collection[str] = ()) -> Checkpoint
         sizes = ("n_action_steps",) if kind in _SHORTER_CHUNKS else _CHUNK_SIZES
         size = next(size for size in sizes if config.get(size) is not None)
     except (KeyError, TypeError, ValueError, AttributeError, StopIteration) as error:
-        raise PolicyError(f"{file}: is no policy's configuration of LeRobot 0.6: {error!r}") from None
+        raise PolicyError(f"{file}: is not a policy's configuration of LeRobot 0.6: {error!r}") from None
     chunk_size = whole(file, size, config[size], MAX_ACTIONS)
     n_obs_steps = whole(file, "n_obs_steps", config.get("n_obs_steps", 1), MAX_HISTORY)
     note = _note_path(path)
@@ -168,7 +170,7 @@ def rename_map(path: Path, step: Mapping[str, Any]) -> dict[str, str]:
 
 
 def check_weights(checkpoint: Checkpoint) -> None:
-    """See that there are weights, that reading them runs no code, and that they give actions of the right size.
+    """Check that the checkpoint has weights that can be read without running code and give actions of the right size.
 
     Raises:
         PolicyError: when there are none, in a format that carries code, or for another number of joints.

@@ -45,7 +45,7 @@ class Composer:
         self._contract = contract
         if foreign := [part for part in contract.action_parts if part.select]:
             raise ContractError(
-                f"{_ACTION}: no {foreign[0].type} can be made, which bags of others have on {foreign[0].topic}"
+                f"{_ACTION}: no {foreign[0].type} can be made, which foreign bags have on {foreign[0].topic}"
             )
         self._topics: dict[str, list[ObservationPart]] = {}
         for part in contract.observation_parts:
@@ -54,7 +54,7 @@ class Composer:
         for key in contract.observations:
             unknown = [part for part in contract.parts(key) if part.image is None and part.feature.shape == (-1,)]
             if len(unknown) > 1:
-                raise ContractError(f"{key}: the lengths of {len(unknown)} whole arrays cannot be told apart")
+                raise ContractError(f"{key}: the lengths of {len(unknown)} whole arrays cannot be distinguished")
 
     def keys(self, topics: Collection[str]) -> set[str]:
         """The keys whose values the messages of `topics` are made of."""
@@ -133,7 +133,7 @@ def _leaves(part: ObservationPart) -> tuple[Leaf, ...]:
             f"{part.key}: no {part.type} can be made of {', '.join(parts)}: the rest of it is not known"
         )
     if len(leaves) > 1 and any(leaf.kind == "array" for leaf in leaves):
-        raise ContractError(f"{part.key}: where {', '.join(part.select)} begin in a vector cannot be told")
+        raise ContractError(f"{part.key}: where {', '.join(part.select)} begin in a vector is unknown")
     return leaves
 
 

@@ -19,7 +19,7 @@ INFO = "meta/info.json"
 STATS = "meta/stats.json"
 TASKS = "meta/tasks.parquet"
 OWN = "meta/ibrobot.json"
-"""What `create` and `merge` were told; LeRobot passes it over."""
+"""The metadata given to `create` and `merge`; LeRobot passes it over."""
 PIXELS = "meta/ibrobot_pixels.json"
 """What the statistics of the pictures were made of, so that they can be continued: key -> `PictureStats.state`."""
 DATA = "data"
@@ -168,7 +168,7 @@ class OnDisk:
     """In the order of their numbers."""
     metadata: dict[str, Any]
     pixels: dict[str, Any]
-    """Key of a camera -> what its statistics were made of; nothing for a dataset of others."""
+    """Key of a camera -> what its statistics were made of; nothing for a foreign dataset."""
 
     @property
     def videos(self) -> list[str]:
@@ -177,7 +177,7 @@ class OnDisk:
 
     @property
     def features(self) -> dict[str, Feature]:
-        """The features, as `create` was told them."""
+        """The features given to `create`."""
         return {
             key: Feature(_dtype(entry), tuple(entry["shape"]), tuple(entry["names"] or ()))
             for key, entry in self.info["features"].items()

@@ -1,4 +1,4 @@
-"""Merging datasets: tables renumbered, videos joined without encoding anew; all of it or nothing."""
+"""Merging datasets: tables renumbered, videos joined without re-encoding; all of it or nothing."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def complete(root: Path) -> None:
     if not merged.is_dir():
         return
     try:
-        # `info.json` says that there is a dataset, so it comes last.
+        # `info.json` marks a complete dataset, so it comes last.
         files = sorted((p for p in merged.rglob("*") if p.is_file()), key=lambda p: (p == merged / layout.INFO, p))
         for path in files:
             target = root / path.relative_to(merged)
@@ -132,7 +132,7 @@ class _Merge:
         self._write_meta(metadata)
 
     def _check(self, part: OnDisk) -> None:
-        """See that a part fits, and take the first one's description where there was none."""
+        """Check that a part fits, and take the first one's description where there was none."""
         if not self._info:
             self._info = part.info
         for name in ("fps", "features"):
@@ -173,7 +173,7 @@ class _Merge:
             if key not in part.pixels:
                 raise DatasetError(
                     f"{part.root}: does not keep what the statistics of {key} were made of ({layout.PIXELS}), so they "
-                    "cannot be continued; convert its episodes anew"
+                    "cannot be continued; convert its episodes again"
                 )
             self._pictures.setdefault(key, picture_stats(feature)).join(part.pixels[key])
 
@@ -262,7 +262,7 @@ class _Merge:
 
 
 def _next(old: OnDisk | None, folder: str, suffix: str) -> int:
-    """The number of the first file after those that there are: old files are never touched."""
+    """The number of the first new file: old files are never touched."""
     files = old.files(folder, suffix) if old else []
     if not files:
         return 0

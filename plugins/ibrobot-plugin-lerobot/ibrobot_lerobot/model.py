@@ -57,7 +57,7 @@ class PolicyModel:
         self._draws: Sequence[Draw] = ()
         """What a request draws by itself."""
         self._one_by_one = False
-        """Whether it draws in a way that cannot be told apart by request."""
+        """Whether its random draws cannot be separated by request."""
         self._log = log
         log.info("%s on %s, %d threads", checkpoint.type, self._device, threads)
 
@@ -194,5 +194,5 @@ def _device(asked: str) -> str:
         return next(name for name, found in there.items() if found)
     if not there[asked]:
         has = ", ".join(name for name, found in there.items() if found)
-        raise PolicyError(f"torch finds no device {asked!r} here; there is: {has}")
+        raise PolicyError(f"torch finds no device {asked!r} here; available: {has}")
     return asked

@@ -57,7 +57,7 @@ def decode_picture(content: bytes, feature: Feature) -> NDArray[Any]:
         feature: its shape (H, W, C), and the type of its elements.
 
     Raises:
-        DatasetError: when it cannot be read, or is no such picture.
+        DatasetError: when it cannot be read, or is not such a picture.
     """
     codec = next((name for begin, name in _DECODERS.items() if content.startswith(begin)), None)
     try:

@@ -51,7 +51,7 @@ class LeRobotSteps:
         """A batch of one through the preprocessor: arrays in, arrays out.
 
         Raises:
-            PolicyError: when a step gives what is no array, and so cannot travel to a model elsewhere.
+            PolicyError: when a step gives what is not an array, and so cannot travel to a model elsewhere.
         """
         tensors: dict[str, Any] = {key: torch.from_numpy(np.array(value)) for key, value in batch.items()}
         found = self._pre({**tensors, "task": prompt, "robot_type": robot_type})
@@ -61,7 +61,7 @@ class LeRobotSteps:
                 tensor = value.float() if value.dtype == torch.bfloat16 else value
                 result[key] = np.array(tensor.numpy(force=True))
             elif key.startswith("observation."):
-                raise PolicyError(f"the preprocessor gives {key} as {type(value).__name__}, which is no tensor")
+                raise PolicyError(f"the preprocessor gives {key} as {type(value).__name__}, which is not a tensor")
         return result
 
     def postprocess(self, action: NDArray[Any]) -> NDArray[Any]:
@@ -78,5 +78,5 @@ def _check_class(path: Path, name: str) -> None:
     except ImportError as error:
         raise PolicyError(f"{path}: step {name!r} cannot be imported: {error}") from None
     if not (isinstance(found, type) and issubclass(found, ProcessorStep) and found.__module__.startswith("lerobot.")):
-        raise PolicyError(f"{path}: step {name!r} is no processor step of LeRobot's")
+        raise PolicyError(f"{path}: step {name!r} is not a processor step of LeRobot")
     check_step_name(path, str(vars(found).get("_registry_name", "")))

@@ -40,7 +40,7 @@ class LeRobotPolicy(Policy):
         ctx: for the log, the robot's type and the seed.
 
     Raises:
-        PolicyError: when the folder is no checkpoint, or LeRobot is needed and missing.
+        PolicyError: when the folder is not a checkpoint, or LeRobot is needed and missing.
     """
 
     def __init__(self, options: LeRobotPolicyOptions, ctx: Context) -> None:
@@ -151,7 +151,7 @@ class LeRobotPolicy(Policy):
         return action[0, : self.spec.chunk_size].astype(np.float64)
 
     def _check(self, tensors: Tensors) -> None:
-        """See that a request, which may come from anywhere, has what `preprocess` makes."""
+        """Check that a request, which may come from anywhere, has what `preprocess` makes."""
         taken = dict(self._taken)
         if self.spec.prompt:
             taken[TASK] = (np.dtype(np.uint8), (1, -1))

@@ -33,8 +33,9 @@ from ibrobot_lerobot.rows import EpisodeRows
 class LeRobotReader(EpisodeReader):
     """Reads an episode of a dataset in LeRobot's format v3.0: at every tick one message of each topic of the contract.
 
-    Datasets of `ibrobot convert` say themselves which contract, units, robot and prompt an episode has; others are
-    told. Stamps count from when the episode was recorded; where that is not known, from the dataset's first frame.
+    Datasets of `ibrobot convert` say themselves which contract, units, robot and prompt an episode has; for others
+    the caller states them. Stamps count from when the episode was recorded; where that is
+    not known, from the dataset's first frame.
 
     Raises:
         RecorderError: when it cannot be read, or the address has no number.
@@ -115,7 +116,7 @@ class LeRobotReader(EpisodeReader):
 
 
 def _check_features(root: Path, features: Mapping[str, Feature], contract: Contract) -> None:
-    """See that what the contract has is there, in the same order."""
+    """Check that what the contract has is there, in the same order."""
     for key, wanted in contract.features().items():
         found = features.get(key)
         if found is None:

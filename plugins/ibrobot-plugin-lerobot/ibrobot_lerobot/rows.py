@@ -38,7 +38,7 @@ class EpisodeRows:
         found = next((row for row in dataset.episodes() if row["episode_index"] == number), None)
         if found is None:
             there = f"0 to {total - 1}" if total else "none"
-            raise DatasetError(f"{dataset.root}: has no episode {number}; there are: {there}")
+            raise DatasetError(f"{dataset.root}: has no episode {number}; available: {there}")
         self._dataset = dataset
         self._number = number
         self._row = found

@@ -157,7 +157,7 @@ def _normalise(path: Path, entry: Mapping[str, Any], *, inverse: bool) -> Normal
 
 
 def _check_sizes(file: Path, statistics: Mapping[str, Array], kind: str, shape: Sequence[int]) -> None:
-    """See that statistics have a number for each of a feature's, or for each of a camera's channels."""
+    """Check that statistics have a number for each of a feature's, or for each of a camera's channels."""
     wanted = {math.prod(shape), *shape[:1]} if kind == "VISUAL" else {math.prod(shape)}
     for name, statistic in statistics.items():
         if statistic.size not in wanted:

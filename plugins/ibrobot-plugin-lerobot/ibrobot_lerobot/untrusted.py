@@ -92,7 +92,7 @@ def own_file(folder: Path, name: str, max_size: int | None = None) -> Path:
         max_size: the most bytes that it may have; None: any number.
 
     Raises:
-        PolicyError: when it is no regular file, a link out of the folder, or too large.
+        PolicyError: when it is not a regular file, a link out of the folder, or too large.
     """
     path, root = folder / name, folder.resolve()
     try:
@@ -138,7 +138,7 @@ def check_steps(path: Path, document: Mapping[str, Any]) -> None:
             raise PolicyError(f"{path}: the {key} of a step is {name!r}, must be the name of a step of LeRobot's")
         if key == "class" and not _LEROBOTS_CLASS.fullmatch(name):
             raise PolicyError(
-                f"{path}: step {name!r} is no processor step of LeRobot's; nothing else is run from a checkpoint"
+                f"{path}: step {name!r} is not a processor step of LeRobot; nothing else is run from a checkpoint"
             )
         check_step_name(path, name)
         if not isinstance(entry.get("config", {}), dict):

@@ -1,4 +1,4 @@
-"""Videos: pictures encoded one by one in a thread of their own, and files joined without encoding anew."""
+"""Videos: pictures encoded one by one in a thread of their own, and files joined without re-encoding."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ os.environ.setdefault("SVT_LOG", "1")  # libsvtav1 tells about every file on std
 
 @attrs.frozen
 class Encoder:
-    """An encoder and what it is told."""
+    """An encoder and its options."""
 
     codec: str
     options: dict[str, str]
@@ -177,12 +177,12 @@ class VideoTrack:
             with self._container:
                 while (frame := self._queue.get()) is not None:
                     if self._failure is not None:
-                        self._stream.encode(None)  # an encoder that is not told of its end complains on stderr
+                        self._stream.encode(None)  # an encoder that is not flushed complains on stderr
                         return
                     self._stats.add(frame.to_ndarray())
                     self._container.mux(self._stream.encode(frame))
                 self._container.mux(self._stream.encode(None))
-        except Exception as error:  # noqa: BLE001 - contained: whoever adds the next picture is told
+        except Exception as error:  # noqa: BLE001 - contained: raised where the next picture is added
             self._failure = error
 
 

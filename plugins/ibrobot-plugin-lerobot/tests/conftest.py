@@ -80,7 +80,7 @@ def shown(root: Path, key: str, episode: int) -> list[NDArray[np.uint8]]:
 
 
 def check(root: Path, features: dict[str, Feature], lengths: tuple[int, ...]) -> None:
-    """See that a dataset has what `write` was told."""
+    """Check that a dataset has what `write` was told."""
     found, number = rows(root), 0
     assert [row["length"] for row in episodes(root)] == list(lengths)
     assert [row["index"] for row in found] == list(range(sum(lengths)))

@@ -140,17 +140,17 @@ _OUTSIDE = r"links to .*, outside of the checkpoint"
 _NAMES_ANOTHER = r"names .* to load besides the checkpoint"
 
 ATTACKS = {
-    "shell": Attack(_step(PRE, _shell), r"step 'os.system' is no processor step of LeRobot's"),
-    "shell_after": Attack(_step(POST, _shell), r"step 'os.system' is no processor step of LeRobot's"),
+    "shell": Attack(_step(PRE, _shell), r"step 'os.system' is not a processor step of LeRobot"),
+    "shell_after": Attack(_step(POST, _shell), r"step 'os.system' is not a processor step of LeRobot"),
     "class_of_another_package": Attack(
         _step(PRE, lambda canary: {"class": "subprocess.Popen", "config": {"args": ["touch", str(canary)]}}),
-        r"step 'subprocess.Popen' is no processor step",
+        r"step 'subprocess.Popen' is not a processor step",
     ),
     "class_that_looks_like_lerobots": Attack(
-        _step(PRE, lambda _: {"class": "lerobotx.Step"}), r"step 'lerobotx.Step' is no processor step"
+        _step(PRE, lambda _: {"class": "lerobotx.Step"}), r"step 'lerobotx.Step' is not a processor step"
     ),
     "class_up_and_out": Attack(
-        _step(PRE, lambda _: {"class": "lerobot..os.system"}), r"step 'lerobot..os.system' is no processor step"
+        _step(PRE, lambda _: {"class": "lerobot..os.system"}), r"step 'lerobot..os.system' is not a processor step"
     ),
     "class_behind_an_empty_name": Attack(
         _step(PRE, lambda canary: {"registry_name": "", **_shell(canary)}), r"registry_name of a step is ''"

@@ -114,7 +114,7 @@ def test_numbers_are_normalised_and_back(tmp_path: Path) -> None:
     np.testing.assert_allclose(actions, np.tile(2 + np.arange(6), (10, 1)))
 
 
-def test_clients_in_other_languages_are_told_of_every_tensor(tmp_path: Path) -> None:
+def test_clients_in_other_languages_learn_of_every_tensor(tmp_path: Path) -> None:
     page = (Path(__file__).parents[3] / "docs/reference/wire.md").read_text(encoding="utf-8")
     policy = make(write(tmp_path / "pi0", type="pi0"))
     plan = np.zeros((3, 6))
@@ -125,7 +125,7 @@ def test_clients_in_other_languages_are_told_of_every_tensor(tmp_path: Path) -> 
         assert (tensors[name].dtype, tensors[name].ndim) == (dtype, shape.count(",") + (shape != "(1,)"))
 
 
-def test_history_begins_with_the_oldest_frame_that_there_is(tmp_path: Path) -> None:
+def test_history_begins_with_the_oldest_available_frame(tmp_path: Path) -> None:
     policy = make(write(tmp_path / "diffusion", type="diffusion", n_obs_steps=3, horizon=16))
     past = (frame(0.1), frame(0.2), frame(0.3))
 
@@ -197,7 +197,7 @@ def test_what_it_was_trained_on(tmp_path: Path) -> None:
     (tmp_path / "set/meta/ibrobot.json").unlink()
     assert make(by_dataset).spec.actions is None
     (beside / "ibrobot.json").write_text('{"contract": {}}')
-    with pytest.raises(PolicyError, match=r"beside/ibrobot.json: is no meta/ibrobot.json of `ibrobot convert`'s"):
+    with pytest.raises(PolicyError, match=r"beside/ibrobot.json: is not the meta/ibrobot.json of `ibrobot convert`'s"):
         make(beside)
 
 
@@ -273,11 +273,11 @@ def test_weights_are_compared_with_the_configuration_without_torch(tmp_path: Pat
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (_empty, "is no folder with a checkpoint: it has no config.json; lerobot-train writes it to"),
+        (_empty, "is not a folder with a checkpoint: it has no config.json; lerobot-train writes it to"),
         (_inner, "did you mean .*/checkpoints/last/pretrained_model"),
         (_old, "has no policy_preprocessor.json: a checkpoint from before LeRobot 0.4"),
         (_cut, "config.json: cannot be read"),
-        (_no_features, "config.json: is no policy's configuration of LeRobot 0.6: KeyError"),
+        (_no_features, "config.json: is not a policy's configuration of LeRobot 0.6: KeyError"),
         (_adapter, "has an adapter only"),
         (_no_statistics, "policy_preprocessor.safetensors: cannot be read"),
         (_too_few, "MIN_MAX needs observation.state.max, which is missing"),
@@ -286,7 +286,7 @@ def test_weights_are_compared_with_the_configuration_without_torch(tmp_path: Pat
         (_relative, "actions relative to the state"),
     ],
 )
-def test_folders_that_are_no_checkpoints(tmp_path: Path, spoil: Any, message: str) -> None:
+def test_folders_without_a_checkpoint(tmp_path: Path, spoil: Any, message: str) -> None:
     path = write(tmp_path / "act")
     spoil(path)
     with pytest.raises(PolicyError, match=message):

@@ -146,19 +146,19 @@ def test_vectors_of_another_length_are_refused():
         Composer(contract)({"state": np.zeros(2)}, STAMP_NS)
 
 
-def test_whole_arrays_that_cannot_be_told_apart_are_refused():
+def test_whole_arrays_that_cannot_be_distinguished_are_refused():
     both = part("state", "/joy", "sensor_msgs/msg/Joy", ["axes", "buttons"])
-    with pytest.raises(ContractError, match="where axes, buttons begin in a vector cannot be told"):
+    with pytest.raises(ContractError, match="where axes, buttons begin in a vector is unknown"):
         Composer(Contract(30.0, (both,), ()))
     arrays_ = [part("state", topic, "std_msgs/msg/Float32MultiArray", []) for topic in ("/a", "/b")]
-    with pytest.raises(ContractError, match="lengths of 2 whole arrays cannot be told apart"):
+    with pytest.raises(ContractError, match="lengths of 2 whole arrays cannot be distinguished"):
         Composer(Contract(30.0, tuple(arrays_), ()))
 
 
-def test_messages_of_others_are_refused():
+def test_foreign_messages_are_refused():
     touch = ObservationPart("touch", "/touch", "lamp_msgs/msg/Touch", ("x",), None, Align(), Feature("float32", (1,)))
     with pytest.raises(ContractError, match="touch: no lamp_msgs/msg/Touch can be made"):
         Composer(Contract(30.0, (touch,), ()))
     command = ActionPart("arm", "/told", "lamp_msgs/msg/Command", "hold", ("a",), ("joints.0.target",))
-    with pytest.raises(ContractError, match=r"action: no .* can be made, which bags of others have on /told"):
+    with pytest.raises(ContractError, match=r"action: no .* can be made, which foreign bags have on /told"):
         Composer(Contract(30.0, (), (command,)))

@@ -27,7 +27,7 @@ def test_pictures_come_back_nearly_as_they_were(height: int, width: int, channel
 
 
 @given(st.binary(max_size=300), st.integers(0, 250))
-def test_what_is_no_such_jpeg_is_refused(noise: bytes, at: int) -> None:
+def test_other_bytes_are_refused_as_jpeg(noise: bytes, at: int) -> None:
     jpeg = CODEC.encode("top", picture(24, 32, 3))
     assert jpeg is not None
     with pytest.raises(WireError, match="a damaged JPEG"):

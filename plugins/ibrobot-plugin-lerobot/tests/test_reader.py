@@ -141,7 +141,7 @@ def test_joints_come_in_radians(tmp_path: Path):
         ),
     ],
 )
-def test_a_dataset_of_others_says_what_it_needs(tmp_path: Path, more: dict[str, str], error: Any, words: str):
+def test_a_foreign_dataset_says_what_it_needs(tmp_path: Path, more: dict[str, str], error: Any, words: str):
     with pytest.raises(error, match=words):
         read(foreign(tmp_path / "set", videos=False), 0, **more)
 
@@ -157,13 +157,13 @@ def test_an_episode_goes_by_its_number(tmp_path: Path):
     registry = installed_plugins()
     with pytest.raises(RecorderError, match=r"set: is a dataset of 3 episodes; name one, e.g. .*set:0"):
         registry.open_episode(tmp_path / "set", told())
-    with pytest.raises(RecorderError, match=r"set: has no episode 3; there are: 0 to 2"):
+    with pytest.raises(RecorderError, match=r"set: has no episode 3; available: 0 to 2"):
         registry.open_episode(tmp_path / "set:3", told())
     with pytest.raises(RecorderError, match=r"sat:0: there is no such episode"):
         registry.open_episode(tmp_path / "sat:0", told())
 
 
-def test_a_table_without_some_of_the_rows_is_told(tmp_path: Path):
+def test_a_table_without_some_of_the_rows_is_reported(tmp_path: Path):
     root = foreign(tmp_path / "set", videos=False)
     dataset = layout.open_dataset(root)
     assert dataset is not None
@@ -200,7 +200,7 @@ def test_jpegs_are_decoded():
 
 
 @pytest.mark.parametrize("content", [b"GIF89a", b"\x89PNG\r\n\x1a\n\0\0"])
-def test_what_is_no_picture_is_refused(content: bytes):
+def test_bytes_without_a_picture_are_refused(content: bytes):
     with pytest.raises(DatasetError, match="picture"):
         decode_picture(content, CAMERA)
 

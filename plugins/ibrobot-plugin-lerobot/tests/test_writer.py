@@ -140,7 +140,7 @@ def test_refuses_a_rate_that_lerobot_cannot_have(tmp_path: Path) -> None:
         writer.create(tmp_path / "set", 12.5, {"observation.state": STATE}, {})
 
 
-def test_an_encoder_that_does_not_open_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_encoder_that_does_not_open_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         "ibrobot_lerobot.video._opens", lambda encoder: "no device" if "nvenc" in encoder.codec else None
     )
@@ -157,7 +157,7 @@ def test_auto_takes_the_first_gpu_encoder_that_opens(monkeypatch: pytest.MonkeyP
     assert choose_encoder(LeRobotOptions(codec="auto")).codec == "libsvtav1"
 
 
-def test_a_full_disk_is_told_and_no_thread_waits(tmp_path: Path) -> None:
+def test_a_full_disk_is_reported_and_no_thread_waits(tmp_path: Path) -> None:
     features = {"observation.images.top": CAMERA}
     writer = LeRobotDatasetWriter(LeRobotOptions())
     writer.create(tmp_path / "set", 30.0, features, {})

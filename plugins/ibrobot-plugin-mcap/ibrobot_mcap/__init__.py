@@ -47,7 +47,7 @@ def ibrobot_recorders() -> Iterable[RecorderDescriptor]:
 
 @hookimpl
 def ibrobot_readers() -> Iterable[ReaderDescriptor]:
-    """What reads bags, also those of others."""
+    """Reads bags, foreign ones included."""
     yield ReaderDescriptor("rosbag2", "ROS 2 bags: MCAP, also unfinished, and sqlite3", _reads, _read)
 
 
@@ -79,4 +79,4 @@ def _contract() -> click.Command:
 def ibrobot_commands() -> Iterable[Command]:
     """`ibrobot episodes …` and `ibrobot contract init`."""
     yield Command("episodes", "List, check, mend, cut, plot and export recorded episodes.", _commands)
-    yield Command("contract", "Draft a contract for bags of others.", _contract)
+    yield Command("contract", "Draft a contract for foreign bags.", _contract)

@@ -71,7 +71,7 @@ def contract_of(metadata: Mapping[str, str]) -> Contract | None:
     try:
         return Contract.from_canonical(json.loads(metadata["contract"]))
     except (ValueError, ContractError):
-        return None  # somebody else's key of the same name
+        return None  # a foreign key of the same name
 
 
 def _required(metadata: Mapping[str, str]) -> Collection[str]:

@@ -156,7 +156,7 @@ def _action(topic: _Topic, unnamed: Iterator[int]) -> list[str]:
     names = [path.rpartition("position.")[2] if "position." in path else f"joint_{next(unnamed)}" for path in paths]
     select = [] if plain else [f"      select: [{', '.join(_quoted(path) for path in paths)}]"]
     return [
-        f"    - topic: {_quoted(topic.name)}  # CHOOSE: is this what the robot was told?",
+        f"    - topic: {_quoted(topic.name)}  # CHOOSE: is this the command of the robot?",
         f"      type: {topic.type}",
         *select,
         f"      joints: [{', '.join(_quoted(name) for name in names)}]  # CHOOSE: their names",

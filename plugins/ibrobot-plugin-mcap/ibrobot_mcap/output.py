@@ -38,7 +38,7 @@ class Output:
 
     @property
     def size(self) -> int:
-        """Bytes in the file, with those that were not handed over."""
+        """Bytes in the file, buffered ones included."""
         return self._written + self._filled
 
     def write(self, data: bytes) -> int:

@@ -193,7 +193,7 @@ class Rosbag2Reader(EpisodeReader):
             files = expanded.paths
         suffixes = {file.suffix for file in files}
         if len(suffixes) > 1 or not suffixes <= _SOURCES.keys():
-            raise RecorderError(f"{self._path}: its files must all be .mcap, or all .db3; there are: {_names(files)}")
+            raise RecorderError(f"{self._path}: its files must all be .mcap, or all .db3; found: {_names(files)}")
         source: Source = _SOURCES[suffixes.pop()](files)
         self._closing.callback(source.close)
         return MessageCompressed(self._path, source) if facts.compressed == "message" else source
@@ -224,7 +224,7 @@ def _read_counts(text: str) -> Mapping[str, int]:
     try:
         counts = json.loads(text)
     except ValueError:
-        return {}  # somebody else's key of the same name
+        return {}  # a foreign key of the same name
     if not isinstance(counts, dict):
         return {}
     return {topic: count for topic, count in counts.items() if isinstance(count, int)}

@@ -1,4 +1,4 @@
-"""Writes an episode anew: whole from what a killed recorder left, or a part of it; messages are copied, not decoded."""
+"""Rewrites an episode: whole from what a killed recorder left, or a part of it; messages are copied, not decoded."""
 
 from __future__ import annotations
 

@@ -82,7 +82,7 @@ class McapFile:
     """One file: its channels and schemas, where its messages are, and whether its writer finished it.
 
     Raises:
-        RecorderError: when it cannot be read or is no MCAP file.
+        RecorderError: when it cannot be read or is not an MCAP file.
     """
 
     def __init__(self, path: Path) -> None:

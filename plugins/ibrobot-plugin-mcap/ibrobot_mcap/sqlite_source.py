@@ -86,7 +86,7 @@ class SqliteSource(Source):
 
 
 def _check_times(path: Path, file: sqlite3.Connection) -> None:
-    """See that the times of the messages are those of the index that rosbag2 makes of them; there are no checksums."""
+    """Compare the times of the messages with the index that rosbag2 makes of them; there are no checksums."""
     if file.execute("SELECT 1 FROM sqlite_master WHERE type = 'index' AND name = 'timestamp_idx'").fetchone() is None:
         return
     by_table = file.execute("SELECT timestamp, id FROM messages NOT INDEXED ORDER BY timestamp, id")

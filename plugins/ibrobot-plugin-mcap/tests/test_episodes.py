@@ -125,7 +125,7 @@ def test_repair_makes_an_episode_whole_with_all_that_was_there(tmp_path, cut):
     assert "good" in run("verify", path)
 
 
-def test_a_cut_episode_is_no_success_and_keeps_what_is_missing_until_a_person_decides(tmp_path):
+def test_a_cut_episode_does_not_count_as_success_and_keeps_what_is_missing_until_a_person_decides(tmp_path):
     path = made(tmp_path, count=3000)
     (file,) = path.glob("*.mcap")
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
@@ -215,7 +215,7 @@ def test_trim_copies_a_part(tmp_path):
     assert messages[0][1] == joints(30)
     assert summary.finished
     assert summary.metadata["trimmed"] == "0.3 s to 0.5 s of episode_000001"
-    with pytest.raises(RecorderError, match=r"is 0\.99 s long; --from 0\.5 --to 0\.2 is no part of it"):
+    with pytest.raises(RecorderError, match=r"is 0\.99 s long; --from 0\.5 --to 0\.2 is not part of it"):
         run("trim", path, "--from", "0.5", "--to", "0.2", "-o", tmp_path / "none")
 
 
@@ -223,7 +223,7 @@ LAMP = "builtin_interfaces/Time since\nstring[] marks\n"
 
 
 @pytest.mark.parametrize("storage", list(StoragePlugin))
-def test_a_bag_of_others_is_trimmed_with_the_definitions_that_it_brings(tmp_path, storage):
+def test_a_foreign_bag_is_trimmed_with_the_definitions_that_it_brings(tmp_path, storage):
     store = get_typestore(Stores.ROS2_JAZZY)
     store.register(get_types_from_msg(LAMP, "lamp_msgs/msg/Lamp"))
     # Known here, but with another field: the copy must say what its sender meant.
@@ -335,14 +335,14 @@ def test_delete_asks_and_takes_nothing_but_episodes(tmp_path):
     path = made(tmp_path)
     CliRunner().invoke(episodes, ["delete", str(path)], input="n\n")
     assert path.is_dir()
-    with pytest.raises(RecorderError, match="is no episode; nothing was deleted"):
+    with pytest.raises(RecorderError, match="is not an episode; nothing was deleted"):
         run("delete", "--yes", path, tmp_path)
     assert path.is_dir()
     run("delete", "--yes", path)
     assert not path.exists()
 
 
-def test_what_is_not_there_is_told(tmp_path):
+def test_what_is_not_there_is_reported(tmp_path):
     with pytest.raises(RecorderError, match="there is no such file or folder"):
         run("list", tmp_path / "none")
     with pytest.raises(RecorderError, match="has no episode in it"):

@@ -94,7 +94,7 @@ def test_an_unfinished_episode_tells_what_it_is(unfinished, tmp_path):
     assert (kept.finished, dict(kept.metadata), kept.outcome) == (False, {"prompt": "pick"}, "unknown")
 
 
-def test_damage_in_the_midst_is_told_after_what_came_before(bench):
+def test_damage_in_the_midst_is_reported_after_what_came_before(bench):
     made = bench(chunk_size=2048)
     made.begin()
     made.write(200)
@@ -132,7 +132,7 @@ NOT_BAGS = {
 
 
 @pytest.mark.parametrize(("name", "content", "reason"), [(n, *rest) for n, rest in NOT_BAGS.items()])
-def test_what_is_no_bag_is_refused(tmp_path, name, content, reason):
+def test_other_folders_and_files_are_refused_as_bags(tmp_path, name, content, reason):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(RecorderError, match=reason):
         Rosbag2Reader(tmp_path / name)
@@ -299,7 +299,7 @@ def foreign_file(path, type_name, text, payloads, encoding="ros2msg"):
         writer.finish()
 
 
-def test_a_type_that_cannot_be_read_is_told_by_topic(tmp_path):
+def test_a_type_that_cannot_be_read_is_reported_by_topic(tmp_path):
     foreign_file(tmp_path / "file.mcap", "odd_msgs/msg/Odd", "wstring text\n", [b"\x00\x01\x00\x00"])
     assert summary(tmp_path / "file.mcap").topics["/it"].count == 1
     with pytest.raises(RecorderError, match=rf"/it at {stamp(0)} ns: odd_msgs/msg/Odd: "):

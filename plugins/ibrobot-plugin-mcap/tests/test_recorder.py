@@ -285,7 +285,7 @@ def test_a_disk_that_refuses_leaves_an_unfinished_episode_of_whole_records(bench
     assert len(read(made.end())) == 3
 
 
-def test_a_folder_that_cannot_be_made_is_told(bench):
+def test_a_folder_that_cannot_be_made_is_reported(bench):
     made = bench()
     made.path = made.path / "in" / "nowhere"
     with pytest.raises(RecorderError, match=r"cannot record into .*nowhere: No such file"):

@@ -73,7 +73,7 @@ def check_asked() -> str:
     known = ("cgl",) if sys.platform == "darwin" else ("egl", "osmesa", "glfw")
     if asked and asked not in known:
         remedy = f"set it to one of {', '.join(known)}, or unset it"
-        raise MissingDependency(f"MUJOCO_GL is {asked!r}, which is no OpenGL backend", remedy=remedy)
+        raise MissingDependency(f"MUJOCO_GL is {asked!r}, which is not an OpenGL backend", remedy=remedy)
     if asked in _LIBRARIES and asked not in usable():
         packages = PACKAGES if asked == "egl" else ("libosmesa6",)
         raise MissingDependency(f"MUJOCO_GL={asked}, which does not work here (or unset it)", apt=packages)

@@ -18,7 +18,7 @@ Range = tuple[float, float]
 
 def _ordered(instance: Any, attribute: attrs.Attribute[Any], value: Range) -> None:
     if not value[0] <= value[1]:
-        raise ValueError(f"[{value[0]}, {value[1]}] is no range, the first must not exceed the second")
+        raise ValueError(f"[{value[0]}, {value[1]}] is not a valid range, the first must not exceed the second")
 
 
 @documented
@@ -123,7 +123,7 @@ def check_world(options: MujocoOptions, robot: Robot, joints: tuple[str, ...]) -
     poses = list(robot.description.poses)
     if robot.description.mjcf is None:
         yield OptionFault((), f"robot {robot.name!r} has no MJCF to simulate: robot.description.mjcf must name one")
-    elif robot.description.mjcf.is_file():  # core has told of one that is not there
+    elif robot.description.mjcf.is_file():  # core has reported a missing one
         yield from _unusable(options, robot)
     if options.start_pose not in poses:
         message = f"unknown pose {options.start_pose!r}{did_you_mean(options.start_pose, poses, 'known')}"

@@ -52,7 +52,7 @@ class _Episode:
 class ScriptedPick(Policy):
     """Plans the whole motion on an episode's first frame; chunks are windows of it by time, so they agree exactly.
 
-    Where the cube is not where it should be (pushed away, dropped, beside the bin) it plans anew, from the next
+    Where the cube is not where it should be (pushed away, dropped, beside the bin) it plans again, from the next
     waypoint that is clear of the table and that no chunk has covered yet.
 
     Args:

@@ -87,7 +87,7 @@ def test_servos_are_the_mjcfs_unless_overridden() -> None:
         np.testing.assert_array_equal(getattr(tuned, name)[:6], value)
 
 
-def test_cameras_look_where_they_are_told() -> None:
+def test_cameras_look_at_their_targets() -> None:
     camera = SceneCamera(name="side", pos=(0.5, -0.4, 0.3), lookat=(0.1, 0.0, 0.05), fovy=60.0)
     carried = SceneCamera(name="palm", pos=(0.0, 0.05, 0.0), lookat=(0.0, 0.0, -0.1), parent="gripper")
     model = build_model(MujocoOptions(cameras=(camera, carried)), ROBOT, visual=True)

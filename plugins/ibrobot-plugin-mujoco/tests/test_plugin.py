@@ -53,7 +53,10 @@ def test_the_so101_of_scripts_is_that_of_the_robot_yaml() -> None:
         (lambda: Fault(at=1.0, kind="silent", joint="gripper"), "a fault of kind silent takes no joint"),
         (lambda: Fault(at=1.0, kind="explode"), "'explode' is not one of: silent, freeze_joint, read_error"),
         (lambda: MujocoOptions(scene="kitchen"), "'kitchen' is not one of: empty, pick_cube"),
-        (lambda: MujocoOptions(cube_distance=(0.3, 0.2)), r"\[0.3, 0.2\] is no range, the first must not exceed"),
+        (
+            lambda: MujocoOptions(cube_distance=(0.3, 0.2)),
+            r"\[0.3, 0.2\] is not a valid range, the first must not exceed",
+        ),
         (lambda: MujocoOptions(timestep=1.0), "1.0 is too large, must be at most 0.02 s"),
         (lambda: SceneCamera(name="c", pos=(0, 0, 1), lookat=(0, 0, 1)), "lookat must differ from pos"),
     ],
@@ -120,7 +123,7 @@ class TestOpenGl:
         monkeypatch.setenv("MUJOCO_GL", "OSMesa")
         assert gl.choose() == "osmesa"
 
-    def test_a_backend_that_does_not_load_is_told_before_mujoco_is_imported(
+    def test_a_backend_that_does_not_load_is_reported_before_mujoco_is_imported(
         self, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         self.have(monkeypatch, "libEGL.so.1", "libGL.so.1")

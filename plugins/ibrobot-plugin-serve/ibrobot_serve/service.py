@@ -352,7 +352,7 @@ class InferenceService:
             ]
             if len(outputs) != len(live):
                 raise PolicyError(f"{len(outputs)} outputs for a batch of {len(live)}")
-        except Exception as error:  # noqa: BLE001 - contained: a request that the policy cannot take is told so
+        except Exception as error:  # noqa: BLE001 - contained: a request that the policy cannot take is refused
             if len(live) == 1:
                 live[0].fail(self._told(error))
             else:  # one of them must not spoil the others
@@ -376,14 +376,14 @@ class InferenceService:
             return False
         try:
             self._policy.check(message.tensors)
-        except Exception as error:  # noqa: BLE001 - contained: the robot is told
+        except Exception as error:  # noqa: BLE001 - contained: the robot gets the error
             ticket.fail(self._told(error))
             return False
         if self._owner != (message.robot, message.episode):
             self._owner = None
             try:
                 self._policy.reset(message.seed)
-            except Exception as error:  # noqa: BLE001 - contained: the robot is told
+            except Exception as error:  # noqa: BLE001 - contained: the robot gets the error
                 ticket.fail(f"the policy's reset failed: {self._told(error)}")
                 return False
         return True

@@ -28,7 +28,7 @@ def test_together_they_take_no_more_than_there_is(counts: list[int], cost_ns: fl
     if pace_ns:
         most = 5 * S / pace_ns
         assert sum(min(1.25 * count, most) for count in counts) * cost_ns <= 1.001 * TARGET * 5 * S
-        assert most < 1.25 * max(counts), "it is said only where it holds somebody back"
+        assert most < 1.25 * max(counts), "it is said only where it holds a robot back"
     elif len(counts) > 1:
         assert sum(1.25 * count for count in counts) * cost_ns <= 1.001 * TARGET * 5 * S
 

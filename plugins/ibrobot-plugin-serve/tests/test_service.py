@@ -303,7 +303,7 @@ def test_the_service_measures_who_asks_and_what_it_costs(monkeypatch: pytest.Mon
         assert noted == ["robot", (1, True)]
 
 
-def test_garbage_is_counted_told_and_harmless():
+def test_garbage_is_counted_reported_and_harmless():
     with served() as cloud:
         cloud.policy.gate.release(10)
         answer = WireEncoder().encode(WireMessage(WireKind.ANSWER, 1))
@@ -475,7 +475,7 @@ def test_the_engine_tells_both_sides_where_the_policies_differ():
             remote.infer({"x": np.zeros(1)}, 1, deadline())
 
 
-def test_policies_that_differ_in_their_files_alone_are_told(monkeypatch: pytest.MonkeyPatch):
+def test_policies_that_differ_in_their_files_alone_are_reported(monkeypatch: pytest.MonkeyPatch):
     other = Net()
     monkeypatch.setattr(other, "fingerprint", lambda: "0ther")
     with (
@@ -494,7 +494,7 @@ def test_the_engine_says_that_nobody_serves_its_model():
     with pytest.raises(PolicyError, match="nobody serves infer/net"):
         remote.infer({"x": np.zeros(1)}, 1, deadline())
     transport.serve(health_name("net"), lambda payload, sender: b"<html>")
-    with pytest.raises(PolicyError, match="is no server of ibrobot: b'<html>'"):
+    with pytest.raises(PolicyError, match="is not an ibrobot server: b'<html>'"):
         RemoteEngine(Net(), transport, "net", "so101", start_timeout_s=PATIENCE_S).start()
     transport.close()
 

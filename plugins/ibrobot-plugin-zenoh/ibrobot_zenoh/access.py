@@ -87,7 +87,7 @@ def _users(path: Path) -> tuple[str, ...]:
     for number, line in enumerate(read_lines(path), 1):
         name, _, password = line.partition(":")
         if not (name and password):
-            raise TransportError(f"{path}:{number}: is no NAME:PASSWORD")
+            raise TransportError(f"{path}:{number}: is not NAME:PASSWORD")
         listed.append((number, name))
     if not listed:
         raise TransportError(f"{path}: is empty, must have a line NAME:PASSWORD for each who may connect")

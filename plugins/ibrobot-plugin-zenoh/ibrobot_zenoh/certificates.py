@@ -65,7 +65,7 @@ class Authority:
         self._key = loaded
         end = self._certificate.not_valid_after_utc
         if end < datetime.now(UTC):
-            raise TransportError(f"{certificate}: has expired on {end:%Y-%m-%d}; make all anew in another folder")
+            raise TransportError(f"{certificate}: has expired on {end:%Y-%m-%d}; make all again in another folder")
 
     @property
     def ends(self) -> datetime:

@@ -1,4 +1,4 @@
-"""A Zenoh session that is there as soon as somebody answers, and what was declared on it before and after."""
+"""A Zenoh session that is there as soon as a peer answers, and what was declared on it before and after."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ _CLOSE_WAIT_S = 1.0
 _ASK_WHY_S = 2.0
 """How often it is looked for what stands between us and the other side."""
 _FIRST_WAIT_S = 0.3
-"""How long making a client waits for somebody to answer, so that what is there can be used at once."""
+"""How long making a client waits for a peer to answer, so that what is there can be used at once."""
 
 _LARGEST_KEPT, _KEPT_BYTES = 32 << 20, 256 << 20
-"""Freed memory that glibc keeps: mapping it anew for each large message costs more than its copies do [bytes]."""
+"""Freed memory that glibc keeps: mapping it again for each large message costs more than its copies do [bytes]."""
 
 
 class Declared(Protocol):
@@ -105,7 +105,7 @@ _open: WeakSet[Connection] = WeakSet()
 
 @cache
 def _close_at_the_end() -> None:
-    """See to it, once, that a process ends that failed before it closed its sessions.
+    """Ensure, once, that a process that failed before it closed its sessions ends.
 
     The interpreter waits for the threads in which Zenoh calls back, and those for the end of their session.
     """
@@ -224,7 +224,7 @@ class Connection:
             session.close()  # type: ignore[no-untyped-call]  # its stub has no types
 
     def _connect(self) -> None:
-        """Try until somebody answers; every new reason why nobody does is logged once."""
+        """Try until a peer answers; log every new reason why none does once."""
         told, asked_s = "", -math.inf
         pause_ms, longest_ms = _RETRY_MS
         while not self._closed.is_set():

@@ -57,7 +57,7 @@ def _check_endpoints(instance: object, attribute: attrs.Attribute[tuple[str, ...
     for endpoint in value:
         found = _ENDPOINT.fullmatch(endpoint)
         if found is None:
-            raise ValueError(f"{endpoint!r} is no endpoint, give PROTOCOL/HOST:PORT, e.g. tcp/127.0.0.1:7447")
+            raise ValueError(f"{endpoint!r} is not an endpoint, give PROTOCOL/HOST:PORT, e.g. tcp/127.0.0.1:7447")
         port = found["address"].rpartition(":")[2].partition("#")[0]
         if found["protocol"] != "unixsock-stream" and not port.isdecimal():
             raise ValueError(f"{endpoint!r} has no port, give PROTOCOL/HOST:PORT, e.g. {endpoint}:7447")
@@ -132,4 +132,4 @@ class ZenohOptions:
                         "trusted_network: true where everybody may do everything"
                     )
         if not re.fullmatch(r"(/?[A-Za-z_][A-Za-z0-9_]*)*", self.namespace or ""):
-            raise ValueError(f"namespace {self.namespace!r} is no ROS 2 name, e.g. robot1 or lab/robot1")
+            raise ValueError(f"namespace {self.namespace!r} is not a ROS 2 name, e.g. robot1 or lab/robot1")

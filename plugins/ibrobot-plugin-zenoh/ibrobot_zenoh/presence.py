@@ -16,7 +16,7 @@ PREFIX = f"{SERVED}/"
 
 
 class Presence:
-    """Knows the tokens that there are; one subscription for all names, from the first moment on."""
+    """Knows all present tokens, by one subscription for all names from the first moment on."""
 
     def __init__(self, connection: Connection) -> None:
         self._lock = threading.Lock()
@@ -28,7 +28,7 @@ class Presence:
 
     def watch(self, name: str, changed: Callable[[bool], object]) -> tuple[Callable[[], None], Workers[bool]]:
         """What ends the watch, and the thread that calls `changed`; see `Transport.watch`."""
-        turn = threading.Lock()  # held until the present state was told, which comes first
+        turn = threading.Lock()  # held until the present state was delivered, which comes first
 
         def tell(served: bool) -> None:
             with turn:

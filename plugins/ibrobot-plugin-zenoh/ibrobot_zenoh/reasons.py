@@ -26,7 +26,7 @@ def tls_context(tls: Tls) -> ssl.SSLContext:
     """What a client needs to show its certificate, and to check the server's.
 
     Raises:
-        TransportError: for a file that cannot be read, is no certificate or key, or a key that belongs to another one.
+        TransportError: for an unreadable file, one without a certificate or key, or a key of another certificate.
     """
     for path in (tls.ca, tls.certificate, tls.key):
         try:
@@ -37,7 +37,7 @@ def tls_context(tls: Tls) -> ssl.SSLContext:
     try:
         context.load_verify_locations(tls.ca)
     except ssl.SSLError as error:
-        raise TransportError(f"{tls.ca}: is no certificate in PEM format") from error
+        raise TransportError(f"{tls.ca}: is not a certificate in PEM format") from error
     try:
         context.load_cert_chain(tls.certificate, tls.key, password="")
     except ssl.SSLError as error:
@@ -89,9 +89,9 @@ def _over_tls(stream: socket.socket, host: str, tls: Tls) -> str:
     return _NOT_TAKEN if greeted else _NO_TLS
 
 
-_NO_TLS = "somebody listens there, but does not speak TLS"
+_NO_TLS = "a server listens there, but does not speak TLS"
 _NOT_TAKEN = (
-    "somebody listens there, but does not take us: are user and password right, and is it a server of ibrobot's?"
+    "a server listens there, but refuses the connection: are user and password right, and is it a server of ibrobot's?"
 )
 
 

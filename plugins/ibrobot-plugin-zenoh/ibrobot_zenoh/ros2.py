@@ -28,11 +28,11 @@ def absolute(topic: str, namespace: str = "") -> str:
     """A topic's full name, e.g. `/robot1/joint_states`.
 
     Raises:
-        TransportError: for what is no ROS 2 name.
+        TransportError: for what is not a ROS 2 name.
     """
     name = "/" + "/".join(part.strip("/") for part in (namespace, topic) if part.strip("/"))
     if not _NAME.fullmatch(name):
-        raise TransportError(f"{topic!r} is no name of a ROS 2 topic, e.g. /joint_states")
+        raise TransportError(f"{topic!r} is not a ROS 2 topic name, e.g. /joint_states")
     return name
 
 
@@ -46,11 +46,11 @@ def ros_type(dds: str) -> str:
     """`sensor_msgs::msg::dds_::Image_` -> `sensor_msgs/msg/Image`.
 
     Raises:
-        TransportError: for what is no such name.
+        TransportError: for what is not such a name.
     """
     *packages, mark, name = dds.split("::")
     if mark != "dds_" or not packages or not name.endswith("_"):
-        raise TransportError(f"{dds!r} is no name of a message type")
+        raise TransportError(f"{dds!r} is not the name of a message type")
     return "/".join((*packages, name[:-1]))
 
 

@@ -62,7 +62,7 @@ class _Publisher:
 
     @property
     def is_heard(self) -> bool:
-        """Whether somebody listens; False before there is a connection."""
+        """Whether there is a subscriber; False before there is a connection."""
         if not isinstance(self._publisher, zenoh.Publisher):
             return False
         status: Any = self._publisher.matching_status  # its stub says bool
@@ -186,7 +186,7 @@ class Topics:
         """See `TopicTransport.shared_topics`."""
         deadline = time.monotonic() + timeout_s
         found, before = self._tokens(timeout_s), None
-        # The first answer after connecting may come before the other side has told all that it knows.
+        # The first answer after connecting may come before the other side has sent all that it knows.
         while found != before and time.monotonic() + _AGAIN_S < deadline:
             time.sleep(_AGAIN_S)
             found, before = self._tokens(timeout_s), found

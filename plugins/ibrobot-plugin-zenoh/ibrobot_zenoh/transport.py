@@ -31,7 +31,7 @@ from ibrobot_zenoh.topics import Topics
 SUBSCRIBER_DEPTH = 1000
 """How many payloads may wait for a subscriber; beyond, the oldest gives way."""
 REQUESTS_WAITING = 64
-"""How many requests may wait for a server's workers; beyond, the oldest is told that it is overloaded."""
+"""How many requests may wait for a server's workers; beyond, the oldest is answered that the server is overloaded."""
 _FAILED = zenoh.Encoding.TEXT_PLAIN
 """Marks a server's own words, which Zenoh's about a timeout are not."""
 

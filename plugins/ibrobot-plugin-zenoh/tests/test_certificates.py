@@ -216,14 +216,14 @@ def test_the_server_s_own_certificate_may_do_everything(lab: Path):
 
 
 @pytest.mark.usefixtures("brief_trials")
-def test_a_server_without_tls_is_told(lab: Path):
+def test_a_server_without_tls_is_reported(lab: Path):
     plain = free_endpoint("tcp")
     server = router(plain)
     assert "does not speak TLS" in why_not(plain.replace("tcp", "tls"), tls(lab, "robot1"))
     server.close()
 
 
-def test_a_client_without_tls_is_told(lab: Path):
+def test_a_client_without_tls_is_reported(lab: Path):
     secured = free_endpoint("tls")
     server = router(secured, tls=tls(lab, "localhost"))
     assert "write tls/ for tcp/" in why_not(secured.replace("tls", "tcp"), None)
@@ -238,7 +238,7 @@ def test_a_client_without_tls_is_told(lab: Path):
         ("quic/127.0.0.1:1", "nobody answers there"),
     ],
 )
-def test_what_is_not_there_is_told(endpoint: str, said: str):
+def test_what_is_not_there_is_reported(endpoint: str, said: str):
     assert said in why_not(endpoint, None)
 
 
@@ -246,13 +246,13 @@ def test_what_is_not_there_is_told(endpoint: str, said: str):
     ("ca", "certificate", "key", "said"),
     [
         ("robot1/ca.pem", "robot1/certificate.pem", "robot2/key.pem", "robot2/key.pem: is not the key of"),
-        ("ca.key", "robot1/certificate.pem", "robot1/key.pem", "ca.key: is no certificate in PEM"),
+        ("ca.key", "robot1/certificate.pem", "robot1/key.pem", "ca.key: is not a certificate in PEM"),
         ("ca.pem", "robot1/certificate.pem", "ca.pem", "are no certificate and key in PEM"),
         ("ca.pem", "robot9/certificate.pem", "robot1/key.pem", "robot9/certificate.pem: cannot be read: No such file"),
     ],
 )
 @pytest.mark.parametrize("mode", ["client", "router"])
-def test_files_that_do_not_belong_together_are_told(
+def test_files_that_do_not_belong_together_are_reported(
     lab: Path, ca: str, certificate: str, key: str, said: str, mode: str
 ):
     endpoint = free_endpoint("tls")
@@ -278,7 +278,7 @@ def test_the_readme_s_access_control(lab: Path, tmp_path: Path):
             pass
         with pytest.raises(TransportError, match="nobody serves secret"):
             robot.request("secret", b"x", WAIT_S)
-    assert first.request("infer/net", b"x", WAIT_S) == b"None"  # who asks is not proved by a list of somebody else's
+    assert first.request("infer/net", b"x", WAIT_S) == b"None"  # who asks is not proved by another robot's list
     for end in (first, second, server):
         end.close()
 
@@ -325,7 +325,7 @@ def test_an_ipv6_address_is_put_in_brackets(tmp_path: Path):
     ]
 
 
-def test_a_folder_that_cannot_be_written_is_told(tmp_path: Path):
+def test_a_folder_that_cannot_be_written_is_reported(tmp_path: Path):
     (tmp_path / "file").touch()
     with pytest.raises(TransportError, match=r"file/lab: cannot be written: Not a directory"):
         certs.main([str(tmp_path / "file/lab"), "--robot", "robot1"], standalone_mode=False)
@@ -353,7 +353,7 @@ def test_nothing_is_valid_for_longer_than_its_authority(tmp_path: Path):
 
 def test_an_authority_that_has_expired_signs_nothing(tmp_path: Path):
     Authority(tmp_path, days=-1)
-    with pytest.raises(TransportError, match=r"ca\.pem: has expired on 20\d\d-\d\d-\d\d; make all anew"):
+    with pytest.raises(TransportError, match=r"ca\.pem: has expired on 20\d\d-\d\d-\d\d; make all again"):
         Authority(tmp_path, days=10)
 
 

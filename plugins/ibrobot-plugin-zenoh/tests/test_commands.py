@@ -130,7 +130,7 @@ def test_pub(robot: ZenohTransport, endpoint: str):
     assert [arrived.get(timeout=WAIT_S) for _ in range(3)] == [Bool(False)] * 3
 
 
-def test_pub_tells_that_nobody_listens(robot: ZenohTransport, endpoint: str, monkeypatch: pytest.MonkeyPatch):
+def test_pub_warns_without_a_subscriber(robot: ZenohTransport, endpoint: str, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("ibrobot_zenoh.commands.topic._HEARD_S", 0.05)
     result = CliRunner().invoke(topic, ["pub", "/dark", "std_msgs/msg/Bool", "data: true", "--endpoint", endpoint])
     assert result.exit_code == 0
@@ -164,7 +164,7 @@ def test_which_network(monkeypatch: pytest.MonkeyPatch):
     with pytest.raises(SystemExit):
         run("list")
     assert "which network? Give --config CONFIG, or --endpoint" in CliRunner().invoke(topic, ["list"]).output
-    assert "is no endpoint" in CliRunner().invoke(topic, ["list", "--endpoint", "gpu"]).output
+    assert "is not an endpoint" in CliRunner().invoke(topic, ["list", "--endpoint", "gpu"]).output
     assert "certificates are given by --config" in CliRunner().invoke(topic, ["list", "--endpoint", "tls/a:1"]).output
     nobody = free_endpoint()
     with pytest.raises(IbrobotError, match=f"{nobody}: nobody listens there: is the robot, server or router up"):

@@ -21,7 +21,7 @@ TLS = Tls(Path("ca.pem"), Path("certificate.pem"), Path("key.pem"))
     ("options", "message"),
     [
         ({}, "needs whom to connect to"),
-        ({"connect": ("gpu.lab:7447",)}, "is no endpoint, give PROTOCOL/HOST:PORT"),
+        ({"connect": ("gpu.lab:7447",)}, "is not an endpoint, give PROTOCOL/HOST:PORT"),
         ({"connect": ("tcp/gpu.lab",)}, "has no port, give PROTOCOL/HOST:PORT, e.g. tcp/gpu.lab:7447"),
         ({"connect": ("tcp/a:1",), "listen": ("tcp/127.0.0.1:1",)}, "a client does not listen"),
         ({"connect": ("tls/a:1",)}, "tls/a:1 needs tls"),
@@ -30,7 +30,7 @@ TLS = Tls(Path("ca.pem"), Path("certificate.pem"), Path("key.pem"))
         ({"mode": "router", "listen": ("tcp/0.0.0.0:1",)}, "can be reached by other machines: give tls or users, or"),
         ({"mode": "router", "listen": ("tcp/[::]:1",)}, "can be reached by other machines"),
         ({"mode": "peer", "listen": ("tcp/gpu.lab:1",)}, "can be reached by other machines"),
-        ({"connect": ("tcp/a:1",), "namespace": "a b"}, "is no ROS 2 name"),
+        ({"connect": ("tcp/a:1",), "namespace": "a b"}, "is not a ROS 2 name"),
         ({"connect": ("tcp/a:1",), "user": "a/b", "password": "x"}, "'a/b' cannot be a robot's name"),
     ],
 )
@@ -72,9 +72,9 @@ def test_files_that_are_not_there(options: dict[str, Any]):
     ("text", "said"),
     [
         ("", "users.txt: is empty, must have a line NAME:PASSWORD"),
-        ("robot1:a\nrobot2\n", "users.txt:2: is no NAME:PASSWORD"),
-        (":a\n", "users.txt:1: is no NAME:PASSWORD"),
-        ("robot1:\n", "users.txt:1: is no NAME:PASSWORD"),
+        ("robot1:a\nrobot2\n", "users.txt:2: is not NAME:PASSWORD"),
+        (":a\n", "users.txt:1: is not NAME:PASSWORD"),
+        ("robot1:\n", "users.txt:1: is not NAME:PASSWORD"),
         ("robot1:a\nrobot1:b\n", "users.txt:2: 'robot1' is listed already"),
         ("robot-1:a\n", "users.txt:1: 'robot-1' cannot be a robot's name"),
     ],
@@ -107,7 +107,7 @@ def test_passwords(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     server.close()
 
 
-def test_users_are_told_apart_by_their_passwords(tmp_path: Path):
+def test_users_are_distinguished_by_their_passwords(tmp_path: Path):
     """The list is made from the file of users: each asks and publishes under its own name, and serves nothing."""
     users = tmp_path / "users.txt"
     users.write_text("robot1:a\nrobot2:b\n")

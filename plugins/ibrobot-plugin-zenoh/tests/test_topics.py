@@ -101,14 +101,14 @@ def raw_config(endpoint: str) -> zenoh.Config:
     return config
 
 
-def test_mistakes_are_told():
+def test_mistakes_are_reported():
     transport = router(free_endpoint(), max_message_size=2000)
     transport.publish_message("/a", Int32(1))
     with pytest.raises(TransportError, match="topic /a carries std_msgs/msg/Int32, not std_msgs/msg/String"):
         transport.publish_message("/a", String(""))
     with pytest.raises(TransportError, match=r"/b: a message of 30.. bytes is larger than max_message_size, 2000"):
         transport.publish_message("/b", String("x" * 3000))
-    with pytest.raises(TransportError, match="is no name of a ROS 2 topic"):
+    with pytest.raises(TransportError, match="is not a ROS 2 topic name"):
         transport.subscribe_messages("/a b", print)
     transport.close()
     for topic in ("/a", "/c"):

@@ -54,7 +54,7 @@ class Codec:
         A type that core does not have becomes a class made from its definition, with stamps as `…_ns` [ns].
 
         Raises:
-            CodecError: for a type that nobody defined, or data that is no such message.
+            CodecError: for a type that nobody defined, or data that is not such a message.
         """
         convert = self._decoders.get(type_name)
         if convert is None:

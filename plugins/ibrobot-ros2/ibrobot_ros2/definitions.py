@@ -51,7 +51,7 @@ def make_typestore() -> Typestore:
 
 
 def define(store: Typestore, type_name: str, text: str) -> None:
-    """Add a type, with those that its text brings along, to a store; they replace others of their names.
+    """Add a type and the types that its text defines to a store; they replace others of their names.
 
     Raises:
         CodecError: for a definition that cannot be used.

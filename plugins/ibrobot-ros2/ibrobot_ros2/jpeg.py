@@ -32,7 +32,7 @@ def to_jpeg(image: Image, quality: int) -> CompressedImage:
     """The picture as JPEG, with its encoding in `format` as image_transport writes it.
 
     Raises:
-        ContractError: for an encoding that JPEG has not, or data that is no such picture.
+        ContractError: for an encoding that JPEG has not, or data that is not such a picture.
     """
     if image.encoding not in _SPACES:
         raise ContractError(f"a {image.encoding} picture cannot become JPEG, only {', '.join(_SPACES)} can")

@@ -74,7 +74,7 @@ def _decode(file: bytes, encoding: str) -> NDArray[np.generic]:
 
 
 def _check(file: memoryview) -> None:
-    """See that a PNG is whole and its checksums are right, which the library does not do for pixels."""
+    """Check that a PNG is whole and its checksums are right, which the library does not do for pixels."""
     at = len(_BEGINS)
     while at + _CHUNK.size <= len(file):
         length, kind = _CHUNK.unpack_from(file, at)

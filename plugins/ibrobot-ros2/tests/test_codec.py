@@ -199,7 +199,7 @@ def test_idl_is_read_too():
 
 
 @pytest.mark.parametrize("text", ["float64", "x_msgs/Nowhere it\n", "wstring w\n"])
-def test_a_definition_that_cannot_be_used_is_told_when_it_is_needed(text):
+def test_a_definition_that_cannot_be_used_is_reported_when_it_is_needed(text):
     codec = Codec({"odd_msgs/msg/Odd": text})
     assert codec.decode("std_msgs/msg/Int32", encode(Int32(1))) == Int32(1)
     with pytest.raises(CodecError, match=re.escape("odd_msgs/msg/Odd: ")):

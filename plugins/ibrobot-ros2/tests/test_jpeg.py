@@ -67,7 +67,7 @@ def test_without_huffman_tables_the_standard_ones_count() -> None:
     np.testing.assert_array_equal(stripped.data, whole.data)
 
 
-def test_padding_that_cheap_webcams_leave_is_no_damage() -> None:
+def test_padding_that_cheap_webcams_leave_is_accepted() -> None:
     padded = file(padding=bytes(200))
     with pytest.raises(ValueError, match="extraneous bytes"):
         simplejpeg.decode_jpeg(padded.tobytes())

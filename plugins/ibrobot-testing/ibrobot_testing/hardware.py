@@ -41,7 +41,7 @@ class HardwareSuite(Suite[Hardware]):
         return control_context()
 
     def elapse(self, hardware: Hardware, ctx: Context, duration_s: float) -> None:
-        """Let `duration_s` [s] pass; override where a fake bus must be told."""
+        """Let `duration_s` [s] pass; override where a fake bus needs the time."""
         for _ in range(max(1, round(ns(duration_s) / ctx.period_ns))):
             ctx.clock.sleep_until(ctx.clock.now_ns() + ctx.period_ns)
             if isinstance(hardware, SimulatedHardware):
@@ -227,7 +227,7 @@ class HardwareSuite(Suite[Hardware]):
                 hardware.read()
                 found = hardware.health()
                 for condition in found:
-                    assert condition.joint in hardware.joints, f"{condition.joint!r} is no joint of this hardware"
+                    assert condition.joint in hardware.joints, f"{condition.joint!r} is not a joint of this hardware"
                     assert condition.quantity
                     assert np.isfinite(condition.value), f"{condition.quantity} of {condition.joint} is not finite"
                     assert condition.joint in condition.message, f"{condition.message!r} does not name its joint"

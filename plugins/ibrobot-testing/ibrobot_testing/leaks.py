@@ -45,7 +45,7 @@ class LeakCheck:
     Files, ports and child processes are found on Linux only.
 
     Attributes:
-        allow: kind of leak -> the reason why it is no fault.
+        allow: kind of leak -> the reason why it is not a fault.
         grace_s: how long threads may take to end [s].
     """
 

@@ -80,7 +80,7 @@ class TeleopSuite(Suite[Teleop]):
             commands += [teleop.read(self._measure(ctx, pose)) for _ in range(10)]
             for command in commands:
                 for joint, position in (command.positions or {}).items():
-                    assert joint in ctx.robot.joint_names, f"{joint!r} is no joint of this robot"
+                    assert joint in ctx.robot.joint_names, f"{joint!r} is not a joint of this robot"
                     assert np.isfinite(position)
 
     def test_operating_moves(self) -> None:

@@ -1,4 +1,4 @@
-"""A command line run in a pseudo-terminal, for tests of dialogues: what is on the screen, and somebody who types."""
+"""A command line run in a pseudo-terminal, for tests of dialogues: what is on the screen, and a person who types."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ def list_cameras(as_json: bool) -> None:
         if camera.stable_id:
             console.print(f"  device: {camera.stable_id}", soft_wrap=True)
         if camera.problem:
-            console.print(styled(f"  {camera.problem}", "red") + styled(": sudo usermod -aG video $USER, log in anew"))
+            console.print(styled(f"  {camera.problem}", "red") + styled(": sudo usermod -aG video $USER, log in again"))
         else:
             console.print(_table(camera))
 

@@ -17,7 +17,7 @@ from ibrobot_feetech.commands.torque import torque
 
 @click.group()
 def feetech() -> None:
-    """Set up, calibrate and look after the servos of an SO-101.
+    """Set up, calibrate and inspect the servos of an SO-101.
 
     PORT may be left out where exactly one adapter of an SO-101 is plugged in.
     """

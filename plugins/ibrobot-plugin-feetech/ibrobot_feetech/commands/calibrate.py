@@ -62,7 +62,7 @@ def calibrate(
     name = name or ("so101_leader" if leader else "so101_follower")
     joints = joints_of(robot, name)
     path = calibration_path(name)
-    if path.exists() and not yes and not agree(f"{path} is there already. Calibrate anew?", flag="--yes"):
+    if path.exists() and not yes and not agree(f"{path} is there already. Calibrate again?", flag="--yes"):
         raise Declined
     compared = [joint.name for joint in joints if not (leader and joint.name == "gripper")]
     answers = Answers(middle_now, range_seconds, accept_ranges, check_signs)
@@ -100,7 +100,7 @@ def backup(path: Path) -> None:
 
 
 def _prepare(bus: FeetechBus, yes: bool) -> None:
-    """See that every servo is there, measures plain positions, and is without torque."""
+    """Ensure that every servo answers, measures plain positions, and has its torque off."""
     servos = list(bus.joints)
     for servo in servos:
         if (mode := bus.read(servo, "operating_mode")) != 0:

@@ -18,7 +18,7 @@ class Unanswered(IbrobotError):
 
 
 def interactive() -> bool:
-    """Whether somebody can answer."""
+    """Whether a person can answer."""
     return sys.stdin.isatty()
 
 

@@ -72,7 +72,7 @@ def emulate(
     from ibrobot_feetech.emulator import Emulator
 
     if link is not None and link.exists() and not link.is_symlink():
-        raise click.BadParameter(f"{link} is there already and is no link: name another path", param_hint="--link")
+        raise click.BadParameter(f"{link} is there already and is not a link: name another path", param_hint="--link")
     ended = threading.Event()
     on_signals(ended.set)
     config = _config(physics) if physics is not None else None

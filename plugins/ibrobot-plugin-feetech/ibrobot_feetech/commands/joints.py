@@ -62,12 +62,12 @@ def chosen(joints: Sequence[Joint], names: Sequence[str]) -> list[Joint]:
     """Those of these names; all where none is given.
 
     Raises:
-        BadParameter: for a name that there is not.
+        BadParameter: for an unknown name.
     """
     known = {joint.name: joint for joint in joints}
     for name in names:
         if name not in known:
-            raise click.BadParameter(f"no joint {name!r}; there are: {', '.join(known)}", param_hint="--joint")
+            raise click.BadParameter(f"no joint {name!r}; available: {', '.join(known)}", param_hint="--joint")
     return [known[name] for name in names] or list(joints)
 
 

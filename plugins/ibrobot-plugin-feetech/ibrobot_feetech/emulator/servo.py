@@ -56,7 +56,7 @@ _DEFAULTS = {
 
 
 class EmulatedServo:
-    """One servo. Time is told to it: `advance` moves the joint; nothing here sleeps.
+    """One servo. Time is passed in: `advance` moves the joint; nothing here sleeps.
 
     The table is kept as the servo keeps it, raw; positions in it are the encoder's less the homing offset.
 

@@ -37,7 +37,7 @@ class Wire:
         self._disconnected: set[int] = set()
 
     def advance(self, now_s: float) -> None:
-        """Let the joints move until `now_s` [s], under the faults that there are."""
+        """Let the joints move until `now_s` [s], under the injected faults."""
         elapsed_s = now_s - self._now_s if self._now_s is not None else 0.0
         self._now_s = now_s
         faults = self._faults

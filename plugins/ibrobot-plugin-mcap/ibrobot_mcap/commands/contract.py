@@ -11,7 +11,7 @@ from ibrobot_core.api import RecorderError, echo, wrong_input
 
 @click.group()
 def contract() -> None:
-    """Contracts for bags of others."""
+    """Contracts for foreign bags."""
 
 
 @contract.command()

@@ -21,7 +21,7 @@ def delete(episodes: tuple[Path, ...], yes: bool) -> None:
 
     for episode in episodes:
         if not (episode.is_dir() and is_rosbag2(episode)):
-            raise RecorderError(f"{episode}: is no episode; nothing was deleted")
+            raise RecorderError(f"{episode}: is not an episode; nothing was deleted")
     for episode in episodes:
         if not (yes or click.confirm(f"delete {episode} ({told_size(size_of(episode))})?")):
             raise Declined

@@ -13,7 +13,7 @@ from rich.table import Table
 from ibrobot_core.api import Screen, echo, wrong_input
 
 _LONG = 200
-"""Metadata longer than this is only told the length of [characters]."""
+"""Of metadata longer than this only the length is printed [characters]."""
 
 
 @click.command()

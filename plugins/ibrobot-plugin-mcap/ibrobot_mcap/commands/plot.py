@@ -103,7 +103,7 @@ def _draw(facts: Facts, output: Path) -> None:
             points = [(at, vector[index]) for at, vector in values if index < len(vector)]
             name = names[index] if index < len(names) else f"{topic} {index}"
             actions.plot(*zip(*points, strict=True), label=name, color=colours.get(name), linewidth=1)
-    actions.set(title="actions: what the joints were told", ylabel="rad")
+    actions.set(title="actions: commanded positions", ylabel="rad")
     for axes in (joints, actions):
         if axes.lines:
             axes.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))

@@ -28,7 +28,9 @@ def trim(episode: Path, begin_s: float, end_s: float | None, output: Path) -> No
     length_s = duration_s(summary)
     last_s = length_s if end_s is None else end_s
     if not begin_s < last_s <= length_s:
-        raise RecorderError(f"{episode}: is {length_s:.2f} s long; --from {begin_s:g} --to {last_s:g} is no part of it")
+        raise RecorderError(
+            f"{episode}: is {length_s:.2f} s long; --from {begin_s:g} --to {last_s:g} is not part of it"
+        )
     start_ns = summary.start_ns
     made = rewrite(
         episode, output, begin_ns=start_ns + ns(begin_s), end_ns=start_ns + ns(last_s),

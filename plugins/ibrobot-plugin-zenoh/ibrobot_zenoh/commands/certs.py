@@ -37,7 +37,7 @@ def certs(out_dir: Path, servers: tuple[str, ...], robots: tuple[str, ...], days
     machines = [*hosts, *robots]
     for name in (*(host for names in hosts.values() for host in names), *robots):
         if not _NAME.fullmatch(name.replace(":", "")):
-            raise click.UsageError(f"{name!r} is no name: letters, digits, '.', '_' and '-' only")
+            raise click.UsageError(f"{name!r} is not a valid name: letters, digits, '.', '_' and '-' only")
     for robot in robots:
         try:
             check_robot_name(robot)

@@ -42,5 +42,5 @@ def message_from(type_name: str, text: str) -> Message:
     if kind is None:
         close = get_close_matches(type_name, MESSAGE_TYPES, 1)
         hint = f"did you mean {close[0]!r}?" if close else f"one of: {', '.join(sorted(MESSAGE_TYPES))}"
-        raise NotSupported(f"{type_name!r} is no type that can be published, {hint}")
+        raise NotSupported(f"{type_name!r} is not a type that can be published, {hint}")
     return from_yaml(text, kind, "MESSAGE")

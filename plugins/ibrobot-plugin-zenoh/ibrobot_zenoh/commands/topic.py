@@ -19,7 +19,7 @@ from ibrobot_zenoh.transport import ZenohTransport
 
 _LIST_S = 2.0
 _HEARD_S = 1.0
-"""How long `pub` waits for somebody to listen."""
+"""How long `pub` waits for a subscriber."""
 
 
 @click.group()
@@ -121,7 +121,7 @@ def pub(transport: ZenohTransport, name: str, type_name: str, text: str, rate: f
 
 
 def _tell_whether_published(transport: ZenohTransport, name: str) -> None:
-    """Who waits for messages is told when nobody sends any."""
+    """Warn when nobody publishes."""
     published = [found.name for found in transport.shared_topics(_LIST_S) if found.publishers]
     if name not in published:
         echo(f"nobody publishes {name} yet; published now: {', '.join(published) or 'nothing'}", err=True)

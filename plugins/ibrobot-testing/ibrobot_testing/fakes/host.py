@@ -106,7 +106,7 @@ class FakeTeleop(Teleop):
 
 
 class FakePolicy(Policy):
-    """Steers every joint towards a place that is drawn anew for each episode, in chunks of ten."""
+    """Steers every joint towards a place that is drawn again for each episode, in chunks of ten."""
 
     def __init__(self, ctx: Context) -> None:
         names = ctx.robot.joint_names
