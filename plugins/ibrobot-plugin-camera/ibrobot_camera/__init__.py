@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 from ibrobot_camera.device import realsense_stream, video_device
 from ibrobot_camera.options import OpenCvOptions, RealSenseOptions, picture_size
-from ibrobot_core.api import Check, Command, DecoderDescriptor, SensorDescriptor, hookimpl
+from ibrobot_core.api import Check, Command, DecoderDescriptor, OptionFault, SensorDescriptor, SensorError, hookimpl
 
 if TYPE_CHECKING:
     import click
 
-    from ibrobot_core.api import CompressedImage, Context, Image, Sensor
+    from ibrobot_core.api import CompressedImage, Context, Image, Robot, Sensor
 
 
 def _opencv(options: Any, ctx: Context) -> Sensor:
@@ -27,6 +27,17 @@ def _realsense(options: Any, ctx: Context) -> Sensor:
     return RealSenseCamera(options, ctx)
 
 
+def _check(options: Any, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
+    """The calibration file can be read."""
+    if options.info is not None:
+        from ibrobot_camera.calibration import load_info
+
+        try:
+            load_info(options.info)
+        except SensorError as error:
+            yield OptionFault(("info",), str(error))
+
+
 def _find_librealsense() -> None:
     from ibrobot_camera.librealsense import load_library
 
@@ -38,7 +49,7 @@ def ibrobot_sensors() -> Iterable[SensorDescriptor]:
     """Cameras."""
     yield SensorDescriptor(
         type="opencv", options=OpenCvOptions, make=_opencv, devices=video_device, picture=picture_size,
-        summary="V4L2 device, RTSP or HTTP stream, or video file",
+        check_options=_check, summary="V4L2 device, RTSP or HTTP stream, or video file",
     )  # fmt: skip
     yield SensorDescriptor(
         type="realsense", options=RealSenseOptions, make=_realsense, check=_find_librealsense, devices=realsense_stream,

@@ -16,7 +16,7 @@ _MATRICES = {"distortion_coefficients": None, "camera_matrix": 9, "rectification
 """Key -> how many numbers it has."""
 
 
-def load_info(path: Path, name: str) -> Callable[[Header], CameraInfo]:
+def load_info(path: Path) -> Callable[[Header], CameraInfo]:
     """What makes the CameraInfo of a calibration file.
 
     Raises:
@@ -25,14 +25,14 @@ def load_info(path: Path, name: str) -> Callable[[Header], CameraInfo]:
     try:
         document = yaml.safe_load(path.read_text())
     except (OSError, yaml.YAMLError) as error:
-        raise SensorError(f"camera {name}: {path}: cannot be read: {error}") from None
+        raise SensorError(f"{path}: cannot be read: {error}") from None
     if not isinstance(document, dict):
-        raise SensorError(f"camera {name}: {path}: must be a mapping, as camera_calibration writes it")
+        raise SensorError(f"{path}: must be a mapping, as camera_calibration writes it")
     height, width = document.get("image_height"), document.get("image_width")
     if type(height) is not int or type(width) is not int:
         found = f"{width!r} and {height!r}"
-        raise SensorError(f"camera {name}: {path}: image_width and image_height must be whole numbers, not {found}")
-    d, k, r, p = (_numbers(document, key, count, f"camera {name}: {path}") for key, count in _MATRICES.items())
+        raise SensorError(f"{path}: image_width and image_height must be whole numbers, not {found}")
+    d, k, r, p = (_numbers(document, key, count, str(path)) for key, count in _MATRICES.items())
     model = str(document.get("distortion_model", "plumb_bob"))
     return lambda header: CameraInfo(header, height, width, model, d, k, r, p)
 

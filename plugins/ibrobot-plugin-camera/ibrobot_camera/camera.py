@@ -56,13 +56,21 @@ class OpenCvCamera(Sensor):
         self._source: _Live | _File | None = None
         self._last_ns = 0
 
+    def _load_info(self) -> Callable[[Header], CameraInfo] | None:
+        if self._options.info is None:
+            return None
+        try:
+            return load_info(self._options.info)
+        except SensorError as error:
+            raise SensorError(f"camera {self._ctx.name}: {error}") from None
+
     @override
     def open(self) -> None:
         device = find_device(self._options.device, self._ctx.name)
         if device.kind != "file" and isinstance(self._ctx.clock, SteppedClock):
             raise SensorError(f"camera {self._ctx.name}: {device}: a live source cannot be in lockstep; a file can")
         make = _File if device.kind == "file" else _Live
-        self._info = load_info(self._options.info, self._ctx.name) if self._options.info is not None else None
+        self._info = self._load_info()
         source = make(lambda: Capture(device, self._options, self._ctx.name), self._options, self._ctx)
         source.open()
         self._source = source
