@@ -8,6 +8,9 @@ from importlib import import_module
 
 from ibrobot_core import api
 
+ELSEWHERE = {"ibrobot_core.interfaces": "interfaces", "ibrobot_core.descriptors": "hooks"}
+"""Module -> the page that describes it whole."""
+
 STABILITY = """# Public API
 
 Plugins import core through one flat module:
@@ -39,14 +42,14 @@ def api_page() -> Iterator[str]:
     names: dict[str, list[str]] = {}
     for name in api.__all__:
         home = api.home_of(name)
-        names.setdefault("ibrobot_core.interfaces" if home.startswith("ibrobot_core.interfaces") else home, []).append(
-            name
-        )
+        group = "ibrobot_core.interfaces" if home.startswith("ibrobot_core.interfaces") else home
+        names.setdefault(group, []).append(name)
     for module, found in names.items():
         yield f"## {module.removeprefix('ibrobot_core.')}\n"
         yield f"{(inspect.getdoc(import_module(module)) or '').split('\n\n', maxsplit=1)[0]}\n"
-        if module == "ibrobot_core.interfaces":
-            yield f"[Interfaces](interfaces.md) describes them: {', '.join(f'`{name}`' for name in found)}.\n"
+        if module in ELSEWHERE:
+            page = ELSEWHERE[module]
+            yield f"[{page.capitalize()}]({page}.md) describes them: {', '.join(f'`{name}`' for name in found)}.\n"
             continue
         yield "```{eval-rst}"
         for name in found:

@@ -49,6 +49,6 @@ def write(directory: Path) -> None:
     }
     for name, page in pages.items():
         text = "\n".join(page()) + "\n"
-        path = directory / f"{name}.md"
+        path = directory / name
         if not path.exists() or path.read_text() != text:
             path.write_text(text)

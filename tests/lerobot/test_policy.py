@@ -242,7 +242,7 @@ def test_a_first_run_that_overflows_is_reported(folders: dict[str, Path], caplog
 
 
 def test_a_first_run_that_fails_is_reported(folders: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ibrobot_lerobot.model.Model.predict", lambda self, batch: 1 / 0)
+    monkeypatch.setattr("ibrobot_lerobot.model.PolicyModel.predict", lambda self, batch: 1 / 0)
     with pytest.raises(PolicyError, match=r"act: its first run failed: ZeroDivisionError: division by zero"):
         make(folders["act"]).load()
 

@@ -74,7 +74,7 @@ class LeRobotPolicy(Policy):
     def load(self) -> None:
         self.check_weights()
         weights = hash_weights(self._options.path)
-        model = _import("model").Model(self._checkpoint, self._options, self._pre, self._pictures, self._ctx.log)
+        model = _import("model").PolicyModel(self._checkpoint, self._options, self._pre, self._pictures, self._ctx.log)
         tensors = self.preprocess(self._zeros())
         model.warm_up(tensors)
         # How long a text is, and what LeRobot's own steps make of it, is not known beforehand.

@@ -27,6 +27,8 @@ _SHARED = ("/dev/dri", "/dev/nvidia", "/dev/urandom", "/dev/null", "anon_inode:[
 """Files that libraries open once and keep, such as a GPU's device, or Matplotlib's fonts among its own files."""
 
 
+_POLL_S = 0.05
+
 _KINDS: tuple[Kind, ...] = get_args(Kind.__value__)
 
 
@@ -46,11 +48,11 @@ class LeakCheck:
 
     Attributes:
         allow: kind of leak -> the reason why it is not a fault.
-        grace_s: how long threads may take to end [s].
+        grace_s: how long threads, processes and connections may take to end [s].
     """
 
     allow: Mapping[Kind, str] = attrs.field(factory=dict[Kind, str], validator=_check_reasons)
-    grace_s: float = 30.0
+    grace_s: float = 5.0
 
     @contextmanager
     def watch(self) -> Iterator[None]:
@@ -63,18 +65,21 @@ class LeakCheck:
             resource_tracker.ensure_running()  # it lives as long as the interpreter, so it counts as there before
         before = _Found.now()
         yield
-        self._join_threads(before)
+        deadline = time.monotonic() + self.grace_s
+        self._join_threads(before, deadline)
         left = self._left_since(before)
         if left:
             gc.collect()  # a file without references is closed only now: untidy, but no leak
             left = self._left_since(before)
+        while left and time.monotonic() < deadline:  # e.g. a server's end of a connection, which its thread closes
+            time.sleep(_POLL_S)
+            left = self._left_since(before)
         if left:
             pytest.fail("the test left behind: " + "; ".join(left), pytrace=False)
 
-    def _join_threads(self, before: _Found) -> None:
+    def _join_threads(self, before: _Found, deadline: float) -> None:
         """Wait for the threads that are ending."""
         if "thread" not in self.allow:
-            deadline = time.monotonic() + self.grace_s
             for thread in _Found.now().threads - before.threads:
                 thread.join(max(0.0, deadline - time.monotonic()))
 
