@@ -41,5 +41,7 @@ def _keep_colons(app: Sphinx, what: str, name: str, obj: object, options: object
 def setup(app: Sphinx) -> None:
     """Called by Sphinx."""
     app.connect("autodoc-process-docstring", _keep_colons, priority=400)
+
+
 # An annotation such as `type[Any]` is taken for an attribute of that name, of which there are several.
 suppress_warnings = ["ref.python"]
