@@ -29,7 +29,7 @@ _LOG_LINES = 6
 _RECENT_NS = 3 * NS_PER_S
 """Rates are over so long [ns]."""
 _SAMPLE_NS = NS_PER_S // 4
-_JOINT_WIDTH = 45
+_JOINT_WIDTH = 47
 """Columns of a joint's name and numbers."""
 
 
@@ -200,6 +200,6 @@ class _Joints:
             room = max(0, options.max_width - _JOINT_WIDTH)
             bar = [ProgressBar(total=1.0, completed=done, width=min(room, 30))] if room else []
             table.add_row(
-                joint.name, f"{state.position[i]:+.3f}", styled(f"told {state.command[i]:+.3f} rad", "dim"), *bar
+                joint.name, f"{state.position[i]:+.3f}", styled(f"target {state.command[i]:+.3f} rad", "dim"), *bar
             )
         yield table

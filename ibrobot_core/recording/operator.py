@@ -104,20 +104,18 @@ class Operator(RunHooks):
         status = self._service.status()
         lost = sum(status["lost"].values())
         rates = "  ".join(f"{topic} {rate:g} Hz" for topic, rate in status["rates_hz"].items())
-        rows = [
+        return [  # a small terminal leaves out the end
             ("record", self._state()),
+            *([("", self._complaint)] if self._complaint else []),
             ("saved", f"{self._saved()} into {self._service.folder}"),
-            ("topics", rates or "none yet"),
             ("lost", f"{lost} messages"),
             (
                 "disk",
                 f"{status['free_bytes'] // _MIB} MiB left at {status['bytes_per_s'] / _MIB:.1f} MiB/s, "
                 f"{status['waiting_bytes'] / _MIB:.1f} MiB wait for it",
             ),
+            ("topics", rates or "none yet"),
         ]
-        if self._complaint:
-            rows.append(("", self._complaint))
-        return rows
 
     @override
     def line(self) -> str:

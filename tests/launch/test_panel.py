@@ -123,7 +123,16 @@ def test_the_newest_messages_are_whole_and_the_oldest_go_first(terminal: Termina
 
 def test_a_wide_terminal_shows_all_facts(runs: Runs):
     shown = Terminal(runs.start(mode="policy"), 120, 40).words()
-    for fact in ("sensors top", "plan ", "loop ", "episodes 0 done", "faults 0 now, 0 in this run", "pan +0.", "grip"):
+    for fact in (
+        "sensors top",
+        "plan ",
+        "loop ",
+        "episodes 0 done",
+        "faults 0 now, 0 in this run",
+        "pan +0.",
+        "target +0.",
+        "grip",
+    ):
         assert fact in shown, shown
 
 
