@@ -6,7 +6,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, override
+from typing import Any, ClassVar, override
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ from ibrobot_camera.librealsense import load_library
 from ibrobot_camera.options import RealSenseOptions
 from ibrobot_camera.realsense import RealSenseCamera
 from ibrobot_ros2.jpeg import from_jpeg
-from ibrobot_testing import SensorSuite, host_context
+from ibrobot_testing import LeakCheck, SensorSuite, host_context
 
 from ibrobot_core.api import (
     CameraInfo,
@@ -141,6 +141,8 @@ def soft(library: Any, request: pytest.FixtureRequest, monkeypatch: pytest.Monke
 
 class TestConformance(SensorSuite):
     timeout_s = PATIENCE_S
+
+    leak_check: ClassVar[LeakCheck] = LeakCheck(allow={"file": "libusb keeps the socket by which it hears of devices"})
 
     @pytest.fixture(autouse=True)
     def _soft(self, soft: SoftwareCamera) -> None:
