@@ -182,7 +182,7 @@ def types(session: nox.Session) -> None:
     session.run("mypy", *UNTYPED, "tests/shared/plugins", env={"MYPYPATH": "tests/shared"})
     for name in (name for name in PLUGINS if name not in NOT_TYPED):
         # Each by itself: all of them have a package `tests`.
-        bases = {"MYPYPATH": f"tests/shared:{FOLDERS[name]}"}
+        bases = {"MYPYPATH": f"tests/shared:benchmarks:{FOLDERS[name]}"}
         session.run("mypy", *UNTYPED, str(FOLDERS[name] / "tests"), env=bases)
 
 

@@ -34,8 +34,8 @@ PATIENCE_NS = 60_000_000_000
 ROBOT = """\
 robot:
   name: mini
-  joints: [{{name: pan, lower: -1.0, upper: 1.0, max_velocity: 2.0, max_acceleration: 10.0}}]
-  groups: {{arm: [pan]}}
+  joints: [{{name: shoulder_pan, lower: -1.0, upper: 1.0, max_velocity: 2.0, max_acceleration: 10.0}}]
+  groups: {{arm: [shoulder_pan]}}
   description: {{mjcf: package://so101_nexus/assets/SO101_menagerie/so101.xml, poses: {{rest: [0.0]}}}}
 simulation: {{type: mujoco}}
 executors: {{arm_position: {{type: position, group: arm}}}}
