@@ -1,12 +1,12 @@
 """Kinematics of arms: forward and inverse kinematics, Jacobians and tool jog, from an MJCF."""
 
 from ibrobot_kinematics.errors import KinematicsError, UnreachableError
-from ibrobot_kinematics.inverse import Target, solve
+from ibrobot_kinematics.inverse import Target, solve, solve_all
 from ibrobot_kinematics.jog import jog
 from ibrobot_kinematics.mjcf import read_mjcf, robot_model
 from ibrobot_kinematics.model import ChainJoint, KinematicModel, TipPose
 
 __all__ = [
     "ChainJoint", "KinematicModel", "KinematicsError", "Target", "TipPose", "UnreachableError",
-    "jog", "read_mjcf", "robot_model", "solve",
+    "jog", "read_mjcf", "robot_model", "solve", "solve_all",
 ]  # fmt: skip

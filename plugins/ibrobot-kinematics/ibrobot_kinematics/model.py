@@ -91,6 +91,17 @@ class KinematicModel:
         jacobian[:, self.moving] = columns.T
         return tip, jacobian
 
+    def screws(self, q: Vector) -> tuple[TipPose, Vector, Vector]:
+        """Pose of the tip, and a point on the axis [m] and the direction of each of the chain's joints.
+
+        Args:
+            q: joint positions, shape (J,).
+
+        Returns:
+            The tip, the points and the directions, both shape (n, 3), all in the base frame.
+        """
+        return self._frames(q)
+
     @cached_property
     def moving(self) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
         """Indices of the joints of `chain`, from the base outwards."""
