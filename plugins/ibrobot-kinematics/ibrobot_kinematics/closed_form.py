@@ -99,7 +99,7 @@ class PanPlanarRoll:
     def at(self, position: Vector, axis: Vector | None, start: Vector, *, pitches: int, rolls: int) -> Candidates:
         """Four branches, two of the pan and two of the elbow; the free pitch and roll are sampled.
 
-        The samples begin with those of `start`. Arguments are those of `with_axis`; an axis counts in `turned` alone.
+        The first sample is that of `start`. The arguments are as in `with_axis`; an axis counts in `turned` alone.
         """
         x, y, _ = self.frame @ (position - self.origin)
         at_start = self._turned(start)
