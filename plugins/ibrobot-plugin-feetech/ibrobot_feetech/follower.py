@@ -95,6 +95,8 @@ class FeetechFollower(Hardware):
         self._again_s = _AGAIN * seconds(ctx.period_ns)
         self._fault: HardwareError | None = None
         self._relaxed = self._holding = False
+        self._resetting = False
+        """Whether a reset has begun and not succeeded: it may have left servos without torque."""
         self._limits = ctx.robot.lower[order], ctx.robot.upper[order]
 
     @override
@@ -184,8 +186,9 @@ class FeetechFollower(Hardware):
     @override
     def reset_faults(self) -> None:
         fault = self._fault
-        if fault is None and not self._health.faulty:
+        if fault is None and not self._health.faulty and not self._resetting:
             return
+        self._resetting = True
         bus, arm = self._bus, self._arm
         if isinstance(fault, PortError) or not bus.is_open:
             bus.close()
@@ -198,6 +201,7 @@ class FeetechFollower(Hardware):
         self._set_up([servo for servo in arm.servos if self._is_troubled(servo)])
         self._start()
         self._health.reset()
+        self._resetting = False
 
     @override
     def disconnect(self) -> None:

@@ -436,6 +436,25 @@ class TestHealth:
         assert not rig.follower.health()
         assert rig.register("torque_enable") == [1] * 6
 
+    def test_a_reset_after_one_that_failed_halfway_puts_torque_on_again(self, rig: Rig) -> None:
+        rig.emulator.faults.overloaded.add(2)
+        rig.run(220)
+        rig.emulator.faults.overloaded.clear()
+
+        def cut_off() -> None:
+            if not rig.emulator.servos[2].torque:
+                rig.emulator.faults.silent.add(2)
+
+        rig.emulator.on_request = cut_off
+        with pytest.raises(NoReply):
+            rig.follower.reset_faults()
+        rig.emulator.on_request = lambda: None
+        rig.emulator.faults.silent.clear()
+        rig.run(2)
+        assert not rig.follower.health(), "torque off has ended the overload"
+        rig.follower.reset_faults()
+        assert rig.register("torque_enable") == [1] * 6
+
     def test_reset_refuses_an_error_that_torque_off_would_not_end_and_leaves_torque_on(self, rig: Rig) -> None:
         rig.emulator.faults.errors[2] = 0x04
         rig.run(2)
