@@ -209,7 +209,6 @@ from ibrobot_core.inference.wire import (
     health_name as health_name,
     service_name as service_name,
 )
-from ibrobot_core.local_transport import LocalTransport as LocalTransport
 from ibrobot_core.recording.dataset import EpisodeDataset as EpisodeDataset
 from ibrobot_core.recording.episode import episode_folder as episode_folder
 from ibrobot_core.recording.provenance import (
@@ -220,7 +219,7 @@ from ibrobot_core.recording.provenance import (
 from ibrobot_core.metrics import Metrics as Metrics, MetricsProbes as MetricsProbes, MetricsServer as MetricsServer
 from ibrobot_core.control.realtime import go_real_time as go_real_time
 from ibrobot_core.memory import set_malloc as set_malloc
-from ibrobot_core.workers import Workers as Workers, end_signals as end_signals, on_signals as on_signals
+from ibrobot_core.signals import end_signals as end_signals, on_signals as on_signals
 from ibrobot_core.outside import LogFormatter as LogFormatter, echo as echo
 from ibrobot_core.screen import Screen as Screen, styled as styled
 from ibrobot_core.terminal import KeyReader as KeyReader

@@ -1,4 +1,4 @@
-"""What core itself offers, registered as any plugin would: the three executors and the local transport."""
+"""What core itself offers, registered as any plugin would: the three executors, and `local` for no transport."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 from ibrobot_core.descriptors import ExecutorDescriptor, TransportDescriptor
+from ibrobot_core.errors import NotSupported
 from ibrobot_core.executor_options import GripperOptions, PositionOptions, TrajectoryOptions
 from ibrobot_core.hookspecs import hookimpl
 
@@ -32,9 +33,7 @@ def _gripper(options: Any, ctx: Context) -> Executor:
 
 
 def _local(options: Any, ctx: Context) -> Transport:
-    from ibrobot_core.local_transport import LocalTransport
-
-    return LocalTransport()
+    raise NotSupported("transport local leads nowhere: a run with it stays in this process, and asks for none")
 
 
 @hookimpl
@@ -56,5 +55,5 @@ def ibrobot_executors() -> Iterable[ExecutorDescriptor]:
 
 @hookimpl
 def ibrobot_transports() -> Iterable[TransportDescriptor]:
-    """Within one process."""
-    yield TransportDescriptor(type="local", make=_local, summary="within this process")
+    """The word for none."""
+    yield TransportDescriptor(type="local", make=_local, summary="none: everything stays in this process")

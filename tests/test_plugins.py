@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from ibrobot_testing import host_context
 
-from ibrobot_core.errors import ContractError, PluginError
+from ibrobot_core.errors import ContractError, NotSupported, PluginError
 from ibrobot_core.messages import CompressedImage, Header
+from ibrobot_core.options import NoOptions
 from ibrobot_core.plugins import KINDS, Registry, discover
 
 if TYPE_CHECKING:
@@ -124,6 +126,11 @@ def test_events_reach_all_though_one_raises(registry: Registry, caplog: pytest.L
 
     assert sys.modules["fake_good"].events == ["teleop"]
     assert caplog.messages == ["plugin 'fake_later' failed in ibrobot_mode_changed: ValueError: not now"]
+
+
+def test_transport_local_is_the_word_for_none() -> None:
+    with pytest.raises(NotSupported, match="transport local leads nowhere"):
+        discover([]).find("transport", "local").make(NoOptions(), host_context())
 
 
 def test_every_kind_has_a_hook() -> None:

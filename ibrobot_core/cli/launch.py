@@ -28,8 +28,8 @@ from ibrobot_core.launch.session import LaunchRequest, Session
 from ibrobot_core.outside import LogFormatter, echo
 from ibrobot_core.plugins import installed_plugins
 from ibrobot_core.run_hooks import RunHooks
+from ibrobot_core.signals import end_signals
 from ibrobot_core.terminal import KeyReader
-from ibrobot_core.workers import end_signals
 
 NOT_ALL_SUCCEEDED = 3
 _FAULTED = 1

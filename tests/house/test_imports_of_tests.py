@@ -25,9 +25,6 @@ ALLOWED = {
     ),
     ("ibrobot-plugin-serve/tests/fuzz_wire.py", "ibrobot_core.inference.remote"): CLIENT,
     ("ibrobot-plugin-serve/tests/test_service.py", "ibrobot_core.inference.remote"): CLIENT,
-    ("ibrobot-testing/tests/test_transport_suite.py", "ibrobot_core.local_transport"): (
-        "wrong transports are the local one, broken inside"
-    ),
 }
 """File and module -> why its tests need it."""
 

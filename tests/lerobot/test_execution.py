@@ -17,13 +17,13 @@ from ibrobot_lerobot.options import LeRobotPolicyOptions
 from ibrobot_lerobot.policy import SEED, LeRobotPolicy
 from ibrobot_serve.service import InferenceService
 from ibrobot_testing.contexts import START_NS, host_context
+from ibrobot_testing.fakes import FakeTransport
 
 from ibrobot_core.config import load_config
 from ibrobot_core.inference.engine import Engine, LocalEngine
 from ibrobot_core.inference.process import ProcessEngine
 from ibrobot_core.inference.remote import RemoteEngine
 from ibrobot_core.interfaces import Frame, Payload
-from ibrobot_core.local_transport import LocalTransport
 
 sys.path.insert(0, str(Path(__file__).parent))
 from checkpoints import CONFIGS, Theirs, save
@@ -50,7 +50,7 @@ def path(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     return save(CONFIGS[request.param](), tmp_path / request.param)
 
 
-class Counting(LocalTransport):
+class Counting(FakeTransport):
     """Knows the size of the last request."""
 
     size = 0
@@ -68,7 +68,7 @@ def make(path: Path) -> LeRobotPolicy:
 @pytest.fixture
 def engines(path: Path, tmp_path: Path) -> Iterator[dict[str, Engine]]:
     """One of each, with weights of its own."""
-    here, cloud, transport = make(path), make(path), LocalTransport()
+    here, cloud, transport = make(path), make(path), FakeTransport()
     here.load()
     cloud.load()
     (tmp_path / "robot.yaml").write_text(textwrap.dedent(ROBOT.format(path=path)))

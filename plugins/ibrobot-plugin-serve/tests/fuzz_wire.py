@@ -28,11 +28,10 @@ from typing import override
 import numpy as np
 from ibrobot_serve.service import InferenceService
 from ibrobot_testing import host_context
-from ibrobot_testing.fakes import FakePolicy
+from ibrobot_testing.fakes import FakePolicy, FakeTransport
 
 from ibrobot_core.api import (
     Handler,
-    LocalTransport,
     Tensors,
     Transport,
     WireDecoder,
@@ -61,7 +60,7 @@ class Adds(FakePolicy):
         return {"sum": np.add(tensors["state"], tensors["one"])}
 
 
-class Tapped(LocalTransport):
+class Tapped(FakeTransport):
     """Keeps the handlers, so that mutants need no thread of their own."""
 
     def __init__(self) -> None:

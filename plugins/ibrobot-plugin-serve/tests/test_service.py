@@ -1,4 +1,4 @@
-"""The cloud side and its clients over the local transport: batches, turns, deadlines, one model, many robots."""
+"""The cloud side and its clients within one process: batches, turns, deadlines, one model, many robots."""
 
 from __future__ import annotations
 
@@ -19,13 +19,12 @@ from ibrobot_serve.metrics import probes
 from ibrobot_serve.pacing import Pacing
 from ibrobot_serve.service import InferenceService, ServiceOptions
 from ibrobot_testing import host_context
-from ibrobot_testing.fakes import FakePolicy
+from ibrobot_testing.fakes import FakePolicy, FakeTransport
 from prometheus_client.parser import text_string_to_metric_families
 
 from ibrobot_core.api import (
     ContractError,
     Handler,
-    LocalTransport,
     Metrics,
     PolicyError,
     Tensors,
@@ -105,10 +104,10 @@ class Cloud:
     """A service with its transport, and robots that ask it in threads of their own."""
 
     def __init__(
-        self, policy: Net, options: ServiceOptions | None = None, transport: LocalTransport | None = None
+        self, policy: Net, options: ServiceOptions | None = None, transport: FakeTransport | None = None
     ) -> None:
         self.policy = policy
-        self.transport = transport or LocalTransport()
+        self.transport = transport or FakeTransport()
         self.hung = threading.Event()
         self.service = InferenceService(policy, self.transport, "net", options, on_hang=self.hung.set)
         self.service.start()
@@ -417,7 +416,7 @@ def test_a_model_that_has_nothing_to_do_does_not_hang():
         assert cloud.health()["state"] == "ready"
 
 
-class Vouching(LocalTransport):
+class Vouching(FakeTransport):
     """Knows every sender as `robot2`."""
 
     @override
@@ -487,7 +486,7 @@ def test_policies_that_differ_in_their_files_alone_are_reported(monkeypatch: pyt
 
 
 def test_the_engine_says_that_nobody_serves_its_model():
-    transport = LocalTransport()
+    transport = FakeTransport()
     remote = RemoteEngine(Net(), transport, "net", "so101", start_timeout_s=0.0)
     with pytest.raises(PolicyError, match="no server for model 'net': nobody serves infer/net/health"):
         remote.start()
@@ -602,7 +601,7 @@ def test_server_that_comes_back_with_another_policy_is_refused_whatever_its_weig
     ],
 )
 def test_the_engine_believes_no_answer_but_its_own(answer: bytes, said: str):
-    transport = LocalTransport()
+    transport = FakeTransport()
     transport.serve(service_name("net"), lambda payload, sender: answer)
     remote = RemoteEngine(Net(), transport, "net", "so101")
     with pytest.raises(PolicyError, match=said):
@@ -612,7 +611,7 @@ def test_the_engine_believes_no_answer_but_its_own(answer: bytes, said: str):
 
 
 def test_the_engine_knows_waiting_from_work_and_the_pace():
-    transport = LocalTransport()
+    transport = FakeTransport()
     replies = [
         WireMessage(WireKind.ANSWER, 1, {}, fingerprint=Net().fingerprint(), latency_ms=50.0, queued_ns=30_000_000),
         WireMessage(WireKind.FAILURE, 2, text="full", pace_ns=750_000_000),
@@ -630,7 +629,7 @@ def test_the_engine_knows_waiting_from_work_and_the_pace():
 
 
 def test_all_requests_on_their_way_in_an_outage_are_one_failure():
-    transport = LocalTransport()
+    transport = FakeTransport()
     together = threading.Barrier(5)
 
     def fail(payload: Any, sender: str | None) -> bytes:

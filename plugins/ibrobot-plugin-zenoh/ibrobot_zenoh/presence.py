@@ -7,9 +7,9 @@ from collections.abc import Callable
 
 import zenoh
 
-from ibrobot_core.api import Workers
 from ibrobot_zenoh.access import SERVED
 from ibrobot_zenoh.connection import Connection
+from ibrobot_zenoh.workers import Workers
 
 PREFIX = f"{SERVED}/"
 """Tokens are PREFIX NAME / ID."""

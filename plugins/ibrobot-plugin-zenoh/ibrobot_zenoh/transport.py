@@ -19,7 +19,6 @@ from ibrobot_core.api import (
     SharedTopic,
     TopicTransport,
     TransportError,
-    Workers,
 )
 from ibrobot_zenoh.access import ANYBODY, SERVED, SERVICES, TOPICS
 from ibrobot_zenoh.connection import Connection, first_line
@@ -27,6 +26,7 @@ from ibrobot_zenoh.identity import own_identity
 from ibrobot_zenoh.options import ZenohOptions
 from ibrobot_zenoh.presence import Presence
 from ibrobot_zenoh.topics import Topics
+from ibrobot_zenoh.workers import Workers
 
 SUBSCRIBER_DEPTH = 1000
 """How many payloads may wait for a subscriber; beyond, the oldest gives way."""

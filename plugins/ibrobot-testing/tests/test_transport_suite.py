@@ -1,4 +1,4 @@
-"""Each check of the transport suite catches something wrong; the local transport's own tests run the suite itself."""
+"""The transport suite passes the fake, and each of its checks catches something wrong."""
 
 from __future__ import annotations
 
@@ -8,9 +8,16 @@ from typing import Any, override
 
 import pytest
 from ibrobot_testing import TransportSuite, checks, failed_checks
+from ibrobot_testing.fakes import FakeTransport
+from ibrobot_testing.fakes.transport import _Request
 
-from ibrobot_core.api import LocalTransport, TransportError
-from ibrobot_core.local_transport import _Request
+from ibrobot_core.api import TransportError
+
+
+class TestTransport(TransportSuite):
+    @override
+    def make(self, ctx):
+        return FakeTransport()
 
 
 class ShortSuite(TransportSuite):
@@ -19,13 +26,13 @@ class ShortSuite(TransportSuite):
     wait_s = 0.2
 
 
-class LosesEmptyPayloads(LocalTransport):
+class LosesEmptyPayloads(FakeTransport):
     def publish(self, topic, payload):
         if payload:
             super().publish(topic, payload)
 
 
-class Reorders(LocalTransport):
+class Reorders(FakeTransport):
     waiting = None
 
     def publish(self, topic, payload):
@@ -38,13 +45,13 @@ class Reorders(LocalTransport):
             self.waiting = None
 
 
-class OneTopic(LocalTransport):
+class OneTopic(FakeTransport):
     def publish(self, topic, payload):
         for known in tuple(self._subscribers):
             super().publish(known, payload)
 
 
-class NeverEnds(LocalTransport):
+class NeverEnds(FakeTransport):
     """Calls the subscribers of a topic one after the other: the ended one before the others."""
 
     def __init__(self):
@@ -59,7 +66,7 @@ class NeverEnds(LocalTransport):
         return lambda: None
 
 
-class CallsInTheSendersThread(LocalTransport):
+class CallsInTheSendersThread(FakeTransport):
     def subscribe(self, topic, callback):
         self.callbacks = [*getattr(self, "callbacks", []), callback]
         return lambda: self.callbacks.remove(callback)
@@ -69,7 +76,7 @@ class CallsInTheSendersThread(LocalTransport):
             callback(payload)
 
 
-class DropsFailingSubscribers(LocalTransport):
+class DropsFailingSubscribers(FakeTransport):
     def subscribe(self, topic, callback):
         failed = threading.Event()
 
@@ -84,7 +91,7 @@ class DropsFailingSubscribers(LocalTransport):
         return super().subscribe(topic, until_it_fails)
 
 
-class SharesAnswers(LocalTransport):
+class SharesAnswers(FakeTransport):
     """Answers come through one queue, in the order asked: whoever asks takes what is there."""
 
     def __init__(self):
@@ -105,7 +112,7 @@ class SharesAnswers(LocalTransport):
         return super().serve(name, handler, workers=1)
 
 
-class MixesAnswers(LocalTransport):
+class MixesAnswers(FakeTransport):
     def __init__(self):
         super().__init__()
         self.answers = []
@@ -115,7 +122,7 @@ class MixesAnswers(LocalTransport):
         return self.answers[0]
 
 
-class EmptyForErrors(LocalTransport):
+class EmptyForErrors(FakeTransport):
     def request(self, name, payload, timeout_s):
         try:
             return super().request(name, payload, timeout_s)
@@ -125,21 +132,21 @@ class EmptyForErrors(LocalTransport):
             return b""
 
 
-class EmptyForNobody(LocalTransport):
+class EmptyForNobody(FakeTransport):
     def request(self, name, payload, timeout_s):
         with self._lock:
             self._check_open()
         return super().request(name, payload, timeout_s) if name in self._servers else b""
 
 
-class LastServerWins(LocalTransport):
+class LastServerWins(FakeTransport):
     def serve(self, name, handler, *, workers=16):
         if name in self._servers:
             self._servers.pop(name).end()
         return super().serve(name, handler, workers=workers)
 
 
-class OneCallAtATime(LocalTransport):
+class OneCallAtATime(FakeTransport):
     def __init__(self):
         super().__init__()
         self.busy = threading.Lock()
@@ -155,7 +162,7 @@ class OneCallAtATime(LocalTransport):
             return super().request(name, payload, timeout_s)
 
 
-class KeepsBuffers(LocalTransport):
+class KeepsBuffers(FakeTransport):
     """Hands the sender's own memory on."""
 
     def publish(self, topic, payload):
@@ -163,19 +170,19 @@ class KeepsBuffers(LocalTransport):
             subscriber.put(payload)
 
 
-class OneWorker(LocalTransport):
+class OneWorker(FakeTransport):
     def serve(self, name, handler, *, workers=16):
         return super().serve(name, handler, workers=1)
 
 
-class WatchesOnce(LocalTransport):
+class WatchesOnce(FakeTransport):
     def watch(self, name, changed):
         end = super().watch(name, changed)
         end()
         return end
 
 
-class WorksWhileClosed(LocalTransport):
+class WorksWhileClosed(FakeTransport):
     def _check_open(self):
         pass
 
@@ -213,3 +220,39 @@ def test_catches(wrong, caught_by, tmp_path):
 
 def test_every_check_catches_something():
     assert checks(TransportSuite) == set(WRONG.values())
+
+
+def test_a_failing_subscriber_is_logged(caplog: pytest.LogCaptureFixture) -> None:
+    transport = FakeTransport()
+    taken: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+
+    def failing(payload: bytes) -> None:
+        if payload == b"bad":
+            raise ValueError("cannot read this")
+        taken.put(payload)
+
+    transport.subscribe("topic", failing)
+    for payload in (b"bad", b"good"):
+        transport.publish("topic", payload)
+    assert taken.get(timeout=30) == b"good"
+    transport.close()
+    assert "a subscriber of topic failed" in caplog.text
+    assert "cannot read this" in caplog.text
+
+
+def test_a_subscriber_may_end_itself() -> None:
+    transport = FakeTransport()
+    arrived: list[bytes] = []
+    done = threading.Event()
+
+    def once(payload: bytes) -> None:
+        arrived.append(payload)
+        end()
+        done.set()
+
+    end = transport.subscribe("topic", once)
+    transport.publish("topic", b"1")
+    transport.publish("topic", b"2")
+    assert done.wait(30)
+    transport.close()
+    assert arrived == [b"1"]

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import threading
 
+from ibrobot_testing.fakes import FakeTransport
+
 from ibrobot_core import hookimpl
 from ibrobot_core.descriptors import TransportDescriptor
 from ibrobot_core.errors import TransportError
 from ibrobot_core.interfaces import TopicTransport
-from ibrobot_core.local_transport import LocalTransport
 
 
-class Network(LocalTransport, TopicTransport):
+class Network(FakeTransport, TopicTransport):
     def __init__(self):
         super().__init__()
         self.sent, self.callbacks, self.refuses, self.goes_on = [], {}, False, threading.Event()

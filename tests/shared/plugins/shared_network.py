@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from ibrobot_testing.fakes import FakeTransport
+
 from ibrobot_core import hookimpl
 from ibrobot_core.descriptors import TransportDescriptor
-from ibrobot_core.local_transport import LocalTransport
 
 
-class Shared(LocalTransport):
+class Shared(FakeTransport):
     """One for the robot and its server."""
 
     def close(self):

@@ -3,6 +3,7 @@
 from ibrobot_testing.fakes.control import FakeExecutor, FakeHardware, FakeRealHardware
 from ibrobot_testing.fakes.host import FakePlanner, FakePolicy, FakeSensor, FakeTeleop, FakeViewer
 from ibrobot_testing.fakes.storage import FakeDataset, FakeRecorder
+from ibrobot_testing.fakes.transport import FakeTransport
 
 __all__ = [
     "FakeDataset",
@@ -14,5 +15,6 @@ __all__ = [
     "FakeRecorder",
     "FakeSensor",
     "FakeTeleop",
+    "FakeTransport",
     "FakeViewer",
 ]

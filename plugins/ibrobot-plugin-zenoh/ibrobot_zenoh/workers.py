@@ -1,33 +1,16 @@
-"""Worker threads: items worked on in the order of arrival by a bounded number of threads; what a signal sets off."""
+"""Worker threads: items worked on in the order of arrival by a bounded number of threads."""
 
 from __future__ import annotations
 
 import logging
-import signal
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
 
-_log = logging.getLogger("ibrobot.workers")
+_log = logging.getLogger("ibrobot.zenoh")
 
 _END_S = 1.0
-
-
-def end_signals() -> tuple[signal.Signals, ...]:
-    """The signals that end a command in order: SIGINT, SIGTERM, and SIGHUP unless the caller ignores it (nohup)."""
-    hangup = [] if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN else [signal.SIGHUP]
-    return (signal.SIGINT, signal.SIGTERM, *hangup)
-
-
-def on_signals(act: Callable[[], object]) -> None:
-    """Have `act` called at each of the `end_signals`, in a thread of its own.
-
-    A handler comes in the middle of what the main thread does. Where that waits for an event it may hold the lock that
-    setting the event takes, and no more would ever happen.
-    """
-    for number in end_signals():
-        signal.signal(number, lambda *_: threading.Thread(target=act, name="signal", daemon=True).start())
 
 
 class Workers[T]:

@@ -6,8 +6,7 @@ import queue
 import threading
 
 import pytest
-
-from ibrobot_core.workers import Workers
+from ibrobot_zenoh.workers import Workers
 
 PATIENCE_S = 30.0
 

@@ -1,17 +1,18 @@
-"""The `local` transport: within one process."""
+"""The fake transport: within this process."""
 
 from __future__ import annotations
 
+import logging
 import queue
 import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from typing import override
 
 import attrs
 
-from ibrobot_core.errors import TransportError
-from ibrobot_core.interfaces.transport import HANDLER_THREADS, Handler, Payload, Transport
-from ibrobot_core.workers import Workers
+from ibrobot_core.api import HANDLER_THREADS, Handler, Payload, Transport, TransportError
 
 
 @attrs.frozen(eq=False)
@@ -20,7 +21,30 @@ class _Request:
     answer: queue.SimpleQueue[Payload | Exception] = attrs.field(factory=queue.SimpleQueue)
 
 
-class LocalTransport(Transport):
+class _Threads[T]:
+    """Calls `act` with each item, in at most `count` threads; with one, in the order of arrival."""
+
+    def __init__(self, act: Callable[[T], object], name: str, count: int = 1) -> None:
+        self._act = act
+        self._name = name
+        self._pool = ThreadPoolExecutor(count, thread_name_prefix=name)
+
+    def put(self, item: T) -> None:
+        with suppress(RuntimeError):  # it has ended
+            self._pool.submit(self._call, item)
+
+    def end(self) -> None:
+        """Begin nothing more."""
+        self._pool.shutdown(wait=False, cancel_futures=True)
+
+    def _call(self, item: T) -> None:
+        try:
+            self._act(item)
+        except Exception:
+            logging.getLogger("ibrobot.testing").exception("%s failed", self._name)
+
+
+class FakeTransport(Transport):
     """Each subscriber is called in a thread of its own, and each server in several.
 
     What a slow one has not taken yet waits for it in memory.
@@ -28,9 +52,9 @@ class LocalTransport(Transport):
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._subscribers: dict[str, list[Workers[bytes]]] = {}
-        self._servers: dict[str, Workers[_Request]] = {}
-        self._watchers: dict[str, list[Workers[bool]]] = {}
+        self._subscribers: dict[str, list[_Threads[bytes]]] = {}
+        self._servers: dict[str, _Threads[_Request]] = {}
+        self._watchers: dict[str, list[_Threads[bool]]] = {}
         self._closed = False
 
     @override
@@ -43,7 +67,7 @@ class LocalTransport(Transport):
 
     @override
     def subscribe(self, topic: str, callback: Callable[[Payload], object]) -> Callable[[], None]:
-        subscriber = Workers[bytes](callback, f"a subscriber of {topic}")
+        subscriber = _Threads[bytes](callback, f"a subscriber of {topic}")
         with self._lock:
             self._check_open()
             self._subscribers.setdefault(topic, []).append(subscriber)
@@ -57,7 +81,7 @@ class LocalTransport(Transport):
             except Exception as error:  # noqa: BLE001 - it is the requester's to see
                 request.answer.put(error)
 
-        server = Workers(answer, f"the server of {name}", workers)
+        server = _Threads(answer, f"the server of {name}", workers)
         with self._lock:
             self._check_open()
             if name in self._servers:
@@ -79,9 +103,10 @@ class LocalTransport(Transport):
         with self._lock:
             self._check_open()
             server = self._servers.get(name)
-        request = _Request(bytes(payload))
-        if server is None or server.put(request) is not None:
-            raise TransportError(f"nobody serves {name}")
+            if server is None:
+                raise TransportError(f"nobody serves {name}")
+            request = _Request(bytes(payload))
+            server.put(request)
         try:
             result = request.answer.get(timeout=timeout_s)
         except queue.Empty:
@@ -98,7 +123,7 @@ class LocalTransport(Transport):
             with turn:
                 changed(served)
 
-        watcher = Workers(tell, f"a watch of {name}")
+        watcher = _Threads(tell, f"a watch of {name}")
         with turn:
             with self._lock:
                 self._check_open()
@@ -111,7 +136,7 @@ class LocalTransport(Transport):
     def close(self) -> None:
         with self._lock:
             self._closed = True
-            ended: list[Workers[bytes] | Workers[_Request] | Workers[bool]] = [*self._servers.values()]
+            ended: list[_Threads[bytes] | _Threads[_Request] | _Threads[bool]] = [*self._servers.values()]
             for subscribers in self._subscribers.values():
                 ended += subscribers
             for watchers in self._watchers.values():
@@ -119,14 +144,14 @@ class LocalTransport(Transport):
             self._subscribers.clear()
             self._servers.clear()
             self._watchers.clear()
-        for workers in ended:
-            workers.end()
+        for threads in ended:
+            threads.end()
 
-    def _end[T](self, of: dict[str, list[Workers[T]]], key: str, workers: Workers[T]) -> None:
+    def _end[T](self, of: dict[str, list[_Threads[T]]], key: str, threads: _Threads[T]) -> None:
         with self._lock:
-            if workers in of.get(key, ()):
-                of[key].remove(workers)
-        workers.end()
+            if threads in of.get(key, ()):
+                of[key].remove(threads)
+        threads.end()
 
     def _tell(self, name: str, served: bool) -> None:
         for watcher in self._watchers.get(name, ()):
