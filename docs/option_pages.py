@@ -28,6 +28,9 @@ def config_page() -> Iterator[str]:
         required = "required" if field.default is attrs.NOTHING else ""
         target = next((f"[`{name}`](#{_anchor(kind)})" for _, kind in _classes(name, field.type)), f"`{name}`")
         yield f"| {target} | {required} | {field.metadata['help']} |"
+    registry = installed_plugins()
+    for name in registry.types("section"):
+        yield f"| [`{name}`](#{_options_anchor('section', name)}) | | {registry.find('section', name).summary} |"
     yield ""
     shown: set[type] = set()
     for name, field in SECTIONS.items():

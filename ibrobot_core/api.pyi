@@ -15,6 +15,7 @@ from ibrobot_core.descriptors import (
     PolicyDescriptor as PolicyDescriptor,
     ReaderDescriptor as ReaderDescriptor,
     RecorderDescriptor as RecorderDescriptor,
+    SectionDescriptor as SectionDescriptor,
     SensorDescriptor as SensorDescriptor,
     TeleopDescriptor as TeleopDescriptor,
     TransportDescriptor as TransportDescriptor,
@@ -140,6 +141,12 @@ from ibrobot_core.messages import (
 from ibrobot_core.robot import Description as Description, Joint as Joint, Robot as Robot, Vector as Vector
 from ibrobot_core.clock import Clock as Clock, RealClock as RealClock, SteppedClock as SteppedClock
 from ibrobot_core.bus import Bus as Bus, Received as Received, Subscription as Subscription
+from ibrobot_core.component import CONTROL as CONTROL, Component as Component, Worker as Worker
+from ibrobot_core.launch.session import (
+    LaunchRequest as LaunchRequest,
+    Session as Session,
+    SessionWorker as SessionWorker,
+)
 from ibrobot_core.units import (
     LEROBOT_MODES as LEROBOT_MODES,
     NORM_MODES as NORM_MODES,

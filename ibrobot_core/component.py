@@ -13,6 +13,8 @@ from typing import override
 from ibrobot_core.bugs import describe_bug
 from ibrobot_core.errors import ComponentFailed, IbrobotError
 
+CONTROL = "control"
+"""Name of the component that owns the hardware. What needs joint states names it in `needs`."""
 _POLL_S = 0.1
 """The longest that a unit of work may wait, so that a stop is seen."""
 _STOP_TIMEOUT_S = 5.0

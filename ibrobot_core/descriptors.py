@@ -14,6 +14,8 @@ from ibrobot_core.options import NoOptions, OptionFault
 if TYPE_CHECKING:
     import click
 
+    from ibrobot_core.component import Component
+    from ibrobot_core.config.schema import RobotConfig
     from ibrobot_core.interfaces import (
         Context,
         DatasetWriter,
@@ -29,6 +31,7 @@ if TYPE_CHECKING:
         Transport,
         Viewer,
     )
+    from ibrobot_core.launch.session import Session
     from ibrobot_core.messages import CompressedImage, Image
     from ibrobot_core.robot import Robot
 
@@ -184,6 +187,25 @@ class DatasetDescriptor(Descriptor["DatasetWriter"]):
 @attrs.frozen
 class ViewerDescriptor(Descriptor["Viewer"]):
     """A viewer."""
+
+
+def only_with_section(config: RobotConfig) -> bool:
+    """For components that run only where the file has their section."""
+    return False
+
+
+@attrs.frozen
+class SectionDescriptor(Descriptor["Component"]):
+    """A section that a plugin adds to the robot YAML, e.g. `metrics: {port: 9464}`, and the component that serves it.
+
+    `type` is the section's key at the top level of the file, one that core does not have. `options` are its keys.
+    """
+
+    make: Callable[[Any, Session], Component] = attrs.field(kw_only=True)  # type: ignore[assignment]
+    """Options and run -> the component that starts and stops with the run. The options are None where the component
+    runs without its section. Imports what it needs when it is called, and opens nothing."""
+    without_section: Callable[[RobotConfig], bool] = attrs.field(default=only_with_section, kw_only=True)
+    """Whether the component also runs with a robot whose file lacks the section."""
 
 
 @attrs.frozen

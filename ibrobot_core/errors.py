@@ -55,11 +55,17 @@ class PluginError(IbrobotError):
     exit_code = 2
 
 
+def plugin_type(kind: str, type: str) -> str:
+    """What messages call a type of a kind, e.g. `teleop type 'gamepad'`."""
+    named = {"command": f"ibrobot {type}", "section": f"section {type!r}"}
+    return named.get(kind, f"{kind} type {type!r}")
+
+
 class PluginNotInstalled(PluginError):
     """A type whose plugin is not installed, or is broken.
 
     Args:
-        kind: e.g. `teleop`, or `command`.
+        kind: e.g. `teleop`, `section` or `command`.
         type: as the YAML has it, or the command's name.
         package: which offers it.
         reason: why the plugin cannot be used, where it is installed.
@@ -70,8 +76,7 @@ class PluginNotInstalled(PluginError):
         self.type = type
         self.package = package
         self.reason = reason
-        what = f"ibrobot {type}" if kind == "command" else f"{kind} type {type!r}"
-        self.missing = reason or f"{what} needs a plugin that is not installed"
+        self.missing = reason or f"{plugin_type(kind, type)} needs a plugin that is not installed"
         self.remedy = f"pip install {'--force-reinstall ' if reason else ''}{package}"
         super().__init__(reason or f"{self.missing}: {self.remedy}")
 

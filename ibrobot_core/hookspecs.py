@@ -89,6 +89,11 @@ def ibrobot_viewers() -> Iterable[descriptors.ViewerDescriptor]:  # type: ignore
 
 
 @hookspec
+def ibrobot_sections() -> Iterable[descriptors.SectionDescriptor]:  # type: ignore[empty-body]
+    """Sections that this plugin adds to the robot YAML."""
+
+
+@hookspec
 def ibrobot_configs() -> Iterable[descriptors.ConfigFile]:  # type: ignore[empty-body]
     """Robot YAMLs that this plugin ships."""
 

@@ -17,7 +17,14 @@ import pluggy
 
 from ibrobot_core import hookspecs
 from ibrobot_core.descriptors import Check, Command, ConfigFile, DecoderDescriptor, Descriptor, ReaderDescriptor
-from ibrobot_core.errors import ContractError, MissingDependency, PluginError, PluginNotInstalled, RecorderError
+from ibrobot_core.errors import (
+    ContractError,
+    MissingDependency,
+    PluginError,
+    PluginNotInstalled,
+    RecorderError,
+    plugin_type,
+)
 from ibrobot_core.options import did_you_mean
 
 if TYPE_CHECKING:
@@ -37,6 +44,7 @@ KINDS: Mapping[str, str] = {
     "recorder": "ibrobot_recorders",
     "dataset": "ibrobot_datasets",
     "viewer": "ibrobot_viewers",
+    "section": "ibrobot_sections",
 }
 """Plugin kind -> the hook that registers it."""
 _UNTYPED = ("ibrobot_readers", "ibrobot_decoders", "ibrobot_configs", "ibrobot_commands")
@@ -177,12 +185,17 @@ class Registry:
         package = next((name for name, offers in official_plugins().items() if type_ in offers.get(kind, ())), None)
         for failure in self.failures:
             if failure.package == package:
-                return PluginNotInstalled(kind, type_, package, f"{kind} type {type_!r} is not available: {failure}")
+                reason = f"{plugin_type(kind, type_)} is not available: {failure}"
+                return PluginNotInstalled(kind, type_, package, reason)
         if package is not None:
             return PluginNotInstalled(kind, type_, package)
-        offered = self.types(kind)
-        broken = "".join(f"; {failure}" for failure in self.failures)
-        return PluginError(f"unknown {kind} type {type_!r}{did_you_mean(type_, offered, 'installed')}{broken}")
+        remark = did_you_mean(type_, self.types(kind), "installed")
+        return PluginError(f"unknown {plugin_type(kind, type_)}{remark}{self.broken}")
+
+    @property
+    def broken(self) -> str:
+        """The plugins that failed, to append to the message that something unknown was asked for."""
+        return "".join(f"; {failure}" for failure in self.failures)
 
     def doctor(self) -> list[Check]:
         """The checks of all plugins; a plugin whose check raises is itself a failed check."""

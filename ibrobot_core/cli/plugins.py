@@ -89,8 +89,8 @@ def _lacking(row: dict[str, Any]) -> str:
 def _unknown(registry: Registry, type_: str) -> str:
     from ibrobot_core.options import did_you_mean
 
-    broken = "".join(f"; {failure}" for failure in registry.failures)
-    return f"unknown type {type_!r}{did_you_mean(type_, sorted({t for _, t in registry.entries}), 'installed')}{broken}"
+    remark = did_you_mean(type_, sorted({t for _, t in registry.entries}), "installed")
+    return f"unknown type {type_!r}{remark}{registry.broken}"
 
 
 def _text(value: Any) -> str:

@@ -29,7 +29,11 @@ _BOUNDS = {"ge": "minimum", "gt": "exclusiveMinimum", "le": "maximum", "lt": "ex
 
 def json_schema(registry: Registry) -> Schema:
     """The schema of the whole file."""
-    schema = _Schemas(registry).of_fields(SECTIONS)
+    schemas = _Schemas(registry)
+    schema = schemas.of_fields(SECTIONS)
+    for name in registry.types("section"):
+        section = registry.find("section", name)
+        schema["properties"][name] = {**schemas.of_fields(fields(section.options)), "description": section.summary}
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "ibrobot robot YAML", **schema}
 
 

@@ -173,6 +173,7 @@ def _build(document: Document, source: Path, sim: bool, registry: Registry, comm
         "recording": _component(sections.recording),
         "transport": _component(sections.transport),
         "viewer": _component(sections.viewer),
+        "plugin_sections": _components(sections.plugin_sections),
     }
     return RobotConfig(
         **arguments,

@@ -8,7 +8,7 @@ from typing import Any
 import attrs
 
 from ibrobot_core.config.yaml_nodes import Document, Key
-from ibrobot_core.errors import PluginNotInstalled
+from ibrobot_core.errors import PluginNotInstalled, plugin_type
 from ibrobot_core.packages import install_command
 
 _OPTIONAL_SENSORS = ("camera",)
@@ -21,6 +21,11 @@ class Missing:
 
     key: Key
     error: PluginNotInstalled
+
+    @property
+    def place(self) -> Key:
+        """What in the file names the plugin."""
+        return self.key if self.error.kind == "section" else (*self.key, "type")
 
 
 def split(
@@ -46,7 +51,7 @@ def split(
     now = always | used.get(entered or "", set())
     needed = [each for each in missing if everything or each.key in now or not _may_wait(document, each.key)]
     if needed:
-        document.add((*needed[0].key, "type"), describe(each.error for each in needed))
+        document.add(needed[0].place, describe(each.error for each in needed))
     lacking = {name: [each.error for each in missing if each.key in keys] for name, keys in used.items()}
     return {name: describe(errors) for name, errors in lacking.items() if errors and name != entered}
 
@@ -68,7 +73,7 @@ def describe(errors: Iterable[PluginNotInstalled]) -> str:
     absent = list(dict.fromkeys((error.kind, error.type) for error in found if not error.reason))
     texts = [error.reason for error in found if error.reason]
     if absent:
-        names = ", ".join(f"{kind} type {type_!r}" for kind, type_ in absent)
+        names = ", ".join(plugin_type(kind, type_) for kind, type_ in absent)
         needs = "needs a plugin that is" if len(absent) == 1 else "need plugins that are"
         command = install_command(error.package for error in found if not error.reason)
         texts.append(f"{names} {needs} not installed: {command}")

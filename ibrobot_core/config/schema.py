@@ -496,6 +496,8 @@ class RobotConfig:
     viewer: ViewerConfig | None = option(None, help="what shows the robot to a person")
     control: ControlConfig = option(factory=ControlConfig, help="the control loop")
     metrics: MetricsConfig | None = option(None, help="counts in Prometheus' text format, over HTTP on this machine")
+    plugin_sections: Mapping[str, ComponentConfig] = not_a_key(factory=dict)
+    """The sections of plugins that the file has, by name."""
     simulated: bool = not_a_key(False)
     """Whether `simulation` stands for `hardware` in this run."""
     unavailable: Mapping[str, str] = not_a_key(factory=dict, repr=False, eq=False)

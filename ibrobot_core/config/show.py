@@ -94,6 +94,7 @@ def _(value: Path) -> str:
 def document(config: RobotConfig) -> dict[str, Any]:
     """What a YAML that says everything about this run would hold, with `${…}` or `***` for secrets."""
     sections = {name: plain(getattr(config, name)) for name in SECTIONS}
+    sections |= {name: plain(section.options) for name, section in config.plugin_sections.items()}
     sections["peripherals"] = list(sections["peripherals"].values())
     if list(config.hardware) == ["hardware"]:
         sections["hardware"] = sections["hardware"]["hardware"]

@@ -65,6 +65,8 @@ class ParsedSections:
     recording: ParsedComponent[RecordingConfig] | None = None
     transport: ParsedComponent[TransportConfig] | None = None
     viewer: ParsedComponent[ViewerConfig] | None = None
+    plugin_sections: dict[str, ParsedComponent[ComponentConfig]] = attrs.field(factory=dict)
+    """The sections of plugins."""
     missing: list[Missing] = attrs.field(factory=list)
     """What could not be made for want of a plugin."""
 
@@ -73,6 +75,7 @@ class ParsedSections:
         yield from () if self.simulated else self.hardware.values()
         yield from self.peripherals.values()
         yield from (part for part in (self.simulation, self.recording, self.transport, self.viewer) if part is not None)
+        yield from self.plugin_sections.values()
 
     def all(self) -> Iterator[ParsedComponent[Any]]:
         """Every component."""
@@ -144,11 +147,28 @@ class SectionParser:
         """The file's own level: unknown and missing sections, and those that need no plugin."""
         known = {name: field for name, field in SECTIONS.items() if name in names}
         faults = Faults()
-        for name in self.document.root:
+        for name, value in self.document.root.items():
             if name not in known:
-                faults.add((name,), unknown_key(name, list(known)))
+                self._plugin_section(sections, name, value, faults)
         sections.plain = _Outline(self.base).arguments(known, self.document.root, faults)
         self._report((), faults)
+
+    def _plugin_section(self, sections: ParsedSections, name: str, value: Any, faults: Faults) -> None:
+        """A section that is not core's, where a plugin has one of this name."""
+        if (found := self.registry.entries.get(("section", name))) is None:
+            error = self.registry.not_found("section", name)
+            if isinstance(error, PluginNotInstalled):
+                self._missing.append(Missing((name,), error))
+            else:
+                known = [*SECTIONS, *self.registry.types("section")]
+                faults.add((name,), unknown_key(name, known) + self.registry.broken)
+        elif value is not None:
+            if isinstance(value, Mapping):
+                note(self.document, found.descriptor.options, value, (name,))
+            with faults.at(name):
+                options = self._converter.structure(value, found.descriptor.options)
+                section = ComponentConfig(name, options)
+                sections.plugin_sections[name] = ParsedComponent((name,), section, found.descriptor)
 
     def _report(self, key: Key, faults: Faults, below_sim: Collection[str] = ()) -> None:
         for inner, message in faults.found:

@@ -8,15 +8,13 @@ from typing import Any, override
 import numpy as np
 
 from ibrobot_core.clock import RealClock, SteppedClock
-from ibrobot_core.component import Component
+from ibrobot_core.component import CONTROL, Component
 from ibrobot_core.control.host import ControlClient, ControlHost, InlineControl
 from ibrobot_core.control.link import ControlState
 from ibrobot_core.descriptors import HardwareDescriptor
 from ibrobot_core.errors import HardwareError
 from ibrobot_core.launch.session import Session
 from ibrobot_core.messages import Float64MultiArray, Header, JointState
-
-NAME = "control"
 
 
 class ControlComponent(Component):
@@ -29,7 +27,7 @@ class ControlComponent(Component):
         parts = (
             simulation.type if config.simulated and simulation else ", ".join(h.type for h in config.hardware.values())
         )
-        super().__init__(NAME, f"{parts} at {config.control.rate_hz:g} Hz, {where}", needs)
+        super().__init__(CONTROL, f"{parts} at {config.control.rate_hz:g} Hz, {where}", needs)
         self._session = session
         self._joints = config.robot.joint_names
         self._actions = [
@@ -49,7 +47,7 @@ class ControlComponent(Component):
             assert isinstance(session.clock, RealClock)
             host = ControlClient(
                 session.config, session.clock, session.request.seed, self._publish, self._take,
-                lambda error: session.fail(NAME, error), given_up=session.finished, aftermath=_aftermath(session),
+                lambda error: session.fail(CONTROL, error), given_up=session.finished, aftermath=_aftermath(session),
             )  # fmt: skip
         session.control = host
         host.start()

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import attrs
 
-from ibrobot_core.component import Component
+from ibrobot_core.component import CONTROL, Component
 from ibrobot_core.config.missing import unavailable_modes
 from ibrobot_core.config.schema import ActionSpec, ObservationSpec, PeripheralConfig, Share
 from ibrobot_core.contract.specs import Contract
+from ibrobot_core.descriptors import SectionDescriptor
 from ibrobot_core.errors import ComponentFailed, NotSupported
 from ibrobot_core.launch.absence import describe, refuse
-from ibrobot_core.launch.control import NAME as CONTROL
 from ibrobot_core.launch.control import ControlComponent
 from ibrobot_core.launch.outputs.metrics import MetricsPort
 from ibrobot_core.launch.outputs.sharing import PublishedTopic, SubscribedTopics
@@ -152,6 +152,7 @@ def build_plan(session: Session) -> LaunchPlan:
     if added.source is not None:
         components.append(added.source)
     components.append(Status(session, (CONTROL,)))
+    components += _plugin_sections(session)
     if config.metrics is not None:
         components.append(MetricsPort(session, config.metrics, (CONTROL,)))
     if (urdf := config.robot.description.urdf) is not None:
@@ -169,6 +170,16 @@ def build_plan(session: Session) -> LaunchPlan:
         tuple(_ordered(components)), link, added, episodes, recording, worker, describe(session.absent),
         config.unavailable,
     )  # fmt: skip
+
+
+def _plugin_sections(session: Session) -> Iterator[Component]:
+    """The components of plugins' sections, each where the file has the section or the plugin says so."""
+    for name in session.registry.types("section"):
+        descriptor = session.registry.find("section", name)
+        assert isinstance(descriptor, SectionDescriptor)
+        section = session.config.plugin_sections.get(name)
+        if section is not None or descriptor.without_section(session.config):
+            yield descriptor.make(section.options if section is not None else None, session)
 
 
 def _ordered(components: list[Component]) -> list[Component]:

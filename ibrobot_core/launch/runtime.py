@@ -204,9 +204,8 @@ class Runtime:
             ComponentFailed: component and cause on one line.
         """
         if self.session.failure is not None:
-            component, error = self.session.failure
-            failure = ComponentFailed(f"{component}: {error_line(error)}")
-            failure.exit_code = exit_code(error)
+            failure = ComponentFailed(self.session.failure_text)
+            failure.exit_code = exit_code(self.session.failure[1])
             raise failure
 
     def summary(self) -> dict[str, Any]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from ibrobot_core.bus import Bus
 from ibrobot_core.clock import Clock, RealClock, SteppedClock
-from ibrobot_core.component import Worker
+from ibrobot_core.component import Worker, error_line
 from ibrobot_core.config import RobotConfig
 from ibrobot_core.config.context import component_context
 from ibrobot_core.config.schema import ComponentConfig
@@ -121,7 +121,27 @@ class CommandSource(ABC):
 
 
 class Session:
-    """What the components of a run share. Everything here is safe to read from any thread."""
+    """What the components of a run share. Everything here is safe to read from any thread.
+
+    Attributes:
+        config: the robot YAML.
+        registry: the plugins.
+        request: what the user asks of the run.
+        clock: the run's time: real, or stepped in lockstep.
+        bus: topics and services within the host process.
+        state: the newest state of the joints and of control; None before the first.
+        mode: name of the control mode that is active.
+        generation: counts mode switches and resets; a plan of an earlier generation moves nothing.
+        acting: the policy that acts; None in a mode without one.
+        sensors: sensor -> what is measured of it, of those that have given messages.
+        outcome: what came of the run so far.
+        failure: the component that died and why; None while all is well.
+        finished: set when the run should stop.
+        log: where the run writes its log.
+        command_source: what gives the active executors something to do; None in a mode without one.
+        held: whether the robot holds after the reset of a fault, until the operator enters the mode again.
+        start_failed: whether the run ended before all of it had started: nothing has moved the robot.
+    """
 
     def __init__(self, config: RobotConfig, registry: Registry, request: LaunchRequest) -> None:
         self.config = config
@@ -135,17 +155,12 @@ class Session:
         self.generation = 0
         self.command_source: CommandSource | None = None
         self.held = False
-        """Whether the robot holds after the reset of a fault, until the operator enters the mode again."""
         self.start_failed = False
-        """Whether the run ended before all of it was there: nothing has moved the robot."""
         self.state: ControlState | None = None
         self.acting: ActingPolicy | None = None
-        """None in a mode without a policy."""
         self.sensors: dict[str, SensorFigures] = {}
-        """Of each sensor that has given messages."""
         self.failure: tuple[str, Exception] | None = None
         self.finished = threading.Event()
-        """Set when the run should stop."""
         self.log = logging.getLogger("ibrobot")
         self._faults: list[tuple[int, str]] = []
         self._control: ControlHost | None = None
@@ -248,9 +263,31 @@ class Session:
         self._faults.append((self.generation if generation is None else generation, fault))
 
     @property
+    def failure_text(self) -> str:
+        """The component that died and why, on one line; empty while all is well."""
+        return f"{self.failure[0]}: {error_line(self.failure[1])}" if self.failure is not None else ""
+
+    @property
     def faults(self) -> tuple[str, ...]:
         """Faults that no reset has cleared yet; `outcome.faults` has all of the run."""
         return tuple(fault for generation, fault in self._faults if generation >= self.generation)
+
+    def counts(self) -> dict[str, Mapping[str, Any]]:
+        """All that is counted and measured in a run, in groups such as `loop` and `executor NAME`."""
+        report = self.control.report
+        counters: Mapping[str, Any] = report["counters"]
+        groups = {"loop": {**report["loop"], **counters.get("loop", {})}, "safety": counters.get("safety", {})}
+        groups["interventions"] = counters.get("joints", {})
+        groups |= {f"executor {name}": values for name, values in counters.get("executors", {}).items()}
+        groups |= {f"hardware {name}": values for name, values in counters.get("hardware", {}).items()}
+        if self.acting is not None:
+            groups |= {"dispatch": attrs.asdict(self.acting.dispatch), "inference": attrs.asdict(self.acting.engine)}
+        for name, sensor in self.sensors.items():
+            age = {"age_ms": round(sensor.age_s * 1e3, 1)} if sensor.age_s is not None else {}
+            groups[f"sensor {name}"] = {"rate_hz": round(sensor.rate_hz, 2), **age}
+        groups |= {f"sensor {each.name}": {"missing": str(each.missing)} for each in self.absent}
+        groups["bus drops"] = self.bus.dropped()
+        return groups
 
     def finish(self) -> None:
         """End the run in good order."""
@@ -264,7 +301,15 @@ class Session:
 
 
 class SessionWorker(Worker):
-    """A worker of a run, whose failure ends it."""
+    """A worker of a run, whose failure ends it.
+
+    Args:
+        session: the run; an attribute, too.
+        name: unique within the run.
+        summary: one line for `--dry-run`.
+        needs: names of the components that must be ready before this one starts, e.g. `CONTROL`.
+        ready_timeout_s: how long `start` waits to be ready [s].
+    """
 
     def __init__(
         self, session: Session, name: str, summary: str, needs: tuple[str, ...] = (), *, ready_timeout_s: float = 60.0

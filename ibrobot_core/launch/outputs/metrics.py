@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, override
 
-from ibrobot_core.component import Component, error_line
+from ibrobot_core.component import Component
 from ibrobot_core.config.schema import MetricsConfig
-from ibrobot_core.launch.outputs.status import counts
 from ibrobot_core.launch.session import Session
 from ibrobot_core.metrics import Metrics, MetricsProbes, MetricsServer
 
@@ -57,7 +56,7 @@ def collect(session: Session, metrics: Metrics) -> None:
     metrics.add("faults", len(outcome.faults), robot, counter=True)
     metrics.add("episodes", outcome.episodes, robot, counter=True)
     metrics.add("successes", outcome.successes, robot, counter=True)
-    for group, values in counts(session).items():
+    for group, values in session.counts().items():
         _collect_group(metrics, group, values, robot)
 
 
@@ -77,10 +76,7 @@ def _collect_group(metrics: Metrics, group: str, values: Mapping[str, Any], robo
 
 def unhealthy(session: Session) -> str:
     """Why the run should be started again; empty where it should not."""
-    if session.failure is not None:
-        component, error = session.failure
-        return f"{component}: {error_line(error)}"
-    return "the run is over" if session.finished.is_set() else ""
+    return session.failure_text or ("the run is over" if session.finished.is_set() else "")
 
 
 def unready(session: Session) -> str:

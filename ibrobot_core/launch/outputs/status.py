@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, override
 
-import attrs
-
 from ibrobot_core.interfaces import Severity
 from ibrobot_core.launch.session import Session, SessionWorker
 from ibrobot_core.messages import DiagnosticArray, DiagnosticStatus, Header, KeyValue, RobotStatus
@@ -53,7 +51,7 @@ class Status(SessionWorker):
 
     def _diagnostics(self, now_ns: int) -> DiagnosticArray:
         session = self.session
-        groups = counts(session)
+        groups = session.counts()
         level = DiagnosticStatus.ERROR if session.faults else DiagnosticStatus.OK
         robot = session.config.robot.name
         statuses = [
@@ -63,24 +61,6 @@ class Status(SessionWorker):
         conditions = session.control.report["counters"].get("conditions", ())
         statuses += [_of_joint(condition, robot) for condition in conditions]
         return DiagnosticArray(Header(now_ns), tuple(statuses))
-
-
-def counts(session: Session) -> dict[str, Mapping[str, Any]]:
-    """All that is counted and measured in a run, in groups such as `loop` and `executor NAME`."""
-    report = session.control.report
-    counters: Mapping[str, Any] = report["counters"]
-    groups = {"loop": {**report["loop"], **counters.get("loop", {})}, "safety": counters.get("safety", {})}
-    groups["interventions"] = counters.get("joints", {})
-    groups |= {f"executor {name}": values for name, values in counters.get("executors", {}).items()}
-    groups |= {f"hardware {name}": values for name, values in counters.get("hardware", {}).items()}
-    if session.acting is not None:
-        groups |= {"dispatch": attrs.asdict(session.acting.dispatch), "inference": attrs.asdict(session.acting.engine)}
-    for name, sensor in session.sensors.items():
-        age = {"age_ms": round(sensor.age_s * 1e3, 1)} if sensor.age_s is not None else {}
-        groups[f"sensor {name}"] = {"rate_hz": round(sensor.rate_hz, 2), **age}
-    groups |= {f"sensor {each.name}": {"missing": str(each.missing)} for each in session.absent}
-    groups["bus drops"] = session.bus.dropped()
-    return groups
 
 
 def _of_joint(condition: Mapping[str, Any], robot: str) -> DiagnosticStatus:

@@ -17,6 +17,7 @@ from ibrobot_testing.leaks import LeakCheck
 from ibrobot_testing.planner import PlannerSuite
 from ibrobot_testing.policy import PolicySuite
 from ibrobot_testing.recorder import RecorderSuite
+from ibrobot_testing.section import SectionSuite, make_session
 from ibrobot_testing.sensor import SensorSuite
 from ibrobot_testing.suite import Suite, checks, failed_checks, run_checks
 from ibrobot_testing.teleop import TeleopSuite
@@ -31,6 +32,7 @@ __all__ = [
     "PlannerSuite",
     "PolicySuite",
     "RecorderSuite",
+    "SectionSuite",
     "SensorSuite",
     "SimulatedHardwareSuite",
     "Suite",
@@ -44,5 +46,6 @@ __all__ = [
     "host_context",
     "ibrobot_command",
     "make_robot",
+    "make_session",
     "run_checks",
 ]

@@ -1,0 +1,89 @@
+"""The conformance suite of the components of sections."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, cast
+
+import attrs
+import numpy as np
+
+from ibrobot_core.api import Component, Header, JointState, LaunchRequest, Registry, RobotConfig, Session
+from ibrobot_testing.contexts import make_robot
+from ibrobot_testing.suite import Suite
+
+
+@attrs.define
+class FakeControl:
+    """The host's side of control, of a run without hardware."""
+
+    report: Mapping[str, Any] = attrs.field(factory=lambda: {"loop": {}, "counters": {}})
+
+
+def make_session(**changes: Any) -> Session:
+    """A run in lockstep of the robot of `make_robot`, without hardware, executors or modes.
+
+    Args:
+        changes: fields of its `RobotConfig`, e.g. `robot`.
+    """
+    fields = {"robot": make_robot(), "executors": {}, "control_modes": {}, "default_control_mode": "idle"}
+    session = Session(RobotConfig(**{**fields, **changes}), Registry(), LaunchRequest(lockstep=True))
+    session.control = cast("Any", FakeControl())
+    return session
+
+
+class SectionSuite(Suite[Component]):
+    """What every component of a section must do. The subclass writes `component`, in place of `make`."""
+
+    def session(self) -> Session:
+        """The run; override for another robot."""
+        return make_session()
+
+    def component(self, session: Session) -> Component:
+        """A new component under test, not yet started, as the descriptor's `make` gives it."""
+        raise NotImplementedError(f"{type(self).__name__} must define component(self, session)")
+
+    @contextmanager
+    def started(self) -> Iterator[tuple[Component, Session]]:
+        """A started component and its run."""
+        session = self.session()
+        component = self.component(session)
+        try:
+            component.start()
+            yield component, session
+        finally:
+            component.stop()
+
+    def test_says_what_it_is(self) -> None:
+        """`name` and `summary` are text, for the plan that `--dry-run` prints."""
+        component = self.component(self.session())
+        assert component.name, "name is empty"
+        assert component.summary, "summary is empty"
+
+    def test_steps_without_and_with_messages(self) -> None:
+        """A tick of lockstep does not need messages, and takes joint states."""
+        with self.started() as (component, session):
+            joints = session.config.robot.joint_names
+            for _ in range(3):
+                component.step(session.clock.now_ns())
+                session.bus.publish("/joint_states", JointState(Header(1), joints, np.zeros(len(joints))))
+
+    def test_start_and_stop_are_safe_at_any_time(self) -> None:
+        """`stop` may come before `start` and twice; `start` works again afterwards, and serves what it served."""
+        session = self.session()
+        component = self.component(session)
+        component.stop()
+        for _ in range(2):
+            component.start()
+            component.stop()
+            component.stop()
+
+    def test_leaves_the_bus_when_stopped(self) -> None:
+        """After `stop` nothing queues up for it any more."""
+        with self.started() as (component, session):
+            component.stop()
+            joints = session.config.robot.joint_names
+            for _ in range(2000):
+                session.bus.publish("/joint_states", JointState(Header(1), joints, np.zeros(len(joints))))
+            assert session.bus.dropped() == {}, "a subscription was left behind"
