@@ -39,6 +39,10 @@ class Message:
 
     ros_type: ClassVar[str] = ""
 
+    def __init_subclass__(cls, ros_type: str = "") -> None:
+        if ros_type:  # attrs makes each class a second time, without it
+            cls.ros_type = ros_type
+
 
 @attrs.frozen
 class Header:
@@ -49,26 +53,23 @@ class Header:
 
 
 @attrs.frozen
-class Bool(Message):
+class Bool(Message, ros_type="std_msgs/msg/Bool"):
     """std_msgs/msg/Bool."""
 
-    ros_type: ClassVar[str] = "std_msgs/msg/Bool"
     data: bool
 
 
 @attrs.frozen
-class Int32(Message):
+class Int32(Message, ros_type="std_msgs/msg/Int32"):
     """std_msgs/msg/Int32."""
 
-    ros_type: ClassVar[str] = "std_msgs/msg/Int32"
     data: int
 
 
 @attrs.frozen
-class String(Message):
+class String(Message, ros_type="std_msgs/msg/String"):
     """std_msgs/msg/String."""
 
-    ros_type: ClassVar[str] = "std_msgs/msg/String"
     data: str
 
 
@@ -90,37 +91,33 @@ class MultiArrayLayout:
 
 
 @attrs.frozen
-class Float32MultiArray(Message):
+class Float32MultiArray(Message, ros_type="std_msgs/msg/Float32MultiArray"):
     """std_msgs/msg/Float32MultiArray; `data` has shape (N,)."""
 
-    ros_type: ClassVar[str] = "std_msgs/msg/Float32MultiArray"
     data: NDArray[np.float32] = attrs.field(converter=_float32s, eq=_EQUAL)
     layout: MultiArrayLayout = MultiArrayLayout()
 
 
 @attrs.frozen
-class Float64MultiArray(Message):
+class Float64MultiArray(Message, ros_type="std_msgs/msg/Float64MultiArray"):
     """std_msgs/msg/Float64MultiArray; `data` has shape (N,)."""
 
-    ros_type: ClassVar[str] = "std_msgs/msg/Float64MultiArray"
     data: NDArray[np.float64] = attrs.field(converter=_float64s, eq=_EQUAL)
     layout: MultiArrayLayout = MultiArrayLayout()
 
 
 @attrs.frozen
-class Int32MultiArray(Message):
+class Int32MultiArray(Message, ros_type="std_msgs/msg/Int32MultiArray"):
     """std_msgs/msg/Int32MultiArray; `data` has shape (N,)."""
 
-    ros_type: ClassVar[str] = "std_msgs/msg/Int32MultiArray"
     data: NDArray[np.int32] = attrs.field(converter=_int32s, eq=_EQUAL)
     layout: MultiArrayLayout = MultiArrayLayout()
 
 
 @attrs.frozen
-class JointState(Message):
+class JointState(Message, ros_type="sensor_msgs/msg/JointState"):
     """sensor_msgs/msg/JointState: position [rad], velocity [rad/s], effort [Nm], shape (J,), or (0,) where unknown."""
 
-    ros_type: ClassVar[str] = "sensor_msgs/msg/JointState"
     header: Header
     name: tuple[str, ...]
     position: NDArray[np.float64] = attrs.field(default=_NOTHING, converter=_float64s, eq=_EQUAL)
@@ -129,10 +126,9 @@ class JointState(Message):
 
 
 @attrs.frozen
-class Image(Message):
+class Image(Message, ros_type="sensor_msgs/msg/Image"):
     """sensor_msgs/msg/Image: `data` holds `height` rows of `step` bytes, padding included, shape (height * step,)."""
 
-    ros_type: ClassVar[str] = "sensor_msgs/msg/Image"
     header: Header
     height: int
     width: int
@@ -143,20 +139,18 @@ class Image(Message):
 
 
 @attrs.frozen
-class CompressedImage(Message):
+class CompressedImage(Message, ros_type="sensor_msgs/msg/CompressedImage"):
     """sensor_msgs/msg/CompressedImage: `data` is a JPEG or PNG file's bytes, shape (N,)."""
 
-    ros_type: ClassVar[str] = "sensor_msgs/msg/CompressedImage"
     header: Header
     format: str
     data: NDArray[np.uint8] = attrs.field(converter=_uint8s, eq=_EQUAL)
 
 
 @attrs.frozen
-class CameraInfo(Message):
+class CameraInfo(Message, ros_type="sensor_msgs/msg/CameraInfo"):
     """sensor_msgs/msg/CameraInfo without binning and region of interest: `k` (9,), `r` (9,), `p` (12,), row-major."""
 
-    ros_type: ClassVar[str] = "sensor_msgs/msg/CameraInfo"
     header: Header
     height: int
     width: int
@@ -187,10 +181,9 @@ class Quaternion:
 
 
 @attrs.frozen
-class Imu(Message):
+class Imu(Message, ros_type="sensor_msgs/msg/Imu"):
     """sensor_msgs/msg/Imu: angular velocity [rad/s], linear acceleration [m/s^2]; covariances (9,), row-major."""
 
-    ros_type: ClassVar[str] = "sensor_msgs/msg/Imu"
     header: Header
     orientation: Quaternion = Quaternion()
     angular_velocity: Vector3 = Vector3()
@@ -201,10 +194,9 @@ class Imu(Message):
 
 
 @attrs.frozen
-class Joy(Message):
+class Joy(Message, ros_type="sensor_msgs/msg/Joy"):
     """sensor_msgs/msg/Joy: `axes` (A,) in -1..1, `buttons` (B,) 0 or 1."""
 
-    ros_type: ClassVar[str] = "sensor_msgs/msg/Joy"
     header: Header
     axes: NDArray[np.float32] = attrs.field(default=_NOTHING, converter=_float32s, eq=_EQUAL)
     buttons: NDArray[np.int32] = attrs.field(default=_NOTHING, converter=_int32s, eq=_EQUAL)
@@ -221,10 +213,9 @@ class PointField:
 
 
 @attrs.frozen
-class PointCloud2(Message):
+class PointCloud2(Message, ros_type="sensor_msgs/msg/PointCloud2"):
     """sensor_msgs/msg/PointCloud2: `data` has shape (height * row_step,)."""
 
-    ros_type: ClassVar[str] = "sensor_msgs/msg/PointCloud2"
     header: Header
     height: int
     width: int
@@ -237,37 +228,33 @@ class PointCloud2(Message):
 
 
 @attrs.frozen
-class Pose(Message):
+class Pose(Message, ros_type="geometry_msgs/msg/Pose"):
     """geometry_msgs/msg/Pose: position [m] and orientation."""
 
-    ros_type: ClassVar[str] = "geometry_msgs/msg/Pose"
     position: Vector3 = Vector3()
     orientation: Quaternion = Quaternion()
 
 
 @attrs.frozen
-class PoseStamped(Message):
+class PoseStamped(Message, ros_type="geometry_msgs/msg/PoseStamped"):
     """geometry_msgs/msg/PoseStamped."""
 
-    ros_type: ClassVar[str] = "geometry_msgs/msg/PoseStamped"
     header: Header
     pose: Pose
 
 
 @attrs.frozen
-class Twist(Message):
+class Twist(Message, ros_type="geometry_msgs/msg/Twist"):
     """geometry_msgs/msg/Twist: linear [m/s], angular [rad/s]."""
 
-    ros_type: ClassVar[str] = "geometry_msgs/msg/Twist"
     linear: Vector3 = Vector3()
     angular: Vector3 = Vector3()
 
 
 @attrs.frozen
-class TransformStamped(Message):
+class TransformStamped(Message, ros_type="geometry_msgs/msg/TransformStamped"):
     """geometry_msgs/msg/TransformStamped: `child_frame_id` as seen from `header.frame_id`."""
 
-    ros_type: ClassVar[str] = "geometry_msgs/msg/TransformStamped"
     header: Header
     child_frame_id: str
     translation: Vector3 = Vector3()
@@ -275,10 +262,9 @@ class TransformStamped(Message):
 
 
 @attrs.frozen
-class TFMessage(Message):
+class TFMessage(Message, ros_type="tf2_msgs/msg/TFMessage"):
     """tf2_msgs/msg/TFMessage."""
 
-    ros_type: ClassVar[str] = "tf2_msgs/msg/TFMessage"
     transforms: tuple[TransformStamped, ...]
 
 
@@ -294,10 +280,9 @@ class JointTrajectoryPoint:
 
 
 @attrs.frozen
-class JointTrajectory(Message):
+class JointTrajectory(Message, ros_type="trajectory_msgs/msg/JointTrajectory"):
     """trajectory_msgs/msg/JointTrajectory."""
 
-    ros_type: ClassVar[str] = "trajectory_msgs/msg/JointTrajectory"
     header: Header
     joint_names: tuple[str, ...]
     points: tuple[JointTrajectoryPoint, ...]
@@ -327,19 +312,17 @@ class DiagnosticStatus:
 
 
 @attrs.frozen
-class DiagnosticArray(Message):
+class DiagnosticArray(Message, ros_type="diagnostic_msgs/msg/DiagnosticArray"):
     """diagnostic_msgs/msg/DiagnosticArray."""
 
-    ros_type: ClassVar[str] = "diagnostic_msgs/msg/DiagnosticArray"
     header: Header
     status: tuple[DiagnosticStatus, ...]
 
 
 @attrs.frozen
-class Variant(Message):
+class Variant(Message, ros_type="ibrobot_msgs/msg/Variant"):
     """ibrobot_msgs/msg/Variant: one named tensor; `data` in C order as bytes of `dtype` with `shape`."""
 
-    ros_type: ClassVar[str] = "ibrobot_msgs/msg/Variant"
     key: str
     dtype: str
     shape: tuple[int, ...]
@@ -347,19 +330,17 @@ class Variant(Message):
 
 
 @attrs.frozen
-class VariantsList(Message):
+class VariantsList(Message, ros_type="ibrobot_msgs/msg/VariantsList"):
     """ibrobot_msgs/msg/VariantsList: named tensors that belong to one instant."""
 
-    ros_type: ClassVar[str] = "ibrobot_msgs/msg/VariantsList"
     header: Header
     variants: tuple[Variant, ...]
 
 
 @attrs.frozen
-class RobotStatus(Message):
+class RobotStatus(Message, ros_type="ibrobot_msgs/msg/RobotStatus"):
     """ibrobot_msgs/msg/RobotStatus: what the robot is doing."""
 
-    ros_type: ClassVar[str] = "ibrobot_msgs/msg/RobotStatus"
     header: Header
     robot: str
     mode: str
@@ -381,12 +362,8 @@ class RobotStatus(Message):
 
 
 MESSAGE_TYPES: dict[str, type[Message]] = {
-    cls.ros_type: cls
-    for cls in (
-        Bool, Int32, String, Float32MultiArray, Float64MultiArray, Int32MultiArray,
-        JointState, Image, CompressedImage, CameraInfo, Imu, Joy, PointCloud2,
-        Pose, PoseStamped, Twist, TransformStamped, TFMessage, JointTrajectory, DiagnosticArray,
-        Variant, VariantsList, RobotStatus,
-    )
-}  # fmt: skip
+    each.ros_type: each
+    for each in tuple(globals().values())
+    if isinstance(each, type) and issubclass(each, Message) and each.ros_type
+}
 """Every message class by its ROS 2 name."""

@@ -9,12 +9,8 @@ from typing import Any
 
 import attrs
 import yaml
-from yaml.composer import Composer
 from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
-from yaml.parser import Parser
-from yaml.reader import Reader
 from yaml.resolver import BaseResolver
-from yaml.scanner import Scanner
 
 from ibrobot_core.config.expand import expand
 from ibrobot_core.errors import ConfigError, Problem
@@ -121,16 +117,10 @@ def _child(value: Any, part: str | int) -> Any:
     return None
 
 
-class _Composer(Reader, Scanner, Parser, Composer, BaseResolver):
+class _Composer(yaml.SafeLoader):
     """PyYAML's composer without its YAML 1.1 scalars: plain ones keep their text."""
 
-    def __init__(self, text: str) -> None:
-        Reader.__init__(self, text)
-        Scanner.__init__(self)
-        Parser.__init__(self)
-        Composer.__init__(self)
-        BaseResolver.__init__(self)
-        self._values = 0
+    _values = 0
 
     def compose_node(self, parent: Node | None, index: Any) -> Node | None:
         self._values += 1
@@ -142,6 +132,9 @@ class _Composer(Reader, Scanner, Parser, Composer, BaseResolver):
         if self.flow_level > _MAX_DEPTH:
             raise _Excess(_TOO_DEEP, self.get_mark())
         super().fetch_flow_collection_start(token)
+
+
+_Composer.yaml_implicit_resolvers = {}
 
 
 class _Excess(yaml.MarkedYAMLError):
