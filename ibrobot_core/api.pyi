@@ -219,9 +219,8 @@ from ibrobot_core.inference.wire import (
 from ibrobot_core.recording.dataset import EpisodeDataset as EpisodeDataset
 from ibrobot_core.recording.episode import episode_folder as episode_folder
 from ibrobot_core.recording.provenance import (
-    episode_origin as episode_origin,
-    recorded_contract as recorded_contract,
     metadata_from_config as metadata_from_config,
+    robot_metadata as robot_metadata,
 )
 from ibrobot_core.metrics import Metrics as Metrics, MetricsProbes as MetricsProbes, MetricsServer as MetricsServer
 from ibrobot_core.control.realtime import go_real_time as go_real_time

@@ -36,6 +36,7 @@ from pathlib import Path
 
 import attrs
 import numpy as np
+from ibrobot_data.episode import recorded_contract
 from ibrobot_data.ticks import Ticks
 from ibrobot_mcap.metadata import METADATA
 from ibrobot_mcap.options import McapOptions
@@ -52,7 +53,6 @@ from ibrobot_core.contract.specs import ActionPart, Contract, ObservationPart
 from ibrobot_core.errors import IbrobotError
 from ibrobot_core.interfaces import EpisodeEnd, EpisodeStart, Feature
 from ibrobot_core.messages import Float64MultiArray, Header, JointState
-from ibrobot_core.recording.provenance import recorded_contract
 
 JOINTS = ("pan", "tilt")
 CONTRACT = Contract(

@@ -35,7 +35,6 @@ from ibrobot_core.api import (
     RecorderError,
     Robot,
     installed_plugins,
-    recorded_contract,
 )
 from ibrobot_data.identity import identity
 from ibrobot_data.request import ConversionRequest, EpisodeReport
@@ -257,6 +256,23 @@ def _contract(request: ConversionRequest, summary: EpisodeSummary) -> Contract:
         difference = request.contract.difference(recorded, names=("--config", "recorded"))
         raise ContractError(f"recorded with another contract; --force-contract takes --config's:\n{difference}")
     return request.contract
+
+
+def recorded_contract(metadata: Mapping[str, str]) -> Contract | None:
+    """The contract that an episode was recorded by; None for one without.
+
+    Raises:
+        ContractError: when it cannot be read, or is not the one that its fingerprint is of.
+    """
+    if "contract" not in metadata:
+        return None
+    try:
+        contract = Contract.from_canonical(json.loads(metadata["contract"]))
+    except (ValueError, RecursionError) as error:
+        raise ContractError(f"the recorded contract cannot be read: {error}") from None
+    if metadata.get("fingerprint", contract.fingerprint()) != contract.fingerprint():
+        raise ContractError("the recorded contract is damaged: it is not the one that the recorded fingerprint is of")
+    return contract
 
 
 def _recorded(summary: EpisodeSummary, name: str) -> Mapping[str, Any]:

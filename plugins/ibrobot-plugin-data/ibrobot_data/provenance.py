@@ -1,4 +1,4 @@
-"""What a dataset keeps of where it comes from; `ibrobot_core.recording.provenance` reads it back."""
+"""What a dataset keeps of where it comes from; the readers of dataset plugins read it back."""
 
 from __future__ import annotations
 

@@ -23,10 +23,10 @@ from ibrobot_core.api import (
     Recorded,
     RecorderError,
     TopicSummary,
-    episode_origin,
 )
 from ibrobot_lerobot import layout
 from ibrobot_lerobot.compose import Composer
+from ibrobot_lerobot.origin import episode_origin
 from ibrobot_lerobot.rows import EpisodeRows
 
 

@@ -1,0 +1,79 @@
+"""Where the episodes of a dataset come from: what `ibrobot convert` kept in it, or what the caller states."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import attrs
+
+from ibrobot_core.api import CalibrationError, Contract, ContractError, RecorderError, robot_metadata
+
+
+@attrs.frozen
+class Origin:
+    """Where an episode of a dataset comes from."""
+
+    metadata: Mapping[str, str]
+    """As the recorder was given: contract, fingerprint, config, calibration, prompt, seed, …"""
+    contract: Contract
+    document: Mapping[str, Any]
+    """The robot YAML as plain values; empty where it is not known."""
+    calibration: Mapping[str, Mapping[str, Any]]
+    """Joint -> fields of `JointCalibration`; empty where it is not known."""
+    norm_mode: str
+    """The unit of the dataset's joint positions."""
+    outcome: str = "unknown"
+    start_ns: int | None = None
+    """Receipt of the first message of the recording [ns]."""
+
+
+def episode_origin(root: Path, metadata: Mapping[str, Any], number: int, given: Mapping[str, str]) -> Origin:
+    """Where episode `number` of a dataset comes from.
+
+    Args:
+        root: the dataset, for errors.
+        metadata: what the dataset keeps; empty for one that `convert` did not make, which goes by `given`.
+        number: from 0.
+        given: as in `EpisodeAddress`.
+
+    Raises:
+        ContractError: when neither says what the vectors are.
+        RecorderError: for metadata that cannot be read.
+    """
+    if "conversion" not in metadata:
+        return _origin_as_given(root, given)
+    try:
+        episode = metadata["episodes"][number]
+        calibration = metadata["calibrations"][episode["calibration"]] if episode["calibration"] else {}
+        document = metadata["configs"][episode["config"]] if episode.get("config") else {}
+        contract = Contract.from_canonical(metadata["contract"]).without_signals()
+        recorded = dict(episode.get("recorded", {}))
+        norm_mode = metadata["conversion"]["norm_mode"]
+        told_apart = {"prompt": episode["prompt"], "source": f"{root.resolve().name}:{number}"}
+        outcome, start_ns = episode["outcome"], episode["start_ns"]
+    except (KeyError, IndexError, TypeError) as error:
+        raise RecorderError(f"{root}: what it keeps of episode {number} cannot be read: {error!r}") from None
+    recorded |= told_apart | robot_metadata(contract, document, {"converted": calibration} if calibration else {})
+    return Origin(recorded, contract, document, calibration, norm_mode, outcome, start_ns)
+
+
+def _origin_as_given(root: Path, given: Mapping[str, str]) -> Origin:
+    if "contract" not in given:
+        raise ContractError(
+            f"{root}: was not made by ibrobot, so it does not say which robot its vectors are of; "
+            "name a robot YAML whose contract fits it"
+        )
+    if "norm_mode" not in given:
+        raise CalibrationError(
+            f"{root}: was not made by ibrobot, so it does not say the unit of its joints; "
+            "--norm-mode does: radians, degrees or range_m100_100"
+        )
+    contract = Contract.from_canonical(json.loads(given["contract"]))
+    calibrations = json.loads(given.get("calibration", "{}"))
+    document = json.loads(given.get("config", "{}"))
+    joined = {joint: numbers for each in calibrations.values() for joint, numbers in each.items()}
+    described = robot_metadata(contract, document, calibrations)
+    return Origin(described, contract, document, joined, given["norm_mode"])
