@@ -28,7 +28,7 @@ def _realsense(options: Any, ctx: Context) -> Sensor:
 
 
 def _check(options: Any, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
-    """The calibration file can be read."""
+    """Check that the calibration file can be read."""
     if options.info is not None:
         from ibrobot_camera.calibration import load_info
 
@@ -66,7 +66,7 @@ def _decoder() -> Callable[[CompressedImage], Image | None]:
 
 @hookimpl
 def ibrobot_decoders() -> Iterable[DecoderDescriptor]:
-    """Of the pictures that these cameras give."""
+    """The decoder of JPEG images."""
     yield DecoderDescriptor(("jpeg", "png", "compressedDepth png"), _decoder)
 
 
@@ -79,12 +79,12 @@ def _commands() -> click.Command:
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
     """`ibrobot camera …`."""
-    yield Command("camera", "List, look through and photograph with cameras.", _commands)
+    yield Command("camera", "List and preview cameras, and save snapshots.", _commands)
 
 
 @hookimpl
 def ibrobot_doctor() -> Iterable[Check]:
-    """Which cameras this user may open."""
+    """Check which cameras the user may open."""
     from ibrobot_camera.v4l2 import cameras
 
     for camera in cameras():

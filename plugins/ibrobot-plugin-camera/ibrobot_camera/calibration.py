@@ -1,4 +1,4 @@
-"""Camera calibrations as ROS's camera_calibration writes them."""
+"""Camera calibrations in the format of ROS's camera_calibration."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from ibrobot_core.api import CameraInfo, Header, SensorError
 
 _MATRICES = {"distortion_coefficients": None, "camera_matrix": 9, "rectification_matrix": 9, "projection_matrix": 12}
-"""Key -> how many numbers it has."""
+"""Key -> number of its values."""
 
 
 def load_info(path: Path) -> Callable[[Header], CameraInfo]:
-    """What makes the CameraInfo of a calibration file.
+    """Read a calibration file; returns a function that makes its CameraInfo.
 
     Raises:
-        SensorError: naming file and key, when it cannot be read or lacks something.
+        SensorError: if the file cannot be read or is incomplete; names file and key.
     """
     try:
         document = yaml.safe_load(path.read_text())

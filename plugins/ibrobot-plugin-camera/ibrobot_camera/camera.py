@@ -1,4 +1,4 @@
-"""The sensor `opencv`: the newest picture of a live source, or a video file at its own rate."""
+"""The sensor `opencv`: the newest image of a live source, or a video file at its own rate."""
 
 from __future__ import annotations
 
@@ -29,21 +29,21 @@ from ibrobot_core.api import (
 )
 
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 2.0
-"""Between attempts to open a lost source again."""
+"""Time between attempts to reopen a lost source."""
 _CLOSE_S = 5.0
 
 
 class OpenCvCamera(Sensor):
-    """Pictures of a V4L2 device or a network stream, read by a thread that keeps only the newest; or of a video file.
+    """Images of a V4L2 device or a network stream, read by a thread that keeps only the newest; or of a video file.
 
-    With `encoding: jpeg` they are `CompressedImage`: the source's own bytes where it sends JPEG and nothing turns them.
+    With `encoding: jpeg` they are `CompressedImage`: the original bytes if the source sends JPEG and `rotation` is 0.
 
     Args:
-        options: the YAML's.
+        options: options from the YAML.
         ctx: name, clock and logger.
 
     Raises:
-        SensorError: for a device that is not there, or a calibration that cannot be read.
+        SensorError: if the device does not exist, or the calibration cannot be read.
     """
 
     def __init__(self, options: OpenCvOptions, ctx: Context) -> None:
@@ -68,7 +68,9 @@ class OpenCvCamera(Sensor):
     def open(self) -> None:
         device = find_device(self._options.device, self._ctx.name)
         if device.kind != "file" and isinstance(self._ctx.clock, SteppedClock):
-            raise SensorError(f"camera {self._ctx.name}: {device}: a live source cannot be in lockstep; a file can")
+            raise SensorError(
+                f"camera {self._ctx.name}: {device}: a live source cannot run in lockstep; a video file can"
+            )
         make = _File if device.kind == "file" else _Live
         self._info = self._load_info()
         source = make(lambda: Capture(device, self._options, self._ctx.name), self._options, self._ctx)
@@ -84,7 +86,7 @@ class OpenCvCamera(Sensor):
             return None
         picture, stamp_ns = found
         self._check_calibration(picture.size)
-        # A driver whose stamps stand still must not give two pictures of one time.
+        # A driver that repeats a stamp must not give two images with the same time.
         self._last_ns = stamp_ns = max(stamp_ns, self._last_ns + 1)
         return self._message(picture.content, Header(stamp_ns, self._frame_id))
 
@@ -106,7 +108,7 @@ class OpenCvCamera(Sensor):
         calibrated, (height, width) = self._info(Header()), size
         if (calibrated.width, calibrated.height) != (width, height):
             raise SensorError(
-                f"camera {self._ctx.name}: {self._options.info}: is for pictures of "
+                f"camera {self._ctx.name}: {self._options.info}: is for images of "
                 f"{calibrated.width}x{calibrated.height}, these are {width}x{height}"
             )
 
@@ -124,7 +126,7 @@ def wants_jpeg(options: OpenCvOptions) -> bool:
 
 
 def to_image(pixels: Pixels, header: Header) -> Image:
-    """A picture as a message: bgr8, mono8, or 16UC1 for depth."""
+    """An image as a message: bgr8, mono8, or 16UC1 for depth."""
     height, width = pixels.shape[:2]
     encoding = "16UC1" if pixels.dtype == "uint16" else "bgr8" if pixels.ndim == 3 else "mono8"
     flat = pixels.reshape(-1).view("uint8")
@@ -132,7 +134,7 @@ def to_image(pixels: Pixels, header: Header) -> Image:
 
 
 class _Live:
-    """A source that gives pictures by itself: a thread takes each, and keeps the newest."""
+    """A live source: a thread reads every image and keeps the newest."""
 
     def __init__(self, make: Callable[[], Capture], options: OpenCvOptions, ctx: Context) -> None:
         self._make = make
@@ -149,7 +151,7 @@ class _Live:
         for difference in capture.differences:
             self._ctx.log.warning("camera %s %s", self._ctx.name, difference)
         if self._as_jpeg and not capture.own_jpeg:
-            self._ctx.log.info("camera %s sends no JPEG; its pictures are encoded once, here", self._ctx.name)
+            self._ctx.log.info("camera %s does not send JPEG; its images are encoded once, here", self._ctx.name)
         self._thread = threading.Thread(target=self._run, args=(capture,), name=f"camera {self._ctx.name}", daemon=True)
         self._thread.start()
 
@@ -187,7 +189,7 @@ class _Live:
             capture.close()
 
     def _reconnect(self) -> Capture | None:
-        """The source again, or None when the camera is closed or was gone for too long."""
+        """The reopened source, or None if the camera was closed or the timeout has passed."""
         self._ctx.log.warning("camera %s is lost; trying for %g s", self._ctx.name, self._patience_s)
         lost, pause_s = time.monotonic(), _FIRST_PAUSE_S
         while True:
@@ -200,7 +202,7 @@ class _Live:
                 return capture
             if time.monotonic() - lost >= self._patience_s:
                 with self._changed:
-                    self._error = SensorError(f"{last}; it was lost and did not come back in {self._patience_s:g} s")
+                    self._error = SensorError(f"{last}; it was lost and did not return within {self._patience_s:g} s")
                     self._changed.notify()
                 return None
             if self._ended.wait(pause_s):
@@ -209,7 +211,7 @@ class _Live:
 
 
 class _File:
-    """A video file: picture `i` is due `i / rate` after it was opened, in the clock's time."""
+    """A video file: image `i` is due `i / rate` after it was opened, by the clock."""
 
     def __init__(self, make: Callable[[], Capture], options: OpenCvOptions, ctx: Context) -> None:
         self._make = make
@@ -221,7 +223,7 @@ class _File:
         rate = self._options.fps or self._capture.fps
         if not rate:
             self._capture.close()
-            raise SensorError(f"camera {self._ctx.name}: the file does not say its rate; give fps")
+            raise SensorError(f"camera {self._ctx.name}: the file does not state its rate; set fps")
         self._period_ns = ns(1.0 / rate)
         self._begun_ns = self._ctx.clock.now_ns()
         self._next = 0
@@ -237,7 +239,7 @@ class _File:
                 return None
             clock.sleep_until(due_ns)
             now_ns = clock.now_ns()
-        # Of several that are due only the newest is given, with the time at which it was.
+        # If several are due, return only the newest, with the time at which it was due.
         picture = None
         while due_ns <= now_ns:
             newer = self._picture()

@@ -1,4 +1,4 @@
-"""One open source of pictures, through OpenCV: set up as asked, compared with what was asked, stamped."""
+"""An open image source, through OpenCV: configured as requested, verified, and stamped."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from ibrobot_camera.v4l2 import Mode, modes
 from ibrobot_core.api import NS_PER_S, CompressedImage, ContractError, Header, SensorError
 
 DEPTHS = ("Y16 ", "Z16 ")
-"""Formats of 16 bits a pixel, which JPEG cannot hold."""
+"""Formats with 16 bits per pixel, which JPEG does not support."""
 _MJPG = "MJPG"
 
 type Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 
 _TIMEOUT_MS = 3000
-"""After it a network stream that says nothing is lost."""
+"""A network stream that is silent for this long is lost."""
 _DAMAGED = 30
-"""After so many pictures in a row that cannot be decoded the source is lost; single ones, as USB has, are left out."""
+"""After this many undecodable images in a row the source is lost; single ones, common over USB, are skipped."""
 _STREAM_OPTIONS = "rtsp_transport;tcp|fflags;nobuffer|flags;low_delay"
 _environment = threading.Lock()
 _MANUAL_EXPOSURE, _AUTO_EXPOSURE = 1, 3
@@ -37,37 +37,37 @@ _MANUAL_EXPOSURE, _AUTO_EXPOSURE = 1, 3
 _ROTATIONS: Mapping[int, int] = {
     90: cv2.ROTATE_90_CLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_90_COUNTERCLOCKWISE,
 }  # fmt: skip
-# Failures are raised as this package's own errors.
+# OpenCV's log is silenced, because failures are raised as this package's errors.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 _SILENT = 0
 _set_log_level = getattr(cv2, "setLogLevel", None) or cv2.utils.logging.setLogLevel  # OpenCV 4, OpenCV 5
 _set_log_level(_SILENT)
-# A device that gives nothing more would hold the reader, and so the end of a run, for 10 s.
+# By default a silent device blocks the reader, and thus the end of a run, for 10 s.
 os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", str(_TIMEOUT_MS // 1000))
 
 
 @attrs.frozen(eq=False)
 class Picture:
-    """A picture and when it was taken."""
+    """An image and the time at which it was taken."""
 
     content: Pixels | CompressedImage
-    """(H, W, 3) uint8, blue first; (H, W) uint8 or, for depth, uint16; or the camera's own JPEG, without a stamp."""
+    """(H, W, 3) uint8, BGR; (H, W) uint8 or, for depth, uint16; or the camera's JPEG, without a stamp."""
     size: tuple[int, int]
     """Height and width [px]."""
     taken_ns: int
-    """`time.monotonic_ns()`: the driver's own stamp where there is one, else when it came."""
+    """`time.monotonic_ns()`: the driver's stamp if it has one, otherwise the time of arrival."""
 
 
 class Capture:
     """An open source.
 
     Args:
-        device: which.
-        options: the YAML's.
-        name: the camera's, for messages.
+        device: the source.
+        options: options from the YAML.
+        name: the camera's name, for messages.
 
     Raises:
-        SensorError: when it cannot be opened, or gives other pictures than were asked for and `strict` is set.
+        SensorError: if it cannot be opened, or if `strict` is set and the images differ from the request.
     """
 
     def __init__(self, device: Device, options: OpenCvOptions, name: str) -> None:
@@ -79,21 +79,21 @@ class Capture:
             if device.kind == "v4l2":
                 self._set_up()
             self.own_jpeg = self._take_jpeg()
-            """Whether pictures are the source's own JPEG."""
+            """Whether images are the source's own JPEG."""
             self.differences = self._differences()
-            """What the source gives differently from what was asked."""
+            """Differences between the request and what the source delivers."""
             if self.differences and options.strict:
-                raise self._error(f"{'; '.join(self.differences)}{self._offered()}; `strict: false` takes it as it is")
+                raise self._error(f"{'; '.join(self.differences)}{self._offered()}; `strict: false` accepts it")
         except BaseException:
             self._capture.release()
             raise
         self.fps = float(self._capture.get(cv2.CAP_PROP_FPS))
-        """Pictures a second, as the source says [Hz]; 0 where it does not."""
+        """Images per second, as reported by the source [Hz]; 0 if unknown."""
         self.driver_stamps = False
-        """Whether the last picture has the driver's own stamp."""
+        """Whether the last image has the driver's stamp."""
 
     def read(self) -> Picture | None:
-        """The next picture; None at the end of a file, or when the source is lost."""
+        """The next image; None at the end of a file, or if the source is lost."""
         for _ in range(_DAMAGED):
             if not self._capture.grab():
                 return None
@@ -105,7 +105,7 @@ class Capture:
         return None
 
     def _picture(self, pixels: NDArray[Any], taken_ns: int) -> Picture | None:
-        """What was retrieved as a picture; None for a damaged one."""
+        """The retrieved pixels as a picture; None if they are damaged."""
         if self.own_jpeg:
             try:
                 return Picture(*own_jpeg(np.ascontiguousarray(pixels).reshape(-1), Header()), taken_ns)
@@ -121,7 +121,7 @@ class Capture:
         return Picture(np.ascontiguousarray(pixels), (height, width), taken_ns)
 
     def _depth(self, pixels: NDArray[Any]) -> tuple[bool, NDArray[Any]]:
-        """Whether a picture is whole, and its depths: OpenCV does not know Z16, and gives the bytes in one row."""
+        """Whether a Z16 image is complete, and its depths; OpenCV does not decode Z16, it returns bytes in one row."""
         get = self._capture.get
         height, width = round(get(cv2.CAP_PROP_FRAME_HEIGHT)), round(get(cv2.CAP_PROP_FRAME_WIDTH))
         if pixels.nbytes != 2 * height * width:
@@ -136,9 +136,9 @@ class Capture:
         device = self._device
         if device.kind == "v4l2":
             if not os.path.exists(device.target):
-                raise self._error("there is no such device; `ibrobot camera list` shows those that are there")
+                raise self._error("there is no such device; `ibrobot camera list` shows the available ones")
             if not os.access(device.target, os.R_OK | os.W_OK):
-                raise self._error("no permission: add yourself to the group `video`, log in again")
+                raise self._error("no permission: add yourself to the group `video`, then log in again")
             capture = cv2.VideoCapture(device.target, cv2.CAP_V4L2)
             why = "cannot be opened; another program may hold it"
         elif device.kind == "stream":
@@ -155,7 +155,7 @@ class Capture:
         return capture
 
     def _fourcc(self) -> str | None:
-        """The pixel format to ask a V4L2 device for."""
+        """The pixel format to request from a V4L2 device."""
         options = self._options
         if options.fourcc is not None:
             return options.fourcc
@@ -163,12 +163,12 @@ class Capture:
         return _MJPG if _MJPG in offered or not offered else None
 
     def _fits(self, mode: Mode) -> bool:
-        """Whether a mode has the size and the rate that the YAML asks for."""
+        """Whether a mode has the size and rate that the YAML requests."""
         size, fps = (self._options.width, self._options.height), self._options.fps
         return (None in size or mode.size == size) and (fps is None or any(_equal(fps, r) for r in mode.rates_hz))
 
     def _take_jpeg(self) -> bool:
-        """Whether the source sends JPEG and it is wanted as it is; OpenCV then gives the bytes in one row."""
+        """Whether to keep the source's JPEG unchanged; OpenCV then returns the bytes in one row."""
         if self._options.encoding != "jpeg" or self._options.rotation or self._format() != _MJPG:
             return False
         prop, value = (cv2.CAP_PROP_CONVERT_RGB, 0) if self._device.kind == "v4l2" else (cv2.CAP_PROP_FORMAT, -1)
@@ -179,7 +179,7 @@ class Capture:
 
     def _set_up(self) -> None:
         options, capture = self._options, self._capture
-        # The format first: it says which sizes there are, and those say which rates.
+        # Set the format first: it determines the available sizes, and the size determines the rates.
         fourcc = self._fourcc()
         if fourcc is not None:
             capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*fourcc))
@@ -199,30 +199,30 @@ class Capture:
 
     def _control(self, name: str, prop: int, value: float | None) -> None:
         if value is not None and not self._capture.set(prop, value):
-            raise self._error(f"does not take {name}: {value:g}")
+            raise self._error(f"does not accept {name}: {value:g}")
 
     def _differences(self) -> list[str]:
         options, get = self._options, self._capture.get
         found = []
         size = round(get(cv2.CAP_PROP_FRAME_WIDTH)), round(get(cv2.CAP_PROP_FRAME_HEIGHT))
         if options.width is not None and size != (options.width, options.height):
-            found.append(f"gives {size[0]}x{size[1]}, {options.width}x{options.height} was asked for")
-        # A stream's rate is its sender's; what FFmpeg says of it is often a guess.
+            found.append(f"delivers {size[0]}x{size[1]} instead of {options.width}x{options.height}")
+        # The sender determines a stream's rate, and FFmpeg often only guesses it.
         rate = get(cv2.CAP_PROP_FPS) if self._device.kind != "stream" else 0.0
         if options.fps is not None and rate and not _equal(options.fps, rate):
-            found.append(f"gives {rate:g} Hz, {options.fps:g} was asked for")
+            found.append(f"delivers {rate:g} Hz instead of {options.fps:g}")
         code = self._format()
         if self._device.kind == "v4l2" and options.fourcc is not None and code != options.fourcc:
-            found.append(f"gives format {code}, {options.fourcc} was asked for")
+            found.append(f"delivers format {code} instead of {options.fourcc}")
         return found
 
     def _offered(self) -> str:
         if self._device.kind != "v4l2":
             return ""
-        return _told(modes(self._device.target))
+        return _listed(modes(self._device.target))
 
     def _taken_ns(self, now_ns: int) -> int:
-        # OpenCV's V4L2 backend gives the buffer's stamp, which drivers take from the monotonic clock.
+        # OpenCV's V4L2 backend returns the buffer's stamp, which drivers take from the monotonic clock.
         if self._device.kind == "v4l2":
             stamp_ns = round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
             if now_ns - NS_PER_S < stamp_ns <= now_ns:
@@ -236,15 +236,15 @@ class Capture:
 
 
 def _equal(asked_hz: float, given_hz: float) -> bool:
-    """Whether two rates are the same: drivers round them."""
+    """Whether two rates are equal; drivers round them."""
     return abs(given_hz - asked_hz) <= 0.01 * asked_hz
 
 
 @contextmanager
 def _stream_options() -> Iterator[None]:
-    """FFmpeg's options for a source that is to be seen at once; OpenCV takes them from the environment only.
+    """FFmpeg's low-latency options, which OpenCV reads from the environment only.
 
-    They must not stay there: with them a video file loses its first picture.
+    They are removed afterwards, because they make a video file lose its first image.
     """
     name = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
     with _environment:
@@ -257,7 +257,7 @@ def _stream_options() -> Iterator[None]:
                 del os.environ[name]
 
 
-def _told(offered: tuple[Mode, ...]) -> str:
+def _listed(offered: tuple[Mode, ...]) -> str:
     if not offered:
         return ""
     lines = (f"{m.fourcc} {m.width}x{m.height} at {', '.join(f'{r:g}' for r in m.rates_hz)}" for m in offered[:12])

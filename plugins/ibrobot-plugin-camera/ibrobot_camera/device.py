@@ -1,4 +1,4 @@
-"""What a YAML means by `device`: a V4L2 device, a network stream, or a video file."""
+"""Resolves `device` of a YAML: a V4L2 device, a network stream, or a video file."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _URL = re.compile(r"[a-z][a-z0-9+.-]*://", re.IGNORECASE)
 
 @attrs.frozen
 class Device:
-    """A source of pictures."""
+    """An image source."""
 
     kind: str
     """`v4l2`, `stream` or `file`."""
@@ -27,7 +27,7 @@ class Device:
     """A device's path, a URL, or a file's path."""
 
     def __str__(self) -> str:
-        """For messages: without user, password and query, where cameras take passwords too."""
+        """Text for messages, without user, password and query, since some cameras take passwords in the query."""
         if self.kind != "stream":
             return self.target
         parts = urlsplit(self.target)
@@ -36,10 +36,10 @@ class Device:
 
 
 def find_device(device: int | str, name: str) -> Device:
-    """What `device` means.
+    """Find the device that `device` refers to.
 
     Raises:
-        SensorError: when it is nothing that is there.
+        SensorError: if it does not exist.
     """
     text = str(device)
     if _URL.match(text):
@@ -58,7 +58,7 @@ def find_device(device: int | str, name: str) -> Device:
 
 
 def video_device(options: OpenCvOptions) -> Mapping[str, str]:
-    """The V4L2 device, by the name that all links to it lead to; streams and files can be opened more than once."""
+    """The resolved path of a V4L2 device; streams and files can be opened more than once."""
     text = str(options.device)
     if text.isdigit():
         return {"device": f"/dev/video{text}"}
@@ -67,6 +67,6 @@ def video_device(options: OpenCvOptions) -> Mapping[str, str]:
 
 
 def realsense_stream(options: RealSenseOptions) -> Mapping[str, str]:
-    """The camera and its stream: colour and depth of one camera are peripherals of their own."""
+    """The camera and its stream; colour and depth of one camera are separate peripherals."""
     camera = f"RealSense {options.serial}" if options.serial else "the only RealSense"
     return {"serial": f"the {options.stream} stream of {camera}"}

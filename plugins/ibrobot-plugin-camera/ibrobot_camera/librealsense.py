@@ -8,14 +8,14 @@ from typing import Any
 from ibrobot_core.api import MissingDependency
 
 _PACKAGES = {"libusb-1.0.so.0": "libusb-1.0-0", "libudev.so.1": "libudev1"}
-"""System library -> the Debian package that brings it."""
+"""System library -> the Debian package that contains it."""
 
 
 def load_library() -> Any:
-    """The module `pyrealsense2`.
+    """Import the module `pyrealsense2`.
 
     Raises:
-        MissingDependency: when it is not installed, or a system library that it loads is not there; says which.
+        MissingDependency: if it, or a system library that it needs, is not installed; names which.
     """
     try:
         import pyrealsense2
@@ -30,5 +30,5 @@ def load_library() -> Any:
         missing = f"pyrealsense2 cannot be loaded: {error}"
         if library in _PACKAGES:
             raise MissingDependency(missing, apt=[_PACKAGES[library]]) from None
-        raise MissingDependency(missing, remedy=f"install the system package that brings {library}") from None
+        raise MissingDependency(missing, remedy=f"install the system package that contains {library}") from None
     return pyrealsense2

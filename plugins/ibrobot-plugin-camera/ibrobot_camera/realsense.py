@@ -1,4 +1,4 @@
-"""The sensor `realsense`: colour, or depth aligned to it, of one Intel RealSense; two peripherals may share it."""
+"""The sensor `realsense`: colour or aligned depth of an Intel RealSense, which two peripherals may share."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from ibrobot_core.api import CameraInfo, CompressedImage, Context, Header, Image
 _WAIT_MS = 200
 _CLOSE_S = 5.0
 _LOST_S = 5.0
-"""After so long without pictures the camera is lost [s]."""
+"""A camera without images for this long is lost [s]."""
 _SAME = 1e-6
 _NS_PER_MS = 1e6
 
 
 def find_device(serial: str) -> Any:
-    """The RealSense of that serial number, or the only one that is there.
+    """The RealSense with that serial number, or the only one connected.
 
     Raises:
         MissingDependency: as `load_library`.
-        SensorError: when there is none, or several and no serial number.
+        SensorError: if none is connected, or several are and no serial number is given.
     """
     rs = load_library()
     devices = {device.get_info(rs.camera_info.serial_number): device for device in rs.context().query_devices()}
@@ -40,13 +40,13 @@ def find_device(serial: str) -> Any:
             raise SensorError(f"no RealSense with serial number {serial}; available: {there}")
         return devices[serial]
     if len(devices) != 1:
-        raise SensorError(f"serial must say which RealSense is meant; available: {there}")
+        raise SensorError(f"set serial to select a RealSense; available: {there}")
     return next(iter(devices.values()))
 
 
 @attrs.define
 class _Pair:
-    """The newest pictures and their time [ns]."""
+    """The newest colour and depth images and their time [ns]."""
 
     pictures: dict[str, Pixels]
     taken_ns: int
@@ -60,7 +60,7 @@ class _Device:
 
     @classmethod
     def use(cls, options: RealSenseOptions, ctx: Context) -> _Device:
-        """The device that `options` mean, opened by the first who uses it."""
+        """The device that `options` select; its first user opens it."""
         with cls.lock:
             shared = cls.open_ones.get(options.serial)
             if shared is None:
@@ -100,7 +100,7 @@ class _Device:
             if wanted:
                 streams = " and ".join(stream.name for stream in wanted)
                 size = f"{options.width}x{options.height} at {options.fps:g} Hz"
-                raise SensorError(f"camera {ctx.name}: this RealSense gives no {streams} of {size}")
+                raise SensorError(f"camera {ctx.name}: this RealSense does not offer {streams} of {size}")
             for sensor in self._open:
                 sensor.start(self._queue)
         except BaseException:
@@ -110,7 +110,7 @@ class _Device:
         self._thread.start()
 
     def leave(self) -> None:
-        """One user less; the last closes the device."""
+        """Remove a user; the last one closes the device."""
         with _Device.lock:
             self.users -= 1
             if self.users:
@@ -133,7 +133,7 @@ class _Device:
                 good, frames = self._queue.try_wait_for_frames(_WAIT_MS)
                 if not good or frames.size() < 2:
                     if time.monotonic() - heard > _LOST_S:
-                        raise RuntimeError(f"the RealSense has given nothing for {_LOST_S:g} s; is it plugged in?")
+                        raise RuntimeError(f"no images from the RealSense for {_LOST_S:g} s; is it plugged in?")
                     continue
                 heard = time.monotonic()
                 aligned = self._align.process(frames)
@@ -164,7 +164,7 @@ class _Device:
 
 
 def _millimetres(depth: Any) -> NDArray[np.uint16]:
-    """Depths [mm], shape (H, W), whatever the unit of the device (a D405's is 0.1 mm)."""
+    """Depths in mm for any unit of the device (a D405's is 0.1 mm); shape (H, W)."""
     found: NDArray[np.uint16] = np.array(depth.get_data())
     unit_mm = depth.get_units() * 1e3
     if abs(unit_mm - 1.0) < _SAME:
@@ -174,10 +174,10 @@ def _millimetres(depth: Any) -> NDArray[np.uint16]:
 
 
 class RealSenseCamera(Sensor):
-    """Colour as bgr8, or depth as 16UC1 [mm], aligned to the colour pictures.
+    """Colour as bgr8, or depth as 16UC1 [mm], aligned to the colour images.
 
     Args:
-        options: the YAML's.
+        options: options from the YAML.
         ctx: name, clock and logger.
 
     Raises:

@@ -1,6 +1,6 @@
-"""What V4L2 devices there are and which pictures each offers, by the kernel's own calls.
+"""Lists V4L2 devices and the formats that they offer, with the kernel's ioctls.
 
-Numbers and layouts: linux/videodev2.h.
+Constants and structures are those of linux/videodev2.h.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _DISCRETE = 1
 
 @attrs.frozen
 class Mode:
-    """Pictures of one format and size, and the rates [Hz] at which they are offered."""
+    """An image format and size, and the available rates [Hz]."""
 
     fourcc: str
     width: int
@@ -45,7 +45,7 @@ class Camera:
     path: str
     name: str
     stable_id: str
-    """Its name under /dev/v4l/by-id; empty where it has none."""
+    """Its name under /dev/v4l/by-id; empty if it has none."""
     modes: tuple[Mode, ...]
     problem: str = ""
     """Why its modes could not be read."""
@@ -69,7 +69,7 @@ def cameras() -> list[Camera]:
 
 
 def modes(path: str) -> tuple[Mode, ...]:
-    """What a device offers; nothing where it does not say."""
+    """The modes that a device offers; empty if it does not report them."""
     try:
         with _opened(Path(path)) as device:
             return tuple(_modes(device))
@@ -101,7 +101,7 @@ def _formats(device: int) -> Iterator[int]:
 def _sizes(device: int, pixel_format: int) -> Iterator[tuple[int, int]]:
     for answer in _enumerate(device, _ENUM_FRAMESIZES, lambda i: struct.pack("<II36x", i, pixel_format)):
         kind, *numbers = struct.unpack_from("<7I", answer, 8)
-        if kind != _DISCRETE:  # least and greatest of a range
+        if kind != _DISCRETE:  # minimum and maximum of a range
             yield numbers[0], numbers[3]
             yield numbers[1], numbers[4]
             return

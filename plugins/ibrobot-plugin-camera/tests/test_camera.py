@@ -1,4 +1,4 @@
-"""The sensor `opencv` with real decoders: files in the clock's time, a local stream, what is lost and comes back."""
+"""The sensor `opencv` with real decoders: video files, a local stream, and lost sources that return."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ PATIENCE_S = 30.0
 
 @pytest.fixture(scope="module")
 def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Twelve numbered pictures at 25 Hz."""
+    """Twelve numbered images at 25 Hz."""
     path = tmp_path_factory.mktemp("video") / "numbers.avi"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), FPS, (WIDTH, HEIGHT))
     for number in range(1, FRAMES + 1):
@@ -74,7 +74,7 @@ class TestFileConformance(SensorSuite):
         ctx.clock.sleep_until(ctx.clock.now_ns() + 40_000_000)
 
     def test_silence_gives_none(self) -> None:
-        """Between two pictures there is none."""
+        """There is no image between two due times."""
         with self.opened() as (sensor, _):
             assert sensor.read(0.0) is not None
             assert sensor.read(0.0) is None
@@ -227,7 +227,7 @@ class TestStream:
             image = top.read(PATIENCE_S)
             top.close()
             assert image is not None
-            # A queue would give before + 1; what decodes the pictures may be a second behind on a busy machine.
+            # A queue would return before + 1; on a busy machine the decoder may lag by a second.
             assert number(image) >= before + 50
 
     def test_a_lost_stream_comes_back(self, caplog: pytest.LogCaptureFixture) -> None:
@@ -255,7 +255,7 @@ class TestStream:
             top = camera(ctx, server.url, reconnect_timeout=0.0)
             top.open()
             assert top.read(PATIENCE_S) is not None
-        with pytest.raises(SensorError, match=r"was lost and did not come back in 0 s"):  # noqa: PT012
+        with pytest.raises(SensorError, match=r"was lost and did not return within 0 s"):  # noqa: PT012
             while True:
                 top.read(5.0)
         top.close()
@@ -279,11 +279,11 @@ class TestStream:
             top.read(0.0)
 
     def test_it_cannot_be_in_lockstep(self) -> None:
-        with pytest.raises(SensorError, match="a live source cannot be in lockstep; a file can"):
+        with pytest.raises(SensorError, match="a live source cannot run in lockstep; a video file can"):
             camera(host_context("top", clock=SteppedClock(START_NS)), "http://127.0.0.1:9/live").open()
 
 
-class TestWhatWasAsked:
+class TestRequestedFormat:
     def test_the_rate_of_a_stream_is_its_senders(self) -> None:
         with StreamServer() as server:
             top = camera(host_context("top", clock=RealClock()), server.url, fps=30.0)
@@ -292,7 +292,7 @@ class TestWhatWasAsked:
 
     def test_another_size_is_an_error_or_a_warning(self, video: Path) -> None:
         ctx = host_context("top", clock=SteppedClock(START_NS))
-        with pytest.raises(SensorError, match=r"gives 64x48, 640x480 was asked for; `strict: false` takes it as it is"):
+        with pytest.raises(SensorError, match=r"delivers 64x48 instead of 640x480; `strict: false` accepts it"):
             camera(ctx, str(video), width=640, height=480).open()
         with StreamServer() as server:
             real = host_context("top", clock=RealClock())
@@ -304,13 +304,13 @@ class TestWhatWasAsked:
         self, video: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(capture_module.Capture, "_open", lambda self: cv2.VideoCapture(str(video)))
-        with pytest.raises(SensorError, match=r"camera top: /dev/video7: does not take exposure: 40"):
+        with pytest.raises(SensorError, match=r"camera top: /dev/video7: does not accept exposure: 40"):
             Capture(Device("v4l2", "/dev/video7"), OpenCvOptions(device=7, exposure=40.0, strict=False), "top")
 
     @pytest.mark.parametrize(
         ("options", "message"),
         [
-            ({"width": 640}, "width and height belong together"),
+            ({"width": 640}, "set both width and height"),
             ({"fourcc": "MJPEG"}, "four characters, e.g. MJPG, not 'MJPEG'"),
             ({"rotation": 45}, "45 is not one of: 0, 90, 180, 270"),
         ],
@@ -333,7 +333,7 @@ class TestDevices:
     def test_what_a_device_means(self, device: int | str, kind: str, target: str) -> None:
         assert find_device(device, "top") == Device(kind, target)
 
-    def test_nothing_that_is_there_is_reported(self, tmp_path: Path) -> None:
+    def test_missing_device_is_reported(self, tmp_path: Path) -> None:
         with pytest.raises(SensorError, match=r"camera top: no file, URL or device 'usb-cam'"):
             find_device("usb-cam", "top")
         with pytest.raises(SensorError, match=r"/dev/video77: there is no such device; `ibrobot camera list`"):
@@ -367,7 +367,7 @@ class TestCalibration:
         assert isinstance(info, CameraInfo)
         assert (info.width, info.k[2], info.d[0]) == (64, 32.0, 0.1)
 
-    def test_one_for_other_pictures_is_reported(self, video: Path, tmp_path: Path) -> None:
+    def test_calibration_for_another_size_is_reported(self, video: Path, tmp_path: Path) -> None:
         three = "{data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}"
         (tmp_path / "top.yaml").write_text(
             f"image_width: 640\nimage_height: 480\ncamera_matrix: {three}\nrectification_matrix: {three}\n"
@@ -376,7 +376,7 @@ class TestCalibration:
         )
         top = camera(host_context("top"), str(video), info=tmp_path / "top.yaml")
         top.open()
-        with pytest.raises(SensorError, match=r"top\.yaml: is for pictures of 640x480, these are 64x48"):
+        with pytest.raises(SensorError, match=r"top\.yaml: is for images of 640x480, these are 64x48"):
             top.read(0.0)
         top.close()
 

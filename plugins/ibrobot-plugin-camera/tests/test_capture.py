@@ -1,4 +1,4 @@
-"""What is made of OpenCV's pictures of a V4L2 device, where only OpenCV itself is replaced."""
+"""Processing of images of a V4L2 device; only OpenCV itself is replaced."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ibrobot_core.api import CompressedImage
 
 
 class Scripted:
-    """What OpenCV gives for a V4L2 device, from a list: the bytes of a picture, or None for one that is damaged."""
+    """A fake `cv2.VideoCapture` of a V4L2 device that returns images from a list, with None for a damaged one."""
 
     def __init__(self, pictures: list[np.ndarray | None], formats: tuple[str, ...] = ()) -> None:
         self._pictures = pictures
@@ -56,7 +56,7 @@ class TestPictures:
         assert source.read() is not None
         assert source.read() is None
 
-    def test_none_but_damaged_ones_are_a_lost_source(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_source_with_only_damaged_images_is_lost(self, monkeypatch: pytest.MonkeyPatch) -> None:
         pictures: list[np.ndarray | None] = [None] * 100
         assert self.capture(monkeypatch, pictures).read() is None
         assert pictures
@@ -73,7 +73,7 @@ MJPG = float(cv2.VideoWriter.fourcc(*"MJPG"))
 
 
 def jpeg(value: int) -> np.ndarray:
-    """A grey picture of 4x3 as OpenCV gives MJPG that it is not to decode: bytes in one row."""
+    """A grey 4x3 image as undecoded MJPG from OpenCV: bytes in one row."""
     _, file = cv2.imencode(".jpg", np.full((3, 4, 3), value, np.uint8))
     return np.asarray(file).reshape(1, -1)
 

@@ -1,4 +1,4 @@
-"""`ibrobot camera …` with real sources: what is printed, the files that are written, the page in the browser."""
+"""`ibrobot camera …` with real sources: the output, the files and the page in the browser."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ SMALL = RealSenseOptions(width=WIDTH, height=HEIGHT)
         (
             "ImportError('libother.so.1: cannot open shared object file')",
             "pyrealsense2 cannot be loaded: libother.so.1: cannot open shared object file; "
-            "install the system package that brings libother.so.1",
+            "install the system package that contains libother.so.1",
         ),
     ],
 )
@@ -66,7 +66,7 @@ def test_what_the_library_lacks_is_named_with_its_remedy(
 
 
 class SoftwareCamera:
-    """A RealSense in software: pictures whose colour and depth say their number."""
+    """A RealSense in software, whose colour and depth encode the image number."""
 
     def __init__(self, rs: Any, unit: float = 0.001) -> None:
         self._rs = rs
@@ -115,7 +115,7 @@ class SoftwareCamera:
 
 @pytest.fixture(autouse=True)
 def patience(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A busy machine may keep the software device, a thread of this process, silent for a while."""
+    """On a busy machine the software device, a thread of this process, may be silent for a while."""
     monkeypatch.setattr(realsense, "_LOST_S", PATIENCE_S)
 
 
@@ -201,14 +201,14 @@ def test_a_camera_that_falls_silent_for_long_is_lost(soft: SoftwareCamera, monke
     assert top.read(PATIENCE_S) is not None
     soft.running.clear()
     monkeypatch.setattr(realsense, "_LOST_S", 0.3)
-    with pytest.raises(SensorError, match=r"camera top: the RealSense has given nothing for 0\.3 s"):  # noqa: PT012
+    with pytest.raises(SensorError, match=r"camera top: no images from the RealSense for 0\.3 s"):  # noqa: PT012
         while True:
             top.read(1.0)
     top.close()
 
 
 def test_sizes_that_it_does_not_give_or_that_differ_are_refused(soft: SoftwareCamera) -> None:
-    with pytest.raises(SensorError, match=r"gives no color and depth of 640x480 at 30 Hz"):
+    with pytest.raises(SensorError, match=r"does not offer color and depth of 640x480 at 30 Hz"):
         RealSenseCamera(RealSenseOptions(), host_context("top")).open()
     first = RealSenseCamera(SMALL, host_context("top"))
     first.open()
@@ -220,5 +220,5 @@ def test_sizes_that_it_does_not_give_or_that_differ_are_refused(soft: SoftwareCa
 def test_no_device_says_which_there_are(library: Any) -> None:
     with pytest.raises(SensorError, match=r"no RealSense with serial number 42; available: none"):
         realsense.find_device("42")
-    with pytest.raises(SensorError, match=r"serial must say which RealSense is meant; available: none"):
+    with pytest.raises(SensorError, match=r"set serial to select a RealSense; available: none"):
         realsense.find_device("")

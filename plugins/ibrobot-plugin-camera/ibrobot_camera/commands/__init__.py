@@ -1,4 +1,4 @@
-"""`ibrobot camera …`: what cameras there are, and what they see; one file a command."""
+"""`ibrobot camera …`: lists and previews cameras; one file per command."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from ibrobot_camera.commands.snapshot import snapshot
 
 @click.group()
 def camera() -> None:
-    """List, look through and photograph with cameras.
+    """List and preview cameras, and save snapshots.
 
-    SOURCE is a device as in a robot YAML (a number, a path, a stable id, a URL, a video file), or a robot YAML: then
-    all its `opencv` cameras.
+    SOURCE is a device as in a robot YAML (a number, a path, a stable id, a URL, a video file), or a robot YAML, which
+    means all its `opencv` cameras.
     """
 
 

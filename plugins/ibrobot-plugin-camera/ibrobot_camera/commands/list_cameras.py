@@ -1,4 +1,4 @@
-"""`ibrobot camera list`: the V4L2 devices of this machine and the pictures that they offer."""
+"""`ibrobot camera list`: the V4L2 devices of this machine and the formats that they offer."""
 
 from __future__ import annotations
 

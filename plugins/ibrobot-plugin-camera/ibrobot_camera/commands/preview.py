@@ -1,4 +1,4 @@
-"""`ibrobot camera preview`: the cameras in a browser, on this machine or through an SSH tunnel."""
+"""`ibrobot camera preview`: shows cameras in a browser, on this machine or through an SSH tunnel."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _QUALITY = 80
 
 
 class Newest:
-    """The newest picture of one camera as a JPEG, for any number of viewers."""
+    """The newest image of one camera as a JPEG, for any number of viewers."""
 
     def __init__(self, name: str, camera: OpenCvCamera, ended: threading.Event) -> None:
         self.name = name
@@ -35,7 +35,7 @@ class Newest:
         self.thread = threading.Thread(target=self._run, name=f"preview {name}", daemon=True)
 
     def after(self, number: int, timeout_s: float) -> tuple[int, bytes]:
-        """The first picture newer than `number`, with its own; empty when none came in time."""
+        """The first image newer than `number`, with its number; empty if none arrived in time."""
         with self._changed:
             self._changed.wait_for(lambda: self._number > number, timeout_s)
             return (self._number, self._jpeg) if self._number > number else (number, b"")
@@ -59,7 +59,7 @@ class Newest:
 
 
 def _to_jpeg(image: Image) -> bytes:
-    """A picture as a browser shows it: depth in colours, up to 4 m."""
+    """An image for a browser, as JPEG; depth is shown in colours, up to 4 m."""
     from ibrobot_camera.commands.sources import pixels
 
     found = pixels(image)
@@ -71,14 +71,14 @@ def _to_jpeg(image: Image) -> bytes:
 
 @click.command()
 @click.argument("source")
-@click.option("--host", default="127.0.0.1", show_default=True, help="Where to listen.")
-@click.option("--port", type=click.IntRange(0, 65535), default=0, help="0: any free one.")
-@click.option("--seconds", type=click.FloatRange(min=0), help="End after so many seconds.")
+@click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on.")
+@click.option("--port", type=click.IntRange(0, 65535), default=0, help="0: any free port.")
+@click.option("--seconds", type=click.FloatRange(min=0), help="Stop after this many seconds.")
 def preview(source: str, host: str, port: int, seconds: float | None) -> None:
     """Show the cameras of SOURCE in a browser.
 
-    Prints the page's address, which has a secret in it; nothing but this machine can open it unless --host says so.
-    From another machine: `ssh -L 8000:127.0.0.1:PORT robot`, with --port. Ctrl-C ends it.
+    Prints the page's address, which contains a secret token. Without --host, only this machine can open it. To open it
+    from another machine, set --port and run `ssh -L 8000:127.0.0.1:PORT robot`. Ctrl-C ends it.
     """
     from ibrobot_camera.commands.sources import opened
 
@@ -105,7 +105,7 @@ def preview(source: str, host: str, port: int, seconds: float | None) -> None:
 
 def _handler(views: dict[str, Newest], token: str, ended: threading.Event) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
-        """The page, and a stream of pictures for each camera."""
+        """Serves the page, and a stream of images for each camera."""
 
         def do_GET(self) -> None:
             """Answer a browser that knows the token."""
@@ -121,7 +121,7 @@ def _handler(views: dict[str, Newest], token: str, ended: threading.Event) -> ty
                 self.send_error(404)
 
         def log_message(self, format: str, *arguments: Any) -> None:
-            """Say nothing: the terminal shows the address."""
+            """Print nothing: the terminal shows the address."""
 
         def _page(self) -> None:
             figures = "".join(

@@ -1,4 +1,4 @@
-"""`ibrobot camera snapshot`: one picture of each camera, at the same time, with its measured rate."""
+"""`ibrobot camera snapshot`: saves one image of each camera and prints its measured rate."""
 
 from __future__ import annotations
 
@@ -17,10 +17,15 @@ _WAIT_S = 10.0
 
 @click.command()
 @click.argument("source")
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="A .png or .jpg; for several, NAME is put in.")
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    help="A .png or .jpg file; with several cameras, _NAME is inserted.",
+)
 @click.option("--seconds", type=click.FloatRange(min=0), default=1.0, show_default=True, help="How long to measure.")
 def snapshot(source: str, output: Path | None, seconds: float) -> None:
-    """Save a picture of each camera of SOURCE, and say its size, encoding and measured rate."""
+    """Save an image of each camera of SOURCE, and print its size, encoding and measured rate."""
     from ibrobot_camera.commands.sources import opened, pixels
 
     output = output or Path("camera.png")
@@ -38,12 +43,12 @@ def snapshot(source: str, output: Path | None, seconds: float) -> None:
 
 
 def _watch(name: str, read: Callable[[float], Image | CompressedImage | None], seconds: float) -> tuple[Image, float]:
-    """The last picture within `seconds`, and the rate by the stamps [Hz]."""
+    """The last image within `seconds`, and the rate computed from the stamps [Hz]."""
     from ibrobot_camera.commands.sources import decoded
 
     first = read(_WAIT_S)
     if first is None:
-        raise SensorError(f"camera {name}: no picture within {_WAIT_S:.0f} s")
+        raise SensorError(f"camera {name}: no image within {_WAIT_S:.0f} s")
     last, count, end = first, 0, time.monotonic() + seconds
     while (remaining := end - time.monotonic()) > 0:
         image = read(remaining)

@@ -31,11 +31,11 @@ _TO_BGR = {"bgr8": None, "rgb8": cv2.COLOR_RGB2BGR, "mono8": cv2.COLOR_GRAY2BGR}
 
 @contextmanager
 def opened(source: str) -> Iterator[dict[str, OpenCvCamera]]:
-    """Name -> camera, open, of a device or of a robot YAML.
+    """Open the cameras of a device or a robot YAML; yields name -> camera.
 
     Raises:
-        ConfigError: for a robot YAML with mistakes.
-        SensorError: when a camera does not open, or the YAML has none.
+        ConfigError: if the robot YAML has mistakes.
+        SensorError: if a camera does not open, or the YAML has none.
     """
     clock = RealClock()
     with ExitStack() as stack:
@@ -62,12 +62,12 @@ def _options(source: str) -> dict[str, OpenCvOptions]:
 
 
 def decoded(message: Image | CompressedImage) -> Image:
-    """A camera's message as pixels."""
+    """A camera's message, decoded to pixels."""
     return from_jpeg(message) if isinstance(message, CompressedImage) else message
 
 
 def pixels(image: Image) -> NDArray[np.uint8] | NDArray[np.uint16]:
-    """An image as OpenCV writes it: (H, W, 3) blue first, or (H, W) of depth."""
+    """An image in OpenCV's layout: (H, W, 3) BGR, or (H, W) for depth."""
     if image.encoding == "16UC1":
         return image.data.view(np.uint16).reshape(image.height, image.width)
     conversion = _TO_BGR[image.encoding]
