@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from enum import IntEnum
 from pathlib import Path
 
 import attrs
@@ -127,8 +128,44 @@ class PolicyError(IbrobotError):
     """A policy that cannot be loaded or run, e.g. a checkpoint without its statistics."""
 
 
+class PlanCode(IntEnum):
+    """Why a motion cannot be planned: names and values of moveit_msgs/msg/MoveItErrorCodes."""
+
+    SUCCESS = 1
+    FAILURE = 99999
+    PLANNING_FAILED = -1
+    INVALID_MOTION_PLAN = -2
+    MOTION_PLAN_INVALIDATED_BY_ENVIRONMENT_CHANGE = -3
+    CONTROL_FAILED = -4
+    TIMED_OUT = -6
+    PREEMPTED = -7
+    START_STATE_IN_COLLISION = -10
+    GOAL_IN_COLLISION = -12
+    GOAL_CONSTRAINTS_VIOLATED = -14
+    INVALID_GROUP_NAME = -15
+    INVALID_GOAL_CONSTRAINTS = -16
+    INVALID_ROBOT_STATE = -17
+    INVALID_LINK_NAME = -18
+    INVALID_OBJECT_NAME = -19
+    FRAME_TRANSFORM_FAILURE = -21
+    COLLISION_CHECKING_UNAVAILABLE = -22
+    START_STATE_INVALID = -26
+    GOAL_STATE_INVALID = -27
+    UNRECOGNIZED_GOAL_TYPE = -28
+    NO_IK_SOLUTION = -31
+
+
 class PlanningError(IbrobotError):
-    """A motion that cannot be planned, e.g. a goal outside the joint limits."""
+    """A motion that cannot be planned, e.g. a goal outside the joint limits.
+
+    Args:
+        message: what is in the way.
+        code: the reason, as MoveIt names it.
+    """
+
+    def __init__(self, message: str, code: PlanCode = PlanCode.PLANNING_FAILED) -> None:
+        super().__init__(message)
+        self.code = code
 
 
 class TransportError(IbrobotError):

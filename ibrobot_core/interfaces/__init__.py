@@ -15,7 +15,19 @@ from ibrobot_core.interfaces.hardware import (
     Torque,
     nan_vector,
 )
-from ibrobot_core.interfaces.planner import JointGoal, Planner, PlanRequest, PoseGoal
+from ibrobot_core.interfaces.planner import (
+    AnyGoal,
+    Goal,
+    JointGoal,
+    LinearGoal,
+    NamedGoal,
+    OrientationPolicy,
+    Planner,
+    PlanRequest,
+    PlanResult,
+    PoseGoal,
+    PositionGoal,
+)
 from ibrobot_core.interfaces.policy import Frame, PictureCodec, Policy, PolicySpec, Tensors
 from ibrobot_core.interfaces.reader import EpisodeAddress, EpisodeReader, EpisodeSummary, Recorded, TopicSummary
 from ibrobot_core.interfaces.recorder import EpisodeEnd, EpisodeStart, Recorder

@@ -124,8 +124,9 @@ class PlannerSource(SourceWorker):
                 executor.joints,
                 told[robot.indices(executor.joints)],
                 JointGoal(tuple(mine), np.array([goal[joint] for joint in mine])),
+                others=dict(zip(robot.joint_names, told.tolist(), strict=True)),
             )
-            goals[name] = goal_from_message(self._planner.plan(request))
+            goals[name] = goal_from_message(self._planner.plan(request).trajectory)
         if not goals:
             raise PlanningError(f"goal {text!r}: no executor of mode {self.mode.name} has these joints")
         return goals

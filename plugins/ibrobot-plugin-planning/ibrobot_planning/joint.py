@@ -15,10 +15,11 @@ from ibrobot_core.api import (
     JointGoal,
     JointTrajectory,
     JointTrajectoryPoint,
+    PlanCode,
     Planner,
     PlanningError,
     PlanRequest,
-    PoseGoal,
+    PlanResult,
     Vector,
     ns,
     seconds,
@@ -46,7 +47,7 @@ class JointPlanner(Planner):
         self._period_ns = ctx.period_ns
 
     @override
-    def plan(self, request: PlanRequest) -> JointTrajectory:
+    def plan(self, request: PlanRequest) -> PlanResult:
         joints = self._check_start(request)
         delta = self._goal(request, joints) - request.start
         velocity = self._options.velocity_scaling * _fraction("velocity_scaling", request.velocity_scaling)
@@ -59,7 +60,7 @@ class JointPlanner(Planner):
             rest = np.zeros(len(joints))
             # Two points and not one: an executor needs some time to be there.
             stay = tuple(JointTrajectoryPoint(stamp, request.start, rest, rest) for stamp in (0, self._period_ns))
-            return JointTrajectory(header, request.joints, stay)
+            return PlanResult(JointTrajectory(header, request.joints, stay))
         # Limits along the line, measured on the joint that moves farthest: the others move by a fraction of its way.
         share = np.abs(delta) / distance
         moving = share > _AT_GOAL
@@ -78,7 +79,7 @@ class JointPlanner(Planner):
             JointTrajectoryPoint(stamp, request.start + way * direction, speed * direction, rate * direction)
             for stamp, way, speed, rate in _points(profile, self._options.step)
         )
-        return JointTrajectory(header, request.joints, points)
+        return PlanResult(JointTrajectory(header, request.joints, points))
 
     def _check_start(self, request: PlanRequest) -> list[Joint]:
         """The joints of the request, once they and its start make sense."""
@@ -94,10 +95,11 @@ class JointPlanner(Planner):
     def _goal(self, request: PlanRequest, joints: list[Joint]) -> Vector:
         """Where every joint of the request ends [rad], shape (J,)."""
         goal = request.goal
-        if isinstance(goal, PoseGoal):
+        if not isinstance(goal, JointGoal):
             raise PlanningError(
                 "planner type 'joint' knows joint goals only, not poses of the tool: "
-                "name a pose of robot.description.poses, or use another type of planner, one for Cartesian goals"
+                "name a pose of robot.description.poses, or use another type of planner, one for Cartesian goals",
+                PlanCode.UNRECOGNIZED_GOAL_TYPE,
             )
         self._check_goal(goal)
         target = np.array(request.start, dtype=float)

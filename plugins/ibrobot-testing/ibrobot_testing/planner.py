@@ -46,7 +46,7 @@ class PlannerSuite(Suite[Planner]):
         with self.loaded() as (planner, ctx):
             for seed in range(5):
                 request = self.request(ctx, seed)
-                points = planner.plan(request).points
+                points = planner.plan(request).trajectory.points
                 assert isinstance(request.goal, JointGoal)
                 assert points[0].time_from_start_ns == 0
                 np.testing.assert_allclose(points[0].positions, request.start, atol=self.tolerance_rad)
@@ -58,7 +58,7 @@ class PlannerSuite(Suite[Planner]):
         with self.loaded() as (planner, ctx):
             for joints in (ctx.robot.joint_names, ctx.robot.joint_names[::-1], ctx.robot.joint_names[1:3]):
                 request = self.request(ctx, 1, joints)
-                trajectory = planner.plan(request)
+                trajectory = planner.plan(request).trajectory
                 assert trajectory.joint_names == joints
                 for point in trajectory.points:
                     assert point.positions.shape == (len(joints),)
@@ -68,7 +68,7 @@ class PlannerSuite(Suite[Planner]):
     def test_begins_and_ends_at_rest(self) -> None:
         """Velocities at both ends are zero."""
         with self.loaded() as (planner, ctx):
-            points = planner.plan(self.request(ctx, 2)).points
+            points = planner.plan(self.request(ctx, 2)).trajectory.points
             for point in (points[0], points[-1]):
                 if point.velocities.size:
                     np.testing.assert_allclose(point.velocities, 0.0, atol=1e-6)
@@ -78,7 +78,7 @@ class PlannerSuite(Suite[Planner]):
         with self.loaded() as (planner, ctx):
             for seed in range(5):
                 request = self.request(ctx, seed)
-                check_limits(planner.plan(request), request, ctx, self.samples)
+                check_limits(planner.plan(request).trajectory, request, ctx, self.samples)
 
     def test_scaling_slows_down(self) -> None:
         """Scaled limits are kept as the whole ones are."""
@@ -86,7 +86,7 @@ class PlannerSuite(Suite[Planner]):
             whole = self.request(ctx, 3)
             for velocity, acceleration in ((0.3, 1.0), (1.0, 0.3), (0.1, 0.1)):
                 slow = attrs.evolve(whole, velocity_scaling=velocity, acceleration_scaling=acceleration)
-                check_limits(planner.plan(slow), slow, ctx, self.samples)
+                check_limits(planner.plan(slow).trajectory, slow, ctx, self.samples)
 
     def test_joints_not_named_stay(self) -> None:
         """A goal for one joint moves no other."""
@@ -94,7 +94,7 @@ class PlannerSuite(Suite[Planner]):
             request = self.request(ctx, 4)
             assert isinstance(request.goal, JointGoal)
             goal = JointGoal(request.joints[1:2], request.goal.positions[1:2])
-            for point in planner.plan(attrs.evolve(request, goal=goal)).points:
+            for point in planner.plan(attrs.evolve(request, goal=goal)).trajectory.points:
                 others = np.delete(point.positions - request.start, 1)
                 np.testing.assert_allclose(others, 0.0, atol=self.tolerance_rad)
 
@@ -102,7 +102,8 @@ class PlannerSuite(Suite[Planner]):
         """A goal where the joints are gives a trajectory that stays there."""
         with self.loaded() as (planner, ctx):
             request = self.request(ctx, 5)
-            points = planner.plan(attrs.evolve(request, goal=JointGoal(request.joints, request.start))).points
+            stay = attrs.evolve(request, goal=JointGoal(request.joints, request.start))
+            points = planner.plan(stay).trajectory.points
             assert points
             for point in points:
                 np.testing.assert_allclose(point.positions, request.start, atol=self.tolerance_rad)

@@ -10,7 +10,7 @@ import pytest
 from ibrobot_testing import PlannerSuite, checks, failed_checks
 from ibrobot_testing.fakes import FakePlanner
 
-from ibrobot_core.api import JointGoal, PlanningError
+from ibrobot_core.api import JointGoal, PlanningError, PlanResult
 
 
 class TestPlanner(PlannerSuite):
@@ -21,45 +21,47 @@ class TestPlanner(PlannerSuite):
 
 class StopsShort(FakePlanner):
     def plan(self, request):
-        trajectory = super().plan(request)
-        return attrs.evolve(trajectory, points=trajectory.points[:-1])
+        trajectory = super().plan(request).trajectory
+        return PlanResult(attrs.evolve(trajectory, points=trajectory.points[:-1]))
 
 
 class BeginsLate(FakePlanner):
     def plan(self, request):
-        trajectory = super().plan(request)
+        trajectory = super().plan(request).trajectory
         later = (attrs.evolve(p, time_from_start_ns=p.time_from_start_ns + 10**9) for p in trajectory.points)
-        return attrs.evolve(trajectory, points=tuple(later))
+        return PlanResult(attrs.evolve(trajectory, points=tuple(later)))
 
 
 class RobotOrder(FakePlanner):
     def plan(self, request):
-        return attrs.evolve(super().plan(request), joint_names=self._robot.joint_names)
+        trajectory = super().plan(request).trajectory
+        return PlanResult(attrs.evolve(trajectory, joint_names=self._robot.joint_names))
 
 
 class RunsThroughTheGoal(FakePlanner):
     def plan(self, request):
-        trajectory = super().plan(request)
+        trajectory = super().plan(request).trajectory
         last = attrs.evolve(trajectory.points[-1], velocities=np.full(len(request.joints), 0.5))
-        return attrs.evolve(trajectory, points=(*trajectory.points[:-1], last))
+        return PlanResult(attrs.evolve(trajectory, points=(*trajectory.points[:-1], last)))
 
 
 class TwiceAsFast(FakePlanner):
     def plan(self, request):
-        trajectory = super().plan(request)
+        trajectory = super().plan(request).trajectory
         fast = (
             attrs.evolve(p, time_from_start_ns=p.time_from_start_ns // 2, velocities=p.velocities * 2)
             for p in trajectory.points
         )
-        return attrs.evolve(trajectory, points=tuple(fast))
+        return PlanResult(attrs.evolve(trajectory, points=tuple(fast)))
 
 
 class LeavesTheLimitsOnTheWay(FakePlanner):
     def plan(self, request):
-        trajectory = super().plan(request)
+        trajectory = super().plan(request).trajectory
         middle = len(trajectory.points) // 2
         far = attrs.evolve(trajectory.points[middle], positions=trajectory.points[middle].positions + 10)
-        return attrs.evolve(trajectory, points=(*trajectory.points[:middle], far, *trajectory.points[middle + 1 :]))
+        points = (*trajectory.points[:middle], far, *trajectory.points[middle + 1 :])
+        return PlanResult(attrs.evolve(trajectory, points=points))
 
 
 class IgnoresScaling(FakePlanner):
@@ -78,9 +80,9 @@ class OthersGoToZero(FakePlanner):
 
 class NoPointsWithoutAWay(FakePlanner):
     def plan(self, request):
-        trajectory = super().plan(request)
+        trajectory = super().plan(request).trajectory
         way = np.abs(trajectory.points[-1].positions - request.start).max()
-        return trajectory if way > 0 else attrs.evolve(trajectory, points=())
+        return PlanResult(trajectory if way > 0 else attrs.evolve(trajectory, points=()))
 
 
 class ClampsTheGoal(FakePlanner):
@@ -98,9 +100,9 @@ class IgnoresUnknownJoints(FakePlanner):
 
 class ChangesTheRequest(FakePlanner):
     def plan(self, request):
-        trajectory = super().plan(request)
+        trajectory = super().plan(request).trajectory
         request.start[:] = 0.0
-        return trajectory
+        return PlanResult(trajectory)
 
 
 class ClosesOnce(FakePlanner):

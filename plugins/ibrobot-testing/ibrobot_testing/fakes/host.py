@@ -17,9 +17,11 @@ from ibrobot_core.api import (
     JointTrajectory,
     JointTrajectoryPoint,
     Message,
+    PlanCode,
     Planner,
     PlanningError,
     PlanRequest,
+    PlanResult,
     Policy,
     PolicyError,
     PolicySpec,
@@ -142,9 +144,12 @@ class FakePlanner(Planner):
         self._robot = ctx.robot
 
     @override
-    def plan(self, request: PlanRequest) -> JointTrajectory:
+    def plan(self, request: PlanRequest) -> PlanResult:
         if not isinstance(request.goal, JointGoal):
-            raise PlanningError(f"the fake planner knows joint goals only, not {type(request.goal).__name__}")
+            raise PlanningError(
+                f"the fake planner knows joint goals only, not {type(request.goal).__name__}",
+                PlanCode.UNRECOGNIZED_GOAL_TYPE,
+            )
         unknown = set(request.goal.joints) - set(request.joints)
         if unknown:
             raise PlanningError(f"no joint {min(unknown)!r} in the request; it has: {', '.join(request.joints)}")
@@ -162,7 +167,7 @@ class FakePlanner(Planner):
         # The peaks of a cubic over time T: velocity 1.5 way / T, acceleration 6 way / T^2.
         duration = max((1.5 * way / velocity).max(), np.sqrt(6 * way / acceleration).max(), 0.01)
         points = tuple(_cubic_point(request.start, end, duration, share) for share in np.linspace(0.0, 1.0, 50))
-        return JointTrajectory(Header(), request.joints, points)
+        return PlanResult(JointTrajectory(Header(), request.joints, points))
 
 
 def _cubic_point(start: Vector, end: Vector, duration: float, share: float) -> JointTrajectoryPoint:
