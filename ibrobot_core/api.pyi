@@ -230,7 +230,7 @@ from ibrobot_core.recording.provenance import (
     metadata_from_config as metadata_from_config,
     robot_metadata as robot_metadata,
 )
-from ibrobot_core.metrics import Metrics as Metrics, MetricsProbes as MetricsProbes, MetricsServer as MetricsServer
+from ibrobot_core.probes import Probes as Probes, ProbeServer as ProbeServer
 from ibrobot_core.control.realtime import go_real_time as go_real_time
 from ibrobot_core.memory import set_malloc as set_malloc
 from ibrobot_core.signals import end_signals as end_signals, on_signals as on_signals

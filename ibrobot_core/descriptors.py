@@ -196,7 +196,7 @@ def only_with_section(config: RobotConfig) -> bool:
 
 @attrs.frozen
 class SectionDescriptor(Descriptor["Component"]):
-    """A section that a plugin adds to the robot YAML, e.g. `metrics: {port: 9464}`, and the component that serves it.
+    """A section that a plugin adds to the robot YAML, e.g. `counter: {topic: /count}`, and what serves it in a run.
 
     `type` is the section's key at the top level of the file, one that core does not have. `options` are its keys.
     """

@@ -465,14 +465,6 @@ class ControlConfig:
 
 
 @documented
-@attrs.frozen
-class MetricsConfig:
-    """The `metrics:` section."""
-
-    port: int = option(ge=0, le=65535, help="of 127.0.0.1, where /metrics, /healthz and /readyz are; 0: any free one")
-
-
-@documented
 @attrs.frozen(slots=False, kw_only=True)
 class RobotConfig:
     """A whole robot YAML, checked. `source` names the file; `document` is its plain data without secrets."""
@@ -495,7 +487,6 @@ class RobotConfig:
     transport: TransportConfig | None = option(None, help="how processes and machines talk")
     viewer: ViewerConfig | None = option(None, help="what shows the robot to a person")
     control: ControlConfig = option(factory=ControlConfig, help="the control loop")
-    metrics: MetricsConfig | None = option(None, help="counts in Prometheus' text format, over HTTP on this machine")
     plugin_sections: Mapping[str, ComponentConfig] = not_a_key(factory=dict)
     """The sections of plugins that the file has, by name."""
     simulated: bool = not_a_key(False)

@@ -15,7 +15,6 @@ from ibrobot_core.descriptors import SectionDescriptor
 from ibrobot_core.errors import ComponentFailed, NotSupported
 from ibrobot_core.launch.absence import describe, refuse
 from ibrobot_core.launch.control import ControlComponent
-from ibrobot_core.launch.outputs.metrics import MetricsPort
 from ibrobot_core.launch.outputs.sharing import PublishedTopic, SubscribedTopics
 from ibrobot_core.launch.outputs.status import Status
 from ibrobot_core.launch.outputs.transforms import Transforms
@@ -153,8 +152,6 @@ def build_plan(session: Session) -> LaunchPlan:
         components.append(added.source)
     components.append(Status(session, (CONTROL,)))
     components += _plugin_sections(session)
-    if config.metrics is not None:
-        components.append(MetricsPort(session, config.metrics, (CONTROL,)))
     if (urdf := config.robot.description.urdf) is not None:
         components.append(Transforms(session, urdf, (CONTROL,)))
     if config.viewer is not None:

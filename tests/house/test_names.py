@@ -24,7 +24,8 @@ def patterns() -> Iterator[str]:
         name = package.removeprefix("ibrobot-plugin-")
         yield rf"\b(ibrobot-plugin-{name}|ibrobot_{name})\b"
         yield from (rf"\bibrobot {command}\b" for command in offers.get("command", ()))
-        for type_ in (type_ for kind in KINDS for type_ in offers.get(kind, ())):
+        yield from (rf"\b{section}: \{{|\[.{section}.\]" for section in offers.get("section", ()))
+        for type_ in (type_ for kind in KINDS if kind != "section" for type_ in offers.get(kind, ())):
             yield rf"\btype: {type_}\b" if type_ in ORDINARY else rf"\b{type_}\b"
 
 
@@ -49,6 +50,7 @@ def test_core_names_no_plugin() -> None:
     [
         'DEFAULT = "recording={type: mcap}"', "# as scripted_pick does", "pip install ibrobot-plugin-zenoh",
         "import ibrobot_feetech", 'teleoperation: {jog: {type: keyboard}}', "see `ibrobot episodes verify`",
+        'config.plugin_sections["metrics"]',
     ],
 )  # fmt: skip
 def test_a_plugin_named_in_core_is_found(line: str) -> None:

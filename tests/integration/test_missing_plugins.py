@@ -103,6 +103,12 @@ def test_plan_says_what_is_not_there(only: Only, ibrobot: Run) -> None:
         (("feetech",), ("--mode", "jog", "--set", "recording={type: mcap}"),
          "sensor type 'opencv', teleop type 'keyboard', recorder type 'mcap' need plugins that are not "
          'installed: pip install "ibrobot[so101]"'),
+        (("feetech",), ("--set", "metrics.port=9464"),
+         "--set metrics.port=9464: metrics: section 'metrics' needs a plugin that is not installed: "
+         "pip install ibrobot-plugin-metrics"),
+        (("feetech",), ("--mode", "jog", "--set", "metrics.port=9464"),
+         "section 'metrics', teleop type 'keyboard' need plugins that are not installed: "
+         'pip install "ibrobot[sim]"'),
     ],
 )  # fmt: skip
 def test_entered_mode_is_one_error_with_one_command(

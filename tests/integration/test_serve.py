@@ -152,7 +152,7 @@ def test_a_server_whose_model_hangs_starts_again(
         answer = remote.infer(tensors, 2, time.monotonic_ns() + 60_000_000_000)
         assert answer["pid"].tolist() == [process.pid], "in the same process, with a new program"
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=60) as page:
-            assert 'ibrobot_serve_answered_total{model="net"} 1\n' in page.read().decode()
+            assert 'ibrobot_serve_answered_total{model="net"} 1.0\n' in page.read().decode()
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/readyz", timeout=60) as page:
             assert page.read() == b"ok\n"
         process.send_signal(signal.SIGTERM)

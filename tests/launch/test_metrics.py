@@ -1,24 +1,35 @@
-"""Metrics of a run: what is on /diagnostics, for Prometheus, and whether the robot is well."""
+"""The metrics plugin in a run: what is on /diagnostics, for Prometheus, and whether the robot is well."""
 
 from __future__ import annotations
 
 import urllib.error
 import urllib.request
+from importlib.metadata import entry_points
 from typing import TYPE_CHECKING
 
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from ibrobot_core.errors import ComponentFailed, ConfigError, SensorError
-from ibrobot_core.launch.outputs.metrics import MetricsPort
 
 if TYPE_CHECKING:
-    from conftest import Runs
+    from conftest import Runs, Site
     from ibrobot_core.launch.runtime import Runtime
 
 
+pytestmark = pytest.mark.integration
+
+
+@pytest.fixture(autouse=True)
+def installed(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The plugin beside the fakes."""
+    made_up = site.entry_points
+    plugin = entry_points(group="ibrobot", name="metrics")
+    monkeypatch.setattr(type(site), "entry_points", lambda _: [*made_up(), *plugin])
+
+
 def url(runtime: Runtime) -> str:
-    (port,) = (component for component in runtime.plan.components if isinstance(component, MetricsPort))
+    (port,) = (component for component in runtime.plan.components if component.name == "metrics")
     return port.url
 
 

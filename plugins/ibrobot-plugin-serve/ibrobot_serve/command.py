@@ -18,8 +18,8 @@ from ibrobot_core.api import (
     ConfigError,
     Context,
     LogFormatter,
-    MetricsServer,
     Policy,
+    ProbeServer,
     Problem,
     RealClock,
     Registry,
@@ -116,7 +116,7 @@ def serve(what: str, **options: Any) -> None:
         try:
             service.start()
             if options["metrics_port"] is not None:
-                metrics = MetricsServer(options["metrics_port"], probes(service))
+                metrics = ProbeServer(options["metrics_port"], probes(service))
                 logging.getLogger("ibrobot").info("metrics on %s", metrics.url)
             echo(f"serving {name} (policy {policy.fingerprint()}); Ctrl-C ends")
             _show(service, stopping)

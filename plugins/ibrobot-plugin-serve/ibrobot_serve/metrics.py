@@ -2,39 +2,76 @@
 
 from __future__ import annotations
 
-from ibrobot_core.api import Metrics, MetricsProbes
+from collections.abc import Iterable, Mapping
+from typing import Any, override
+
+from prometheus_client import generate_latest
+from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
+
+from ibrobot_core.api import Probes
 from ibrobot_serve.service import InferenceService
 
 _COUNTS = ("requests", "answered", "failed", "expired")
-_TIMES = ("latency_p50_ms", "latency_p99_ms")
+_LABEL_SIZE = 200
+_Rows = Mapping[tuple[str, ...], Mapping[str, Any]]
+"""Values of the labels -> counts."""
 
 
-def probes(service: InferenceService) -> MetricsProbes:
+def probes(service: InferenceService) -> Probes:
     """What an HTTP port says of a service."""
-    return MetricsProbes(
-        lambda metrics: collect(service, metrics),
+    return Probes(
+        lambda: generate_latest(ServiceCollector(service)),
         lambda: "the model hangs" if service.state == "hangs" else "",
         lambda: "the server is stopping" if service.state == "draining" else "",
     )
 
 
-def collect(service: InferenceService, metrics: Metrics) -> None:
-    """Add all numbers of a service."""
-    statistics = service.statistics()
-    model = {"model": statistics["model"]}
-    for name, about in (
-        ("uptime_s", ""),
-        ("waiting", "robots whose requests wait"),
-        ("pace_ms", "time that robots are asked to leave between requests; 0: any"),
-    ):
-        metrics.add(f"serve_{name}", statistics[name], model, about=about)
-    metrics.add("serve_malformed", statistics["malformed"], model, counter=True, about="payloads that are no request")
-    for size, count in statistics["batches"].items():
-        metrics.add("serve_batches", count, {**model, "size": size}, counter=True, about="by requests in one run")
-    # All robots together, since a robot that was not heard of for long is forgotten.
-    robots = [("serve_robot", {**model, "robot": name}, counts) for name, counts in statistics["robots"].items()]
-    for prefix, labels, counts in [("serve", model, statistics), *robots]:
-        for name in _COUNTS:
-            metrics.add(f"{prefix}_{name}", counts[name], labels, counter=True)
-        for name in _TIMES:
-            metrics.add(f"{prefix}_{name}", counts[name], labels, about="of the newest thousand requests")
+class ServiceCollector(Collector):
+    """All numbers of a service, each with the label `model`."""
+
+    def __init__(self, service: InferenceService) -> None:
+        self._service = service
+
+    @override
+    def collect(self) -> Iterable[Metric]:
+        """All numbers as they are now."""
+        statistics = self._service.statistics()
+        model = statistics["model"]
+        malformed = CounterMetricFamily("ibrobot_serve_malformed", "payloads that are no request", labels=["model"])
+        malformed.add_metric([model], statistics["malformed"])
+        batches = CounterMetricFamily("ibrobot_serve_batches", "by requests in one run", labels=["model", "size"])
+        for size, count in statistics["batches"].items():
+            batches.add_metric([model, size], count)
+        # All robots together, since a robot that was not heard of for long is forgotten.
+        together: _Rows = {(model,): statistics}
+        each: _Rows = {(model, name[:_LABEL_SIZE]): counts for name, counts in statistics["robots"].items()}
+        return [
+            _gauge("uptime_seconds", "time since the start", model, statistics["uptime_s"]),
+            _gauge("waiting", "robots whose requests wait", model, statistics["waiting"]),
+            _gauge("pace_seconds", "time that robots leave between requests", model, statistics["pace_ms"] / 1e3),
+            malformed,
+            batches,
+            *_answers("ibrobot_serve", ("model",), together),
+            *_answers("ibrobot_serve_robot", ("model", "robot"), each),
+        ]
+
+
+def _gauge(name: str, about: str, model: str, value: float) -> Metric:
+    family = GaugeMetricFamily(f"ibrobot_serve_{name}", about, labels=["model"])
+    family.add_metric([model], value)
+    return family
+
+
+def _answers(prefix: str, labels: tuple[str, ...], rows: _Rows) -> Iterable[Metric]:
+    """Requests and their latencies, for each row's values of the labels."""
+    for name in _COUNTS:
+        counter = CounterMetricFamily(f"{prefix}_{name}", "requests, by what came of them", labels=labels)
+        for values, counts in rows.items():
+            counter.add_metric(values, counts[name])
+        yield counter
+    for name in ("latency_p50", "latency_p99"):
+        gauge = GaugeMetricFamily(f"{prefix}_{name}_seconds", "of the newest thousand requests", labels=labels)
+        for values, counts in rows.items():
+            gauge.add_metric(values, counts[f"{name}_ms"] / 1e3)
+        yield gauge

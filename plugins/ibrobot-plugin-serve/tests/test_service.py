@@ -25,7 +25,6 @@ from prometheus_client.parser import text_string_to_metric_families
 from ibrobot_core.api import (
     ContractError,
     Handler,
-    Metrics,
     PolicyError,
     Tensors,
     TransportError,
@@ -662,9 +661,7 @@ def test_prometheus_learns_what_a_server_counts():
         for robot, x in (("one", 1), ("one", 2), ('t"wo\n', 13)):
             cloud.ask(robot, x).result(PATIENCE_S)
         asked = probes(cloud.service)
-        metrics = Metrics()
-        asked.collect(metrics)
-        families = {family.name: family for family in text_string_to_metric_families(metrics.text())}
+        families = {family.name: family for family in text_string_to_metric_families(asked.metrics().decode())}
         assert {"ibrobot_serve_waiting", "ibrobot_serve_pace_seconds", "ibrobot_serve_latency_p99_seconds"} < set(
             families
         )
