@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections import deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable
 from typing import Any
 
@@ -30,7 +30,7 @@ class Subscription:
         self.topic = topic
         self.depth = depth
         self.dropped = 0
-        self.lost: dict[str, int] = {}
+        self.lost = Counter[str]()
         """Topic -> messages dropped."""
         self._bus = bus
         self._queue: deque[Received] = deque()
@@ -41,7 +41,7 @@ class Subscription:
         if len(self._queue) >= self.depth:
             oldest = self._queue.popleft()
             self.dropped += 1
-            self.lost[oldest.topic] = self.lost.get(oldest.topic, 0) + 1
+            self.lost[oldest.topic] += 1
         self._queue.append(item)
         self._arrived.notify_all()
 
@@ -74,8 +74,8 @@ class Bus:
     def __init__(self, clock: Clock) -> None:
         self.clock = clock
         self._lock = threading.RLock()
-        self._subscriptions: dict[str, list[Subscription]] = {}
-        self._all: list[Subscription] = []
+        self._subscriptions: defaultdict[str, list[Subscription]] = defaultdict(list)
+        """By topic; the empty one has those of every topic."""
         self._types: dict[str, str] = {}
         self._latched: dict[str, Received] = {}
         self._counts: dict[str, int] = {}
@@ -95,9 +95,7 @@ class Bus:
             self._counts[topic] = self._counts.get(topic, 0) + 1
             if latched:
                 self._latched[topic] = item
-            for subscription in self._subscriptions.get(topic, ()):
-                subscription._put(item)
-            for subscription in self._all:
+            for subscription in (*self._subscriptions.get(topic, ()), *self._subscriptions.get("", ())):
                 subscription._put(item)
 
     def subscribe(self, topic: str | None, depth: int = 10) -> Subscription:
@@ -110,21 +108,16 @@ class Bus:
             raise ValueError(f"depth must be at least 1, got {depth}")
         with self._lock:
             subscription = Subscription(self, topic or "", depth)
-            if topic is None:
-                self._all.append(subscription)
-                for item in self._latched.values():
+            self._subscriptions[subscription.topic].append(subscription)
+            for item in self._latched.values():
+                if topic in (None, item.topic):
                     subscription._put(item)
-            else:
-                self._subscriptions.setdefault(topic, []).append(subscription)
-                if topic in self._latched:
-                    subscription._put(self._latched[topic])
             return subscription
 
     def _unsubscribe(self, subscription: Subscription) -> None:
         with self._lock:
-            for subscriptions in (self._all, self._subscriptions.get(subscription.topic, [])):
-                if subscription in subscriptions:
-                    subscriptions.remove(subscription)
+            if subscription in self._subscriptions[subscription.topic]:
+                self._subscriptions[subscription.topic].remove(subscription)
 
     def snapshot_ns(self) -> int:
         """Now [ns], such that every message received at or before it is in its subscribers' queues."""
@@ -144,13 +137,10 @@ class Bus:
     def dropped(self) -> dict[str, int]:
         """Messages dropped from full queues, per topic, over the present subscribers; topics without loss left out."""
         with self._lock:
-            lost: dict[str, int] = {}
-            for subscriptions in (self._all, *self._subscriptions.values()):
-                for subscription in subscriptions:
-                    if subscription.dropped:
-                        name = subscription.topic or "*"
-                        lost[name] = lost.get(name, 0) + subscription.dropped
-            return lost
+            lost = Counter[str]()
+            for topic, subscriptions in self._subscriptions.items():
+                lost[topic or "*"] += sum(subscription.dropped for subscription in subscriptions)
+            return dict(+lost)
 
     def serve(self, name: str, handler: Callable[[Any], Any]) -> None:
         """Answer calls of service `name` with `handler`, in the caller's thread.

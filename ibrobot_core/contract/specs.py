@@ -14,13 +14,10 @@ from ibrobot_core.config.contract_checks import completed
 from ibrobot_core.config.schema import ActionSpec, Align, ImageSpec, ObservationSpec, RobotConfig
 from ibrobot_core.errors import ContractError
 from ibrobot_core.interfaces.dataset import Feature
-from ibrobot_core.messages import MESSAGE_TYPES
+from ibrobot_core.messages import MESSAGE_TYPES, CompressedImage, Image, JointState
 from ibrobot_core.selection import Selection
 from ibrobot_core.units import NS_PER_S
 
-_JOINTS_TYPE = "sensor_msgs/msg/JointState"
-_CAMERA_TYPE = "sensor_msgs/msg/Image"
-_COMPRESSED_TYPE = "sensor_msgs/msg/CompressedImage"
 _IMAGE_DTYPES = {"16UC1": "uint16", "32FC1": "float32"}
 
 
@@ -118,23 +115,9 @@ class Contract:
             parts = [
                 _recorded_observation(key, part) for key, each in canonical["observations"].items() for part in each
             ]
-            actions = [
-                ActionPart(
-                    part["topic"],
-                    part["topic"],
-                    part["type"],
-                    "hold",
-                    tuple(part["joints"]),
-                    tuple(part.get("select", ())),
-                    part.get("align", "hold"),
-                )
-                for part in canonical["action"]
-            ]
-            signals = tuple(
-                SignalPart(each["key"], each["topic"], each["type"], each["path"], each["align"])
-                for each in canonical.get("signals", ())
-            )
-            contract = cls(float(canonical["rate_hz"]), tuple(parts), tuple(actions), signals)
+            actions = [_recorded_action(**part) for part in canonical["action"]]
+            signals = [SignalPart(**each) for each in canonical.get("signals", ())]
+            contract = cls(float(canonical["rate_hz"]), tuple(parts), tuple(actions), tuple(signals))
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise ContractError(f"not a contract as it is recorded: {error!r}") from None
         if canonical.get("version") != contract.canonical()["version"]:
@@ -223,11 +206,12 @@ def _observation(spec: ObservationSpec, config: RobotConfig) -> ObservationPart:
     """Find the paths and the shape of a spec."""
     peripheral = config.peripherals[spec.peripheral] if spec.peripheral is not None else None
     spec = completed(spec, peripheral.kind if peripheral is not None else "")
-    type_ = _CAMERA_TYPE if spec.type == _COMPRESSED_TYPE else spec.type  # a picture is a picture, however it is sent
+    # A picture is a picture, however it is sent.
+    type_ = Image.ros_type if spec.type == CompressedImage.ros_type else spec.type
     known = MESSAGE_TYPES.get(type_)
     has_header = known is None or "header" in attrs.fields_dict(known)
     align = spec.align if has_header else attrs.evolve(spec.align, stamp="receive")
-    if type_ == _CAMERA_TYPE:
+    if type_ == Image.ros_type:
         image = spec.image or ImageSpec()
         size = peripheral.picture if peripheral is not None else None
         return ObservationPart(spec.key, spec.topic, type_, (), image, align, _image_feature(image, size))
@@ -249,6 +233,12 @@ def _recorded_observation(key: str, part: Mapping[str, Any]) -> ObservationPart:
     return ObservationPart(key, part["topic"], part["type"], (), image, align, _image_feature(image, None))
 
 
+def _recorded_action(
+    topic: str, type: str, joints: Sequence[str], select: Sequence[str] = (), align: str = "hold"
+) -> ActionPart:
+    return ActionPart(topic, topic, type, "hold", tuple(joints), tuple(select), align)
+
+
 def _image_feature(image: ImageSpec, size: tuple[int, int] | None) -> Feature:
     height, width = image.resize or size or (-1, -1)
     channels = 3 if image.encoding in ("rgb8", "bgr8") else 1
@@ -259,7 +249,7 @@ def _image_feature(image: ImageSpec, size: tuple[int, int] | None) -> Feature:
 def _action(spec: ActionSpec, config: RobotConfig) -> ActionPart:
     executor = config.executors[spec.executor]
     select = spec.select
-    if not select and spec.type == _JOINTS_TYPE:
+    if not select and spec.type == JointState.ros_type:
         select = tuple(f"position.{joint}" for joint in executor.joints)
     return ActionPart(executor.name, spec.topic, spec.type, spec.safety_behavior, executor.joints, select, spec.align)
 

@@ -92,9 +92,7 @@ class ControlComponent(Component):
             fault = str(event["fault"])
             session.add_fault(fault, int(event["generation"]))
             session.log.error("fault: %s; the robot %s", fault, event["then"])
-            session.registry.emit(
-                "ibrobot_fault_raised", robot=session.config.robot.name, fault=fault, stamp_ns=int(event["stamp_ns"])
-            )
+            session.emit("ibrobot_fault_raised", fault=fault, stamp_ns=int(event["stamp_ns"]))
         else:
             raise HardwareError(f"control sent an unknown event {event['event']!r}")
 

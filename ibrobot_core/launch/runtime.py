@@ -140,10 +140,7 @@ class Runtime:
         old, self._mode_components = self._mode_components.components(), added
         self._started = [component for component in self._started if component not in old] + new
         self._stop_all(old)
-        session.registry.emit(
-            "ibrobot_mode_changed", robot=session.config.robot.name, mode=name, previous=previous,
-            stamp_ns=session.clock.now_ns(),
-        )  # fmt: skip
+        session.emit("ibrobot_mode_changed", mode=name, previous=previous)
         if not session.request.by_operator:
             self.plan.episodes.begin()
 

@@ -289,6 +289,10 @@ class Session:
         groups["bus drops"] = self.bus.dropped()
         return groups
 
+    def emit(self, event: str, **facts: Any) -> None:
+        """Tell plugins of an event: this robot, at this time where `facts` has no other `stamp_ns`."""
+        self.registry.emit(event, **{"robot": self.config.robot.name, "stamp_ns": self.clock.now_ns(), **facts})
+
     def finish(self) -> None:
         """End the run in good order."""
         self.finished.set()

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ibrobot_core.recording.run import Run
-
 if TYPE_CHECKING:
+    from ibrobot_core.launch.session import Session
     from ibrobot_core.recording.worker import RecordingWorker
 
 
 class Episodes:
     """Begins and ends episodes. One thread at a time uses it."""
 
-    def __init__(self, session: Run, recording: RecordingWorker | None) -> None:
+    def __init__(self, session: Session, recording: RecordingWorker | None) -> None:
         self._session = session
         self._recording = recording
         self.number = 0
@@ -37,10 +36,7 @@ class Episodes:
         self.number += 1
         self.running = True
         self.begun_ns = session.clock.now_ns()
-        session.registry.emit(
-            "ibrobot_episode_started", robot=session.config.robot.name, episode=self.number, mode=session.mode,
-            stamp_ns=session.clock.now_ns(),
-        )  # fmt: skip
+        session.emit("ibrobot_episode_started", episode=self.number, mode=session.mode)
 
     def end(self, outcome: str) -> None:
         """The present episode, if any, ends as `success`, `failure`, `discarded` or `unknown`."""
@@ -56,7 +52,4 @@ class Episodes:
             session.outcome.episodes += 1
             session.outcome.successes += outcome == "success"
             session.log.info("episode %d: %s", self.number, outcome)
-        session.registry.emit(
-            "ibrobot_episode_ended", robot=session.config.robot.name, episode=self.number, outcome=outcome,
-            stamp_ns=session.clock.now_ns(),
-        )  # fmt: skip
+        session.emit("ibrobot_episode_ended", episode=self.number, outcome=outcome)

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from math import inf
-from typing import override
+from typing import TYPE_CHECKING, override
 
 from ibrobot_core.errors import DiskFull, IbrobotError, NotSupported
-from ibrobot_core.recording.run import Run
 from ibrobot_core.recording.service import EpisodeService
 from ibrobot_core.run_hooks import RunHooks
 from ibrobot_core.units import plural, seconds
+
+if TYPE_CHECKING:
+    from ibrobot_core.launch.session import Session
 
 _MIB = 1 << 20
 _START, _FAILURE, _DISCARD = "tab", "f11", "f12"
@@ -36,7 +38,7 @@ class Operator(RunHooks):
     """
 
     def __init__(
-        self, run: Run, service: EpisodeService, count: int | None, reset_time_s: float, prompt: str | None, *,
+        self, run: Session, service: EpisodeService, count: int | None, reset_time_s: float, prompt: str | None, *,
         auto: bool, keys: bool, continuous: bool = False,
     ) -> None:  # fmt: skip
         if service.by_mode and continuous:

@@ -5,16 +5,18 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import DiskFull, NotSupported, RecorderError, wrong_input
 from ibrobot_core.recording.dataset import EpisodeDataset
 from ibrobot_core.recording.episode import is_kept
 from ibrobot_core.recording.episodes import Episodes
-from ibrobot_core.recording.run import Run
 from ibrobot_core.recording.worker import RecordingWorker
 from ibrobot_core.units import seconds
+
+if TYPE_CHECKING:
+    from ibrobot_core.launch.session import Session
 
 START = "/record_episode/start"
 """Request: a prompt, or None for the last. Begins an episode."""
@@ -45,7 +47,7 @@ class EpisodeService:
             record and `recording.topics` leaves out a topic of the contract.
     """
 
-    def __init__(self, session: Run, episodes: Episodes, recording: RecordingWorker, *, by_mode: bool) -> None:
+    def __init__(self, session: Session, episodes: Episodes, recording: RecordingWorker, *, by_mode: bool) -> None:
         self._session = session
         self._episodes = episodes
         self._recording = recording

@@ -6,7 +6,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import override
+from typing import TYPE_CHECKING, override
 
 import attrs
 
@@ -18,8 +18,10 @@ from ibrobot_core.errors import RecorderError
 from ibrobot_core.interfaces import EpisodeEnd, EpisodeStart, Recorder
 from ibrobot_core.messages import Message
 from ibrobot_core.recording.episode import episode_start, is_kept
-from ibrobot_core.recording.run import Run
 from ibrobot_core.units import NS_PER_S, seconds
+
+if TYPE_CHECKING:
+    from ibrobot_core.launch.session import Session
 
 _DEPTH = 4096
 """Messages that may wait for the recorder."""
@@ -61,7 +63,7 @@ class RecordingWorker(Worker):
     and the next episode is recorded again.
     """
 
-    def __init__(self, session: Run, config: RecordingConfig) -> None:
+    def __init__(self, session: Session, config: RecordingConfig) -> None:
         super().__init__(
             "recording", f"{config.type} into {config.root}", on_failure=session.fail,
             lockstep=session.request.lockstep,
@@ -248,9 +250,7 @@ class RecordingWorker(Worker):
         fault = f"recording ended: {error_line(error)}"
         session.add_fault(fault)
         session.log.error("%s; the robot goes on", fault)
-        session.registry.emit(
-            "ibrobot_fault_raised", robot=session.config.robot.name, fault=fault, stamp_ns=session.clock.now_ns()
-        )
+        session.emit("ibrobot_fault_raised", fault=fault)
 
     def _report_absent(self) -> None:
         """Say once, after the first episode, which listed topics never came: a misspelt one never will."""
