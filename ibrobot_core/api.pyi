@@ -151,10 +151,17 @@ from ibrobot_core.clock import Clock as Clock, RealClock as RealClock, SteppedCl
 from ibrobot_core.bus import Bus as Bus, Received as Received, Subscription as Subscription
 from ibrobot_core.component import CONTROL as CONTROL, Component as Component, Worker as Worker
 from ibrobot_core.launch.session import (
+    CommandSource as CommandSource,
     LaunchRequest as LaunchRequest,
     Session as Session,
     SessionWorker as SessionWorker,
 )
+from ibrobot_core.launch.sources.source_worker import SourceWorker as SourceWorker
+from ibrobot_core.control.link import ControlState as ControlState
+from ibrobot_core.launch.runtime import Runtime as Runtime
+from ibrobot_core.cli.run import run_robot as run_robot
+from ibrobot_core.cli.options import run_options as run_options, run_overrides as run_overrides
+from ibrobot_core.run_hooks import RunHooks as RunHooks
 from ibrobot_core.units import (
     LEROBOT_MODES as LEROBOT_MODES,
     NORM_MODES as NORM_MODES,
@@ -195,11 +202,17 @@ from ibrobot_core.contract.frames import FrameAssembler as FrameAssembler
 from ibrobot_core.contract.joint_units import JointUnits as JointUnits
 from ibrobot_core.contract.joint_units import with_closed_ends as with_closed_ends
 from ibrobot_core.selection import Leaf as Leaf, Selection as Selection, value_at as value_at
-from ibrobot_core.config import RobotConfig as RobotConfig, find_config as find_config, load_config as load_config
+from ibrobot_core.config import (
+    RobotConfig as RobotConfig,
+    find_config as find_config,
+    from_document as from_document,
+    load_config as load_config,
+)
 from ibrobot_core.config.load import load_contract as load_contract
 from ibrobot_core.config.schema import (
     TASK_KEY as TASK_KEY,
     Align as Align,
+    ControlMode as ControlMode,
     ImageSpec as ImageSpec,
     TransportConfig as TransportConfig,
 )

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 
 class RunHooks:
     """What a command adds to a run. This one adds nothing."""
@@ -30,7 +28,3 @@ class RunHooks:
     def summary_rows(self) -> list[tuple[str, str]]:
         """Heading and text, for the summary of the run."""
         return []
-
-    def facts(self) -> dict[str, Any]:
-        """What it adds to the summary as JSON."""
-        return {}

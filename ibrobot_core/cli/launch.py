@@ -2,51 +2,19 @@
 
 from __future__ import annotations
 
-import json
-import logging
-import os
-import queue
-import signal
-import sys
-import threading
-import time
-from collections.abc import Callable
-from contextlib import ExitStack
 from typing import Any
 
-import attrs
 import click
 
-from ibrobot_core.cli.options import launch_options
-from ibrobot_core.cli.panel import RecentLog, RecentRates, panel, plain_line
-from ibrobot_core.config import RobotConfig, find_config, load_config
-from ibrobot_core.control.core import EMERGENCY_STOP
-from ibrobot_core.errors import IbrobotError
-from ibrobot_core.launch.models import check_models
-from ibrobot_core.launch.runtime import Runtime
-from ibrobot_core.launch.session import LaunchRequest, Session
-from ibrobot_core.outside import LogFormatter, echo
+from ibrobot_core.cli.options import run_options, run_overrides
+from ibrobot_core.cli.run import MakeHooks, no_hooks, run_robot
+from ibrobot_core.config import find_config, load_config
+from ibrobot_core.launch.session import LaunchRequest
 from ibrobot_core.plugins import installed_plugins
-from ibrobot_core.run_hooks import RunHooks
-from ibrobot_core.signals import end_signals
-from ibrobot_core.terminal import KeyReader
-
-NOT_ALL_SUCCEEDED = 3
-_FAULTED = 1
-_INTERRUPTED_TWICE = 130
-_PANEL_HZ = 8
-_PLAIN_PERIOD_S = 2.0
-
-
-MakeHooks = Callable[[Runtime], RunHooks]
-
-
-def _no_hooks(runtime: Runtime) -> RunHooks:
-    return RunHooks()
 
 
 @click.command()
-@launch_options
+@run_options()
 def launch(config: str | None, **options: Any) -> None:
     """Run a robot.
 
@@ -56,19 +24,19 @@ def launch(config: str | None, **options: Any) -> None:
     Exits with 0 when the run ended well, 1 when a component failed or a fault was raised, 2 for a wrong command line
     or YAML, 3 when not every episode or goal succeeded, 130 on a second Ctrl-C.
     """
-    run_robot(config, options)
+    run_config(config, options)
 
 
-def run_robot(
-    config: str | None, options: dict[str, Any], *, hooks: MakeHooks = _no_hooks,
+def run_config(
+    config: str | None, options: dict[str, Any], *, make_hooks: MakeHooks = no_hooks,
     recording: tuple[str, ...] | None = None, prompt: str = "",
 ) -> None:  # fmt: skip
     """Run a robot as a command line says, to the end of the process.
 
     Args:
         config: the robot YAML, as `launch` takes it.
-        options: those of `launch_options`.
-        hooks: makes those of the command, once the run is made and not started yet.
+        options: those of `run_options`.
+        make_hooks: as `run_robot` takes it.
         recording: overrides of the `recording` section, which is made where the YAML has none; None: the run does what
             the mode does.
         prompt: what recorded episodes are recorded under.
@@ -78,7 +46,7 @@ def run_robot(
     """
     registry = installed_plugins()
     path = find_config(config, registry)
-    changes, chosen = overrides_of(options), {"mode": options["mode"], "sim": options["sim"], "registry": registry}
+    changes, chosen = run_overrides(options), {"mode": options["mode"], "sim": options["sim"], "registry": registry}
     # An override within the section must not count as the section.
     known = [change for change in changes if recording is None or not change.startswith("recording.")]
     robot = load_config(path, overrides=known, **chosen)
@@ -91,236 +59,7 @@ def run_robot(
         options["lockstep"], options["seed"], options["duration"], options["episodes"], options["goals"],
         prompt=prompt, by_operator=recording is not None,
     )  # fmt: skip
-    run_loaded(robot, request, options, hooks)
-
-
-def overrides_of(options: dict[str, Any]) -> tuple[str, ...]:
-    """The overrides of a robot YAML that a command line asks for.
-
-    Raises:
-        click.UsageError: for options that exclude each other.
-    """
-    if options["window"] and options["headless"]:
-        raise click.UsageError("--window and --headless exclude each other")
-    window = [f"viewer={{type: {installed_plugins().default('viewer')}}}"] if options["window"] else []
-    return (*options["overrides"], *window)
-
-
-def run_loaded(robot: RobotConfig, request: LaunchRequest, options: dict[str, Any], make_hooks: MakeHooks) -> None:
-    """Run a robot whose YAML has been read, to the end of the process.
-
-    Args:
-        robot: the robot.
-        request: what is asked of the run.
-        options: `headless`, `dry_run` and `as_json` of `launch_options`.
-        make_hooks: makes those of the command, once the run is made and not started yet.
-
-    Raises:
-        IbrobotError: e.g. when a component fails.
-    """
-    as_json = options["as_json"]
-    if request.lockstep and not robot.simulated:
-        raise click.UsageError("--lockstep is for simulation: add --sim")
-    if options["headless"] and robot.viewer is not None:
-        robot = attrs.evolve(robot, viewer=None)
-    with ExitStack() as stack:
-        keys = KeyReader() if sys.stdin.isatty() and not (options["headless"] or options["dry_run"]) else None
-        if keys is not None:
-            request = attrs.evolve(request, keys=keys.subscribe)
-        runtime = Runtime(Session(robot, installed_plugins(), request))
-        if options["dry_run"]:
-            models = check_models(robot, installed_plugins(), [runtime.session.mode])
-            plan = runtime.plan
-            echo(json.dumps({**plan.facts(), "models": models}) if as_json else "\n".join([*plan.lines(), *models]))
-            return
-        hooks = make_hooks(runtime)
-        _stop_on_signals(runtime.session, keys)
-        if keys is not None:  # only now: until here Ctrl-C ends the process, and could not put the terminal back
-            stack.enter_context(keys)
-        try:
-            status = _run(runtime, hooks, live=not options["headless"], as_json=as_json)
-        finally:
-            for line in runtime.session.outcome.holding:
-                echo(line, err=True)
-    _tell(runtime, hooks, as_json)
-    runtime.raise_failure()
-    sys.exit(status)
-
-
-def _run(runtime: Runtime, hooks: RunHooks, *, live: bool, as_json: bool) -> int:
-    """Start, run and stop; returns the exit status of a run in which nothing failed.
-
-    What it shows meanwhile is on standard output, or on standard error where that is for JSON.
-    """
-    session = runtime.session
-    where = "simulation" if session.config.simulated else "hardware"
-    with ExitStack() as stack:
-        panel_fits = live and (sys.stderr if as_json else sys.stdout).isatty()
-        display = (_Panel if panel_fits else _Lines)(runtime, hooks, stack, err=as_json)
-        robot = session.config
-        session.log.info("%s from %s: %s, mode %s", robot.robot.name, robot.source, where, session.mode)
-        runtime.start(display.starting)
-        stack.callback(runtime.stop)
-        if session.request.lockstep:
-            while not runtime.step():
-                hooks.step()
-                display.show()
-        else:
-            while not runtime.wait(1.0 / _PANEL_HZ):
-                hooks.step()
-                display.show()
-    outcome = session.outcome
-    if any(fault != EMERGENCY_STOP for fault in outcome.faults):
-        return _FAULTED
-    return NOT_ALL_SUCCEEDED if outcome.successes < outcome.episodes or outcome.goals_failed else 0
-
-
-def _stop_on_signals(session: Session, keys: KeyReader | None) -> None:
-    """The first of the `end_signals` stops in order; a second Ctrl-C ends the host, and control stops the robot."""
-    terminals = [fd for fd in (1, 2) if os.isatty(fd)]
-
-    def stop(number: int, frame: object) -> None:
-        if session.finished.is_set() and number == signal.SIGINT:
-            if keys is not None:
-                keys.close()
-            os._exit(_INTERRUPTED_TWICE)
-        if number == signal.SIGHUP:  # the terminal may be gone: what is written to it must not fail
-            _discard(terminals)
-        if session.request.lockstep:  # nobody waits for the end, which comes at a tick
-            finish()
-        else:  # see `on_signals`
-            threading.Thread(target=finish, name="signal", daemon=True).start()
-
-    def finish() -> None:
-        session.log.info("stopping; Ctrl-C again stops at once")
-        session.finish()
-
-    for each in end_signals():
-        signal.signal(each, stop)
-
-
-def _discard(descriptors: list[int]) -> None:
-    """Have what is written to these go nowhere."""
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    for descriptor in descriptors:
-        os.dup2(nowhere, descriptor)
-    os.close(nowhere)
-
-
-class _Lines:
-    """Plain lines of status, where standard output is not a terminal."""
-
-    def __init__(self, runtime: Runtime, hooks: RunHooks, stack: ExitStack, *, err: bool) -> None:
-        self._session = runtime.session
-        self._hooks = hooks
-        self._err = err
-        self._rates = RecentRates()
-        self._next_s = time.monotonic() + _PLAIN_PERIOD_S
-        handler = logging.StreamHandler(sys.stderr)
-        handler.setFormatter(LogFormatter("%(levelname).1s %(message)s"))
-        _log_to(handler)
-
-    def starting(self, component: str) -> None:
-        """Nothing is said of a component that starts."""
-
-    def show(self) -> None:
-        """Print a line, now and then."""
-        self._rates.sample(self._session)
-        if time.monotonic() >= self._next_s:
-            self._next_s += _PLAIN_PERIOD_S
-            line = plain_line(self._session, self._rates)
-            echo(f"{line} | {more}" if (more := self._hooks.line()) else line, err=self._err)
-
-
-class _Panel:
-    """The live panel, and the runtime's own keys: F1..F9 modes, Esc emergency stop, F10 reset."""
-
-    def __init__(self, runtime: Runtime, hooks: RunHooks, stack: ExitStack, *, err: bool) -> None:
-        from rich.live import Live
-
-        from ibrobot_core.screen import Screen
-
-        self._runtime = runtime
-        self._hooks = hooks
-        self._log = RecentLog()
-        self._rates = RecentRates()
-        _log_to(self._log)
-        self._display = stack.enter_context(Live(console=Screen(stderr=err), auto_refresh=False, screen=False))
-        self._next_s = 0.0
-        self._pressed: queue.SimpleQueue[str] = queue.SimpleQueue()
-        keys = runtime.session.request.keys
-        if keys is not None:
-            threading.Thread(target=self._listen, args=(keys(),), name="runtime keys", daemon=True).start()
-
-    def starting(self, component: str) -> None:
-        """Show which component starts."""
-        self._display.update(f"starting {component} …", refresh=True)
-
-    def show(self) -> None:
-        """Handle the keys pressed, and redraw the panel."""
-        if time.monotonic() < self._next_s:
-            return
-        self._next_s = time.monotonic() + 1.0 / _PANEL_HZ
-        while not self._pressed.empty():
-            self._handle_key(self._pressed.get())
-        session = self._runtime.session
-        help_text = session.command_source.help() if session.command_source is not None else ""
-        help_text = "\n".join(text for text in (help_text, self._hooks.help()) if text)
-        self._rates.sample(session)
-        self._display.update(panel(session, self._log, self._rates, help_text, self._hooks.rows()), refresh=True)
-
-    def _listen(self, keys: queue.SimpleQueue[str]) -> None:
-        """In a thread of its own, so that the emergency stop waits for nothing, e.g. not for a mode that loads."""
-        while True:
-            key = keys.get()
-            if key == "esc":
-                self._try(lambda: self._runtime.session.control.call("estop"))
-            else:
-                self._pressed.put(key)
-
-    def _handle_key(self, key: str) -> None:
-        if self._hooks.key(key):
-            return
-        modes = self._runtime.session.mode_keys
-        if key == "f10":
-            self._try(self._runtime.reset)
-        elif (mode := modes.get(key.upper())) is not None:
-            self._try(lambda: self._runtime.switch_mode(mode))
-
-    def _try(self, act: Callable[[], object]) -> None:
-        try:
-            act()
-        except IbrobotError as error:
-            self._runtime.session.log.error("%s", error)
-
-
-def _log_to(handler: logging.Handler) -> None:
-    """Our own words from INFO on, those of libraries from WARNING on."""
-    logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
-    logging.getLogger("ibrobot").setLevel(logging.INFO)
-
-
-def _tell(runtime: Runtime, hooks: RunHooks, as_json: bool) -> None:
-    """The summary of a run."""
-    summary = runtime.summary()
-    if as_json:
-        summary |= hooks.facts()
-        echo(json.dumps(summary))
-        return
-    loop = summary["loop"]
-    echo(f"{summary['robot']}: {summary['mode']} for {summary['duration_s']:.1f} s")
-    if summary["episodes"]:
-        echo(f"episodes   {summary['episodes']}, of which {summary['successes']} succeeded")
-    if summary["lockstep"]:
-        echo(f"loop       {loop['ticks']} ticks in lockstep")
-    elif loop["ticks"]:
-        echo(
-            f"loop       {loop['rate_hz']:.2f} Hz, lateness p50 {loop['lateness_p50_us']:.0f} us, "
-            f"p99 {loop['lateness_p99_us']:.0f} us, missed {loop['missed']}"
-        )
-    for heading, text in hooks.summary_rows():
-        echo(f"{heading:10} {text}")
-    if runtime.plan.without:
-        echo(f"without    {runtime.plan.without}")
-    faults = summary["faults"]
-    echo(f"faults     {'; '.join(faults) + ' (all of the run, those that were reset too)' if faults else 'none'}")
+    run_robot(
+        robot, request, headless=options["headless"], dry_run=options["dry_run"], as_json=options["as_json"],
+        make_hooks=make_hooks,
+    )  # fmt: skip

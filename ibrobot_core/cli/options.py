@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import click
+
+from ibrobot_core.plugins import installed_plugins
 
 _OPTIONS: dict[str, Callable[..., Any]] = {
     "config": click.argument("config", required=False),
@@ -40,17 +42,35 @@ _OPTIONS: dict[str, Callable[..., Any]] = {
 }
 
 
-def launch_options[C: Callable[..., Any]](command: C) -> C:
-    """The argument and the options of every command that runs a robot."""
-    return run_options(*_OPTIONS)(command)
-
-
 def run_options[C: Callable[..., Any]](*names: str) -> Callable[[C], C]:
-    """Some of the options of `launch_options`."""
+    """The argument `config` and the options of commands that run a robot.
+
+    Args:
+        names: which of them: `config`, `sim`, `lockstep`, `seed`, `mode`, `overrides`, `duration`, `episodes`, `goals`,
+            `window`, `headless`, `dry_run`, `as_json`. All when none is named.
+
+    Returns:
+        A decorator of the function that becomes a click command.
+    """
 
     def add(command: C) -> C:
-        for name in reversed(names):
+        for name in reversed(names or tuple(_OPTIONS)):
             command = _OPTIONS[name](command)
         return command
 
     return add
+
+
+def run_overrides(options: Mapping[str, Any]) -> tuple[str, ...]:
+    """The overrides of a robot YAML that a command line asks for.
+
+    Args:
+        options: `overrides`, `window` and `headless` of `run_options`.
+
+    Raises:
+        click.UsageError: for options that exclude each other.
+    """
+    if options["window"] and options["headless"]:
+        raise click.UsageError("--window and --headless exclude each other")
+    window = [f"viewer={{type: {installed_plugins().default('viewer')}}}"] if options["window"] else []
+    return (*options["overrides"], *window)

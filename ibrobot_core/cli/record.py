@@ -8,14 +8,14 @@ from typing import Any
 
 import click
 
-from ibrobot_core.cli.launch import run_robot
-from ibrobot_core.cli.options import launch_options
+from ibrobot_core.cli.launch import run_config
+from ibrobot_core.cli.options import run_options
 from ibrobot_core.launch.runtime import Runtime
 from ibrobot_core.recording.operator import Operator
 
 
 @click.command()
-@launch_options
+@run_options()
 @click.option("--dataset", metavar="NAME", help="Folder of the episodes, below the root.")
 @click.option("--root", type=click.Path(path_type=Path), help="Folder of all datasets.")
 @click.option("--prompt", metavar="TEXT", help="What the task is called; asked for where it is left out.")
@@ -48,4 +48,4 @@ def record(config: str | None, dataset: str | None, root: Path | None, **options
             auto=auto, continuous=continuous, keys=live,
         )  # fmt: skip
 
-    run_robot(config, options, hooks=operator, recording=overrides, prompt=prompt or "")
+    run_config(config, options, make_hooks=operator, recording=overrides, prompt=prompt or "")

@@ -24,8 +24,6 @@ from ibrobot_core.launch.session import Session
 from ibrobot_core.launch.simulation import SimulatedEpisodes
 from ibrobot_core.launch.sources.planner import PlannerSource
 from ibrobot_core.launch.sources.policy import LoadedModel, PolicySource
-from ibrobot_core.launch.sources.replay import MODE as REPLAY
-from ibrobot_core.launch.sources.replay import ReplaySource
 from ibrobot_core.launch.sources.source_worker import SourceWorker
 from ibrobot_core.launch.sources.teleop import TeleopSource
 from ibrobot_core.launch.transport import TransportLink
@@ -83,16 +81,16 @@ class LaunchPlan:
 def mode_components(session: Session, name: str, link: TransportLink | None) -> ModeComponents:
     """The components of a mode; nothing is loaded yet."""
     mode = session.config.control_modes[name]
-    needs = (CONTROL, *(f"sensor:{sensor.name}" for sensor in _sensors(session)))
-    if session.request.replay is not None and name == REPLAY:
-        return ModeComponents((), ReplaySource(session, mode, session.request.replay, (CONTROL,)))
+    if session.request.source is not None and name == session.config.default_control_mode:
+        return ModeComponents((), session.request.source(session, mode))
     if mode.inference is not None:
         model = LoadedModel(session, mode.inference, link)
+        needs = (CONTROL, *(f"sensor:{sensor.name}" for sensor in _sensors(session)))
         return ModeComponents((model,), PolicySource(session, mode, mode.inference, model, needs))
     if mode.teleop is not None:
-        return ModeComponents((), TeleopSource(session, mode, mode.teleop, (CONTROL,)))
+        return ModeComponents((), TeleopSource(session, mode, mode.teleop))
     if mode.planner is not None:
-        return ModeComponents((), PlannerSource(session, mode, mode.planner, (CONTROL,)))
+        return ModeComponents((), PlannerSource(session, mode, mode.planner))
     return ModeComponents((), None)
 
 

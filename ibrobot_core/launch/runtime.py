@@ -206,7 +206,7 @@ class Runtime:
             raise failure
 
     def summary(self) -> dict[str, Any]:
-        """What `--json` prints."""
+        """What `--json` prints, with what the source of the first mode reports."""
         session = self.session
         outcome = session.outcome
         report = session.control.report if session.has_control else {"loop": {}, "counters": {}}
@@ -227,6 +227,7 @@ class Runtime:
             "rates_hz": {name: round(sensor.rate_hz, 2) for name, sensor in session.sensors.items()},
             "drops": session.bus.dropped(),
             "absent": {sensor.name: str(sensor.missing) for sensor in session.absent},
+            **(self.plan.mode.source.facts() if self.plan.mode.source is not None else {}),
         }
 
     def _start(self, component: Component) -> None:

@@ -17,7 +17,7 @@ from ibrobot_core.clock import Clock, RealClock, SteppedClock
 from ibrobot_core.component import Worker, error_line
 from ibrobot_core.config import RobotConfig
 from ibrobot_core.config.context import component_context
-from ibrobot_core.config.schema import ComponentConfig
+from ibrobot_core.config.schema import ComponentConfig, ControlMode
 from ibrobot_core.control.link import ControlState, PlanRecord
 from ibrobot_core.errors import ComponentFailed
 from ibrobot_core.interfaces import Context, JointReading
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from ibrobot_core.control.host import ControlHost
     from ibrobot_core.dispatch.dispatcher import DispatchStats
     from ibrobot_core.inference.engine import EngineStats
-    from ibrobot_core.launch.sources.replay import Replay
+    from ibrobot_core.launch.sources.source_worker import SourceWorker
 
 
 @attrs.frozen
@@ -37,17 +37,23 @@ class LaunchRequest:
     """What a user asks of a run; the options of `ibrobot launch`."""
 
     lockstep: bool = False
+    """Whether time is simulated, and advances when all work of a tick is done."""
     seed: int = 0
+    """Of the first episode; later ones count up."""
     duration_s: float | None = None
+    """When the run ends [s]; None: it ends by itself, or when the user ends it."""
     episodes: int | None = None
+    """After how many episodes the run ends."""
     goals: tuple[str, ...] = ()
+    """For a mode with a planner, as `--goal` takes them."""
     keys: Callable[[], Any] | None = None
+    """Subscribes to the keys of the terminal, e.g. `KeyReader.subscribe`."""
     prompt: str = ""
     """What episodes are recorded under."""
     by_operator: bool = False
     """Whether an operator begins and ends episodes, rather than the mode."""
-    replay: Replay | None = None
-    """The episode that mode `replay` plays."""
+    source: Callable[[Session, ControlMode], SourceWorker] | None = None
+    """Makes the command source of the mode in which the run begins, in place of the one that the YAML says."""
 
 
 @attrs.define
@@ -118,6 +124,14 @@ class CommandSource(ABC):
     def help(self) -> str:
         """Instructions for the operator in this mode."""
         return ""
+
+    def summary_rows(self) -> list[tuple[str, str]]:
+        """What it reports in the summary of the run: heading and text of each row."""
+        return []
+
+    def facts(self) -> dict[str, Any]:
+        """What it adds to the summary as JSON."""
+        return {}
 
 
 class Session:

@@ -41,6 +41,7 @@ control_modes:
   bug: {executors: [position], teleop: bug}
   person: {executors: [position], teleop: person}
   plan: {executors: [trajectory], planner: {type: cubic}}
+  idle: {executors: [position]}
 default_control_mode: policy
 teleoperation:
   stick: {type: stick}
@@ -185,7 +186,7 @@ def test_a_hangup_that_the_caller_ignores_stays_ignored(launch: Callable[..., Ra
 
 
 def test_json_is_alone_on_standard_output(launch: Callable[..., Ran], monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("ibrobot_core.cli.launch._PLAIN_PERIOD_S", 0.0)
+    monkeypatch.setattr("ibrobot_core.cli.run._PLAIN_PERIOD_S", 0.0)
     ran = launch(*LOCKSTEP, "--duration", "0.2", "--json")
     assert json.loads(ran.out)["mode"] == "policy"
     assert "mode policy | loop " in ran.err
@@ -212,6 +213,18 @@ def test_dry_run_prints_the_plan(launch: Callable[..., Ran]):
         "model net fits the contract: observation.state -> 1 joints in chunks of 10; "
         "what it was trained on is not known"
     )
+
+
+def test_command_of_a_plugin_runs_a_robot_with_a_source_of_its_own(
+    launch: Callable[..., Ran], ibrobot: Callable[..., Ran], site: Site
+):
+    site.add("nodding", "nodding.py")
+    nod = ("nod", "mini.yaml", *LOCKSTEP, "--mode", "idle", "--joint", "pan")
+    ran = ibrobot(*nod)
+    assert ran.code == 0, ran.err
+    assert "nodded     once, with pan" in ran.out.splitlines()
+    assert json.loads(ibrobot(*nod, "--json").out)["nodded"] == "pan"
+    assert "mode:idle  nods with pan  (needs control)" in ibrobot(*nod, "--dry-run").out
 
 
 WRONG_CONTRACT = """\

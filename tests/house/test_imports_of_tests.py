@@ -13,7 +13,6 @@ PLUGINS = Path(__file__).parents[2] / "plugins"
 LOOP = "a loop of a few lines with core's own smoother and safety layer, which plans of policies pass through"
 CLIENT = "the server against core's own client"
 ALLOWED = {
-    ("ibrobot-plugin-jointlog/tests/test_reader.py", "ibrobot_core.recording.playback"): "what `replay` makes of a log",
     (
         "ibrobot-plugin-lerobot/tests/test_compose.py",
         "ibrobot_core.contract.image",

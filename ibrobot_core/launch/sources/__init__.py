@@ -1,1 +1,1 @@
-"""Command sources: a policy, a teleoperation device, a planner or a replay commands the executors of a mode."""
+"""Command sources: a policy, a teleoperation device or a planner commands the executors of a mode."""

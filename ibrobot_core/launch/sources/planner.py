@@ -35,8 +35,8 @@ class _Motion:
 class PlannerSource(SourceWorker):
     """Plans from where the robot is to each goal in turn; service `/planning/go_to` takes goals too."""
 
-    def __init__(self, session: Session, mode: ControlMode, planner: ComponentConfig, needs: tuple[str, ...]) -> None:
-        super().__init__(session, mode, f"planner {planner.type}", needs)
+    def __init__(self, session: Session, mode: ControlMode, planner: ComponentConfig) -> None:
+        super().__init__(session, mode, f"planner {planner.type}")
         self._component = planner
         self._planner: Planner | None = None
         self._goals: queue.SimpleQueue[str] = queue.SimpleQueue()

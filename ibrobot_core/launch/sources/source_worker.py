@@ -1,4 +1,4 @@
-"""The base of command sources that work in steps: a policy, a teleoperation device, a planner, a replay."""
+"""The base of command sources that work in steps: of a policy, a teleoperation device, a planner, and of plugins."""
 
 from __future__ import annotations
 
@@ -6,19 +6,36 @@ import threading
 from abc import abstractmethod
 from typing import override
 
+from ibrobot_core.component import CONTROL
 from ibrobot_core.config.schema import ControlMode
 from ibrobot_core.launch.session import CommandSource, Session, SessionWorker
 
 
 class SourceWorker(SessionWorker, CommandSource):
-    """A command source with its own thread (in lockstep: its own step), for one mode."""
+    """A command source with its own thread (in lockstep: its own step), for one mode.
 
-    def __init__(self, session: Session, mode: ControlMode, summary: str, needs: tuple[str, ...]) -> None:
+    `setup` runs once, then `work` repeatedly, and `teardown` at the end. `begin_mode` and `end_mode` run between two
+    units of work. A source sends setpoints with `session.send_plan`, and ends the run with `session.finish`. What it
+    raises ends the run too.
+
+    Args:
+        session: of the run.
+        mode: the mode whose executors it commands.
+        summary: one line for `--dry-run`.
+        needs: names of the components that must be ready before it starts.
+
+    Attributes:
+        session: of the run.
+        mode: the mode.
+        active: whether the mode is entered; `work` sends nothing otherwise.
+        lock: held during `begin_mode` and `end_mode`. Hold it where `work` checks `active` and sends commands.
+    """
+
+    def __init__(self, session: Session, mode: ControlMode, summary: str, needs: tuple[str, ...] = (CONTROL,)) -> None:
         super().__init__(session, f"mode:{mode.name}", summary, needs)
         self.mode = mode
         self.active = False
         self.lock = threading.RLock()
-        """Held while working, so that `begin` and `end` fall between units of work."""
 
     @override
     def begin(self, seed: int) -> None:

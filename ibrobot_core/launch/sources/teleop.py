@@ -20,9 +20,9 @@ class TeleopSource(SourceWorker):
     A device that fails while the robot follows is a fault; a reset connects it again.
     """
 
-    def __init__(self, session: Session, mode: ControlMode, device: str, needs: tuple[str, ...]) -> None:
+    def __init__(self, session: Session, mode: ControlMode, device: str) -> None:
         component = session.config.teleoperation[device]
-        super().__init__(session, mode, f"teleop {device} ({component.type})", needs)
+        super().__init__(session, mode, f"teleop {device} ({component.type})")
         self._device_name = device
         self._component = component
         self._device: Teleop | None = None

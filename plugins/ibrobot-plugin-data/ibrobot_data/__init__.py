@@ -1,4 +1,4 @@
-"""The plugin's hooks: the command `ibrobot convert`."""
+"""The plugin's hooks: the commands `ibrobot convert` and `ibrobot replay`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,14 @@ def _convert() -> click.Command:
     return convert
 
 
+def _replay() -> click.Command:
+    from ibrobot_data.replay import replay
+
+    return replay
+
+
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
-    """`ibrobot convert`."""
+    """`ibrobot convert` and `ibrobot replay`."""
     yield Command("convert", "Make a dataset for training from episodes.", _convert)
+    yield Command("replay", "Play a recorded episode on a robot, and compare.", _replay)

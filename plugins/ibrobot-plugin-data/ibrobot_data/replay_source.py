@@ -7,17 +7,19 @@ from typing import Any, override
 import attrs
 import numpy as np
 
-from ibrobot_core.bus import Subscription
-from ibrobot_core.config.schema import ControlMode
-from ibrobot_core.control.link import ControlState
-from ibrobot_core.launch.session import Session
-from ibrobot_core.launch.sources.source_worker import SourceWorker
-from ibrobot_core.recording.playback import Playback, Track
-from ibrobot_core.robot import Vector
-from ibrobot_core.units import NS_PER_S, ns, seconds
+from ibrobot_core.api import (
+    NS_PER_S,
+    ControlMode,
+    ControlState,
+    Session,
+    SourceWorker,
+    Subscription,
+    Vector,
+    ns,
+    seconds,
+)
+from ibrobot_data.playback import Playback, Track
 
-MODE = "replay"
-"""The name of the mode in which an episode is replayed."""
 _APPROACH_SPEED = 0.5
 """Greatest speed on the way to the first command [rad/s]; `max_velocity` bounds it too."""
 _PEAK_SPEED, _PEAK_ACCELERATION = 1.5, 6.0
@@ -47,8 +49,8 @@ class ReplaySource(SourceWorker):
 
     autonomous = True
 
-    def __init__(self, session: Session, mode: ControlMode, replay: Replay, needs: tuple[str, ...]) -> None:
-        super().__init__(session, mode, f"{replay.source}, {replay.playback.duration / replay.speed:.1f} s", needs)
+    def __init__(self, session: Session, mode: ControlMode, replay: Replay) -> None:
+        super().__init__(session, mode, f"{replay.source}, {replay.playback.duration / replay.speed:.1f} s")
         self._replay = replay
         self._period_ns = ns(1.0 / session.config.control.rate_hz)
         self._columns = session.config.robot.indices(replay.playback.joints)
@@ -140,6 +142,24 @@ class ReplaySource(SourceWorker):
             session.outcome.episodes += 1
             session.outcome.successes += self._success
         session.finish()
+
+    @override
+    def summary_rows(self) -> list[tuple[str, str]]:
+        report = self.report()
+        rows = [("replayed", f"{report['source']}, {report['recorded_s']:.1f} s at speed {report['speed']:g}")]
+        if report["success"] is not None:
+            again = "success" if report["success"] else "no success"
+            rows.append(("scene", f"{again}; recorded: {report['recorded_outcome']}"))
+        if not report["tracking"]:
+            rows.append(("tracking", "nothing to compare"))
+        for joint, away in report["tracking"].items():
+            off = f"rms {away['rms_rad']:.4f} rad, max {away['max_rad']:.4f} rad off the recording"
+            rows.append(("tracking", f"{joint:14} {off}"))
+        return rows
+
+    @override
+    def facts(self) -> dict[str, Any]:
+        return {"replay": self.report()}
 
     def report(self) -> dict[str, Any]:
         """What became of it, as JSON values."""

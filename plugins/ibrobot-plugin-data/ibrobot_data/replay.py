@@ -5,54 +5,36 @@ from __future__ import annotations
 import json
 from contextlib import closing
 from pathlib import Path
-from typing import Any, override
+from typing import Any
 
 import attrs
 import click
 
-from ibrobot_core.calibration import load_calibration
-from ibrobot_core.cli.launch import overrides_of, run_loaded
-from ibrobot_core.cli.options import run_options
-from ibrobot_core.config import RobotConfig, find_config, from_document, load_config
-from ibrobot_core.contract.specs import Contract
-from ibrobot_core.errors import ContractError, RecorderError, wrong_input
-from ibrobot_core.interfaces import EpisodeSummary
-from ibrobot_core.launch.runtime import Runtime
-from ibrobot_core.launch.session import LaunchRequest
-from ibrobot_core.launch.sources.replay import MODE, Replay, ReplaySource
-from ibrobot_core.outside import echo
-from ibrobot_core.plugins import installed_plugins
-from ibrobot_core.recording.playback import read_playback
-from ibrobot_core.recording.provenance import metadata_from_config
-from ibrobot_core.run_hooks import RunHooks
-from ibrobot_core.units import NORM_MODES
+from ibrobot_core.api import (
+    NORM_MODES,
+    Contract,
+    ContractError,
+    EpisodeSummary,
+    LaunchRequest,
+    RecorderError,
+    RobotConfig,
+    echo,
+    find_config,
+    from_document,
+    installed_plugins,
+    load_calibration,
+    load_config,
+    metadata_from_config,
+    run_options,
+    run_overrides,
+    run_robot,
+    wrong_input,
+)
+from ibrobot_data.playback import read_playback
+from ibrobot_data.replay_source import Replay, ReplaySource
 
-
-class _Comparison(RunHooks):
-    """Tells how near the replay came."""
-
-    def __init__(self, runtime: Runtime) -> None:
-        source = runtime.plan.mode.source
-        assert isinstance(source, ReplaySource)
-        self._source = source
-
-    @override
-    def summary_rows(self) -> list[tuple[str, str]]:
-        report = self._source.report()
-        rows = [("replayed", f"{report['source']}, {report['recorded_s']:.1f} s at speed {report['speed']:g}")]
-        if report["success"] is not None:
-            again = "success" if report["success"] else "no success"
-            rows.append(("scene", f"{again}; recorded: {report['recorded_outcome']}"))
-        if not report["tracking"]:
-            rows.append(("tracking", "nothing to compare"))
-        for joint, away in report["tracking"].items():
-            off = f"rms {away['rms_rad']:.4f} rad, max {away['max_rad']:.4f} rad off the recording"
-            rows.append(("tracking", f"{joint:14} {off}"))
-        return rows
-
-    @override
-    def facts(self) -> dict[str, Any]:
-        return {"replay": self._source.report()}
+_MODE = "replay"
+"""The name of the mode in which an episode is replayed."""
 
 
 @click.command()
@@ -79,7 +61,7 @@ def replay(
 
     Exits as `ibrobot launch` does; with 3 where the recorded episode was a success in its scene and this one is not.
     """
-    changes, sim = overrides_of(options), options["sim"]
+    changes, sim = run_overrides(options), options["sim"]
     robot = _named(config, changes, sim=sim) if config is not None else None
     numbers = load_calibration(calibration).snapshot() if calibration is not None else None
     told = metadata_from_config(robot, norm_mode, numbers) if robot is not None else None
@@ -91,8 +73,14 @@ def replay(
         playback = read_playback(reader, contract)
     if not summary.finished:
         echo(f"{episode}: was never finished; {playback.duration:.2f} s of it could be read", err=True)
-    request = LaunchRequest(options["lockstep"], playback.seed or 0, replay=Replay(str(episode), playback, speed))
-    run_loaded(_without_sensors(robot), request, options, _Comparison)
+    run = Replay(str(episode), playback, speed)
+    request = LaunchRequest(
+        options["lockstep"], playback.seed or 0, source=lambda session, mode: ReplaySource(session, mode, run)
+    )
+    run_robot(
+        _without_sensors(robot), request,
+        headless=options["headless"], dry_run=options["dry_run"], as_json=options["as_json"],
+    )  # fmt: skip
 
 
 def _without_sensors(robot: RobotConfig) -> RobotConfig:
@@ -107,7 +95,7 @@ def _named(config: str, changes: tuple[str, ...], *, sim: bool) -> RobotConfig:
     registry = installed_plugins()
     path = find_config(config, registry)
     robot = load_config(path, overrides=changes, sim=sim, registry=registry)
-    return load_config(path, overrides=(*changes, _mode(robot)), mode=MODE, sim=sim, registry=registry)
+    return load_config(path, overrides=(*changes, _mode(robot)), mode=_MODE, sim=sim, registry=registry)
 
 
 def _recorded(summary: EpisodeSummary, changes: tuple[str, ...], *, sim: bool) -> RobotConfig:
@@ -121,13 +109,13 @@ def _recorded(summary: EpisodeSummary, changes: tuple[str, ...], *, sim: bool) -
         raise RecorderError(f"{summary.path}: its robot YAML cannot be read: {error}; name one as CONFIG") from None
     source = Path("recorded config")
     robot = from_document(document, source=source, overrides=changes, sim=sim)
-    return from_document(document, source=source, overrides=(*changes, _mode(robot)), mode=MODE, sim=sim)
+    return from_document(document, source=source, overrides=(*changes, _mode(robot)), mode=_MODE, sim=sim)
 
 
 def _mode(robot: RobotConfig) -> str:
     """The override that adds the mode of the replay: the executors of the contract's actions, with nothing else."""
     executors = ", ".join(dict.fromkeys(spec.executor for spec in robot.contract.actions))
-    return f"control_modes.{MODE}={{executors: [{executors}]}}"
+    return f"control_modes.{_MODE}={{executors: [{executors}]}}"
 
 
 def _check(contract: Contract, summary: EpisodeSummary, name: str, *, force: bool) -> None:

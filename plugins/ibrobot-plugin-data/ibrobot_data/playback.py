@@ -9,12 +9,16 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.contract.specs import Contract
-from ibrobot_core.errors import ContractError, RecorderError
-from ibrobot_core.interfaces import EpisodeReader
-from ibrobot_core.messages import Float64MultiArray, JointState
-from ibrobot_core.robot import Vector
-from ibrobot_core.units import NS_PER_S
+from ibrobot_core.api import (
+    NS_PER_S,
+    Contract,
+    ContractError,
+    EpisodeReader,
+    Float64MultiArray,
+    JointState,
+    RecorderError,
+    Vector,
+)
 
 
 @attrs.frozen(eq=False)

@@ -1,0 +1,72 @@
+"""Made-up plugins for tests of what runs whole robots: installed for this process and for those that it starts."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import invalidate_caches
+from importlib.metadata import EntryPoint, distributions
+from pathlib import Path
+
+import attrs
+import pytest
+
+from ibrobot_core.api import installed_plugins
+
+
+@attrs.define
+class Site:
+    """A folder on the import path, with made-up distributions that are plugins.
+
+    Args:
+        folder: of the distributions.
+        sources: where `add` finds its sources.
+    """
+
+    folder: Path
+    sources: Path
+    modules: list[str] = attrs.field(factory=list, init=False)
+    """Names of the modules added."""
+
+    def add(self, distribution: str, source: str | Path) -> None:
+        """Install version 1.0 of `distribution`: a copy of one module, named in its entry point.
+
+        Args:
+            distribution: its name, which the module gets too.
+            source: a file in `sources`, or an absolute path.
+        """
+        module = distribution.replace("-", "_")
+        shutil.copyfile(self.sources / source, self.folder / f"{module}.py")
+        metadata = self.folder / f"{module}-1.0.dist-info"
+        metadata.mkdir()
+        (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {distribution}\nVersion: 1.0\n")
+        (metadata / "entry_points.txt").write_text(f"[ibrobot]\n{module} = {module}\n")
+        self.modules.append(module)
+        # Python lists a folder again when its time stamp has changed, which it has not within some milliseconds.
+        invalidate_caches()
+
+    def entry_points(self) -> list[EntryPoint]:
+        """The entry points of what was added, and of nothing else."""
+        return [entry for found in distributions(path=[str(self.folder)]) for entry in found.entry_points]
+
+
+@contextmanager
+def made_up_site(folder: Path, sources: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
+    """An empty `Site`; `installed_plugins()` discovers what is added to it, and forgets it at the end.
+
+    Args:
+        folder: where to make it.
+        sources: where `Site.add` finds its sources.
+        monkeypatch: puts the import path back.
+    """
+    site = Site(folder, sources)
+    folder.mkdir()
+    monkeypatch.syspath_prepend(str(folder))
+    monkeypatch.setenv("PYTHONPATH", str(folder))
+    installed_plugins.cache_clear()
+    yield site
+    installed_plugins.cache_clear()
+    for module in site.modules:
+        sys.modules.pop(module, None)

@@ -1,0 +1,77 @@
+"""A plugin with a command that runs a robot: it nods with one joint."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, override
+
+import click
+import numpy as np
+
+from ibrobot_core.api import (
+    Command,
+    ControlMode,
+    LaunchRequest,
+    Session,
+    SourceWorker,
+    find_config,
+    hookimpl,
+    installed_plugins,
+    load_config,
+    run_options,
+    run_overrides,
+    run_robot,
+)
+
+
+class Nod(SourceWorker):
+    """Moves a joint to and fro once, and ends the run."""
+
+    autonomous = True
+
+    def __init__(self, session: Session, mode: ControlMode, joint: str) -> None:
+        super().__init__(session, mode, f"nods with {joint}")
+        self._joint = joint
+        self._end_ns = 0
+
+    @override
+    def begin_mode(self, seed: int) -> None:
+        session = self.session
+        start, step_ns = session.measured(), 20_000_000
+        position = start.position[session.config.robot.indices((self._joint,))]
+        way = position + 0.1 * np.sin(np.linspace(0.0, 2 * np.pi, 100))[:, np.newaxis]
+        session.send_plan(start.stamp_ns, step_ns, (self._joint,), way)
+        self._end_ns = start.stamp_ns + len(way) * step_ns
+
+    @override
+    def work(self, timeout_s: float) -> None:
+        self.pause(timeout_s)
+        with self.lock:
+            if self.active and self.session.clock.now_ns() >= self._end_ns:
+                self.session.finish()
+
+    @override
+    def summary_rows(self) -> list[tuple[str, str]]:
+        return [("nodded", f"once, with {self._joint}")]
+
+    @override
+    def facts(self) -> dict[str, Any]:
+        return {"nodded": self._joint}
+
+
+@click.command()
+@run_options("config", "sim", "lockstep", "mode", "overrides", "window", "headless", "dry_run", "as_json")
+@click.option("--joint", required=True)
+def nod(config: str | None, joint: str, **options: Any) -> None:
+    """Nod."""
+    path = find_config(config, installed_plugins())
+    robot = load_config(path, overrides=run_overrides(options), mode=options["mode"], sim=options["sim"])
+    request = LaunchRequest(options["lockstep"], source=lambda session, mode: Nod(session, mode, joint))
+    run_robot(
+        robot, request, headless=options["headless"], dry_run=options["dry_run"], as_json=options["as_json"]
+    )  # fmt: skip
+
+
+@hookimpl
+def ibrobot_commands() -> Iterator[Command]:
+    yield Command("nod", "Nod.", lambda: nod)
