@@ -371,7 +371,7 @@ def incidents(chance: np.random.Generator) -> Iterator[Incident]:
             Incident("overload of the gripper", r"servo 6 \(gripper\).*in overload and holds on", GRIPPER, stops=False),
             Incident("brown-out", rf"servo {n} \({name}\): its torque went off|joint {name} does not follow", n),
             Incident("brown-out of all", r": its torque went off|does not follow"),
-            Incident("servo without its cable", rf"servo {n} \({name}\).*no good reply", n),
+            Incident("servo without its cable", rf"servo {n} \({name}\).*no valid reply", n),
             Incident("follower unplugged", r"/follower: the port is gone"),
             Incident("leader unplugged", r"leader: .*/leader: the port is gone"),
         ]

@@ -53,7 +53,7 @@ def ibrobot_hardware() -> Iterable[HardwareDescriptor]:
 
 @hookimpl
 def ibrobot_sensors() -> Iterable[SensorDescriptor]:
-    """What the simulation behind an emulated arm says of its scene."""
+    """Signals of the simulation that moves an emulated arm."""
     yield SensorDescriptor(
         type="feetech_emulator", kind="simulation", options=EmulatedSignalOptions, make=_signal,
         summary="a signal of the simulation that moves an emulated arm",
@@ -62,7 +62,7 @@ def ibrobot_sensors() -> Iterable[SensorDescriptor]:
 
 @hookimpl
 def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
-    """The SO-101's leader arm."""
+    """The SO-101 leader arm."""
     yield TeleopDescriptor(
         type="so101_leader", options=LeaderOptions, make=_leader, summary="SO-101 leader arm, moved by hand",
         check_options=check_leader, devices=serial_port,
@@ -78,4 +78,4 @@ def _commands() -> click.Command:
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
     """`ibrobot feetech …`."""
-    yield Command("feetech", "Set up, calibrate, watch and emulate the servos of an SO-101.", _commands)
+    yield Command("feetech", "Set up, calibrate, monitor and emulate the servos of an SO-101.", _commands)

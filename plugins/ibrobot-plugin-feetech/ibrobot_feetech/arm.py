@@ -1,4 +1,4 @@
-"""The servos of one arm: which joint each is, where its zero lies, and how it is set up."""
+"""The servos of one arm: their joints, zeros and configuration."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from ibrobot_feetech.supply import check_supply
 
 _LAST_TICK = 4095
 _ANGLE_BEYOND_A_TURN = 0x10
-"""Bit of `phase` that lets the reported position leave 0 to 4095."""
+"""Bit of `phase` that allows reported positions outside 0 to 4095."""
 
 
 @attrs.frozen(slots=False)
@@ -33,9 +33,9 @@ class Arm:
     """Joints and their servos, in the order of all vectors.
 
     Args:
-        joints: names.
-        calibration: has every one of them.
-        closed: joint -> its angle at its calibrated closed end [rad], for those that are anchored there.
+        joints: joint names.
+        calibration: a calibration of all these joints.
+        closed: joint -> angle at its calibrated closed end [rad], for joints that are anchored there.
     """
 
     joints: tuple[str, ...]
@@ -72,7 +72,7 @@ class Arm:
 
     @cached_property
     def sign(self) -> Vector:
-        """1, or -1 where radians fall while ticks grow; shape (J,)."""
+        """1, or -1 where radians decrease as ticks increase; shape (J,)."""
         signs: Vector = np.where(self._inverted, -1.0, 1.0)
         return signs
 
@@ -85,7 +85,7 @@ class Arm:
         return np.clip(self.positions(radians), *self._limits).astype(np.intp)
 
     def positions(self, radians: Vector) -> NDArray[np.intp]:
-        """Joint positions [rad] -> reported positions [ticks], shape (J,), wherever they lie."""
+        """Joint positions [rad] -> reported positions [ticks], shape (J,), not limited to the calibrated ranges."""
         return np.rint(radians_to_ticks(radians, zero=self._zero, inverted=self._inverted)).astype(np.intp)
 
     def reach(self) -> tuple[Vector, Vector]:
@@ -99,20 +99,20 @@ class Arm:
 
 @attrs.frozen
 class Tuning:
-    """What every servo of an arm is set to, beside its calibration."""
+    """Register values of an arm's servos, in addition to the calibration."""
 
     registers: Mapping[str, int]
     """Register -> value, for all servos."""
     special: Mapping[str, Mapping[str, int]] = attrs.field(factory=dict)
-    """Joint -> registers of its own."""
+    """Joint -> registers that differ for this joint."""
 
 
 def find_servos(bus: FeetechBus, arm: Arm) -> None:
     """Check that every servo answers, has the right model, and that all have one firmware.
 
     Raises:
-        FeetechError: names all servos that are missing, or the one that is another model.
-        HardwareError: for firmwares that differ, and a supply that a servo is not made for.
+        FeetechError: if servos are missing; names all of them.
+        HardwareError: if a servo is another model, firmware versions differ, or a servo has the wrong supply voltage.
     """
     missing, firmware = [], {}
     for servo in arm.servos:
@@ -123,7 +123,7 @@ def find_servos(bus: FeetechBus, arm: Arm) -> None:
             last = error
             continue
         if model != MODEL_STS3215:
-            found = f"it is model {model}, an STS3215 is {MODEL_STS3215}"
+            found = f"it is model {model}; an STS3215 is {MODEL_STS3215}"
             raise HardwareError(f"{bus.place(servo, 'model_number')}: {found}; check that it is the right arm")
         major, minor = (bus.read_faulty(servo, f"firmware_{part}") for part in ("major", "minor"))
         firmware[servo] = f"{major}.{minor}"
@@ -139,10 +139,10 @@ def find_servos(bus: FeetechBus, arm: Arm) -> None:
 
 
 def calibration_differences(bus: FeetechBus, arm: Arm) -> list[tuple[int, str, int, int]]:
-    """Where the servos' own calibration is another: servo, register, its value, the file's.
+    """Differences between servos and file, as (servo, register, value in the servo, value in the file).
 
     Raises:
-        FeetechError: when a servo does not answer.
+        FeetechError: if a servo does not answer.
     """
     differences = []
     for servo in arm.servos:
@@ -153,20 +153,20 @@ def calibration_differences(bus: FeetechBus, arm: Arm) -> list[tuple[int, str, i
 
 
 def write_calibration(bus: FeetechBus, arm: Arm, servos: Sequence[int] | None = None) -> None:
-    """Write the file's calibration to the servos; their torque goes off.
+    """Write the file's calibration to the servos, which switches their torque off.
 
     Raises:
-        FeetechError: when a servo does not take it.
+        FeetechError: if a servo does not accept it.
     """
     for servo in arm.servos if servos is None else servos:
         write_eprom(bus, servo, _calibrated(arm, servo))
 
 
 def write_eprom(bus: FeetechBus, servo: int, values: Mapping[str, int]) -> None:
-    """Set registers of a servo's EPROM, torque off, and see that it kept them.
+    """Switch a servo's torque off, set registers of its EPROM, and read them back.
 
     Raises:
-        FeetechError: when it did not take one.
+        FeetechError: if a register did not keep its value.
     """
     bus.write(servo, "torque_enable", 0, faulty=True)
     bus.write(servo, "lock", 0, faulty=True)
@@ -181,12 +181,12 @@ def write_eprom(bus: FeetechBus, servo: int, values: Mapping[str, int]) -> None:
 
 
 def set_up(bus: FeetechBus, arm: Arm, tuning: Tuning, servo: int, *, torque: bool = True) -> None:
-    """Set one servo up: torque off, unlock, its registers, lock, and with `torque` on again where the joint stands.
+    """Configure a servo: torque off, unlock, set its registers, lock, and with `torque`, hold the joint where it is.
 
-    Errors that it reports meanwhile are accepted: taking torque off is what ends some of them.
+    Errors that the servo reports meanwhile are ignored, because switching the torque off clears some of them.
 
     Raises:
-        FeetechError: when it does not take a register.
+        FeetechError: if a register did not keep its value.
     """
     bus.write(servo, "torque_enable", 0, faulty=True)
     bus.write(servo, "lock", 0, faulty=True)
@@ -201,26 +201,26 @@ def set_up(bus: FeetechBus, arm: Arm, tuning: Tuning, servo: int, *, torque: boo
 
 
 def hold(bus: FeetechBus, servo: int) -> None:
-    """Torque on, with the goal where the joint stands, so that nothing jumps.
+    """Switch the torque on, with the goal at the present position, so that the joint does not jump.
 
     Raises:
-        FeetechError: when the servo does not answer, or stands beyond one turn.
+        FeetechError: if the servo does not answer, or its position is beyond one turn.
     """
     position = bus.read(servo, "present_position")
     if not 0 <= position <= _LAST_TICK:
         raise FeetechError(
-            bus.place(servo, "present_position"), f"it stands at {position}, beyond one turn (0 to {_LAST_TICK})"
+            bus.place(servo, "present_position"), f"its position is {position}, beyond one turn (0 to {_LAST_TICK})"
         )
     bus.write(servo, "goal_position", position)
     bus.write(servo, "torque_enable", 1)
 
 
 def relax(bus: FeetechBus, servos: Sequence[int]) -> None:
-    """Torque off, on all servos at once, and see that it is; errors that they report are no reason to leave it on.
+    """Switch the torque of all servos off at once and confirm it, even if they report errors.
 
     Raises:
-        TorqueStaysOn: naming a servo that says so.
-        FeetechError: naming one that did not say whether it is off, or a port that is gone.
+        TorqueStaysOn: if a servo reports that its torque is still on; names it.
+        FeetechError: if a servo did not confirm it, or the port is gone; names the servo or port.
     """
     last: FeetechError | None = None
     for _ in range(bus.retries + 1):

@@ -1,12 +1,12 @@
-"""A Feetech bus: requests and their replies, each matched, checked, retried and counted.
+"""A Feetech bus: matches replies to requests, checks them, retries requests, and counts errors.
 
-The protocol has no sequence numbers: a reply says which servo sent it and how long it is, nothing more. A reply that
-comes after its request timed out could therefore be taken for the answer to the next one, and every later answer would
-then be one request old. So an exchange that timed out leaves its servo and the length of its reply on a list, for
-longer than any reply can be late (but not where exactly the bytes came that were due: a reply that came damaged comes
-no more); meanwhile
+The protocol has no sequence numbers: a reply contains its servo and length, but not its request. A reply that arrives
+after its request timed out could therefore be mistaken for the answer to the next one, and every later answer would be
+one request old. So after a timeout, the servo and the length of the expected reply are kept on a list, for longer
+than any reply can be late. (A reply that arrived damaged, with exactly the expected number of bytes, is not listed,
+because it cannot arrive again.) Meanwhile
 
-- a read asks for a span of another length, by beginning some registers earlier;
+- a read requests a span of another length, by beginning some registers earlier;
 - a reply of a listed length is dropped and counted;
 - a write, whose acknowledgements are all alike, is confirmed by reading the register back.
 """
@@ -25,17 +25,17 @@ from ibrobot_feetech.protocol import BROADCAST, OVERHEAD, Packet
 from ibrobot_feetech.registers import STS3215, Register, register, writable
 
 LATE_S = 0.5
-"""Longer than a reply can be late [s]: adapters held one back for 0.08 s."""
+"""Upper bound on the delay of a reply [s]; adapters have delayed replies by 0.08 s."""
 _ADAPTER_S = 0.004
-"""Time for the USB adapter and the kernel beside the time on the wire [s]."""
+"""Time for the USB adapter and the kernel, in addition to the time on the wire [s]."""
 _TRAIL_S = 0.001
-"""How long to go on listening when as many bytes came as were asked for, but not all of them good [s]."""
+"""How long to keep listening when the expected number of bytes has arrived, but some are damaged [s]."""
 RETURN_DELAY_S = 0.000_5
-"""A servo's own delay before it answers, as it is shipped [s]: 250 units of 2 us."""
+"""Default delay of a servo before it answers [s]: 250 units of 2 us."""
 _EPROM_S = 0.02
-"""Further time for an acknowledgement, where the servo first writes its EPROM [s]."""
+"""Additional time for the acknowledgement of an EPROM write [s]."""
 _MOST_EXTRA = 16
-"""Most bytes that are read for nothing so that a reply has a length of its own."""
+"""Maximum number of extra bytes to read so that a reply has a unique length."""
 _BITS_PER_BYTE = 10
 
 
@@ -46,7 +46,7 @@ class FeetechBus:
         port: e.g. `/dev/ttyACM0`.
         baud_rate: [baud].
         joints: servo id -> joint, for the messages of errors.
-        retries: how often a request that failed is sent again before it is an error.
+        retries: how often to repeat a failed request before raising an error.
     """
 
     def __init__(
@@ -56,13 +56,13 @@ class FeetechBus:
         self.joints = dict(joints or {})
         self.retries = retries
         self.return_delay_s = RETURN_DELAY_S
-        """What every servo waits before it answers [s]; less once they are set up."""
+        """Delay of every servo before it answers [s]; shorter once the servos are configured."""
         self.counters: Counter[str] = Counter(
             dict.fromkeys(("requests", "retries", "timeouts", "late_replies", "bad_packets", "discarded_bytes"), 0)
         )
-        """Every request and everything that went wrong, since the bus was made."""
+        """Counts of requests and errors since the bus was created."""
         self.outstanding: dict[tuple[int, int], float] = {}
-        """Servo and length of replies that may yet come late -> until when (`time.monotonic`) [s]."""
+        """Servo and length of replies that may still arrive late -> until when (`time.monotonic`) [s]."""
 
     @property
     def is_open(self) -> bool:
@@ -73,7 +73,7 @@ class FeetechBus:
         """Open the port.
 
         Raises:
-            PortError: when it is not there, not permitted, or held by another program.
+            PortError: if it does not exist, is not permitted, or is held by another program.
         """
         self.outstanding.clear()
         self.port.open()
@@ -83,31 +83,31 @@ class FeetechBus:
         self.port.close()
 
     def place(self, servo: int | None = None, name: str | None = None) -> Place:
-        """Where on this bus something happens, for an error's message."""
+        """A place on this bus, for error messages."""
         return Place(self.port.path, servo, self.joints.get(servo) if servo is not None else None, name)
 
     def ping(self, servo: int) -> int:
-        """The model number of a servo, which is there if this returns.
+        """Check that a servo answers; returns its model number.
 
         Raises:
-            NoReply: when it is not.
+            NoReply: if it does not answer.
         """
         return self.read(servo, "model_number")
 
     def scan(self, servos: Iterable[int] = range(protocol.MAX_ID + 1), *, one_by_one: bool = True) -> dict[int, int]:
-        """Servo id -> model number, of those that answer a broadcast ping or, where none does, one of their own.
+        """Find servos; returns servo id -> model number.
 
         Args:
             servos: ids to look for.
-            one_by_one: whether to ask each id, which takes seconds, where none answers the broadcast.
+            one_by_one: whether to ping each id, which takes seconds, if no servo answers a broadcast ping.
 
         Raises:
-            PortError: when the port is gone.
+            PortError: if the port is gone.
         """
         wanted = set(servos)
         self.begin_request()
         self.port.write(protocol.ping(BROADCAST))
-        # Each servo waits for its turn, which is due by its id.
+        # Servos answer in turn, in the order of their ids.
         timeout_s = self.timeout(OVERHEAD, OVERHEAD * len(wanted)) + 0.001 * len(wanted)
         found = {
             p.servo for p in self._collect(OVERHEAD * (protocol.MAX_ID + 1), timeout_s, bytearray()) if not p.parameters
@@ -124,57 +124,60 @@ class FeetechBus:
         return models
 
     def read(self, servo: int, name: str) -> int:
-        """The value of a register.
+        """Read a register.
 
         Raises:
-            FeetechError: when no good reply came, after all retries.
+            FeetechError: if no valid reply arrived after all retries.
         """
         return self._retried(lambda: self._read_once(servo, register(name)))
 
     def read_faulty(self, servo: int, name: str) -> int:
-        """As `read`, also from a servo that reports an error of its own."""
+        """As `read`, but also accepts replies of a servo that reports an error."""
         return self._retried(lambda: self._read_once(servo, register(name), faulty=True))
 
     def write(self, servo: int, name: str, value: int, *, faulty: bool = False) -> None:
-        """Set a register and wait for the servo to say that it is set.
+        """Set a register and wait for the acknowledgement.
 
         Args:
-            servo: its id.
-            name: of the register.
-            value: what it is set to.
-            faulty: whether a servo may report an error of its own meanwhile, e.g. while its torque is taken off.
+            servo: servo id.
+            name: register name.
+            value: new value.
+            faulty: whether to accept replies of a servo that reports an error, e.g. while its torque is switched off.
 
         Raises:
-            FeetechError: when it did not, after all retries, or for a register of EPROM while that is locked.
-            ValueError: for a value that the register cannot hold, or a register that cannot be set.
+            FeetechError: if no acknowledgement arrived after all retries, or for an EPROM register while it is locked.
+            ValueError: if the value is out of range or the register is read-only.
         """
         target = writable(name)
         request = protocol.write(servo, target.address, target.encode(value))
-        # A servo acknowledges this all the same, and forgets the value without power.
+        # A servo acknowledges this nevertheless, but loses the value with its power.
         if target.area == "eprom" and self.read_faulty(servo, "lock"):
             raise EpromLocked(self.place(servo, name), f"EPROM is locked, {value} was not written")
         self._retried(lambda: self._write_once(servo, target, value, request, faulty=faulty))
 
     def reg_write(self, servo: int, name: str, value: int) -> None:
-        """Prepare a register's value, which `action` sets.
+        """Prepare a register's value; `action` sets it.
 
         Raises:
-            FeetechError: when the servo did not acknowledge it. It is sent once: there is no telling by reading back.
+            FeetechError: if the servo did not acknowledge it. It is sent only once, since it cannot be read back.
         """
         target = writable(name)
         request = protocol.reg_write(servo, target.address, target.encode(value))
         self._acknowledged(servo, target, request, faulty=False)
 
     def action(self) -> None:
-        """Set on all servos at once what `reg_write` prepared; none answers."""
+        """Set the values that `reg_write` prepared, on all servos at once; no servo answers."""
         self.counters["requests"] += 1
         self.port.write(protocol.action())
 
     def sync_read(self, name: str, servos: Sequence[int], *, faulty: bool = False) -> dict[int, int]:
-        """Servo id -> value of a register, asked for in one request; with `faulty` also of servos that report errors.
+        """Read a register of several servos in one request; `faulty` also accepts servos that report errors.
+
+        Returns:
+            Servo id -> value.
 
         Raises:
-            FeetechError: when a servo did not answer well, after all retries.
+            FeetechError: if a servo sent no valid reply after all retries.
         """
         target = register(name)
         missing, values = list(servos), dict[int, int]()
@@ -192,23 +195,26 @@ class FeetechBus:
         raise NoReply(self.place(missing[0], name), self._silence(missing))
 
     def sync_write(self, name: str, values: Mapping[int, int]) -> None:
-        """Set a register of several servos in one request; none answers.
+        """Set a register of several servos in one request; no servo answers.
 
         Raises:
-            PortError: when the port is gone.
-            ValueError: for a value that the register cannot hold, or a register that cannot be set.
+            PortError: if the port is gone.
+            ValueError: if a value is out of range or the register is read-only.
         """
         target = writable(name)
         self.counters["requests"] += 1
         self.port.write(protocol.sync_write(target.address, {s: target.encode(v) for s, v in values.items()}))
 
     def sync_read_span(self, address: int, size: int, servos: Sequence[int]) -> dict[int, tuple[bytes, int]]:
-        """Servo id -> registers from `address`, shape (size,), and error byte; of those that answered in one request.
+        """Read `size` bytes from `address` of several servos in one request.
 
-        None is asked while too many replies may be late: on a line as bad as that nothing can be believed.
+        Nothing is sent while too many replies may be late, because no reply on such a line can be trusted.
+
+        Returns:
+            Servo id -> bytes and error byte, for the servos that answered.
 
         Raises:
-            PortError: when the port is gone.
+            PortError: if the port is gone.
         """
         start, length = self._span(servos, address, size)
         if not length:
@@ -221,7 +227,7 @@ class FeetechBus:
     def sync_replies(
         self, received: bytes, request: bytes, servos: Sequence[int], length: int, skip: int, size: int
     ) -> dict[int, tuple[bytes, int]]:
-        """Take in the replies to a sync read whose first bytes are `received`, and list those that did not come."""
+        """Collect the replies to a sync read whose first bytes are `received`, and list the missing ones."""
         wanted = set(servos)
         found: dict[int, tuple[bytes, int]] = {}
         expected = (OVERHEAD + length) * len(servos)
@@ -240,10 +246,10 @@ class FeetechBus:
         return found
 
     def resynchronise(self) -> None:
-        """Wait until no reply can be late any more; for after a fault, since it takes `LATE_S`.
+        """Wait for `LATE_S`, after which no late reply can arrive; for use after a fault.
 
         Raises:
-            PortError: when the port is gone.
+            PortError: if the port is gone.
         """
         end = time.monotonic() + LATE_S
         while time.monotonic() < end:
@@ -251,7 +257,7 @@ class FeetechBus:
         self.outstanding.clear()
 
     def may_be_late(self, servo: int, length: int) -> bool:
-        """Whether a reply of that length may still come from an earlier request that timed out."""
+        """Whether a reply of that length may still arrive for an earlier request that timed out."""
         expiry = self.outstanding.get((servo, length))
         if expiry is None:
             return False
@@ -276,11 +282,11 @@ class FeetechBus:
             try:
                 self._acknowledged(servo, target, request, faulty=faulty)
             except NoReply:
-                pass  # it may have been set all the same: the register tells
+                pass  # it may have been set nevertheless: read the register
             else:
                 return
         else:
-            # Its acknowledgement, which nobody waits for, may be late in its turn.
+            # Its acknowledgement, for which nothing waits, may be late too.
             self._expect_late(servo, 0)
             self.counters["requests"] += 1
             self.port.write(request)
@@ -306,7 +312,7 @@ class FeetechBus:
             self.counters["late_replies"] += 1
         own = self.counters["late_replies"] == foreign
         if own and _all_in_place(heard, (servo,), {}, OVERHEAD + length):
-            raise PacketError(self.place(servo, name), "the reply came damaged")
+            raise PacketError(self.place(servo, name), "the reply is damaged")
         self._lost(servo, length)
         raise NoReply(self.place(servo, name), f"no reply within {timeout_s * 1e3:.1f} ms")
 
@@ -314,9 +320,9 @@ class FeetechBus:
         return len(packet.parameters) == length and not self.may_be_late(packet.servo, length)
 
     def _collect(self, expected: int, timeout_s: float, heard: bytearray, received: bytes = b"") -> Generator[Packet]:
-        """Packets as they come, until the time is over; the caller stops when it has what it waits for.
+        """Yield packets as they arrive, until the timeout; the caller stops when it has the expected ones.
 
-        All bytes are added to `heard`.
+        All received bytes are appended to `heard`.
         """
         missing = expected - len(received)
         last = time.monotonic() + timeout_s
@@ -326,7 +332,7 @@ class FeetechBus:
             while True:
                 heard += received
                 yield from scanner.feed(received)
-                # What came may have been garbage: go on while there is time, a packet at a time.
+                # Some bytes may be garbage: continue until the timeout, one packet at a time.
                 received = self.port.read(max(missing, OVERHEAD), deadline)
                 if not received:
                     yield from scanner.finish()
@@ -339,9 +345,9 @@ class FeetechBus:
             self.counters["discarded_bytes"] += scanner.discarded
 
     def _span(self, servos: Sequence[int], address: int, size: int) -> tuple[int, int]:
-        """Where to begin reading, and how many bytes, so that no reply that may be late has that length.
+        """Start address and number of bytes of a read such that no late reply has the same length.
 
-        Nothing (0, 0) where too many may be late.
+        Returns (0, 0) if too many replies may be late.
         """
         for extra in range(min(address, _MOST_EXTRA) + 1):
             if not any(self.may_be_late(servo, size + extra) for servo in servos):
@@ -349,10 +355,10 @@ class FeetechBus:
         return 0, 0
 
     def begin_request(self) -> None:
-        """Count a request, and throw away what came unasked before it.
+        """Count a request, and discard bytes received before it.
 
         Raises:
-            PortError: when the port is gone.
+            PortError: if the port is gone.
         """
         self.counters["requests"] += 1
         self.counters["discarded_bytes"] += self.port.discard()
@@ -365,7 +371,7 @@ class FeetechBus:
         self.outstanding[servo, length] = time.monotonic() + LATE_S
 
     def timeout(self, sent: int, expected: int, servos: int = 1) -> float:
-        """How long to wait for replies [s]: the time on the wire of both, and the delays on both sides."""
+        """How long to wait for replies [s]: wire time of request and replies, plus the delays on both sides."""
         wire_s = (sent + expected) * _BITS_PER_BYTE / self.port.baud_rate
         return wire_s + servos * self.return_delay_s + _ADAPTER_S
 
@@ -384,11 +390,11 @@ class FeetechBus:
         names = ", ".join(
             f"{servo} ({self.joints[servo]})" if servo in self.joints else str(servo) for servo in missing
         )
-        return f"no reply; nor from the others of servos {names}"
+        return f"no reply; nor from any other of servos {names}"
 
 
 def _all_in_place(heard: bytearray, servos: Sequence[int], found: Container[int], size: int) -> bool:
-    """Whether exactly the replies came that were due, each of `size` bytes and in its place, good or damaged."""
+    """Whether exactly the expected replies arrived, each with `size` bytes and in order, valid or damaged."""
     if len(heard) != size * len(servos):
         return False
     places = enumerate(servos)

@@ -1,4 +1,4 @@
-"""Saving a calibration, so that a crash leaves the old one or the new one."""
+"""Saves calibrations; after a crash, either the old or the new one is complete."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from ibrobot_core.api import Calibration, CalibrationError, calibration_path, co
 def save_calibration(
     calibration: Calibration, name: str | Path, *, overwrite: bool = False, by_id: bool = False
 ) -> Path:
-    """Save a calibration as LeRobot's JSON, and beside it `NAME.meta.json`: arm, date, adapter, place of 0 rad, hash.
+    """Save a calibration as LeRobot's JSON, and `NAME.meta.json` with arm, date, adapter, position of 0 rad, and hash.
 
-    Two files, since LeRobot's loader refuses keys that it does not know.
+    There are two files because LeRobot's loader refuses unknown keys.
 
     Args:
-        calibration: what to save.
+        calibration: the calibration to save.
         name: a name or a path, see `calibration_path`.
         overwrite: whether it may replace a file.
-        by_id: write IB-Robot's layout, servo id -> numbers.
+        by_id: write IB-Robot's layout, servo id -> values.
 
     Raises:
-        CalibrationError: when there is one already, or it cannot be written.
+        CalibrationError: if the file exists already, or cannot be written.
     """
     path = calibration_path(name)
     if path.exists() and not overwrite:
-        raise CalibrationError(f"{path}: is there already; give another name, or say that it may be overwritten")
+        raise CalibrationError(f"{path}: exists already; choose another name, or allow overwriting it")
     meta = {
         "version": calibration.version,
         "robot": calibration.robot,
@@ -43,7 +43,7 @@ def save_calibration(
         path.parent.mkdir(parents=True, exist_ok=True)
         numbers = calibration.numbers()
         by_key = {str(joint["id"]): joint for joint in numbers.values()} if by_id else numbers
-        # The companion comes first: numbers without it would be taken for LeRobot's, with 0 rad elsewhere.
+        # The companion comes first: without it, the file would be read as LeRobot's, with another 0 rad.
         _write_all({companion_path(path): meta, path: by_key})
     except OSError as error:
         raise CalibrationError(f"{path}: cannot be written: {error.strerror}") from None
@@ -51,7 +51,7 @@ def save_calibration(
 
 
 def _write_all(documents: Mapping[Path, Mapping[str, Any]]) -> None:
-    """Replace files in their order, once all of them are on the disk."""
+    """Replace files in order, after all new ones are on the disk."""
     prepared: dict[Path, Path] = {}
     try:
         for path, document in documents.items():
@@ -64,7 +64,7 @@ def _write_all(documents: Mapping[Path, Mapping[str, Any]]) -> None:
 
 
 def _prepare(path: Path, document: Mapping[str, Any]) -> Path:
-    """A file beside `path` with its new content."""
+    """Write a temporary file in the same folder as `path` with its new content."""
     descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
         with os.fdopen(descriptor, "w") as file:

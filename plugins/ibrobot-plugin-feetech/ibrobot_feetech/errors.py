@@ -1,4 +1,4 @@
-"""What can go wrong on a Feetech bus; every error names the port, the servo, the register and what to check."""
+"""Errors of a Feetech bus; each names the port, servo and register, and what to check."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ibrobot_core.api import HardwareError
 
 @attrs.frozen
 class Place:
-    """Where on a bus something went wrong."""
+    """The place of an error on a bus."""
 
     port: str
     servo: int | None = None
@@ -31,12 +31,12 @@ class FeetechError(HardwareError):
     """Base of the errors of a servo bus.
 
     Args:
-        place: where.
-        what: what happened, with the values.
+        place: port, servo and register.
+        what: the problem, with values.
     """
 
     check: ClassVar[str] = "`ibrobot feetech monitor` shows what the servos report"
-    """What to look at."""
+    """What the user should check."""
 
     def __init__(self, place: Place, what: str) -> None:
         self.place = place
@@ -44,57 +44,57 @@ class FeetechError(HardwareError):
 
 
 class PortError(FeetechError):
-    """A serial port that cannot be opened or is gone, e.g. an unplugged cable."""
+    """A serial port cannot be opened or has disappeared, e.g. because of an unplugged cable."""
 
-    check = "check the USB cable; `ibrobot feetech find-port` lists the ports that are there"
+    check = "check the USB cable; `ibrobot feetech find-port` lists the available ports"
 
 
 class PortForbidden(PortError):
-    """A port that this user may not open."""
+    """The user has no permission to open a port."""
 
     check = "add yourself to the group that owns it, e.g. `sudo usermod -aG dialout $USER`, and log in again"
 
 
 class PortHeld(PortError):
-    """A port that another program has open."""
+    """Another program has the port open."""
 
-    check = "end that program (another `ibrobot`, LeRobot, a serial monitor); `fuser -v PORT` names it"
+    check = "close that program (another `ibrobot`, LeRobot, a serial monitor); `fuser -v PORT` names it"
 
 
 class NoReply(FeetechError):
-    """A servo that did not answer in time, after all retries."""
+    """A servo did not answer in time, after all retries."""
 
-    check = "check its power, the cable to it, its id and the baud rate; `ibrobot feetech scan` shows who answers"
+    check = "check its power, cable, id and baud rate; `ibrobot feetech scan` shows which servos answer"
 
 
 class PacketError(FeetechError):
-    """Bytes that are no valid packet, e.g. one with a wrong checksum."""
+    """The received bytes are not a valid packet, e.g. because of a wrong checksum."""
 
     check = "check the cable, its ground, and that no two servos share an id"
 
 
 class UnexpectedReply(FeetechError):
-    """A valid packet that does not answer the request, e.g. one of another servo or length."""
+    """A valid packet does not answer the request, e.g. because it is from another servo or has another length."""
 
     check = "check that no other program uses the port and that no two servos share an id"
 
 
 class EpromLocked(FeetechError):
-    """A write to EPROM that the servo would not keep."""
+    """A write to locked EPROM, which the servo would lose."""
 
     check = "set `lock` to 0 first, and to 1 afterwards"
 
 
 class TorqueStaysOn(FeetechError):
-    """A servo whose torque was taken off and that says it is on."""
+    """A servo still reports torque after it was switched off."""
 
     check = "cut its power before you touch the arm"
 
 
 class ServoFault(FeetechError):
-    """A servo that reports an error of its own, e.g. overheating; `faults` names them."""
+    """A servo reports an error, e.g. overheating; `faults` lists them."""
 
-    check = "check its supply, its load and its temperature, then take its torque off and on"
+    check = "check its supply, its load and its temperature, then switch its torque off and on"
 
     def __init__(self, place: Place, faults: tuple[str, ...]) -> None:
         self.faults = faults

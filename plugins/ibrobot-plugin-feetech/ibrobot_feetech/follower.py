@@ -1,4 +1,4 @@
-"""The follower: an SO-101 whose STS3215 servos sit on one bus, as hardware of the control loop."""
+"""The follower: an SO-101 with STS3215 servos on one bus, as hardware of the control loop."""
 
 from __future__ import annotations
 
@@ -39,30 +39,30 @@ from ibrobot_feetech.usb import check_adapter
 
 _RADIANS_PER_TICK = 2 * np.pi / 4096
 _SLACK_TICKS = 16
-"""How far a position may be from where the last one and the speed say [ticks]."""
+"""Allowed distance of a position from the one predicted by the last position and speed [ticks]."""
 _MAX_ACCELERATION, _MAX_SPEED = 40_000, 4_000
-"""What a joint can do beside that [ticks/s^2, ticks/s]."""
+"""Maximum acceleration and additional speed of a joint [ticks/s^2, ticks/s]."""
 _AGAIN = 0.4
-"""Part of a tick within which servos that did not answer well are asked once more."""
+"""Fraction of a tick within which servos without a valid reply are asked again."""
 _HEALTH_AGAIN_S = 0.05
-"""After which a health read that was not complete is tried again [s]: it is long, and more of it may be damaged."""
+"""Delay before an incomplete health read is repeated [s]; long replies are damaged more often."""
 _VOLTAGE_V, _CURRENT_A, _LOAD = 0.1, 0.0065, 1e-3
 
 
 class FeetechFollower(Hardware):
-    """Each tick one sync read of position, velocity and load, and one sync write of goals.
+    """An SO-101 on its servo bus: one sync read of position, velocity and load and one sync write of goals per tick.
 
-    A reply that is lost, damaged or implausible leaves the joint where it was, for `lost_replies` ticks, in readings
-    that are stale; then it is a fault, and until `reset_faults` `read` fails without waiting for anything. What servos
-    report of themselves is in `health`; a fault there leaves `read` as it is. `reset_faults` sets servos up that lost
-    power, torque or their connection or are in error; a joint that holds on in overload keeps its grasp.
+    If a reply is lost, damaged or implausible, readings repeat the joint's last state and are stale, for up to
+    `lost_replies` ticks. Then it is a fault, and until `reset_faults`, `read` fails without waiting. Errors that servos
+    report are in `health`; they do not affect `read`. `reset_faults` configures servos that lost power, torque or
+    connection, or that report errors; a gripping joint in overload keeps its grasp.
 
     Args:
-        options: the YAML's.
-        ctx: its `joints` are the servos', in the order of the vectors.
+        options: options from the YAML.
+        ctx: its `joints` are those of the servos, in the order of the vectors.
 
     Raises:
-        CalibrationError: for a calibration that is missing or does not have every joint.
+        CalibrationError: if the calibration is missing or lacks a joint.
     """
 
     def __init__(self, options: FollowerOptions, ctx: Context) -> None:
@@ -96,7 +96,7 @@ class FeetechFollower(Hardware):
         self._fault: HardwareError | None = None
         self._relaxed = self._holding = False
         self._resetting = False
-        """Whether a reset has begun and not succeeded: it may have left servos without torque."""
+        """Whether the last reset failed, which may have left servos without torque."""
         self._limits = ctx.robot.lower[order], ctx.robot.upper[order]
 
     @override
@@ -166,7 +166,7 @@ class FeetechFollower(Hardware):
             raise
         except FeetechError as error:
             self._relaxed = True
-            self._ctx.log.warning("whether the torque is off is not known: %s", error)
+            self._ctx.log.warning("cannot confirm that the torque is off: %s", error)
             return Torque.UNKNOWN
         self._relaxed, self._holding = True, False
         return Torque.OFF
@@ -197,7 +197,7 @@ class FeetechFollower(Hardware):
         bus.return_delay_s = RETURN_DELAY_S
         bus.resynchronise()
         servos.find_servos(bus, arm)
-        # A servo that kept its settings and its torque goes on holding its joint.
+        # A servo that kept its settings and torque continues to hold its joint.
         self._set_up([servo for servo in arm.servos if self._is_troubled(servo)])
         self._start()
         self._health.reset()
@@ -217,22 +217,22 @@ class FeetechFollower(Hardware):
         out[:] = self._values[index]
 
     def _set_up(self, ids: Sequence[int]) -> None:
-        """Set servos up; torque on where they stand, unless the arm is relaxed."""
+        """Configure servos, and hold their present positions unless the arm is relaxed."""
         for servo in ids:
             self._holding = self._holding or not self._relaxed
             servos.set_up(self._bus, self._arm, self._tuning(), servo, torque=not self._relaxed)
 
     def _undo(self) -> None:
-        """After a start that failed: torque off, as far as can be; what is not known to be off counts as held."""
+        """Switch the torque off after a failed start; servos that do not confirm it count as holding."""
         if self._holding:
             with suppress(TorqueStaysOn):
                 self.relax()
 
     def _is_troubled(self, servo: int) -> bool:
-        """Whether a servo has lost its settings or torque, or is in an error that torque off and on ends.
+        """Whether a servo has lost its settings or torque, or has an error that switching the torque off and on clears.
 
         Raises:
-            ServoFault: for an error that lasts all the same, e.g. heat; its torque stays as it is.
+            ServoFault: if the error would persist, e.g. overheating; the torque is not changed.
         """
         code = self._bus.read_faulty(servo, "status")
         if lasting := code & ~(OVERLOAD | OVER_CURRENT):
@@ -242,7 +242,7 @@ class FeetechFollower(Hardware):
         return bool(code) or self._bus.read_faulty(servo, "torque_enable") != 1
 
     def _start(self) -> None:
-        """Begin to read again: from where the joints stand, which every servo must say."""
+        """Start reading from the joints' present positions, which every servo must report."""
         bus, ids = self._bus, self._arm.servos
         bus.return_delay_s = 0.0
         self._reader = SyncReader(bus, ids, "present_position", "present_load")
@@ -259,9 +259,10 @@ class FeetechFollower(Hardware):
         self._fault = None
 
     def _plausible(self, ticks: NDArray[np.intp], answered: NDArray[np.bool_], stamp_ns: int) -> NDArray[np.bool_]:
-        """Whether a joint can be where its reply says. The checksum has 8 bits: some damage passes it.
+        """Whether the reported positions are plausible; with its 8 bits, the checksum does not detect all damage.
 
-        What its speed does not explain, since its own last good reply, is believed when the next reply says it again.
+        A position that the joint's speed since its last valid reply cannot explain is accepted if the next reply
+        confirms it.
         """
         elapsed_s = (stamp_ns - self._ticks_ns) * 1e-9
         near = np.abs(ticks - self._ticks - self._speed * elapsed_s) <= _reach(elapsed_s)
@@ -274,14 +275,14 @@ class FeetechFollower(Hardware):
         return good
 
     def _check_lost(self, replies: Replies, good: NDArray[np.bool_]) -> None:
-        """Raise where good replies are missing for too long."""
+        """Raise an error if valid replies are missing for too long."""
         self._lost = np.where(good, 0, self._lost + 1)
         self._counts["lost_replies"] += int((~replies.answered).sum())
         if (self._lost > self._options.lost_replies).any():
             gone = [self._arm.servos[i] for i in np.flatnonzero(self._lost > self._options.lost_replies)]
             ticks = self._options.lost_replies + 1
             others = f", nor from {', '.join(self._arm.names[servo] for servo in gone[1:])}" if len(gone) > 1 else ""
-            raise NoReply(self._bus.place(gone[0], "present_position"), f"no good reply for {ticks} ticks{others}")
+            raise NoReply(self._bus.place(gone[0], "present_position"), f"no valid reply for {ticks} ticks{others}")
 
     def _take(self, values: NDArray[np.intp], good: NDArray[np.bool_], stamp_ns: int) -> None:
         position, velocity, load = values[:, 0], values[:, 1], values[:, 2]
@@ -293,7 +294,7 @@ class FeetechFollower(Hardware):
         self._load.add(self._values[3], good)
 
     def _take_health(self, values: NDArray[np.intp], now_ns: int) -> float:
-        """Take a complete slow reading in; returns how long until the next one [s]."""
+        """Process a complete health reading; returns the time until the next one [s]."""
         columns = dict(zip(self._health_reader.registers, values.T.astype(np.float64), strict=True))
         self._values[0] = columns["present_temperature"]
         self._values[1] = columns["present_voltage"] * _VOLTAGE_V
@@ -335,12 +336,12 @@ class FeetechFollower(Hardware):
             "maximum_acceleration": 254,
             "acceleration": options.acceleration,
         }
-        # As LeRobot protects the gripper's motor from burning out.
+        # The same values protect the gripper's motor in LeRobot.
         gentle = {"max_torque": 500, "protection_current": 250, "overload_torque": 25}
         return Tuning(every, dict.fromkeys(options.gentle, gentle))
 
     def _warn_of_reach(self) -> None:
-        """Say where the calibrated range ends before the YAML's limit: the servo will not go there."""
+        """Warn if a calibrated range ends before the YAML's limit, because the servo stops at the range."""
         for joint, low, high, lower, upper in zip(self.joints, *self._arm.reach(), *self._limits, strict=True):
             if lower < low - 0.1 or upper > high + 0.1:
                 self._ctx.log.warning(
@@ -350,6 +351,6 @@ class FeetechFollower(Hardware):
 
 
 def _reach(elapsed_s: Vector) -> Vector:
-    """How far from the expected position a joint can get in that time [ticks]."""
+    """Maximum distance of a joint from its expected position after that time [ticks]."""
     reach: Vector = _SLACK_TICKS + np.minimum(_MAX_ACCELERATION * elapsed_s, _MAX_SPEED) * elapsed_s
     return reach

@@ -1,4 +1,4 @@
-"""What is wrong with the joints of an arm: errors that servos report, and values that left their levels."""
+"""Health of an arm's joints: errors that servos report, and values beyond their warning and fault levels."""
 
 from __future__ import annotations
 
@@ -15,50 +15,50 @@ from ibrobot_feetech.protocol import OVERLOAD, faults
 from ibrobot_feetech.supply import Supply
 
 _QUANTITIES = {0: "voltage", 1: "position sensor", 2: "temperature", 3: "current", 5: "load"}
-"""Error bit -> the quantity that it is about; others are about themselves."""
+"""Error bit -> affected quantity; any other bit is its own quantity."""
 _LIGHTER = ("temperature", "current", "load")
-"""Quantities that less load helps."""
+"""Quantities that a smaller load relieves."""
 _REMEDIES = {
     "temperature": "let the arm rest without load",
     "voltage": "check the power supply, its cables, and that it is the one for these servos",
-    "current": "see whether something blocks the joint; a reset takes its torque off and on",
-    "load": "see whether something blocks the joint or weighs it down; a reset takes its torque off and on",
-    "torque": "check the power supply and the servo's cable; a reset sets the servo up and puts torque on again",
+    "current": "check whether something blocks the joint; a reset switches its torque off and on",
+    "load": "check whether something blocks or loads the joint; a reset switches its torque off and on",
+    "torque": "check the power supply and the servo's cable; a reset configures the servo and switches its torque on",
 }
 _TEMPERATURE_MARGIN, _VOLTAGE_MARGIN, _LOAD_MARGIN = 2.0, 0.2, 0.05
-"""How far a value is back within its level before a condition ends [deg C, V, of full torque]."""
+"""Hysteresis: how far a value must return within its level to end a condition [deg C, V, of full torque]."""
 
 
 @attrs.frozen(eq=False)
 class Measured:
-    """One slow reading of all servos; arrays of shape (S,)."""
+    """One health reading of all servos; arrays of shape (S,)."""
 
     temperature: Vector
     """[deg C]"""
     voltage: Vector
     """[V]"""
     load: Vector
-    """What a `SteadyLoad` held, of full torque."""
+    """Load from `SteadyLoad`, as a fraction of full torque."""
     torque: NDArray[np.bool_] | None
-    """Whether torque is on; None where it is meant to be off."""
+    """Whether the torque is on; None if it should be off."""
 
 
 @attrs.frozen
 class _Level:
-    """Where a condition begins."""
+    """A level at which a condition begins."""
 
     name: str
-    """The option, or the servos' register."""
+    """Name of the option, or of the servos' register."""
     value: float
     severity: Severity = Severity.FAULT
 
 
 class SteadyLoad:
-    """The least load of each joint over a period: what a joint carries, rather than what it takes to speed up.
+    """The minimum load of each joint over a period, which excludes short loads such as acceleration.
 
     Args:
-        size: how many joints.
-        period_ns: [ns].
+        size: number of joints.
+        period_ns: length of a period [ns].
     """
 
     def __init__(self, size: int, period_ns: int) -> None:
@@ -66,17 +66,17 @@ class SteadyLoad:
         self.begin(0)
 
     def begin(self, now_ns: int) -> None:
-        """Forget what was, and begin a period."""
+        """Discard earlier loads and begin a period."""
         self._least = np.full(self._size, np.inf)
         self._held: Vector = np.zeros(self._size)
         self._end_ns = now_ns + self._period_ns
 
     def add(self, load: Vector, measured: NDArray[np.bool_]) -> None:
-        """Take in loads [of full torque], shape (J,), where they were measured."""
+        """Add loads [of full torque], shape (J,), where `measured` is true."""
         self._least = np.where(measured, np.minimum(self._least, np.abs(load)), self._least)
 
     def held(self, now_ns: int) -> Vector:
-        """That of the last complete period, shape (J,); 0 where nothing was measured."""
+        """Minimum load in the last complete period, shape (J,); 0 where nothing was measured."""
         if now_ns >= self._end_ns:
             held = np.where(np.isfinite(self._least), self._least, 0.0)
             self.begin(now_ns)
@@ -91,13 +91,13 @@ type _Key = tuple[int, str]
 class Health:
     """Present conditions of the joints.
 
-    Damage that passes a packet's checksum must not stop the robot: an error counts when it is reported twice, and a
-    value when the next reading of it says so too.
+    Damage that a packet's checksum does not detect must not stop the robot. So an error counts only if it is reported
+    twice, and a value only if the next reading confirms it.
 
     Args:
-        options: have the levels.
-        joints: their names.
-        place: index of a servo -> where it is, for messages.
+        options: options with the levels.
+        joints: joint names.
+        place: index of a servo -> its place, for messages.
     """
 
     def __init__(self, options: FollowerOptions, joints: Sequence[str], place: Callable[[int], Place]) -> None:
@@ -109,12 +109,12 @@ class Health:
         self.reset()
 
     def begin(self, supplies: Sequence[Supply]) -> None:
-        """The arm was connected; its servos have these supplies, S of them."""
+        """Start with a connected arm, whose S servos have these supplies."""
         self._supplies = supplies
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything: faults were cleared."""
+        """Clear all conditions, after a reset of faults."""
         self._reported = np.zeros(len(self._joints), dtype=np.uint8)
         self._errors = np.zeros(len(self._joints), dtype=np.uint8)
         self._suspected: dict[_Key, Condition] = {}
@@ -128,7 +128,7 @@ class Health:
         return any(condition.severity is Severity.FAULT for condition in self.conditions)
 
     def report(self, errors: NDArray[np.uint8], answered: NDArray[np.bool_]) -> None:
-        """Take in the error bytes of one reading, shape (S,), of those that answered."""
+        """Process the error bytes of one reading, shape (S,), where `answered` is true."""
         before = self._reported
         self._reported = np.where(answered, errors, before)
         lasting = (self._reported & before) | (self._errors & (self._reported | before))
@@ -140,7 +140,7 @@ class Health:
             self._collect()
 
     def measure(self, measured: Measured) -> bool:
-        """Take in a slow reading; returns whether to read again soon, to see whether something new is true."""
+        """Process a health reading; returns whether to read again soon, to confirm a new condition."""
         found = dict(self._found(measured))
         known, suspected = self._measured, self._suspected
         true = {
@@ -164,8 +164,8 @@ class Health:
         quantity, name = _quantity(bit), faults(1 << bit)[0]
         if 1 << bit == OVERLOAD and self._gentle[index]:
             message = (
-                f"{self._place(index)}: the servo is in overload and holds on with its protective torque; the run goes "
-                "on; let go for a moment to let the motor rest"
+                f"{self._place(index)}: the servo is in overload and holds on with its protective torque; the run "
+                "continues; release the grasp for a moment to let the motor cool"
             )
             return Condition(self._joints[index], quantity, 1.0, "", Severity.WARNING, message)
         message = f"{self._place(index)}: the servo reports {name}; {_REMEDIES.get(quantity, 'replace the servo')}"
@@ -192,7 +192,7 @@ class Health:
 
     def _load(self, index: int, value: float) -> Condition | None:
         if self._gentle[index]:
-            return None  # holding on is what it is for, and its servo protects itself
+            return None  # such a joint is made to grip, and its servo protects itself
         levels = _levels("load", self._options.max_load, self._options.warning_load)
         return self._beyond(index, "load", value, "", levels, _LOAD_MARGIN)
 
@@ -220,9 +220,9 @@ class Health:
     def _beyond(
         self, index: int, quantity: str, value: float, unit: str, levels: Sequence[_Level], margin: float, sign: int = 1
     ) -> Condition | None:
-        """The condition of a value that is beyond one of `levels`, given the worst first; None where it is not.
+        """The condition of a value beyond one of `levels`, sorted from worst to mildest; None if it is within all.
 
-        A value that was beyond must come back by `margin`. `sign` is -1 where smaller values are worse.
+        To end a condition, the value must return by `margin`. `sign` is -1 if smaller values are worse.
         """
         known = self._measured.get((index, quantity))
         for level in levels:
@@ -247,5 +247,5 @@ def _levels(quantity: str, most: float, warning: float) -> tuple[_Level, _Level]
 
 
 def _as_severe(known: Condition | None, severity: Severity) -> bool:
-    """Whether there is a condition at least that severe."""
+    """Whether the known condition is at least that severe."""
     return known is not None and (known.severity is Severity.FAULT or severity is Severity.WARNING)

@@ -1,4 +1,4 @@
-"""Teleop `so101_leader`: an arm without torque that a person moves, and that the robot follows."""
+"""Teleop `so101_leader`: an arm without torque, moved by hand, that the robot follows."""
 
 from __future__ import annotations
 
@@ -31,20 +31,20 @@ from ibrobot_feetech.sync import SyncReader
 from ibrobot_feetech.usb import check_adapter
 
 _LONGEST_STEP_S = 0.1
-"""What a ramp makes up for at most, after a host that stood still [s]."""
+"""Longest time step of the approach, e.g. after a pause of the host [s]."""
 _FASTEST_HAND = 13_000
-"""Faster than a person turns a joint [ticks/s]: three turns a second."""
+"""Upper bound on the speed of a joint moved by hand [ticks/s]: three turns per second."""
 _SLACK = 64
-"""What a position may differ from the last one at any rate [ticks]."""
+"""Change of a position that is always accepted [ticks]."""
 _TAKEN_UP = 40
-"""A leader whose joint turned by more is in a hand [ticks]: 3.5 degrees."""
+"""A joint that turned by more was moved by hand [ticks]: 3.5 degrees."""
 
 
 class LeaderTeleop(Teleop):
     """Maps the leader's positions to the robot's joints; approaches them slowly at first, then follows directly.
 
-    Joints are mapped by angle; those in `scaled` by their share of the calibrated range, which becomes the same share
-    of the robot's limits. Arrays here have one element for each mapped joint, shape (S,).
+    Joints are mapped by angle; those in `scaled` linearly from their calibrated range to the robot's limits.
+    Arrays have one element for each mapped joint, shape (S,).
     """
 
     def __init__(self, options: LeaderOptions, ctx: Context) -> None:
@@ -73,31 +73,31 @@ class LeaderTeleop(Teleop):
         self._reader: SyncReader | None = None
         self._keys: queue.SimpleQueue[str] | None = None
         self._ticks = np.zeros(len(pairs), dtype=np.int32)
-        """The last good positions."""
+        """The last valid positions [ticks]."""
         self._ticks_ns = np.zeros(len(pairs), dtype=np.int64)
-        """When they came [ns]."""
+        """When they were read [ns]."""
         self._lost = np.zeros(len(pairs), dtype=np.int32)
-        """Reads since then."""
+        """Number of reads since then."""
         self._setpoint: Vector | None = None
-        """The last one [rad]; None while paused."""
+        """The last setpoint [rad]; None while paused."""
         self._set_ns = 0
-        """When it was made [ns]."""
+        """When it was computed [ns]."""
         self._following = False
-        """Whether the approach is over."""
+        """Whether the approach is finished."""
         self._toggled = False
         self._pressed_ns: int | None = None
         self._held_until_ns = 0
         self._resting: NDArray[np.int32] | None = None
-        """Where the leader stood when the mode began [ticks]; None until that was read."""
+        """The leader's positions at the start of the mode [ticks]; None until they are read."""
         self._taken_up = False
-        """Whether it was moved since then."""
+        """Whether the leader was moved since then."""
 
     @override
     def connect(self) -> None:
         if self._options.deadman != "none" and self._ctx.keys is None:
             raise TeleopError(
-                f"{self._ctx.name}: deadman: {self._options.deadman} needs a terminal: start ibrobot in one, its input "
-                "not redirected, or set deadman: none, with which the robot follows once the leader arm is moved"
+                f"{self._ctx.name}: deadman: {self._options.deadman} needs a terminal: start ibrobot in one, without "
+                "redirecting its input, or set deadman: none, so that the robot follows once the leader arm is moved"
             )
         bus = FeetechBus(self._options.port, baud_rate=self._options.baud_rate, joints=self._arm.names)
         try:
@@ -114,12 +114,12 @@ class LeaderTeleop(Teleop):
     @override
     def activate(self, measured: JointReading) -> None:
         self._release()
-        self._typed()  # what was typed for something else
+        self._typed()  # discard keys typed before the mode
 
     @override
     def read(self, measured: JointReading) -> TeleopCommand:
         if self._reader is None:
-            raise TeleopError(f"{self._ctx.name}: the leader is not connected: connect comes before read")
+            raise TeleopError(f"{self._ctx.name}: the leader is not connected: call connect before read")
         now_ns = measured.stamp_ns
         if self._options.estop_key in (typed := self._typed()):
             self._release()
@@ -156,10 +156,10 @@ class LeaderTeleop(Teleop):
                 raise TeleopError(f"{self._ctx.name}: {option}: no joint {name!r}; the joints are: {', '.join(known)}")
 
     def _prepare(self, bus: FeetechBus) -> None:
-        """Torque off and confirmed, answers without delay, the calibration's numbers in the servos.
+        """Switch the torque off and confirm it, remove the servos' answer delay, and check their calibration.
 
         Raises:
-            HardwareError: e.g. naming a servo that does not answer.
+            HardwareError: e.g. if a servo does not answer; names it.
         """
         ids = self._arm.servos
         find_servos(bus, self._arm)
@@ -180,12 +180,12 @@ class LeaderTeleop(Teleop):
         self._lost[:] = 0
 
     def _receive(self, reader: SyncReader, now_ns: int) -> None:
-        """Take the positions that came; those that did not, or that no hand can have reached, stay as they were."""
+        """Store the received positions; missing or implausible ones keep their last values."""
         try:
             replies = reader.read()
         except FeetechError as error:
             raise TeleopError(f"{self._ctx.name}: {error}") from None
-        # Error bits are passed over: without torque nothing can overheat, and the encoder is right all the same.
+        # Error bits are ignored: without torque nothing can overheat, and the encoder is still correct.
         ticks = replies.values[:, 0]
         reach = _SLACK + _FASTEST_HAND * (now_ns - self._ticks_ns) * 1e-9
         good = replies.answered & (ticks >= 0) & (ticks < TICKS_PER_TURN) & (np.abs(ticks - self._ticks) <= reach)
@@ -210,7 +210,7 @@ class LeaderTeleop(Teleop):
         )
 
     def _pose(self) -> Vector:
-        """What the leader's positions mean for the robot [rad], within its limits."""
+        """The leader's pose mapped to the robot's joints [rad], within their limits."""
         ticks = self._ticks.astype(np.float64)
         low, high = self._range
         angles = np.where(self._mirrored, -1.0, 1.0) * self._arm.radians(ticks)
@@ -221,7 +221,7 @@ class LeaderTeleop(Teleop):
         return np.clip(positions, self._lower, self._upper)
 
     def _next(self, measured: JointReading) -> Vector:
-        """The setpoint [rad]: the measured positions at first, then nearer to the leader's, then the leader's."""
+        """The setpoint [rad], which moves from the measured positions to the leader's and then follows."""
         now_ns, pose = measured.stamp_ns, self._pose()
         before = self._setpoint
         elapsed_s, self._set_ns = min(seconds(now_ns - self._set_ns), _LONGEST_STEP_S), now_ns
@@ -232,12 +232,12 @@ class LeaderTeleop(Teleop):
         if self._following or np.abs(way).max() <= self._options.follow_tolerance:
             self._following = True
             return pose
-        # All joints arrive together: the one with the longest way sets the pace.
+        # All joints arrive together; the one with the longest distance sets the pace.
         share = float(np.min(self._ramp * elapsed_s / np.maximum(np.abs(way), 1e-9)))
         return before + way * min(1.0, share)
 
     def _release(self) -> None:
-        """As if nobody had touched a key or the leader: paused, and a ramp to begin with."""
+        """Return to the paused state, so that following begins with an approach."""
         self._setpoint = self._pressed_ns = self._resting = None
         self._toggled = self._taken_up = False
         self._held_until_ns = 0
@@ -249,9 +249,10 @@ class LeaderTeleop(Teleop):
         return typed
 
     def _handle_presses(self, presses: int, now_ns: int) -> None:
-        """Take in presses of the deadman.
+        """Process presses of the deadman.
 
-        A terminal tells of no release, but repeats a held key: it is held while presses come close together.
+        A terminal does not report the release of a key, but repeats a held one. So it counts as held while presses
+        follow one another quickly.
         """
         release_ns = ns(self._options.release)
         for _ in range(presses):
@@ -269,7 +270,7 @@ class LeaderTeleop(Teleop):
         return self._is_taken_up()
 
     def _is_taken_up(self) -> bool:
-        """Whether the leader was moved since the mode began; nobody knows before every servo has answered once."""
+        """Whether the leader was moved since the mode began; False until every servo has answered once."""
         if self._resting is None:
             self._resting = None if self._lost.any() else self._ticks.copy()
         elif not self._taken_up:

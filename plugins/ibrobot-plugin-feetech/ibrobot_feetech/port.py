@@ -1,4 +1,4 @@
-"""A serial port for request and reply: exclusive, raw, with blocking reads that end at a deadline."""
+"""A serial port for requests and replies: exclusive, raw, with blocking reads that have a deadline."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ _VMIN = 6
 """Index of the control characters among a terminal's attributes."""
 _NOTHING = bytes(4)
 _MOST_AWAITED = 255
-"""Greatest number of bytes that a reader can be woken by."""
+"""Maximum number of bytes for which the kernel can delay waking a reader."""
 
 
 class SerialPort:
     """One open serial port.
 
-    A reader sleeps until as many bytes are there as its reply has (the line discipline's VMIN, which `poll` honours):
-    one wake-up an exchange instead of one a packet.
+    A reader sleeps until the complete reply has arrived (with the line discipline's VMIN, which `poll` honours). This
+    takes one wake-up per exchange instead of one per packet.
 
     Args:
         path: e.g. `/dev/ttyACM0`.
@@ -43,14 +43,14 @@ class SerialPort:
 
     @property
     def is_open(self) -> bool:
-        """Whether the port is open; it may be unplugged all the same."""
+        """Whether the port is open; it may nevertheless be unplugged."""
         return self._serial is not None
 
     def open(self) -> None:
         """Open the port for this process alone.
 
         Raises:
-            PortError: when it is not there, not permitted, or held by another program.
+            PortError: if it does not exist, is not permitted, or is held by another program.
         """
         if self._serial is not None:
             return
@@ -58,7 +58,7 @@ class SerialPort:
             self._serial = serial.Serial(self.path, self.baud_rate, timeout=0, write_timeout=None, exclusive=True)
         except (OSError, ValueError, termios.error) as error:
             raise _why_closed(Place(self.path), error) from None
-        # Drivers without such a flag are fast already, or cannot be made so.
+        # Drivers without this flag are already fast, or cannot be made faster.
         with suppress(OSError, ValueError, NotImplementedError, AttributeError):
             self._serial.set_low_latency_mode(True)
         self._fd = self._serial.fileno()
@@ -74,10 +74,10 @@ class SerialPort:
                 port.close()
 
     def set_baud_rate(self, baud_rate: int) -> None:
-        """Go on at another rate [baud].
+        """Change the baud rate [baud].
 
         Raises:
-            PortError: for a rate that the port cannot have.
+            PortError: if the port does not support the rate.
         """
         self.baud_rate = baud_rate
         if self._serial is not None:
@@ -91,7 +91,7 @@ class SerialPort:
         """Send all of `request`.
 
         Raises:
-            PortError: when the port is gone or closed.
+            PortError: if the port is gone or closed.
         """
         try:
             sent = os.write(self._fd, request)
@@ -102,10 +102,10 @@ class SerialPort:
             raise self._gone(error) from None
 
     def read(self, size: int, deadline: float) -> bytes:
-        """What comes until `size` bytes are there or `time.monotonic()` reaches `deadline` [s]: all of it.
+        """Read all bytes until at least `size` have arrived or `time.monotonic()` reaches `deadline` [s].
 
         Raises:
-            PortError: when the port is gone or closed.
+            PortError: if the port is gone or closed.
         """
         received = b""
         while len(received) < size:
@@ -123,10 +123,10 @@ class SerialPort:
         return received
 
     def exchange(self, request: bytes, size: int, timeout_ms: int) -> bytes:
-        """Send `request` and give back what came when `size` bytes are there, or in time: the fast way of a tick.
+        """Send `request` and return the bytes received when `size` have arrived or at the timeout; optimised for ticks.
 
         Raises:
-            PortError: when the port is gone or closed.
+            PortError: if the port is gone or closed.
         """
         if size > _MOST_AWAITED:
             self.write(request)
@@ -135,7 +135,7 @@ class SerialPort:
             self._wake_when(size)
         try:
             if os.write(self._fd, request) < len(request):
-                raise OSError(errno.EIO, "the port does not take a request of a few bytes")
+                raise OSError(errno.EIO, "the port does not accept a request of a few bytes")
             if self._poll.poll(timeout_ms):
                 if received := os.read(self._fd, size):
                     return received
@@ -145,10 +145,10 @@ class SerialPort:
             raise self._gone(error) from None
 
     def discard(self) -> int:
-        """Throw away what has come unasked; returns how many bytes it was.
+        """Discard received bytes; returns their number.
 
         Raises:
-            PortError: when the port is gone or closed.
+            PortError: if the port is gone or closed.
         """
         try:
             fcntl.ioctl(self._fd, termios.FIONREAD, self._waiting)

@@ -1,4 +1,4 @@
-"""Packets of the Feetech STS bus: packing, parsing, and finding them in a stream of bytes."""
+"""Packets of the Feetech STS bus: packing, parsing, and finding them in a byte stream."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ HEADER = b"\xff\xff"
 BROADCAST = 0xFE
 MAX_ID = 0xFD
 OVERHEAD = 6
-"""Bytes of a packet beside its parameters: header, id, length, code, checksum."""
+"""Bytes of a packet without its parameters: header, id, length, code, checksum."""
 MAX_PARAMETERS = 0xFF - 2 - 1
-"""One less than the length byte could say: length 0xFF could be taken for a header."""
+"""One less than the length byte allows, because length 0xFF could be mistaken for a header."""
 
 
 class Instruction(IntEnum):
-    """What a packet of the host asks for."""
+    """Instructions in packets from the host."""
 
     PING = 0x01
     READ = 0x02
@@ -29,14 +29,14 @@ class Instruction(IntEnum):
 
 
 OVERLOAD, OVER_CURRENT = 0x20, 0x08
-"""Bits of a status packet's error byte that last until torque was off."""
+"""Bits of a status packet's error byte that persist until the torque is switched off."""
 FAULTS: Mapping[int, str] = {0: "voltage", 1: "angle sensor", 2: "overheating", 3: "over-current", 5: "overload"}
-"""Bit of a status packet's error byte -> what it means."""
+"""Bit of a status packet's error byte -> meaning."""
 
 
 @attrs.frozen
 class Packet:
-    """A packet: of the host, where `code` is the instruction, or of a servo, where it is the error byte."""
+    """A packet. `code` is the instruction in packets from the host, and the error byte in those from a servo."""
 
     servo: int
     code: int
@@ -44,7 +44,7 @@ class Packet:
 
 
 def checksum(body: bytes | bytearray) -> int:
-    """The checksum of what lies between header and checksum."""
+    """The checksum of the bytes between header and checksum."""
     return ~sum(body) & 0xFF
 
 
@@ -52,7 +52,7 @@ def pack(packet: Packet) -> bytes:
     """The bytes of a packet.
 
     Raises:
-        ValueError: for an id, code or number of parameters that no packet can have.
+        ValueError: if id, code or number of parameters are out of range.
     """
     if not 0 <= packet.servo <= BROADCAST:
         raise ValueError(f"servo id must be 0 to {MAX_ID}, or {BROADCAST} for all, not {packet.servo}")
@@ -65,7 +65,7 @@ def pack(packet: Packet) -> bytes:
 
 
 def ping(servo: int) -> bytes:
-    """Ask whether a servo is there."""
+    """Ask a servo to answer."""
     return pack(Packet(servo, Instruction.PING))
 
 
@@ -80,30 +80,30 @@ def write(servo: int, address: int, content: bytes) -> bytes:
 
 
 def reg_write(servo: int, address: int, content: bytes) -> bytes:
-    """Set bytes from `address` when `action` comes."""
+    """Set bytes from `address` when `action` is received."""
     return pack(Packet(servo, Instruction.REG_WRITE, bytes((address,)) + content))
 
 
 def action(servo: int = BROADCAST) -> bytes:
-    """Carry out what `reg_write` prepared."""
+    """Execute the writes that `reg_write` prepared."""
     return pack(Packet(servo, Instruction.ACTION))
 
 
 def sync_read(servos: Iterable[int], address: int, size: int) -> bytes:
-    """Ask several servos for the same registers; each answers in turn."""
+    """Ask several servos for the same registers; they answer in turn."""
     return pack(Packet(BROADCAST, Instruction.SYNC_READ, bytes((address, size, *_distinct(servos)))))
 
 
 def sync_write(address: int, contents: Mapping[int, bytes]) -> bytes:
-    """Set the same registers of several servos; none answers.
+    """Set the same registers of several servos; no servo answers.
 
     Args:
         address: the first register.
-        contents: servo id -> bytes, of one length for all.
+        contents: servo id -> bytes, of equal length.
     """
     sizes = {len(content) for content in contents.values()}
     if len(sizes) != 1:
-        raise ValueError(f"sync write needs bytes of one length for all servos, not of {sorted(sizes)}")
+        raise ValueError(f"sync write needs the same number of bytes for all servos, not {sorted(sizes)}")
     each = b"".join(bytes((servo,)) + contents[servo] for servo in _distinct(contents))
     return pack(Packet(BROADCAST, Instruction.SYNC_WRITE, bytes((address, *sizes)) + each))
 
@@ -121,17 +121,17 @@ def faults(code: int) -> tuple[str, ...]:
 
 
 class Scanner:
-    """Finds packets in a stream that may hold garbage; what begins like a packet and is none costs one byte."""
+    """Finds packets in a stream with garbage; after an invalid packet it skips one byte and searches again."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
         self.discarded = 0
-        """Bytes dropped so far since they belonged to no packet."""
+        """Number of bytes dropped so far because they did not belong to a packet."""
         self.damaged = 0
-        """What began like a packet and had a wrong checksum."""
+        """Number of packets with a wrong checksum."""
 
     def feed(self, received: bytes) -> list[Packet]:
-        """The packets complete now; an unfinished one is kept for the next call."""
+        """Add bytes; returns complete packets and keeps an incomplete one for the next call."""
         self._buffer += received
         packets = []
         while (packet := self._next()) is not None:
@@ -139,7 +139,7 @@ class Scanner:
         return packets
 
     def finish(self) -> list[Packet]:
-        """The packets in what looked like the beginning of a longer one, now that nothing more comes."""
+        """The packets within the remaining bytes, which looked like an incomplete packet, at the end of the stream."""
         packets = []
         while self._buffer:
             self._drop(1)
@@ -155,7 +155,7 @@ class Scanner:
                 return None
             self._drop(start)
             if len(buffer) < 4:
-                # Of three ff the first can be no header: no id is ff.
+                # With three ff in a row, the first is not a header, because ff is not a valid id.
                 if buffer[2:3] == b"\xff":
                     self._drop(1)
                     continue

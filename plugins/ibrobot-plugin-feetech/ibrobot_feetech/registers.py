@@ -1,4 +1,4 @@
-"""The control table of the STS3215: where each register is, how it is coded, and in what units."""
+"""The control table of the STS3215: addresses, encodings and units of the registers."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ class Register:
     address: int
     size: int
     area: Literal["eprom", "ram", "factory"]
-    """EPROM survives power-off and is written only while `lock` is 0."""
+    """EPROM keeps its values without power and can be written only while `lock` is 0."""
     unit: str = ""
     writable: bool = True
     sign_bit: int | None = None
-    """The bit that says minus, with the magnitude below it; None for unsigned values."""
+    """The sign bit, with the magnitude below it; None for unsigned values."""
 
     @property
     def limits(self) -> tuple[int, int]:
-        """The least and the greatest value that can be coded."""
+        """The minimum and maximum value that can be encoded."""
         if self.sign_bit is None:
             return 0, (1 << 8 * self.size) - 1
         magnitude = (1 << self.sign_bit) - 1
@@ -37,7 +37,7 @@ class Register:
         """The bytes of a value.
 
         Raises:
-            ValueError: when it cannot be coded.
+            ValueError: if it is out of range.
         """
         least, greatest = self.limits
         if not least <= value <= greatest:
@@ -50,7 +50,7 @@ class Register:
         """The value of bytes, shape (size,); bits above the sign bit are ignored.
 
         Raises:
-            ValueError: when there are more or fewer.
+            ValueError: if the number of bytes is wrong.
         """
         if len(content) != self.size:
             raise ValueError(f"{self.name} has {self.size} bytes, not {len(content)}")
@@ -131,10 +131,10 @@ STS3215: Mapping[str, Register] = {register.name: register for register in _TABL
 
 
 def register(name: str) -> Register:
-    """The register of that name.
+    """The register with that name.
 
     Raises:
-        KeyError: when there is none.
+        KeyError: if the name is unknown.
     """
     if name in STS3215:
         return STS3215[name]
@@ -144,13 +144,13 @@ def register(name: str) -> Register:
 
 
 def writable(name: str) -> Register:
-    """The register of that name, which can be set.
+    """The writable register with that name.
 
     Raises:
-        KeyError: when there is none.
-        ValueError: when it can only be read.
+        KeyError: if the name is unknown.
+        ValueError: if it is read-only.
     """
     found = register(name)
     if not found.writable:
-        raise ValueError(f"{name} can only be read")
+        raise ValueError(f"{name} is read-only")
     return found

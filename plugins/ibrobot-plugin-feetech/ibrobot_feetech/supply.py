@@ -1,4 +1,4 @@
-"""Whether the servos of an arm can stand the voltage that they are given."""
+"""Checks whether the supply voltage is within the limits of the servos."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _VOLTS = 0.1
 
 @attrs.frozen
 class Supply:
-    """What a servo measures, and what it is made for [V]."""
+    """The voltage that a servo measures, and its limits [V]."""
 
     measured: float
     least: float
@@ -20,7 +20,7 @@ class Supply:
 
     @property
     def fits(self) -> bool:
-        """Whether it may stay on."""
+        """Whether the voltage is within the limits."""
         return self.least <= self.measured <= self.greatest
 
     @property
@@ -30,17 +30,17 @@ class Supply:
 
     @property
     def remedy(self) -> str:
-        """What to do where it does not fit."""
+        """The remedy if the voltage is outside the limits."""
         if self.measured > self.greatest:
             return "unplug it now: a servo for 7.4 V does not last on 12 V; give it its own supply"
-        return "check the supply, its plug, and whether it is made for that many servos"
+        return "check the supply, its plug, and whether it is strong enough for all servos"
 
 
 def supply(bus: FeetechBus, servo: int) -> Supply:
-    """What a servo says of its supply.
+    """Read a servo's supply voltage and its limits.
 
     Raises:
-        FeetechError: when it does not answer.
+        FeetechError: if the servo does not answer.
     """
     names = ("present_voltage", "min_voltage_limit", "max_voltage_limit")
     return Supply(*(bus.read_faulty(servo, name) * _VOLTS for name in names))
@@ -50,8 +50,8 @@ def check_supply(bus: FeetechBus, servo: int) -> None:
     """Check that a servo's supply is within its limits.
 
     Raises:
-        HardwareError: with the measured voltage and the limits.
-        FeetechError: when it does not answer.
+        HardwareError: if it is not; with the measured voltage and the limits.
+        FeetechError: if the servo does not answer.
     """
     found = supply(bus, servo)
     if not found.fits:

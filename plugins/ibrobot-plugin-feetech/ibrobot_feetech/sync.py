@@ -1,4 +1,4 @@
-"""The bus traffic of every tick: one sync read of all servos, one sync write of their goals, prepared beforehand."""
+"""The bus traffic of every tick: a sync read of all servos and a sync write of their goals, prepared in advance."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ _HEADER = 5
 
 
 class Replies(NamedTuple):
-    """What the servos answered to one sync read, in the order in which they were asked."""
+    """The servos' replies to a sync read, in the order in which they were asked."""
 
     decoded: list[int]
-    """Registers, servo by servo, S x R of them; 0 where there was no answer."""
+    """Register values, servo by servo, S x R of them; 0 where a reply is missing."""
     answered: NDArray[np.bool_]
     """Shape (S,)."""
     errors: NDArray[np.uint8]
     """The error byte of each reply, shape (S,)."""
     complete: bool
-    """Whether all answered, and none reports an error."""
+    """Whether all servos answered and none reports an error."""
 
     @property
     def values(self) -> NDArray[np.intp]:
@@ -39,15 +39,15 @@ class Replies(NamedTuple):
 
 
 class SyncReader:
-    """Reads the registers `first` to `last` of all servos, in one request.
+    """Reads the registers from `first` to `last` of all servos in one request.
 
-    A good answer is checked and decoded as one array; anything else goes through the bus, packet by packet.
+    A complete answer is checked and decoded as one array; otherwise the bus parses it packet by packet.
 
     Args:
         bus: an open bus.
         servos: the ids, in the order of the result.
         first: the first register.
-        last: the last; every register between them is in the result, see `registers`.
+        last: the last register; the result includes all registers in between, see `registers`.
     """
 
     def __init__(self, bus: FeetechBus, servos: Sequence[int], first: str, last: str | None = None) -> None:
@@ -72,20 +72,20 @@ class SyncReader:
         self._timeout_ms = math.ceil(bus.timeout(len(self._request), self._expected, count) * 1e3)
 
     def read(self, again_until: float = 0.0) -> Replies:
-        """Ask all servos and take what comes in time.
+        """Ask all servos and return the replies that arrive in time.
 
         Args:
-            again_until: until when (`time.monotonic`) [s] those that did not answer well are asked once more.
+            again_until: until this time (`time.monotonic`) [s], servos without a valid reply are asked again, once.
 
         Raises:
-            PortError: when the port is gone.
+            PortError: if the port is gone.
         """
         bus = self._bus
         if bus.outstanding:
             return self._slowly(bus.sync_read_span(self._address, self._size, self._servos), again_until)
         bus.begin_request()
         received = bus.port.exchange(self._request, self._expected, self._timeout_ms)
-        # Headers, ids, lengths and error bytes of all, as one great number; then the checksums.
+        # Compare headers, ids, lengths and error bytes of all replies as one large integer; then the checksums.
         if len(received) == self._expected and int.from_bytes(received) & self._mask == self._pattern:
             for start, end in self._bodies:
                 if sum(received[start:end]) & 0xFF != 0xFF:
@@ -96,7 +96,7 @@ class SyncReader:
         return self._slowly(found, again_until)
 
     def _frame(self) -> tuple[int, int]:
-        """Mask and pattern of the bytes that are known beforehand in a good answer."""
+        """Mask and pattern of the bytes that a valid answer must have."""
         one = b"\xff" * _HEADER + b"\x00" * (self._size + 1)
         pattern = b"".join(
             protocol.HEADER + bytes((servo, self._size + 2, 0)) + b"\x00" * (self._size + 1) for servo in self._servos
@@ -123,7 +123,7 @@ class SyncReader:
 
 
 class SyncWriter:
-    """Writes one register of all servos in one request, which none answers.
+    """Writes one register of all servos in one request, which no servo answers.
 
     Args:
         bus: an open bus.
@@ -147,8 +147,8 @@ class SyncWriter:
         """Send the values, one for each servo.
 
         Raises:
-            PortError: when the port is gone.
-            ValueError: for a value that the register cannot hold.
+            PortError: if the port is gone.
+            ValueError: if a value is out of range.
         """
         numbers = values.tolist() if isinstance(values, np.ndarray) else values
         if min(numbers) < 0 or max(numbers) > self._greatest:
@@ -161,7 +161,7 @@ class SyncWriter:
 
 
 def _layout(registers: Sequence[Register], address: int, size: int) -> str:
-    """A reply as the module `struct` describes it: only its registers."""
+    """The `struct` format of a reply's registers."""
     layout, at = f"{_HEADER}x", address
     for found in registers:
         layout += f"{found.address - at}x" + ("H" if found.size == 2 else "B")

@@ -1,4 +1,4 @@
-"""USB serial adapters: which ports there are, and whether an arm is on the one that it was calibrated at."""
+"""USB serial adapters: lists ports, and checks that an arm uses the adapter with which it was calibrated."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from serial.tools import list_ports
 from ibrobot_core.api import Calibration, HardwareError
 
 ADAPTER_VENDOR = 0x1A86
-"""USB vendor of the CH340 and CH343 on the SO-101's boards."""
+"""USB vendor id of the CH340 and CH343 on the SO-101's boards."""
 _BY_ID = Path("/dev/serial/by-id")
 
 
@@ -24,23 +24,23 @@ class UsbPort:
     usb_id: str
     """Vendor and product, e.g. `1a86:55d3`."""
     serial_number: str
-    """Of the adapter; empty where it has none."""
+    """Serial number of the adapter; empty if it has none."""
     stable: str
-    """A path that stays the same over replugging; empty where there is none."""
+    """A path that stays the same after replugging; empty if there is none."""
 
     @property
     def is_arm(self) -> bool:
-        """Whether the adapter is of the kind on the SO-101's boards."""
+        """Whether the adapter is of the type on the SO-101's boards."""
         return self.usb_id.startswith(f"{ADAPTER_VENDOR:04x}:")
 
     @property
     def permitted(self) -> bool:
-        """Whether this user may open it."""
+        """Whether the user may open it."""
         return os.access(self.path, os.R_OK | os.W_OK)
 
 
 def usb_ports() -> list[UsbPort]:
-    """All of them, by path."""
+    """All USB serial ports, sorted by path."""
     links = {str(link.resolve()): str(link) for link in _BY_ID.iterdir()} if _BY_ID.is_dir() else {}
     return [
         UsbPort(
@@ -53,16 +53,16 @@ def usb_ports() -> list[UsbPort]:
 
 
 def usb_port(path: str) -> UsbPort | None:
-    """The USB port at a path, or at what a link there points to; None for a port that is not behind USB."""
+    """The USB port at a path or symbolic link; None if it is not a USB port."""
     real = str(Path(path).resolve())
     return next((found for found in usb_ports() if found.path == real), None)
 
 
 def check_adapter(calibration: Calibration, port: str) -> None:
-    """Check that the adapter at a port is the one that the calibration was made at, where both are known.
+    """Check that the adapter at a port is the one with which the calibration was made, if both are known.
 
     Raises:
-        HardwareError: for another one, e.g. when the ports of leader and follower are swapped.
+        HardwareError: if it is another one, e.g. because the ports of leader and follower are swapped.
     """
     found = usb_port(port)
     if not calibration.adapter or found is None or found.serial_number == calibration.adapter:
@@ -73,5 +73,5 @@ def check_adapter(calibration: Calibration, port: str) -> None:
     raise HardwareError(
         f"{port}: this is another arm: its adapter {there}, {calibration.path} was made with "
         f"{calibration.adapter}{where}; are the ports of leader and follower swapped? If the adapter was replaced, "
-        f"`ibrobot feetech import {calibration.path} --port {port} --yes` remembers the new one"
+        f"`ibrobot feetech import {calibration.path} --port {port} --yes` stores the new one"
     )

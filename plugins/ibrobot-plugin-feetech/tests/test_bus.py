@@ -68,7 +68,7 @@ class TestRequests:
             lambda: bus.sync_write("present_load", {2: 1}),
             lambda: SyncWriter(bus, SERVOS, "present_load"),
         ):
-            with pytest.raises(ValueError, match="present_load can only be read"):
+            with pytest.raises(ValueError, match="present_load is read-only"):
                 write()
 
     def test_sync_read_and_write_reach_all(self, bus: FeetechBus) -> None:

@@ -49,7 +49,7 @@ def test_the_file_holds_lerobots_keys_and_nothing_else(tmp_path: Path) -> None:
 def test_it_overwrites_only_on_request(tmp_path: Path) -> None:
     made = Calibration({"pan": JointCalibration(**GOOD)})
     path = save_calibration(made, tmp_path / "arm.json")
-    with pytest.raises(CalibrationError, match="is there already"):
+    with pytest.raises(CalibrationError, match="exists already"):
         save_calibration(made, path)
     save_calibration(made, path, overwrite=True)
 

@@ -141,7 +141,7 @@ def test_an_arm_is_calibrated_in_the_dialogue_and_the_former_file_is_kept(emulat
     (kept,) = (path for path in home.glob("so101_follower.2*.json") if "meta" not in path.name)
     assert kept.read_text() == before
     _, screen = ran("check", emulator.port)
-    assert "are as the calibration says" in screen
+    assert "match the calibration" in screen
     assert "0 rad is the pose that was set by hand" in screen
     code, screen = ran("check", emulator.port, "--write", "--yes", before=adapter.replace("5A12", "5A99"))
     assert code == 1
@@ -188,9 +188,9 @@ def test_an_existing_file_is_not_overwritten_against_the_answer(emulator, home):
     ("ends", "told"),
     [
         (ENDS | {3: (2048, 4400)}, "elbow_flex: its range 2048 to 4400 crosses the encoder's end (0/4095)"),
-        ({servo: both for servo, both in ENDS.items() if servo != 4}, "wrist_flex: it moved by 0 ticks"),
+        ({servo: both for servo, both in ENDS.items() if servo != 4}, "wrist_flex: it moved by only 0 ticks"),
         (ENDS | {2: (1747, 2347)}, "shoulder_lift: it moved by 53 deg, its limits are 200 deg apart"),
-        (ENDS | {1: (1247, 3747)}, "shoulder_pan: the middle of its range is 39 deg off the middle pose"),
+        (ENDS | {1: (1247, 3747)}, "shoulder_pan: the middle of its range is 39 deg from the middle pose"),
     ],
 )
 def test_ranges_that_cannot_be_true_are_explained_and_not_kept(emulator, person, home, ends, told):
@@ -294,7 +294,7 @@ def test_an_arm_of_lerobot_is_imported_with_its_0_or_with_the_pose(home, tmp_pat
     assert again.exit_code != 0, "it asks before it overwrites"
     again = run(feetech, ["import", str(file), "--name", "theirs", "--zero-at", "pose", "--yes", "--arm", "left"])
     assert again.exit_code == 0, again.output
-    assert "the former one is kept" in again.output
+    assert "the old file is kept" in again.output
     found = load_calibration("theirs")
     assert (found.zero_at, found.robot, found.joints["gripper"].zero()) == ("pose", "left", 2048)
     assert found.numbers() == numbers
@@ -303,7 +303,7 @@ def test_an_arm_of_lerobot_is_imported_with_its_0_or_with_the_pose(home, tmp_pat
 def test_zero_in_the_middle_of_the_range_asks_for_limits_about_zero():
     measured = Range(1000, 2000, 3000)
     aside = Joint("elbow_flex", 3, 0.0, 3.0)
-    assert "take --zero-at pose" in str(doubtful(aside, measured, "range"))
+    assert "use --zero-at pose" in str(doubtful(aside, measured, "range"))
     assert doubtful(Joint("elbow_flex", 3, -1.5, 1.5), measured, "range") is None
     assert doubtful(attrs.evolve(aside, anchored=True), measured, "range") is None
 

@@ -55,5 +55,5 @@ def test_a_file_in_the_links_place_is_left_alone(tmp_path: Path) -> None:
         check=False,
     )
     assert ran.returncode == 2
-    assert f"{file} is there already and is not a link" in ran.stderr
+    assert f"{file} exists already and is not a link" in ran.stderr
     assert file.read_text() == "mine"

@@ -200,7 +200,7 @@ class TestFaults:
             assert reading.position[2] == before[2]
         assert reading.position[0] > before[0], "the others go on"
         with pytest.raises(
-            NoReply, match=r"servo 3 \(elbow_flex\), present_position: no good reply for 4 ticks; check its power"
+            NoReply, match=r"servo 3 \(elbow_flex\), present_position: no valid reply for 4 ticks; check its power"
         ):
             rig.tick()
         assert rig.follower.counters()["lost_replies"] == 4
@@ -400,7 +400,7 @@ class TestHealth:
         ("bits", "quantities", "message"),
         [
             (0x04, ["temperature"], "servo 5 (wrist_roll): the servo reports overheating; let the arm rest"),
-            (0x20, ["load"], "servo 5 (wrist_roll): the servo reports overload; see whether something blocks"),
+            (0x20, ["load"], "servo 5 (wrist_roll): the servo reports overload; check whether something blocks"),
             (0x09, ["voltage", "current"], "servo 5 (wrist_roll): the servo reports voltage; check the power supply"),
             (0x40, ["unknown error bit 6"], "servo 5 (wrist_roll): the servo reports unknown error bit 6"),
         ],

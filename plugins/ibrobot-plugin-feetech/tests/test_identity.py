@@ -101,7 +101,7 @@ class TestAdapter:
         run = CliRunner().invoke
         absent = run(feetech, ["import", str(file), "--port", "/dev/ttyACM9", "--yes"])
         assert isinstance(absent.exception, HardwareError)
-        assert "no USB adapter is there" in str(absent.exception)
+        assert "there is no USB adapter" in str(absent.exception)
         assert run(feetech, ["import", str(file), "--port", emulator.port, "--yes"]).exit_code == 0
         assert load_calibration(file).adapter == "NEW"
         arm = follower(emulator.port, file)
@@ -146,7 +146,7 @@ class TestPort:
         [
             (2, PortError, "there is no such port; check the USB cable"),
             (13, PortForbidden, "no permission; add yourself to the group"),
-            (16, PortHeld, "another program holds the port; end that program"),
+            (16, PortHeld, "another program holds the port; close that program"),
         ],
     )
     def test_the_remedy_is_that_of_what_happened(

@@ -111,5 +111,5 @@ def test_sync_needs_distinct_servos_and_one_length() -> None:
         protocol.sync_read((1, 1), 56, 2)
     with pytest.raises(ValueError, match="distinct"):
         protocol.sync_read((), 56, 2)
-    with pytest.raises(ValueError, match="one length"):
+    with pytest.raises(ValueError, match="same number of bytes"):
         protocol.sync_write(42, {1: b"\x00", 2: b"\x00\x00"})

@@ -90,5 +90,5 @@ def test_a_damaged_answer_differs_from_none() -> None:
     good = bytearray(protocol.pack(Packet(2, 0, b"\x10\x08")))
     assert answering(bytes(good)).read(2, "present_position") == 0x0810
     good[5] ^= 1
-    with pytest.raises(PacketError, match="servo 2, present_position: the reply came damaged"):
+    with pytest.raises(PacketError, match="servo 2, present_position: the reply is damaged"):
         answering(bytes(good)).read(2, "present_position")

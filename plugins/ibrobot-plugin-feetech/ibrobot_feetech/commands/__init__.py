@@ -1,4 +1,4 @@
-"""`ibrobot feetech …`: setting up, calibrating and looking after the servos of an arm; one file a command."""
+"""`ibrobot feetech …`: sets up, calibrates and inspects the servos of an arm; one file per command."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ibrobot_feetech.commands.torque import torque
 def feetech() -> None:
     """Set up, calibrate and inspect the servos of an SO-101.
 
-    PORT may be left out where exactly one adapter of an SO-101 is plugged in.
+    PORT may be omitted if exactly one SO-101 adapter is plugged in.
     """
 
 

@@ -1,4 +1,4 @@
-"""`ibrobot feetech calibrate`: each joint's middle and range, kept in a file and in the servos."""
+"""`ibrobot feetech calibrate`: measures each joint's middle and range, and saves them in a file and in the servos."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ from ibrobot_feetech.usb import usb_port
 
 @click.command()
 @port_argument
-@click.option("--name", help="Of the calibration, or a path.  [default: so101_follower, or so101_leader]")
-@click.option("--leader", is_flag=True, help="A leader arm: the range of its gripper is its own.")
-@click.option("--robot", metavar="CONFIG", help="Robot YAML with the joints; an SO-101's by default.")
-@click.option("--arm", help="Which arm it is, for the records.  [default: the adapter's serial number]")
+@click.option("--name", help="Name of the calibration, or a path.  [default: so101_follower, or so101_leader]")
+@click.option("--leader", is_flag=True, help="A leader arm, whose gripper has a different range.")
+@click.option("--robot", metavar="CONFIG", help="Robot YAML with the joints; by default an SO-101.")
+@click.option("--arm", help="Name of the arm, for the records.  [default: the adapter's serial number]")
 @click.option(
-    "--full-turn", multiple=True, default=("wrist_roll",), show_default=True, help="Joint that turns all round."
+    "--full-turn", multiple=True, default=("wrist_roll",), show_default=True, help="Joint that can make a full turn."
 )
 @click.option(
     "--zero-at",
@@ -47,22 +47,22 @@ from ibrobot_feetech.usb import usb_port
     help="0 rad: the middle pose, set by hand, or the middle of each range, as in LeRobot.",
 )
 @click.option("--check-signs", is_flag=True, help="Ask to turn each joint in its positive direction.")
-@click.option("--middle-now", is_flag=True, help="The arm stands in its middle pose: do not ask.")
-@click.option("--range-seconds", type=click.FloatRange(0.1), help="Watch the ranges for so long, not until Enter.")
-@click.option("--accept-ranges", is_flag=True, help="Take ranges that do not look like the joints' limits.")
-@click.option("--yes", is_flag=True, help="Torque off, and overwrite, without asking; the former file is kept.")
+@click.option("--middle-now", is_flag=True, help="The arm is in its middle pose: do not ask.")
+@click.option("--range-seconds", type=click.FloatRange(0.1), help="Measure the ranges for this long, not until Enter.")
+@click.option("--accept-ranges", is_flag=True, help="Accept ranges that differ from the joints' limits.")
+@click.option("--yes", is_flag=True, help="Switch torque off and overwrite without asking; the old file is kept.")
 def calibrate(
     port: str | None, name: str | None, leader: bool, robot: str | None, arm: str | None, full_turn: tuple[str, ...],
     zero_at: str, check_signs: bool, middle_now: bool, range_seconds: float | None, accept_ranges: bool, yes: bool,
 ) -> None:  # fmt: skip
     """Calibrate an arm: its middle pose, then the range of each joint, moved by hand.
 
-    Nothing is written, to the servos or to disk, before all is measured.
+    Nothing is written to the servos or to disk before everything is measured.
     """
     name = name or ("so101_leader" if leader else "so101_follower")
     joints = joints_of(robot, name)
     path = calibration_path(name)
-    if path.exists() and not yes and not agree(f"{path} is there already. Calibrate again?", flag="--yes"):
+    if path.exists() and not yes and not agree(f"{path} exists already. Calibrate again?", flag="--yes"):
         raise Declined
     compared = [joint.name for joint in joints if not (leader and joint.name == "gripper")]
     answers = Answers(middle_now, range_seconds, accept_ranges, check_signs)
@@ -74,7 +74,7 @@ def calibrate(
             )
             found = measurement.run()
         except BaseException:
-            echo("Nothing was written; the torque is off, and the servos are calibrated as before.", err=True)
+            echo("Nothing was written. The torque is off, and the servos' calibration is unchanged.", err=True)
             raise
         usb = usb_port(bus.port.path)
         adapter = usb.serial_number if usb is not None else ""
@@ -89,27 +89,27 @@ def calibrate(
 
 
 def backup(path: Path) -> None:
-    """Keep a calibration that is there, under its date."""
+    """Rename an existing calibration to include its date."""
     if path.exists():
         date = datetime.fromtimestamp(path.stat().st_mtime, UTC).strftime("%Y%m%dT%H%M%SZ")
         for suffix in (".json", ".meta.json"):
             former = path.with_suffix(suffix)
             if former.exists():
                 shutil.copy2(former, path.with_name(f"{path.stem}.{date}{suffix}"))
-        echo(f"the former one is kept: {path.with_name(f'{path.stem}.{date}.json')}")
+        echo(f"the old file is kept: {path.with_name(f'{path.stem}.{date}.json')}")
 
 
 def _prepare(bus: FeetechBus, yes: bool) -> None:
-    """Ensure that every servo answers, measures plain positions, and has its torque off."""
+    """Check that every servo answers and is in position mode, and switch its torque off."""
     servos = list(bus.joints)
     for servo in servos:
         if (mode := bus.read(servo, "operating_mode")) != 0:
             raise HardwareError(
-                f"{bus.place(servo, 'operating_mode')}: it is {mode}, and must be 0 (position); "
+                f"{bus.place(servo, 'operating_mode')}: it is {mode} and must be 0 (position); "
                 f"`ibrobot feetech setup-motors --joint {bus.joints[servo]}` sets it"
             )
     if any(bus.sync_read("torque_enable", servos).values()) and not yes:
-        echo("The torque goes off, and the arm falls: hold it.")
+        echo("The torque will be switched off, and the arm will fall: hold it.")
         if not agree("Go on?", flag="--yes", default=True):
             raise Declined
     relax(bus, servos)

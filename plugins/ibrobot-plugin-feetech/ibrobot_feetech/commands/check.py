@@ -1,4 +1,4 @@
-"""`ibrobot feetech check`: whether the servos are as their calibration's file says."""
+"""`ibrobot feetech check`: compares the servos with their calibration file."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _TUNING = ("p_coefficient", "i_coefficient", "d_coefficient")
 
 @attrs.frozen
 class Difference:
-    """A register that is not as it should be."""
+    """A register whose value differs from the expected one."""
 
     joint: str
     servo: int
@@ -34,18 +34,18 @@ class Difference:
     found: str
     wanted: str
     remedy: str
-    """What to do; empty where `--write` does it."""
+    """Remedy; empty if `--write` fixes it."""
     matters: bool = True
 
 
 @click.command()
 @port_argument
-@click.option("--name", default="so101_follower", show_default=True, help="Of the calibration, or a path.")
-@click.option("--robot", metavar="CONFIG", help="Robot YAML with the joints; an SO-101's by default.")
-@click.option("--write", is_flag=True, help="Write the file's values to servos that have others; torque goes off.")
+@click.option("--name", default="so101_follower", show_default=True, help="Name of the calibration, or a path.")
+@click.option("--robot", metavar="CONFIG", help="Robot YAML with the joints; by default an SO-101.")
+@click.option("--write", is_flag=True, help="Write the file's values to servos that differ; switches their torque off.")
 @click.option("--yes", is_flag=True, help="Write without asking.")
 def check(port: str | None, name: str, robot: str | None, write: bool, yes: bool) -> None:
-    """Compare the servos with a calibration; exit 1 with a table of what differs."""
+    """Compare the servos with a calibration. If they differ, print a table and exit with 1."""
     calibration = load_calibration(name, [joint.name for joint in joints_of(robot, name)], tool=TOOL)
     echo(f"{calibration.path}: arm {calibration.robot or 'unnamed'}, made {calibration.date or 'at an unknown time'}")
     echo(zero_text(calibration))
@@ -55,7 +55,7 @@ def check(port: str | None, name: str, robot: str | None, write: bool, yes: bool
         if write and (wrong := [each for each in found if not each.remedy]):
             _print(found)
             servos = sorted({each.servo for each in wrong})
-            echo("The torque of these servos goes off, and the arm may fall: hold it.")
+            echo("The torque of these servos will be switched off, and the arm may fall: hold it.")
             if not (yes or agree(f"Write to servos {', '.join(map(str, servos))}?", flag="--yes")):
                 raise Declined
             for servo in servos:
@@ -65,14 +65,14 @@ def check(port: str | None, name: str, robot: str | None, write: bool, yes: bool
         _print(found)
     if any(each.matters for each in found):
         sys.exit(1)
-    echo(f"{len(calibration.joints)} servos are as the calibration says")
+    echo(f"{len(calibration.joints)} servos match the calibration")
 
 
 def differences(bus: FeetechBus, calibration: Calibration) -> Iterator[Difference]:
-    """Everything that is not as it should be, servo by servo.
+    """Yield all differences, servo by servo.
 
     Raises:
-        FeetechError: when a servo answers wrongly, or the port is gone.
+        FeetechError: if a servo answers wrongly, or the port is gone.
     """
     options = attrs.fields_dict(FollowerOptions)
     versions: dict[str, str] = {}

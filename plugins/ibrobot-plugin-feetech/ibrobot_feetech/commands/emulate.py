@@ -1,4 +1,4 @@
-"""`ibrobot feetech emulate`: a servo bus on a pseudo-terminal, for trying things out without an arm."""
+"""`ibrobot feetech emulate`: emulates a servo bus on a pseudo-terminal, for tests without an arm."""
 
 from __future__ import annotations
 
@@ -35,28 +35,30 @@ _JOINTS = tuple(SO101)
 _GRIPPER = _JOINTS[-1]
 
 _PRIORITY = 70
-"""Above a control process's, which waits for the servos."""
+"""Real-time priority, above that of a control process, which waits for the servos."""
 _SWITCH_S = 2e-4
-"""For how long the physics may keep the servos from answering [s]."""
+"""Longest time for which the physics may delay the servos' answers [s]."""
 
 
 @click.command()
-@click.option("--servos", type=click.IntRange(1, 253), default=6, show_default=True, help="How many, from id 1.")
-@click.option("--baud", type=int, default=1_000_000, show_default=True, help="At which the servos listen at first.")
-@click.option("--throttle", is_flag=True, help="Let bytes take the time that they take on a wire.")
-@click.option("--link", type=click.Path(path_type=Path), help="A path that always leads to the port.")
-@click.option("--calibration", metavar="NAME", help="Give the servos this calibration; made and saved where missing.")
-@click.option("--physics", metavar="CONFIG", help="Let the simulation of this robot YAML move the joints.")
-@click.option("--seed", type=int, default=0, show_default=True, help="Of all chances, and of the scene.")
+@click.option(
+    "--servos", type=click.IntRange(1, 253), default=6, show_default=True, help="How many servos, ids from 1."
+)
+@click.option("--baud", type=int, default=1_000_000, show_default=True, help="Initial baud rate of the servos.")
+@click.option("--throttle", is_flag=True, help="Delay bytes by their time on a real wire.")
+@click.option("--link", type=click.Path(path_type=Path), help="Path of a symbolic link to the port.")
+@click.option("--calibration", metavar="NAME", help="Calibration of the servos; created if it does not exist.")
+@click.option("--physics", metavar="CONFIG", help="Move the joints with the simulation of this robot YAML.")
+@click.option("--seed", type=int, default=0, show_default=True, help="Seed of random faults and of the scene.")
 @click.option("--drop", type=click.FloatRange(0, 1), default=0.0, help="Probability that a reply is lost.")
-@click.option("--corrupt", type=click.FloatRange(0, 1), default=0.0, help="Probability that a byte of one is damaged.")
-@click.option("--duplicate", type=click.FloatRange(0, 1), default=0.0, help="Probability that a reply comes twice.")
-@click.option("--late", type=click.FloatRange(0, 1), default=0.0, help="Probability that one comes late.")
+@click.option("--corrupt", type=click.FloatRange(0, 1), default=0.0, help="Probability that a reply's byte is damaged.")
+@click.option("--duplicate", type=click.FloatRange(0, 1), default=0.0, help="Probability that a reply is sent twice.")
+@click.option("--late", type=click.FloatRange(0, 1), default=0.0, help="Probability that a reply is late.")
 @click.option("--late-s", type=click.FloatRange(min=0), default=0.05, show_default=True, help="How late [s].")
-@click.option("--delay-s", type=click.FloatRange(min=0), default=0.0, help="Further delay of every reply [s].")
-@click.option("--silent", type=int, multiple=True, metavar="ID", help="A servo that neither hears nor answers.")
+@click.option("--delay-s", type=click.FloatRange(min=0), default=0.0, help="Additional delay of every reply [s].")
+@click.option("--silent", type=int, multiple=True, metavar="ID", help="A servo that ignores requests.")
 @click.option("--blocked", type=int, multiple=True, metavar="ID", help="A servo whose joint does not move.")
-@click.option("--overloaded", type=int, multiple=True, metavar="ID", help="A servo that carries all that it can.")
+@click.option("--overloaded", type=int, multiple=True, metavar="ID", help="A servo under its maximum load.")
 @click.option("--disconnected", type=int, multiple=True, metavar="ID", help="A servo without its cable.")
 @click.option("--error", "errors", type=(int, int), multiple=True, metavar="ID BITS", help="Error bits of a servo.")
 def emulate(
@@ -66,13 +68,13 @@ def emulate(
 ) -> None:  # fmt: skip
     """Emulate a bus of STS3215 servos on a pseudo-terminal.
 
-    The first line says the port's path; use it wherever a serial port is asked for. With --physics the simulation of
-    a robot YAML moves the joints, and its scene is served to the run that uses the port. Ctrl-C ends it.
+    The first line of the output is the path of the port. With --physics the simulation of a robot YAML moves the
+    joints, and the run that uses the port can read the simulation's scene. Ctrl-C ends it.
     """
     from ibrobot_feetech.emulator import Emulator
 
     if link is not None and link.exists() and not link.is_symlink():
-        raise click.BadParameter(f"{link} is there already and is not a link: name another path", param_hint="--link")
+        raise click.BadParameter(f"{link} exists already and is not a link: choose another path", param_hint="--link")
     ended = threading.Event()
     on_signals(ended.set)
     config = _config(physics) if physics is not None else None
@@ -100,7 +102,7 @@ def emulate(
 
 
 def _hurry() -> None:
-    """Have the servos answer in time on a busy machine, as those with processors of their own do."""
+    """Raise the priority, so that the servos answer in time on a busy machine, as real ones do."""
     from ibrobot_core.api import go_real_time
 
     sys.setswitchinterval(_SWITCH_S)
@@ -109,14 +111,14 @@ def _hurry() -> None:
 
 
 def _wait(ended: threading.Event, arm: PhysicsArm | None) -> None:
-    told = False
+    announced = False
     while not ended.wait(0.05):
         if arm is not None:
             if arm.error is not None:
                 return
-            if arm.success and not told:
-                told = True
-                echo("success: the scene's task is done")
+            if arm.success and not announced:
+                announced = True
+                echo("success: the task of the scene is done")
 
 
 def _config(name: str) -> RobotConfig:
@@ -139,13 +141,13 @@ def _physics(config: RobotConfig, calibration: Calibration, emulator: Emulator, 
             config, installed_plugins(), Arm(robot.joint_names, calibration, closed), emulator, socket, seed
         )
     except OSError as error:
-        raise click.BadParameter(f"no socket can be made at {socket}: {error}", param_hint="--link") from None
+        raise click.BadParameter(f"cannot create a socket at {socket}: {error}", param_hint="--link") from None
     echo(f"signals on {socket}")
     return arm
 
 
 def _calibrate(emulator: Emulator, name: str | None, joints: Sequence[str], robot: Robot | None) -> Calibration | None:
-    """Give the servos a calibration; None where none was asked for."""
+    """Write a calibration to the servos; returns None if no name is given."""
     if name is None and robot is None:
         return None
     if name is not None and calibration_path(name).exists():
@@ -165,13 +167,13 @@ def _calibrate(emulator: Emulator, name: str | None, joints: Sequence[str], robo
 
 
 def _ranges(joints: Sequence[str], robot: Robot | None) -> dict[str, JointCalibration]:
-    """Ranges as the joints' limits, about the middle of the turn; of an SO-101's size where no robot is given."""
+    """Ranges that match the joints' limits, centred on the turn; those of an SO-101 if no robot is given."""
     limits = {joint.name: (joint.lower, joint.upper) for joint in robot.joints} if robot is not None else SO101
     found = {}
     for number, joint in enumerate(joints, 1):
         lower, upper = limits[joint]
         per_radian = TICKS_PER_TURN / (2 * math.pi)
-        if joint == _GRIPPER:  # anchored at its closed end: about the middle all the same
+        if joint == _GRIPPER:  # anchored at its closed end, but centred on the turn as well
             half = (upper - lower) / 2
             lower, upper = -half, half
         low, high = math.floor(MIDDLE_TICK + lower * per_radian), math.ceil(MIDDLE_TICK + upper * per_radian)

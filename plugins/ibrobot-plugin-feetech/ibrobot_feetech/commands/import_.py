@@ -1,4 +1,4 @@
-"""`ibrobot feetech import`: a calibration of another program, or one whose adapter was replaced."""
+"""`ibrobot feetech import`: imports a calibration of another program, or updates one after a change of adapter."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from ibrobot_feetech.usb import usb_port
 
 @click.command("import")
 @click.argument("file")
-@click.option("--name", help="Of the calibration that is made, or a path.  [default: FILE itself]")
+@click.option("--name", help="Name of the new calibration, or a path.  [default: FILE itself]")
 @click.option(
     "--zero-at",
     type=click.Choice(list(ZERO_AT)),
-    help="0 rad: the pose set by hand, or the middle of each range.  [default: what FILE says; range for LeRobot's]",
+    help="0 rad: the pose set by hand, or the middle of each range.  [default: that of FILE; range for LeRobot's]",
 )
-@click.option("--port", help="Where the arm is plugged in: its adapter is remembered.")
-@click.option("--arm", help="Which arm it is, for the records.")
-@click.option("--robot", metavar="CONFIG", help="Robot YAML with the joints; an SO-101's by default.")
-@click.option("--yes", is_flag=True, help="Overwrite without asking; the former file is kept.")
+@click.option("--port", help="Port of the arm, to store the serial number of its adapter.")
+@click.option("--arm", help="Name of the arm, for the records.")
+@click.option("--robot", metavar="CONFIG", help="Robot YAML with the joints; by default an SO-101.")
+@click.option("--yes", is_flag=True, help="Overwrite without asking; the old file is kept.")
 def import_calibration(
     file: str, name: str | None, zero_at: str | None, port: str | None, arm: str | None, robot: str | None, yes: bool
 ) -> None:
-    """Take the calibration FILE, a path or a name, and say where its 0 rad is. No servo is touched."""
+    """Import the calibration FILE, a path or a name, and set where its 0 rad is. Does not access any servo."""
     path = calibration_path(name or file)
     found = load_calibration(file, [joint.name for joint in joints_of(robot, name)], zero_at=zero_at)
-    if path.exists() and not yes and not agree(f"{path} is there already. Overwrite it?", flag="--yes"):
+    if path.exists() and not yes and not agree(f"{path} exists already. Overwrite it?", flag="--yes"):
         raise Declined
     adapter = found.adapter if port is None else _adapter(port)
     made = attrs.evolve(found, robot=arm or found.robot, adapter=adapter)
@@ -45,5 +45,5 @@ def import_calibration(
 def _adapter(port: str) -> str:
     found = usb_port(port)
     if found is None:
-        raise HardwareError(f"{port}: no USB adapter is there; `ibrobot feetech find-port --list` lists them")
+        raise HardwareError(f"{port}: there is no USB adapter; `ibrobot feetech find-port --list` lists them")
     return found.serial_number

@@ -1,4 +1,4 @@
-"""The joints that a command is about: names, servo ids, limits."""
+"""The joints that a command works on: names, servo ids, limits."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SO101 = {
     "wrist_roll": (-2.74385, 2.74385),
     "gripper": (-0.17453, 1.74533),
 }
-"""Joint -> its limits [rad], in the order of the servos' ids from 1."""
+"""Joint -> limits [rad], in the order of servo ids from 1."""
 
 
 @attrs.frozen
@@ -31,18 +31,18 @@ class Joint:
     upper: float
     """[rad]"""
     anchored: bool = False
-    """Whether its calibrated closed end, rather than its middle pose, says where its angle begins."""
+    """Whether its angle is measured from its calibrated closed end rather than from its middle pose."""
 
 
 def joints_of(robot: str | None = None, calibration: str | None = None) -> list[Joint]:
-    """The joints of a robot's YAML, or the SO-101's; servos have the ids from 1 in that order.
+    """The joints of a robot YAML, or of an SO-101; servos have ids from 1 in that order.
 
     Args:
         robot: a path, or the name of a shipped config.
-        calibration: where the robot has several arms, the one whose options name this calibration.
+        calibration: selects the arm whose options name this calibration, if the robot has several arms.
 
     Raises:
-        ConfigError: when the config cannot be used.
+        ConfigError: if the config is invalid.
     """
     limits: Mapping[str, tuple[float, float]] = SO101
     anchored: tuple[str, ...] = ("gripper",)
@@ -59,10 +59,10 @@ def joints_of(robot: str | None = None, calibration: str | None = None) -> list[
 
 
 def chosen(joints: Sequence[Joint], names: Sequence[str]) -> list[Joint]:
-    """Those of these names; all where none is given.
+    """The joints with these names; all if no name is given.
 
     Raises:
-        BadParameter: for an unknown name.
+        BadParameter: if a name is unknown.
     """
     known = {joint.name: joint for joint in joints}
     for name in names:

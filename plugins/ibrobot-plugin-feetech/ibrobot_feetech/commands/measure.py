@@ -1,4 +1,4 @@
-"""The dialogue that measures an arm: the middle pose, the ranges by hand, the signs. It writes nothing."""
+"""The dialogue that measures an arm: middle pose, ranges and signs. It writes nothing."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from ibrobot_feetech.commands.ranges import Range, doubtful, homing_offset, impo
 
 _PERIOD_S = 0.03
 _TURNED = 40
-"""A joint that moved by as much was turned on purpose [ticks]."""
+"""A joint that moved by this much was turned on purpose [ticks]."""
 
 
 @attrs.frozen
 class Answers:
-    """What the flags answer beforehand."""
+    """Answers given by flags."""
 
     middle_now: bool
     range_seconds: float | None
@@ -33,15 +33,15 @@ class Answers:
 
 
 class Measurement:
-    """One arm, its torque off.
+    """Measures one arm, whose torque is off.
 
     Args:
         bus: an open bus.
-        joints: the arm's.
-        zero_at: where they are at 0 rad, one of `calibration.ZERO_AT`.
-        full_turn: joints that turn all round: their range is all of it.
+        joints: the arm's joints.
+        zero_at: position of 0 rad, one of `calibration.ZERO_AT`.
+        full_turn: joints that can make a full turn, which is then their range.
         compared: joints whose range is compared with their limits.
-        answers: what the flags answer.
+        answers: answers given by flags.
     """
 
     def __init__(
@@ -58,11 +58,11 @@ class Measurement:
         self._kept = {servo: bus.read(servo, "homing_offset") for servo in self._ids}
 
     def run(self) -> dict[str, JointCalibration]:
-        """Go through the dialogue.
+        """Run the dialogue.
 
         Raises:
-            CalibrationError: when what was measured cannot be true.
-            FeetechError: when a servo stops answering.
+            CalibrationError: if the measured values are impossible.
+            FeetechError: if a servo stops answering.
         """
         offsets = self._middle()
         ranges = self._ranges(offsets)
@@ -105,7 +105,7 @@ class Measurement:
             crossed = any(measured.crosses for measured in ranges.values())
             if not wrong and self._accepted(ranges):
                 return ranges
-            refused = "\n".join(wrong) or "the ranges were not accepted; --accept-ranges takes them all the same"
+            refused = "\n".join(wrong) or "the ranges were not accepted; --accept-ranges accepts them"
             if crossed or self._answers.range_seconds is not None:
                 raise CalibrationError(refused)
             echo(refused, err=True)
@@ -119,19 +119,19 @@ class Measurement:
             echo(f"warning: {text}", err=True)
         if not doubts or self._answers.accept_ranges:
             return True
-        return self._answers.range_seconds is None and agree("Take these ranges all the same?", flag="--accept-ranges")
+        return self._answers.range_seconds is None and agree("Use these ranges anyway?", flag="--accept-ranges")
 
     def _reported(self, offsets: Mapping[int, int]) -> dict[int, int]:
-        """Servo id -> what it will report with its new offset [ticks], 0 to 4095."""
+        """Servo id -> position that it will report with its new offset [ticks], 0 to 4095."""
         return {servo: (encoder - offsets[servo]) % TICKS_PER_TURN for servo, encoder in self._encoders().items()}
 
     def _follow(self, offsets: Mapping[int, int], ranges: Mapping[str, Range]) -> None:
-        """Watch the joints being moved, until Enter or the end of the time."""
+        """Record the joints' positions until Enter or the end of the time."""
         seconds = self._answers.range_seconds
         if seconds is None and not interactive():
-            raise Unanswered("Nobody is at a terminal to press Enter; run it in one, or give --range-seconds")
+            raise Unanswered("There is no terminal to press Enter in; run the command in one, or give --range-seconds")
         end = "Enter ends it" if seconds is None else f"for {seconds:g} s"
-        echo(f"Move each joint of the table to both ends ({end}).")
+        echo(f"Move each joint in the table to both ends ({end}).")
         until = time.monotonic() + (seconds if seconds is not None else float("inf"))
         with ExitStack() as stack:
             typed = stack.enter_context(KeyReader()).subscribe() if interactive() else queue.SimpleQueue[str]()
@@ -153,17 +153,17 @@ class Measurement:
             console.print(_rows(self._measured, ranges))
 
     def _is_inverted(self, joint: Joint) -> bool:
-        """Whether radians fall while ticks grow."""
+        """Whether radians decrease as ticks increase."""
         while True:
             before = self._encoders()[joint.servo]
-            wait_for_enter(f"Turn {joint.name} a little, so that its angle grows.", flag="no --check-signs")
+            wait_for_enter(f"Turn {joint.name} a little in its positive direction.", flag="no --check-signs")
             half = TICKS_PER_TURN // 2
             moved = (self._encoders()[joint.servo] - before + half) % TICKS_PER_TURN - half
             if abs(moved) >= _TURNED:
                 break
-            echo(f"error: {joint.name} moved by {moved} ticks only; again", err=True)
+            echo(f"error: {joint.name} moved by only {moved} ticks; try again", err=True)
         if moved < 0:
-            echo(f"warning: {joint.name}: ticks fall while its angle grows: it is stored as inverted", err=True)
+            echo(f"warning: {joint.name}: ticks decrease as its angle increases: it is stored as inverted", err=True)
         return moved < 0
 
 

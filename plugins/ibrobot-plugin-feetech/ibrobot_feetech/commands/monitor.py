@@ -1,4 +1,4 @@
-"""`ibrobot feetech monitor`: what the servos say of themselves, live; it only reads."""
+"""`ibrobot feetech monitor`: shows the state of the servos, live; it only reads."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ _UNITS = {
 
 @click.command()
 @port_argument
-@click.option("--robot", metavar="CONFIG", help="Robot YAML with the joints; an SO-101's by default.")
+@click.option("--robot", metavar="CONFIG", help="Robot YAML with the joints; by default an SO-101.")
 @click.option("--period", type=click.FloatRange(0.01), default=0.1, show_default=True, help="Between readings [s].")
-@click.option("--once", is_flag=True, help="One reading, then end.")
-@click.option("--json", "as_json", is_flag=True, help="A line of JSON each reading.")
+@click.option("--once", is_flag=True, help="Print one reading, then exit.")
+@click.option("--json", "as_json", is_flag=True, help="Print one line of JSON per reading.")
 def monitor(port: str | None, robot: str | None, period: float, once: bool, as_json: bool) -> None:
     """Show position, speed, load, temperature, voltage, current and errors of every servo. Ctrl-C ends it."""
     joints = joints_of(robot)
@@ -63,7 +63,7 @@ def monitor(port: str | None, robot: str | None, period: float, once: bool, as_j
 
 
 def reading(reader: SyncReader, joints: Sequence[Joint]) -> list[dict[str, Any]]:
-    """What each servo says, in units for people; of one that does not answer, only that."""
+    """A reading of each servo, in human units; for a servo that does not answer, only an error."""
     replies = reader.read()
     found: list[dict[str, Any]] = []
     for row, joint in enumerate(joints):

@@ -1,4 +1,4 @@
-"""The argument PORT, and the port where it is left out."""
+"""The argument PORT, and the port to use if it is omitted."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.usb import ADAPTER_VENDOR, usb_ports
 
 _RETRIES = 5
-"""Nothing here is in a hurry."""
+"""Retries of the commands, which have no deadline."""
 
 
 def the_port(port: str | None) -> str:
-    """The port that was given, or the only one that an arm can be on.
+    """The given port, or the only port with an SO-101 adapter.
 
     Raises:
-        HardwareError: when there are none or several.
+        HardwareError: if no port is given, and none or several have such an adapter.
     """
     if port is not None:
         return port
@@ -37,7 +37,7 @@ def the_port(port: str | None) -> str:
 
 
 def port_argument[F: Callable[..., Any]](command: F) -> F:
-    """Adds the argument PORT."""
+    """Add the argument PORT."""
     return click.argument("port", required=False)(command)
 
 
@@ -45,10 +45,10 @@ def port_argument[F: Callable[..., Any]](command: F) -> F:
 def opened(
     port: str | None, baud_rate: int = 1_000_000, joints: Mapping[int, str] | None = None
 ) -> Iterator[FeetechBus]:
-    """An open bus at the port that was given, or at the only one that can be meant.
+    """Open a bus at the given port, or at the only port with an SO-101 adapter.
 
     Raises:
-        HardwareError: when it cannot be opened.
+        HardwareError: if it cannot be opened.
     """
     with wrong_input():
         bus = FeetechBus(the_port(port), baud_rate=baud_rate, joints=joints, retries=_RETRIES)

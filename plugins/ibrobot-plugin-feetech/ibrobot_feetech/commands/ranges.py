@@ -1,7 +1,7 @@
-"""Arithmetic of calibrating: the homing offset, a range that is followed over the encoder's end, what is plausible.
+"""Calibration arithmetic: homing offsets, ranges that cross the end of the encoder, plausibility checks.
 
-Nothing needs to be written to a servo to measure: it reports its encoder's position less the offset that it has, so
-both are known, and with them what it would report with any other offset.
+Measuring does not need to write to a servo. It reports its encoder's position minus its offset. Both are known, so the
+position that it would report with any other offset can be computed.
 """
 
 from __future__ import annotations
@@ -14,32 +14,32 @@ from ibrobot_core.api import MAX_HOMING_OFFSET, MIDDLE_TICK, TICKS_PER_TURN, ZER
 from ibrobot_feetech.commands.joints import Joint
 
 _LEAST_SPAN = 150
-"""A joint that moved by less was not moved [ticks]: 13 degrees."""
+"""A joint that moved by less counts as not moved [ticks]: 13 degrees."""
 _TOLERANCE = 0.25
-"""What part of its limits' span a measured span may differ by."""
+"""Allowed relative difference between a measured span and the span of the limits."""
 _OFF_CENTRE = 230
-"""How far the middle of a range may be from where the limits say [ticks]: 20 degrees."""
+"""Allowed distance between the middle of a range and the middle of the limits [ticks]: 20 degrees."""
 
 
 def homing_offset(joint: str, encoder: int) -> int:
     """The offset with which a servo whose encoder is at `encoder` [ticks] reports the middle.
 
     Raises:
-        CalibrationError: when the servo cannot keep it.
+        CalibrationError: if the offset does not fit into the servo's register.
     """
     offset = encoder - MIDDLE_TICK
     if abs(offset) > MAX_HOMING_OFFSET:
         raise CalibrationError(
-            f"{joint}: in the middle pose its encoder is at {encoder}, which needs an offset of {offset}, and a servo "
-            f"keeps -{MAX_HOMING_OFFSET} to {MAX_HOMING_OFFSET}: move the joint a little; if that does not help, "
-            "mount the servo's horn half a turn on"
+            f"{joint}: in the middle pose its encoder is at {encoder}, which needs an offset of {offset}, but a servo "
+            f"accepts -{MAX_HOMING_OFFSET} to {MAX_HOMING_OFFSET}: move the joint a little; if that does not help, "
+            "turn the servo's horn by half a turn and mount it again"
         )
     return offset
 
 
 @attrs.define
 class Range:
-    """How far a joint was moved, in ticks from the middle's 0 to 4095 and beyond."""
+    """The range over which a joint was moved, in ticks; may extend beyond 0 to 4095."""
 
     least: int
     now: int
@@ -47,59 +47,59 @@ class Range:
 
     @classmethod
     def at(cls, reported: int) -> Range:
-        """A joint that was not moved yet."""
+        """The range of a joint that was not moved yet."""
         return cls(reported, reported, reported)
 
     def follow(self, reported: int) -> None:
-        """Take in a reported position, 0 to 4095: the shorter way from the last one, over the encoder's end or not."""
+        """Add a reported position, 0 to 4095; of the two ways from the last one, the shorter is assumed."""
         half = TICKS_PER_TURN // 2
         self.now += (reported - self.now + half) % TICKS_PER_TURN - half
         self.least, self.greatest = min(self.least, self.now), max(self.greatest, self.now)
 
     @property
     def span(self) -> int:
-        """How far it moved [ticks]."""
+        """Size of the range [ticks]."""
         return self.greatest - self.least
 
     @property
     def crosses(self) -> bool:
-        """Whether it went over the encoder's end."""
+        """Whether it crosses the encoder's end."""
         return self.least < 0 or self.greatest >= TICKS_PER_TURN
 
 
 def impossible(joint: str, measured: Range) -> str | None:
-    """Why a range cannot be used at all; None where it can."""
+    """The reason why a range is unusable; None if it is usable."""
     if measured.crosses:
         return (
             f"{joint}: its range {measured.least} to {measured.greatest} crosses the encoder's end (0/4095): "
-            "the joint was not in the middle of its range in the middle pose; begin again with it there"
+            "the joint was not in the middle of its range in the middle pose; start again with it there"
         )
     if measured.span < _LEAST_SPAN:
-        return f"{joint}: it moved by {measured.span} ticks ({_deg(measured.span):.0f} deg) only: did you move it?"
+        return f"{joint}: it moved by only {measured.span} ticks ({_deg(measured.span):.0f} deg): move it to both ends"
     return None
 
 
 def doubtful(joint: Joint, measured: Range, zero_at: str = ZERO_AT_POSE) -> str | None:
-    """Why a range does not look like the joint's limits; None where it does."""
+    """The reason why a range does not match the joint's limits; None if it does."""
     ticks = TICKS_PER_TURN / (2 * math.pi)
     expected = (joint.upper - joint.lower) * ticks
     if abs(measured.span - expected) > _TOLERANCE * expected:
         return (
             f"{joint.name}: it moved by {_deg(measured.span):.0f} deg, its limits are {_deg(expected):.0f} deg apart; "
-            "was it moved to both ends, and is it the right joint?"
+            "check that it was moved to both ends, and that it is the right joint"
         )
     middle = abs((joint.lower + joint.upper) / 2) * ticks
     if zero_at != ZERO_AT_POSE:
         if joint.anchored or middle <= _OFF_CENTRE:
             return None
         return (
-            f"{joint.name}: the middle of its limits is {_deg(middle):.0f} deg off 0, so 0 deg is not in the middle of "
-            "its range: take --zero-at pose"
+            f"{joint.name}: the middle of its limits is {_deg(middle):.0f} deg off 0, so 0 deg is not the middle of "
+            "its range: use --zero-at pose"
         )
-    # The sign of the ticks is not known here: limits about 0 have their middle near 0 either way.
+    # The sign of the ticks is unknown here, but limits around 0 have their middle near 0 either way.
     off = abs((measured.least + measured.greatest) / 2 - MIDDLE_TICK) - middle
     if not joint.anchored and off > _OFF_CENTRE:
-        return f"{joint.name}: the middle of its range is {_deg(off):.0f} deg off the middle pose, which is its 0 deg"
+        return f"{joint.name}: the middle of its range is {_deg(off):.0f} deg from the middle pose, which is its 0 deg"
     return None
 
 

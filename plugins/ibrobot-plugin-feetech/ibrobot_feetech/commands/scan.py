@@ -1,4 +1,4 @@
-"""`ibrobot feetech scan`: who is on the bus."""
+"""`ibrobot feetech scan`: lists the servos on the bus."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ class BaudRates(click.ParamType):  # type: ignore[type-arg]  # generic in newer 
             return tuple(BAUD_RATES)
         if str(value).isdigit() and int(str(value)) in BAUD_RATES:
             return (int(str(value)),)
-        return self.fail(f"{value!r} is none of: all, {', '.join(map(str, BAUD_RATES))}", param, ctx)
+        return self.fail(f"{value!r} is not one of: all, {', '.join(map(str, BAUD_RATES))}", param, ctx)
 
 
 @click.command()
 @port_argument
-@click.option("--baud", type=BaudRates(), default="1000000", show_default=True, help="Rate at which to ask.")
+@click.option("--baud", type=BaudRates(), default="1000000", show_default=True, help="Baud rate to use.")
 def scan(port: str | None, baud: tuple[int, ...]) -> None:
-    """List the servos that answer: id, model, firmware, baud rate. Exit 1 if there are none."""
+    """List the servos that answer: id, model, firmware, baud rate. Exit with 1 if there are none."""
     names = by_servo(joints_of())
     found = table(">id", "joint of an SO-101", "model", "firmware", ">baud")
     with opened(port, baud[0]) as bus:
@@ -55,19 +55,19 @@ def scan(port: str | None, baud: tuple[int, ...]) -> None:
 
 
 def search(bus: FeetechBus, rates: Sequence[int]) -> dict[tuple[int, int], int]:
-    """Servo id and baud rate -> model, of those that answer.
+    """Find servos; returns (servo id, baud rate) -> model.
 
-    All are asked together at each rate; one by one, which takes a while, only where that finds none at any rate.
+    A broadcast asks all ids at each rate. Only if it finds no servo at any rate, each id is asked, which takes longer.
 
     Raises:
-        PortError: when the port is gone.
+        PortError: if the port is gone.
     """
     for one_by_one in (False, True):
         found: dict[tuple[int, int], int] = {}
         for rate in rates:
             try:
                 bus.port.set_baud_rate(rate)
-            except PortError:  # not every port can have every rate
+            except PortError:  # the port does not support this rate
                 if len(rates) == 1:
                     raise
                 continue

@@ -1,4 +1,4 @@
-"""`ibrobot feetech setup-motors`: gives each servo its id and the baud rate, one at a time."""
+"""`ibrobot feetech setup-motors`: sets each servo's id and baud rate, one at a time."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ _RATE = 1_000_000
 @click.command()
 @port_argument
 @click.option("--joint", "names", multiple=True, metavar="NAME", help="Only this joint; may be repeated.")
-@click.option("--robot", metavar="CONFIG", help="Robot YAML with the joints; an SO-101's by default.")
+@click.option("--robot", metavar="CONFIG", help="Robot YAML with the joints; by default an SO-101.")
 @click.option(
     "--baud", type=BaudRates(), default="all", show_default=True, help="Rates at which to look for the servo."
 )
-@click.option("--yes", is_flag=True, help="The servo is connected: ask nothing; goes with one --joint.")
+@click.option("--yes", is_flag=True, help="The servo is connected: do not ask; needs exactly one --joint.")
 def setup_motors(port: str | None, names: tuple[str, ...], robot: str | None, baud: tuple[int, ...], yes: bool) -> None:
-    """Give each servo its id and 1 Mbaud, with only that one connected; the last joint comes first."""
+    """Set each servo's id and 1 Mbaud, with only one servo connected at a time, beginning with the last joint."""
     if yes and len(names) != 1:
-        raise click.UsageError("--yes goes with exactly one --joint: only one servo may be connected")
+        raise click.UsageError("--yes needs exactly one --joint, because only one servo may be connected")
     every = joints_of(robot)
     with opened(port, joints=by_servo(every)) as bus:
         for joint in reversed(chosen(every, names)):
@@ -56,34 +56,34 @@ def _set_up(bus: FeetechBus, joint: Joint, rates: tuple[int, ...], yes: bool) ->
 
 
 def _the_only_one(bus: FeetechBus, joint: Joint, rates: tuple[int, ...]) -> tuple[int, int]:
-    """Id and baud rate of the servo that is connected.
+    """Id and baud rate of the connected servo.
 
     Raises:
-        HardwareError: when none answers, more than one does, or it is another model.
+        HardwareError: if none or several answer, or it is another model.
     """
     damaged = bus.counters["bad_packets"]
     found = search(bus, rates)
     where = f"{bus.port.path}, {joint.name}"
     if not found:
         if bus.counters["bad_packets"] > damaged:
-            raise HardwareError(f"{where}: the answers are damaged: several servos share an id; connect only one")
+            raise HardwareError(f"{where}: the answers are damaged, so several servos share an id; connect only one")
         raise HardwareError(f"{where}: no servo answers at {len(rates)} baud rates; check its power and its cable")
     if len(found) > 1:
         who = ", ".join(f"id {servo} at {rate} baud" for servo, rate in found)
         raise HardwareError(f"{where}: {len(found)} servos answer ({who}); connect only that of {joint.name}")
     (servo, rate), model = next(iter(found.items()))
     if model != MODEL_STS3215:
-        raise HardwareError(f"{where}: servo {servo} is model {model}, an STS3215 is {MODEL_STS3215}")
+        raise HardwareError(f"{where}: servo {servo} is model {model}; an STS3215 is {MODEL_STS3215}")
     return servo, rate
 
 
 def _assign(bus: FeetechBus, servo: int, rate: int, joint: Joint) -> None:
-    """Give the servo its id and baud rate, position mode besides, and lock them."""
+    """Set and lock the servo's id, baud rate and position mode."""
     bus.port.set_baud_rate(rate)
     bus.write(servo, "torque_enable", 0)
     bus.write(servo, "lock", 0)
     bus.write(servo, "operating_mode", 0)
-    # Whether the acknowledgement comes from the old id or rate or from the new differs between firmwares.
+    # Firmware versions differ in whether the acknowledgement has the old or the new id and rate.
     with suppress(NoReply):
         bus.write(servo, "id", joint.servo)
     with suppress(NoReply):
@@ -92,4 +92,4 @@ def _assign(bus: FeetechBus, servo: int, rate: int, joint: Joint) -> None:
     bus.write(joint.servo, "lock", 1)
     found = bus.read(joint.servo, "id"), bus.read(joint.servo, "baud_rate")
     if found != (joint.servo, BAUD_RATES[_RATE]):
-        raise HardwareError(f"{bus.place(joint.servo)}: it has id and rate code {found} after being set; try again")
+        raise HardwareError(f"{bus.place(joint.servo)}: its id and rate code are {found} after being set; try again")

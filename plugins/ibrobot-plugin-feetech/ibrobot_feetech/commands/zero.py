@@ -1,4 +1,4 @@
-"""Where the joints of a calibration are at 0 rad, in words."""
+"""Describes where the joints of a calibration are at 0 rad."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from ibrobot_core.api import MIDDLE_TICK, TICKS_PER_TURN, ZERO_AT, ZERO_AT_RANGE
 
 
 def zero_text(calibration: Calibration) -> str:
-    """Where 0 rad is, and how far that is from the other convention."""
+    """A description of 0 rad, and its distance from the other convention."""
     off = {
         name: abs(joint.range_middle - MIDDLE_TICK) * 360 / TICKS_PER_TURN for name, joint in calibration.joints.items()
     }

@@ -1,4 +1,4 @@
-"""An emulator of a Feetech servo bus on a pseudo-terminal, for tests and for trying things out without an arm."""
+"""An emulator of a Feetech servo bus on a pseudo-terminal, for tests and for use without an arm."""
 
 from ibrobot_feetech.emulator.faults import Faults
 from ibrobot_feetech.emulator.pty import Emulator

@@ -1,4 +1,4 @@
-"""What goes wrong on an emulated bus and in its servos, by chance or on command."""
+"""Faults of an emulated bus and its servos, random or injected."""
 
 from __future__ import annotations
 
@@ -8,38 +8,38 @@ import numpy as np
 
 @attrs.define
 class Faults:
-    """Faults of replies and servos; any may be changed while the bus is served, and takes effect at the next request.
+    """Faults of replies and servos. They may be changed at any time, and take effect at the next request.
 
-    Probabilities are of each reply, but `corrupt` is of each byte. Servos are named by their ids.
+    Probabilities are per reply, but `corrupt` is per byte. Servos are identified by id.
     """
 
     drop: float = 0.0
     corrupt: float = 0.0
     duplicate: float = 0.0
     late: float = 0.0
-    """Of a reply that comes `late_s` later than it should."""
+    """Probability that a reply is late by `late_s`."""
     late_s: float = 0.05
     delay_s: float = 0.0
-    """Further delay of every reply [s]."""
+    """Additional delay of every reply [s]."""
     silent: set[int] = attrs.field(factory=set)
-    """Servos that neither hear nor answer."""
+    """Servos that ignore requests."""
     errors: dict[int, int] = attrs.field(factory=dict)
     """Servo id -> error bits that it reports."""
     blocked: set[int] = attrs.field(factory=set)
     """Servos whose joints do not move; far from its goal, such a servo goes into overload."""
     overloaded: set[int] = attrs.field(factory=set)
-    """Servos that carry all that they can where they stand; they go into overload."""
+    """Servos under maximum load at their present position; they go into overload."""
     disconnected: set[int] = attrs.field(factory=set)
-    """Servos without their cable: silent, without torque, and without their RAM when they come back."""
+    """Servos without a cable: silent and without torque; their RAM is lost when they return."""
     brown_out: set[int] = attrs.field(factory=set)
-    """Servos that lose their supply for a moment: their RAM and torque are gone. Emptied once that has happened."""
+    """Servos that lose power for a moment, and thus RAM and torque. Cleared after it has happened."""
     counts: dict[str, int] = attrs.field(
         factory=lambda: dict.fromkeys(("replies", "dropped", "corrupted", "duplicated", "late"), 0)
     )
-    """What was done so far."""
+    """Faults injected so far."""
 
     def apply(self, reply: bytes, due_s: float, chance: np.random.Generator) -> list[tuple[float, bytes]]:
-        """The replies that really go out, with the times at which they do [s]."""
+        """The replies that are actually sent, with their times [s]."""
         self.counts["replies"] += 1
         due_s += self.delay_s
         if self.drop and chance.random() < self.drop:

@@ -1,4 +1,4 @@
-"""An emulated arm whose joints a simulation moves: the servos' goals go to the physics, its joints to the encoders."""
+"""An emulated arm whose joints are simulated: the servos' goals drive the physics, and its joints the encoders."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ from ibrobot_feetech.emulator.signals import SignalServer
 
 
 class PhysicsArm:
-    """Advances a simulation in real time and couples it to the servos of an emulator; `start` and `stop` it.
+    """Advances a simulation in real time, coupled to the servos of an emulator, from `start` to `stop`.
 
     Args:
-        config: a robot whose `simulation` section names the physics.
-        registry: where its plugin is.
-        arm: which servo is which joint.
-        emulator: whose servos it moves.
-        socket: where the simulation's signals are served.
-        seed: of the scene.
+        config: a robot with a `simulation` section.
+        registry: the installed plugins.
+        arm: maps servos to joints.
+        emulator: the emulator whose servos it moves.
+        socket: path at which the simulation's signals are served.
+        seed: seed of the scene.
 
     Raises:
-        IbrobotError: when the simulation cannot be made.
+        IbrobotError: if the simulation cannot be created.
     """
 
     def __init__(
@@ -59,12 +59,12 @@ class PhysicsArm:
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, name="emulated physics", daemon=True)
         self.error: IbrobotError | None = None
-        """What ended the simulation, if something did."""
+        """The error that ended the simulation, if any."""
         self.success: bool | None = None
-        """Whether the scene's task is done; None for a scene without one."""
+        """Whether the scene's task is done; None if it has no task."""
 
     def start(self) -> None:
-        """Set the scene up, and the servos where its joints are."""
+        """Set up the scene, move the servos to its joints' positions, and start."""
         self._hardware.connect()
         self._hardware.reset(EpisodeSetup(self._seed))
         self._place()
@@ -73,7 +73,7 @@ class PhysicsArm:
         self._thread.start()
 
     def stop(self) -> None:
-        """End; raises what went wrong in the simulation."""
+        """Stop; raises any error of the simulation."""
         self._ended.set()
         self._thread.join()
         self._server.close()
@@ -98,7 +98,7 @@ class PhysicsArm:
             torque = np.array([servo.torque for servo in servos])
             goals = np.array([servo.goal - servo.get("homing_offset") for servo in servos])
         if torque.any():
-            # A joint without torque among others that have it is led by where it is.
+            # A joint without torque follows its measured position.
             here = hardware.read().position
             hardware.write(np.where(torque, self._arm.radians(goals), here))
         else:
@@ -109,7 +109,7 @@ class PhysicsArm:
         self.success = hardware.success()
 
     def _place(self) -> None:
-        """Put the encoders where the simulation's joints are."""
+        """Set the encoders to the positions of the simulated joints."""
         reading = self._hardware.read()
         arm = self._arm
         ticks = arm.positions(reading.position)

@@ -1,4 +1,4 @@
-"""Serves emulated servos on a real pseudo-terminal, from a thread."""
+"""Serves emulated servos on a pseudo-terminal, in a thread."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from ibrobot_feetech.emulator.wire import Wire
 _SPEED = 5
 """Index of the output speed in a terminal's attributes."""
 _UNASKED = 50
-"""A rate that no host asks for, to tell whether one has asked [baud]."""
+"""A rate that no host uses, to detect whether a host has set one [baud]."""
 _TCGETS2 = 0x802C542A
 _TERMIOS2 = struct.Struct("4I20B2I")
 """A terminal's attributes on Linux, the speeds last: in baud, where `termios` has codes and none for 250,000."""
@@ -35,16 +35,16 @@ _TERMIOS2 = struct.Struct("4I20B2I")
 class Emulator:
     """A bus of emulated servos behind a pseudo-terminal; a context manager.
 
-    Servos move in the clock's time, as far as it has come whenever a byte arrives: with a stepped clock all is
-    deterministic. `lock` is held while a request is carried out; hold it to change several things at once.
+    Servos advance to the clock's present time whenever a byte arrives, so with a stepped clock everything is
+    deterministic. `lock` is held while a request is processed; hold it to change several values atomically.
 
     Args:
-        servos: how many, with the ids 1 to `servos`; or id -> servo.
-        baud_rate: at which the servos listen at first [baud].
-        throttle: whether bytes take the time that they take on a wire.
-        seed: of the chances in `faults`.
-        clock: in whose time the joints move; the machine's when None.
-        link: where to put a symbolic link to the pseudo-terminal, which stays the same over unplugging.
+        servos: number of servos, with ids from 1; or id -> servo.
+        baud_rate: initial rate of the servos [baud].
+        throttle: whether to delay bytes by their time on a real wire.
+        seed: seed of `faults`.
+        clock: clock of the joints' motion; None for the machine's.
+        link: path of a symbolic link to the pseudo-terminal, which stays valid after unplugging.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class Emulator:
         self.faults = Faults()
         self.lock = threading.RLock()
         self.on_request: Callable[[], None] = lambda: None
-        """Called, with the lock held, after every request was carried out."""
+        """Called after every request, with the lock held."""
         self._default_rate = baud_rate
         self._wire = Wire(self.servos, self.faults, throttle=throttle, seed=seed)
         self._clock = clock
@@ -77,13 +77,13 @@ class Emulator:
         self.stop()
 
     def start(self) -> None:
-        """Begin to serve."""
+        """Start serving."""
         self._stop_reader, self._stop_writer = os.pipe()
         self.settle()
         self._plug()
 
     def stop(self) -> None:
-        """End, and raise what went wrong in the serving thread."""
+        """Stop, and raise any error of the serving thread."""
         self.unplug()
         os.close(self._stop_reader)
         os.close(self._stop_writer)
@@ -91,7 +91,7 @@ class Emulator:
             raise self._error
 
     def unplug(self) -> None:
-        """Pull the cable: the port is gone for whoever has it open."""
+        """Unplug the cable: the port disappears for the program that has it open."""
         if self._thread is None:
             return
         os.write(self._stop_writer, b".")
@@ -104,12 +104,12 @@ class Emulator:
             os.close(descriptor)
 
     def replug(self) -> None:
-        """Put the cable back: a port under the same link, or under a new path in `port`."""
+        """Plug the cable in again: the port has the same link, or a new path in `port`."""
         if self._thread is None:
             self._plug()
 
     def settle(self) -> None:
-        """Let the joints move to where they are now, in the clock's time, with no request."""
+        """Advance the joints to the clock's present time without a request."""
         with self.lock:
             self._wire.advance(self._now_s())
 
@@ -122,7 +122,7 @@ class Emulator:
         attributes[_SPEED - 1] = attributes[_SPEED] = termios.B50
         termios.tcsetattr(self._slave, termios.TCSANOW, attributes)
         if self.link is not None:
-            if self.link.is_symlink():  # of an emulator that was killed; anything else is not ours to remove
+            if self.link.is_symlink():  # left by an emulator that was killed; never remove anything else
                 self.link.unlink()
             self.link.symlink_to(self.port)
         self._thread = threading.Thread(target=self._serve, name=f"emulator {self.port}", daemon=True)
@@ -153,11 +153,11 @@ class Emulator:
             while pending and pending[0][0] <= time.monotonic():
                 out += heapq.heappop(pending)[2]
             if out:
-                with suppress(BlockingIOError):  # nobody reads: a wire keeps nothing either
+                with suppress(BlockingIOError):  # without a reader, bytes are lost, as on a wire
                     os.write(self._master, out)
 
     def _wait_ms(self, pending: list[tuple[float, int, bytes]]) -> float | None:
-        """How long to sleep: not at all in the last millisecond before a reply is due, which `poll` cannot measure."""
+        """How long to sleep; 0 in the last millisecond before a reply is due, because `poll` is not precise enough."""
         if not pending:
             return None
         wait_s = pending[0][0] - time.monotonic()
@@ -178,7 +178,7 @@ class Emulator:
         return time.monotonic() if self._clock is None else seconds(self._clock.now_ns())
 
     def _host_rate(self) -> int:
-        """The rate that the host has set on its side; the servos' own until then."""
+        """The rate that the host has set; the servos' rate until then."""
         rate = _baud_rate(self._slave)
         return self._default_rate if rate == _UNASKED else rate
 
@@ -187,4 +187,4 @@ def _baud_rate(terminal: int) -> int:
     """A terminal's output speed [baud]."""
     if sys.platform == "linux":
         return int(_TERMIOS2.unpack(fcntl.ioctl(terminal, _TCGETS2, bytes(_TERMIOS2.size)))[-1])
-    return int(termios.tcgetattr(terminal)[_SPEED])  # elsewhere the codes are the rates
+    return int(termios.tcgetattr(terminal)[_SPEED])  # on other systems the codes are the rates

@@ -7,16 +7,16 @@ import math
 from ibrobot_feetech.registers import MODEL_STS3215, STS3215, Register, register
 
 TURN = 4096
-"""Ticks of one turn."""
+"""Ticks per turn."""
 _LOCK = register("lock").address
 _EPROM_END = register("torque_enable").address
 _TORQUE = register("torque_enable").address
 _MIDDLE = 128
-"""Written to `torque_enable`, it makes the present position the middle of the turn."""
+"""Writing it to `torque_enable` makes the present position the middle of the turn."""
 _MAX_VELOCITY = 3073
-"""What the motor can do at 12 V without load [ticks/s]: 0.222 s for 60 degrees."""
+"""Maximum speed at 12 V without load [ticks/s]: 0.222 s for 60 degrees."""
 _DUTY_PER_TICK = 8.0
-"""Of the motor, for each tick between goal and joint, with a P coefficient of 32 [0.1 %]."""
+"""Duty cycle per tick between goal and joint, with a P coefficient of 32 [0.1 %]."""
 _UNDERVOLTAGE, _OVERHEATING, _OVERLOAD = 0x01, 0x04, 0x20
 _MEASURED = ("present_voltage", "present_temperature")
 
@@ -56,13 +56,13 @@ _DEFAULTS = {
 
 
 class EmulatedServo:
-    """One servo. Time is passed in: `advance` moves the joint; nothing here sleeps.
+    """One servo. The caller passes in time with `advance`, which moves the joint; nothing sleeps.
 
-    The table is kept as the servo keeps it, raw; positions in it are the encoder's less the homing offset.
+    The table holds raw values, as in the servo; positions are the encoder's minus the homing offset.
 
     Args:
-        servo: its id.
-        encoder: where the joint is at first [ticks], 0 to 4095.
+        servo: servo id.
+        encoder: initial position of the joint [ticks], 0 to 4095.
     """
 
     def __init__(self, servo: int, encoder: float = 2048.0) -> None:
@@ -72,25 +72,25 @@ class EmulatedServo:
         self.set("id", servo)
         self._eprom = bytes(self.table[:_EPROM_END])
         self.encoder = encoder
-        """Where the joint is [ticks], before the homing offset."""
+        """Position of the joint [ticks], without the homing offset."""
         self.velocity = 0.0
         """[ticks/s]"""
         self.blocked = False
-        """Whether something holds the joint where it is."""
+        """Whether the joint is blocked."""
         self.burdened = False
-        """Whether the joint carries all that the motor can, wherever its goal is."""
+        """Whether the motor is under maximum load, independent of the goal."""
         self._driven = False
         self._heavy_s = 0.0
         self._overload = False
         self.errors = 0
-        """Error bits forced upon it."""
+        """Injected error bits."""
         self._prepared: tuple[int, bytes] | None = None
         self._publish()
         self.set("goal_position", self.get("present_position"))
 
     @property
     def id(self) -> int:
-        """Its id, as others address it."""
+        """Its id in the table."""
         return self.table[STS3215["id"].address]
 
     @property
@@ -104,20 +104,20 @@ class EmulatedServo:
         return self.table[_TORQUE] == 1
 
     def get(self, name: str) -> int:
-        """A register's value, decoded."""
+        """The decoded value of a register."""
         found = register(name)
         return found.decode(bytes(self.table[found.address : found.address + found.size]))
 
     def set(self, name: str, value: int) -> None:
-        """Set a register, read-only or locked as it may be."""
+        """Set a register, even if it is read-only or locked."""
         found = register(name)
         self.table[found.address : found.address + found.size] = found.encode(value)
 
     def turn(self, encoder: float) -> None:
-        """Somebody moves the joint by hand to an encoder position [ticks]; only with torque off.
+        """Move the joint by hand to an encoder position [ticks]; only with torque off.
 
         Raises:
-            ValueError: with torque on.
+            ValueError: if the torque is on.
         """
         if self.torque:
             raise ValueError(f"servo {self.id} has torque on: it cannot be turned by hand")
@@ -125,7 +125,7 @@ class EmulatedServo:
         self._publish()
 
     def drive(self, encoder: float, velocity: float) -> None:
-        """Put the joint where physics outside of the servo have it [ticks, ticks/s]; from now on only they move it."""
+        """Set position and velocity from external physics [ticks, ticks/s], which alone moves the joint from now on."""
         self._driven = True
         self.encoder, self.velocity = encoder, velocity
         self._publish()
@@ -135,7 +135,7 @@ class EmulatedServo:
         return bytes(self.table[address : address + size])
 
     def write(self, address: int, content: bytes) -> None:
-        """Write as the host does: read-only registers keep their values, and EPROM does while it is locked."""
+        """Write as a host does: read-only registers and locked EPROM keep their values."""
         for offset, value in enumerate(content):
             self._write_byte(address + offset, value)
         touched = range(address, address + len(content))
@@ -146,17 +146,17 @@ class EmulatedServo:
         self._publish()
 
     def prepare(self, address: int, content: bytes) -> None:
-        """Keep a write until `act`."""
+        """Store a write until `act`."""
         self._prepared = address, content
 
     def act(self) -> None:
-        """Carry out what was prepared."""
+        """Execute the prepared write."""
         if self._prepared is not None:
             prepared, self._prepared = self._prepared, None
             self.write(*prepared)
 
     def brown_out(self) -> None:
-        """Lose power for a moment: RAM and torque are gone, EPROM stays."""
+        """Lose power for a moment: RAM and torque are lost, EPROM is kept."""
         measured = {name: self.get(name) for name in _MEASURED}
         self.table[:] = EmulatedServo(self.id, self.encoder).table
         self.table[:_EPROM_END] = self._eprom
@@ -168,7 +168,7 @@ class EmulatedServo:
         self.set("goal_position", self.get("present_position"))
 
     def advance(self, elapsed_s: float) -> None:
-        """Let time pass [s]: the joint moves towards its goal, and too much load for too long is an overload."""
+        """Advance by `elapsed_s` [s]: the joint moves towards its goal, and lasting high load causes an overload."""
         if not self._driven:
             if self.torque and not self.blocked and self.get("operating_mode") == 0:
                 self._follow(elapsed_s)
@@ -179,7 +179,7 @@ class EmulatedServo:
 
     @property
     def goal(self) -> float:
-        """Where the motor wants the joint [ticks of the encoder], within the limits of its table."""
+        """The motor's goal [encoder ticks], within the limits of its table."""
         low, high = self.get("min_position_limit"), self.get("max_position_limit")
         goal = self.get("goal_position")
         if low < high:
@@ -187,7 +187,7 @@ class EmulatedServo:
         return goal + self.get("homing_offset")
 
     def _follow(self, elapsed_s: float) -> None:
-        """Along a trapezoid of velocity towards the goal; exact in the way, not in the last few ticks' timing."""
+        """Move towards the goal with a trapezoidal velocity profile; the timing of the end is approximate."""
         way = self._way()
         if abs(way) < 0.5 and abs(self.velocity) < 50:
             self.encoder, self.velocity = self.encoder + way, 0.0
@@ -213,7 +213,7 @@ class EmulatedServo:
         return self.goal - self.encoder
 
     def _protect(self, elapsed_s: float) -> None:
-        """Go into overload as the table says; only torque off ends it, and an instant later the error bit."""
+        """Go into overload according to the table. Only torque off ends it and, a moment later, the error bit."""
         if not self.torque:
             self._heavy_s, self._overload = 0.0, False
             return
@@ -222,7 +222,7 @@ class EmulatedServo:
         self._overload = self._overload or (heavy and self._heavy_s >= 0.01 * self.get("protection_time"))
 
     def _duty(self) -> float:
-        """What the motor is driven with [0.1 %], signed."""
+        """Duty cycle of the motor [0.1 %], signed."""
         if not self.torque:
             return 0.0
         most = min(self.get("max_torque"), self.get("torque_limit"))
@@ -244,7 +244,7 @@ class EmulatedServo:
         self.table[address] = value
 
     def _publish(self) -> None:
-        """Bring the read-only registers up to date."""
+        """Update the read-only registers."""
         reported = round(self.encoder) - self.get("homing_offset")
         # With bit 4 of `phase` clear the reported position stays within one turn.
         if not self.get("phase") & 0x10:

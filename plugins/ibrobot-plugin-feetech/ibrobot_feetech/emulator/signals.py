@@ -18,11 +18,11 @@ _LONGEST = 1 << 16
 
 
 class SignalServer:
-    """Sends every value of a signal, as float64, to those who asked for its topic. One that is slow misses some.
+    """Sends every value of a signal, as float64, to the clients of its topic. Slow clients miss some values.
 
     Args:
-        path: of the socket; one that nobody serves any more is replaced.
-        signals: what there is.
+        path: path of the socket; a stale socket is replaced.
+        signals: the available signals.
     """
 
     def __init__(self, path: Path, signals: Sequence[Signal]) -> None:
@@ -51,7 +51,7 @@ class SignalServer:
                 self._send(client, signal.topic, values.tobytes())
 
     def close(self) -> None:
-        """End; the socket is gone."""
+        """Stop, and remove the socket."""
         for client in self._clients:
             client.close()
         self._clients.clear()
@@ -72,7 +72,7 @@ class SignalServer:
 
 
 class EmulatedSignal(Sensor):
-    """Publishes a signal of the simulation behind an emulated arm under its own topic."""
+    """Publishes a signal of the simulation that moves an emulated arm, under the signal's topic."""
 
     message_type = Float64MultiArray
 

@@ -1,4 +1,4 @@
-"""The emulated wire: bytes of the host in, replies of the servos out, each with the time at which it is due."""
+"""The emulated wire: takes the host's bytes and returns the servos' replies, with the times at which they are due."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ibrobot_feetech.protocol import BROADCAST, Instruction, Packet
 from ibrobot_feetech.registers import BAUD_RATES
 
 _BITS = 10
-"""Bits on the wire for a byte: start, eight, stop."""
+"""Bits on the wire per byte: start, eight data bits, stop."""
 _RATES = {code: rate for rate, code in BAUD_RATES.items()}
 
 
@@ -22,9 +22,9 @@ class Wire:
 
     Args:
         servos: id -> servo, as wired; a servo answers to the id in its table.
-        faults: what goes wrong.
-        throttle: whether bytes take the time that they take on a wire.
-        seed: of the chances.
+        faults: faults to inject.
+        throttle: whether to delay bytes by their time on a real wire.
+        seed: seed of the faults.
     """
 
     def __init__(self, servos: Mapping[int, EmulatedServo], faults: Faults, *, throttle: bool, seed: int) -> None:
@@ -37,7 +37,7 @@ class Wire:
         self._disconnected: set[int] = set()
 
     def advance(self, now_s: float) -> None:
-        """Let the joints move until `now_s` [s], under the injected faults."""
+        """Advance the joints to `now_s` [s], with the injected faults."""
         elapsed_s = now_s - self._now_s if self._now_s is not None else 0.0
         self._now_s = now_s
         faults = self._faults
@@ -52,10 +52,10 @@ class Wire:
             servo.advance(max(0.0, elapsed_s))
 
     def receive(self, received: bytes, baud_rate: int) -> list[tuple[float, bytes]]:
-        """Take bytes of the host in, sent at `baud_rate`.
+        """Process bytes from the host, sent at `baud_rate`.
 
         Returns:
-            Seconds from now, and the bytes that go out then, in the order of sending.
+            Delays from now [s] and the bytes to send, in order.
         """
         replies: list[tuple[float, bytes]] = []
         for packet in self._scanner.feed(received):
@@ -73,7 +73,7 @@ class Wire:
         return replies
 
     def _hearing(self, baud_rate: int) -> dict[int, EmulatedServo]:
-        """Those that hear the host, by the ids in their tables."""
+        """The servos that receive the host's bytes, by the ids in their tables."""
         silent = self._faults.silent | self._faults.disconnected
         return {
             servo.id: servo
@@ -82,9 +82,9 @@ class Wire:
         }
 
     def _carry_out(self, packet: Packet, servos: dict[int, EmulatedServo]) -> list[tuple[int, bytes]]:
-        """Do what a packet asks for; returns which ids answer, in order, with what.
+        """Execute a packet; returns the answers and their ids, in order.
 
-        A servo whose id or status return level is changed answers as it would have before.
+        A servo whose id or status return level changes still answers with the old setting.
         """
         if packet.code == Instruction.SYNC_READ and len(packet.parameters) > 2:
             address, size, *ids = packet.parameters
@@ -110,12 +110,12 @@ class Wire:
 
 
 def _answered(servo: EmulatedServo, packet: Packet) -> bool:
-    """Whether the servo's status return level has it answer; at level 0 it acknowledges no writes."""
+    """Whether the servo answers, according to its status return level; at level 0 it does not acknowledge writes."""
     return servo.get("status_return_level") != 0 or packet.code in (Instruction.PING, Instruction.READ)
 
 
 def _one(servo: EmulatedServo, packet: Packet) -> bytes | None:
-    """Do what a packet asks of one servo; the parameters of its answer, None where there is none."""
+    """Execute a packet on one servo; returns the parameters of its answer, or None without an answer."""
     parameters = packet.parameters
     match packet.code:
         case Instruction.PING:
