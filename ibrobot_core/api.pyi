@@ -70,14 +70,12 @@ from ibrobot_core.interfaces import (
     Recorder as Recorder,
     Sensor as Sensor,
     Severity as Severity,
-    SharedTopic as SharedTopic,
     Signal as Signal,
     SimulatedHardware as SimulatedHardware,
     Teleop as Teleop,
     TeleopCommand as TeleopCommand,
     Tensors as Tensors,
     TopicSummary as TopicSummary,
-    TopicTransport as TopicTransport,
     Torque as Torque,
     Transport as Transport,
     Viewer as Viewer,
@@ -162,6 +160,7 @@ from ibrobot_core.launch.runtime import Runtime as Runtime
 from ibrobot_core.cli.run import run_robot as run_robot
 from ibrobot_core.cli.options import run_options as run_options, run_overrides as run_overrides
 from ibrobot_core.run_hooks import RunHooks as RunHooks
+from ibrobot_core.launch.transport import TransportLink as TransportLink
 from ibrobot_core.units import (
     LEROBOT_MODES as LEROBOT_MODES,
     NORM_MODES as NORM_MODES,

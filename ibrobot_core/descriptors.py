@@ -32,6 +32,7 @@ if TYPE_CHECKING:
         Viewer,
     )
     from ibrobot_core.launch.session import Session
+    from ibrobot_core.launch.transport import TransportLink
     from ibrobot_core.messages import CompressedImage, Image
     from ibrobot_core.robot import Robot
 
@@ -151,12 +152,18 @@ class PlannerDescriptor(Descriptor["Planner"]):
 
 @attrs.frozen
 class TransportDescriptor(Descriptor["Transport"]):
-    """A transport; `topics` says that it is a `TopicTransport`."""
+    """A transport."""
 
-    topics: bool = False
     listen: Callable[[Sequence[str]], Mapping[str, Any]] | None = None
     """Endpoints -> the options with which a server listens there and connects to nobody; at an endpoint of this machine
     alone where none is given. None where servers cannot use this transport."""
+    used: Callable[[Any], bool] = attrs.field(default=lambda options: False, kw_only=True)
+    """Whether a run with these options uses the transport even if no mode needs it."""
+    components: Callable[[Any, Session, TransportLink], Sequence[Component]] = attrs.field(
+        default=lambda options, session, link: (), kw_only=True
+    )
+    """Options, run and its transport -> what the options add to a run that uses the transport, e.g. components that
+    send topics to other machines. Each needs `link.name`; from its start on, `link.transport` is open."""
 
 
 @attrs.frozen

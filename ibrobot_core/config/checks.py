@@ -15,7 +15,6 @@ from ibrobot_core.config.schema import (
     ExecutorConfig,
     HardwareConfig,
     InferenceConfig,
-    Share,
 )
 from ibrobot_core.config.structure import ParsedComponent, ParsedSections
 from ibrobot_core.config.yaml_nodes import Document, Key
@@ -288,25 +287,13 @@ class Checks:
 
     def _transport(self) -> None:
         part = self.sections.transport
-        if part is None:
+        if part is None or self.communicates or part.descriptor.type == "local":
             return
-        if part.component.share == Share():
-            if not self.communicates:
-                self._used(part)
-            return
-        if not (isinstance(part.descriptor, TransportDescriptor) and part.descriptor.topics):
-            does = example_type("transport")
-            message = f"transport {part.descriptor.type!r} carries no topics to other machines; {does} does"
-            self.document.add(("transport", "share"), message)
-
-    def _used(self, part: ParsedComponent[Any]) -> None:
         modes = (self.sections.plain.get("control_modes") or {}).values()
         distributed = any(mode.inference and mode.inference.execution_mode == "distributed" for mode in modes)
-        if part.descriptor.type != "local" and not distributed:
-            message = (
-                f"nothing would use {part.descriptor.type!r}; a model does with execution_mode: distributed, and "
-                "topics under share"
-            )
+        assert isinstance(part.descriptor, TransportDescriptor)
+        if not (distributed or part.descriptor.used(part.component.options)):
+            message = f"nothing would use {part.descriptor.type!r}; a model does with execution_mode: distributed"
             self.document.add((*part.key, "type"), message)
 
     def _recording(self) -> None:

@@ -395,39 +395,12 @@ class RecordingConfig(ComponentConfig):
         return Path(self.root) / self.dataset
 
 
-def _check_topics(instance: Any, attribute: attrs.Attribute[tuple[str, ...]], value: tuple[str, ...]) -> None:
-    for topic in value:
-        if not topic.startswith("/"):
-            raise ValueError(f"{topic!r} is not a full topic name, did you mean '/{topic}'?")
-        if value.count(topic) > 1:
-            raise ValueError(f"{topic} is given twice")
-
-
-@documented
-@attrs.frozen
-class Share:
-    """Topics shared with other machines."""
-
-    publish: tuple[str, ...] = option(
-        (), validator=_check_topics, help="topics of this robot for others, e.g. /joint_states"
-    )
-    subscribe: tuple[str, ...] = option(
-        (), validator=_check_topics, help="topics of other machines for this robot's bus, e.g. /force_torque"
-    )
-
-    def __attrs_post_init__(self) -> None:
-        if both := [topic for topic in self.publish if topic in self.subscribe]:
-            raise ValueError(f"{both[0]} is both published and subscribed; it can only go one way")
-
-
 @documented
 @attrs.frozen
 class TransportConfig(ComponentConfig):
     """How processes and machines talk."""
 
     plugin_kind = "transport"
-
-    share: Share = option(factory=Share, help="topics shared with other machines")
 
 
 @documented

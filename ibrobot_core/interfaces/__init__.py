@@ -33,5 +33,5 @@ from ibrobot_core.interfaces.reader import EpisodeAddress, EpisodeReader, Episod
 from ibrobot_core.interfaces.recorder import EpisodeEnd, EpisodeStart, Recorder
 from ibrobot_core.interfaces.sensor import Sensor
 from ibrobot_core.interfaces.teleop import Teleop, TeleopCommand
-from ibrobot_core.interfaces.transport import Handler, Payload, SharedTopic, TopicTransport, Transport
+from ibrobot_core.interfaces.transport import Handler, Payload, Transport
 from ibrobot_core.interfaces.viewer import Viewer

@@ -5,10 +5,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 
-import attrs
-
-from ibrobot_core.messages import Message
-
 type Payload = bytes | bytearray | memoryview
 """Bytes, flat. What was received is not to be written to, and lives as long as a reference to it exists."""
 
@@ -78,46 +74,3 @@ class Transport(ABC):
 
     def close(self) -> None:
         """End all subscriptions, services and watches; every later call is a TransportError. Safe to call twice."""
-
-
-@attrs.frozen
-class SharedTopic:
-    """A shared topic: its name and message type, and how many publish it and listen."""
-
-    name: str
-    type: str
-    publishers: int
-    subscribers: int
-
-
-class TopicTransport(Transport):
-    """A transport that also carries messages, between the buses of several machines."""
-
-    @abstractmethod
-    def publish_message(self, topic: str, message: Message, *, latched: bool = False) -> None:
-        """Send a message to all who listen to `topic`; of a latched topic also the newest to who comes later.
-
-        It may wait for the network: call it from a thread that has nothing else to do.
-
-        Raises:
-            TransportError: when closed, or the topic carries another type.
-            IbrobotError: when the message cannot be sent.
-        """
-
-    @abstractmethod
-    def subscribe_messages(self, topic: str, callback: Callable[[Message], object]) -> Callable[[], None]:
-        """Call `callback` with every message on `topic`, of whatever type; returns a function that ends it.
-
-        What nobody can read is passed over, with a warning.
-
-        Raises:
-            TransportError: when closed.
-        """
-
-    @abstractmethod
-    def shared_topics(self, timeout_s: float) -> list[SharedTopic]:
-        """All topics that are shared now, by name, waiting up to `timeout_s` [s] for the answer.
-
-        Raises:
-            TransportError: when closed, or not connected.
-        """

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from functools import partial
 from typing import Any
 
 import attrs
 
 from ibrobot_core.component import CONTROL, Component
 from ibrobot_core.config.missing import unavailable_modes
-from ibrobot_core.config.schema import ActionSpec, ObservationSpec, PeripheralConfig, Share
+from ibrobot_core.config.schema import ActionSpec, ObservationSpec, PeripheralConfig
 from ibrobot_core.contract.specs import Contract
-from ibrobot_core.descriptors import SectionDescriptor
+from ibrobot_core.descriptors import SectionDescriptor, TransportDescriptor
 from ibrobot_core.errors import ComponentFailed, NotSupported
-from ibrobot_core.launch.absence import describe, refuse
+from ibrobot_core.launch.absence import describe
 from ibrobot_core.launch.control import ControlComponent
-from ibrobot_core.launch.outputs.sharing import PublishedTopic, SubscribedTopics
 from ibrobot_core.launch.outputs.status import Status
 from ibrobot_core.launch.outputs.transforms import Transforms
 from ibrobot_core.launch.outputs.viewer import ViewerWorker
@@ -100,14 +100,6 @@ def _sensors(session: Session) -> list[PeripheralConfig]:
     return [peripheral for name, peripheral in session.config.peripherals.items() if name not in absent]
 
 
-def _refuse_absent(session: Session, share: Share) -> None:
-    """Refuse a run that would record or publish the messages of a sensor that cannot run here."""
-    refuse(session.absent, "transport.share.publish", share.publish.__contains__)
-    if (recording := session.config.recording) is not None:
-        contract = Contract.from_config(session.config)
-        refuse(session.absent, "the recording", lambda topic: is_kept(topic, recording, contract))
-
-
 def build_plan(session: Session) -> LaunchPlan:
     """All components of a run, in the order in which they can start.
 
@@ -118,8 +110,6 @@ def build_plan(session: Session) -> LaunchPlan:
     config = session.config
     modes = config.control_modes.values()
     distributed = any(mode.inference and mode.inference.execution_mode == "distributed" for mode in modes)
-    share = config.transport.share if config.transport is not None else Share()
-    used = distributed or share != Share()
     specs: tuple[ObservationSpec | ActionSpec, ...] = (*config.contract.observations, *config.contract.actions)
     foreign = next((spec for spec in specs if spec.foreign), None)
     if foreign is not None and (config.recording is not None or any(mode.inference for mode in modes)):
@@ -133,10 +123,16 @@ def build_plan(session: Session) -> LaunchPlan:
             f"contract.signals: {unknown.key}: {unknown.type} cannot be recorded here, but only be read from bags; "
             f"known are: {', '.join(MESSAGE_TYPES)}"
         )
-    if session.request.lockstep and share.subscribe:
-        raise NotSupported("transport.share.subscribe: in lockstep nothing may come from other machines, at any time")
-    _refuse_absent(session, share)
-    link = TransportLink(session, config.transport) if config.transport is not None and used else None
+    if config.recording is not None:
+        kept = partial(is_kept, recording=config.recording, contract=Contract.from_config(config))
+        session.refuse_absent("the recording", kept)
+    link = None
+    if (transport := config.transport) is not None:
+        descriptor = session.registry.find("transport", transport.type)
+        assert isinstance(descriptor, TransportDescriptor)
+        if distributed or descriptor.used(transport.options):
+            link = TransportLink(session, transport)
+            shared = descriptor.components(transport.options, session, link)
     added = mode_components(session, session.mode, link)
     components: list[Component] = [link] if link is not None else []
     components += added.models
@@ -155,8 +151,7 @@ def build_plan(session: Session) -> LaunchPlan:
     if config.viewer is not None:
         components.append(ViewerWorker(session, config.viewer, (CONTROL,)))
     if link is not None:
-        components += [PublishedTopic(session, link, topic) for topic in share.publish]
-        components += [SubscribedTopics(session, link, share.subscribe)] if share.subscribe else []
+        components += shared
     worker = None
     if config.simulated and isinstance(added.source, PolicySource):
         worker = SimulatedEpisodes(session, episodes, (added.source.name,))

@@ -21,7 +21,7 @@ from ibrobot_core.config.schema import ComponentConfig, ControlMode
 from ibrobot_core.control.link import ControlState, PlanRecord
 from ibrobot_core.errors import ComponentFailed
 from ibrobot_core.interfaces import Context, JointReading
-from ibrobot_core.launch.absence import AbsentSensor, absent_sensors
+from ibrobot_core.launch.absence import AbsentSensor, absent_sensors, refuse
 from ibrobot_core.plugins import Registry
 from ibrobot_core.robot import Vector
 
@@ -188,6 +188,18 @@ class Session:
             MissingDependency: as `absent_sensors`.
         """
         return absent_sensors(self.config, self.registry)
+
+    def refuse_absent(self, user: str, needs: Callable[[str], bool]) -> None:
+        """Refuse a part of the run that needs the messages of a sensor that cannot run here.
+
+        Args:
+            user: what it is, for the error.
+            needs: whether it needs the messages on a topic.
+
+        Raises:
+            MissingDependency: with the remedy.
+        """
+        refuse(self.absent, user, needs)
 
     @property
     def control(self) -> ControlHost:

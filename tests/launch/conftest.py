@@ -20,7 +20,8 @@ from ibrobot_core.plugins import discover
 if TYPE_CHECKING:
     from conftest import Site
 
-collect_ignore = [] if find_spec("ibrobot_serve") else ["test_distributed.py"]
+NEEDS = {"test_distributed.py": "ibrobot_serve", "test_sharing.py": "ibrobot_zenoh"}
+collect_ignore = [name for name, package in NEEDS.items() if find_spec(package) is None]
 
 ROBOT = textwrap.dedent("""\
     robot:

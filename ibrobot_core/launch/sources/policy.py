@@ -15,7 +15,6 @@ from ibrobot_core.inference.policy_units import PolicyInItsUnits
 from ibrobot_core.inference.process import ProcessEngine
 from ibrobot_core.inference.remote import RemoteEngine
 from ibrobot_core.interfaces import PictureCodec, Policy
-from ibrobot_core.launch.absence import refuse
 from ibrobot_core.launch.models import check_model
 from ibrobot_core.launch.session import ActingPolicy, Session
 from ibrobot_core.launch.sources.source_worker import SourceWorker
@@ -69,7 +68,7 @@ class LoadedModel(Component):
         policy = session.make("policy", model, model.name)
         units = check_model(session.config, model, policy.spec, session.log)
         topics = {part.topic for key in policy.spec.observations for part in self.contract.parts(key)}
-        refuse(session.absent, f"model {model.name!r}", topics.__contains__)
+        session.refuse_absent(f"model {model.name!r}", topics.__contains__)
         if units is not None:
             policy = PolicyInItsUnits(policy, units)
         self._policy = policy

@@ -6,12 +6,12 @@ from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 from ibrobot_core.api import Command, DecoderDescriptor, TransportDescriptor, hookimpl
-from ibrobot_zenoh.options import ZenohOptions, server_options
+from ibrobot_zenoh.options import Share, ZenohOptions, server_options
 
 if TYPE_CHECKING:
     import click
 
-    from ibrobot_core.api import CompressedImage, Context, Image, Transport
+    from ibrobot_core.api import Component, CompressedImage, Context, Image, Session, Transport, TransportLink
 
 
 def _zenoh(options: Any, ctx: Context) -> Transport:
@@ -20,11 +20,18 @@ def _zenoh(options: Any, ctx: Context) -> Transport:
     return ZenohTransport(options, ctx)
 
 
+def _components(options: ZenohOptions, session: Session, link: TransportLink) -> list[Component]:
+    from ibrobot_zenoh.sharing import components
+
+    return components(options.share, session, link)
+
+
 @hookimpl
 def ibrobot_transports() -> Iterable[TransportDescriptor]:
     """Between machines."""
     yield TransportDescriptor(
-        type="zenoh", options=ZenohOptions, make=_zenoh, default=True, topics=True, listen=server_options,
+        type="zenoh", options=ZenohOptions, make=_zenoh, default=True, listen=server_options, components=_components,
+        used=lambda options: options.share != Share(),
         summary="between machines; ROS 2 nodes with rmw_zenoh join in",
     )  # fmt: skip
 

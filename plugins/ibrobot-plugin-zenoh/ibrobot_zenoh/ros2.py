@@ -10,7 +10,7 @@ from collections.abc import Iterable
 import attrs
 from ibrobot_ros2 import type_hash
 
-from ibrobot_core.api import SharedTopic, TransportError
+from ibrobot_core.api import TransportError
 
 ADMIN = "@ros2_lv"
 NO_HASH = "TypeHashNotSupported"
@@ -22,6 +22,16 @@ _ENDPOINTS = {"MP": "publisher", "MS": "subscriber"}
 _TOKEN_PARTS = 13
 _QOS = ":{durability}:,{depth}:,:,:,,"
 """Reliable; empty is the default of each field."""
+
+
+@attrs.frozen
+class SharedTopic:
+    """A shared topic: its name and message type, and how many publish it and listen."""
+
+    name: str
+    type: str
+    publishers: int
+    subscribers: int
 
 
 def absolute(topic: str, namespace: str = "") -> str:

@@ -14,11 +14,11 @@ import zenoh
 import zenoh.ext
 from ibrobot_ros2 import decode, encode
 
-from ibrobot_core.api import Context, IbrobotError, Message, SharedTopic, TransportError
+from ibrobot_core.api import Context, IbrobotError, Message, TransportError
 from ibrobot_zenoh.connection import Connection, Declared, first_line
 from ibrobot_zenoh.identity import Identity, Role
 from ibrobot_zenoh.options import ZenohOptions
-from ibrobot_zenoh.ros2 import ADMIN, Node, absolute, attachment, topic_key, topics_of_tokens, type_of_key
+from ibrobot_zenoh.ros2 import ADMIN, Node, SharedTopic, absolute, attachment, topic_key, topics_of_tokens, type_of_key
 from ibrobot_zenoh.workers import Workers
 
 DEPTH = 100

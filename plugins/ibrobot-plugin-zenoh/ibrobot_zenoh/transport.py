@@ -16,8 +16,6 @@ from ibrobot_core.api import (
     Handler,
     Message,
     Payload,
-    SharedTopic,
-    TopicTransport,
     TransportError,
 )
 from ibrobot_zenoh.access import ANYBODY, SERVED, SERVICES, TOPICS
@@ -25,6 +23,8 @@ from ibrobot_zenoh.connection import Connection, first_line
 from ibrobot_zenoh.identity import own_identity
 from ibrobot_zenoh.options import ZenohOptions
 from ibrobot_zenoh.presence import Presence
+from ibrobot_zenoh.ros2 import SharedTopic
+from ibrobot_zenoh.sharing import TopicTransport
 from ibrobot_zenoh.topics import Topics
 from ibrobot_zenoh.workers import Workers
 

@@ -13,9 +13,9 @@ import pytest
 import zenoh
 from ibrobot_ros2 import encode
 from ibrobot_zenoh import topics as topics_module
-from ibrobot_zenoh.ros2 import Node, absolute, attachment, ros_type, topic_key, topics_of_tokens
+from ibrobot_zenoh.ros2 import Node, SharedTopic, absolute, attachment, ros_type, topic_key, topics_of_tokens
 
-from ibrobot_core.api import Header, Image, Int32, JointState, Message, SharedTopic, String, TransportError
+from ibrobot_core.api import Header, Image, Int32, JointState, Message, String, TransportError
 
 from .pair import WAIT_S, client, free_endpoint, router, settle, wait_for
 

@@ -4,12 +4,20 @@ from __future__ import annotations
 
 import threading
 
+import attrs
 from ibrobot_testing.fakes import FakeTransport
+from ibrobot_zenoh.options import Share
+from ibrobot_zenoh.sharing import TopicTransport, components
 
 from ibrobot_core import hookimpl
 from ibrobot_core.descriptors import TransportDescriptor
 from ibrobot_core.errors import TransportError
-from ibrobot_core.interfaces import TopicTransport
+from ibrobot_core.options import option
+
+
+@attrs.frozen
+class NetworkOptions:
+    share: Share = option(factory=Share)
 
 
 class Network(FakeTransport, TopicTransport):
@@ -47,4 +55,8 @@ def make(options, ctx):
 
 @hookimpl
 def ibrobot_transports():
-    yield TransportDescriptor("network", make, "a network", topics=True)
+    yield TransportDescriptor(
+        "network", make, "a network", NetworkOptions,
+        used=lambda options: options.share != Share(),
+        components=lambda options, session, link: components(options.share, session, link),
+    )  # fmt: skip

@@ -1,19 +1,26 @@
-"""Sharing: topics between this run and other machines, over the transport. The bus never waits for it."""
+"""Sharing: topics between a run and other machines, over the transport. The bus never waits for it."""
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable
 from typing import override
 
-from ibrobot_core.bus import Subscription
-from ibrobot_core.component import Component
-from ibrobot_core.errors import IbrobotError, NotSupported
-from ibrobot_core.interfaces import TopicTransport
-from ibrobot_core.launch.session import Session, SessionWorker
-from ibrobot_core.launch.transport import TransportLink
-from ibrobot_core.messages import Message
-from ibrobot_core.options import did_you_mean
-from ibrobot_core.units import NS_PER_S
+from ibrobot_core.api import (
+    NS_PER_S,
+    Component,
+    IbrobotError,
+    Message,
+    NotSupported,
+    Session,
+    SessionWorker,
+    Subscription,
+    Transport,
+    TransportLink,
+    did_you_mean,
+)
+from ibrobot_zenoh.options import Share
+from ibrobot_zenoh.ros2 import SharedTopic
 
 _DEPTH = 10
 """Messages of a topic that may wait for the network; beyond, the oldest is dropped and counted by the bus."""
@@ -22,10 +29,56 @@ _SILENT_NS = 5 * NS_PER_S
 """A topic without any message for so long after the start is reported, once [ns]."""
 
 
+class TopicTransport(Transport):
+    """A transport that also carries messages, between the buses of several machines."""
+
+    @abstractmethod
+    def publish_message(self, topic: str, message: Message, *, latched: bool = False) -> None:
+        """Send a message to all who listen to `topic`; of a latched topic also the newest to who comes later.
+
+        It may wait for the network: call it from a thread that has nothing else to do.
+
+        Raises:
+            TransportError: when closed, or the topic carries another type.
+            IbrobotError: when the message cannot be sent.
+        """
+
+    @abstractmethod
+    def subscribe_messages(self, topic: str, callback: Callable[[Message], object]) -> Callable[[], None]:
+        """Call `callback` with every message on `topic`, of whatever type; returns a function that ends it.
+
+        What nobody can read is passed over, with a warning.
+
+        Raises:
+            TransportError: when closed.
+        """
+
+    @abstractmethod
+    def shared_topics(self, timeout_s: float) -> list[SharedTopic]:
+        """All topics that are shared now, by name, waiting up to `timeout_s` [s] for the answer.
+
+        Raises:
+            TransportError: when closed, or not connected.
+        """
+
+
+def components(share: Share, session: Session, link: TransportLink) -> list[Component]:
+    """What shares the topics that a YAML lists.
+
+    Raises:
+        NotSupported: for topics of other machines in lockstep.
+        MissingDependency: for topics of a sensor that this machine cannot run.
+    """
+    if session.request.lockstep and share.subscribe:
+        raise NotSupported("transport.share.subscribe: in lockstep nothing may come from other machines, at any time")
+    session.refuse_absent("transport.share.publish", share.publish.__contains__)
+    subscribed: list[Component] = [SubscribedTopics(session, link, share.subscribe)] if share.subscribe else []
+    return [*(PublishedTopic(session, link, topic) for topic in share.publish), *subscribed]
+
+
 def _topics(link: TransportLink) -> TopicTransport:
     transport = link.transport
-    if not isinstance(transport, TopicTransport):
-        raise NotSupported(f"transport.share: {type(transport).__name__} carries no topics")
+    assert isinstance(transport, TopicTransport)
     return transport
 
 
