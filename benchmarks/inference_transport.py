@@ -36,17 +36,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from ibrobot_serve.process import ProcessEngine
+from ibrobot_serve.remote import RemoteEngine
 from ibrobot_serve.service import InferenceService
+from ibrobot_serve.wire import WireKind, WireMessage, encode
 from ibrobot_testing import host_context
 from made_up import plugin
 
 from ibrobot_core.config import load_config
 from ibrobot_core.inference.client import DispatchInfer, EngineClient
-from ibrobot_core.inference.engine import Engine
-from ibrobot_core.inference.process import ProcessEngine
-from ibrobot_core.inference.remote import RemoteEngine
-from ibrobot_core.inference.wire import WireKind, WireMessage, encode
-from ibrobot_core.interfaces import Frame, Transport
+from ibrobot_core.interfaces import Engine, Frame, Transport
 from ibrobot_core.plugins import installed_plugins
 
 PLUGIN = '''

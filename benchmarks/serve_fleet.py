@@ -28,6 +28,7 @@ from typing import Any, override
 
 import attrs
 import numpy as np
+from ibrobot_serve.remote import RemoteEngine
 from ibrobot_serve.service import InferenceService, ServiceOptions
 from ibrobot_testing import host_context, make_robot
 from ibrobot_testing.fakes import FakePolicy
@@ -47,7 +48,6 @@ from ibrobot_core.contract.specs import Contract
 from ibrobot_core.dispatch.dispatcher import Dispatcher
 from ibrobot_core.errors import PolicyError
 from ibrobot_core.inference.client import EngineClient
-from ibrobot_core.inference.remote import RemoteEngine
 from ibrobot_core.interfaces import Frame, Tensors, Transport
 from ibrobot_core.messages import Header, JointState
 from ibrobot_core.options import NoOptions

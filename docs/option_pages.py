@@ -75,9 +75,9 @@ def _class_lines(path: str, kind: type[Any], shown: set[type]) -> Iterator[str]:
 
 def _types(kind: type[ComponentConfig]) -> Iterator[str]:
     registry = installed_plugins()
-    found = [registry.find(kind.plugin_kind, type_) for type_ in registry.types(kind.plugin_kind)]
-    links = [f"[`{each.type}`](#{_options_anchor(kind.plugin_kind, each.type)})" for each in found if kind.takes(each)]
-    yield f"`type` is one of {', '.join(links)}, each with options of its own.\n"
+    found = [each for each in registry.of_kind(kind.plugin_kind) if kind.takes(each)]
+    links = [f"[`{each.type}`](#{_options_anchor(kind.plugin_kind, each.type)})" for each in found]
+    yield f"`{kind.type_key()}` is one of {', '.join(links)}, each with options of its own.\n"
 
 
 def _class_tables(kind: type[Any]) -> Iterator[str]:

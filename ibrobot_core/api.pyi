@@ -8,6 +8,7 @@ from ibrobot_core.descriptors import (
     DatasetDescriptor as DatasetDescriptor,
     DecoderDescriptor as DecoderDescriptor,
     Descriptor as Descriptor,
+    EngineDescriptor as EngineDescriptor,
     ExecutorDescriptor as ExecutorDescriptor,
     Flag as Flag,
     HardwareDescriptor as HardwareDescriptor,
@@ -36,6 +37,8 @@ from ibrobot_core.interfaces import (
     Context as Context,
     DatasetSummary as DatasetSummary,
     DatasetWriter as DatasetWriter,
+    Engine as Engine,
+    EngineStats as EngineStats,
     EpisodeSetup as EpisodeSetup,
     EpisodeAddress as EpisodeAddress,
     EpisodeEnd as EpisodeEnd,
@@ -54,6 +57,7 @@ from ibrobot_core.interfaces import (
     JointGoal as JointGoal,
     JointReading as JointReading,
     LinearGoal as LinearGoal,
+    ModelContext as ModelContext,
     NamedGoal as NamedGoal,
     OrientationPolicy as OrientationPolicy,
     Payload as Payload,
@@ -81,7 +85,7 @@ from ibrobot_core.interfaces import (
     Viewer as Viewer,
     nan_vector as nan_vector,
 )
-from ibrobot_core.interfaces.policy import copied_tensors as copied_tensors, whole_fingerprint as whole_fingerprint
+from ibrobot_core.interfaces.policy import copied_tensors as copied_tensors
 from ibrobot_core.interfaces.transport import HANDLER_THREADS as HANDLER_THREADS
 from ibrobot_core.errors import (
     CalibrationError as CalibrationError,
@@ -147,7 +151,12 @@ from ibrobot_core.messages import (
 from ibrobot_core.robot import Description as Description, Joint as Joint, Robot as Robot, Vector as Vector
 from ibrobot_core.clock import Clock as Clock, RealClock as RealClock, SteppedClock as SteppedClock
 from ibrobot_core.bus import Bus as Bus, Received as Received, Subscription as Subscription
-from ibrobot_core.component import CONTROL as CONTROL, Component as Component, Worker as Worker
+from ibrobot_core.component import (
+    CONTROL as CONTROL,
+    Component as Component,
+    Worker as Worker,
+    error_text as error_text,
+)
 from ibrobot_core.launch.session import (
     CommandSource as CommandSource,
     LaunchRequest as LaunchRequest,
@@ -226,16 +235,6 @@ from ibrobot_core.plugins import (
     installed_plugins as installed_plugins,
 )
 from ibrobot_core.inference.build import build_policy as build_policy
-from ibrobot_core.inference.wire import (
-    WIRE_LIMITS as WIRE_LIMITS,
-    WireDecoder as WireDecoder,
-    WireEncoder as WireEncoder,
-    WireKind as WireKind,
-    WireLimits as WireLimits,
-    WireMessage as WireMessage,
-    health_name as health_name,
-    service_name as service_name,
-)
 from ibrobot_core.recording.dataset import EpisodeDataset as EpisodeDataset
 from ibrobot_core.recording.episode import episode_folder as episode_folder
 from ibrobot_core.recording.provenance import (
@@ -244,7 +243,8 @@ from ibrobot_core.recording.provenance import (
 )
 from ibrobot_core.probes import Probes as Probes, ProbeServer as ProbeServer
 from ibrobot_core.control.realtime import go_real_time as go_real_time
-from ibrobot_core.memory import set_malloc as set_malloc
+from ibrobot_core.memory import create_memory as create_memory, set_malloc as set_malloc
+from ibrobot_core.child import Channel as Channel, Child as Child, open_parent as open_parent
 from ibrobot_core.signals import end_signals as end_signals, on_signals as on_signals
 from ibrobot_core.outside import LogFormatter as LogFormatter, echo as echo
 from ibrobot_core.screen import Screen as Screen, styled as styled

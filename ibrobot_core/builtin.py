@@ -1,17 +1,17 @@
-"""What core itself offers, registered as any plugin would: the three executors, and `local` for no transport."""
+"""What core itself offers, registered as any plugin would: three executors, an engine, and `local` for no transport."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.descriptors import ExecutorDescriptor, TransportDescriptor
+from ibrobot_core.descriptors import EngineDescriptor, ExecutorDescriptor, TransportDescriptor
 from ibrobot_core.errors import NotSupported
 from ibrobot_core.executor_options import GripperOptions, PositionOptions, TrajectoryOptions
 from ibrobot_core.hookspecs import hookimpl
 
 if TYPE_CHECKING:
-    from ibrobot_core.interfaces import Context, Executor, Transport
+    from ibrobot_core.interfaces import Context, Engine, Executor, Transport
 
 
 def _position(options: Any, ctx: Context) -> Executor:
@@ -30,6 +30,13 @@ def _gripper(options: Any, ctx: Context) -> Executor:
     from ibrobot_core.control.executors.gripper import GripperExecutor
 
     return GripperExecutor(options, ctx)
+
+
+def _monolithic(options: Any, ctx: Context) -> Engine:
+    from ibrobot_core.inference.engine import LocalEngine
+
+    assert ctx.model is not None
+    return LocalEngine(ctx.model.policy)
 
 
 def _local(options: Any, ctx: Context) -> Transport:
@@ -51,6 +58,12 @@ def ibrobot_executors() -> Iterable[ExecutorDescriptor]:
         type="gripper", options=GripperOptions, make=_gripper, goals="position",
         summary="opens or closes a gripper; a stall counts as grasped",
     )  # fmt: skip
+
+
+@hookimpl
+def ibrobot_engines() -> Iterable[EngineDescriptor]:
+    """In the host."""
+    yield EngineDescriptor(type="monolithic", make=_monolithic, summary="in the host process")
 
 
 @hookimpl

@@ -51,7 +51,7 @@ class Channel:
             self._unsent += line
             self._flush()
 
-    def flush(self, timeout_s: float) -> None:
+    def flush(self, timeout_s: float = FAREWELL_S) -> None:
         """Wait up to `timeout_s` [s] for the peer to read what is yet unsent."""
         deadline = time.monotonic() + timeout_s
         while self.backlog and not self.closed and (left := deadline - time.monotonic()) > 0:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from ibrobot_core.interfaces import (
         Context,
         DatasetWriter,
+        Engine,
         EpisodeAddress,
         EpisodeReader,
         Executor,
@@ -130,6 +131,19 @@ class TeleopDescriptor(Descriptor["Teleop"]):
 @attrs.frozen
 class PolicyDescriptor(Descriptor["Policy"]):
     """A policy."""
+
+
+@attrs.frozen
+class EngineDescriptor(Descriptor["Engine"]):
+    """A place where the model of a policy runs, and `Context.model` is that model.
+
+    In the YAML `inference.execution_mode` names the type, and its options stand beside it.
+    """
+
+    uses_transport: bool = False
+    """Whether it reaches the model over the transport of the YAML, which must then lead to other machines."""
+    weights_here: bool = True
+    """Whether this machine has the model's weights, so that `ibrobot config check --deep` looks at them."""
 
 
 @attrs.frozen

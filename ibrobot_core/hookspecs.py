@@ -49,6 +49,11 @@ def ibrobot_policies() -> Iterable[descriptors.PolicyDescriptor]:  # type: ignor
 
 
 @hookspec
+def ibrobot_engines() -> Iterable[descriptors.EngineDescriptor]:  # type: ignore[empty-body]
+    """Engines: places where the model of a policy runs."""
+
+
+@hookspec
 def ibrobot_executors() -> Iterable[descriptors.ExecutorDescriptor]:  # type: ignore[empty-body]
     """Executors, ahead of the safety layer in the control process."""
 

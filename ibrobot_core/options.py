@@ -59,6 +59,7 @@ def option(
     factory: Any = None,
     validator: Any = None,
     secret: bool = False,
+    key: str | None = None,
 ) -> Any:
     """An attrs field for an options class.
 
@@ -74,6 +75,7 @@ def option(
         factory: makes the default, for mutable ones.
         validator: a further attrs validator; it raises ValueError with what would be right.
         secret: never shown or written; recordings and `config show` have `${NAME}` as the YAML has it, else `***`.
+        key: what the YAML calls it, where that is not the field's name.
     """
     bounds = {"ge": ge, "gt": gt, "le": le, "lt": lt}
     metadata = {"unit": unit, "help": help, "choices": tuple(choices) if choices is not None else None, **bounds}
@@ -101,14 +103,14 @@ def option(
 
     validators = [check] if validator is None else [check, validator]
     if factory is not None:
-        return attrs.field(factory=factory, metadata=metadata, validator=validators, repr=shown)
-    return attrs.field(default=default, metadata=metadata, validator=validators, repr=shown)
+        return attrs.field(factory=factory, metadata=metadata, validator=validators, repr=shown, alias=key)
+    return attrs.field(default=default, metadata=metadata, validator=validators, repr=shown, alias=key)
 
 
 def documented[C](cls: type[C]) -> type[C]:
     """Class decorator: append what `option` says of each field to the docstring, for `help()` and the API pages."""
     lines = [
-        f"    {field.name}: {field.metadata['help']}{unit}."
+        f"    {field.alias}: {field.metadata['help']}{unit}."
         for field in attrs.fields(cls)  # type: ignore[arg-type]
         if field.metadata.get("help")
         for unit in (f" [{field.metadata['unit']}]" if field.metadata["unit"] else "",)
@@ -126,7 +128,7 @@ def not_a_key(default: Any = attrs.NOTHING, *, factory: Any = None, repr: bool =
 def fields(kind: type[Any]) -> Mapping[str, attrs.Attribute[Any]]:
     """The keys that an options class takes, with resolved types."""
     attrs.resolve_types(kind)
-    return {field.name: field for field in attrs.fields(kind) if field.init and field.metadata.get("key", True)}
+    return {str(field.alias): field for field in attrs.fields(kind) if field.init and field.metadata.get("key", True)}
 
 
 def default_of(field: attrs.Attribute[Any]) -> Any:

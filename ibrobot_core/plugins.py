@@ -38,6 +38,7 @@ KINDS: Mapping[str, str] = {
     "sensor": "ibrobot_sensors",
     "teleop": "ibrobot_teleop",
     "policy": "ibrobot_policies",
+    "engine": "ibrobot_engines",
     "executor": "ibrobot_executors",
     "planner": "ibrobot_planners",
     "transport": "ibrobot_transports",
@@ -98,6 +99,10 @@ class Registry:
     def types(self, kind: str) -> list[str]:
         """The types offered of a kind, sorted."""
         return sorted(t for k, t in self.entries if k == kind)
+
+    def of_kind(self, kind: str) -> list[Descriptor[Any]]:
+        """The descriptors of a kind, sorted by type."""
+        return [self.entries[kind, type_].descriptor for type_ in self.types(kind)]
 
     def versions(self) -> dict[str, str]:
         """Package -> version, of those that offer something, sorted."""

@@ -228,9 +228,9 @@ class Checks:
             self._claims(key, mode, robot)
         if mode.teleop is not None:
             self._refer((*key, "teleop"), mode.teleop, self._known("teleoperation"), "teleoperation device")
-        if mode.inference is not None:
-            self._refer((*key, "inference", "model"), mode.inference.model, self._known("models"), "model")
-            self._execution((*key, "inference"), mode.inference)
+        if (part := self.sections.inference.get(name)) is not None:
+            self._refer((*part.key, "model"), part.component.model, self._known("models"), "model")
+            self._reaches(part)
         sources = [source for source in ("teleop", "inference", "planner") if getattr(mode, source) is not None]
         if len(sources) > 1:
             self.document.add((*key, sources[1]), f"{sources[0]} drives this mode already; make a mode for each")
@@ -239,18 +239,16 @@ class Checks:
         if mode.inference is None and self.document.get(*key, "dispatch") is not None:
             self.document.add((*key, "dispatch"), "has a meaning only beside inference")
 
-    def _execution(self, key: Key, inference: InferenceConfig) -> None:
-        if inference.execution_mode == "distributed":
-            transport = self.document.root.get("transport")
-            if not isinstance(transport, Mapping) or transport.get("type") == "local":
-                message = (
-                    "distributed needs a transport to the server, "
-                    f"e.g. transport: {{type: {example_type('transport')}, connect: [tcp/127.0.0.1:7447]}}"
-                )
-                self.document.add((*key, "execution_mode"), message)
-        elif inference.server_model:
-            message = "has a meaning only with execution_mode: distributed"
-            self.document.add((*key, "server_model"), message)
+    def _reaches(self, part: ParsedComponent[InferenceConfig]) -> None:
+        """An engine that uses the transport has one to other machines."""
+        transport = self.document.root.get("transport")
+        elsewhere = isinstance(transport, Mapping) and transport.get("type") != "local"
+        if part.component.uses_transport and not elsewhere:
+            message = (
+                f"{part.component.type} needs a transport to the server, "
+                f"e.g. transport: {{type: {example_type('transport')}, connect: [tcp/127.0.0.1:7447]}}"
+            )
+            self.document.add((*part.key, part.component.type_key()), message)
 
     def _claims(self, key: Key, mode: ControlMode, robot: Robot) -> None:
         owners: dict[str, str] = {}
@@ -289,11 +287,12 @@ class Checks:
         part = self.sections.transport
         if part is None or self.communicates or part.descriptor.type == "local":
             return
-        modes = (self.sections.plain.get("control_modes") or {}).values()
-        distributed = any(mode.inference and mode.inference.execution_mode == "distributed" for mode in modes)
         assert isinstance(part.descriptor, TransportDescriptor)
-        if not (distributed or part.descriptor.used(part.component.options)):
-            message = f"nothing would use {part.descriptor.type!r}; a model does with execution_mode: distributed"
+        inference = self.sections.inference.values()
+        used = part.descriptor.used(part.component.options) or any(e.component.uses_transport for e in inference)
+        unknown = any(each.error.kind == InferenceConfig.plugin_kind for each in self.sections.missing)
+        if not used and not unknown:
+            message = f"nothing uses {part.descriptor.type!r}: no mode has an execution_mode that needs a transport"
             self.document.add((*part.key, "type"), message)
 
     def _recording(self) -> None:

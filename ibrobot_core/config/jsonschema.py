@@ -91,13 +91,16 @@ class _Schemas:
 
     def _of_component(self, kind: type[ComponentConfig]) -> Schema:
         """A section with a `type`: which further keys it takes follows from it."""
-        found = [self.registry.find(kind.plugin_kind, type_) for type_ in self.registry.types(kind.plugin_kind)]
-        offered = [descriptor for descriptor in found if kind.takes(descriptor)]
-        own = self.of_fields(fields(kind))
-        own["properties"]["type"]["enum"] = [descriptor.type for descriptor in offered]
+        offered = [descriptor for descriptor in self.registry.of_kind(kind.plugin_kind) if kind.takes(descriptor)]
+        own, key = self.of_fields(fields(kind)), kind.type_key()
+        own["properties"][key]["enum"] = [descriptor.type for descriptor in offered]
+        default = own["properties"][key].get("default")
         branches = [
             {
-                "if": {"properties": {"type": {"const": descriptor.type}}, "required": ["type"]},
+                "if": {
+                    "properties": {key: {"const": descriptor.type}},
+                    "required": [key] if descriptor.type != default else [],
+                },
                 "then": {
                     **self.of_fields({**fields(descriptor.options), **fields(kind)}),
                     "description": descriptor.summary,

@@ -151,7 +151,12 @@ def _build(document: Document, source: Path, sim: bool, registry: Registry, comm
         **sections.plain,
         "executors": {name: attrs.evolve(each, joints=robot.groups[each.group]) for name, each in executors.items()},
         "control_modes": {
-            name: attrs.evolve(mode, name=name, planner=_component(sections.planners.get(name)))
+            name: attrs.evolve(
+                mode,
+                name=name,
+                planner=_component(sections.planners.get(name)),
+                inference=_component(sections.inference.get(name)),
+            )
             for name, mode in sections.plain["control_modes"].items()
         },
         "default_control_mode": entered,

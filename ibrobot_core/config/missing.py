@@ -20,12 +20,9 @@ class Missing:
     """A component that cannot be made, since its plugin is not installed or is broken."""
 
     key: Key
+    place: Key
+    """What in the file names the plugin."""
     error: PluginNotInstalled
-
-    @property
-    def place(self) -> Key:
-        """What in the file names the plugin."""
-        return self.key if self.error.kind == "section" else (*self.key, "type")
 
 
 def split(
@@ -82,11 +79,11 @@ def describe(errors: Iterable[PluginNotInstalled]) -> str:
 
 def _used(name: str, mode: Any) -> set[Key]:
     """What drives a mode."""
-    keys: set[Key] = {("control_modes", name, "planner")}
+    keys: set[Key] = {("control_modes", name, "planner"), ("control_modes", name, "inference")}
     if mode.teleop is not None:
         keys.add(("teleoperation", mode.teleop))
     if mode.inference is not None:
-        keys.add(("models", mode.inference.model))
+        keys.add(("models", str(mode.inference.get("model"))))
     return keys
 
 

@@ -12,7 +12,13 @@ from typing import Any, ClassVar, Literal, get_args, get_origin
 
 import attrs
 
-from ibrobot_core.descriptors import Descriptor, ExecutorDescriptor, HardwareDescriptor, SensorDescriptor
+from ibrobot_core.descriptors import (
+    Descriptor,
+    EngineDescriptor,
+    ExecutorDescriptor,
+    HardwareDescriptor,
+    SensorDescriptor,
+)
 from ibrobot_core.errors import PluginNotInstalled
 from ibrobot_core.options import documented, fields, not_a_key, option
 from ibrobot_core.robot import Robot
@@ -32,6 +38,11 @@ class ComponentConfig:
     type: str = option(help="which plugin; `ibrobot plugins` lists them")
     options: Any = not_a_key()
     """An instance of the plugin's options class."""
+
+    @classmethod
+    def type_key(cls) -> str:
+        """The key that names the plugin."""
+        return str(attrs.fields(cls).type.alias)
 
     @classmethod
     def takes(cls, descriptor: Descriptor[Any]) -> bool:
@@ -330,33 +341,25 @@ class DispatchConfig:
 
 @documented
 @attrs.frozen
-class InferenceConfig:
+class InferenceConfig(ComponentConfig):
     """Which model a mode runs, and where."""
 
+    plugin_kind = "engine"
+
     model: str = option(help="a name under models")
-    execution_mode: str = option(
-        "monolithic",
-        choices=("monolithic", "process", "distributed"),
-        help="where infer runs: in the host, in a process of its own, or on a server over the transport",
-    )
-    server_model: str = option("", help="what the server calls the model, where that is not its name here")
+    type: str = option("monolithic", key="execution_mode", help="where infer runs; `ibrobot plugins` lists the engines")
     request_timeout: float = option(5.0, unit="s", gt=0, help="after it a request has failed and the arm holds")
-    hang_timeout: float = option(
-        30.0, unit="s", gt=0, help="for process: a model at work on one request for longer hangs, and is replaced"
-    )
     prompt: str = option("", help="task for language-conditioned policies")
-    jpeg_quality: int | None = option(
-        None, ge=1, le=100, help="send pictures to the server as JPEG: far fewer bytes, other pixels; null: as they are"
-    )
+    uses_transport: bool = not_a_key(False)
+    """Whether it needs the transport."""
+    weights_here: bool = not_a_key(True)
+    """Whether the weights are on this machine."""
 
-    accept_new_weights: bool = option(
-        False,
-        help="go on, with a warning, when the server or process comes back with other weights; else the arm holds",
-    )
-
-    def __attrs_post_init__(self) -> None:
-        if self.jpeg_quality is not None and self.execution_mode != "distributed":
-            raise ValueError(f"jpeg_quality has no meaning for execution_mode {self.execution_mode}: nothing is sent")
+    @classmethod
+    def described(cls, descriptor: Descriptor[Any], options: Any) -> Mapping[str, Any]:
+        """What the engine needs."""
+        assert isinstance(descriptor, EngineDescriptor)
+        return {"uses_transport": descriptor.uses_transport, "weights_here": descriptor.weights_here}
 
 
 @documented

@@ -39,7 +39,7 @@ def _fields(value: Any) -> dict[str, Any]:
     return {
         name: _Secret(item) if field.metadata.get("secret") and isinstance(item, str) else plain(item)
         for name, field in fields(type(value)).items()
-        for item in (getattr(value, name),)
+        for item in (getattr(value, field.name),)
     }
 
 

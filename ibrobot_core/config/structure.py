@@ -17,6 +17,7 @@ from ibrobot_core.config.schema import (
     ComponentConfig,
     ExecutorConfig,
     HardwareConfig,
+    InferenceConfig,
     ModelConfig,
     NamedComponentConfig,
     PeripheralConfig,
@@ -62,6 +63,8 @@ class ParsedSections:
     teleoperation: dict[str, ParsedComponent[TeleopConfig]] = attrs.field(factory=dict)
     planners: dict[str, ParsedComponent[PlannerConfig]] = attrs.field(factory=dict)
     """By control mode."""
+    inference: dict[str, ParsedComponent[InferenceConfig]] = attrs.field(factory=dict)
+    """By control mode."""
     recording: ParsedComponent[RecordingConfig] | None = None
     transport: ParsedComponent[TransportConfig] | None = None
     viewer: ParsedComponent[ViewerConfig] | None = None
@@ -81,7 +84,7 @@ class ParsedSections:
         """Every component."""
         yield from self.active()
         yield from self.hardware.values() if self.simulated else ()
-        for section in (self.executors, self.models, self.teleoperation, self.planners):
+        for section in (self.executors, self.models, self.teleoperation, self.planners, self.inference):
             yield from section.values()
 
 
@@ -132,6 +135,9 @@ class SectionParser:
             if mode.planner is not None:
                 planner = self._component(("control_modes", name, "planner"), PlannerConfig)
                 sections.planners |= {name: planner} if planner is not None else {}
+            if mode.inference is not None:
+                inference = self._component(("control_modes", name, "inference"), InferenceConfig)
+                sections.inference |= {name: inference} if inference is not None else {}
         sections.transport = self._component(("transport",), TransportConfig)
         sections.viewer = self._component(("viewer",), ViewerConfig)
         sections.recording = self._component(("recording",), RecordingConfig)
@@ -158,7 +164,7 @@ class SectionParser:
         if (found := self.registry.entries.get(("section", name))) is None:
             error = self.registry.not_found("section", name)
             if isinstance(error, PluginNotInstalled):
-                self._missing.append(Missing((name,), error))
+                self._missing.append(Missing((name,), (name,), error))
             else:
                 known = [*SECTIONS, *self.registry.types("section")]
                 faults.add((name,), unknown_key(name, known) + self.registry.broken)
@@ -200,16 +206,19 @@ class SectionParser:
             return None  # reported already, with the sections
         own = fields(kind)
         faults = Faults()
-        if "type" not in value and (close := get_close_matches("type", [k for k in value if k not in own], 1)):
-            self.document.add((*key, close[0]), "unknown key, did you mean 'type'?")
+        type_key = kind.type_key()
+        default = own[type_key].default if type_key not in value else None
+        unknown = [name for name in value if name not in own]
+        if default is attrs.NOTHING and (close := get_close_matches(type_key, unknown, 1)):
+            self.document.add((*key, close[0]), f"unknown key, did you mean {type_key!r}?")
             return None
         arguments = self._converter.arguments(own, value, faults)
         options = None
-        type_: str | None = arguments.get("type")
-        descriptor = self._find(key, kind.plugin_kind, type_, needed, faults) if type_ is not None else None
+        type_ = arguments.get(type_key, default)
+        descriptor = self._find(key, kind, type_, needed, faults) if isinstance(type_, str) else None
         if descriptor is not None:
             note(self.document, descriptor.options, value, key)
-            options = self._options(descriptor, own, value, faults)
+            options = self._options(descriptor, kind, value, faults)
         self._report(key, faults, below_sim)
         if faults.found or descriptor is None:
             return None
@@ -217,25 +226,31 @@ class SectionParser:
         described = kind.described(descriptor, options)
         return ParsedComponent(key, kind(**arguments, **named, **described, options=options), descriptor)
 
-    def _find(self, key: Key, kind: str, type_: str, needed: bool, faults: Faults) -> Descriptor[Any] | None:
-        if not needed and (kind, type_) not in self.registry.entries:
+    def _find(
+        self, key: Key, kind: type[ComponentConfig], type_: str, needed: bool, faults: Faults
+    ) -> Descriptor[Any] | None:
+        if not needed and (kind.plugin_kind, type_) not in self.registry.entries:
             return None
         try:
-            return self.registry.find(kind, type_)
+            return self.registry.find(kind.plugin_kind, type_)
         except PluginNotInstalled as error:
-            self._missing.append(Missing(key, error))
+            self._missing.append(Missing(key, (*key, kind.type_key()), error))
             return None
         except PluginError as error:
-            faults.add(("type",), str(error))
+            faults.add((kind.type_key(),), str(error))
             return None
 
     def _options(
-        self, descriptor: Descriptor[Any], own: Mapping[str, Any], value: Mapping[str, Any], faults: Faults
+        self, descriptor: Descriptor[Any], kind: type[ComponentConfig], value: Mapping[str, Any], faults: Faults
     ) -> Any:
+        own = fields(kind)
         known = {name: field for name, field in fields(descriptor.options).items() if name not in own}
         for name in value:
             if name not in own and name not in known:
-                faults.add((name,), unknown_key(name, [*own, *known]))
+                others = [other for other in self.registry.of_kind(kind.plugin_kind) if name in fields(other.options)]
+                types = ", ".join(other.type for other in others)
+                message = f"unknown key with {kind.type_key()} {descriptor.type!r}; it belongs to {types}"
+                faults.add((name,), message if others else unknown_key(name, [*own, *known]))
         before = len(faults.found)
         arguments = self._converter.arguments(known, value, faults)
         if len(faults.found) > before:

@@ -14,8 +14,8 @@ import attrs
 import numpy as np
 
 from ibrobot_core.errors import PolicyError
-from ibrobot_core.inference.engine import Engine, LocalEngine
-from ibrobot_core.interfaces import Frame, Policy
+from ibrobot_core.inference.engine import LocalEngine
+from ibrobot_core.interfaces import Engine, Frame, Policy
 from ibrobot_core.robot import Vector
 from ibrobot_core.units import ns
 

@@ -1,7 +1,8 @@
 """One abstract class per plugin kind; the whole of what an implementation must know."""
 
-from ibrobot_core.interfaces.context import Context
+from ibrobot_core.interfaces.context import Context, ModelContext
 from ibrobot_core.interfaces.dataset import DatasetSummary, DatasetWriter, Feature
+from ibrobot_core.interfaces.engine import Engine, EngineStats
 from ibrobot_core.interfaces.executor import Executor, GoalState, GoalStatus, Plan
 from ibrobot_core.interfaces.hardware import (
     Condition,

@@ -75,16 +75,6 @@ def copied_tensors(tensors: Tensors) -> dict[str, NDArray[np.generic]]:
     return {name: np.array(array) for name, array in tensors.items()}
 
 
-def whole_fingerprint(fingerprint: str, weights: str) -> str:
-    """Of a policy with its weights: what requests and answers carry, so that one side notices when the other's change.
-
-    Args:
-        fingerprint: `Policy.fingerprint`.
-        weights: `Policy.weights`.
-    """
-    return hashlib.sha256(f"{fingerprint}\0{weights}".encode()).hexdigest()[:32] if weights else fingerprint
-
-
 class PictureCodec(ABC):
     """JPEG for tensors that are camera pictures: `uint8`, shape (H, W, 3) or (H, W, 1)."""
 

@@ -67,7 +67,7 @@ def check_models(config: RobotConfig, registry: Registry, modes: Iterable[str]) 
         ConfigError: with a problem for each model that does not fit, or cannot be read.
     """
     used = [mode.inference for name in modes if (mode := config.control_modes[name]).inference is not None]
-    loaded_here = {inference.model for inference in used if inference.execution_mode != "distributed"}
+    loaded_here = {inference.model for inference in used if inference.weights_here}
     lines, problems = [], []
     for name in dict.fromkeys(inference.model for inference in used):
         try:

@@ -109,7 +109,7 @@ def build_plan(session: Session) -> LaunchPlan:
     """
     config = session.config
     modes = config.control_modes.values()
-    distributed = any(mode.inference and mode.inference.execution_mode == "distributed" for mode in modes)
+    elsewhere = any(mode.inference is not None and mode.inference.uses_transport for mode in modes)
     specs: tuple[ObservationSpec | ActionSpec, ...] = (*config.contract.observations, *config.contract.actions)
     foreign = next((spec for spec in specs if spec.foreign), None)
     if foreign is not None and (config.recording is not None or any(mode.inference for mode in modes)):
@@ -130,7 +130,7 @@ def build_plan(session: Session) -> LaunchPlan:
     if (transport := config.transport) is not None:
         descriptor = session.registry.find("transport", transport.type)
         assert isinstance(descriptor, TransportDescriptor)
-        if distributed or descriptor.used(transport.options):
+        if elsewhere or descriptor.used(transport.options):
             link = TransportLink(session, transport)
             shared = descriptor.components(transport.options, session, link)
     added = mode_components(session, session.mode, link)

@@ -20,7 +20,7 @@ from ibrobot_core.config.context import component_context
 from ibrobot_core.config.schema import ComponentConfig, ControlMode
 from ibrobot_core.control.link import ControlState, PlanRecord
 from ibrobot_core.errors import ComponentFailed
-from ibrobot_core.interfaces import Context, JointReading
+from ibrobot_core.interfaces import Context, EngineStats, JointReading
 from ibrobot_core.launch.absence import AbsentSensor, absent_sensors, refuse
 from ibrobot_core.plugins import Registry
 from ibrobot_core.robot import Vector
@@ -28,7 +28,6 @@ from ibrobot_core.robot import Vector
 if TYPE_CHECKING:
     from ibrobot_core.control.host import ControlHost
     from ibrobot_core.dispatch.dispatcher import DispatchStats
-    from ibrobot_core.inference.engine import EngineStats
     from ibrobot_core.launch.sources.source_worker import SourceWorker
 
 
@@ -226,14 +225,14 @@ class Session:
         """Whether control was made."""
         return self._control is not None
 
-    def context(self, name: str) -> Context:
-        """The context for a plugin's `make` in the host."""
+    def context(self, name: str, **more: Any) -> Context:
+        """The context for a plugin's `make` in the host; `more` are further fields of it."""
         request = self.request
-        return component_context(self.config, name, self.clock, request.seed, bus=self.bus, keys=request.keys)
+        return component_context(self.config, name, self.clock, request.seed, bus=self.bus, keys=request.keys, **more)
 
-    def make(self, kind: str, component: ComponentConfig, name: str) -> Any:
-        """What the plugin of a component of the YAML makes; `name` is that of its context."""
-        return self.registry.find(kind, component.type).make(component.options, self.context(name))
+    def make(self, kind: str, component: ComponentConfig, name: str, **more: Any) -> Any:
+        """What the plugin of a component of the YAML makes; `name` and `more` are those of its context."""
+        return self.registry.find(kind, component.type).make(component.options, self.context(name, **more))
 
     def measured(self) -> JointReading:
         """The newest state.

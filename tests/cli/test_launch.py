@@ -258,7 +258,7 @@ def test_deep_check_compares_the_models_of_all_modes(launch: Callable[..., Ran],
     assert problem["path"] == "models.net"
 
 
-@pytest.mark.parametrize(("mode", "code"), [("monolithic", 2), ("process", 2), ("distributed", 0)])
+@pytest.mark.parametrize(("mode", "code"), [("monolithic", 2), ("far", 0)])
 def test_deep_check_wants_weights_only_where_they_are_loaded(
     launch: Callable[..., Ran], ibrobot: Callable[..., Ran], monkeypatch: pytest.MonkeyPatch, mode: str, code: int
 ):
@@ -266,7 +266,7 @@ def test_deep_check_wants_weights_only_where_they_are_loaded(
         raise PolicyError("model.safetensors is missing")
 
     monkeypatch.setattr(FakePolicy, "check_weights", check_weights)
-    transport = ("--set", "transport={type: net}") if mode == "distributed" else ()
+    transport = ("--set", "transport={type: net}") if mode == "far" else ()
     ran = ibrobot(
         "config", "check", "mini.yaml", "--sim", "--deep", "--set",
         f"control_modes.policy.inference.execution_mode={mode}", *transport,

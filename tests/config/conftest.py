@@ -13,6 +13,7 @@ import pytest
 from ibrobot_core.config import RobotConfig, load_config
 from ibrobot_core.descriptors import (
     ConfigFile,
+    EngineDescriptor,
     HardwareDescriptor,
     PlannerDescriptor,
     PolicyDescriptor,
@@ -100,6 +101,11 @@ class NetOptions:
     scale: float | str = option("auto", help="a number, or auto")
 
 
+@attrs.frozen
+class FarOptions:
+    server: str = option("", help="where the model is")
+
+
 def _make(options: object, ctx: object) -> object:
     raise AssertionError("checking a config makes nothing")
 
@@ -144,6 +150,7 @@ def registry(tmp_path: Path) -> Registry:
         ("sensor", SensorDescriptor("virtual", _make, "a camera", VirtualOptions)),
         ("sensor", SensorDescriptor("gyro", _make, "a gyroscope", kind="imu")),
         ("policy", PolicyDescriptor("net", _make, "a network", NetOptions)),
+        ("engine", EngineDescriptor("far", _make, "on a server", FarOptions, uses_transport=True)),
         ("teleop", TeleopDescriptor("stick", _make, "a stick")),
         ("planner", PlannerDescriptor("straight", _make, "straight lines")),
         ("recorder", RecorderDescriptor("log", _make, "a log")),

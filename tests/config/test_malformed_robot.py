@@ -201,8 +201,36 @@ CASES = {
     "execution_mode": (
         "{model: net}",
         "{model: net, execution_mode: cloud}",
-        "robot.yaml:26: control_modes.policy.inference.execution_mode: 'cloud' is not one of: "
-        "monolithic, process, distributed",
+        "robot.yaml:26: control_modes.policy.inference.execution_mode: unknown engine type 'cloud'; installed: "
+        "far, monolithic",
+    ),
+    "execution_mode_nearly": (
+        "{model: net}",
+        "{model: net, execution_mode: monolitic}",
+        "robot.yaml:26: control_modes.policy.inference.execution_mode: unknown engine type 'monolitic', did you mean "
+        "'monolithic'?",
+    ),
+    "execution_mode_is_no_text": (
+        "{model: net}",
+        "{model: net, execution_mode: 5}",
+        "robot.yaml:26: control_modes.policy.inference.execution_mode: expected text, got 5 (quote it: '5')",
+    ),
+    "execution_mode_option": (
+        "{model: net}",
+        "{model: net, server: big}",
+        "robot.yaml:26: control_modes.policy.inference.server: unknown key with execution_mode 'monolithic'; "
+        "it belongs to far",
+    ),
+    "execution_mode_option_value": (
+        "{model: net}",
+        "{model: net, execution_mode: far, server: 5}\n    dispatch: {watermark: 1}",
+        "robot.yaml:26: control_modes.policy.inference.server: expected text, got 5 (quote it: '5')",
+    ),
+    "execution_mode_without_a_transport": (
+        "{model: net}",
+        "{model: net, execution_mode: far}",
+        "robot.yaml:26: control_modes.policy.inference.execution_mode: far needs a transport to the server, "
+        "e.g. transport: {type: zenoh, connect: [tcp/127.0.0.1:7447]}",
     ),
     "default_mode": (
         "default_control_mode: teleop",

@@ -106,5 +106,5 @@ def test_transport_that_nothing_uses_is_refused(load_text: Load, base: str, regi
     registry.entries["transport", "shared"] = attrs.evolve(local, descriptor=shared)
 
     assert faults(load_text, base + "transport: {type: shared}\n") == (
-        "robot.yaml:42: transport.type: nothing would use 'shared'; a model does with execution_mode: distributed"
+        "robot.yaml:42: transport.type: nothing uses 'shared': no mode has an execution_mode that needs a transport"
     )

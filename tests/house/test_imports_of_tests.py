@@ -11,7 +11,6 @@ import pytest
 
 PLUGINS = Path(__file__).parents[2] / "plugins"
 LOOP = "a loop of a few lines with core's own smoother and safety layer, which plans of policies pass through"
-CLIENT = "the server against core's own client"
 ALLOWED = {
     (
         "ibrobot-plugin-lerobot/tests/test_compose.py",
@@ -22,8 +21,6 @@ ALLOWED = {
     ("ibrobot-plugin-mujoco/tests/test_model_limits.py", "ibrobot_core.config.models"): (
         "limits as core reads them, against those of MuJoCo"
     ),
-    ("ibrobot-plugin-serve/tests/fuzz_wire.py", "ibrobot_core.inference.remote"): CLIENT,
-    ("ibrobot-plugin-serve/tests/test_service.py", "ibrobot_core.inference.remote"): CLIENT,
 }
 """File and module -> why its tests need it."""
 

@@ -12,8 +12,8 @@ from ibrobot_core.packages import EXTRAS
 from ibrobot_core.plugins import KINDS, OFFICIAL, example_type, official_plugins
 
 CORE = OFFICIAL.parent
-ORDINARY = {"joint", "keyboard"}
-"""Types that are words of the language too: they count where a text says `type: WORD`."""
+ORDINARY = {"joint", "keyboard", "process"}
+"""Types that are words of the language too: they count where a YAML would name them, as in `type: WORD`."""
 ALLOWED = {("config/models.py", '_root(path, "mujoco")')}
 """File and text: the root element of MJCF files."""
 
@@ -26,7 +26,7 @@ def patterns() -> Iterator[str]:
         yield from (rf"\bibrobot {command}\b" for command in offers.get("command", ()))
         yield from (rf"\b{section}: \{{|\[.{section}.\]" for section in offers.get("section", ()))
         for type_ in (type_ for kind in KINDS if kind != "section" for type_ in offers.get(kind, ())):
-            yield rf"\btype: {type_}\b" if type_ in ORDINARY else rf"\b{type_}\b"
+            yield rf"\b(type|execution_mode): {type_}\b" if type_ in ORDINARY else rf"\b{type_}\b"
 
 
 def named(text: str, file: str = "") -> list[str]:

@@ -18,11 +18,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from ibrobot_serve.remote import RemoteEngine
 from ibrobot_testing import host_context
 from ibrobot_testing.fakes import FakePolicy
 
 from ibrobot_core.errors import PolicyError
-from ibrobot_core.inference.remote import RemoteEngine
 from ibrobot_core.interfaces import Transport
 from ibrobot_core.plugins import installed_plugins
 

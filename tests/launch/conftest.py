@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import textwrap
 from collections.abc import Iterator
+from importlib.metadata import EntryPoint
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -78,6 +79,8 @@ class Runs:
     folder: Path
     site: Site
     made: list[Runtime] = attrs.field(factory=list)
+    installed: list[EntryPoint] = attrs.field(factory=list)
+    """Plugins that are not made up."""
 
     @property
     def parts(self) -> Any:
@@ -87,7 +90,7 @@ class Runs:
         """A run in lockstep, unless `asked` says otherwise; not started."""
         path = self.folder / "mini.yaml"
         path.write_text(ROBOT)
-        registry = discover(self.site.entry_points())
+        registry = discover([*self.site.entry_points(), *self.installed])
         config = load_config(path, overrides=overrides, mode=mode, sim=sim, registry=registry)
         runtime = Runtime(Session(config, registry, LaunchRequest(**{"lockstep": True, **asked})))
         self.made.append(runtime)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
+from importlib.metadata import entry_points
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,6 +22,11 @@ pytestmark = pytest.mark.integration
 
 MODE = "control_modes.policy.inference.execution_mode={}"
 NETWORK = "transport={type: shared}"
+
+
+@pytest.fixture(autouse=True)
+def engines(runs: Runs) -> None:
+    runs.installed.extend(entry_points(group="ibrobot", name="serve"))
 
 
 @pytest.fixture

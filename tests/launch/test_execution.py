@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import TYPE_CHECKING, Any
 
 import attrs
@@ -10,7 +11,7 @@ import pytest
 from ibrobot_core.errors import ComponentFailed, ConfigError
 
 if TYPE_CHECKING:
-    from conftest import Runs
+    from conftest import Runs, Site
 
 MODE = "control_modes.policy.inference.execution_mode={}"
 
@@ -59,11 +60,23 @@ def test_the_status_and_the_diagnostics_tell_how_the_plan_is_kept_filled(runs: R
 
 
 @pytest.mark.parametrize("transport", [(), ("transport={type: local}",)])
-def test_distributed_needs_a_transport_to_elsewhere(runs: Runs, transport: tuple[str, ...]):
-    with pytest.raises(ConfigError, match="distributed needs a transport to the server"):
-        runs.make(MODE.format("distributed"), *transport)
+def test_engine_that_uses_the_transport_needs_one_to_other_machines(runs: Runs, transport: tuple[str, ...]):
+    with pytest.raises(ConfigError, match="far needs a transport to the server"):
+        runs.make(MODE.format("far"), *transport)
 
 
-def test_a_servers_name_has_no_meaning_without_one(runs: Runs):
-    with pytest.raises(ConfigError, match="has a meaning only with execution_mode: distributed"):
-        runs.make("control_modes.policy.inference.server_model=big")
+def test_engine_is_given_the_model_and_an_open_transport(runs: Runs, site: Site):
+    site.add("shared-network", "shared_network.py")
+    server = "control_modes.policy.inference.server=big"
+    runtime = runs.start(MODE.format("far"), server, "transport={type: shared}", seed=5)
+    engine, model = runs.parts.MADE["far"], runs.parts.MADE["far"].model
+    assert (engine.name, engine.options.server, engine.stats.alive) == ("net", "big", True)
+    assert (model.config, model.policy, model.timeout_s) == (runtime.session.config, runs.parts.MADE["net"], 5.0)
+    assert model.transport is sys.modules["shared_network"].NETWORK
+    assert not model.ending.is_set()
+    assert [line.strip() for line in runtime.plan.lines()][:2] == [
+        "1. transport    transport shared",
+        "2. model:net    policy net, far away  (needs transport)",
+    ]
+    runtime.stop()
+    assert model.ending.is_set()

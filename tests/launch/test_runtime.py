@@ -64,7 +64,7 @@ def test_nothing_stands_in_the_plan_before_what_it_needs(runs: Runs, mode: str):
 def test_the_plan_in_words(runs: Runs):
     runtime = runs.make(episodes=2, seed=5)
     assert [line.strip() for line in runtime.plan.lines()] == [
-        "1. model:net    policy net",
+        "1. model:net    policy net, in the host process",
         "2. control      scene at 50 Hz, in this process, in lockstep  (needs model:net)",
         "3. sensor:top   camera drawn  (needs control)",
         "4. sensor:side  camera drawn  (needs control)",

@@ -15,15 +15,15 @@ import pytest
 import torch
 from ibrobot_lerobot.options import LeRobotPolicyOptions
 from ibrobot_lerobot.policy import SEED, LeRobotPolicy
+from ibrobot_serve.process import ProcessEngine
+from ibrobot_serve.remote import RemoteEngine
 from ibrobot_serve.service import InferenceService
 from ibrobot_testing.contexts import START_NS, host_context
 from ibrobot_testing.fakes import FakeTransport
 
 from ibrobot_core.config import load_config
-from ibrobot_core.inference.engine import Engine, LocalEngine
-from ibrobot_core.inference.process import ProcessEngine
-from ibrobot_core.inference.remote import RemoteEngine
-from ibrobot_core.interfaces import Frame, Payload
+from ibrobot_core.inference.engine import LocalEngine
+from ibrobot_core.interfaces import Engine, Frame, Payload
 
 sys.path.insert(0, str(Path(__file__).parent))
 from checkpoints import CONFIGS, Theirs, save

@@ -8,13 +8,9 @@ from ibrobot_core.component import Component
 from ibrobot_core.config.schema import ControlMode, InferenceConfig
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.dispatch.dispatcher import Dispatcher
-from ibrobot_core.errors import PolicyError
 from ibrobot_core.inference.client import EngineClient, InferenceClient, LockstepClient
-from ibrobot_core.inference.engine import Engine, LocalEngine
 from ibrobot_core.inference.policy_units import PolicyInItsUnits
-from ibrobot_core.inference.process import ProcessEngine
-from ibrobot_core.inference.remote import RemoteEngine
-from ibrobot_core.interfaces import PictureCodec, Policy
+from ibrobot_core.interfaces import Engine, ModelContext, Policy
 from ibrobot_core.launch.models import check_model
 from ibrobot_core.launch.session import ActingPolicy, Session
 from ibrobot_core.launch.sources.source_worker import SourceWorker
@@ -30,11 +26,10 @@ class LoadedModel(Component):
 
     def __init__(self, session: Session, inference: InferenceConfig, link: TransportLink | None) -> None:
         model = session.config.models[inference.model]
-        distributed = inference.execution_mode == "distributed"
-        where = {"monolithic": "", "process": ", in a process of its own", "distributed": ", on a server"}
-        summary = f"policy {model.type}{where[inference.execution_mode]}"
-        super().__init__(f"model:{model.name}", summary, (link.name,) if distributed and link is not None else ())
-        self._link = link
+        where = session.registry.find("engine", inference.type).summary
+        self._link = link if inference.uses_transport else None
+        needs = (self._link.name,) if self._link is not None else ()
+        super().__init__(f"model:{model.name}", f"policy {model.type}, {where}", needs)
         self._session = session
         self._inference = inference
         self._model = model
@@ -72,40 +67,13 @@ class LoadedModel(Component):
         if units is not None:
             policy = PolicyInItsUnits(policy, units)
         self._policy = policy
-        self._engine = self._made_engine(policy)
-        self._engine.start()
+        engine: Engine = session.make("engine", self._inference, model.name, model=self._context(policy))
+        self._engine = engine
+        engine.start()
 
-    def _made_engine(self, policy: Policy) -> Engine:
-        session, inference = self._session, self._inference
-        match inference.execution_mode:
-            case "process":
-                return ProcessEngine(
-                    session.config, inference.model, policy.fingerprint(), session.request.seed, session.finished,
-                    inference.hang_timeout, accept_new_weights=inference.accept_new_weights,
-                )  # fmt: skip
-            case "distributed":
-                assert self._link is not None, "the YAML's checks require a transport"
-                return RemoteEngine(
-                    policy, self._link.transport, inference.server_model or inference.model, session.config.robot.name,
-                    start_timeout_s=inference.request_timeout, codec=self._codec(policy),
-                    accept_new_weights=inference.accept_new_weights,
-                )  # fmt: skip
-            case _:
-                return LocalEngine(policy)
-
-    def _codec(self, policy: Policy) -> PictureCodec | None:
-        quality = self._inference.jpeg_quality
-        if quality is None:
-            return None
-        codec = policy.picture_codec(quality)
-        if codec is None:
-            raise PolicyError(
-                f"model {self._model.name!r}: jpeg_quality cannot be used, the policy sends no pictures as they are"
-            )
-        self._session.log.info(
-            "model %s: pictures are sent as JPEG of quality %d, with a loss", self._model.name, quality
-        )
-        return codec
+    def _context(self, policy: Policy) -> ModelContext:
+        session, transport = self._session, self._link.transport if self._link is not None else None
+        return ModelContext(session.config, policy, transport, self._inference.request_timeout, session.finished)
 
     @override
     def stop(self) -> None:

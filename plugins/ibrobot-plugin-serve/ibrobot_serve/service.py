@@ -17,7 +17,6 @@ import numpy as np
 
 from ibrobot_core.api import (
     NS_PER_S,
-    WIRE_LIMITS,
     IbrobotError,
     Payload,
     PictureCodec,
@@ -25,19 +24,22 @@ from ibrobot_core.api import (
     PolicyError,
     Tensors,
     Transport,
+    WireError,
+    copied_tensors,
+)
+from ibrobot_serve.fair_queue import FairQueue
+from ibrobot_serve.pacing import Pacing
+from ibrobot_serve.wire import (
+    WIRE_LIMITS,
     WireDecoder,
     WireEncoder,
-    WireError,
     WireKind,
     WireLimits,
     WireMessage,
-    copied_tensors,
     health_name,
     service_name,
     whole_fingerprint,
 )
-from ibrobot_serve.fair_queue import FairQueue
-from ibrobot_serve.pacing import Pacing
 
 _ROBOTS_KEPT = 256
 """Robots whose counts are kept; those heard of last."""

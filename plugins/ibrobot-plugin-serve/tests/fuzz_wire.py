@@ -26,7 +26,9 @@ from pathlib import Path
 from typing import override
 
 import numpy as np
+from ibrobot_serve.remote import RemoteEngine
 from ibrobot_serve.service import InferenceService
+from ibrobot_serve.wire import WireDecoder, WireEncoder, WireKind, WireMessage, service_name
 from ibrobot_testing import host_context
 from ibrobot_testing.fakes import FakePolicy, FakeTransport
 
@@ -34,14 +36,8 @@ from ibrobot_core.api import (
     Handler,
     Tensors,
     Transport,
-    WireDecoder,
-    WireEncoder,
-    WireKind,
-    WireMessage,
     installed_plugins,
-    service_name,
 )
-from ibrobot_core.inference.remote import RemoteEngine
 
 GROWTH_MIB = 64
 """What the process may grow by: threads' stacks and arenas, and the counts of 256 robots."""

@@ -17,7 +17,9 @@ import pytest
 from ibrobot_serve import service as module
 from ibrobot_serve.metrics import probes
 from ibrobot_serve.pacing import Pacing
+from ibrobot_serve.remote import RemoteEngine
 from ibrobot_serve.service import InferenceService, ServiceOptions
+from ibrobot_serve.wire import WireDecoder, WireEncoder, WireKind, WireMessage, health_name, service_name
 from ibrobot_testing import host_context
 from ibrobot_testing.fakes import FakePolicy, FakeTransport
 from prometheus_client.parser import text_string_to_metric_families
@@ -28,14 +30,7 @@ from ibrobot_core.api import (
     PolicyError,
     Tensors,
     TransportError,
-    WireDecoder,
-    WireEncoder,
-    WireKind,
-    WireMessage,
-    health_name,
-    service_name,
 )
-from ibrobot_core.inference.remote import RemoteEngine
 
 PATIENCE_S = 30.0
 SOON_NS = round(PATIENCE_S * 1e9)

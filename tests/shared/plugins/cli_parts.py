@@ -9,6 +9,7 @@ from ibrobot_testing.fakes import FakeHardware, FakePlanner, FakePolicy, FakeRea
 
 from ibrobot_core import hookimpl
 from ibrobot_core.descriptors import (
+    EngineDescriptor,
     HardwareDescriptor,
     PlannerDescriptor,
     PolicyDescriptor,
@@ -102,6 +103,11 @@ def ibrobot_hardware():
 @hookimpl
 def ibrobot_transports():
     yield TransportDescriptor("net", unused, "a network")
+
+
+@hookimpl
+def ibrobot_engines():
+    yield EngineDescriptor("far", unused, "elsewhere", uses_transport=True, weights_here=False)
 
 
 @hookimpl

@@ -7,6 +7,7 @@ from typing import Any
 
 import attrs
 from ibrobot_testing.fakes import (
+    FakeEngine,
     FakeHardware,
     FakePlanner,
     FakePolicy,
@@ -18,6 +19,7 @@ from ibrobot_testing.fakes import (
 
 from ibrobot_core import hookimpl
 from ibrobot_core.descriptors import (
+    EngineDescriptor,
     HardwareDescriptor,
     PlannerDescriptor,
     PolicyDescriptor,
@@ -27,6 +29,7 @@ from ibrobot_core.descriptors import (
 )
 from ibrobot_core.errors import HardwareError, MissingDependency, PolicyError, SensorError
 from ibrobot_core.interfaces import Holding
+from ibrobot_core.options import option
 
 EVENTS: list[tuple[Any, ...]] = []
 CALLS: list[str] = []
@@ -156,6 +159,18 @@ class Lost(Net):
         raise PolicyError("no such checkpoint")
 
 
+@attrs.frozen
+class FarOptions:
+    server: str = option("", help="where the model is")
+
+
+class Far(FakeEngine):
+    def __init__(self, options, ctx):
+        super().__init__(ctx, "far")
+        MADE["far"] = self
+        self.options, self.name = options, ctx.name
+
+
 def can_draw():
     if "no OpenGL" in TROUBLE:
         raise MissingDependency("no OpenGL", apt=["libegl1", "libopengl0"])
@@ -188,6 +203,11 @@ def ibrobot_policies():
     yield PolicyDescriptor("continuing", make(Continuing), "a network that continues the plan")
     yield PolicyDescriptor("seeing", make(Seeing), "a network with eyes")
     yield PolicyDescriptor("lost", make(Lost), "a network that is not there")
+
+
+@hookimpl
+def ibrobot_engines():
+    yield EngineDescriptor("far", Far, "far away", FarOptions, uses_transport=True, weights_here=False)
 
 
 @hookimpl

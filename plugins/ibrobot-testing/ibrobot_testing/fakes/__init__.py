@@ -1,12 +1,13 @@
 """The least that is a correct implementation of each kind: for tests, and as examples to read."""
 
 from ibrobot_testing.fakes.control import FakeExecutor, FakeHardware, FakeRealHardware
-from ibrobot_testing.fakes.host import FakePlanner, FakePolicy, FakeSensor, FakeTeleop, FakeViewer
+from ibrobot_testing.fakes.host import FakeEngine, FakePlanner, FakePolicy, FakeSensor, FakeTeleop, FakeViewer
 from ibrobot_testing.fakes.storage import FakeDataset, FakeRecorder
 from ibrobot_testing.fakes.transport import FakeTransport
 
 __all__ = [
     "FakeDataset",
+    "FakeEngine",
     "FakeExecutor",
     "FakeHardware",
     "FakePlanner",

@@ -1,4 +1,4 @@
-"""Fakes of what runs in the host: sensor, teleoperation device, policy, planner and viewer."""
+"""Fakes of what runs in the host: sensor, teleoperation device, policy, engine, planner and viewer."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ibrobot_core.api import (
     Context,
+    Engine,
     Frame,
     Header,
     Image,
@@ -135,6 +136,25 @@ class FakePolicy(Policy):
     def postprocess(self, tensors: Tensors) -> NDArray[np.float64]:
         shares = np.linspace(0.1, 1.0, self.spec.chunk_size)[:, None]
         return np.asarray(tensors["state"], np.float64) + shares * np.asarray(tensors["delta"], np.float64)
+
+
+class FakeEngine(Engine):
+    """The model in this process."""
+
+    def __init__(self, ctx: Context, mode: str = "fake") -> None:
+        super().__init__(mode, ctx.seed)
+        assert ctx.model is not None
+        self.model = ctx.model
+
+    @override
+    def start(self) -> None:
+        self.model.policy.load()
+        self.stats.weights = self.model.policy.weights()
+        self.stats.alive = True
+
+    @override
+    def run(self, tensors: Tensors, request_id: int, deadline_ns: int) -> Tensors:
+        return self.model.policy.infer(tensors)
 
 
 class FakePlanner(Planner):

@@ -14,10 +14,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-
-from ibrobot_core.errors import WireError
-from ibrobot_core.inference import wire
-from ibrobot_core.inference.wire import (
+from ibrobot_serve import wire
+from ibrobot_serve.wire import (
     ALIGNMENT,
     Buffer,
     PictureCodec,
@@ -30,7 +28,9 @@ from ibrobot_core.inference.wire import (
     encode,
 )
 
-PAGE = Path(__file__).parents[2] / "docs/reference/wire.md"
+from ibrobot_core.api import WireError
+
+PAGE = Path(__file__).parents[3] / "docs/reference/wire.md"
 DTYPES = st.sampled_from(["?", "u1", "i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f2", "<f4", "<f8", ">f4", ">i2"])
 ARRAYS = DTYPES.flatmap(lambda code: hnp.arrays(code, hnp.array_shapes(min_dims=0, max_dims=4, min_side=0, max_side=5)))
 TEXTS = st.text(st.characters(codec="utf-8"), max_size=20)

@@ -12,18 +12,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from ibrobot_serve.process import ProcessEngine
 from ibrobot_testing import host_context
 from ibrobot_testing.fakes import FakePolicy
 
-from ibrobot_core.config import RobotConfig, load_config
-from ibrobot_core.errors import PolicyError
-from ibrobot_core.inference.process import ProcessEngine
-from ibrobot_core.plugins import discover
+from ibrobot_core.api import PolicyError, RobotConfig, load_config
 
 if TYPE_CHECKING:
-    from conftest import Site
-
-pytestmark = pytest.mark.integration
+    from ibrobot_testing.site import Site
 
 PATIENCE_NS = 30_000_000_000
 ROBOT = textwrap.dedent("""\
@@ -43,7 +39,7 @@ ROBOT = textwrap.dedent("""\
 def config(site: Site, tmp_path: Path) -> RobotConfig:
     site.add("net-parts", "inference_parts.py")
     (tmp_path / "mini.yaml").write_text(ROBOT)
-    return load_config(tmp_path / "mini.yaml", sim=True, registry=discover(site.entry_points()))
+    return load_config(tmp_path / "mini.yaml", sim=True)
 
 
 def fingerprint(config: RobotConfig) -> str:

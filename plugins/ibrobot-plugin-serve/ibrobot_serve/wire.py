@@ -7,6 +7,7 @@ makes about itself is checked against its length and the limits before anything 
 from __future__ import annotations
 
 import enum
+import hashlib
 import math
 import struct
 import threading
@@ -18,8 +19,7 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.errors import WireError
-from ibrobot_core.interfaces import Payload, PictureCodec, Tensors
+from ibrobot_core.api import Payload, PictureCodec, Tensors, WireError
 
 MAGIC = b"IBRW"
 VERSION = 1
@@ -51,6 +51,16 @@ def service_name(model: str) -> str:
 def health_name(model: str) -> str:
     """What a transport calls its health."""
     return f"{service_name(model)}/health"
+
+
+def whole_fingerprint(fingerprint: str, weights: str) -> str:
+    """Of a policy with its weights: requests and answers carry it, so that one side notices when the other's change.
+
+    Args:
+        fingerprint: `Policy.fingerprint`.
+        weights: `Policy.weights`.
+    """
+    return hashlib.sha256(f"{fingerprint}\0{weights}".encode()).hexdigest()[:32] if weights else fingerprint
 
 
 class WireKind(enum.IntEnum):

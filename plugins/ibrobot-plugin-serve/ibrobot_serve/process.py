@@ -8,16 +8,22 @@ import os
 import threading
 import time
 from collections.abc import Mapping
-from typing import Any, override
+from typing import Any, Self, override
 
-from ibrobot_core.child import Child
-from ibrobot_core.config import RobotConfig
-from ibrobot_core.errors import ComponentFailed, PolicyError
-from ibrobot_core.inference.engine import Engine, check_weights
-from ibrobot_core.inference.wire import WIRE_LIMITS, WireDecoder, WireEncoder, WireKind, WireMessage
-from ibrobot_core.interfaces import Tensors
-from ibrobot_core.memory import create_memory
-from ibrobot_core.units import NS_PER_S
+from ibrobot_core.api import (
+    NS_PER_S,
+    Child,
+    ComponentFailed,
+    Context,
+    Engine,
+    PolicyError,
+    RobotConfig,
+    Tensors,
+    create_memory,
+)
+from ibrobot_serve.options import ProcessOptions
+from ibrobot_serve.weights import check_weights
+from ibrobot_serve.wire import WIRE_LIMITS, WireDecoder, WireEncoder, WireKind, WireMessage
 
 _START_TIMEOUT_S = 600.0
 _END_TIMEOUT_S = 2.0
@@ -37,7 +43,7 @@ class ProcessEngine(Engine):
         model: the model's name there.
         fingerprint: of the policy on this side.
         seed: the run's.
-        given_up: set when nobody waits for it any more, e.g. while it loads.
+        given_up: set when the run ends, e.g. while the model loads.
         hang_timeout_s: how long it may be at work on one request before it is taken to hang [s].
         accept_new_weights: go on, with a warning, when the process starts again with other weights.
     """
@@ -68,6 +74,15 @@ class ProcessEngine(Engine):
         self._deaths = 0
         self._start_again_s = 0.0
 
+    @classmethod
+    def from_context(cls, options: ProcessOptions, ctx: Context) -> Self:
+        """The engine that a robot YAML describes."""
+        assert ctx.model is not None
+        return cls(
+            ctx.model.config, ctx.name, ctx.model.policy.fingerprint(), ctx.seed, ctx.model.ending,
+            options.hang_timeout, accept_new_weights=options.accept_new_weights,
+        )  # fmt: skip
+
     @property
     def pid(self) -> int | None:
         """The id of the model's process; None before `start`."""
@@ -96,7 +111,7 @@ class ProcessEngine(Engine):
             self._sent = request_id
             self._at_work_s = self._at_work_s or time.monotonic()
             while (event := self._await("answer", child, deadline_s))["id"] != request_id:
-                pass  # of a request that nobody waits for any more
+                pass  # of a request that was given up
             # The memory belongs to the next answer; this one is kept.
             answer = self._decoder.decode(bytes(self._answer[: event["size"]]))
         self._deaths = 0
@@ -123,7 +138,7 @@ class ProcessEngine(Engine):
             for memory in memories:
                 os.ftruncate(memory, WIRE_LIMITS.size)  # pages are there from their first use on
             self._request, self._answer = (memoryview(mmap.mmap(memory, WIRE_LIMITS.size)) for memory in memories)
-            self._child = Child("ibrobot_core.inference.model_process", self._order, *memories)
+            self._child = Child("ibrobot_serve.model_process", self._order, *memories)
         finally:
             for memory in memories:
                 os.close(memory)

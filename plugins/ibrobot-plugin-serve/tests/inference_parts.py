@@ -8,9 +8,7 @@ import signal
 import numpy as np
 from ibrobot_testing.fakes import FakeHardware, FakePolicy
 
-from ibrobot_core import hookimpl
-from ibrobot_core.descriptors import HardwareDescriptor, PolicyDescriptor
-from ibrobot_core.errors import PolicyError
+from ibrobot_core.api import HardwareDescriptor, PolicyDescriptor, PolicyError, hookimpl
 
 
 class Net(FakePolicy):

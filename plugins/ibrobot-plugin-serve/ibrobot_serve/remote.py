@@ -3,17 +3,31 @@
 from __future__ import annotations
 
 import json
+import logging
 import threading
 import time
 import uuid
 from collections.abc import Callable, Mapping
-from typing import Any, override
+from typing import Any, Self, override
 
 import attrs
 
-from ibrobot_core.errors import ContractError, PolicyError, TransportError, WireError
-from ibrobot_core.inference.engine import Engine, check_weights
-from ibrobot_core.inference.wire import (
+from ibrobot_core.api import (
+    NS_PER_S,
+    Context,
+    ContractError,
+    Engine,
+    PictureCodec,
+    Policy,
+    PolicyError,
+    Tensors,
+    Transport,
+    TransportError,
+    WireError,
+)
+from ibrobot_serve.options import DistributedOptions
+from ibrobot_serve.weights import check_weights
+from ibrobot_serve.wire import (
     WIRE_LIMITS,
     Buffer,
     WireDecoder,
@@ -23,10 +37,8 @@ from ibrobot_core.inference.wire import (
     WireMessage,
     health_name,
     service_name,
+    whole_fingerprint,
 )
-from ibrobot_core.interfaces import PictureCodec, Policy, Tensors, Transport
-from ibrobot_core.interfaces.policy import whole_fingerprint
-from ibrobot_core.units import NS_PER_S
 
 _HEALTH_TIMEOUT_S = 2.0
 _HEALTH_SIZE = 1 << 20
@@ -75,6 +87,30 @@ class RemoteEngine(Engine):
         self._episode = time.time_ns()
         """An episode's number does not come again after a restart under the same certificate."""
         self._end_watch: Callable[[], None] | None = None
+
+    @classmethod
+    def from_context(cls, options: DistributedOptions, ctx: Context) -> Self:
+        """The engine that a robot YAML describes.
+
+        Raises:
+            PolicyError: for `jpeg_quality`, where the policy sends no pictures as they are.
+        """
+        model = ctx.model
+        assert model is not None
+        assert model.transport is not None, "the YAML's checks require a transport"
+        codec = None
+        if options.jpeg_quality is not None:
+            codec = model.policy.picture_codec(options.jpeg_quality)
+            if codec is None:
+                raise PolicyError(
+                    f"model {ctx.name!r}: jpeg_quality cannot be used, the policy sends no pictures as they are"
+                )
+            message = "model %s: pictures are sent as JPEG of quality %d, with a loss"
+            logging.getLogger("ibrobot.inference").info(message, ctx.name, options.jpeg_quality)
+        return cls(
+            model.policy, model.transport, options.server_model or ctx.name, ctx.robot.name,
+            start_timeout_s=model.timeout_s, codec=codec, accept_new_weights=options.accept_new_weights,
+        )  # fmt: skip
 
     @override
     def start(self) -> None:

@@ -1,6 +1,6 @@
 """The model process: loads one policy and runs its `infer` for one robot, until the host ends it or is gone.
 
-Started by `ibrobot_core.inference.process` as a `Child` with the descriptors REQUEST and ANSWER: memory for the frames
+Started by `ibrobot_serve.process` as a `Child` with the descriptors REQUEST and ANSWER: memory for the frames
 of the wire format, one each way.
 """
 
@@ -15,14 +15,17 @@ from pathlib import Path
 
 import attrs
 
-from ibrobot_core.child import FAREWELL_S, Channel, open_parent
-from ibrobot_core.component import error_text
-from ibrobot_core.config import from_document
-from ibrobot_core.errors import ComponentFailed
-from ibrobot_core.inference.build import build_policy
-from ibrobot_core.inference.wire import WIRE_LIMITS, WireDecoder, WireEncoder, WireKind, WireMessage
-from ibrobot_core.interfaces import Policy
-from ibrobot_core.plugins import installed_plugins
+from ibrobot_core.api import (
+    Channel,
+    ComponentFailed,
+    Policy,
+    build_policy,
+    error_text,
+    from_document,
+    installed_plugins,
+    open_parent,
+)
+from ibrobot_serve.wire import WIRE_LIMITS, WireDecoder, WireEncoder, WireKind, WireMessage
 
 _GLANCE_S = 0.5
 """How often to look whether the host is still there."""
@@ -46,7 +49,7 @@ class ModelLoop:
         """Answer until the host hangs up."""
         while True:
             try:
-                order = self.channel.wait(None)[-1]  # nobody waits for earlier ones any more
+                order = self.channel.wait(None)[-1]  # earlier ones were given up
             except ComponentFailed:
                 return
             size = self._answered(order["id"], order["size"])
@@ -97,7 +100,7 @@ def main(parent: int, request: int, answer: int) -> int:
     finally:
         if policy is not None:
             policy.close()
-        channel.flush(FAREWELL_S)
+        channel.flush()
     return 0
 
 
