@@ -1,10 +1,11 @@
 """Kinematics of arms: forward and inverse kinematics, Jacobians and tool jog, from an MJCF."""
 
 from ibrobot_kinematics.errors import KinematicsError, UnreachableError
-from ibrobot_kinematics.inverse import Target, solve, solve_all
+from ibrobot_kinematics.inverse import solve, solve_all
 from ibrobot_kinematics.jog import jog
 from ibrobot_kinematics.mjcf import read_mjcf, robot_model
 from ibrobot_kinematics.model import ChainJoint, KinematicModel, TipPose
+from ibrobot_kinematics.target import Target
 
 __all__ = [
     "ChainJoint", "KinematicModel", "KinematicsError", "Target", "TipPose", "UnreachableError",

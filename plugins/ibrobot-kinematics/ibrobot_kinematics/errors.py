@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from ibrobot_core.api import IbrobotError, Vector
 
 
@@ -12,15 +14,31 @@ class KinematicsError(IbrobotError):
 class UnreachableError(KinematicsError):
     """A target that the arm cannot reach within its joint limits and the tolerances.
 
+    The nearest point is nearest in position; where the arm reaches the position, it has the nearest orientation there.
+
     Args:
-        message: the target, and how far off the nearest solution is.
-        nearest: joint positions [rad] of the nearest solution found, shape (J,).
+        tip: name of the tip's frame.
+        target: the position asked for [m], shape (3,).
+        nearest: joint positions [rad or m] of the nearest point, shape (J,).
+        position: the tip there [m], shape (3,).
         position_error: distance [m] of the tip from the target there.
         rotation_error: angle [rad] between the tip and the target there; 0 for a target without an orientation.
     """
 
-    def __init__(self, message: str, nearest: Vector, position_error: float, rotation_error: float) -> None:
-        super().__init__(message)
+    def __init__(
+        self, tip: str, target: Vector, nearest: Vector, position: Vector, position_error: float, rotation_error: float
+    ) -> None:
+        turned = f" and {math.degrees(rotation_error):.1f} degrees" if rotation_error else ""
+        super().__init__(
+            f"{tip} cannot reach {_point(target)} as asked within the joint limits; the nearest is {_point(position)},"
+            f" {1000 * position_error:.1f} mm{turned} off"
+        )
         self.nearest = nearest
+        self.position = position
         self.position_error = position_error
         self.rotation_error = rotation_error
+
+
+def _point(position: Vector) -> str:
+    x, y, z = position
+    return f"({x:.3f}, {y:.3f}, {z:.3f}) m"

@@ -64,7 +64,10 @@ class KinematicModel:
         """Pose of the tip in the base frame.
 
         Args:
-            q: joint positions, shape (J,).
+            q: joint positions, shape (…, J): one configuration, or many at once.
+
+        Returns:
+            Position and rotation of shapes (…, 3) and (…, 3, 3).
         """
         return self._frames(q)[0]
 
@@ -72,33 +75,32 @@ class KinematicModel:
         """How the tip moves with the joints.
 
         Args:
-            q: joint positions, shape (J,).
+            q: joint positions, shape (…, J).
 
         Returns:
-            Shape (6, J): velocity of the tip's origin [m/s] in rows 0-2 and angular velocity of the tip [rad/s] in rows
-            3-5 for each joint at unit speed, both in the base frame.
+            Shape (…, 6, J): velocity of the tip's origin [m/s] in rows 0-2 and angular velocity of the tip [rad/s] in
+            rows 3-5 for each joint at unit speed, both in the base frame.
         """
         return self.forward_and_jacobian(q)[1]
 
     def forward_and_jacobian(self, q: Vector) -> tuple[TipPose, Vector]:
         """`forward(q)` and `jacobian(q)` for little more than the time of one."""
         tip, origins, axes = self._frames(q)
+        jacobian = np.zeros((*q.shape[:-1], 6, len(self.joint_names)))
         slides = self._slides[:, None]
-        columns = np.where(
-            slides, np.hstack([axes, np.zeros_like(axes)]), np.hstack([cross(axes, tip.position - origins), axes])
-        )
-        jacobian = np.zeros((6, len(self.joint_names)))
-        jacobian[:, self.moving] = columns.T
+        linear = np.where(slides, axes, cross(axes, tip.position[..., None, :] - origins))
+        jacobian[..., :3, self.moving] = linear.swapaxes(-1, -2)
+        jacobian[..., 3:, self.moving] = np.where(slides, 0.0, axes).swapaxes(-1, -2)
         return tip, jacobian
 
     def screws(self, q: Vector) -> tuple[TipPose, Vector, Vector]:
         """Pose of the tip, and a point on the axis [m] and the direction of each of the chain's joints.
 
         Args:
-            q: joint positions, shape (J,).
+            q: joint positions, shape (…, J).
 
         Returns:
-            The tip, the points and the directions, both shape (n, 3), all in the base frame.
+            The tip, the points and the directions, both shape (…, n, 3), all in the base frame.
         """
         return self._frames(q)
 
@@ -133,17 +135,17 @@ class KinematicModel:
         return still, np.array(moves).reshape(-1, 3)
 
     def _frames(self, q: Vector) -> tuple[TipPose, Vector, Vector]:
-        """The tip, and the origins and axes of the chain's joints in the base frame, both shape (n, 3)."""
-        way = q[self.moving] - self._reference
-        angle = np.where(self._slides, 0.0, way)[:, None, None]
+        """The tip, and the origins and axes of the chain's joints in the base frame, both shape (…, n, 3)."""
+        way = q[..., self.moving] - self._reference
+        angle = np.where(self._slides, 0.0, way)[..., None, None]
         still, turning, turned = self._rodrigues
         turns = still + np.sin(angle) * turning + (1 - np.cos(angle)) * turned
-        offsets = self._offsets[0] + self._offsets[1] * way[:, None]
+        offsets = self._offsets[0] + self._offsets[1] * way[..., None]
         origins, axes = np.empty_like(offsets), np.empty_like(offsets)
-        position, rotation = np.zeros(3), np.eye(3)
+        position, rotation = np.zeros((*q.shape[:-1], 3)), np.broadcast_to(np.eye(3), (*q.shape[:-1], 3, 3))
         for i, joint in enumerate(self.chain):
-            origins[i] = position = position + rotation @ offsets[i]
-            rotation = rotation @ turns[i]
-            axes[i] = rotation @ joint.axis
+            origins[..., i, :] = position = position + (rotation @ offsets[..., i, :, None])[..., 0]
+            rotation = rotation @ turns[..., i, :, :]
+            axes[..., i, :] = rotation @ joint.axis
         tip = self.tip_pose
         return TipPose(position + rotation @ tip.position, rotation @ tip.rotation), origins, axes

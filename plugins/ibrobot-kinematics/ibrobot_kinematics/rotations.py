@@ -31,16 +31,20 @@ def exp(v: Vector) -> Vector:
 
 
 def log(rotation: Vector) -> Vector:
-    """Rotation vector, shape (3,), of a matrix, shape (3, 3); its length is at most pi."""
+    """Rotation vectors, shape (…, 3), of matrices, shape (…, 3, 3); their length is at most pi."""
     r = rotation
-    sine = np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]]) / 2
-    length, cosine = float(np.linalg.norm(sine)), (float(np.trace(r)) - 1) / 2
-    if length > _NO_SINE:
-        return np.asarray(sine * (np.arctan2(length, cosine) / length))
-    if cosine > 0:
-        return sine
-    # Near half a turn the symmetric part, cos I + (1 - cos) a aT, has the axis.
-    columns = (r + r.T) / 2 - cosine * np.eye(3)
-    axis = columns[:, np.argmax(np.diag(columns))]
-    axis = axis / np.linalg.norm(axis) * (-1.0 if axis @ sine < 0 else 1.0)
-    return np.asarray(axis * np.arctan2(length, cosine))
+    sine = np.stack([r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]], -1) / 2
+    length, cosine = np.linalg.norm(sine, axis=-1), (np.trace(r, axis1=-2, axis2=-1) - 1) / 2
+    small = length <= _NO_SINE
+    angle = np.arctan2(length, cosine)
+    vector = np.asarray(sine * np.where(small, 1.0, angle / np.where(small, 1.0, length))[..., None])
+    half = small & (cosine <= 0)
+    if half.any():
+        # Near half a turn the symmetric part, cos I + (1 - cos) a aT, has the axis.
+        symmetric = (r + r.mT)[half] / 2 - cosine[half][:, None, None] * np.eye(3)
+        largest = np.argmax(np.diagonal(symmetric, axis1=-2, axis2=-1), axis=-1)
+        axis = np.take_along_axis(symmetric, largest[:, None, None], axis=-1)[..., 0]
+        axis /= np.linalg.norm(axis, axis=-1, keepdims=True)
+        axis *= np.where((axis * sine[half]).sum(axis=-1) < 0, -1.0, 1.0)[:, None]
+        vector[half] = axis * angle[half][:, None]
+    return vector

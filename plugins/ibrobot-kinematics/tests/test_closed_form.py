@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from ibrobot_kinematics import (
     KinematicModel,
-    KinematicsError,
     Target,
     UnreachableError,
     read_mjcf,
@@ -21,7 +20,7 @@ from ibrobot_kinematics import (
 
 from ibrobot_core.api import Vector
 
-from .arms import FIVE, SIX, write_arm
+from .arms import FIVE, write_arm
 
 JOINTS = ("a", "b", "c", "d", "e")
 SHARES = st.lists(st.floats(0.02, 0.98), min_size=5, max_size=5).map(np.array)
@@ -144,15 +143,6 @@ def test_an_unreachable_target_comes_with_the_nearest_point(axis: Vector | None)
     rng = np.random.default_rng(0)
     others = (ARM.forward(within(ARM, share)).position for share in rng.random((2000, 5)))
     assert e.value.position_error <= min(np.linalg.norm(other - target.position) for other in others)
-
-
-def test_other_arms_and_full_poses_have_no_closed_form(tmp_path: Path):
-    six = read_mjcf(write_arm(tmp_path, *SIX), "tool", SIX)
-    with pytest.raises(KinematicsError, match="no closed form"):
-        solve_all(six, Target(np.array([0.2, 0.0, 0.2])))
-    tip = ARM.forward(np.zeros(5))
-    with pytest.raises(KinematicsError, match=r"without a rotation; use solve"):
-        solve_all(ARM, Target(tip.position, rotation=tip.rotation))
 
 
 def test_joints_off_the_chain_stay(tmp_path: Path):
