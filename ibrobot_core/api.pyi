@@ -59,6 +59,7 @@ from ibrobot_core.interfaces import (
     LinearGoal as LinearGoal,
     ModelContext as ModelContext,
     NamedGoal as NamedGoal,
+    OperatorEvent as OperatorEvent,
     OrientationPolicy as OrientationPolicy,
     Payload as Payload,
     PictureCodec as PictureCodec,

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from typing import Literal
 
 import attrs
 
 from ibrobot_core.interfaces.hardware import JointReading
+
+OperatorEvent = Literal["start", "success", "failure", "discard", "intervention"]
+"""What an operator asks of the run by a button of the device: begin an episode; end it as a success, as a failure, or
+leave nothing of it; take the robot from the policy, or give it back."""
 
 
 @attrs.frozen
@@ -19,6 +24,8 @@ class TeleopCommand:
     estop: bool = False
     finished: bool = False
     """True when the device has nothing more to give, e.g. the end of a recording."""
+    events: tuple[OperatorEvent, ...] = ()
+    """What the operator asked for since the last command, in order; each press once."""
 
 
 class Teleop(ABC):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import queue
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
@@ -20,7 +21,7 @@ from ibrobot_core.config.context import component_context
 from ibrobot_core.config.schema import ComponentConfig, ControlMode
 from ibrobot_core.control.link import ControlState, PlanRecord
 from ibrobot_core.errors import ComponentFailed
-from ibrobot_core.interfaces import Context, EngineStats, JointReading
+from ibrobot_core.interfaces import Context, EngineStats, JointReading, OperatorEvent
 from ibrobot_core.launch.absence import AbsentSensor, absent_sensors, refuse
 from ibrobot_core.plugins import Registry
 from ibrobot_core.robot import Vector
@@ -150,6 +151,7 @@ class Session:
         outcome: what came of the run so far.
         failure: the component that died and why; None while all is well.
         finished: set when the run should stop.
+        operator_events: what the operator asked for by buttons of a teleoperation device, for what records episodes.
         log: where the run writes its log.
         command_source: what gives the active executors something to do; None in a mode without one.
         held: whether the robot holds after the reset of a fault, until the operator enters the mode again.
@@ -174,6 +176,7 @@ class Session:
         self.sensors: dict[str, SensorFigures] = {}
         self.failure: tuple[str, Exception] | None = None
         self.finished = threading.Event()
+        self.operator_events: queue.SimpleQueue[OperatorEvent] = queue.SimpleQueue()
         self.log = logging.getLogger("ibrobot")
         self._faults: list[tuple[int, str]] = []
         self._control: ControlHost | None = None

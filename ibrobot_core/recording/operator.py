@@ -7,6 +7,7 @@ from math import inf
 from typing import TYPE_CHECKING, override
 
 from ibrobot_core.errors import DiskFull, IbrobotError, NotSupported
+from ibrobot_core.interfaces import OperatorEvent
 from ibrobot_core.recording.service import EpisodeService
 from ibrobot_core.run_hooks import RunHooks
 from ibrobot_core.units import plural, seconds
@@ -64,6 +65,8 @@ class Operator(RunHooks):
     @override
     def step(self) -> None:
         """Do what is due; called a few times a second."""
+        while not self._run.operator_events.empty():
+            self._press(self._run.operator_events.get())
         if self._service.by_mode:
             return
         service = self._service
@@ -99,6 +102,20 @@ class Operator(RunHooks):
         else:
             return False
         return True
+
+    def _press(self, event: OperatorEvent) -> None:
+        """Act on a button of a teleoperation device. It begins an episode under the last prompt: nobody types there."""
+        service = self._service
+        if service.by_mode or self._continuous:
+            self._run.log.warning("%s: this run begins and ends its episodes by itself", event)
+        elif event == "start":
+            self._begin(self._prompt)
+        elif not service.recording:
+            self._refuse(f"{event}: no episode is being recorded")
+        elif event == "discard":
+            self._end(service.discard)
+        else:
+            self._end(lambda: service.stop(event))
 
     @override
     def rows(self) -> list[tuple[str, str]]:

@@ -151,6 +151,14 @@ def test_a_dataset_of_another_contract_is_refused_before_anything_starts(run: Ru
     assert runs.parts.MADE == {}
 
 
+def test_buttons_that_mean_nothing_in_a_run_are_told(runs: Runs, caplog: pytest.LogCaptureFixture):
+    runtime = runs.start(mode="teleop")
+    runs.parts.MADE["stick"].events = ("start", "intervention")
+    ticks(runtime, 3)
+    assert "start: this run records no episodes by hand; `ibrobot record` does" in caplog.text
+    assert "intervention: mode teleop has no policy to take the robot from" in caplog.text
+
+
 class TestOperator:
     def watch(self, run: Runtime, **asked: object) -> Operator:
         assert run.episode_service is not None
@@ -190,6 +198,34 @@ class TestOperator:
             self.step(run, operator, 2)
         assert [event[2] for event in runs.parts.EVENTS if event[0] == "ended"] == ["failure", "discarded"]
         assert run.episode_service.saved == 1
+
+    def press(self, run: Runtime, runs: Runs, *events: str) -> None:
+        runs.parts.MADE["stick"].events = events
+
+    def test_buttons_of_the_device_begin_and_end_episodes(self, run: Runtime, runs: Runs):
+        operator = self.watch(run, prompt="pick")
+        for events in (("start",), ("success",), ("start",), ("failure",), ("start",), ("discard",)):
+            self.press(run, runs, *events)
+            self.step(run, operator, 3)
+            assert run.episode_service.recording == (events == ("start",))
+        assert [event[2] for event in runs.parts.EVENTS if event[0] == "ended"] == ["success", "failure", "discarded"]
+        assert run.episode_service.saved == 2
+
+    def test_a_button_without_an_episode_to_end_says_so(self, run: Runtime, runs: Runs):
+        operator = self.watch(run, prompt="pick")
+        self.press(run, runs, "failure")
+        self.step(run, operator, 3)
+        assert ("", "failure: no episode is being recorded") in operator.rows()
+
+    def test_buttons_leave_episodes_alone_that_end_by_themselves(
+        self, run: Runtime, runs: Runs, caplog: pytest.LogCaptureFixture
+    ):
+        operator = self.watch(run, continuous=True, keys=False, prompt="watch")
+        self.step(run, operator, 3)
+        self.press(run, runs, "discard")
+        self.step(run, operator, 3)
+        assert run.episode_service.recording
+        assert "discard: this run begins and ends its episodes by itself" in caplog.text
 
     def test_unattended_episodes_pause_and_end_with_the_count(self, run: Runtime, runs: Runs):
         operator = self.watch(run, auto=True, count=2, reset_time_s=0.5, prompt="pick")

@@ -9,7 +9,7 @@ import numpy as np
 from ibrobot_core.bus import Subscription
 from ibrobot_core.config.schema import ControlMode
 from ibrobot_core.errors import TeleopError
-from ibrobot_core.interfaces import Teleop
+from ibrobot_core.interfaces import OperatorEvent, Teleop
 from ibrobot_core.launch.session import Session
 from ibrobot_core.launch.sources.source_worker import SourceWorker
 
@@ -73,8 +73,19 @@ class TeleopSource(SourceWorker):
             joints = tuple(command.positions)
             setpoint = np.array([list(command.positions.values())])
             session.send_plan(session.clock.now_ns(), 1, joints, setpoint)
+        for event in command.events:
+            self._pass_on(event)
         if command.finished:
             session.finish()
+
+    def _pass_on(self, event: OperatorEvent) -> None:
+        session = self.session
+        if event == "intervention":
+            session.log.warning("%s: mode %s has no policy to take the robot from", event, self.mode.name)
+        elif not session.request.by_operator:
+            session.log.warning("%s: this run records no episodes by hand; `ibrobot record` does", event)
+        else:
+            session.operator_events.put(event)
 
     @override
     def teardown(self) -> None:

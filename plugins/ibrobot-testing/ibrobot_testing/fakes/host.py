@@ -18,6 +18,7 @@ from ibrobot_core.api import (
     JointTrajectory,
     JointTrajectoryPoint,
     Message,
+    OperatorEvent,
     PlanCode,
     Planner,
     PlanningError,
@@ -74,7 +75,7 @@ class FakeSensor(Sensor):
 
 
 class FakeTeleop(Teleop):
-    """A device whose deadman and velocity are attributes."""
+    """A device whose deadman, velocity and pressed buttons are attributes."""
 
     def __init__(self, ctx: Context) -> None:
         self._names = ctx.robot.joint_names
@@ -84,6 +85,8 @@ class FakeTeleop(Teleop):
         self.deadman = False
         self.velocity = 0.0
         """Of all joints [rad/s]."""
+        self.events: tuple[OperatorEvent, ...] = ()
+        """For the next command."""
 
     @override
     def connect(self) -> None:
@@ -105,7 +108,9 @@ class FakeTeleop(Teleop):
             raise TeleopError("the fake device is not connected")
         self._positions = self._positions + self.velocity * seconds(measured.stamp_ns - self._last_ns)
         self._last_ns = measured.stamp_ns
-        return TeleopCommand(dict(zip(self._names, self._positions.tolist(), strict=True)) if self.deadman else None)
+        events, self.events = self.events, ()
+        positions = dict(zip(self._names, self._positions.tolist(), strict=True)) if self.deadman else None
+        return TeleopCommand(positions, events=events)
 
 
 class FakePolicy(Policy):
