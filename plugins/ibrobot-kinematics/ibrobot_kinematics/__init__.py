@@ -3,11 +3,12 @@
 from ibrobot_kinematics.errors import KinematicsError, UnreachableError
 from ibrobot_kinematics.inverse import solve, solve_all
 from ibrobot_kinematics.jog import jog
+from ibrobot_kinematics.jog_arm import JogArm, JogMotion, VelocityJog
 from ibrobot_kinematics.mjcf import read_mjcf, robot_model
 from ibrobot_kinematics.model import ChainJoint, KinematicModel, TipPose
 from ibrobot_kinematics.target import Target
 
 __all__ = [
-    "ChainJoint", "KinematicModel", "KinematicsError", "Target", "TipPose", "UnreachableError",
-    "jog", "read_mjcf", "robot_model", "solve", "solve_all",
+    "ChainJoint", "JogArm", "JogMotion", "KinematicModel", "KinematicsError", "Target", "TipPose", "UnreachableError",
+    "VelocityJog", "jog", "read_mjcf", "robot_model", "solve", "solve_all",
 ]  # fmt: skip

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import queue
-from typing import TYPE_CHECKING, override
+from typing import override
 
 import numpy as np
+from ibrobot_kinematics import JogArm
 
 from ibrobot_core.api import Context, JointReading, Teleop, TeleopCommand, TeleopError, Vector, ns, seconds
 from ibrobot_keyboard.keymap import CARTESIAN_AXES, Mode, keymap_of
 from ibrobot_keyboard.options import KeyboardOptions
-
-if TYPE_CHECKING:
-    from ibrobot_kinematics import KinematicModel
 
 _SPEED_STEP = 1.25
 _SLOWEST, _FASTEST = 0.1, 4.0
@@ -33,14 +31,10 @@ class KeyboardTeleop(Teleop):
         self._options = options
         self._ctx = ctx
         robot = ctx.robot
-        gripper = robot.groups.get(options.gripper, ())
-        self._gripper = robot.indices(gripper)
-        self._arm = tuple(name for name in robot.joint_names if name not in gripper)
+        self._arm = JogArm(robot, options.gripper)
         self._home = robot.pose("home") if "home" in robot.description.poses else None
         self._keymap = keymap_of(options, robot)
         self._keys: queue.SimpleQueue[str] | None = None
-        self._model: KinematicModel | None = None
-        """The arm's, where there is Cartesian jog."""
         self._mode: Mode = "joints"
         self._speed = 1.0
         self._setpoint: Vector | None = None
@@ -57,7 +51,7 @@ class KeyboardTeleop(Teleop):
                 "or choose another teleop"
             )
         if self._options.cartesian:
-            self._model = self._kinematics()
+            self._arm.load_model("cartesian: false")
         self._keys = self._ctx.keys()
 
     @override
@@ -95,7 +89,7 @@ class KeyboardTeleop(Teleop):
 
     @override
     def disconnect(self) -> None:
-        self._keys = self._model = self._setpoint = None
+        self._keys = self._setpoint = None
 
     @override
     def help(self) -> str:
@@ -127,54 +121,21 @@ class KeyboardTeleop(Teleop):
 
     def _move(self, before: Vector, dt: float) -> Vector:
         """The setpoint `dt` [s] after `before`, both [rad], shape (J,)."""
-        robot = self._ctx.robot
-        reach = np.minimum(self._options.joint_speed * self._speed, robot.max_velocity) * dt
-        after = before.copy()
+        robot, options, speed = self._ctx.robot, self._options, self._speed
+        velocity = np.zeros(len(robot.joints))
+        after = before
         if _HOME in self._held and self._home is not None:
-            way = self._home - before
-            after += way * min(1.0, float(np.min(reach / np.maximum(np.abs(way), 1e-9))))
+            after = self._arm.move_towards(before, self._home, options.joint_speed * speed, dt)
         elif self._mode == "joints":
-            for i, name in zip(robot.indices(self._arm), self._arm, strict=True):
-                after[i] += self._direction(name) * reach[i]
-        elif self._model is not None and any(axis in self._held for axis in CARTESIAN_AXES):
+            for i, name in zip(robot.indices(self._arm.arm), self._arm.arm, strict=True):
+                velocity[i] = self._direction(name) * options.joint_speed * speed
+        elif any(axis in self._held for axis in CARTESIAN_AXES):
             x, y, z, pitch, roll = (self._direction(axis) for axis in CARTESIAN_AXES)
-            linear = np.array([x, y, z]) * self._options.cartesian_speed * self._speed
-            turn = np.array([0.0, pitch, roll]) * self._options.joint_speed * self._speed
-            after = self._jog(self._model, before, linear, turn, dt)
-        for i in self._gripper:
-            opening = min(self._options.gripper_speed * self._speed, robot.max_velocity[i]) * dt
-            after[i] += self._direction(_GRIPPER) * opening
-        # An arm that rests outside its limits may come in, no joint may go out.
-        return np.clip(after, np.minimum(robot.lower, before), np.maximum(robot.upper, before))
-
-    def _kinematics(self) -> KinematicModel:
-        from ibrobot_kinematics import KinematicsError, robot_model
-
-        if self._ctx.robot.description.mjcf is None:
-            raise TeleopError("Cartesian jog needs robot.description.mjcf: set it, or cartesian: false")
-        try:
-            return robot_model(self._ctx.robot, self._arm)
-        except KinematicsError as error:
-            raise TeleopError(f"Cartesian jog: {error}; set cartesian: false to do without it") from error
-
-    def _jog(self, model: KinematicModel, before: Vector, linear: Vector, turn: Vector, dt: float) -> Vector:
-        """The setpoint `dt` [s] after `before`, both [rad], shape (J,), where the tool moves.
-
-        Args:
-            model: the arm.
-            before: the setpoint before.
-            linear: velocity of the tool in the base frame [m/s], shape (3,).
-            turn: angular velocity about the tool's own axes [rad/s], shape (3,). The z axis is where the tool points:
-                roll turns about it, pitch about y, and the heading, about x, is held as well as the arm can.
-            dt: the step [s].
-        """
-        from ibrobot_kinematics import jog
-
-        arm = self._ctx.robot.indices(self._arm)
-        angular = model.forward(before[arm]).rotation @ turn
-        after = before.copy()
-        after[arm] = jog(model, before[arm], linear, angular, dt, self._ctx.robot.max_velocity[arm])
-        return after
+            linear = np.array([x, y, z]) * options.cartesian_speed * speed
+            turn = np.array([0.0, pitch, roll]) * options.joint_speed * speed
+            after = self._arm.move_tool(before, linear, turn, dt)
+        velocity[robot.indices(self._arm.gripper)] = self._direction(_GRIPPER) * options.gripper_speed * speed
+        return self._arm.move_joints(after, velocity, dt)
 
     def _direction(self, axis: str) -> int:
         return self._held[axis][0] if axis in self._held else 0
