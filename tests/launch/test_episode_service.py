@@ -151,7 +151,7 @@ def test_a_dataset_of_another_contract_is_refused_before_anything_starts(run: Ru
     assert runs.parts.MADE == {}
 
 
-def test_buttons_that_mean_nothing_in_a_run_are_told(runs: Runs, caplog: pytest.LogCaptureFixture):
+def test_buttons_without_a_meaning_in_a_run_are_reported(runs: Runs, caplog: pytest.LogCaptureFixture):
     runtime = runs.start(mode="teleop")
     runs.parts.MADE["stick"].events = ("start", "intervention")
     ticks(runtime, 3)
