@@ -85,6 +85,7 @@ from ibrobot_core.interfaces import (
     Transport as Transport,
     Viewer as Viewer,
     nan_vector as nan_vector,
+    trajectory_goal as trajectory_goal,
 )
 from ibrobot_core.interfaces.policy import copied_tensors as copied_tensors
 from ibrobot_core.interfaces.transport import HANDLER_THREADS as HANDLER_THREADS
@@ -166,6 +167,7 @@ from ibrobot_core.launch.session import (
 )
 from ibrobot_core.launch.sources.source_worker import SourceWorker as SourceWorker
 from ibrobot_core.control.link import ControlState as ControlState
+from ibrobot_core.control.spline import Spline as Spline
 from ibrobot_core.launch.runtime import Runtime as Runtime
 from ibrobot_core.cli.run import run_robot as run_robot
 from ibrobot_core.cli.options import run_options as run_options, run_overrides as run_overrides

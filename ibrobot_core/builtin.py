@@ -1,4 +1,4 @@
-"""What core itself offers, registered as any plugin would: three executors, an engine, and `local` for no transport."""
+"""What core itself offers, as plugins do: executor `position`, engine `monolithic`, and `local` for no transport."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from ibrobot_core.descriptors import EngineDescriptor, ExecutorDescriptor, TransportDescriptor
 from ibrobot_core.errors import NotSupported
-from ibrobot_core.executor_options import GripperOptions, PositionOptions, TrajectoryOptions
+from ibrobot_core.executor_options import PositionOptions
 from ibrobot_core.hookspecs import hookimpl
 
 if TYPE_CHECKING:
@@ -15,21 +15,9 @@ if TYPE_CHECKING:
 
 
 def _position(options: Any, ctx: Context) -> Executor:
-    from ibrobot_core.control.executors.position import PositionExecutor
+    from ibrobot_core.control.position import PositionExecutor
 
     return PositionExecutor(options, ctx)
-
-
-def _trajectory(options: Any, ctx: Context) -> Executor:
-    from ibrobot_core.control.executors.trajectory import TrajectoryExecutor
-
-    return TrajectoryExecutor(options, ctx)
-
-
-def _gripper(options: Any, ctx: Context) -> Executor:
-    from ibrobot_core.control.executors.gripper import GripperExecutor
-
-    return GripperExecutor(options, ctx)
 
 
 def _monolithic(options: Any, ctx: Context) -> Engine:
@@ -45,18 +33,10 @@ def _local(options: Any, ctx: Context) -> Transport:
 
 @hookimpl
 def ibrobot_executors() -> Iterable[ExecutorDescriptor]:
-    """The three that IB-Robot users know."""
+    """The one that policies and teleoperation need."""
     yield ExecutorDescriptor(
         type="position", options=PositionOptions, make=_position, streams=True,
         summary="follows a stream of setpoints; holds when it goes stale",
-    )  # fmt: skip
-    yield ExecutorDescriptor(
-        type="trajectory", options=TrajectoryOptions, make=_trajectory,
-        summary="follows joint trajectories, with path and goal tolerances",
-    )  # fmt: skip
-    yield ExecutorDescriptor(
-        type="gripper", options=GripperOptions, make=_gripper, goals="position",
-        summary="opens or closes a gripper; a stall counts as grasped",
     )  # fmt: skip
 
 

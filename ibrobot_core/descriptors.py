@@ -155,7 +155,7 @@ class ExecutorDescriptor(Descriptor["Executor"]):
 
     streams: bool = False
     goals: Literal["trajectory", "position"] = "trajectory"
-    """What a planner sends to one that does not stream: a timed path, as `goal_from_message` gives it, or
+    """What a planner sends to one that does not stream: a timed path, as `trajectory_goal` gives it, or
     `{"position": q}`, where the first of its joints goes [rad]."""
 
 

@@ -268,10 +268,8 @@ class Checks:
             part = self.sections.executors.get(name)
             if part is None or streams(part) == (source != "planner"):
                 continue
-            takes, sends, example = (
-                ("setpoints", "goals", "trajectory") if streams(part) else ("goals", "setpoints", "position")
-            )
-            message = f"executor {name!r} takes {takes}, but {source} sends {sends}; use one of type {example}, say"
+            takes, sends = ("setpoints", "goals") if streams(part) else ("goals", "setpoints")
+            message = f"executor {name!r} takes {takes}, but {source} sends {sends}; use one that takes {sends}"
             self.document.add((*key, "executors", i), message)
 
     def _default_mode(self) -> None:

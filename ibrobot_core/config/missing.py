@@ -44,7 +44,7 @@ def split(
     used = {name: _used(name, mode) for name, mode in modes.items()}
     observed = _observed(document, plain)
     used = {name: keys | observed if modes[name].inference is not None else keys for name, keys in used.items()}
-    always = observed if "recording" in document.root else set[Key]()
+    always = _acting(plain) | (observed if "recording" in document.root else set[Key]())
     now = always | used.get(entered or "", set())
     needed = [each for each in missing if everything or each.key in now or not _may_wait(document, each.key)]
     if needed:
@@ -78,13 +78,20 @@ def describe(errors: Iterable[PluginNotInstalled]) -> str:
 
 
 def _used(name: str, mode: Any) -> set[Key]:
-    """What drives a mode."""
+    """What drives a mode, and moves its joints."""
     keys: set[Key] = {("control_modes", name, "planner"), ("control_modes", name, "inference")}
+    keys |= {("executors", executor) for executor in mode.executors}
     if mode.teleop is not None:
         keys.add(("teleoperation", mode.teleop))
     if mode.inference is not None:
         keys.add(("models", str(mode.inference.get("model"))))
     return keys
+
+
+def _acting(plain: Mapping[str, Any]) -> set[Key]:
+    """The executors of the contract, whose commands a run publishes in every mode."""
+    contract = plain.get("contract")
+    return {("executors", spec.executor) for spec in contract.actions} if contract is not None else set()
 
 
 def _observed(document: Document, plain: Mapping[str, Any]) -> set[Key]:
@@ -104,4 +111,4 @@ def _may_wait(document: Document, key: Key) -> bool:
     """Whether only some modes need what is at `key`."""
     if key[0] == "peripherals":
         return str(document.get(*key, "kind")) in _OPTIONAL_SENSORS
-    return key[0] in ("models", "teleoperation", "control_modes")
+    return key[0] in ("executors", "models", "teleoperation", "control_modes")

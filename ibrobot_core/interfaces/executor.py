@@ -11,6 +11,7 @@ import attrs
 
 from ibrobot_core.errors import GoalRejected
 from ibrobot_core.interfaces.hardware import JointReading
+from ibrobot_core.messages import JointTrajectory
 from ibrobot_core.robot import Vector
 
 
@@ -95,3 +96,28 @@ class Executor(ABC):
     def counters(self) -> Mapping[str, int]:
         """What it refused or went without, by name, since construction; e.g. `stale`, `refused_nonfinite`."""
         return {}
+
+
+def trajectory_goal(message: JointTrajectory) -> dict[str, Any]:
+    """The goal that executors with `goals="trajectory"` in their descriptor take, of plain numbers, strings and lists.
+
+    It starts when it is accepted: the stamp of the message is not used.
+
+    Returns:
+        `{"trajectory": {"joint_names": […], "points": […]}}`. Each point has `time_from_start_ns` and, where the
+        message has them, `positions` [rad], `velocities` [rad/s] and `accelerations` [rad/s^2], in the order of the
+        names.
+
+    Raises:
+        GoalRejected: for a point with efforts, which positions cannot follow.
+    """
+    points = []
+    for index, point in enumerate(message.points):
+        if point.effort.size:
+            raise GoalRejected(f"point {index} has efforts; only positions, velocities and accelerations are followed")
+        motion = {
+            "positions": point.positions, "velocities": point.velocities, "accelerations": point.accelerations
+        }  # fmt: skip
+        given = {name: values.tolist() for name, values in motion.items() if values.size}
+        points.append({"time_from_start_ns": point.time_from_start_ns, **given})
+    return {"trajectory": {"joint_names": list(message.joint_names), "points": points}}

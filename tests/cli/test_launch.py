@@ -32,7 +32,7 @@ hardware: {type: arm}
 simulation: {type: scene}
 executors:
   position: {type: position, group: arm}
-  trajectory: {type: trajectory, group: arm}
+  trajectory: {type: waypoints, group: arm}
 models:
   net: {type: net}
 control_modes:

@@ -14,6 +14,7 @@ from ibrobot_core.config import RobotConfig, load_config
 from ibrobot_core.descriptors import (
     ConfigFile,
     EngineDescriptor,
+    ExecutorDescriptor,
     HardwareDescriptor,
     PlannerDescriptor,
     PolicyDescriptor,
@@ -45,7 +46,7 @@ BASE = textwrap.dedent("""\
     executors:
       arm_position: {type: position, group: arm}
       grip_position: {type: position, group: gripper}
-      arm_trajectory: {type: trajectory, group: arm}
+      arm_trajectory: {type: waypoints, group: arm}
     models:
       net: {type: net}
     control_modes:
@@ -153,6 +154,7 @@ def registry(tmp_path: Path) -> Registry:
         ("engine", EngineDescriptor("far", _make, "on a server", FarOptions, uses_transport=True)),
         ("teleop", TeleopDescriptor("stick", _make, "a stick")),
         ("planner", PlannerDescriptor("straight", _make, "straight lines")),
+        ("executor", ExecutorDescriptor("waypoints", _make, "straight lines")),
         ("recorder", RecorderDescriptor("log", _make, "a log")),
     ]
     for kind, descriptor in offered:

@@ -245,3 +245,18 @@ def test_a_file_that_cannot_be_read(registry: Registry, tmp_path: Path) -> None:
 def test_a_file_without_a_mapping_is_refused(load_text: Load, text: str, found: str) -> None:
     with pytest.raises(ConfigError, match=f"^robot.yaml: expected a mapping of sections, got {found}$"):
         load_text(text)
+
+
+NOT_INSTALLED = "executor type 'trajectory' needs a plugin that is not installed: pip install ibrobot-plugin-planning"
+
+
+def test_mode_whose_executor_is_not_installed_is_unavailable(base: str, load_text: Load) -> None:
+    config = load_text(base.replace("type: waypoints", "type: trajectory"))
+    assert config.unavailable == {"plan": NOT_INSTALLED}
+    assert "arm_trajectory" not in config.executors
+
+
+@pytest.mark.parametrize("mode", ["teleop", "plan"])
+def test_executor_of_the_contract_must_be_installed(faults_of_edit: Faults, mode: str) -> None:
+    told = faults_of_edit("arm_position: {type: position", "arm_position: {type: trajectory", mode=mode)
+    assert told == f"robot.yaml:18: executors.arm_position.type: {NOT_INSTALLED}"

@@ -121,7 +121,7 @@ CASES = {
             "robot.yaml:27: control_modes.teleop.executors.1: executors 'arm_position' and 'arm_trajectory' both "
             "claim joint 'pan'\n"
             "robot.yaml:27: control_modes.teleop.executors.1: executor 'arm_trajectory' takes goals, but teleop "
-            "sends setpoints; use one of type position, say"
+            "sends setpoints; use one that takes setpoints"
         ),
     ),
     "mode_executor_twice": (
@@ -149,7 +149,7 @@ CASES = {
         "[arm_trajectory, grip_position], teleop: stick",
         (
             "robot.yaml:27: control_modes.teleop.executors.0: executor 'arm_trajectory' takes goals, but teleop "
-            "sends setpoints; use one of type position, say"
+            "sends setpoints; use one that takes setpoints"
         ),
     ),
     "mode_stream_executor_for_planner": (
@@ -157,7 +157,7 @@ CASES = {
         "plan: {executors: [arm_position]",
         (
             "robot.yaml:28: control_modes.plan.executors.0: executor 'arm_position' takes setpoints, but planner "
-            "sends goals; use one of type trajectory, say"
+            "sends goals; use one that takes goals"
         ),
     ),
     "mode_two_sources": (

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 import yaml
 from ibrobot_testing.contexts import START_NS
-from ibrobot_testing.fakes import FakeHardware, FakeRealHardware
+from ibrobot_testing.fakes import FakeHardware, FakeRealHardware, FakeTrajectoryExecutor
 
 from ibrobot_core.clock import SteppedClock
 from ibrobot_core.config import RobotConfig, from_document
 from ibrobot_core.control.build import build_core
 from ibrobot_core.control.core import ControlCore
 from ibrobot_core.control.link import ControlState, PlanRecord
-from ibrobot_core.descriptors import HardwareDescriptor
+from ibrobot_core.descriptors import ExecutorDescriptor, HardwareDescriptor
 from ibrobot_core.errors import HardwareError
 from ibrobot_core.interfaces import Condition, Context, Holding, JointReading, Torque
 from ibrobot_core.plugins import Entry, Registry, discover
@@ -40,8 +40,8 @@ simulation: {type: scene}
 executors:
   arm_position: {type: position, group: arm}
   gripper_position: {type: position, group: gripper}
-  arm_trajectory: {type: trajectory, group: arm}
-  gripper_action: {type: gripper, group: gripper}
+  arm_trajectory: {type: waypoints, group: arm}
+  gripper_action: {type: waypoints, group: gripper}
 control_modes:
   stream: {executors: [arm_position, gripper_position]}
   plan: {executors: [arm_trajectory, gripper_action]}
@@ -148,6 +148,8 @@ class Rig:
             HardwareDescriptor("stiff", lambda _, ctx: FakeRealHardware(ctx), "cannot relax"),
         ):
             registry.entries["hardware", descriptor.type] = Entry("hardware", descriptor, "fake", "fake", "1.0")
+        waypoints = ExecutorDescriptor("waypoints", lambda _, ctx: FakeTrajectoryExecutor(ctx), "straight lines")
+        registry.entries["executor", "waypoints"] = Entry("executor", waypoints, "fake", "fake", "1.0")
         return registry
 
     @property

@@ -38,7 +38,7 @@ robot:
 simulation: {type: arm}
 executors:
   position: {type: position, group: arm}
-  trajectory: {type: trajectory, group: arm}
+  trajectory: {type: waypoints, group: arm}
 control_modes:
   stream: {executors: [position]}
   plan: {executors: [trajectory]}

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ibrobot_core.clock import SteppedClock
-from ibrobot_core.control.executors.position import PositionExecutor
+from ibrobot_core.control.position import PositionExecutor
 from ibrobot_core.errors import GoalRejected
 from ibrobot_core.executor_options import PositionOptions
 from ibrobot_core.interfaces import Context, JointReading, Plan

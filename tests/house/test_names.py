@@ -12,7 +12,7 @@ from ibrobot_core.packages import EXTRAS
 from ibrobot_core.plugins import KINDS, OFFICIAL, example_type, official_plugins
 
 CORE = OFFICIAL.parent
-ORDINARY = {"joint", "keyboard", "process"}
+ORDINARY = {"gripper", "joint", "keyboard", "process", "trajectory"}
 """Types that are words of the language too: they count where a YAML would name them, as in `type: WORD`."""
 ALLOWED = {("config/models.py", '_root(path, "mujoco")')}
 """File and text: the root element of MJCF files."""

@@ -57,8 +57,8 @@ NOTES = [
     'installed: pip install "ibrobot[so101]"',
     "mode jog is unavailable: teleop type 'keyboard' needs a plugin that is not installed: "
     "pip install ibrobot-plugin-keyboard",
-    "mode moveit_planning is unavailable: planner type 'joint' needs a plugin that is not installed: "
-    "pip install ibrobot-plugin-planning",
+    "mode moveit_planning is unavailable: executor type 'trajectory', executor type 'gripper', planner type 'joint' "
+    "need plugins that are not installed: pip install ibrobot-plugin-planning",
 ]
 CAMERAS = (
     "camera top, camera wrist: sensor type 'opencv' needs a plugin that is not installed; "

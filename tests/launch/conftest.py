@@ -41,7 +41,7 @@ ROBOT = textwrap.dedent("""\
     executors:
       arm_position: {type: position, group: arm}
       grip_position: {type: position, group: gripper}
-      arm_trajectory: {type: trajectory, group: arm}
+      arm_trajectory: {type: waypoints, group: arm}
     models:
       net: {type: net}
       lost: {type: lost}

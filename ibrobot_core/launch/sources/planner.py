@@ -12,9 +12,8 @@ import attrs
 import numpy as np
 
 from ibrobot_core.config.schema import ComponentConfig, ControlMode
-from ibrobot_core.control.executors.trajectory_goal import goal_from_message
 from ibrobot_core.errors import HardwareError, PlanningError
-from ibrobot_core.interfaces import JointGoal, Planner, PlanRequest
+from ibrobot_core.interfaces import JointGoal, Planner, PlanRequest, trajectory_goal
 from ibrobot_core.launch.session import Session
 from ibrobot_core.launch.sources.source_worker import SourceWorker
 from ibrobot_core.robot import Robot
@@ -126,7 +125,7 @@ class PlannerSource(SourceWorker):
                 JointGoal(tuple(mine), np.array([goal[joint] for joint in mine])),
                 others=dict(zip(robot.joint_names, told.tolist(), strict=True)),
             )
-            goals[name] = goal_from_message(self._planner.plan(request).trajectory)
+            goals[name] = trajectory_goal(self._planner.plan(request).trajectory)
         if not goals:
             raise PlanningError(f"goal {text!r}: no executor of mode {self.mode.name} has these joints")
         return goals

@@ -1,15 +1,16 @@
-"""The plugin's hooks: planner type `joint`."""
+"""The plugin's hooks: planner type `joint`, executor types `trajectory` and `gripper`."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.api import PlannerDescriptor, hookimpl
+from ibrobot_core.api import ExecutorDescriptor, PlannerDescriptor, hookimpl
+from ibrobot_planning.executors.options import GripperOptions, TrajectoryOptions
 from ibrobot_planning.options import JointPlannerOptions
 
 if TYPE_CHECKING:
-    from ibrobot_core.api import Context, Planner
+    from ibrobot_core.api import Context, Executor, Planner
 
 
 def _joint(options: Any, ctx: Context) -> Planner:
@@ -24,4 +25,29 @@ def ibrobot_planners() -> Iterable[PlannerDescriptor]:
     yield PlannerDescriptor(
         type="joint", options=JointPlannerOptions, make=_joint,
         summary="straight line in joint space, time-optimal within velocity, acceleration and jerk limits",
+    )  # fmt: skip
+
+
+def _trajectory(options: Any, ctx: Context) -> Executor:
+    from ibrobot_planning.executors.trajectory import TrajectoryExecutor
+
+    return TrajectoryExecutor(options, ctx)
+
+
+def _gripper(options: Any, ctx: Context) -> Executor:
+    from ibrobot_planning.executors.gripper import GripperExecutor
+
+    return GripperExecutor(options, ctx)
+
+
+@hookimpl
+def ibrobot_executors() -> Iterable[ExecutorDescriptor]:
+    """Trajectories, and the gripper."""
+    yield ExecutorDescriptor(
+        type="trajectory", options=TrajectoryOptions, make=_trajectory,
+        summary="follows joint trajectories, with path and goal tolerances",
+    )  # fmt: skip
+    yield ExecutorDescriptor(
+        type="gripper", options=GripperOptions, make=_gripper, goals="position",
+        summary="opens or closes a gripper; a stall counts as grasped",
     )  # fmt: skip

@@ -7,7 +7,7 @@ from typing import override
 import numpy as np
 import pytest
 from ibrobot_testing import ExecutorSuite, checks, failed_checks
-from ibrobot_testing.fakes import FakeExecutor
+from ibrobot_testing.fakes import FakeExecutor, FakeTrajectoryExecutor
 
 from ibrobot_core.api import GoalRejected, GoalState, GoalStatus
 
@@ -24,6 +24,17 @@ class TestExecutor(ExecutorSuite):
     @override
     def wrong_goals(self, ctx):
         return [{}, {"position": [0.0]}, {"position": [float("nan")] * len(ctx.joints)}]
+
+
+class TestTrajectoryExecutor(ExecutorSuite):
+    @override
+    def make(self, ctx):
+        return FakeTrajectoryExecutor(ctx)
+
+    @override
+    def goal(self, ctx, position):
+        point = {"time_from_start_ns": 2_000_000_000, "positions": position.tolist()}
+        return {"trajectory": {"joint_names": list(ctx.joints), "points": [point]}}
 
 
 class OtherJoints(FakeExecutor):

@@ -5,11 +5,19 @@ from __future__ import annotations
 import signal
 from typing import Never
 
-from ibrobot_testing.fakes import FakeHardware, FakePlanner, FakePolicy, FakeRealHardware, FakeTeleop
+from ibrobot_testing.fakes import (
+    FakeHardware,
+    FakePlanner,
+    FakePolicy,
+    FakeRealHardware,
+    FakeTeleop,
+    FakeTrajectoryExecutor,
+)
 
 from ibrobot_core import hookimpl
 from ibrobot_core.descriptors import (
     EngineDescriptor,
+    ExecutorDescriptor,
     HardwareDescriptor,
     PlannerDescriptor,
     PolicyDescriptor,
@@ -125,3 +133,8 @@ def ibrobot_teleop():
 @hookimpl
 def ibrobot_planners():
     yield PlannerDescriptor("cubic", lambda options, ctx: FakePlanner(ctx), "cubics")
+
+
+@hookimpl
+def ibrobot_executors():
+    yield ExecutorDescriptor("waypoints", lambda options, ctx: FakeTrajectoryExecutor(ctx), "along straight lines")

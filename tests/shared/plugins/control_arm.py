@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import attrs
-from ibrobot_testing.fakes import FakeHardware
+from ibrobot_testing.fakes import FakeHardware, FakeTrajectoryExecutor
 
 from ibrobot_core import hookimpl
-from ibrobot_core.descriptors import HardwareDescriptor
+from ibrobot_core.descriptors import ExecutorDescriptor, HardwareDescriptor
 from ibrobot_core.errors import HardwareError
 from ibrobot_core.interfaces import Holding
 from ibrobot_core.options import option
@@ -46,3 +46,8 @@ class Options:
 @hookimpl
 def ibrobot_hardware():
     yield HardwareDescriptor("arm", Arm, "an arm", Options, simulated=True)
+
+
+@hookimpl
+def ibrobot_executors():
+    yield ExecutorDescriptor("waypoints", lambda options, ctx: FakeTrajectoryExecutor(ctx), "along straight lines")

@@ -15,11 +15,13 @@ from ibrobot_testing.fakes import (
     FakeRecorder,
     FakeSensor,
     FakeTeleop,
+    FakeTrajectoryExecutor,
 )
 
 from ibrobot_core import hookimpl
 from ibrobot_core.descriptors import (
     EngineDescriptor,
+    ExecutorDescriptor,
     HardwareDescriptor,
     PlannerDescriptor,
     PolicyDescriptor,
@@ -244,3 +246,8 @@ def ibrobot_mode_changed(mode, previous):
 @hookimpl
 def ibrobot_fault_raised(fault):
     EVENTS.append(("fault", fault))
+
+
+@hookimpl
+def ibrobot_executors():
+    yield ExecutorDescriptor("waypoints", lambda options, ctx: FakeTrajectoryExecutor(ctx), "along straight lines")

@@ -1,6 +1,6 @@
 """The least that is a correct implementation of each kind: for tests, and as examples to read."""
 
-from ibrobot_testing.fakes.control import FakeExecutor, FakeHardware, FakeRealHardware
+from ibrobot_testing.fakes.control import FakeExecutor, FakeHardware, FakeRealHardware, FakeTrajectoryExecutor
 from ibrobot_testing.fakes.host import FakeEngine, FakePlanner, FakePolicy, FakeSensor, FakeTeleop, FakeViewer
 from ibrobot_testing.fakes.storage import FakeDataset, FakeRecorder
 from ibrobot_testing.fakes.transport import FakeTransport
@@ -16,6 +16,7 @@ __all__ = [
     "FakeRecorder",
     "FakeSensor",
     "FakeTeleop",
+    "FakeTrajectoryExecutor",
     "FakeTransport",
     "FakeViewer",
 ]

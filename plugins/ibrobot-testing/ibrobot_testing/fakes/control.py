@@ -202,3 +202,67 @@ class FakeExecutor(Executor):
     def _end_goal(self, state: GoalState) -> None:
         self._statuses.append(GoalStatus(self._goal_id, state))
         self._goal = None
+
+
+class FakeTrajectoryExecutor(Executor):
+    """Takes goals as `trajectory_goal` gives them, and follows their positions along straight lines, by time.
+
+    A goal succeeds once the joints are within 0.02 rad of its end.
+    """
+
+    def __init__(self, ctx: Context) -> None:
+        self.joints = ctx.joints
+        self._setpoint: Vector = np.zeros(len(ctx.joints))
+        self._statuses: list[GoalStatus] = []
+        self.deactivate()
+
+    @override
+    def activate(self, measured: JointReading) -> None:
+        self._setpoint = measured.position.copy()
+
+    @override
+    def deactivate(self) -> None:
+        self._goal_id = ""
+        self._times_ns: Vector = np.empty(0)
+        self._positions: Vector = np.empty((0, len(self.joints)))
+
+    @override
+    def set_goal(self, goal_id: str, goal: Mapping[str, Any], measured: JointReading) -> None:
+        try:
+            names, points = goal["trajectory"]["joint_names"], goal["trajectory"]["points"]
+            order = [names.index(joint) for joint in self.joints]
+            positions = np.array([[point["positions"][i] for i in order] for point in points], np.float64)
+            times_ns = np.array([point["time_from_start_ns"] for point in points], np.float64)
+        except (KeyError, ValueError, TypeError) as error:
+            raise GoalRejected(f"not a trajectory of {', '.join(self.joints)}: {goal!r}") from error
+        self._end_goal(GoalState.CANCELED)
+        self._times_ns = measured.stamp_ns + np.concatenate(([0.0], times_ns))
+        self._positions = np.vstack((self._setpoint, positions))
+        self._goal_id = goal_id
+        self._statuses.append(GoalStatus(goal_id, GoalState.EXECUTING))
+
+    @override
+    def update(self, measured: JointReading) -> Vector:
+        if self._goal_id:
+            self._setpoint = np.array(
+                [np.interp(measured.stamp_ns, self._times_ns, column) for column in self._positions.T]
+            )
+            at_end = np.abs(measured.position - self._positions[-1]).max() <= 0.02
+            if measured.stamp_ns >= self._times_ns[-1] and at_end:
+                self._end_goal(GoalState.SUCCEEDED)
+        return self._setpoint.copy()
+
+    @override
+    def cancel(self, measured: JointReading) -> None:
+        if self._goal_id:
+            self._end_goal(GoalState.CANCELED)
+            self._setpoint = measured.position.copy()
+
+    @override
+    def pop_status(self) -> GoalStatus | None:
+        return self._statuses.pop(0) if self._statuses else None
+
+    def _end_goal(self, state: GoalState) -> None:
+        if self._goal_id:
+            self._statuses.append(GoalStatus(self._goal_id, state))
+            self._goal_id = ""

@@ -11,16 +11,25 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from ibrobot_planning.executors.options import TrajectoryOptions
+from ibrobot_planning.executors.trajectory import TrajectoryExecutor
 
-from ibrobot_core.clock import SteppedClock
-from ibrobot_core.control.executors.trajectory import TrajectoryExecutor
-from ibrobot_core.control.executors.trajectory_goal import goal_from_message
-from ibrobot_core.errors import GoalRejected
-from ibrobot_core.executor_options import TrajectoryOptions
-from ibrobot_core.interfaces import Context, GoalState, GoalStatus, JointReading
-from ibrobot_core.messages import Header, JointTrajectory, JointTrajectoryPoint
-from ibrobot_core.robot import Joint, Robot, Vector
-from ibrobot_core.units import ns
+from ibrobot_core.api import (
+    Context,
+    GoalRejected,
+    GoalState,
+    GoalStatus,
+    Header,
+    Joint,
+    JointReading,
+    JointTrajectory,
+    JointTrajectoryPoint,
+    Robot,
+    SteppedClock,
+    Vector,
+    ns,
+    trajectory_goal,
+)
 
 MS = 1_000_000
 ROBOT = Robot(
@@ -355,13 +364,13 @@ def test_a_goal_is_made_of_a_message() -> None:
         end = JointTrajectoryPoint(ns(1.0), np.array([0.5, 0.25]), np.zeros(2), **more)
         return JointTrajectory(Header(), ("roll", "pan"), (end,))
 
-    made = goal_from_message(message())
+    made = trajectory_goal(message())
     assert made == goal(point(1.0, (0.5, 0.25), AT_REST), joint_names=("roll", "pan"))
     arm = Arm()
     arm.go(made)
     assert arm.at(1.0) == [0.25, 0.5]
     with pytest.raises(GoalRejected, match="point 0 has efforts"):
-        goal_from_message(message(effort=np.ones(2)))
+        trajectory_goal(message(effort=np.ones(2)))
 
 
 def test_fields_given_as_empty_lists_are_not_given() -> None:

@@ -1,4 +1,4 @@
-"""What a trajectory goal may say: checked, ordered by the executor's joints, and made from a JointTrajectory."""
+"""What a trajectory goal may say: checked, and ordered by the executor's joints."""
 
 from __future__ import annotations
 
@@ -10,13 +10,8 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.errors import GoalRejected
-from ibrobot_core.executor_options import TrajectoryOptions
-from ibrobot_core.messages import JointTrajectory
-from ibrobot_core.robot import Vector
-from ibrobot_core.units import ns
-
-_FIELDS = ("positions", "velocities", "accelerations")
+from ibrobot_core.api import GoalRejected, Vector, ns
+from ibrobot_planning.executors.options import TrajectoryOptions
 
 
 @attrs.frozen(eq=False)
@@ -37,21 +32,6 @@ class TrajectoryGoal:
     """[rad], shape (J,); 0: not checked."""
     goal_time_ns: int
     """[ns]; 0: no limit."""
-
-
-def goal_from_message(message: JointTrajectory) -> dict[str, Any]:
-    """A goal of plain numbers, strings and lists. It starts when it is accepted: the message's stamp is not used.
-
-    Raises:
-        GoalRejected: for a point with efforts, which positions cannot follow.
-    """
-    points = []
-    for index, point in enumerate(message.points):
-        if point.effort.size:
-            raise GoalRejected(f"point {index} has efforts; only positions, velocities and accelerations are followed")
-        given = {name: getattr(point, name).tolist() for name in _FIELDS if getattr(point, name).size}
-        points.append({"time_from_start_ns": point.time_from_start_ns, **given})
-    return {"trajectory": {"joint_names": list(message.joint_names), "points": points}}
 
 
 def parse_goal(goal: Mapping[str, Any], joints: Sequence[str], options: TrajectoryOptions) -> TrajectoryGoal:

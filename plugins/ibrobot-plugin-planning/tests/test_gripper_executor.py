@@ -7,13 +7,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+from ibrobot_planning.executors.gripper import GripperExecutor
+from ibrobot_planning.executors.options import GripperOptions
 
-from ibrobot_core.clock import SteppedClock
-from ibrobot_core.control.executors.gripper import GripperExecutor
-from ibrobot_core.errors import GoalRejected, NotSupported
-from ibrobot_core.executor_options import GripperOptions
-from ibrobot_core.interfaces import Context, GoalState, GoalStatus, JointReading
-from ibrobot_core.robot import Joint, Robot
+from ibrobot_core.api import (
+    Context,
+    GoalRejected,
+    GoalState,
+    GoalStatus,
+    Joint,
+    JointReading,
+    NotSupported,
+    Robot,
+    SteppedClock,
+)
 
 PERIOD_NS = 10_000_000
 ROBOT = Robot(

@@ -10,11 +10,19 @@ from typing import Any, override
 import attrs
 import numpy as np
 
-from ibrobot_core.errors import GoalRejected, NotSupported
-from ibrobot_core.executor_options import GripperOptions
-from ibrobot_core.interfaces import Context, Executor, GoalState, GoalStatus, JointReading
-from ibrobot_core.robot import Vector
-from ibrobot_core.units import ns, seconds
+from ibrobot_core.api import (
+    Context,
+    Executor,
+    GoalRejected,
+    GoalState,
+    GoalStatus,
+    JointReading,
+    NotSupported,
+    Vector,
+    ns,
+    seconds,
+)
+from ibrobot_planning.executors.options import GripperOptions
 
 
 @attrs.define

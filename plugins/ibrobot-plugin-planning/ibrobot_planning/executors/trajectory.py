@@ -10,13 +10,19 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.control.executors.trajectory_goal import TrajectoryGoal, parse_goal
-from ibrobot_core.control.spline import Sample, Spline
-from ibrobot_core.errors import GoalRejected
-from ibrobot_core.executor_options import TrajectoryOptions
-from ibrobot_core.interfaces import Context, Executor, GoalState, GoalStatus, JointReading
-from ibrobot_core.robot import Vector
-from ibrobot_core.units import seconds
+from ibrobot_core.api import (
+    Context,
+    Executor,
+    GoalRejected,
+    GoalState,
+    GoalStatus,
+    JointReading,
+    Spline,
+    Vector,
+    seconds,
+)
+from ibrobot_planning.executors.options import TrajectoryOptions
+from ibrobot_planning.executors.trajectory_goal import TrajectoryGoal, parse_goal
 
 START_TOLERANCE_RAD = 0.1
 """How far from the present setpoint a trajectory's point at time zero may lie."""
@@ -119,7 +125,7 @@ class TrajectoryExecutor(Executor):
     def pop_status(self) -> GoalStatus | None:
         return self._statuses.popleft() if self._statuses else None
 
-    def _sample(self, now_ns: int) -> Sample:
+    def _sample(self, now_ns: int) -> tuple[Vector, Vector, Vector]:
         """The setpoint at `now_ns` [ns] with its velocity and acceleration, each shape (J,)."""
         if self._running is not None:
             return self._running.spline.at(now_ns)

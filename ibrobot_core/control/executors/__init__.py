@@ -1,1 +1,0 @@
-"""The built-in executors: `position`, `trajectory` and `gripper`."""

@@ -1,0 +1,1 @@
+"""The executors of goals: `trajectory` and `gripper`. They run in the control process."""
