@@ -225,8 +225,10 @@ from ibrobot_core.config.schema import (
     Align as Align,
     ControlMode as ControlMode,
     ImageSpec as ImageSpec,
+    Mount as Mount,
     TransportConfig as TransportConfig,
 )
+from ibrobot_core.config.models import ModelError as ModelError, XmlElement as XmlElement, read_xml as read_xml
 from ibrobot_core.config.expand import resolve_path as resolve_path
 from ibrobot_core.config.overrides import apply_overrides as apply_overrides
 from ibrobot_core.config.show import dump_yaml as dump_yaml

@@ -210,6 +210,11 @@ class ViewerDescriptor(Descriptor["Viewer"]):
     """A viewer."""
 
 
+def nothing_is_wrong_with(config: RobotConfig) -> Iterable[OptionFault]:
+    """The check of sections that stand by themselves."""
+    return ()
+
+
 def only_with_section(config: RobotConfig) -> bool:
     """For components that run only where the file has their section."""
     return False
@@ -227,6 +232,11 @@ class SectionDescriptor(Descriptor["Component"]):
     runs without its section. Imports what it needs when it is called, and opens nothing."""
     without_section: Callable[[RobotConfig], bool] = attrs.field(default=only_with_section, kw_only=True)
     """Whether the component also runs with a robot whose file lacks the section."""
+    check_config: Callable[[RobotConfig], Iterable[OptionFault]] = attrs.field(
+        default=nothing_is_wrong_with, kw_only=True
+    )
+    """What is wrong with a robot that it runs with, in any section; opens no device. The `option` of a fault begins at
+    the top of the file: `("peripherals", 0, "transform")`."""
 
 
 @attrs.frozen

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from difflib import get_close_matches
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
@@ -16,7 +16,15 @@ import attrs
 import pluggy
 
 from ibrobot_core import hookspecs
-from ibrobot_core.descriptors import Check, Command, ConfigFile, DecoderDescriptor, Descriptor, ReaderDescriptor
+from ibrobot_core.descriptors import (
+    Check,
+    Command,
+    ConfigFile,
+    DecoderDescriptor,
+    Descriptor,
+    ReaderDescriptor,
+    SectionDescriptor,
+)
 from ibrobot_core.errors import (
     ContractError,
     MissingDependency,
@@ -28,6 +36,7 @@ from ibrobot_core.errors import (
 from ibrobot_core.options import did_you_mean
 
 if TYPE_CHECKING:
+    from ibrobot_core.config.schema import RobotConfig
     from ibrobot_core.interfaces import EpisodeReader
     from ibrobot_core.messages import CompressedImage, Image
 
@@ -118,6 +127,15 @@ class Registry:
         if entry is None:
             raise self.not_found(kind, type_)
         return entry.descriptor
+
+    def sections(self, config: RobotConfig) -> Iterator[tuple[SectionDescriptor, Any]]:
+        """The plugins' sections that count for a robot, each with its options; None where the file lacks it."""
+        for name in self.types("section"):
+            descriptor = self.find("section", name)
+            assert isinstance(descriptor, SectionDescriptor)
+            section = config.plugin_sections.get(name)
+            if section is not None or descriptor.without_section(config):
+                yield descriptor, None if section is None else section.options
 
     def default(self, kind: str) -> str:
         """The type of a kind that commands take where none is named.

@@ -56,6 +56,7 @@ class Description:
 
     mjcf: Path | None = option(None, help="MuJoCo model: a path, or package://PYTHON_PACKAGE/path")
     urdf: Path | None = option(None, help="URDF model: a path, or package://PYTHON_PACKAGE/path")
+    srdf: Path | None = option(None, help="SRDF with groups, poses and pairs of links that may touch: a path as above")
     tip: str = option("gripperframe", help="site (MJCF) or link (URDF) of the tool centre point")
     poses: Mapping[str, tuple[float, ...]] = option(factory=dict, unit="rad", help="joint positions in joint order")
 

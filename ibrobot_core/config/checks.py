@@ -106,12 +106,15 @@ class Checks:
     def _models(self, robot: Robot) -> None:
         """The models can be read, the tip is in them, and no joint may go where none of them lets it."""
         known: list[DescriptionModel] = []
-        for model, path in (("mjcf", robot.description.mjcf), ("urdf", robot.description.urdf)):
+        described = robot.description
+        for model, path in (("mjcf", described.mjcf), ("urdf", described.urdf), ("srdf", described.srdf)):
             key: Key = ("robot", "description", model)
             if path is None:
                 continue
             if not path.is_file():
                 self.document.add(key, f"no such file: {path}; a relative path starts at the folder of the YAML file")
+                continue
+            if model not in READERS:
                 continue
             try:
                 known.append(READERS[model](path))

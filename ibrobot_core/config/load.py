@@ -180,7 +180,7 @@ def _build(document: Document, source: Path, sim: bool, registry: Registry, comm
         "viewer": _component(sections.viewer),
         "plugin_sections": _components(sections.plugin_sections),
     }
-    return RobotConfig(
+    config = RobotConfig(
         **arguments,
         simulated=sections.simulated,
         closed_ends=_closed_ends(robot, sections),
@@ -191,6 +191,11 @@ def _build(document: Document, source: Path, sim: bool, registry: Registry, comm
         complete=document.root,
         secrets=secrets,
     )
+    for section, _ in registry.sections(config):
+        for fault in section.check_config(config):
+            document.add(fault.option, fault.message)
+    document.raise_problems()
+    return config
 
 
 def _closed_ends(robot: Robot, sections: ParsedSections) -> dict[str, float | None]:

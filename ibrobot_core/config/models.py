@@ -41,20 +41,35 @@ class DescriptionModel:
 
 
 @attrs.frozen
-class Element:
+class XmlElement:
     """An XML element."""
 
     tag: str
     attributes: Mapping[str, str]
     file: Path
     line: int
-    children: list[Element] = attrs.field(factory=list)
+    children: list[XmlElement] = attrs.field(factory=list)
 
     def error(self, message: str) -> ModelError:
         """An error that names this place."""
         return ModelError(f"{self.file}:{self.line}: {message}")
 
-    def below(self) -> Iterator[Element]:
+    def numbers(self, name: str, default: str, count: int) -> list[float]:
+        """The numbers in an attribute.
+
+        Raises:
+            ModelError: unless they are `count` finite numbers.
+        """
+        text = self.attributes.get(name, default)
+        try:
+            numbers = [float(word) for word in text.split()]
+        except ValueError:
+            numbers = []
+        if len(numbers) != count or not all(map(math.isfinite, numbers)):
+            raise self.error(f"{name} is {text!r}, must be {count} finite number{'s' if count > 1 else ''}")
+        return numbers
+
+    def below(self) -> Iterator[XmlElement]:
         """All elements within this one, in file order."""
         waiting = self.children[::-1]
         while waiting:
@@ -63,18 +78,22 @@ class Element:
             waiting += element.children[::-1]
 
 
-def read_xml(path: Path) -> Element:
+def read_xml(path: Path, root: str = "") -> XmlElement:
     """The root element of an XML file. Document types, and with them entities, are refused.
+
+    Args:
+        path: the file.
+        root: the tag of its root element; any where it is empty.
 
     Raises:
         ModelError: when it cannot be read, or is not such XML.
     """
     parser = expat.ParserCreate()
-    top = Element("", {}, path, 0)
+    top = XmlElement("", {}, path, 0)
     opened = [top]
 
     def start(tag: str, attributes: dict[str, str]) -> None:
-        element = Element(tag, attributes, path, parser.CurrentLineNumber)
+        element = XmlElement(tag, attributes, path, parser.CurrentLineNumber)
         opened[-1].children.append(element)
         opened.append(element)
 
@@ -93,7 +112,10 @@ def read_xml(path: Path) -> Element:
         raise ModelError(f"{path}: cannot be read: {error.strerror}") from None
     except expat.ExpatError as error:
         raise ModelError(f"{path}:{error.lineno}: not valid XML: {expat.ErrorString(error.code)}") from None
-    return top.children[0]
+    found = top.children[0]
+    if root and found.tag != root:
+        raise found.error(f"begins with <{found.tag}>, must be <{root}>")
+    return found
 
 
 def read_urdf(path: Path) -> DescriptionModel:
@@ -102,13 +124,13 @@ def read_urdf(path: Path) -> DescriptionModel:
     Raises:
         ModelError: when it is not a URDF.
     """
-    root = _root(path, "robot")
+    root = read_xml(path, "robot")
     found = {}
     for joint in root.children:
         if joint.tag == "joint" and joint.attributes.get("type") in ("revolute", "prismatic"):
             for limit in joint.children:
                 if limit.tag == "limit":
-                    lower, upper = (_numbers(limit, name, "0", 1)[0] for name in ("lower", "upper"))
+                    lower, upper = (limit.numbers(name, "0", 1)[0] for name in ("lower", "upper"))
                     found[joint.attributes.get("name", "")] = Limits(lower, upper, f"{path.name}:{limit.line}")
     return DescriptionModel(found, _names(root.children, "link"), "link")
 
@@ -119,7 +141,7 @@ def read_mjcf(path: Path) -> DescriptionModel:
     Raises:
         ModelError: when it is not an MJCF.
     """
-    root = _root(path, "mujoco")
+    root = read_xml(path, "mujoco")
     _include(root, path.parent)
     compiler: dict[str, str] = {}
     for element in root.children:
@@ -137,7 +159,7 @@ def read_mjcf(path: Path) -> DescriptionModel:
         if limited == "auto":
             limited = compiler.get("autolimits", "true") if "range" in given else "false"
         if name is not None and kind in ("hinge", "slide") and limited == "true":
-            lower, upper = _numbers(attrs.evolve(joint, attributes=given), "range", "0 0", 2)
+            lower, upper = attrs.evolve(joint, attributes=given).numbers("range", "0 0", 2)
             turn = math.pi / 180 if kind == "hinge" and compiler.get("angle", "degree") == "degree" else 1.0
             found[name] = Limits(lower * turn, upper * turn, f"{joint.file.name}:{joint.line}")
     return DescriptionModel(found, _names(root.below(), "site"), "site")
@@ -147,35 +169,17 @@ READERS: Mapping[str, Callable[[Path], DescriptionModel]] = {"mjcf": read_mjcf, 
 """Key under `robot.description` -> what reads that model."""
 
 
-def _names(elements: Iterable[Element], tag: str) -> tuple[str, ...]:
+def _names(elements: Iterable[XmlElement], tag: str) -> tuple[str, ...]:
     return tuple(each.attributes["name"] for each in elements if each.tag == tag and "name" in each.attributes)
 
 
-def _root(path: Path, tag: str) -> Element:
-    root = read_xml(path)
-    if root.tag != tag:
-        raise root.error(f"begins with <{root.tag}>, must be <{tag}>")
-    return root
-
-
-def _numbers(element: Element, name: str, default: str, count: int) -> list[float]:
-    text = element.attributes.get(name, default)
-    try:
-        numbers = [float(word) for word in text.split()]
-    except ValueError:
-        numbers = []
-    if len(numbers) != count or not all(map(math.isfinite, numbers)):
-        raise element.error(f"{name} is {text!r}, must be {count} finite number{'s' if count > 1 else ''}")
-    return numbers
-
-
-def _include(root: Element, folder: Path) -> None:
+def _include(root: XmlElement, folder: Path) -> None:
     """Put the content of included files, whose names are relative to the model's folder, in the place of includes."""
     seen: set[Path] = set()
     waiting = [root]
     while waiting:
         element = waiting.pop()
-        children: list[Element] = []
+        children: list[XmlElement] = []
         todo = element.children[::-1]
         while todo:
             child = todo.pop()
@@ -191,7 +195,7 @@ def _include(root: Element, folder: Path) -> None:
         waiting += children
 
 
-def _default_classes(root: Element) -> dict[str, dict[str, str]]:
+def _default_classes(root: XmlElement) -> dict[str, dict[str, str]]:
     """Default class -> attributes of its joints; `main` is that of joints without a class."""
     classes: dict[str, dict[str, str]] = {"main": {}}
     waiting = [(element, "main") for element in reversed(root.children) if element.tag == "default"]
@@ -206,7 +210,7 @@ def _default_classes(root: Element) -> dict[str, dict[str, str]]:
     return classes
 
 
-def _mjcf_joints(root: Element) -> Iterator[tuple[Element, str]]:
+def _mjcf_joints(root: XmlElement) -> Iterator[tuple[XmlElement, str]]:
     """The joints below the world, each with its default class."""
     worlds = [element for element in root.children if element.tag == "worldbody"]
     waiting = [(world, world.attributes.get("childclass", "main")) for world in reversed(worlds)]

@@ -5,6 +5,7 @@ Loading, `config show`, the JSON Schema and the reference pages derive from thes
 
 from __future__ import annotations
 
+import math
 import types
 from collections.abc import Mapping
 from pathlib import Path
@@ -23,6 +24,9 @@ from ibrobot_core.errors import PluginNotInstalled
 from ibrobot_core.options import documented, fields, not_a_key, option
 from ibrobot_core.robot import Robot
 from ibrobot_core.units import NORM_MODES
+
+_UNIT = 1e-3
+"""How far the length of a quaternion may be from 1: people round."""
 
 
 @documented
@@ -113,6 +117,28 @@ class SimulationConfig(ComponentConfig):
 
 @documented
 @attrs.frozen
+class Mount:
+    """Where a sensor is mounted: its frame in the frame of what carries it."""
+
+    parent: str = option(help="the frame that it is fixed to: a link of the URDF, or the frame of another mount")
+    xyz: tuple[float, float, float] = option((0.0, 0.0, 0.0), unit="m", help="its origin in the parent frame")
+    rpy: tuple[float, float, float] | None = option(
+        None, unit="rad", help="roll, pitch and yaw about the fixed axes of the parent frame, as in a URDF"
+    )
+    quaternion: tuple[float, float, float, float] | None = option(None, help="x, y, z, w, in place of rpy")
+    frame: str = option("", help="name of the frame; NAME_frame if empty. A camera looks along its x axis")
+
+    def __attrs_post_init__(self) -> None:
+        if self.rpy is not None and self.quaternion is not None:
+            raise ValueError("rpy and quaternion say the same; give one of them")
+        if not all(map(math.isfinite, (*self.xyz, *(self.rpy or ()), *(self.quaternion or ())))):
+            raise ValueError("xyz, rpy and quaternion must be finite numbers")
+        if self.quaternion is not None and abs(math.hypot(*self.quaternion) - 1) > _UNIT:
+            raise ValueError(f"quaternion has length {math.hypot(*self.quaternion):.4g}, must have 1")
+
+
+@documented
+@attrs.frozen
 class PeripheralConfig(ComponentConfig):
     """A sensor. Under `--sim` the simulation's own sensor of the same kind stands for it."""
 
@@ -120,6 +146,7 @@ class PeripheralConfig(ComponentConfig):
 
     name: str = option(help="what the contract calls it")
     kind: str = option(help="camera, imu, …")
+    transform: Mount | None = option(None, help="where it is mounted")
     sim: Mapping[str, Any] = option(factory=dict, help="further options for the simulated sensor that stands for it")
     picture: tuple[int, int] | None = not_a_key(None)
     """Height and width of its pictures [px], where its options say them."""

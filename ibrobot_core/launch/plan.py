@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -12,12 +12,11 @@ from ibrobot_core.component import CONTROL, Component
 from ibrobot_core.config.missing import unavailable_modes
 from ibrobot_core.config.schema import ActionSpec, ObservationSpec, PeripheralConfig
 from ibrobot_core.contract.specs import Contract
-from ibrobot_core.descriptors import SectionDescriptor, TransportDescriptor
+from ibrobot_core.descriptors import TransportDescriptor
 from ibrobot_core.errors import ComponentFailed, NotSupported
 from ibrobot_core.launch.absence import describe
 from ibrobot_core.launch.control import ControlComponent
 from ibrobot_core.launch.outputs.status import Status
-from ibrobot_core.launch.outputs.transforms import Transforms
 from ibrobot_core.launch.outputs.viewer import ViewerWorker
 from ibrobot_core.launch.perception import SensorWorker
 from ibrobot_core.launch.session import Session
@@ -145,9 +144,7 @@ def build_plan(session: Session) -> LaunchPlan:
     if added.source is not None:
         components.append(added.source)
     components.append(Status(session, (CONTROL,)))
-    components += _plugin_sections(session)
-    if (urdf := config.robot.description.urdf) is not None:
-        components.append(Transforms(session, urdf, (CONTROL,)))
+    components += [section.make(options, session) for section, options in session.registry.sections(config)]
     if config.viewer is not None:
         components.append(ViewerWorker(session, config.viewer, (CONTROL,)))
     if link is not None:
@@ -160,16 +157,6 @@ def build_plan(session: Session) -> LaunchPlan:
         tuple(_ordered(components)), link, added, episodes, recording, worker, describe(session.absent),
         config.unavailable,
     )  # fmt: skip
-
-
-def _plugin_sections(session: Session) -> Iterator[Component]:
-    """The components of plugins' sections, each where the file has the section or the plugin says so."""
-    for name in session.registry.types("section"):
-        descriptor = session.registry.find("section", name)
-        assert isinstance(descriptor, SectionDescriptor)
-        section = session.config.plugin_sections.get(name)
-        if section is not None or descriptor.without_section(session.config):
-            yield descriptor.make(section.options if section is not None else None, session)
 
 
 def _ordered(components: list[Component]) -> list[Component]:

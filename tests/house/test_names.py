@@ -14,7 +14,7 @@ from ibrobot_core.plugins import KINDS, OFFICIAL, example_type, official_plugins
 CORE = OFFICIAL.parent
 ORDINARY = {"gripper", "joint", "keyboard", "process", "trajectory"}
 """Types that are words of the language too: they count where a YAML would name them, as in `type: WORD`."""
-ALLOWED = {("config/models.py", '_root(path, "mujoco")')}
+ALLOWED = {("config/models.py", 'read_xml(path, "mujoco")')}
 """File and text: the root element of MJCF files."""
 
 
@@ -24,7 +24,7 @@ def patterns() -> Iterator[str]:
         name = package.removeprefix("ibrobot-plugin-")
         yield rf"\b(ibrobot-plugin-{name}|ibrobot_{name})\b"
         yield from (rf"\bibrobot {command}\b" for command in offers.get("command", ()))
-        yield from (rf"\b{section}: \{{|\[.{section}.\]" for section in offers.get("section", ()))
+        yield from (rf"\b{section}: \{{|plugin_sections\[.{section}.\]" for section in offers.get("section", ()))
         for type_ in (type_ for kind in KINDS if kind != "section" for type_ in offers.get(kind, ())):
             yield rf"\b(type|execution_mode): {type_}\b" if type_ in ORDINARY else rf"\b{type_}\b"
 

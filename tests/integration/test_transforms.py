@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ibrobot_description.frames import transform
+from ibrobot_kinematics.urdf import read_urdf
 
 from ibrobot_core.config import load_config
-from ibrobot_core.launch.outputs.transforms import read_urdf
 from ibrobot_core.messages import Quaternion, Vector3
 
 pytestmark = pytest.mark.integration
@@ -35,14 +36,14 @@ def test_links_stand_where_mujoco_has_them() -> None:
     robot = load_config(CONFIG, sim=True).robot
     assert robot.description.urdf is not None
     position = np.array([0.3, -0.5, 0.7, 0.2, 0.9, 0.4])
-    links = read_urdf(robot.description.urdf)
+    joints = read_urdf(robot.description.urdf).joints
     at = dict(zip(robot.joint_names, position, strict=True))
     poses = {"base_link": np.eye(4)}
-    while len(poses) <= len(links):
-        for link in links:
-            if link.parent in poses and link.child not in poses:
-                transform = link.transform(float(at.get(link.joint, 0.0)), 0)
-                poses[link.child] = poses[link.parent] @ matrix(transform.translation, transform.rotation)
+    while len(poses) <= len(joints):
+        for joint in joints:
+            if joint.parent in poses and joint.child not in poses:
+                found = transform(joint, float(at.get(joint.name, 0.0)), 0)
+                poses[joint.child] = poses[joint.parent] @ matrix(found.translation, found.rotation)
     model = mujoco.MjModel.from_xml_path(str(robot.description.mjcf))
     physics = mujoco.MjData(model)
     physics.qpos[:] = position

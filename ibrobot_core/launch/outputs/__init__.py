@@ -1,1 +1,1 @@
-"""What shows or publishes a run: status, transforms, shared topics, the viewer."""
+"""What shows or publishes a run: status, shared topics, the viewer."""

@@ -1,0 +1,37 @@
+"""The plugin's hooks: section `description`, which robots with a URDF or with mounted sensors need not write."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+from ibrobot_core.api import SectionDescriptor, hookimpl
+
+if TYPE_CHECKING:
+    from ibrobot_core.api import Component, NoOptions, OptionFault, RobotConfig, Session
+
+
+def _publisher(options: NoOptions | None, session: Session) -> Component:
+    from ibrobot_description.component import DescriptionPublisher
+
+    return DescriptionPublisher(session)
+
+
+def _has_frames(config: RobotConfig) -> bool:
+    mounted = any(peripheral.transform is not None for peripheral in config.peripherals.values())
+    return mounted or config.robot.description.urdf is not None
+
+
+def _check(config: RobotConfig) -> Iterable[OptionFault]:
+    from ibrobot_description.check import faults
+
+    return faults(config)
+
+
+@hookimpl
+def ibrobot_sections() -> Iterable[SectionDescriptor]:
+    """What robot_state_publisher does in ROS."""
+    yield SectionDescriptor(
+        type="description", make=_publisher, without_section=_has_frames, check_config=_check,
+        summary="/tf, /tf_static and /robot_description from the URDF and the mounts of sensors; has no keys",
+    )  # fmt: skip

@@ -1,0 +1,64 @@
+"""What is wrong with a robot's frames: models that make no tree, and mounts that loop or hang loose."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from ibrobot_kinematics.errors import KinematicsError
+from ibrobot_kinematics.srdf import read_srdf
+from ibrobot_kinematics.urdf import Urdf, read_urdf
+
+from ibrobot_core.api import OptionFault, RobotConfig, did_you_mean
+from ibrobot_description.frames import MountedFrame, mounted
+
+_URDF, _SRDF = ("robot", "description", "urdf"), ("robot", "description", "srdf")
+
+
+def faults(config: RobotConfig) -> Iterator[OptionFault]:
+    """All of them, each with its place in the YAML; those of a model also name file and line there."""
+    description = config.robot.description
+    urdf: Urdf | None = None
+    if description.urdf is not None:
+        try:
+            urdf = read_urdf(description.urdf)
+        except KinematicsError as error:
+            yield OptionFault(_URDF, str(error))
+            return
+    if description.srdf is not None:
+        if urdf is None:
+            yield OptionFault(_SRDF, "needs a URDF, whose links and joints it names: robot.description.urdf")
+        else:
+            try:
+                read_srdf(description.srdf, urdf)
+            except KinematicsError as error:
+                yield OptionFault(_SRDF, str(error))
+    yield from _mounts(list(mounted(config)), urdf)
+
+
+def _mounts(frames: list[MountedFrame], urdf: Urdf | None) -> Iterator[OptionFault]:
+    definers = {link: f"a link of {urdf.path.name}" for link in urdf.links} if urdf is not None else {}
+    parents: dict[str, str] = {}
+    for frame in frames:
+        for name in filter(None, (frame.name, frame.optical)):
+            if name in definers:
+                message = f"frame {name!r} is {definers[name]} already; give another name by transform.frame"
+                yield OptionFault((*_place(frame), "frame"), message)
+            definers.setdefault(name, f"a frame of peripheral {frame.peripheral!r}")
+        parents.setdefault(frame.name, frame.mount.parent)
+        if frame.optical:
+            parents.setdefault(frame.optical, frame.name)
+    for frame in frames:
+        place = (*_place(frame), "parent")
+        parent = frame.mount.parent
+        if urdf is not None and parent not in definers:
+            remark = did_you_mean(parent, list(definers), "the frames are")
+            yield OptionFault(place, f"frame {frame.name!r} hangs loose: no frame {parent!r}{remark}")
+        chain = [frame.name]
+        while chain[-1] in parents and chain[-1] not in chain[:-1]:
+            chain.append(parents[chain[-1]])
+        if chain[-1] == frame.name and len(chain) > 1:
+            yield OptionFault(place, f"frame {frame.name!r} hangs on itself: {' -> '.join(reversed(chain))}")
+
+
+def _place(frame: MountedFrame) -> tuple[str | int, ...]:
+    return ("peripherals", frame.index, "transform")
