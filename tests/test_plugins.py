@@ -52,7 +52,7 @@ def test_a_good_plugin_works_beside_broken_ones(registry: Registry) -> None:
     assert (entry.package, entry.version, entry.plugin) == ("fake-good", "1.0", "fake_good")
     assert registry.find("hardware", "good_arm").summary == "an arm that works"
     assert [config.name for config in registry.configs] == ["good", "other"]
-    assert registry.types("executor") == ["gripper", "position", "trajectory"]
+    assert registry.types("executor") == ["position"]
 
 
 def test_every_failure_is_reported_with_its_cause(registry: Registry) -> None:

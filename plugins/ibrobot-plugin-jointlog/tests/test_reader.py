@@ -11,7 +11,16 @@ from ibrobot_jointlog import ibrobot_readers
 from ibrobot_jointlog.log import header, row
 from ibrobot_testing import make_robot
 
-from ibrobot_core.api import ActionPart, Contract, EpisodeAddress, EpisodeReader, Float64MultiArray, RecorderError, ns
+from ibrobot_core.api import (
+    ActionPart,
+    Contract,
+    EpisodeAddress,
+    EpisodeReader,
+    Float64MultiArray,
+    JointState,
+    RecorderError,
+    ns,
+)
 
 JOINTS = make_robot().joint_names
 WAVE = np.array([[0.1 * i, -0.2 * i, 0.3, 0.0, 0.01 * i, 0.5] for i in range(5)])
@@ -43,10 +52,12 @@ def test_log_has_the_commands_of_the_contract(tmp_path: Path, joints: tuple[str,
     known = contract(JOINTS[:5], JOINTS[5:])
     found = list(read(write_log(tmp_path / "wave.csv", joints), known).messages())
     for topic, columns in (("/group_0/commands", slice(5)), ("/group_1/commands", slice(5, 6))):
-        commands = [each for each in found if each.topic == topic]
-        assert [each.received_ns - commands[0].received_ns for each in commands] == [ns(0.1 * i) for i in range(5)]
-        np.testing.assert_array_equal([each.message.data for each in commands], WAVE[:, columns])
-    states = [each.message for each in found if each.topic == "/joint_states"]
+        stamps = [each.received_ns for each in found if each.topic == topic]
+        assert [stamp - stamps[0] for stamp in stamps] == [ns(0.1 * i) for i in range(5)]
+        commands = [each.message for each in found if each.topic == topic]
+        data = [each.data for each in commands if isinstance(each, Float64MultiArray)]
+        np.testing.assert_array_equal(data, WAVE[:, columns])
+    states = [each.message for each in found if isinstance(each.message, JointState)]
     assert {each.name for each in states} == {joints}
     np.testing.assert_array_equal([each.position for each in states], WAVE[:, [JOINTS.index(each) for each in joints]])
 

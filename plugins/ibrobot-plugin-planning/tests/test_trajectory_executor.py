@@ -280,7 +280,7 @@ def test_deactivation_ends_the_goal() -> None:
 
 
 AT_REST = (0.0, 0.0)
-BAD = {
+BAD: dict[str, Any] = {
     "the trajectory has no points; it needs at least one": goal(),
     "the goal has no trajectory": {},
     "the trajectory has no joint_names": {"trajectory": {"points": []}},
