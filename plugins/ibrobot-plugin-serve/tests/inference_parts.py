@@ -58,4 +58,5 @@ def ibrobot_hardware():
 @hookimpl
 def ibrobot_policies():
     yield PolicyDescriptor("net", lambda options, ctx: Net(ctx), "a network")
+    yield PolicyDescriptor("plain", lambda options, ctx: FakePolicy(ctx), "a network without tricks")
     yield PolicyDescriptor("lost", lambda options, ctx: Lost(ctx), "a network that is not there")

@@ -16,7 +16,7 @@ from ibrobot_serve.process import ProcessEngine
 from ibrobot_testing import host_context
 from ibrobot_testing.fakes import FakePolicy
 
-from ibrobot_core.api import PolicyError, RobotConfig, load_config
+from ibrobot_core.api import PolicyError, RobotConfig, Tensors, load_config
 
 if TYPE_CHECKING:
     from ibrobot_testing.site import Site
@@ -194,7 +194,7 @@ def test_process_that_starts_again_with_other_weights_is_accepted_only_where_the
         engine.start()
         assert engine.stats.weights == "a1"
         (site.folder / "weights").write_text("b2")
-        die = {"x": np.arange(3), "do": np.frombuffer(b"die", np.uint8)}
+        die: Tensors = {"x": np.arange(3), "do": np.frombuffer(b"die", np.uint8)}
         with pytest.raises(PolicyError, match="died"):
             engine.infer(die, 1, time.monotonic_ns() + PATIENCE_NS)
         if accept:

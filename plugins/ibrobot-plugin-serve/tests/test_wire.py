@@ -18,7 +18,6 @@ from ibrobot_serve import wire
 from ibrobot_serve.wire import (
     ALIGNMENT,
     Buffer,
-    PictureCodec,
     WireDecoder,
     WireEncoder,
     WireKind,
@@ -28,7 +27,7 @@ from ibrobot_serve.wire import (
     encode,
 )
 
-from ibrobot_core.api import WireError
+from ibrobot_core.api import PictureCodec, WireError
 
 PAGE = Path(__file__).parents[3] / "docs/reference/wire.md"
 DTYPES = st.sampled_from(["?", "u1", "i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f2", "<f4", "<f8", ">f4", ">i2"])
@@ -101,9 +100,18 @@ def test_robots_that_come_and_go_cost_no_memory():
 @pytest.mark.parametrize("robots", [64, 65, 300])
 def test_robots_that_take_turns_are_laid_out_once(robots: int, monkeypatch: pytest.MonkeyPatch):
     laid_out: list[str] = []
-    for name in ("_lay_out", "_places"):
+
+    def counted(name: str) -> Any:
         work = getattr(wire, name)
-        monkeypatch.setattr(wire, name, lambda *args, work=work, name=name: laid_out.append(name) or work(*args))
+
+        def count(*arguments: Any) -> Any:
+            laid_out.append(name)
+            return work(*arguments)
+
+        return count
+
+    for name in ("_lay_out", "_places"):
+        monkeypatch.setattr(wire, name, counted(name))
     encoder, decoder = WireEncoder(), WireDecoder()
     for _ in range(3):
         for number in range(robots):

@@ -11,6 +11,7 @@ from ibrobot_testing.command import ibrobot_command
 from ibrobot_testing.contexts import control_context, host_context, make_robot
 from ibrobot_testing.dataset import DatasetSuite
 from ibrobot_testing.descriptor import check_descriptor
+from ibrobot_testing.engine import EngineSuite
 from ibrobot_testing.executor import ExecutorSuite
 from ibrobot_testing.hardware import HardwareSuite, SimulatedHardwareSuite
 from ibrobot_testing.leaks import LeakCheck
@@ -26,6 +27,7 @@ from ibrobot_testing.viewer import ViewerSuite
 
 __all__ = [
     "DatasetSuite",
+    "EngineSuite",
     "ExecutorSuite",
     "HardwareSuite",
     "LeakCheck",
