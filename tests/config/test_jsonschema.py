@@ -11,6 +11,8 @@ from ibrobot_core.config.jsonschema import json_schema
 from ibrobot_core.config.yaml_nodes import parse_yaml
 from ibrobot_core.plugins import Registry
 
+INFERENCE = ("control_modes", "policy", "inference")
+
 
 @pytest.fixture
 def validator(registry: Registry) -> jsonschema.Draft202012Validator:
@@ -29,6 +31,12 @@ def test_named_hardware_is_valid(validator: jsonschema.Draft202012Validator, bas
     validator.validate(parse_yaml(base.replace("hardware: {type: bus, port: /dev/null}", both), "robot.yaml").root)
 
 
+def test_options_of_an_engine_are_valid(validator: jsonschema.Draft202012Validator, base: str) -> None:
+    far = "{model: net, execution_mode: far, server: big}"
+
+    validator.validate(parse_yaml(base.replace("{model: net}", far), "robot.yaml").root)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "path"),
     [
@@ -43,6 +51,22 @@ def test_named_hardware_is_valid(validator: jsonschema.Draft202012Validator, bas
         ("{type: position, group: arm}", "{type: position}", ("executors", "arm_position")),
         ("type: webcam, fps: 30", "type: webcam, fps: fast", ("peripherals", 0, "fps")),
         ("planner: {type: straight}", "planner: {type: bent}", ("control_modes", "plan", "planner", "type")),
+        ("{model: net}", "{model: net, server: big}", INFERENCE),
+        (
+            "{model: net}",
+            "{model: net, execution_mode: monolithic, server: big}",
+            INFERENCE,
+        ),
+        (
+            "{model: net}",
+            "{model: net, execution_mode: fat}",
+            (*INFERENCE, "execution_mode"),
+        ),
+        (
+            "{model: net}",
+            "{model: net, execution_mode: far, server: 5}",
+            (*INFERENCE, "server"),
+        ),
         ("net: {type: net}", "net: {type: net, gains: [1.0]}", ("models", "net", "gains")),
         ("strategy: asof", "strategy: newest", ("contract", "observations", 1, "align", "strategy")),
         ("stop: hold}", "stop: hold, priority: 100}", ("control", "priority")),

@@ -210,6 +210,19 @@ def test_what_show_prints_loads_to_the_same(load_text: Load, base: str, sim: boo
     assert attrs.evolve(again, document={}) == attrs.evolve(config, document={})
 
 
+def test_options_of_an_engine_stand_beside_its_execution_mode(load_text: Load, base: str, registry: Registry) -> None:
+    entry = registry.entries["engine", "far"]
+    descriptor = attrs.evolve(entry.descriptor, uses_transport=False)  # for a YAML without a transport
+    registry.entries["engine", "far"] = attrs.evolve(entry, descriptor=descriptor)
+    config = load_text(base.replace("{model: net}", "{model: net, execution_mode: far, server: big}"))
+    inference = config.control_modes["policy"].inference
+
+    assert inference is not None
+    assert (inference.type, inference.options.server, inference.request_timeout) == ("far", "big", 5.0)
+    assert "execution_mode: far" in to_yaml(config)
+    assert load_text(to_yaml(config)).control_modes == config.control_modes
+
+
 @pytest.mark.parametrize("name", ["mini", "mini.yaml"])
 def test_shipped_configs_are_found_by_name(
     name: str, registry: Registry, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -127,6 +127,23 @@ def test_entered_mode_is_one_error_with_one_command(
     assert line.endswith(told)
 
 
+FAR = ("--set", "transport={type: zenoh, connect: [tcp/127.0.0.1:7447]}")
+MODE = ("--set", "control_modes.model_inference.inference.execution_mode=distributed")
+
+
+def test_mode_whose_engine_is_not_installed_is_unavailable(only: Only, ibrobot: Run) -> None:
+    only("mujoco", "keyboard", "planning", "zenoh")
+    lacks = "engine type 'distributed' needs a plugin that is not installed: pip install ibrobot-plugin-serve\n"
+
+    code, out, err = ibrobot("config", "check", "so101_blind", "--sim", *FAR, *MODE, "--mode", "teleop")
+    entered = ibrobot("config", "check", "so101_blind", "--sim", *FAR, *MODE, "--mode", "model_inference")
+
+    assert (code, err) == (0, "")
+    assert f"mode model_inference is unavailable: {lacks}" in out
+    assert entered[0] == 2
+    assert entered[2].endswith(f"control_modes.model_inference.inference.execution_mode: {lacks}")
+
+
 def test_unknown_type_stays_an_error_in_every_mode(only: Only, ibrobot: Run) -> None:
     only("feetech")
 
