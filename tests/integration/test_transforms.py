@@ -1,11 +1,13 @@
-"""The URDF's transforms against MuJoCo's kinematics of the MJCF."""
+"""The description in a run: the URDF's transforms against MuJoCo's kinematics, and what a recording has of it."""
 
 from __future__ import annotations
 
+import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from ibrobot_description.frames import transform
 from ibrobot_kinematics.urdf import read_urdf
 
@@ -50,3 +52,16 @@ def test_links_stand_where_mujoco_has_them() -> None:
     mujoco.mj_kinematics(model, physics)
     for link_name, body in BODIES.items():
         np.testing.assert_allclose(poses[link_name][:3, 3], physics.body(body).xpos, atol=2e-4)
+
+
+def test_recording_offers_the_description_to_late_subscribers(tmp_path: Path, ibrobot: tuple[str, ...]) -> None:
+    command = [*ibrobot, "record", "so101_blind", "--sim", "--lockstep", "--headless", "--episodes", "1"]
+    options = ["--set", "contract.max_duration_s=0.2", "--set", "recording.topics=all"]
+    subprocess.run([*command, *options], cwd=tmp_path, capture_output=True, timeout=120, check=False)
+    (metadata,) = tmp_path.glob("**/metadata.yaml")
+    topics = yaml.safe_load(metadata.read_text())["rosbag2_bagfile_information"]["topics_with_message_count"]
+    offered = {topic["topic_metadata"]["name"]: (topic["topic_metadata"], topic["message_count"]) for topic in topics}
+    for name, latched in (("/robot_description", True), ("/tf_static", True), ("/tf", False)):
+        found, count = offered[name]
+        assert ("transient_local" in str(found["offered_qos_profiles"])) == latched
+        assert (count == 1) == latched
