@@ -158,6 +158,11 @@ class Bus:
         with self._lock:
             self._services.pop(name, None)
 
+    def serves(self, name: str) -> bool:
+        """Whether service `name` is served."""
+        with self._lock:
+            return name in self._services
+
     def call(self, name: str, request: Any) -> Any:
         """Call service `name`.
 

@@ -1,13 +1,13 @@
-"""The plugin's hooks: planner type `joint`, executor types `trajectory` and `gripper`."""
+"""The plugin's hooks: planner types `joint` and `rrt_connect`, executor types `trajectory` and `gripper`."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.api import ExecutorDescriptor, PlannerDescriptor, hookimpl
+from ibrobot_core.api import ExecutorDescriptor, MissingDependency, PlannerDescriptor, hookimpl
 from ibrobot_planning.executors.options import GripperOptions, TrajectoryOptions
-from ibrobot_planning.options import JointPlannerOptions
+from ibrobot_planning.options import JointPlannerOptions, RrtConnectOptions
 
 if TYPE_CHECKING:
     from ibrobot_core.api import Context, Executor, Planner
@@ -19,12 +19,33 @@ def _joint(options: Any, ctx: Context) -> Planner:
     return JointPlanner(options, ctx)
 
 
+def _find_engines() -> None:
+    from importlib.util import find_spec
+
+    missing = [name for name in ("pinocchio", "coal", "mujoco", "ibrobot_kinematics") if find_spec(name) is None]
+    if missing:
+        raise MissingDependency(
+            f"planning around obstacles needs the Python package {missing[0]}, which is not installed",
+            remedy="pip install 'ibrobot-plugin-planning[obstacles]'",
+        )
+
+
+def _rrt_connect(options: Any, ctx: Context) -> Planner:
+    from ibrobot_planning.rrt import RrtConnectPlanner
+
+    return RrtConnectPlanner(options, ctx)
+
+
 @hookimpl
 def ibrobot_planners() -> Iterable[PlannerDescriptor]:
-    """Straight lines between joint positions."""
+    """Straight lines between joint positions, and ways around obstacles."""
     yield PlannerDescriptor(
         type="joint", options=JointPlannerOptions, make=_joint,
         summary="straight line in joint space, time-optimal within velocity, acceleration and jerk limits",
+    )  # fmt: skip
+    yield PlannerDescriptor(
+        type="rrt_connect", options=RrtConnectOptions, make=_rrt_connect, check=_find_engines,
+        summary="around obstacles, to joint positions or poses of the tool, checked against padding after timing",
     )  # fmt: skip
 
 

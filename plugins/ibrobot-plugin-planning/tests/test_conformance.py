@@ -1,17 +1,58 @@
-"""The joint planner passes the suite of planners."""
+"""Both planners pass the suite of planners."""
 
 from __future__ import annotations
 
 from typing import override
 
+import attrs
+import numpy as np
+import pytest
+from ibrobot_planning.arm import robot_arm
+from ibrobot_planning.collision import Collisions, unchecked_pairs
 from ibrobot_planning.joint import JointPlanner
-from ibrobot_planning.options import JointPlannerOptions
+from ibrobot_planning.options import JointPlannerOptions, RrtConnectOptions
+from ibrobot_planning.rrt import RrtConnectPlanner
+from ibrobot_planning.world import World
 from ibrobot_testing import PlannerSuite
 
-from ibrobot_core.api import Context
+from ibrobot_core.api import Context, JointGoal, PlanRequest
+
+from .table_arm import make_robot
 
 
 class TestJointPlanner(PlannerSuite):
     @override
     def make(self, ctx: Context) -> JointPlanner:
         return JointPlanner(JointPlannerOptions(), ctx)
+
+
+class TestRrtConnectPlanner(PlannerSuite):
+    @pytest.fixture(autouse=True)
+    def folder(self, tmp_path):
+        self._folder = tmp_path
+
+    @override
+    def context(self) -> Context:
+        return attrs.evolve(super().context(), robot=make_robot(self._folder))
+
+    @override
+    def make(self, ctx: Context) -> RrtConnectPlanner:
+        return RrtConnectPlanner(RrtConnectOptions(), ctx)
+
+    @override
+    def request(self, ctx: Context, seed: int, joints: tuple[str, ...] | None = None) -> PlanRequest:
+        """Between random configurations that touch nothing, others at zero."""
+        joints = ctx.robot.joint_names if joints is None else joints
+        arm = robot_arm(ctx.robot)
+        checks = Collisions(arm, World(), joints, unchecked=unchecked_pairs(arm))
+        order = ctx.robot.indices(joints)
+        samples = np.random.default_rng(seed).uniform(ctx.robot.lower[order], ctx.robot.upper[order], (99, len(joints)))
+        # One joint of the goal alone must be free as well: the suite asks for that.
+        free = [q for q in samples if checks.free(q)]
+        start = free[0]
+        for goal in free[1:]:
+            mixed = start.copy()
+            mixed[1] = goal[1]
+            if checks.free(mixed):
+                return PlanRequest(joints, start, JointGoal(joints, goal))
+        raise AssertionError("no free goal")

@@ -208,6 +208,6 @@ def test_a_pose_goal_is_refused_with_the_way_out():
 
 
 def test_the_hook_offers_the_planner():
-    (descriptor,) = ibrobot_planners()
-    assert descriptor.type == "joint"
+    descriptor, around_obstacles = ibrobot_planners()
+    assert (descriptor.type, around_obstacles.type) == ("joint", "rrt_connect")
     assert isinstance(descriptor.make(descriptor.options(), CONTEXT), JointPlanner)

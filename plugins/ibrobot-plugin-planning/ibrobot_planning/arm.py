@@ -1,0 +1,279 @@
+"""The arm as collision checks see it: its links' shapes on its joints, from the MJCF.
+
+MuJoCo reads the file. Pinocchio computes where links are and Coal what touches; ADR 31 has why.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import attrs
+import numpy as np
+
+from ibrobot_core.api import PlanCode, PlanningError, Robot, Vector
+from ibrobot_planning.shapes import convex, geometry
+from ibrobot_planning.transforms import rotation
+from ibrobot_planning.world import Box, Capsule, Cylinder, Plane, Shape, Sphere
+
+ADJACENT, ALWAYS, NEVER = "Adjacent", "Always", "Never"
+"""Why a pair of links is not checked, as an SRDF says it."""
+_PLANE, _SPHERE, _CAPSULE, _CYLINDER, _BOX, _MESH = 0, 2, 3, 5, 6, 7
+"""Values of mujoco.mjtGeom."""
+_HINGE, _SLIDE = 3, 2
+"""Values of mujoco.mjtJoint."""
+
+type Pair = tuple[str, str]
+
+
+@attrs.frozen(eq=False)
+class LinkShape:
+    """One shape of a link."""
+
+    link: str
+    joint: int
+    """Pinocchio's number of the joint that moves it; 0: none."""
+    placement: Vector
+    """In the frame of the joint, shape (4, 4)."""
+    geometry: Any
+    """The shape as Coal has it."""
+
+
+@attrs.frozen(eq=False)
+class Arm:
+    """Joints, links and shapes. Vectors of joint positions have the order of `joint_names`."""
+
+    joint_names: tuple[str, ...]
+    model: Any
+    """pinocchio.Model; its order of joints is that of the MJCF."""
+    columns: np.ndarray[tuple[int], np.dtype[np.intp]]
+    """Where each joint is in Pinocchio's vector, shape (J,)."""
+    reference: Vector
+    """Positions at which the joints move nothing [rad or m], shape (J,)."""
+    lower: Vector
+    """[rad or m], shape (J,)."""
+    upper: Vector
+    """[rad or m], shape (J,)."""
+    shapes: tuple[LinkShape, ...]
+    frames: dict[str, tuple[int, Vector]]
+    """Link -> the joint that moves it, and its frame in that of the joint, shape (4, 4)."""
+    numbers: np.ndarray[tuple[int], np.dtype[np.intp]]
+    """Pinocchio's number of each joint, shape (J,)."""
+    slides: np.ndarray[tuple[int], np.dtype[np.bool_]]
+    """Which joints are prismatic, shape (J,)."""
+
+    def native(self, q: Vector) -> Vector:
+        """Joint positions, shape (..., J), in Pinocchio's order and zero."""
+        converted = np.empty(q.shape)
+        converted[..., self.columns] = q - self.reference
+        return converted
+
+    def link_pose(self, link: str, q: Vector) -> Vector:
+        """Pose of a link in the base frame, shape (4, 4).
+
+        Raises:
+            PlanningError: for an unknown link.
+        """
+        import pinocchio
+
+        joint, frame = self.frame(link)
+        data = self.model.createData()
+        pinocchio.forwardKinematics(self.model, data, self.native(np.asarray(q, dtype=float)))
+        return np.asarray(data.oMi[joint].homogeneous @ frame)
+
+    def frame(self, link: str) -> tuple[int, Vector]:
+        """The joint that moves a link, and the link's frame in that of the joint.
+
+        Raises:
+            PlanningError: for an unknown link.
+        """
+        if link not in self.frames:
+            raise PlanningError(
+                f"no link {link!r}; the links are: {', '.join(self.frames)}", PlanCode.INVALID_LINK_NAME
+            )
+        return self.frames[link]
+
+    def pairs(self) -> list[tuple[int, int]]:
+        """Shapes of different links that can move towards one another, as indices of `shapes`."""
+        return [(i, j) for (i, a), (j, b) in combinations(enumerate(self.shapes), 2) if a.joint != b.joint]
+
+    def adjacent(self) -> set[Pair]:
+        """Links that one joint connects."""
+        found = set()
+        for i, j in self.pairs():
+            a, b = self.shapes[i], self.shapes[j]
+            if self.model.parents[a.joint] == b.joint or self.model.parents[b.joint] == a.joint:
+                found.add(sorted_pair(a.link, b.link))
+        return found
+
+
+def sorted_pair(a: str, b: str) -> Pair:
+    """The same for (a, b) and (b, a)."""
+    return (a, b) if a < b else (b, a)
+
+
+def robot_arm(robot: Robot) -> Arm:
+    """The arm of a robot, within the robot's joint limits.
+
+    Raises:
+        PlanningError: when there is no MJCF, or it cannot be read, or lacks one of the joints.
+    """
+    if robot.description.mjcf is None:
+        raise PlanningError(
+            f"robot {robot.name!r} has no robot.description.mjcf; planning around obstacles needs a MuJoCo model",
+            PlanCode.COLLISION_CHECKING_UNAVAILABLE,
+        )
+    arm = read_arm(robot.description.mjcf, robot.joint_names)
+    return attrs.evolve(arm, lower=robot.lower, upper=robot.upper)
+
+
+@lru_cache(maxsize=4)
+def read_arm(path: Path, joints: tuple[str, ...]) -> Arm:
+    """An arm from an MJCF.
+
+    Links without collision geometry, such as the base of the SO-101, get the convex hulls of their visible meshes.
+
+    Args:
+        path: the MJCF.
+        joints: the joints that may move, in the order of vectors. Others stay at their reference position.
+
+    Raises:
+        PlanningError: when the file cannot be read, lacks a joint, or one is neither a hinge nor a slide.
+    """
+    import pinocchio
+
+    source = _compiled(path)
+    known = {source.joint(i).name: i for i in range(source.njnt)}
+    for name in joints:
+        if name not in known:
+            raise _unusable(f"{path} has no joint {name!r}; it has: {', '.join(known)}")
+        if source.jnt_type[known[name]] not in (_SLIDE, _HINGE):
+            raise _unusable(f"{path}: joint {name!r} is neither a hinge nor a slide")
+    ids = [known[name] for name in joints]
+    model = pinocchio.Model()
+    numbers: dict[int, int] = {}
+    bodies = {0: (0, np.eye(4))}
+    for body in range(1, source.nbody):
+        number, placed = bodies[int(source.body_parentid[body])]
+        placed = placed @ _placement(source.body_pos[body], source.body_quat[body])
+        first = int(source.body_jntadr[body])
+        for joint in range(first, first + int(source.body_jntnum[body])):
+            if joint not in ids:
+                continue
+            anchor = _placement(source.jnt_pos[joint], (1, 0, 0, 0))
+            axis = source.jnt_axis[joint].copy()
+            kind = (
+                pinocchio.JointModelPrismaticUnaligned
+                if source.jnt_type[joint] == _SLIDE
+                else pinocchio.JointModelRevoluteUnaligned
+            )
+            number = model.addJoint(number, kind(axis), pinocchio.SE3(placed @ anchor), source.joint(joint).name)
+            numbers[joint] = number
+            placed = np.linalg.inv(anchor)
+        bodies[body] = number, placed
+    shapes = tuple(_shapes(source, bodies))
+    if not shapes:
+        raise _unusable(f"{path} has no geometry that could collide")
+    return Arm(
+        joint_names=joints,
+        model=model,
+        columns=np.array([model.joints[numbers[joint]].idx_q for joint in ids], dtype=np.intp),
+        reference=source.qpos0[source.jnt_qposadr[ids]].copy(),
+        lower=source.jnt_range[ids, 0].copy(),
+        upper=source.jnt_range[ids, 1].copy(),
+        shapes=shapes,
+        frames={source.body(body).name: place for body, place in bodies.items()},
+        numbers=np.array([numbers[joint] for joint in ids], dtype=np.intp),
+        slides=source.jnt_type[ids] == _SLIDE,
+    )
+
+
+def _unusable(message: str) -> PlanningError:
+    return PlanningError(message, PlanCode.COLLISION_CHECKING_UNAVAILABLE)
+
+
+def _compiled(path: Path) -> Any:
+    import mujoco
+
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+        for body in spec.bodies:
+            geoms = list(body.geoms)
+            if not any(geom.contype or geom.conaffinity for geom in geoms):
+                for geom in geoms:
+                    geom.contype = 1  # so that the compiler finds its hull
+        return spec.compile()
+    except ValueError as error:
+        raise _unusable(f"{path} cannot be loaded: {error}") from error
+
+
+def _placement(position: Sequence[float] | Vector, quaternion: Sequence[float] | Vector) -> Vector:
+    placed = np.eye(4)
+    placed[:3, :3] = rotation(*quaternion)
+    placed[:3, 3] = position
+    return placed
+
+
+def _shapes(source: Any, bodies: dict[int, tuple[int, Vector]]) -> list[LinkShape]:
+    shapes = []
+    for geom in range(source.ngeom):
+        if not (source.geom_contype[geom] or source.geom_conaffinity[geom]):
+            continue
+        body = int(source.geom_bodyid[geom])
+        joint, frame = bodies[body]
+        placed = frame @ _placement(source.geom_pos[geom], source.geom_quat[geom])
+        shapes.append(LinkShape(source.body(body).name, joint, placed, _geometry(source, geom)))
+    return shapes
+
+
+def _geometry(source: Any, geom: int) -> Any:
+    kind, size = int(source.geom_type[geom]), source.geom_size[geom]
+    if kind == _MESH:
+        return convex(*_hull(source, int(source.geom_dataid[geom])))
+    shape: Shape
+    if kind == _BOX:
+        shape = Box(tuple((2 * size).tolist()))
+    elif kind == _SPHERE:
+        shape = Sphere(float(size[0]))
+    elif kind == _CYLINDER:
+        shape = Cylinder(float(size[0]), float(2 * size[1]))
+    elif kind == _CAPSULE:
+        shape = Capsule(float(size[0]), float(2 * size[1]))
+    elif kind == _PLANE:
+        shape = Plane()
+    else:
+        raise _unusable(f"geometry {source.geom(geom).name or geom} of the MJCF has a type that planning does not know")
+    return geometry(shape)
+
+
+def _hull(source: Any, mesh: int) -> tuple[Vector, np.ndarray[tuple[int, ...], np.dtype[np.intp]]]:
+    """Vertices and triangles of a mesh's convex hull, as MuJoCo collides it (mesh_graph in mjmodel.h)."""
+    first = int(source.mesh_vertadr[mesh])
+    vertices = source.mesh_vert[first : first + int(source.mesh_vertnum[mesh])].astype(float)
+    graph = source.mesh_graph[int(source.mesh_graphadr[mesh]) :]
+    corners, faces = int(graph[0]), int(graph[1])
+    used = graph[2 + corners : 2 + 2 * corners]
+    triangles = graph[2 + 3 * corners + 3 * faces : 2 + 3 * corners + 6 * faces].reshape(-1, 3)
+    order = np.argsort(used)
+    return vertices[used], order[np.searchsorted(used, triangles, sorter=order)]
+
+
+def reach(arm: Arm, shapes: Sequence[LinkShape]) -> Vector:
+    """How far any point of the shapes is at most from each joint's axis [m], shape (J,); 1 for joints that slide.
+
+    An upper bound, from bounding spheres of the shapes on links that are stretched out in any direction.
+    """
+    model = arm.model
+    farthest = np.zeros(model.njoints)
+    for shape in shapes:
+        if shape.joint:
+            shape.geometry.computeLocalAABB()
+            centre = shape.placement[:3, :3] @ shape.geometry.aabb_center + shape.placement[:3, 3]
+            farthest[shape.joint] = max(farthest[shape.joint], np.linalg.norm(centre) + shape.geometry.aabb_radius)
+    for joint in range(model.njoints - 1, 0, -1):
+        parent, away = model.parents[joint], np.linalg.norm(model.jointPlacements[joint].translation)
+        farthest[parent] = max(farthest[parent], away + farthest[joint])
+    return np.where(arm.slides, 1.0, farthest[arm.numbers])

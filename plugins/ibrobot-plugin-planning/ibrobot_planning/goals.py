@@ -1,0 +1,301 @@
+"""Goals as configurations: what an arm can do of what was asked."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import attrs
+import numpy as np
+from ibrobot_kinematics import KinematicModel, KinematicsError, Target, TipPose, UnreachableError, solve, solve_all
+
+from ibrobot_core.api import (
+    JointGoal,
+    NamedGoal,
+    PlanCode,
+    PlanningError,
+    PoseGoal,
+    PositionGoal,
+    Robot,
+    Vector,
+    Vector3,
+)
+from ibrobot_planning.transforms import matrix
+
+_PITCHES = np.linspace(-np.pi / 2, np.pi / 2, 7)
+"""Directions of the tool that are tried at a position without one: from straight down to straight up."""
+_SAME = 1e-3
+"""Solutions that differ less [rad] count as one."""
+_SEEDS = 12
+"""Random configurations from which numerical searches begin, besides the start."""
+_NEARLY_ONE = 1e-3
+"""How far from 1 the length of a quaternion may be."""
+
+
+@attrs.frozen(eq=False)
+class Candidate:
+    """A configuration that reaches a goal."""
+
+    joints: Vector
+    """All joints of the model [rad], shape (J,)."""
+    position_error: float = 0.0
+    """[m]."""
+    orientation_error: float = 0.0
+    """[rad]."""
+
+
+def joint_target(goal: JointGoal | NamedGoal, robot: Robot, joints: Sequence[str], start: Vector) -> Vector:
+    """Where the planned `joints` end [rad], shape (len(joints),).
+
+    Raises:
+        PlanningError: for unknown poses and joints, wrong shapes, and positions outside the limits.
+    """
+    if isinstance(goal, NamedGoal):
+        try:
+            whole = robot.pose(goal.name)
+        except KeyError as error:
+            raise PlanningError(str(error.args[0]), PlanCode.INVALID_GOAL_CONSTRAINTS) from None
+        goal = JointGoal(tuple(joints), whole[robot.indices(joints)])
+    positions = np.asarray(goal.positions, dtype=float)
+    if positions.shape != (len(goal.joints),):
+        raise _invalid(f"goal has {len(goal.joints)} joints but positions of shape {positions.shape}")
+    if not 0 <= goal.tolerance < np.inf:
+        raise _invalid(f"goal has a tolerance of {goal.tolerance} rad, must be at least 0")
+    target = np.array(start, dtype=float)
+    limits = {joint.name: (joint.lower, joint.upper) for joint in robot.joints}
+    for i, (name, value) in enumerate(zip(goal.joints, positions.tolist(), strict=True)):
+        if name not in limits:
+            raise _invalid(f"no joint {name!r}; the joints are: {', '.join(limits)}")
+        if name not in joints:
+            raise _invalid(f"goal names joint {name!r}, which is not planned: {', '.join(joints)}")
+        if name in goal.joints[:i]:
+            raise _invalid(f"goal names joint {name!r} twice")
+        lower, upper = limits[name]
+        # Written so that NaN fails it.
+        if not lower <= value <= upper:
+            raise _invalid(f"goal of joint {name} is {value} rad, must be within {lower} .. {upper} rad")
+        target[joints.index(name)] = value
+    return target
+
+
+def _invalid(message: str) -> PlanningError:
+    return PlanningError(message, PlanCode.INVALID_GOAL_CONSTRAINTS)
+
+
+def _unreachable(message: str) -> PlanningError:
+    return PlanningError(message, PlanCode.NO_IK_SOLUTION)
+
+
+def _vector(value: Vector3, what: str) -> Vector:
+    vector = np.array([value.x, value.y, value.z], dtype=float)
+    if not np.isfinite(vector).all():
+        raise _invalid(f"{what} of the goal is {vector.tolist()}, must be finite")
+    return vector
+
+
+def _tolerances(**values: float) -> None:
+    for name, value in values.items():
+        if not 0 < value < np.inf:
+            raise _invalid(f"{name} of the goal is {value}, must be above 0")
+
+
+def _unit(value: Vector3) -> Vector:
+    vector = _vector(value, "the axis")
+    length = float(np.linalg.norm(vector))
+    if length < 1e-9:
+        raise _invalid("the axis of the goal has no length; give a direction, e.g. (0, 0, -1) for down")
+    return vector / length
+
+
+def pose_matrix(goal: PoseGoal) -> Vector:
+    """The pose of a goal, shape (4, 4).
+
+    Raises:
+        PlanningError: for a pose that is not finite or whose quaternion is not of length 1.
+    """
+    _vector(goal.pose.position, "the position")
+    q = goal.pose.orientation
+    quaternion = np.array([q.x, q.y, q.z, q.w], dtype=float)
+    length = float(np.linalg.norm(quaternion))
+    # Written so that NaN fails it.
+    if not abs(length - 1) <= _NEARLY_ONE:
+        raise _invalid(f"the orientation of the goal is a quaternion of length {length:.3g}, must be 1")
+    return matrix(goal.pose)
+
+
+@attrs.frozen(eq=False)
+class Tool:
+    """Inverse kinematics of goals for the tool centre point."""
+
+    model: KinematicModel
+
+    def candidates(self, goal: PositionGoal | PoseGoal, start: Vector) -> list[Candidate]:
+        """Configurations that reach a goal, the preferred ones first.
+
+        Args:
+            goal: the goal.
+            start: where all joints of the model are [rad], shape (J,); those that do not move the tip stay.
+
+        Raises:
+            PlanningError: for a goal that makes no sense, or that the arm cannot reach, with how far off it is.
+        """
+        if isinstance(goal, PositionGoal):
+            position = _vector(goal.position, "the position")
+            _tolerances(position_tolerance=goal.position_tolerance, axis_tolerance=goal.axis_tolerance)
+            axis = None if goal.axis is None else _unit(goal.axis)
+            return self._at(position, axis, start, goal.position_tolerance, goal.axis_tolerance)
+        placed = pose_matrix(goal)
+        position, rotation = placed[:3, 3], placed[:3, :3]
+        _tolerances(position_tolerance=goal.position_tolerance)
+        if goal.orientation_tolerance is None:
+            return self._at(position, None, start, goal.position_tolerance, 0.01)
+        _tolerances(orientation_tolerance=goal.orientation_tolerance)
+        found = self._posed(position, rotation, start, goal.position_tolerance)
+        met = [each for each in found if each.orientation_error <= goal.orientation_tolerance]
+        return met or self._beyond(goal, position, rotation, start, found)
+
+    def _beyond(
+        self, goal: PoseGoal, position: Vector, rotation: Vector, start: Vector, found: list[Candidate]
+    ) -> list[Candidate]:
+        """What the goal's policy makes of an orientation that the arm cannot take."""
+        tolerance = goal.position_tolerance
+        policy = goal.beyond_reach
+        if policy in ("refuse", "nearest") or not found:
+            if not found:
+                self._at(position, None, start, tolerance, 0.01)  # tells how far off the position is
+            if policy == "refuse" or not found:
+                off = np.degrees(found[0].orientation_error) if found else 180.0
+                raise _unreachable(
+                    f"{self.model.tip} cannot take this orientation at {_text(position)};"
+                    f" the nearest found is {off:.1f} degrees off (beyond_reach chooses what to do then)"
+                )
+            return found
+        if policy == "free":
+            taken = self._at(position, None, start, tolerance, 0.01)
+        elif policy == "keep_axis":
+            taken = self._at(position, rotation[:, 2], start, tolerance, goal.orientation_tolerance or 0.01)
+        elif policy == "arm_plane":
+            axis = self._in_plane(position, rotation[:, 2])
+            taken = self._at(position, axis, start, tolerance, goal.orientation_tolerance or 0.01)
+        else:
+            taken = self._posed(position, self.model.forward(start).rotation, start, tolerance)
+        return [self._compared(each.joints, position, rotation) for each in taken]
+
+    def _in_plane(self, position: Vector, axis: Vector) -> Vector:
+        """The direction nearest to `axis` in the plane through the first joint's axis and `position`."""
+        _, points, axes = self.model.screws(np.zeros(len(self.model.joint_names)))
+        normal = np.cross(axes[0], position - points[0])
+        length = float(np.linalg.norm(normal))
+        if length < 1e-6:
+            return axis
+        normal = normal / length
+        flat = axis - (axis @ normal) * normal
+        if np.linalg.norm(flat) < 1e-6:
+            raise _unreachable("the tool's axis stands across the arm's plane; arm_plane cannot turn it into the plane")
+        return np.asarray(flat / np.linalg.norm(flat))
+
+    def _at(
+        self, position: Vector, axis: Vector | None, start: Vector, tolerance: float, axis_tolerance: float
+    ) -> list[Candidate]:
+        """Configurations at a position, all branches where there is a closed form."""
+        found: list[Vector] = []
+        error: UnreachableError | None = None
+        tolerances = {"position_tolerance": tolerance, "rotation_tolerance": axis_tolerance}
+        axes = [axis] if axis is not None else [None, *self._pitched(position)]
+        for asked in axes:
+            target = Target(position, axis=asked)
+            try:
+                found += solve_all(self.model, target, start, **tolerances)
+            except UnreachableError as unreachable:
+                error = error or unreachable
+                if asked is None:
+                    break
+            except KinematicsError:  # no closed form
+                solutions, error = self._numerical(target, start, tolerances)
+                found += solutions
+                break
+        distinct = _distinct(found)
+        if not distinct:
+            assert error is not None
+            raise _unreachable(str(error)) from error
+        return [self._compared(q, position, None, axis) for q in distinct]
+
+    def _pitched(self, position: Vector) -> Iterator[Vector]:
+        """Directions of the tool in the plane through the first joint's axis and `position`."""
+        _, points, axes = self.model.screws(np.zeros(len(self.model.joint_names)))
+        up = axes[0] if axes[0][2] >= 0 else -axes[0]
+        out = position - points[0]
+        out = out - (out @ up) * up
+        length = float(np.linalg.norm(out))
+        if length > 1e-6:
+            yield from (np.cos(pitch) * out / length + np.sin(pitch) * up for pitch in _PITCHES)
+
+    def _posed(self, position: Vector, rotation: Vector, start: Vector, tolerance: float) -> list[Candidate]:
+        """Configurations at a position, the orientation as near to `rotation` as found, nearest first."""
+        starts = [start]
+        try:
+            starts += solve_all(self.model, Target(position, axis=rotation[:, 2]), start, position_tolerance=tolerance)
+        except KinematicsError:  # out of reach, or no closed form
+            starts += list(self._seeds(start))
+        found = []
+        for begin in starts:
+            try:
+                found.append(
+                    solve(
+                        self.model, Target(position, rotation), begin, position_tolerance=tolerance,
+                        rotation_tolerance=np.pi,
+                    )
+                )  # fmt: skip
+            except UnreachableError:
+                continue
+        candidates = [self._compared(q, position, rotation) for q in _distinct(found)]
+        return sorted(candidates, key=lambda each: each.orientation_error)
+
+    def _numerical(
+        self, target: Target, start: Vector, tolerances: Mapping[str, float]
+    ) -> tuple[list[Vector], UnreachableError | None]:
+        found: list[Vector] = []
+        error = None
+        for begin in (start, *self._seeds(start)):
+            try:
+                found.append(solve(self.model, target, begin, **tolerances))
+            except UnreachableError as unreachable:
+                # Each of these searched from many configurations.
+                return found, unreachable
+        return found, error
+
+    def _seeds(self, start: Vector) -> Iterator[Vector]:
+        moving = self.model.moving
+        rng = np.random.default_rng(0)
+        for _ in range(_SEEDS):
+            begin = start.copy()
+            begin[moving] = rng.uniform(self.model.lower[moving], self.model.upper[moving])
+            yield begin
+
+    def _compared(self, q: Vector, position: Vector, rotation: Vector | None, axis: Vector | None = None) -> Candidate:
+        tip = self.model.forward(q)
+        return Candidate(q, float(np.linalg.norm(tip.position - position)), turned(tip, rotation, axis))
+
+
+def turned(tip: TipPose, rotation: Vector | None, axis: Vector | None = None) -> float:
+    """Angle between a tip and an orientation or a direction of its z axis [rad]; 0 for neither."""
+    if rotation is not None:
+        relative = rotation.T @ tip.rotation
+        skewed = relative - relative.T
+        sine = float(np.linalg.norm([skewed[2, 1], skewed[0, 2], skewed[1, 0]])) / 2
+        return float(np.arctan2(sine, (np.trace(relative) - 1) / 2))
+    if axis is not None:
+        return float(np.arctan2(np.linalg.norm(np.cross(axis, tip.rotation[:, 2])), axis @ tip.rotation[:, 2]))
+    return 0.0
+
+
+def _distinct(found: Sequence[Vector]) -> list[Vector]:
+    kept: list[Vector] = []
+    for q in found:
+        if all(np.abs(q - other).max() > _SAME for other in kept):
+            kept.append(q)
+    return kept
+
+
+def _text(position: Vector) -> str:
+    x, y, z = position
+    return f"({x:.3f}, {y:.3f}, {z:.3f}) m"

@@ -1,0 +1,211 @@
+"""Straight-line paths of the tool as configurations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import attrs
+import numpy as np
+from ibrobot_kinematics import KinematicModel, Target, UnreachableError, solve
+
+from ibrobot_core.api import PlanCode, PlanningError, PoseGoal, PositionGoal, Vector
+from ibrobot_planning.goals import Tool, pose_matrix, turned
+
+_STEP_M = 0.004
+_STEP_RAD = 0.05
+"""Greatest distances between configurations on the path."""
+_STEPS, _CONVERGED = 8, 1e-7
+_EXACT_M = 1e-4
+"""How far from the line the tool may be at a configuration."""
+_TURN_M = 0.1
+"""A turn by a radian counts as much as this distance."""
+_LARGEST_JUMP = 0.35
+"""A joint that moves further [rad] between two of them would leave the line between."""
+
+
+@attrs.frozen(eq=False)
+class LinearPath:
+    """Configurations along a path, as far as it is possible."""
+
+    joints: Vector
+    """All joints [rad], shape (N, J)."""
+    fractions: Vector
+    """Share of the path up to each, shape (N,)."""
+    errors: Vector
+    """Angle between the tool and the asked orientation at each [rad], shape (N,)."""
+    reason: str
+    """Why it ends; empty where it is complete."""
+
+
+def linear_path(tool: Tool, waypoints: Sequence[PositionGoal | PoseGoal], start: Vector) -> LinearPath:
+    """Configurations along straight lines through waypoints; orientations and directions turn evenly.
+
+    Args:
+        tool: inverse kinematics.
+        waypoints: where the lines end; a direction or orientation that one leaves free stays free up to there.
+        start: all joints at the begin [rad], shape (J,).
+
+    Raises:
+        PlanningError: for no waypoints, or one that makes no sense.
+    """
+    if not waypoints:
+        raise PlanningError("a straight path needs at least one waypoint", PlanCode.INVALID_GOAL_CONSTRAINTS)
+    targets, lengths = _targets(tool, waypoints, start)
+    total = sum(lengths)
+    joints, fractions, errors, reason, covered = [start], [0.0], [0.0], "", 0.0
+    for (target, tolerance, axis_tolerance), length in zip(targets, lengths, strict=True):
+        q = _followed(tool.model, target, joints[-1], tolerance, axis_tolerance)
+        if q is None:
+            try:
+                q = solve(
+                    tool.model, target, joints[-1], position_tolerance=tolerance, rotation_tolerance=axis_tolerance
+                )
+            except UnreachableError as error:
+                reason = str(error)
+                break
+        ways = np.abs(q - joints[-1])
+        if ways.max() > _LARGEST_JUMP:
+            joint = tool.model.joint_names[int(ways.argmax())]
+            reason = f"joint {joint} would have to jump by {ways.max():.2f} rad"
+            break
+        covered += length
+        joints.append(q)
+        fractions.append(min(covered / total, 1.0) if total > 0 else 1.0)
+        errors.append(turned(tool.model.forward(q), target.rotation, target.axis))
+    return LinearPath(np.array(joints), np.array(fractions), np.array(errors), reason)
+
+
+def _followed(
+    model: KinematicModel, target: Target, start: Vector, tolerance: float, axis_tolerance: float
+) -> Vector | None:
+    """The configuration nearest to `start` at a target close by, by Gauss-Newton steps; None where they miss it."""
+    moving = model.moving
+    q = start.copy()
+    weight = _TURN_M if axis_tolerance < 1 else 0.01 * _TURN_M
+    for _ in range(_STEPS):
+        tip, jacobian = model.forward_and_jacobian(q)
+        error, rows = [target.position - tip.position], [jacobian[:3, moving]]
+        if target.rotation is not None:
+            error.append(weight * _rotation_vector(target.rotation @ tip.rotation.T))
+            rows.append(weight * jacobian[3:, moving])
+        elif target.axis is not None:
+            axis = tip.rotation[:, 2]
+            error.append(weight * np.cross(axis, target.axis))
+            rows.append(weight * (jacobian[3:, moving] - np.outer(axis, axis @ jacobian[3:, moving])))
+        step = np.linalg.lstsq(np.concatenate(rows), np.concatenate(error), rcond=1e-3)[0]
+        q[moving] = np.clip(q[moving] + step, model.lower[moving], model.upper[moving])
+        if np.abs(step).max() < _CONVERGED:
+            break
+    tip = model.forward(q)
+    close = np.linalg.norm(tip.position - target.position) <= min(tolerance, _EXACT_M)
+    return q if close and turned(tip, target.rotation, target.axis) <= axis_tolerance else None
+
+
+def _targets(
+    tool: Tool, waypoints: Sequence[PositionGoal | PoseGoal], start: Vector
+) -> tuple[list[tuple[Target, float, float]], list[float]]:
+    """Targets along the lines with their tolerances, and the length of the path up to each from the one before."""
+    tip = tool.model.forward(start)
+    position, rotation = tip.position, tip.rotation
+    targets, lengths = [], []
+    for waypoint in waypoints:
+        end, end_rotation, axis, angle_tolerance = _end(waypoint)
+        away = float(np.linalg.norm(end - position))
+        angle = 0.0
+        if end_rotation is not None:
+            angle = turned(tip, end_rotation) if rotation is tip.rotation else _angle(rotation, end_rotation)
+        elif axis is not None:
+            angle = float(np.arccos(np.clip(axis @ rotation[:, 2], -1, 1)))
+        number = max(int(np.ceil(away / _STEP_M)), int(np.ceil(angle / _STEP_RAD)), 1)
+        for share in np.arange(1, number + 1) / number:
+            between = position + share * (end - position)
+            if end_rotation is not None:
+                target = Target(between, rotation @ _turn(rotation.T @ end_rotation, share))
+            elif axis is not None:
+                target = Target(between, axis=_towards(rotation[:, 2], axis, share))
+            else:
+                target = Target(between)
+            targets.append((target, waypoint.position_tolerance, angle_tolerance))
+            lengths.append(away / number)
+        position = end
+        if end_rotation is not None:
+            rotation = end_rotation
+        elif axis is not None:
+            rotation = _with_axis(rotation, axis)
+    return targets, lengths
+
+
+def _end(waypoint: PositionGoal | PoseGoal) -> tuple[Vector, Vector | None, Vector | None, float]:
+    if isinstance(waypoint, PoseGoal):
+        placed = pose_matrix(waypoint)
+        if waypoint.orientation_tolerance is None or waypoint.beyond_reach == "free":
+            return placed[:3, 3], None, None, 0.01
+        if waypoint.beyond_reach in ("keep_axis", "arm_plane"):
+            return placed[:3, 3], None, placed[:3, 2], waypoint.orientation_tolerance
+        tolerance = waypoint.orientation_tolerance if waypoint.beyond_reach == "refuse" else np.pi
+        return placed[:3, 3], placed[:3, :3], None, tolerance
+    place = np.array([waypoint.position.x, waypoint.position.y, waypoint.position.z])
+    if not np.isfinite(place).all():
+        raise PlanningError(
+            f"the position of a waypoint is {place.tolist()}, must be finite", PlanCode.INVALID_GOAL_CONSTRAINTS
+        )
+    if waypoint.axis is None:
+        return place, None, None, waypoint.axis_tolerance
+    axis = np.array([waypoint.axis.x, waypoint.axis.y, waypoint.axis.z])
+    length = float(np.linalg.norm(axis))
+    if not 1e-9 < length < np.inf:
+        raise PlanningError(
+            "the axis of a waypoint has no length; give a direction, e.g. (0, 0, -1) for down",
+            PlanCode.INVALID_GOAL_CONSTRAINTS,
+        )
+    return place, None, axis / length, waypoint.axis_tolerance
+
+
+def _rotation_vector(relative: Vector) -> Vector:
+    skewed = relative - relative.T
+    vector = np.array([skewed[2, 1], skewed[0, 2], skewed[1, 0]]) / 2
+    sine = float(np.linalg.norm(vector))
+    angle = float(np.arctan2(sine, (np.trace(relative) - 1) / 2))
+    return np.asarray(vector * (angle / sine if sine > 1e-12 else 1.0))
+
+
+def _angle(a: Vector, b: Vector) -> float:
+    return float(np.arccos(np.clip((np.trace(a.T @ b) - 1) / 2, -1, 1)))
+
+
+def _turn(relative: Vector, share: float) -> Vector:
+    """A share of a rotation, shape (3, 3)."""
+    angle = float(np.arccos(np.clip((np.trace(relative) - 1) / 2, -1, 1)))
+    if angle < 1e-9:
+        return np.eye(3)
+    values, vectors = np.linalg.eigh((relative + relative.T) / 2)
+    axis = vectors[:, int(values.argmax())]
+    skewed = relative - relative.T
+    sense = axis @ np.array([skewed[2, 1], skewed[0, 2], skewed[1, 0]])
+    return _about(axis if sense >= 0 else -axis, share * angle)
+
+
+def _about(axis: Vector, angle: float) -> Vector:
+    x, y, z = axis
+    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.asarray(np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k)
+
+
+def _towards(a: Vector, b: Vector, share: float) -> Vector:
+    """A unit vector a share of the way from one to another."""
+    normal = np.cross(a, b)
+    sine = float(np.linalg.norm(normal))
+    angle = float(np.arctan2(sine, a @ b))
+    if sine < 1e-9:
+        return b if angle < 1 or share == 1 else a
+    turned_to = _about(normal / sine, share * angle) @ a
+    return np.asarray(turned_to / np.linalg.norm(turned_to))
+
+
+def _with_axis(rotation: Vector, axis: Vector) -> Vector:
+    """A rotation turned the short way so that its z axis is `axis`."""
+    normal = np.cross(rotation[:, 2], axis)
+    sine = float(np.linalg.norm(normal))
+    if sine < 1e-9:
+        return rotation
+    return np.asarray(_about(normal / sine, float(np.arctan2(sine, rotation[:, 2] @ axis))) @ rotation)

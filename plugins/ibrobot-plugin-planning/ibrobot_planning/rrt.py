@@ -1,0 +1,457 @@
+"""The planner around obstacles: goals to configurations, search, shortening, timing, check of the timed motion."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+from typing import override
+
+import attrs
+import numpy as np
+from ibrobot_kinematics import KinematicModel, robot_model
+
+from ibrobot_core.api import (
+    AnyGoal,
+    Context,
+    Header,
+    JointGoal,
+    JointTrajectory,
+    JointTrajectoryPoint,
+    LinearGoal,
+    NamedGoal,
+    PlanCode,
+    Planner,
+    PlanningError,
+    PlanRequest,
+    PlanResult,
+    PoseGoal,
+    PositionGoal,
+    Vector,
+    ns,
+)
+from ibrobot_planning.arm import Arm, Pair, robot_arm
+from ibrobot_planning.collision import Collisions, Contact, unchecked_pairs
+from ibrobot_planning.goals import Candidate, Tool, joint_target
+from ibrobot_planning.linear import linear_path
+from ibrobot_planning.options import RrtConnectOptions
+from ibrobot_planning.search import Space, connect, shortened
+from ibrobot_planning.timing import Motion, timed
+from ibrobot_planning.world import World
+
+SNAPSHOT = "/world/snapshot"
+"""Service that answers with the `World` of the run; where nobody serves it, `RrtConnectPlanner.world` counts."""
+
+_RESOLUTIONS_M = (0.02, 0.006)
+"""How far the arm moves at most between checks of the search; finer ones follow where the timed motion touches."""
+_FINEST_M = 0.0015
+"""The same for a whole path before it is timed."""
+_CHECK_S = 0.001
+"""Time between checks of the timed motion."""
+_REPAIRS = 12
+"""Timings of one path, each with smaller blends where the one before touched."""
+_LEAST_BLEND = 0.01
+"""Smaller blends [rad] become stops."""
+_WIDEST_WINDOW_S, _LINEAR_WINDOW_S = 0.1, 0.03
+"""The moving average of free motions and of straight lines: the wider, the further they leave the path."""
+_ROUNDING = 1e-6
+"""By how much positions may exceed a limit [rad]."""
+_WORSE_M = 1e-4
+"""How much closer something may come on the way out of a contact [m]."""
+_EXITS = 60
+"""Directions that are tried at each distance on the way out of a contact."""
+
+
+class RrtConnectPlanner(Planner):
+    """Plans around the objects of a world, with padding.
+
+    Attributes:
+        world: what is around the arm where no component of the run serves it; replace it at any time.
+    """
+
+    def __init__(self, options: RrtConnectOptions, ctx: Context) -> None:
+        self.world = World()
+        self._options = options
+        self._ctx = ctx
+        self._arm: Arm | None = None
+        self._tool: Tool | None = None
+        self._unchecked: dict[Pair, str] = {}
+
+    @override
+    def load(self) -> None:
+        robot = self._ctx.robot
+        self._arm = robot_arm(robot)
+        self._tool = Tool(robot_model(robot))
+        self._unchecked = unchecked_pairs(self._arm)
+
+    @property
+    def arm(self) -> Arm:
+        """The collision model, once loaded."""
+        if self._arm is None:
+            raise PlanningError("the planner is not loaded", PlanCode.COLLISION_CHECKING_UNAVAILABLE)
+        return self._arm
+
+    @override
+    def plan(self, request: PlanRequest) -> PlanResult:
+        arm, options = self.arm, self._options
+        begun = time.monotonic()
+        start = self._check_start(request)
+        checks = Collisions(
+            arm, self._snapshot(), request.joints, request.others,
+            padding=options.padding, self_padding=options.self_padding, unchecked=self._unchecked,
+        )  # fmt: skip
+        plan = _Plan(self._ctx, options, request, start, checks, begun + options.planning_time)
+        assert self._tool is not None
+        return plan.solve(self._tool)
+
+    def _snapshot(self) -> World:
+        bus = self._ctx.bus
+        if bus is not None and bus.serves(SNAPSHOT):
+            world = bus.call(SNAPSHOT, None)
+            assert isinstance(world, World)
+            return world
+        return self.world
+
+    def _check_start(self, request: PlanRequest) -> Vector:
+        robot = self._ctx.robot
+        for name in (*request.joints, *request.others):
+            if name not in robot.joint_names:
+                raise PlanningError(
+                    f"no joint {name!r}; the joints are: {', '.join(robot.joint_names)}", PlanCode.INVALID_GROUP_NAME
+                )
+        start = np.array(request.start, dtype=float)
+        if start.shape != (len(request.joints),):
+            raise PlanningError(
+                f"start has shape {start.shape}, must be ({len(request.joints)},): one per joint",
+                PlanCode.INVALID_ROBOT_STATE,
+            )
+        for name, scaling in (("velocity", request.velocity_scaling), ("acceleration", request.acceleration_scaling)):
+            if not 0 < scaling <= 1:
+                raise PlanningError(f"{name}_scaling is {scaling}, must be above 0 and at most 1")
+        for name, value in zip(request.joints, start.tolist(), strict=True):
+            joint = robot.joints[robot.joint_names.index(name)]
+            if not np.isfinite(value):
+                raise PlanningError(f"start of joint {name} is {value}, must be finite", PlanCode.INVALID_ROBOT_STATE)
+            beyond = max(joint.lower - value, value - joint.upper)
+            if beyond > self._options.start_beyond_limits:
+                raise PlanningError(
+                    f"start of joint {name} is {value:.4f} rad, {beyond:.4f} rad outside its limits {joint.lower} .."
+                    f" {joint.upper} rad; at most {self._options.start_beyond_limits} rad is let pass",
+                    PlanCode.START_STATE_INVALID,
+                )
+        return start
+
+
+@attrs.frozen(eq=False)
+class _Goal:
+    """One alternative."""
+
+    number: int
+    candidates: list[Candidate]
+    """Of all joints."""
+
+
+@attrs.define(eq=False)
+class _Plan:
+    """One request under way."""
+
+    ctx: Context
+    options: RrtConnectOptions
+    request: PlanRequest
+    start: Vector
+    checks: Collisions
+    deadline: float
+
+    def solve(self, tool: Tool) -> PlanResult:
+        goal = self.request.goal
+        if isinstance(goal, LinearGoal):
+            return self._linear(tool, goal)
+        way_out = self._way_out()
+        alternatives = goal.goals if isinstance(goal, AnyGoal) else (goal,)
+        if not alternatives:
+            raise PlanningError("the goal has no alternatives", PlanCode.INVALID_GOAL_CONSTRAINTS)
+        failures: list[PlanningError] = []
+        for number, alternative in enumerate(alternatives):
+            try:
+                # What is left of the time is shared, so that a hard alternative leaves some for the next.
+                share = (self.deadline - time.monotonic()) / (len(alternatives) - number)
+                return self._reach(tool, alternative, number, way_out, time.monotonic() + share)
+            except PlanningError as failure:
+                failures.append(failure)
+        if len(failures) == 1:
+            raise failures[0]
+        reasons = "; ".join(f"alternative {number}: {failure}" for number, failure in enumerate(failures))
+        raise PlanningError(f"no alternative of the goal can be reached: {reasons}", failures[0].code)
+
+    @property
+    def _order(self) -> np.ndarray[tuple[int, ...], np.dtype[np.intp]]:
+        return self.ctx.robot.indices(self.request.joints)
+
+    @property
+    def _limits(self) -> tuple[Vector, Vector]:
+        return self.ctx.robot.lower[self._order], self.ctx.robot.upper[self._order]
+
+    def _whole(self) -> Vector:
+        """All joints at the start, shape (J,)."""
+        robot = self.ctx.robot
+        whole = np.array([self.request.others.get(name, 0.0) for name in robot.joint_names])
+        whole[self._order] = self.start
+        return whole
+
+    def _reach(
+        self, tool: Tool, goal: JointGoal | NamedGoal | PositionGoal | PoseGoal, number: int,
+        way_out: list[Vector], deadline: float,
+    ) -> PlanResult:  # fmt: skip
+        candidates = self._free_goals(self._candidates(tool, goal), goal)
+        if np.abs(candidates[0].joints[self._order] - self.start).max() < _ROUNDING and len(way_out) == 1:
+            return self._result(Motion(*_still(self.start, self.options.step)), candidates[0], number)
+        goals = [candidate.joints[self._order] for candidate in candidates]
+        for path in self._paths(way_out[-1], goals, deadline):
+            motion = self._checked([*way_out[:-1], *path])
+            if motion is not None:
+                reached = next(i for i, each in enumerate(goals) if np.array_equal(each, path[-1]))
+                return self._result(motion, candidates[reached], number)
+        raise PlanningError(self._stuck(way_out[-1], goals[0]), PlanCode.TIMED_OUT)
+
+    def _paths(self, start: Vector, goals: list[Vector], deadline: float) -> Iterator[list[Vector]]:
+        """Short paths, of which the next is wanted where the timed motion touches; ever more closely checked."""
+        rng = np.random.default_rng(self.ctx.seed)
+        finest = Space(self.checks, *self._limits, _FINEST_M)
+        for resolution in _RESOLUTIONS_M:
+            space = Space(self.checks, *self._limits, resolution)
+            found = connect(space, start, goals, rng, lambda: time.monotonic() > deadline)
+            if found is None:
+                return
+            for closely in (resolution, *(finer for finer in _RESOLUTIONS_M if finer < resolution)):
+                path = shortened(Space(self.checks, *self._limits, closely), found, rng)
+                if all(finest.free(a, b) for a, b in pairwise(path)):
+                    yield path
+                    break
+
+    def _candidates(self, tool: Tool, goal: object) -> list[Candidate]:
+        robot = self.ctx.robot
+        if isinstance(goal, JointGoal | NamedGoal):
+            whole = self._whole()
+            whole[self._order] = joint_target(goal, robot, self.request.joints, self.start)
+            return [Candidate(whole)]
+        if isinstance(goal, PositionGoal | PoseGoal):
+            self._check_chain(tool.model)
+            return tool.candidates(goal, self._whole())
+        raise PlanningError(
+            f"a goal of type {type(goal).__name__} is not known; known are JointGoal, NamedGoal, PositionGoal,"
+            " PoseGoal, AnyGoal and LinearGoal",
+            PlanCode.UNRECOGNIZED_GOAL_TYPE,
+        )
+
+    def _check_chain(self, model: KinematicModel) -> None:
+        missing = [model.joint_names[i] for i in model.moving if model.joint_names[i] not in self.request.joints]
+        if missing:
+            raise PlanningError(
+                f"a goal of the tool needs all joints that move it; not planned: {', '.join(missing)}",
+                PlanCode.INVALID_GROUP_NAME,
+            )
+
+    def _free_goals(self, candidates: list[Candidate], goal: object) -> list[Candidate]:
+        """Those that touch nothing.
+
+        Raises:
+            PlanningError: where all of them touch something.
+        """
+        free = [candidate for candidate in candidates if self.checks.free(candidate.joints[self._order])]
+        if not free and isinstance(goal, JointGoal) and goal.tolerance > 0:
+            free = self._nearby(candidates[0].joints, goal)
+        if free:
+            return free
+        least = min(
+            (self.checks.contacts(candidate.joints[self._order]) for candidate in candidates),
+            key=lambda contacts: contacts[0].padding - contacts[0].distance,
+        )
+        at_all = f" in all of its {len(candidates)} configurations" if len(candidates) > 1 else ""
+        raise PlanningError(f"the goal is in collision{at_all}: {_sentence(least)}", PlanCode.GOAL_IN_COLLISION)
+
+    def _nearby(self, whole: Vector, goal: JointGoal) -> list[Candidate]:
+        """The nearest free of random configurations within the goal's tolerance."""
+        rng = np.random.default_rng(self.ctx.seed)
+        robot = self.ctx.robot
+        found = []
+        indices = robot.indices(goal.joints)
+        for share in np.linspace(0.1, 1.0, 100):
+            near = whole.copy()
+            near[indices] += share * goal.tolerance * rng.uniform(-1, 1, len(indices))
+            near = np.clip(near, robot.lower, robot.upper)
+            if self.checks.free(near[self._order]):
+                found.append(Candidate(near))
+        return sorted(found, key=lambda each: float(np.abs(each.joints - whole).max()))[:1]
+
+    def _way_out(self) -> list[Vector]:
+        """From the start to where joints are within limits and nothing touches; the start alone where it is so there.
+
+        Raises:
+            PlanningError: where the start touches too deeply, or no way leads out.
+        """
+        inside = np.clip(self.start, *self._limits)
+        way = [self.start] if np.array_equal(inside, self.start) else [self.start, inside]
+        touching = [contact for q in way for contact in self.checks.contacts(q)]
+        if not touching and Space(self.checks, *self._limits, _FINEST_M).free(way[0], way[-1]):
+            return way
+        deepest = min(touching, key=lambda contact: contact.distance, default=None)
+        if deepest is None or deepest.distance < -self.options.start_overlap:
+            raise PlanningError(f"the start is in collision: {_sentence(touching)}", PlanCode.START_STATE_IN_COLLISION)
+        rng = np.random.default_rng(self.ctx.seed)
+        for distance in (0.03, 0.06, 0.1, 0.2, 0.4):
+            for _ in range(_EXITS):
+                direction = rng.normal(size=len(inside))
+                end = np.clip(inside + distance * direction / np.linalg.norm(direction), *self._limits)
+                if self.checks.free(end) and self._leaves(self.start, end):
+                    return [self.start, end]
+        raise PlanningError(
+            f"the start is in collision, and no short way leads out: {_sentence(touching)}",
+            PlanCode.START_STATE_IN_COLLISION,
+        )
+
+    def _leaves(self, start: Vector, end: Vector) -> bool:
+        """Whether what touches at the start only gets away on the line to a free end, and nothing else touches."""
+        line = Space(self.checks, *self._limits, _FINEST_M).line(start, end)
+        return self._outwards(np.concatenate([start[None], line])) is not None
+
+    def _outwards(self, configurations: Vector) -> int | None:
+        """How many configurations from the start on touch, getting away; None where something comes closer."""
+        before = {(each.first, each.second): each.distance for each in self.checks.contacts(configurations[0])}
+        for number, q in enumerate(configurations):
+            if self.checks.free(q):
+                return number
+            now = {(each.first, each.second): each.distance for each in self.checks.contacts(q)}
+            if any(pair not in before or distance < before[pair] - _WORSE_M for pair, distance in now.items()):
+                return None
+            before = {pair: max(distance, before[pair]) for pair, distance in now.items()}
+        return None
+
+    def _linear(self, tool: Tool, goal: LinearGoal) -> PlanResult:
+        self._check_chain(tool.model)
+        if not 0 < goal.least_fraction <= 1:
+            raise PlanningError(
+                f"least_fraction is {goal.least_fraction}, must be above 0 and at most 1",
+                PlanCode.INVALID_GOAL_CONSTRAINTS,
+            )
+        touching = self.checks.contacts(self.start)
+        if touching:
+            raise PlanningError(f"the start is in collision: {_sentence(touching)}", PlanCode.START_STATE_IN_COLLISION)
+        line = linear_path(tool, goal.waypoints, self._whole())
+        path = line.joints[:, self._order]
+        space = Space(self.checks, *self._limits, _FINEST_M)
+        possible, reason = len(path), line.reason
+        for number in range(1, len(path)):
+            if not space.free(path[number - 1], path[number]):
+                possible, reason = number, _sentence(self.checks.contacts(path[number]))
+                break
+        motion = None
+        while possible > 1:
+            motion = self._checked(list(path[:possible]), linear=True)
+            if motion is not None:
+                break
+            possible -= max(1, possible // 10)
+        fraction = float(line.fractions[possible - 1])
+        if possible == 1 or fraction < goal.least_fraction - 1e-9:
+            raise PlanningError(
+                f"the tool can follow {100 * fraction:.0f} % of the straight path, {100 * goal.least_fraction:.0f} %"
+                f" asked: {reason}",
+                PlanCode.PLANNING_FAILED,
+            )
+        assert motion is not None
+        end = Candidate(line.joints[possible - 1], 0.0, float(line.errors[possible - 1]))
+        return self._result(motion, end, 0, fraction)
+
+    def _checked(self, path: Sequence[Vector], *, linear: bool = False) -> Motion | None:
+        """The fastest motion along a path that touches nothing; None where even one that stops at corners does."""
+        robot, options, request = self.ctx.robot, self.options, self.request
+        way = np.array(path)
+        velocity = robot.max_velocity[self._order] * options.velocity_scaling * request.velocity_scaling
+        limit = robot.max_acceleration[self._order] * options.acceleration_scaling * request.acceleration_scaling
+        widest = _LINEAR_WINDOW_S if linear else _WIDEST_WINDOW_S
+        acceleration = np.minimum(limit, options.max_jerk * widest / 2)
+        window = 2 * float(acceleration.max()) / options.max_jerk
+        blends = self._blends(way)
+        for _ in range(_REPAIRS):
+            motion = timed(way, velocity, acceleration, blends=blends, window=window, step=options.step)
+            touching = self._touching(motion)
+            if not len(touching):
+                return motion
+            if not blends.any():
+                return None
+            corners = np.linalg.norm(touching[:, None] - way[None, 1:-1], axis=2)
+            nearest = np.unique(np.where(blends > 0, corners, np.inf).argmin(axis=1))
+            blends[nearest] /= 2
+            blends[blends < _LEAST_BLEND] = 0.0
+        blends[:] = 0.0
+        motion = timed(way, velocity, acceleration, blends=blends, window=window, step=options.step)
+        return None if len(self._touching(motion)) else motion
+
+    def _blends(self, way: Vector) -> Vector:
+        """How far each corner may be cut, so that the cut touches nothing."""
+        lengths = np.linalg.norm(np.diff(way, axis=0), axis=1)
+        blends = np.minimum(np.minimum(lengths[:-1], lengths[1:]) / 2, self.options.blend)
+        shares = np.linspace(0, 1, 9)[:, None]
+        for i, corner in enumerate(way[1:-1]):
+            while blends[i] >= _LEAST_BLEND:
+                before = corner - blends[i] * (corner - way[i]) / max(lengths[i], 1e-12)
+                after = corner + blends[i] * (way[i + 2] - corner) / max(lengths[i + 1], 1e-12)
+                curve = (1 - shares) ** 2 * before + 2 * shares * (1 - shares) * corner + shares**2 * after
+                if self.checks.first_hit(curve) == len(curve):
+                    break
+                blends[i] /= 2
+            else:
+                # Lines of many points have short segments: their blends touch as little as the corners do.
+                blends[i] = blends[i] if lengths[i : i + 2].max() < 4 * _LEAST_BLEND else 0.0
+        return blends
+
+    def _touching(self, motion: Motion) -> Vector:
+        """Where a motion touches or leaves the limits, shape (N, J)."""
+        positions = motion.sampled(_CHECK_S)[0]
+        lower, upper = self._limits
+        # From outside the limits only inwards.
+        lower, upper = np.minimum(lower, self.start), np.maximum(upper, self.start)
+        outside = ((positions < lower - _ROUNDING) | (positions > upper + _ROUNDING)).any(axis=1)
+        bad = [positions[outside]]
+        checked = 0
+        if not self.checks.free(self.start):
+            out = self._outwards(positions)
+            if out is None:
+                return np.asarray(positions[:1])
+            checked = out
+        while checked < len(positions):
+            checked += self.checks.first_hit(positions[checked:])
+            if checked < len(positions):
+                bad.append(positions[checked : checked + 1])
+                # On past this contact, by what a corner takes at least.
+                checked += 10
+        return np.asarray(np.concatenate(bad))
+
+    def _stuck(self, start: Vector, goal: Vector) -> str:
+        line = Space(self.checks, *self._limits, _RESOLUTIONS_M[0]).line(start, goal)
+        hit = self.checks.first_hit(line)
+        message = f"no path found within {self.options.planning_time:g} s"
+        if hit == len(line):
+            return message
+        return f"{message}; on the straight way {_sentence(self.checks.contacts(line[hit]))}"
+
+    def _result(self, motion: Motion, end: Candidate, number: int, fraction: float = 1.0) -> PlanResult:
+        points = tuple(
+            JointTrajectoryPoint(ns(stamp), position, velocity, acceleration)
+            for stamp, position, velocity, acceleration in zip(
+                motion.times.tolist(), motion.positions, motion.velocities, motion.accelerations, strict=True
+            )
+        )
+        trajectory = JointTrajectory(Header(stamp_ns=self.ctx.clock.now_ns()), self.request.joints, points)
+        return PlanResult(trajectory, fraction, number, end.position_error, end.orientation_error)
+
+
+def _still(q: Vector, step: float) -> tuple[Vector, Vector, Vector, Vector]:
+    rest = np.zeros((2, len(q)))
+    return np.array([0.0, step]), np.array([q, q]), rest, rest
+
+
+def _sentence(contacts: Sequence[Contact], most: int = 3) -> str:
+    if not contacts:
+        return "something touches"
+    further = f", and {len(contacts) - most} more" if len(contacts) > most else ""
+    return "; ".join(str(contact) for contact in contacts[:most]) + further

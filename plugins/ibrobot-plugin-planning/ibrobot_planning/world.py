@@ -1,0 +1,262 @@
+"""What is around the arm: objects with shapes, at poses in the base frame or attached to a link. All of it immutable.
+
+A plan takes one `World`; changes make a new one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+import attrs
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ibrobot_core.api import PlanCode, PlanningError, Pose, Vector
+
+_LARGEST_M = 100.0
+"""Sizes above this are most likely millimetres."""
+
+
+def _positive(instance: object, attribute: attrs.Attribute[float], value: float) -> None:
+    # Written so that NaN fails it.
+    if not 0 < value <= _LARGEST_M:
+        raise ValueError(f"{attribute.name} is {value} m, must be above 0 and at most {_LARGEST_M:g} m")
+
+
+def _three(value: Sequence[float]) -> tuple[float, ...]:
+    return tuple(float(each) for each in value)
+
+
+def _array(value: ArrayLike) -> Vector:
+    return np.asarray(value, dtype=float)
+
+
+def _names(value: Iterable[str]) -> frozenset[str]:
+    return frozenset(value)
+
+
+def _sizes(instance: object, attribute: attrs.Attribute[tuple[float, ...]], value: tuple[float, ...]) -> None:
+    if len(value) != 3 or not all(0 < each <= _LARGEST_M for each in value):
+        raise ValueError(
+            f"{attribute.name} is {list(value)}, must be three lengths above 0 and at most {_LARGEST_M:g} m"
+        )
+
+
+@attrs.frozen
+class Box:
+    """A box about its origin."""
+
+    size: tuple[float, ...] = attrs.field(converter=_three, validator=_sizes)
+    """Whole lengths along x, y and z [m]."""
+
+
+@attrs.frozen
+class Sphere:
+    """A sphere about its origin."""
+
+    radius: float = attrs.field(validator=_positive)
+    """[m]."""
+
+
+@attrs.frozen
+class Cylinder:
+    """A cylinder about its origin, along z."""
+
+    radius: float = attrs.field(validator=_positive)
+    """[m]."""
+    height: float = attrs.field(validator=_positive)
+    """Whole length along z [m]."""
+
+
+@attrs.frozen
+class Capsule:
+    """A cylinder with half spheres at its ends, about its origin, along z."""
+
+    radius: float = attrs.field(validator=_positive)
+    """[m]."""
+    height: float = attrs.field(validator=_positive)
+    """Length of the cylinder alone [m]."""
+
+
+@attrs.frozen
+class Plane:
+    """Everything below z = 0 of its frame, e.g. a floor or a table without edges."""
+
+
+@attrs.frozen(eq=False)
+class Mesh:
+    """Triangles. What is inside a closed mesh touches nothing, unless the mesh is `convex`.
+
+    Raises:
+        ValueError: for arrays of other shapes, vertices that are not finite, triangles of missing vertices, a mesh
+            without area, or one that is more than 100 m across.
+    """
+
+    vertices: Vector = attrs.field(converter=_array)
+    """[m], shape (N, 3)."""
+    triangles: np.ndarray[tuple[int, ...], np.dtype[np.intp]] = attrs.field(converter=np.asarray)
+    """Indices of vertices, shape (M, 3)."""
+    convex: bool = False
+    """Whether to take the convex hull instead: solid, and faster to check."""
+
+    def __attrs_post_init__(self) -> None:
+        vertices, triangles = self.vertices, self.triangles
+        if vertices.ndim != 2 or vertices.shape[1] != 3 or len(vertices) < 3:
+            raise ValueError(f"vertices have shape {vertices.shape}, must be (N, 3) with at least three")
+        if not np.isfinite(vertices).all():
+            raise ValueError("vertices must be finite")
+        if triangles.ndim != 2 or triangles.shape[1] != 3 or not len(triangles):
+            raise ValueError(f"triangles have shape {triangles.shape}, must be (M, 3) with at least one")
+        if not np.issubdtype(triangles.dtype, np.integer):
+            raise ValueError(f"triangles are {triangles.dtype}, must be whole numbers")
+        if triangles.min() < 0 or triangles.max() >= len(vertices):
+            raise ValueError(f"a triangle has vertex {triangles.max()}, there are {len(vertices)}")
+        extent = float(np.ptp(vertices, axis=0).max())
+        if extent > _LARGEST_M:
+            raise ValueError(f"the mesh is {extent:g} m across; for millimetres give scale: 0.001")
+        corners = vertices[triangles]
+        if not np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).max() > 0:
+            raise ValueError("the mesh has no area")
+        if self.convex and np.linalg.matrix_rank(vertices - vertices.mean(axis=0), tol=1e-9) < 3:
+            raise ValueError("a flat mesh has no convex hull; leave convex out")
+
+
+@attrs.frozen(eq=False)
+class Voxels:
+    """Occupied cells of a grid that is aligned with its frame.
+
+    Raises:
+        ValueError: for indices of another shape or type, or none.
+    """
+
+    size: float = attrs.field(validator=_positive)
+    """Edge of a cell [m]."""
+    cells: np.ndarray[tuple[int, ...], np.dtype[np.int64]] = attrs.field(converter=np.asarray)
+    """Indices of the occupied cells, shape (N, 3); cell (0, 0, 0) reaches from the origin to `size` along each axis."""
+
+    def __attrs_post_init__(self) -> None:
+        if self.cells.ndim != 2 or self.cells.shape[1] != 3 or not len(self.cells):
+            raise ValueError(f"cells have shape {self.cells.shape}, must be (N, 3) with at least one")
+        if not np.issubdtype(self.cells.dtype, np.integer):
+            raise ValueError(f"cells are {self.cells.dtype}, must be whole numbers")
+
+    @property
+    def centres(self) -> Vector:
+        """Centres of the cells [m], shape (N, 3)."""
+        return np.asarray((self.cells + 0.5) * self.size)
+
+
+type Shape = Box | Sphere | Cylinder | Capsule | Plane | Mesh | Voxels
+
+
+@attrs.frozen
+class WorldObject:
+    """A shape at a pose."""
+
+    shape: Shape
+    pose: Pose = Pose()
+    """In the base frame, or in the frame of `link`."""
+    link: str | None = None
+    """The link that carries it, e.g. the gripper; None: it stands in the base frame."""
+    may_touch: frozenset[str] = attrs.field(default=frozenset(), converter=_names)
+    """Links and objects that it may touch."""
+
+    def __attrs_post_init__(self) -> None:
+        p, o = self.pose.position, self.pose.orientation
+        if not np.isfinite([p.x, p.y, p.z, o.x, o.y, o.z, o.w]).all():
+            raise ValueError("the pose must be finite")
+        length = float(np.linalg.norm([o.x, o.y, o.z, o.w]))
+        if abs(length - 1) > 1e-3:
+            raise ValueError(f"the orientation is a quaternion of length {length:.3g}, must be 1")
+
+
+@attrs.frozen
+class World:
+    """Objects by name. Every method returns a new world."""
+
+    objects: Mapping[str, WorldObject] = attrs.field(factory=dict)
+
+    def add(self, name: str, thing: WorldObject) -> World:
+        """With one object more.
+
+        Raises:
+            PlanningError: for a name that is taken.
+        """
+        if not name:
+            raise PlanningError("an object needs a name", PlanCode.INVALID_OBJECT_NAME)
+        if name in self.objects:
+            raise PlanningError(f"there is an object {name!r} already", PlanCode.INVALID_OBJECT_NAME)
+        return World({**self.objects, name: thing})
+
+    def remove(self, name: str) -> World:
+        """Without an object.
+
+        Raises:
+            PlanningError: for a name that no object has; so do the methods below.
+        """
+        self._named(name)
+        return World({key: value for key, value in self.objects.items() if key != name})
+
+    def move(self, name: str, pose: Pose) -> World:
+        """With an object elsewhere, in the frame in which it stands."""
+        return World({**self.objects, name: attrs.evolve(self._named(name), pose=pose)})
+
+    def attach(self, name: str, link: str, pose: Pose, may_touch: frozenset[str] = frozenset()) -> World:
+        """With an object carried by `link`, at `pose` in the link's frame, touching the link and `may_touch`.
+
+        Raises:
+            PlanningError: for a name that no object has, or an object that is attached already.
+        """
+        thing = self._named(name)
+        if thing.link is not None:
+            raise PlanningError(f"object {name!r} is attached to {thing.link!r} already", PlanCode.INVALID_OBJECT_NAME)
+        touching = thing.may_touch | may_touch | {link}
+        return World({**self.objects, name: attrs.evolve(thing, link=link, pose=pose, may_touch=touching)})
+
+    def detach(self, name: str, pose: Pose, may_touch: frozenset[str] = frozenset()) -> World:
+        """With an attached object put down at `pose` in the base frame, touching `may_touch` alone.
+
+        Raises:
+            PlanningError: for a name that no object has, or an object that is not attached.
+        """
+        thing = self._named(name)
+        if thing.link is None:
+            raise PlanningError(f"object {name!r} is not attached", PlanCode.INVALID_OBJECT_NAME)
+        return World({**self.objects, name: attrs.evolve(thing, link=None, pose=pose, may_touch=may_touch)})
+
+    def _named(self, name: str) -> WorldObject:
+        if name not in self.objects:
+            raise PlanningError(
+                f"no object {name!r}; the objects are: {', '.join(self.objects) or 'none'}",
+                PlanCode.INVALID_OBJECT_NAME,
+            )
+        return self.objects[name]
+
+
+def read_mesh(path: Path, scale: float = 1.0, *, convex: bool = False) -> Mesh:
+    """A mesh from a file, e.g. STL, OBJ or PLY.
+
+    Args:
+        path: the file.
+        scale: what its numbers are multiplied by, e.g. 0.001 for millimetres.
+        convex: whether to take the convex hull.
+
+    Raises:
+        ValueError: when the file cannot be read, or has no usable triangles.
+    """
+    import coal
+
+    if not path.is_file():
+        raise ValueError(f"no file {path}")
+    if not scale > 0:
+        raise ValueError(f"scale is {scale}, must be above 0")
+    try:
+        model = coal.MeshLoader().load(str(path), np.full(3, scale))
+    except (ValueError, RuntimeError) as error:
+        raise ValueError(f"{path} cannot be read as a mesh: {str(error).strip().splitlines()[-1]}") from error
+    triangles = [[model.tri_indices(i)[k] for k in range(3)] for i in range(model.num_tris)]
+    try:
+        return Mesh(np.array(model.vertices()), np.array(triangles, dtype=np.intp).reshape(-1, 3), convex)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error

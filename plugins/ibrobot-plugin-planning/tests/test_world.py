@@ -1,0 +1,140 @@
+"""Worlds: immutable, and strict about what they are given."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from ibrobot_planning.transforms import from_rpy, matrix, pose
+from ibrobot_planning.world import Box, Capsule, Cylinder, Mesh, Sphere, Voxels, World, WorldObject, read_mesh
+
+from ibrobot_core.api import PlanCode, PlanningError, Pose, Quaternion, Vector3
+
+TRIANGLE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.0]])
+ONE = np.array([[0, 1, 2]])
+
+MALFORMED = {
+    "box with two lengths": (lambda: Box((1.0, 2.0)), r"size is \[1.0, 2.0\], must be three lengths"),
+    "box without height": (lambda: Box((1.0, 1.0, 0.0)), "three lengths above 0"),
+    "box in millimetres": (lambda: Box((400.0, 300.0, 20.0)), "at most 100 m"),
+    "box that is nan": (lambda: Box((math.nan, 1.0, 1.0)), "three lengths above 0"),
+    "sphere without radius": (lambda: Sphere(0.0), "radius is 0.0 m, must be above 0"),
+    "sphere turned inside out": (lambda: Sphere(-0.1), "radius is -0.1 m"),
+    "cylinder that is nan": (lambda: Cylinder(0.1, math.nan), "height is nan m"),
+    "cylinder in millimetres": (lambda: Cylinder(30.0, 120.0), "height is 120.0 m, must be above 0 and at most 100 m"),
+    "capsule without end": (lambda: Capsule(0.1, math.inf), "height is inf m"),
+    "mesh of two corners": (lambda: Mesh(TRIANGLE[:2], ONE), r"vertices have shape \(2, 3\)"),
+    "mesh in a plane": (lambda: Mesh(TRIANGLE[:, :2], ONE), r"vertices have shape \(3, 2\)"),
+    "mesh that is nan": (lambda: Mesh(TRIANGLE * np.nan, ONE), "vertices must be finite"),
+    "mesh without triangles": (lambda: Mesh(TRIANGLE, ONE[:0]), r"triangles have shape \(0, 3\)"),
+    "mesh of quadrangles": (lambda: Mesh(TRIANGLE, np.array([[0, 1, 2, 0]])), r"triangles have shape \(1, 4\)"),
+    "mesh of fractions": (lambda: Mesh(TRIANGLE, ONE * 1.0), "triangles are float64, must be whole numbers"),
+    "mesh with a corner too many": (lambda: Mesh(TRIANGLE, ONE + 1), "a triangle has vertex 3, there are 3"),
+    "mesh without area": (lambda: Mesh(TRIANGLE * [1, 0, 0], ONE), "the mesh has no area"),
+    "mesh in millimetres": (lambda: Mesh(TRIANGLE * 400, ONE), "400 m across; for millimetres give scale: 0.001"),
+    "flat hull": (lambda: Mesh(TRIANGLE, ONE, convex=True), "a flat mesh has no convex hull"),
+    "voxels without cells": (lambda: Voxels(0.01, np.zeros((0, 3), int)), r"cells have shape \(0, 3\)"),
+    "voxels between cells": (lambda: Voxels(0.01, np.zeros((1, 3))), "cells are float64, must be whole numbers"),
+    "voxels without size": (lambda: Voxels(0.0, np.zeros((1, 3), int)), "size is 0.0 m"),
+    "pose that is nan": (lambda: WorldObject(Sphere(0.1), Pose(Vector3(math.nan, 0, 0))), "the pose must be finite"),
+    "quaternion of no length": (
+        lambda: WorldObject(Sphere(0.1), Pose(orientation=Quaternion(0, 0, 0, 0))),
+        "a quaternion of length 0, must be 1",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("make", "message"), MALFORMED.values(), ids=MALFORMED)
+def test_malformed_objects_are_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+CAN = WorldObject(Cylinder(0.03, 0.1), Pose(Vector3(0.2, 0, 0.05)))
+WORLD = World({"can": CAN, "ball": WorldObject(Sphere(0.02))})
+REFUSED = {
+    "taken name": (lambda: WORLD.add("can", CAN), "there is an object 'can' already"),
+    "no name": (lambda: WORLD.add("", CAN), "an object needs a name"),
+    "unknown object to remove": (lambda: WORLD.remove("cup"), "no object 'cup'; the objects are: can, ball"),
+    "unknown object to move": (lambda: WORLD.move("cup", Pose()), "no object 'cup'"),
+    "unknown object to attach": (lambda: World().attach("cup", "hand", Pose()), "the objects are: none"),
+    "object attached twice": (
+        lambda: WORLD.attach("can", "hand", Pose()).attach("can", "hand", Pose()),
+        "'can' is attached to 'hand' already",
+    ),
+    "object that is not attached": (lambda: WORLD.detach("can", Pose()), "object 'can' is not attached"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("change", "message"), REFUSED.values(), ids=REFUSED)
+def test_impossible_changes_are_refused(change, message):
+    with pytest.raises(PlanningError, match=message) as caught:
+        change()
+    assert caught.value.code is PlanCode.INVALID_OBJECT_NAME
+
+
+def test_changes_make_new_worlds():
+    attached = WORLD.attach("can", "hand", Pose(Vector3(0, 0, 0.05)), frozenset({"finger"}))
+    assert WORLD.objects["can"] == CAN
+    assert attached.objects["can"].link == "hand"
+    assert attached.objects["can"].may_touch == {"hand", "finger"}
+    put = attached.detach("can", CAN.pose)
+    assert put.objects["can"] == CAN
+    assert set(WORLD.remove("ball").objects) == {"can"}
+    assert WORLD.move("ball", CAN.pose).objects["ball"].pose == CAN.pose
+
+
+numbers = st.floats(-3.0, 3.0)
+
+
+@given(st.tuples(numbers, numbers, numbers), st.tuples(numbers, numbers, numbers))
+def test_poses_and_matrices_are_the_same(position, turns):
+    there = Pose(Vector3(*position), from_rpy(*turns))
+    placed = matrix(there)
+    np.testing.assert_allclose(placed[:3, :3] @ placed[:3, :3].T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(matrix(pose(placed)), placed, atol=1e-12)
+
+
+def test_turns_are_about_the_fixed_axes_in_order():
+    # First x to x, y to z; then z to x.
+    np.testing.assert_allclose(
+        matrix(Pose(orientation=from_rpy(np.pi / 2, np.pi / 2, 0)))[:3, :3] @ [0, 1, 0], [1, 0, 0], atol=1e-12
+    )
+
+
+STL = """solid a
+facet normal 0 0 1
+outer loop
+vertex 0 0 0
+vertex 30 0 0
+vertex 0 40 0
+endloop
+endfacet
+endsolid a
+"""
+
+
+def test_meshes_are_read_from_files(tmp_path):
+    path = tmp_path / "part.stl"
+    path.write_text(STL)
+    mesh = read_mesh(path, 0.001)
+    np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), [0.03, 0.04, 0.0])
+    assert mesh.triangles.shape == (1, 3)
+
+
+def test_mesh_files_that_cannot_be_used_are_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"no file .*cup.stl"):
+        read_mesh(tmp_path / "cup.stl")
+    broken = tmp_path / "broken.stl"
+    broken.write_bytes(b"\0" * 100)
+    with pytest.raises(ValueError, match=r"broken.stl"):
+        read_mesh(broken)
+    large = tmp_path / "large.stl"
+    large.write_text(STL.replace("30", "300").replace("40", "4000"))
+    with pytest.raises(ValueError, match=r"large.stl: the mesh is 4000 m across; for millimetres give scale: 0.001"):
+        read_mesh(large)
+    with pytest.raises(ValueError, match=r"scale is 0, must be above 0"):
+        read_mesh(large, 0)
