@@ -28,7 +28,6 @@ from ibrobot_core.options import (
     did_you_mean as did_you_mean,
     documented as documented,
     option as option,
-    unknown_names as unknown_names,
 )
 from ibrobot_core.executor_options import StreamOptions as StreamOptions
 from ibrobot_core.interfaces import (
@@ -233,7 +232,7 @@ from ibrobot_core.config.expand import resolve_path as resolve_path
 from ibrobot_core.config.overrides import apply_overrides as apply_overrides
 from ibrobot_core.config.show import dump_yaml as dump_yaml
 from ibrobot_core.config.yaml_nodes import parse_yaml as parse_yaml
-from ibrobot_core.config.single import from_yaml as from_yaml, single_options as single_options
+from ibrobot_core.config.single import single_options as single_options
 from ibrobot_core.plugins import (
     Registry as Registry,
     example_type as example_type,
@@ -241,11 +240,7 @@ from ibrobot_core.plugins import (
 )
 from ibrobot_core.inference.build import build_policy as build_policy
 from ibrobot_core.recording.dataset import EpisodeDataset as EpisodeDataset
-from ibrobot_core.recording.episode import episode_folder as episode_folder
-from ibrobot_core.recording.provenance import (
-    metadata_from_config as metadata_from_config,
-    robot_metadata as robot_metadata,
-)
+from ibrobot_core.recording.episode import episode_folder as episode_folder, robot_metadata as robot_metadata
 from ibrobot_core.probes import Probes as Probes, ProbeServer as ProbeServer
 from ibrobot_core.control.realtime import go_real_time as go_real_time
 from ibrobot_core.memory import create_memory as create_memory, set_malloc as set_malloc

@@ -38,20 +38,6 @@ if TYPE_CHECKING:
     from ibrobot_core.robot import Robot
 
 
-def nothing_is_missing() -> None:
-    """The check of a type that needs nothing but Python packages that come with its plugin."""
-
-
-def nothing_is_wrong(options: Any, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
-    """The check of options that stand by themselves."""
-    return ()
-
-
-def no_devices(options: Any) -> Mapping[str, str]:
-    """The devices of a type that opens none, or that others may open too."""
-    return {}
-
-
 @attrs.frozen
 class Descriptor[T]:
     """One implementation of one kind.
@@ -66,36 +52,21 @@ class Descriptor[T]:
     summary: str
     options: builtins.type[Any] = NoOptions
     """A frozen attrs class made with `ibrobot_core.options.option`."""
-    check: Callable[[], None] = attrs.field(default=nothing_is_missing, kw_only=True)
+    check: Callable[[], None] = attrs.field(default=lambda: None, kw_only=True)
     """Whether this machine has what the type needs beyond the plugin's own packages; imports nothing heavy.
 
     Raises:
         MissingDependency: e.g. for a system library. A run goes on without a sensor that nothing in it needs.
     """
     check_options: Callable[[Any, Robot, tuple[str, ...]], Iterable[OptionFault]] = attrs.field(
-        default=nothing_is_wrong, kw_only=True
+        default=lambda options, robot, joints: (), kw_only=True
     )
     """What is wrong with the options for a robot, e.g. a joint that it does not have; the third argument has the joints
     that the component owns, or all where its kind owns none. Opens no device, and imports nothing heavy."""
-    devices: Callable[[Any], Mapping[str, str]] = attrs.field(default=no_devices, kw_only=True)
+    devices: Callable[[Any], Mapping[str, str]] = attrs.field(default=lambda options: {}, kw_only=True)
     """Option -> the device that it names and that one component at a time can open, always written in the same way."""
     default: bool = attrs.field(default=False, kw_only=True)
     """Whether commands take this type where none of its kind is named; one type of a kind at most."""
-
-
-def no_calibration(options: Any) -> str | None:
-    """For hardware that works without a calibration."""
-    return None
-
-
-def no_joints(options: Any) -> tuple[str, ...]:
-    """For hardware whose joints are all at 0 rad where their calibration says."""
-    return ()
-
-
-def no_picture(options: Any) -> tuple[int, int] | None:
-    """For sensors that give no pictures, or whose size only the pictures tell."""
-    return None
 
 
 @attrs.frozen
@@ -107,9 +78,10 @@ class HardwareDescriptor(Descriptor["Hardware"]):
     """For simulated hardware, sensor kind, e.g. `camera` -> the sensor type that stands for it."""
     torque_off: str = ""
     """For joints that hold on when no process commands them any more: the command that takes their torque off."""
-    calibration: Callable[[Any], str | None] = attrs.field(default=no_calibration, kw_only=True)
-    """Name or path of the calibration that the options name, as `load_calibration` takes it; recordings keep it."""
-    anchored: Callable[[Any], tuple[str, ...]] = attrs.field(default=no_joints, kw_only=True)
+    calibration: Callable[[Any], str | None] = attrs.field(default=lambda options: None, kw_only=True)
+    """Name or path of the calibration that the options name, as `load_calibration` takes it; recordings keep it. None
+    where it works without one."""
+    anchored: Callable[[Any], tuple[str, ...]] = attrs.field(default=lambda options: (), kw_only=True)
     """The joints whose calibrated closed end is their lower limit, as a gripper's may be. In LeRobot's units these are
     0 to 100."""
 
@@ -119,7 +91,7 @@ class SensorDescriptor(Descriptor["Sensor"]):
     """A sensor of a kind, e.g. `camera` or `imu`."""
 
     kind: str = "camera"
-    picture: Callable[[Any], tuple[int, int] | None] = attrs.field(default=no_picture, kw_only=True)
+    picture: Callable[[Any], tuple[int, int] | None] = attrs.field(default=lambda options: None, kw_only=True)
     """Height and width of the pictures [px], as far as the options say them."""
 
 
@@ -210,16 +182,6 @@ class ViewerDescriptor(Descriptor["Viewer"]):
     """A viewer."""
 
 
-def nothing_is_wrong_with(config: RobotConfig) -> Iterable[OptionFault]:
-    """The check of sections that stand by themselves."""
-    return ()
-
-
-def only_with_section(config: RobotConfig) -> bool:
-    """For components that run only where the file has their section."""
-    return False
-
-
 @attrs.frozen
 class SectionDescriptor(Descriptor["Component"]):
     """A section that a plugin adds to the robot YAML, e.g. `counter: {topic: /count}`, and what serves it in a run.
@@ -230,10 +192,10 @@ class SectionDescriptor(Descriptor["Component"]):
     make: Callable[[Any, Session], Component] = attrs.field(kw_only=True)  # type: ignore[assignment]
     """Options and run -> the component that starts and stops with the run. The options are None where the component
     runs without its section. Imports what it needs when it is called, and opens nothing."""
-    without_section: Callable[[RobotConfig], bool] = attrs.field(default=only_with_section, kw_only=True)
+    without_section: Callable[[RobotConfig], bool] = attrs.field(default=lambda config: False, kw_only=True)
     """Whether the component also runs with a robot whose file lacks the section."""
     check_config: Callable[[RobotConfig], Iterable[OptionFault]] = attrs.field(
-        default=nothing_is_wrong_with, kw_only=True
+        default=lambda config: (), kw_only=True
     )
     """What is wrong with a robot that it runs with, in any section; opens no device. The `option` of a fault begins at
     the top of the file: `("peripherals", 0, "transform")`."""

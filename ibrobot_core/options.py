@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from typing import Any
 
@@ -29,13 +29,6 @@ def did_you_mean(word: str, known: Sequence[str], what: str) -> str:
     """What should have stood for `word`: the nearest of `known`, or all of them."""
     close = get_close_matches(word, known, 1)
     return f", did you mean {close[0]!r}?" if close else f"; {what}: {', '.join(known) or 'none'}"
-
-
-def unknown_names(option: str, names: Sequence[str], known: Sequence[str], what: str) -> Iterator[OptionFault]:
-    """A fault for each of the names in a list option that is not among the known ones, e.g. of joints."""
-    for i, name in enumerate(names):
-        if name not in known:
-            yield OptionFault((option, i), f"unknown {what} {name!r}{did_you_mean(name, known, 'known')}")
 
 
 HIDDEN = "***"

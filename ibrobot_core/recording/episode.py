@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 from uuid import NAMESPACE_OID, uuid4, uuid5
 
 import ibrobot_core
@@ -71,6 +72,22 @@ def episode_start(
         kept = {topic: type_ for topic, type_ in topics.items() if is_kept(topic, recording, contract)}
     directory = episode_folder(root.parent, _next_number(root))
     return EpisodeStart(directory, stamp_ns, kept, metadata, any_topic=recording.topics != "contract")
+
+
+def robot_metadata(contract: Contract, document: Mapping[str, Any], calibrations: Mapping[str, Any]) -> dict[str, str]:
+    """Metadata of an episode, by the names that a recorder's metadata has.
+
+    Args:
+        contract: of the episode.
+        document: the robot YAML as plain values; empty where it is not known.
+        calibrations: hardware -> joint -> fields of `JointCalibration`; empty where they are not known.
+    """
+    robot = document.get("robot") or {}
+    found = {"contract": json.dumps(contract.canonical()), "fingerprint": contract.fingerprint()}
+    if document:
+        found |= {"config": json.dumps(document)}
+        found |= {"robot": str(robot.get("name", "")), "robot_type": str(robot.get("robot_type", ""))}
+    return found | ({"calibration": json.dumps(calibrations)} if calibrations else {})
 
 
 def is_kept(topic: str, recording: RecordingConfig, contract: Contract) -> bool:

@@ -12,7 +12,7 @@ import pytest
 from ibrobot_core.config import RobotConfig
 from ibrobot_core.descriptors import TeleopDescriptor
 from ibrobot_core.errors import ConfigError
-from ibrobot_core.options import OptionFault, option, unknown_names
+from ibrobot_core.options import OptionFault, did_you_mean, option
 from ibrobot_core.plugins import Entry, Registry
 from ibrobot_core.robot import Robot
 
@@ -26,7 +26,9 @@ class StickOptions:
 
 
 def _check(options: Any, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
-    return unknown_names("inverted", options.inverted, joints, "joint")
+    for i, name in enumerate(options.inverted):
+        if name not in joints:
+            yield OptionFault(("inverted", i), f"unknown joint {name!r}{did_you_mean(name, joints, 'known')}")
 
 
 def _port(options: Any) -> Mapping[str, str]:

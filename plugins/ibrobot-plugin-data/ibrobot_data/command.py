@@ -130,8 +130,9 @@ def _to_bags(
     *, episodes: tuple[Path, ...], out: Path, config: str | None, calibration: str | None, as_json: bool,
     sets: tuple[str, ...], norm_mode: str | None, numbers: str | None, prompt: str, **_: Any,
 ) -> Report:  # fmt: skip
-    from ibrobot_core.api import EpisodeAddress, metadata_from_config
+    from ibrobot_core.api import EpisodeAddress
     from ibrobot_data.episode import make_writer
+    from ibrobot_data.given import metadata_from_config
     from ibrobot_data.to_bags import BagRequest, convert_to_bags
 
     if len(episodes) != 1:

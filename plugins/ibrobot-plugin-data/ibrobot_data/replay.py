@@ -24,12 +24,12 @@ from ibrobot_core.api import (
     installed_plugins,
     load_calibration,
     load_config,
-    metadata_from_config,
     run_options,
     run_overrides,
     run_robot,
     wrong_input,
 )
+from ibrobot_data.given import metadata_from_config
 from ibrobot_data.playback import read_playback
 from ibrobot_data.replay_source import Replay, ReplaySource
 

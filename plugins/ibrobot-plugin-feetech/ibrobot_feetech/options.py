@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import attrs
 
-from ibrobot_core.api import OptionFault, did_you_mean, documented, option, unknown_names
+from ibrobot_core.api import OptionFault, did_you_mean, documented, option
 
 if TYPE_CHECKING:
     from ibrobot_core.api import Robot
@@ -125,7 +125,7 @@ def check_follower(options: FollowerOptions, robot: Robot, joints: tuple[str, ..
     """Check that the joints in the options exist; they may belong to another component of the robot."""
     for key, names in (("anchored", options.anchored), ("gentle", options.gentle)):
         if joints == robot.joint_names or names != _GRIPPER:
-            yield from unknown_names(key, names, robot.joint_names, "joint")
+            yield from _unknown(key, names, robot.joint_names, "joint")
 
 
 def check_leader(options: LeaderOptions, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:
@@ -138,7 +138,14 @@ def check_leader(options: LeaderOptions, robot: Robot, joints: tuple[str, ...]) 
     known = tuple(options.joints) or robot.joint_names
     for key, names in (("inverted", options.inverted), ("scaled", options.scaled)):
         if names != _GRIPPER:
-            yield from unknown_names(key, names, known, "joint of the leader")
+            yield from _unknown(key, names, known, "joint of the leader")
+
+
+def _unknown(option: str, names: Sequence[str], known: Sequence[str], what: str) -> Iterator[OptionFault]:
+    """A fault for each name that is not among the known ones."""
+    for i, name in enumerate(names):
+        if name not in known:
+            yield OptionFault((option, i), f"unknown {what} {name!r}{did_you_mean(name, known, 'known')}")
 
 
 def calibration_of(options: FollowerOptions) -> str:

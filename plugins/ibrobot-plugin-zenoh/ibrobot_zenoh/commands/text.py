@@ -8,7 +8,7 @@ from typing import Any
 import attrs
 import numpy as np
 
-from ibrobot_core.api import MESSAGE_TYPES, Message, NotSupported, dump_yaml, from_yaml
+from ibrobot_core.api import MESSAGE_TYPES, Message, NotSupported, dump_yaml, single_options
 
 _SHOWN = 16
 """Elements of an array that are shown."""
@@ -43,4 +43,4 @@ def message_from(type_name: str, text: str) -> Message:
         close = get_close_matches(type_name, MESSAGE_TYPES, 1)
         hint = f"did you mean {close[0]!r}?" if close else f"one of: {', '.join(sorted(MESSAGE_TYPES))}"
         raise NotSupported(f"{type_name!r} is not a type that can be published, {hint}")
-    return from_yaml(text, kind, "MESSAGE")
+    return single_options(kind, (), "MESSAGE", text=text)
