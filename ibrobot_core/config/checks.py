@@ -19,7 +19,6 @@ from ibrobot_core.config.schema import (
 from ibrobot_core.config.structure import ParsedComponent, ParsedSections
 from ibrobot_core.config.yaml_nodes import Document, Key
 from ibrobot_core.descriptors import ExecutorDescriptor, TransportDescriptor
-from ibrobot_core.options import did_you_mean
 from ibrobot_core.plugins import example_type
 from ibrobot_core.robot import Joint, Robot
 from ibrobot_core.units import radians
@@ -53,17 +52,6 @@ class Checks:
         self._recording()
         self._transport()
 
-    def _known(self, section: str) -> list[str]:
-        """The names that a section gives, faulty or not, so that a fault is reported once."""
-        value = self.document.root.get(section)
-        return list(value) if isinstance(value, Mapping) else []
-
-    def _refer(self, key: Key, name: str, known: list[str], what: str) -> bool:
-        if name in known:
-            return True
-        self.document.add(key, f"unknown {what} {name!r}{did_you_mean(name, known, 'known')}")
-        return False
-
     def _unique(self, key: Key, names: tuple[str, ...], what: str) -> None:
         for i, name in enumerate(names):
             if name in names[:i]:
@@ -92,7 +80,7 @@ class Checks:
                 self.document.add((*at, "joints", i, "name"), f"a second joint named {name!r}")
         for group, members in robot.groups.items():
             for i, joint in enumerate(members):
-                self._refer((*at, "groups", group, i), joint, names, "joint")
+                self.document.refer((*at, "groups", group, i), joint, names, "joint")
             self._unique((*at, "groups", group), members, "joint")
         grouped = {joint for members in robot.groups.values() for joint in members}
         for i, name in enumerate(names):
@@ -127,7 +115,7 @@ class Checks:
         at: Key = ("robot", "description", "tip")
         if known and self.document.get(*at) is not None:
             frames = [name for each in known for name in each.frames]
-            self._refer(at, robot.description.tip, frames, " or ".join(each.frame for each in known))
+            self.document.refer(at, robot.description.tip, frames, " or ".join(each.frame for each in known))
 
     def _within(self, key: Key, joint: Joint, limits: list[Limits]) -> None:
         lowest, highest = min(limits, key=lambda each: each.lower), max(limits, key=lambda each: each.upper)
@@ -160,7 +148,7 @@ class Checks:
                 self.document.add((*part.key, "joints"), "required where there is more than one hardware component")
             for i, joint in enumerate(part.component.joints):
                 key: Key = (*part.key, "joints", i)
-                self._refer(key, joint, list(robot.joint_names), "joint")
+                self.document.refer(key, joint, list(robot.joint_names), "joint")
                 if joint in owners:
                     self.document.add(key, f"joint {joint!r} is owned by hardware {owners[joint]!r} already")
                 owners.setdefault(joint, name)
@@ -199,14 +187,14 @@ class Checks:
 
     def _executors(self, robot: Robot) -> None:
         for part in self.sections.executors.values():
-            self._refer((*part.key, "group"), part.component.group, list(robot.groups), "group")
+            self.document.refer((*part.key, "group"), part.component.group, list(robot.groups), "group")
 
     def _behaviours(self, robot: Robot) -> None:
         control: ControlConfig | None = self.sections.plain.get("control", ControlConfig())
         if control is None:
             return
         if pose := control.load_shedding.pose:
-            self._refer(("control", "load_shedding", "pose"), pose, list(robot.description.poses), "pose")
+            self.document.refer(("control", "load_shedding", "pose"), pose, list(robot.description.poses), "pose")
         for key, value, words in (
             ("startup", control.startup, ("hold",)),
             ("stop", control.stop, ("hold", "relax")),
@@ -215,24 +203,24 @@ class Checks:
             if value in words:
                 continue
             if word == "pose" and pose:
-                self._refer(("control", key), pose, list(robot.description.poses), "pose")
+                self.document.refer(("control", key), pose, list(robot.description.poses), "pose")
             else:
                 self.document.add(("control", key), f"{value!r} is not one of: {', '.join(words)}, pose NAME")
 
     def _mode(self, name: str, mode: ControlMode, robot: Robot | None) -> None:
         key: Key = ("control_modes", name)
-        known = self._known("executors")
+        names = self.document.names
         for i, executor in enumerate(mode.executors):
-            self._refer((*key, "executors", i), executor, known, "executor")
+            self.document.refer((*key, "executors", i), executor, names("executors"), "executor")
         self._unique((*key, "executors"), mode.executors, "executor")
         if not mode.executors:
             self.document.add((*key, "executors"), "a mode needs at least one executor")
         if robot is not None:
             self._claims(key, mode, robot)
         if mode.teleop is not None:
-            self._refer((*key, "teleop"), mode.teleop, self._known("teleoperation"), "teleoperation device")
+            self.document.refer((*key, "teleop"), mode.teleop, names("teleoperation"), "teleoperation device")
         if (part := self.sections.inference.get(name)) is not None:
-            self._refer((*part.key, "model"), part.component.model, self._known("models"), "model")
+            self.document.refer((*part.key, "model"), part.component.model, names("models"), "model")
             self._reaches(part)
         sources = [source for source in ("teleop", "inference", "planner") if getattr(mode, source) is not None]
         if len(sources) > 1:
@@ -278,11 +266,11 @@ class Checks:
     def _default_mode(self) -> None:
         name = self.sections.plain.get("default_control_mode")
         if name is not None:
-            self._refer(("default_control_mode",), name, self._known("control_modes"), "control mode")
+            self.document.refer(("default_control_mode",), name, self.document.names("control_modes"), "control mode")
         simulation = self.sections.simulation
         if simulation is not None and (name := simulation.component.default_control_mode) is not None:
             key = ("simulation", "default_control_mode")
-            self._refer(key, name, self._known("control_modes"), "control mode")
+            self.document.refer(key, name, self.document.names("control_modes"), "control mode")
 
     def _transport(self) -> None:
         part = self.sections.transport

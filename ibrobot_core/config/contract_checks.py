@@ -107,12 +107,9 @@ class ContractChecks:
         elif spec.foreign:
             self._foreign(key, spec)
         elif spec.type not in messages.MESSAGE_TYPES:
-            known = sorted(messages.MESSAGE_TYPES)
-            self.document.add(
-                (*key, "type"),
-                f"unknown message type {spec.type!r}{did_you_mean(spec.type, known, 'known')} "
-                "(`foreign: true` takes one that only bags to convert have)",
-            )
+            remark = did_you_mean(spec.type, sorted(messages.MESSAGE_TYPES), "known")
+            hint = "(`foreign: true` takes one that only bags to convert have)"
+            self.document.add((*key, "type"), f"unknown message type {spec.type!r}{remark} {hint}")
         elif spec.topic == JOINT_STATES and spec.type != messages.JointState.ros_type:
             self.document.add((*key, "type"), f"{JOINT_STATES} carries {messages.JointState.ros_type}, not {spec.type}")
         else:
@@ -135,14 +132,11 @@ class ContractChecks:
             if getattr(spec, other):
                 self.document.add((*key, other), f"comes from peripheral {spec.peripheral!r}; give one or the other")
                 return spec
-        written = self.document.root.get("peripherals")
-        items = [item for item in written if isinstance(item, Mapping)] if isinstance(written, list) else []
-        kinds = {str(item.get("name")): str(item.get("kind")) for item in reversed(items)}
-        if spec.peripheral not in kinds:
-            remark = did_you_mean(str(spec.peripheral), list(kinds), "known")
-            self.document.add((*key, "peripheral"), f"unknown peripheral {spec.peripheral!r}{remark}")
+        items = reversed(self.document.items("peripherals"))
+        kinds = {str(item.get("name")): str(item.get("kind")) for _, item in items}
+        if not self.document.refer((*key, "peripheral"), str(spec.peripheral), list(kinds), "peripheral"):
             return spec
-        kind = kinds[spec.peripheral]
+        kind = kinds[str(spec.peripheral)]
         if kind not in PERIPHERAL_TOPICS:
             message = f"the topic of a peripheral of kind {kind!r} is not known by itself; give topic and type instead"
             self.document.add((*key, "peripheral"), message)
@@ -175,8 +169,8 @@ class ContractChecks:
                 return
             robot = self.sections.plain.get("robot")
             joints = list(robot.joint_names) if robot is not None else [joint]
-            if spec.topic == JOINT_STATES and joint not in joints:
-                self.document.add(key, f"unknown joint {joint!r}{did_you_mean(joint, joints, 'known')}")
+            if spec.topic == JOINT_STATES:
+                self.document.refer(key, joint, joints, "joint")
         self._size(key, spec.type, (path,))
 
     def _size(self, key: Key, type_: str, select: Sequence[str]) -> int | None:
@@ -212,12 +206,8 @@ class ContractChecks:
             return spec
         if spec.joints:
             self.document.add((*key, "joints"), f"are those of executor {spec.executor!r}; leave them out")
-        written = self.document.root.get("executors")
-        known = list(written) if isinstance(written, Mapping) else []
-        if spec.executor not in known:
-            self.document.add(
-                (*key, "executor"), f"unknown executor {spec.executor!r}{did_you_mean(spec.executor, known, 'known')}"
-            )
+        known = self.document.names("executors")
+        if not self.document.refer((*key, "executor"), spec.executor, known, "executor"):
             return spec
         self._commands(key, spec)
         if any(other.executor == spec.executor for other in earlier):

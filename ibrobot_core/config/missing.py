@@ -98,13 +98,7 @@ def _observed(document: Document, plain: Mapping[str, Any]) -> set[Key]:
     """The peripherals that the contract observes."""
     contract = plain.get("contract")
     names = {spec.peripheral for spec in contract.observations} if contract is not None else set()
-    peripherals = document.root.get("peripherals")
-    items = peripherals if isinstance(peripherals, list) else ()
-    return {
-        ("peripherals", i)
-        for i, item in enumerate(items)
-        if isinstance(item, Mapping) and str(item.get("name")) in names
-    }
+    return {key for key, item in document.items("peripherals") if str(item.get("name")) in names}
 
 
 def _may_wait(document: Document, key: Key) -> bool:

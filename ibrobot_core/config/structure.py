@@ -262,9 +262,8 @@ class SectionParser:
             return None
 
     def _named[C: NamedComponentConfig](self, section: str, kind: type[C]) -> dict[str, ParsedComponent[C]]:
-        value = self.document.root.get(section)
         found = {}
-        for name in value if isinstance(value, Mapping) else ():
+        for name in self.document.names(section):
             self._check_name((section, name), name)
             part = self._component((section, name), kind, name=name)
             if part is not None:
@@ -290,9 +289,7 @@ class SectionParser:
     @property
     def _elsewhere(self) -> bool:
         """Whether a simulation runs in another process: peripherals of kind `simulation` bring its state here."""
-        peripherals = self.document.root.get("peripherals")
-        items = peripherals if isinstance(peripherals, list) else ()
-        return any(isinstance(item, Mapping) and item.get("kind") == "simulation" for item in items)
+        return any(item.get("kind") == "simulation" for _, item in self.document.items("peripherals"))
 
     def _hardware(self, sections: ParsedSections) -> None:
         value = self.document.root.get("hardware")
@@ -314,11 +311,7 @@ class SectionParser:
         descriptor = sections.simulation.descriptor if sections.simulation and sections.simulated else None
         stand_ins = descriptor.sensors if isinstance(descriptor, HardwareDescriptor) else {}
         lines: dict[str, int] = {}
-        value = self.document.root.get("peripherals")
-        for i, item in enumerate(value if isinstance(value, list) else ()):
-            if not isinstance(item, Mapping):
-                continue
-            key: Key = ("peripherals", i)
+        for key, item in self.document.items("peripherals"):
             name = item.get("name")
             if isinstance(name, str):
                 self._check_name((*key, "name"), name)

@@ -14,6 +14,7 @@ from yaml.resolver import BaseResolver
 
 from ibrobot_core.config.expand import expand
 from ibrobot_core.errors import ConfigError, Problem
+from ibrobot_core.options import did_you_mean
 from ibrobot_core.outside import redacted
 
 Key = tuple[str | int, ...]
@@ -94,6 +95,23 @@ class Document:
         for part in key:
             value = _child(value, part)
         return value
+
+    def items(self, section: str) -> list[tuple[Key, Mapping[str, Any]]]:
+        """Key and value of each mapping in a section that is a list, as far as it is one."""
+        value = self.root.get(section)
+        items = value if isinstance(value, list) else ()
+        return [((section, i), item) for i, item in enumerate(items) if isinstance(item, Mapping)]
+
+    def names(self, section: str) -> list[str]:
+        """The names that a section gives, faulty or not, so that a fault is reported once."""
+        value = self.root.get(section)
+        return list(value) if isinstance(value, Mapping) else []
+
+    def refer(self, key: Key, name: str, known: Sequence[str], what: str) -> bool:
+        """Note where `name`, at `key`, is not among the known ones; whether it is."""
+        if name not in known:
+            self.add(key, f"unknown {what} {name!r}{did_you_mean(name, known, 'known')}")
+        return name in known
 
     def raise_problems(self) -> None:
         """Raise all that was noted, in file order.

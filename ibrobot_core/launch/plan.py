@@ -29,6 +29,7 @@ from ibrobot_core.launch.transport import TransportLink
 from ibrobot_core.messages import MESSAGE_TYPES
 from ibrobot_core.recording.episode import is_kept
 from ibrobot_core.recording.episodes import Episodes
+from ibrobot_core.recording.service import EpisodeService
 from ibrobot_core.recording.worker import RecordingWorker
 
 
@@ -54,7 +55,6 @@ class LaunchPlan:
     mode: ModeComponents
     """What the first mode brings; among `components` too."""
     episodes: Episodes
-    recording: RecordingWorker | None
     episodes_worker: SimulatedEpisodes | None
     without: str
     """The sensors that this machine cannot run, and why; empty where there are none."""
@@ -137,10 +137,12 @@ def build_plan(session: Session) -> LaunchPlan:
     components += added.models
     components.append(ControlComponent(session, tuple(model.name for model in added.models)))
     components += [SensorWorker(session, peripheral, (CONTROL,)) for peripheral in _sensors(session)]
-    recording = RecordingWorker(session, config.recording) if config.recording is not None else None
-    if recording is not None:
-        components.append(recording)
-    episodes = Episodes(session, recording)
+    judged = config.simulated and isinstance(added.source, PolicySource)
+    episodes = Episodes(session)
+    if config.recording is not None:
+        worker = RecordingWorker(session, config.recording)
+        components.append(worker)
+        episodes = EpisodeService(session, worker, by_mode=judged or not session.request.by_operator)
     if added.source is not None:
         components.append(added.source)
     components.append(Status(session, (CONTROL,)))
@@ -149,14 +151,12 @@ def build_plan(session: Session) -> LaunchPlan:
         components.append(ViewerWorker(session, config.viewer, (CONTROL,)))
     if link is not None:
         components += shared
-    worker = None
-    if config.simulated and isinstance(added.source, PolicySource):
-        worker = SimulatedEpisodes(session, episodes, (added.source.name,))
-        components.append(worker)
-    return LaunchPlan(
-        tuple(_ordered(components)), link, added, episodes, recording, worker, describe(session.absent),
-        config.unavailable,
-    )  # fmt: skip
+    simulated = None
+    if judged and added.source is not None:
+        simulated = SimulatedEpisodes(session, episodes, (added.source.name,))
+        components.append(simulated)
+    without = describe(session.absent)
+    return LaunchPlan(tuple(_ordered(components)), link, added, episodes, simulated, without, config.unavailable)
 
 
 def _ordered(components: list[Component]) -> list[Component]:

@@ -39,11 +39,9 @@ class Runtime:
                 "--episodes counts a policy's episodes in simulation: it needs --sim and a mode with inference; "
                 f"mode {session.mode} ends with --duration, --goal or Ctrl-C"
             )
-        self.episode_service: EpisodeService | None = None
+        episodes = self.plan.episodes
+        self.episode_service = episodes if isinstance(episodes, EpisodeService) else None
         """Where an operator begins and ends episodes; None in a run that records nothing."""
-        if self.plan.recording is not None:
-            by_mode = self.plan.episodes_worker is not None or not session.request.by_operator
-            self.episode_service = EpisodeService(session, self.plan.episodes, self.plan.recording, by_mode=by_mode)
         self._mode_components = self.plan.mode
         session.command_source = self.plan.mode.source
         self._started: list[Component] = []

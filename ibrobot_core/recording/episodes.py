@@ -1,4 +1,4 @@
-"""The life of episodes: numbered, counted, announced to plugins, and recorded where there is a recorder."""
+"""The life of episodes: numbered, counted, and announced to plugins."""
 
 from __future__ import annotations
 
@@ -6,15 +6,13 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from ibrobot_core.launch.session import Session
-    from ibrobot_core.recording.worker import RecordingWorker
 
 
 class Episodes:
     """Begins and ends episodes. One thread at a time uses it."""
 
-    def __init__(self, session: Session, recording: RecordingWorker | None) -> None:
+    def __init__(self, session: Session) -> None:
         self._session = session
-        self._recording = recording
         self.number = 0
         """Of the present episode, from 1; 0 before the first."""
         self.running = False
@@ -23,16 +21,9 @@ class Episodes:
         self.begun_ns = 0
         """When the present episode began [ns]."""
 
-    @property
-    def saved(self) -> int:
-        """Episodes that ended, were kept, and whose recording did not end before them."""
-        return 0 if self._recording is None else self._recording.saved
-
     def begin(self) -> None:
         """The next episode begins."""
         session = self._session
-        if self._recording is not None:
-            self._recording.begin(self.number + 1, self.prompt)
         self.number += 1
         self.running = True
         self.begun_ns = session.clock.now_ns()
@@ -44,8 +35,6 @@ class Episodes:
             return
         session = self._session
         self.running = False
-        if self._recording is not None:
-            self._recording.end(outcome)
         if outcome == "discarded":
             session.log.info("episode %d: discarded", self.number)
         elif outcome != "unknown":

@@ -70,7 +70,7 @@ class Operator(RunHooks):
         if self._service.by_mode:
             return
         service = self._service
-        if service.recording:
+        if service.running:
             if service.failure is not None:
                 self._end(lambda: service.stop("unknown"))
                 self._refuse(f"recording ended: {service.failure}")
@@ -91,13 +91,13 @@ class Operator(RunHooks):
             return False
         if self._typed is not None:
             self._type(key)
-        elif key == _START and self._service.recording:
+        elif key == _START and self._service.running:
             self._end(lambda: self._service.stop("success"))
         elif key == _START:
             self._ask()
-        elif key == _FAILURE and self._service.recording:
+        elif key == _FAILURE and self._service.running:
             self._end(lambda: self._service.stop("failure"))
-        elif key == _DISCARD and self._service.recording:
+        elif key == _DISCARD and self._service.running:
             self._end(self._service.discard)
         else:
             return False
@@ -159,7 +159,7 @@ class Operator(RunHooks):
         if self._typed is not None:
             enter = f"takes “{service.last_prompt}”" if service.last_prompt else "leaves it empty"
             return f"prompt (Enter alone {enter}, Tab goes back): {self._typed}_"
-        if service.recording:
+        if service.running:
             prompt = f" “{service.last_prompt}”" if service.last_prompt else ""
             left = "" if self._continuous else f", {max(0.0, self._longest_s - service.elapsed_s()):.0f} s left"
             return f"recording{prompt}, {service.elapsed_s():.0f} s{left}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, override
 
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import DiskFull, NotSupported, RecorderError, wrong_input
@@ -30,12 +30,11 @@ OUTCOMES = ("success", "failure", "unknown")
 _MIB = 1 << 20
 
 
-class EpisodeService:
-    """Episodes that an operator begins and ends. Safe to use from any thread.
+class EpisodeService(Episodes):
+    """Recorded episodes, which the mode or an operator begins and ends. The operator's part is safe in any thread.
 
     Args:
         session: the run.
-        episodes: the run's episodes, whose only user this is.
         recording: what records them.
         by_mode: whether the mode begins and ends them itself, so that here they can only be watched.
 
@@ -47,9 +46,8 @@ class EpisodeService:
             record and `recording.topics` leaves out a topic of the contract.
     """
 
-    def __init__(self, session: Session, episodes: Episodes, recording: RecordingWorker, *, by_mode: bool) -> None:
-        self._session = session
-        self._episodes = episodes
+    def __init__(self, session: Session, recording: RecordingWorker, *, by_mode: bool) -> None:
+        super().__init__(session)
         self._recording = recording
         self.by_mode = by_mode
         self._lock = threading.Lock()
@@ -68,20 +66,26 @@ class EpisodeService:
                 "converted: add them, or write `topics: contract`"
             )
 
+    @override
+    def begin(self) -> None:
+        self._recording.begin(self.number + 1, self.prompt)
+        super().begin()
+
+    @override
+    def end(self, outcome: str) -> None:
+        if self.running:
+            self._recording.end(outcome)
+        super().end(outcome)
+
     @property
     def saved(self) -> int:
         """Episodes that were recorded whole and kept."""
-        return self._episodes.saved
+        return self._recording.saved
 
     @property
     def failure(self) -> RecorderError | None:
         """Why the recording of the present or last episode ended before it; None where it did not."""
         return self._recording.failure
-
-    @property
-    def recording(self) -> bool:
-        """Whether an episode is on."""
-        return self._episodes.running
 
     @property
     def last_prompt(self) -> str:
@@ -90,7 +94,7 @@ class EpisodeService:
         Raises:
             RecorderError: when the dataset's file cannot be read.
         """
-        return self._episodes.prompt or self._dataset.prompt
+        return self.prompt or self._dataset.prompt
 
     def start(self, prompt: str | None = None) -> None:
         """Begin an episode.
@@ -105,7 +109,7 @@ class EpisodeService:
         """
         with self._lock:
             self._check_mine()
-            if self._episodes.running:
+            if self.running:
                 raise RecorderError("an episode is being recorded; end it first")
             if silent := self._recording.silent():
                 told = ", ".join(
@@ -114,10 +118,10 @@ class EpisodeService:
                 )
                 raise RecorderError(f"not recording: the contract's topics are silent: {told}")
             self._check_space()
-            self._episodes.prompt = self.last_prompt if prompt is None else prompt
-            self._episodes.begin()
-            if self._episodes.prompt:
-                self._dataset.prompt = self._episodes.prompt
+            self.prompt = self.last_prompt if prompt is None else prompt
+            self.begin()
+            if self.prompt:
+                self._dataset.prompt = self.prompt
 
     def stop(self, outcome: str = "unknown") -> None:
         """End the episode.
@@ -141,9 +145,9 @@ class EpisodeService:
 
     def elapsed_s(self) -> float:
         """Since the episode began [s]; 0 where none is on."""
-        if not self._episodes.running:
+        if not self.running:
             return 0.0
-        return seconds(self._session.clock.now_ns() - self._episodes.begun_ns)
+        return seconds(self._session.clock.now_ns() - self.begun_ns)
 
     def free_bytes(self) -> int:
         """Space left on the disk of the dataset."""
@@ -157,8 +161,8 @@ class EpisodeService:
         """What a front end shows."""
         failure = self._recording.failure
         return {
-            "recording": self._episodes.running, "episode": self._episodes.number, "saved": self.saved,
-            "prompt": self._episodes.prompt, "elapsed_s": round(self.elapsed_s(), 2),
+            "recording": self.running, "episode": self.number, "saved": self.saved,
+            "prompt": self.prompt, "elapsed_s": round(self.elapsed_s(), 2),
             "max_duration_s": self._session.config.contract.max_duration_s,
             "rates_hz": {topic: round(rate, 1) for topic, rate in self._recording.rates().items()},
             "silent": list(self._recording.silent()), "lost": self._recording.lost(),
@@ -182,9 +186,9 @@ class EpisodeService:
     def _end(self, outcome: str) -> None:
         with self._lock:
             self._check_mine()
-            if not self._episodes.running:
+            if not self.running:
                 raise RecorderError("no episode is being recorded")
-            self._episodes.end(outcome)
+            self.end(outcome)
 
     def _check_space(self) -> None:
         longest_s, flow = self._session.config.contract.max_duration_s, self._recording.flow()

@@ -127,7 +127,7 @@ def test_a_disk_too_small_for_an_episode_is_refused_with_the_figures(
     assert folders(runs) == []
     monkeypatch.setattr(service, "free_bytes", lambda: (3 << 20) + flow + 2)
     service.start("")
-    assert service.recording
+    assert service.running
 
 
 def test_a_mode_that_begins_its_own_episodes_keeps_them(runs: Runs, monkeypatch: pytest.MonkeyPatch):
@@ -178,15 +178,15 @@ class TestOperator:
         for key in ("tab", "h", "o", "p", "backspace", "space", "!"):
             assert operator.key(key)
         assert "ho !_" in operator.rows()[0][1]
-        assert not run.episode_service.recording
+        assert not run.episode_service.running
         operator.key("enter")
-        assert run.episode_service.recording
+        assert run.episode_service.running
         assert "recording “ho !”" in operator.line()
         operator.key("tab")
-        assert (run.episode_service.recording, run.episode_service.saved) == (False, 1)
+        assert (run.episode_service.running, run.episode_service.saved) == (False, 1)
         operator.key("tab")
         operator.key("tab")
-        assert not run.episode_service.recording, "a second Tab goes back"
+        assert not run.episode_service.running, "a second Tab goes back"
         assert not operator.key("a"), "letters belong to the mode again"
 
     def test_failure_and_discard(self, run: Runtime, runs: Runs):
@@ -259,17 +259,17 @@ class TestOperator:
         if not auto:
             operator.key("tab")
         self.step(run, operator, 3)
-        assert run.episode_service.recording
+        assert run.episode_service.running
         with monkeypatch.context() as patch:
             patch.setattr(runs.parts.MADE["recording"], "write", full)
             self.step(run, operator, 3)
-        assert (run.episode_service.recording, run.episode_service.saved) == (False, 0)
+        assert (run.episode_service.running, run.episode_service.saved) == (False, 0)
         assert ("", "recording ended: its disk has 1 MiB left") in operator.rows()
         assert run.session.finished.is_set() == auto, "the robot goes on where an operator is there"
         if not auto:
             operator.key("tab")
             self.step(run, operator, 3)
-            assert run.episode_service.recording, "there is room again"
+            assert run.episode_service.running, "there is room again"
             assert "" not in dict(operator.rows())
 
     def test_unattended_the_run_ends_without_room_for_another_episode(

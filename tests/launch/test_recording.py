@@ -78,14 +78,14 @@ def test_a_recorder_that_fails_costs_its_episode_and_the_robot_goes_on(
     assert runtime.session.outcome.faults == [fault]
     assert ("fault", fault) in runs.parts.EVENTS
     assert caplog.text.count(f"{fault}; the robot goes on") == 1
-    assert str(runtime.plan.recording.failure) == "its disk has 1 MiB left"
+    assert str(runtime.episode_service.failure) == "its disk has 1 MiB left"
     notes.full = notes.stuck = False
     runtime.plan.episodes.end("success")
     runtime.plan.episodes.begin()
     ticks(runtime, 3)
     assert len(notes.begun) == 2
     assert len(notes.written) > kept
-    assert runtime.plan.recording.failure is None
+    assert runtime.episode_service.failure is None
 
 
 def test_an_episode_that_is_not_written_to_its_end_does_not_count(runs: Runs, monkeypatch: pytest.MonkeyPatch):
