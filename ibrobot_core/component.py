@@ -7,7 +7,7 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from typing import override
 
 from ibrobot_core.bugs import describe_bug
@@ -73,6 +73,8 @@ class Worker(Component):
         self._end = threading.Event()
         self._ready = threading.Event()
         self._failure: Exception | None = None
+        self.on_end = ExitStack()
+        """What `setup` opens it gives a way to close: `on_end.callback(device.close)`. The last is closed first."""
         self.given_up = threading.Event()
         """Set when the run ends, so that `start` waits no longer."""
 
@@ -84,7 +86,8 @@ class Worker(Component):
         """Do one unit of work, waiting for it no longer than `timeout_s` [s]."""
 
     def teardown(self) -> None:
-        """Close what `setup` opened; also called when it failed."""
+        """Close what `setup` opened; also called when it failed. By default what was given to `on_end` is called."""
+        self.on_end.close()
 
     def pause(self, timeout_s: float) -> None:
         """Wait `timeout_s` [s], or until the stop."""

@@ -20,6 +20,7 @@ ACTION = "action"
 """Key of the action vector."""
 _CLOSED_MODE = "range_0_100"
 _POSITION = "position."
+_NUMBERS = ("range_min", "range_max", "inverted")
 
 
 @attrs.frozen
@@ -28,10 +29,8 @@ class _Elements:
 
     indices: NDArray[np.intp]
     mode: str
-    range_min: NDArray[np.float64]
-    range_max: NDArray[np.float64]
-    zero: NDArray[np.float64]
-    inverted: NDArray[np.bool_]
+    calibration: Mapping[str, NDArray[Any]]
+    """What `radians_to_lerobot` takes of it, one number for each element."""
 
 
 class JointUnits:
@@ -82,10 +81,7 @@ class JointUnits:
             return value
         vector = value.astype(np.float64)
         for group in self._elements[key]:
-            vector[..., group.indices] = convert(
-                vector[..., group.indices], group.mode, range_min=group.range_min, range_max=group.range_max,
-                zero=group.zero, inverted=group.inverted,
-            )  # fmt: skip
+            vector[..., group.indices] = convert(vector[..., group.indices], group.mode, **group.calibration)
         return vector.astype(value.dtype)
 
 
@@ -135,14 +131,9 @@ def _elements(
             has = f"it has: {', '.join(calibration)}" if calibration else f"there is none; {remedy}"
             raise CalibrationError(f"{mode} needs the calibration of joint {joint!r}; {has}")
     each = {joint: JointCalibration(**calibration[joint]) for joint in named.values()}
-    return _Elements(
-        np.array(list(named), np.intp),
-        mode,
-        np.array([joint.range_min for joint in each.values()], np.float64),
-        np.array([joint.range_max for joint in each.values()], np.float64),
-        np.array([joint.zero(closed.get(name)) for name, joint in each.items()]),
-        np.array([joint.inverted for joint in each.values()]),
-    )
+    columns = {name: np.array([getattr(joint, name) for joint in each.values()]) for name in _NUMBERS}
+    zero = np.array([joint.zero(closed.get(name)) for name, joint in each.items()])
+    return _Elements(np.array(list(named), np.intp), mode, {**columns, "zero": zero})
 
 
 def _closed_ends(calibration: Mapping[str, Mapping[str, Any]], document: Mapping[str, Any]) -> dict[str, float]:

@@ -31,6 +31,7 @@ class SensorWorker(SessionWorker):
     @override
     def setup(self) -> None:
         sensor = self._sensor = self.session.make("sensor", self._peripheral, self._peripheral.name)
+        self.on_end.callback(sensor.close)
         sensor.open()
         for topic, message in sensor.latched():
             self.session.bus.publish(topic, message, latched=True)
@@ -51,11 +52,6 @@ class SensorWorker(SessionWorker):
             age_s = seconds(now_ns - header.stamp_ns) if header is not None else None
             rate_hz = (len(self._stamps) - 1) / elapsed_s
             self.session.sensors[self._peripheral.name] = SensorFigures(self._received, rate_hz, age_s)
-
-    @override
-    def teardown(self) -> None:
-        if self._sensor is not None:
-            self._sensor.close()
 
     @override
     def is_ready(self) -> bool:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, override
 
 import attrs
 
-from ibrobot_core.bus import Received, Subscription
+from ibrobot_core.bus import Received
 from ibrobot_core.component import Worker, error_line
 from ibrobot_core.config.schema import RecordingConfig
 from ibrobot_core.contract.specs import Contract
@@ -70,12 +70,10 @@ class RecordingWorker(Worker):
         )  # fmt: skip
         self._session = session
         self._config = config
-        self._recorder: Recorder | None = None
         self._contract = Contract.from_config(session.config)
         self._orders: deque[_Begin | _End] = deque()
         self._order = threading.Lock()
         """Held while an order is stamped and queued, and while orders and messages are taken: neither overtakes."""
-        self._incoming: Subscription | None = None
         self._open = False
         self._seen: dict[str, deque[int]] = {}
         """Topic -> times of the last messages [ns]."""
@@ -96,8 +94,11 @@ class RecordingWorker(Worker):
     def setup(self) -> None:
         session = self._session
         descriptor = session.registry.find("recorder", self._config.type)
-        self._recorder = descriptor.make(self._config.options, session.context("recording"))
+        self._recorder: Recorder = descriptor.make(self._config.options, session.context("recording"))
         self._incoming = session.bus.subscribe(None, _DEPTH)
+        self.on_end.callback(self._incoming.close)
+        self.on_end.callback(self._did, self._recorder.close)
+        self.on_end.callback(self.work, 0.0)
 
     def begin(self, number: int, prompt: str) -> None:
         """From here on messages belong to a new episode.
@@ -117,7 +118,7 @@ class RecordingWorker(Worker):
                 policy=session.policy() if session.policy is not None else None,
             )  # fmt: skip
             latched = tuple(i for i in session.bus.latched().values() if i.received_ns <= start.stamp_ns)
-            self._orders.append(_Begin(start, latched, self._lost_now()))
+            self._orders.append(_Begin(start, latched, self._incoming.lost.copy()))
 
     def end(self, outcome: str) -> None:
         """Messages up to here belong to the episode."""
@@ -134,8 +135,6 @@ class RecordingWorker(Worker):
 
     @override
     def work(self, timeout_s: float) -> None:
-        assert self._recorder is not None
-        assert self._incoming is not None
         first = self._incoming.get(timeout_s)
         with self._order:
             orders, self._orders = self._orders, deque()
@@ -158,8 +157,6 @@ class RecordingWorker(Worker):
 
     def flow(self) -> float:
         """What an episode takes on the disk, by the rates and the messages of now [bytes/s]."""
-        if self._recorder is None:
-            return 0.0
         for topic, message in self._newest.copy().items():
             if topic not in self._sizes:
                 self._sizes[topic] = self._recorder.size_of(message)
@@ -169,11 +166,11 @@ class RecordingWorker(Worker):
     @property
     def min_free(self) -> int:
         """Space on the disk that the recorder leaves free [bytes]."""
-        return 0 if self._recorder is None else self._recorder.min_free
+        return self._recorder.min_free
 
     def waiting(self) -> int:
         """What the recorder has taken and not written yet [bytes]."""
-        return 0 if self._recorder is None else self._recorder.waiting()
+        return self._recorder.waiting()
 
     def silent(self) -> dict[str, float | None]:
         """The contract's topics without a message for a second: topic -> for how long [s], None: none ever came."""
@@ -189,8 +186,9 @@ class RecordingWorker(Worker):
 
     def lost(self) -> dict[str, int]:
         """Messages that were lost on the way here during the present episode, per topic."""
-        counts = self._lost_now() if self._incoming is not None else {}
-        return {topic: n - self._lost.get(topic, 0) for topic, n in counts.items() if n > self._lost.get(topic, 0)}
+        return {
+            topic: n for topic, total in self._incoming.lost.copy().items() if (n := total - self._lost.get(topic, 0))
+        }
 
     def _note(self, item: Received) -> None:
         if self._keeps(item.topic):
@@ -219,8 +217,7 @@ class RecordingWorker(Worker):
             return False
         self._open = False
         # Counted now: what waited when the episode ended may have been lost since.
-        lost = {topic: n - self._lost.get(topic, 0) for topic, n in self._lost_now().items() if self._keeps(topic)}
-        dropped = {topic: n for topic, n in lost.items() if n}
+        dropped = {topic: n for topic, n in self.lost().items() if self._keeps(topic)}
         return self._did(partial(recorder.end, attrs.evolve(end, dropped=dropped)))
 
     def _write(self, recorder: Recorder, item: Received, received_ns: int) -> None:
@@ -266,18 +263,3 @@ class RecordingWorker(Worker):
 
     def _keeps(self, topic: str) -> bool:
         return is_kept(topic, self._config, self._contract)
-
-    def _lost_now(self) -> dict[str, int]:
-        assert self._incoming is not None
-        return self._incoming.lost.copy()
-
-    @override
-    def teardown(self) -> None:
-        try:
-            if self._incoming is not None:
-                self.work(0.0)
-        finally:
-            if self._recorder is not None:
-                self._did(self._recorder.close)
-            if self._incoming is not None:
-                self._incoming.close()

@@ -18,25 +18,19 @@ class ViewerWorker(SessionWorker):
     def __init__(self, session: Session, component: ComponentConfig, needs: tuple[str, ...]) -> None:
         super().__init__(session, "viewer", component.type, needs)
         self._component = component
-        self._viewer: Viewer | None = None
 
     @override
     def setup(self) -> None:
-        viewer = self._viewer = self.session.make("viewer", self._component, "viewer")
-        viewer.open()
-        if where := viewer.where():
+        self._viewer: Viewer = self.session.make("viewer", self._component, "viewer")
+        self.on_end.callback(self._viewer.close)
+        self._viewer.open()
+        if where := self._viewer.where():
             self.session.log.info("viewer: %s", where)
 
     @override
     def work(self, timeout_s: float) -> None:
-        assert self._viewer is not None
         begun = time.monotonic()
         if not self._viewer.update():
             self.session.finish()
         if timeout_s > 0:
             self.pause(max(0.0, 1.0 / _RATE_HZ - (time.monotonic() - begun)))
-
-    @override
-    def teardown(self) -> None:
-        if self._viewer is not None:
-            self._viewer.close()

@@ -37,7 +37,6 @@ class PlannerSource(SourceWorker):
     def __init__(self, session: Session, mode: ControlMode, planner: ComponentConfig) -> None:
         super().__init__(session, mode, f"planner {planner.type}")
         self._component = planner
-        self._planner: Planner | None = None
         self._goals: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._events: queue.SimpleQueue[Mapping[str, Any]] = queue.SimpleQueue()
         self._motion: _Motion | None = None
@@ -49,8 +48,9 @@ class PlannerSource(SourceWorker):
 
     @override
     def setup(self) -> None:
-        planner = self._planner = self.session.make("planner", self._component, self._component.type)
-        planner.load()
+        self._planner: Planner = self.session.make("planner", self._component, self._component.type)
+        self.on_end.callback(self._planner.close)
+        self._planner.load()
 
     def go_to(self, goal: str) -> None:
         """Queue a goal: a pose's name, or `joint=radians,joint=radians`.
@@ -118,7 +118,6 @@ class PlannerSource(SourceWorker):
             if executor.goals == "position":
                 goals[name] = {"position": goal[mine[0]]}
                 continue
-            assert self._planner is not None
             request = PlanRequest(
                 executor.joints,
                 told[robot.indices(executor.joints)],
@@ -150,11 +149,6 @@ class PlannerSource(SourceWorker):
             self.session.log.info("goal %s reached", text)
         if self._asked and self._done >= self._asked:
             self.session.finish()
-
-    @override
-    def teardown(self) -> None:
-        if self._planner is not None:
-            self._planner.close()
 
 
 def parse_goal(text: str, robot: Robot) -> dict[str, float]:

@@ -6,7 +6,6 @@ from typing import override
 
 import numpy as np
 
-from ibrobot_core.bus import Subscription
 from ibrobot_core.config.schema import ControlMode
 from ibrobot_core.errors import TeleopError
 from ibrobot_core.interfaces import OperatorEvent, Teleop
@@ -25,43 +24,40 @@ class TeleopSource(SourceWorker):
         super().__init__(session, mode, f"teleop {device} ({component.type})")
         self._device_name = device
         self._component = component
-        self._device: Teleop | None = None
-        self._states: Subscription | None = None
         self._lost = False
 
     @override
     def setup(self) -> None:
-        device = self._device = self.session.make("teleop", self._component, self._device_name)
-        device.connect()
+        self._device: Teleop = self.session.make("teleop", self._component, self._device_name)
+        self.on_end.callback(self._device.disconnect)
+        self._device.connect()
         self._states = self.session.bus.subscribe("/joint_states", 1)
+        self.on_end.callback(self._states.close)
 
     @override
     def recover(self) -> None:
         with self.lock:
-            if self._lost and self._device is not None:
+            if self._lost:
                 self._device.disconnect()
                 self._device.connect()
                 self._lost = False
 
     @override
     def begin_mode(self, seed: int) -> None:
-        assert self._device is not None
         self._device.activate(self.session.measured())
 
     @override
     def work(self, timeout_s: float) -> None:
-        assert self._device is not None
-        assert self._states is not None
         if self._states.get(timeout_s) is None:
             return
         with self.lock:
             if self.active:
-                self._follow(self._device)
+                self._follow()
 
-    def _follow(self, device: Teleop) -> None:
+    def _follow(self) -> None:
         session = self.session
         try:
-            command = device.read(session.measured())
+            command = self._device.read(session.measured())
         except TeleopError as error:
             self._lost = True
             self.end()
@@ -88,12 +84,5 @@ class TeleopSource(SourceWorker):
             session.operator_events.put(event)
 
     @override
-    def teardown(self) -> None:
-        if self._states is not None:
-            self._states.close()
-        if self._device is not None:
-            self._device.disconnect()
-
-    @override
     def help(self) -> str:
-        return self._device.help() if self._device is not None else ""
+        return self._device.help()
