@@ -68,7 +68,7 @@ class Scene(FakeHardware):
 
 
 class Camera(FakeSensor):
-    """50 Hz in real time; `TROUBLE` says which one is missing, has a bug, or is unplugged at its sixth frame."""
+    """50 Hz in real time; `TROUBLE` says which one is missing, has a bug, is unplugged at its sixth frame, or does not close."""
 
     frames = 0
 
@@ -89,6 +89,8 @@ class Camera(FakeSensor):
         return super().read(timeout_s)
 
     def close(self):
+        if TROUBLE.get(self._ctx.name) == "stays open":
+            raise OSError("the port is gone")
         CALLS.append("close " + self._ctx.name)
         super().close()
 
