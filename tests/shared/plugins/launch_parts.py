@@ -68,7 +68,7 @@ class Scene(FakeHardware):
 
 
 class Camera(FakeSensor):
-    """50 Hz in real time; `TROUBLE` says which one is missing, has a bug, is unplugged at its sixth frame, or does not close."""
+    """50 Hz in real time; `TROUBLE` says which one is missing, has a bug, is unplugged at frame six, or stays open."""
 
     frames = 0
 
