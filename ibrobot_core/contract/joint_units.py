@@ -13,6 +13,7 @@ from ibrobot_core.calibration import JointCalibration, load_calibration
 from ibrobot_core.config.schema import RobotConfig
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import CalibrationError
+from ibrobot_core.interfaces import Frame
 from ibrobot_core.messages import JointState
 from ibrobot_core.units import lerobot_to_radians, radians_to_lerobot
 
@@ -71,6 +72,12 @@ class JointUnits:
     def __call__(self, values: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
         """Radians -> the unit: the values of a tick, or any of them, joints last; arrays that change are copied."""
         return {key: self._converted(key, value, radians_to_lerobot) for key, value in values.items()}
+
+    def frame(self, frame: Frame) -> Frame:
+        """A frame with its history and its prefix in the unit."""
+        prefix = None if frame.prefix is None else self._converted(ACTION, frame.prefix, radians_to_lerobot)
+        history = tuple(self.frame(each) for each in frame.history)
+        return attrs.evolve(frame, values=self(frame.values), prefix=prefix, history=history)
 
     def radians(self, key: str, value: NDArray[Any]) -> NDArray[Any]:
         """The unit -> radians, of the vectors of one key, joints last."""

@@ -10,6 +10,7 @@ import attrs
 from ibrobot_core.bus import Bus
 from ibrobot_core.config.schema import DispatchConfig
 from ibrobot_core.contract.frames import FrameSampler
+from ibrobot_core.contract.joint_units import ACTION, JointUnits
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.dispatch.latency import LatencyEstimate
 from ibrobot_core.dispatch.resume import LeadIn
@@ -99,6 +100,7 @@ class Dispatcher:
         send: takes the plan: time of the first action [ns], step [ns], actions (N, A).
         request_timeout_s: after which a request has failed.
         prompt: the task, for policies that want one.
+        units: of the policy's vectors; None for radians.
 
     Raises:
         ContractError: as `check_strategy`.
@@ -115,6 +117,7 @@ class Dispatcher:
         send: SendPlan,
         request_timeout_s: float,
         prompt: str = "",
+        units: JointUnits | None = None,
     ) -> None:
         check_strategy(options, spec)
         self._contract = contract
@@ -125,6 +128,7 @@ class Dispatcher:
         self._send = send
         self._timeout_ns = ns(request_timeout_s)
         self._prompt = prompt
+        self._units = units
         step_ns = round(1e9 / (spec.rate_hz or contract.rate_hz))
         joints = contract.action_joints
         columns = robot.indices(joints)
@@ -219,8 +223,9 @@ class Dispatcher:
             return
         self._smoother.trim(now_ns)
         try:
-            joined = self._smoother.update(chunk.actions, chunk.start_ns)
-        except ValueError as error:
+            actions = chunk.actions if self._units is None else self._units.radians(ACTION, chunk.actions)
+            joined = self._smoother.update(actions, chunk.start_ns)
+        except (ValueError, IndexError) as error:
             self._fail(chunk.id, now_ns, str(error))
             return
         # A chunk for older observations is of no use any more.
@@ -249,7 +254,7 @@ class Dispatcher:
         self._open[self._request_id] = t_ns
         prefix, delay_steps = self._continued(t_ns)
         frame = attrs.evolve(frame, prompt=self._prompt, prefix=prefix, delay_steps=delay_steps)
-        self._client.submit(DispatchInfer(self._request_id, frame))
+        self._client.submit(DispatchInfer(self._request_id, frame if self._units is None else self._units.frame(frame)))
         return True
 
     def _continued(self, t_ns: int) -> tuple[Vector | None, int]:

@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from ibrobot_testing import PolicySuite
 from ibrobot_testing.contexts import host_context
-from ibrobot_testing.fakes import FakePolicy
 from numpy.typing import NDArray
 
 from ibrobot_core.calibration import ZERO_AT, Calibration, JointCalibration
@@ -20,7 +18,6 @@ from ibrobot_core.config.schema import Align
 from ibrobot_core.contract.joint_units import JointUnits
 from ibrobot_core.contract.specs import ActionPart, Contract, ObservationPart
 from ibrobot_core.errors import CalibrationError
-from ibrobot_core.inference.policy_units import PolicyInItsUnits
 from ibrobot_core.interfaces import Feature, Frame, Policy, PolicySpec, Tensors
 from ibrobot_core.units import radians_to_lerobot, ticks_to_lerobot, ticks_to_radians
 
@@ -76,9 +73,9 @@ def frame(seed: int = 0) -> Frame:
 
 @pytest.mark.parametrize("norm_mode", ["degrees", "range_m100_100"])
 def test_it_sees_its_unit_and_gives_radians(norm_mode: str) -> None:
-    policy = PolicyInItsUnits(Echo(), units(norm_mode))
+    policy, converted = Echo(), units(norm_mode)
     shown = frame()
-    seen = policy.preprocess(shown)["rows"]
+    seen = policy.preprocess(converted.frame(shown))["rows"]
     arm = CALIBRATION["shoulder_lift"]
     lift = radians_to_lerobot(
         float(shown.values["observation.state"][1]), norm_mode, range_min=arm["range_min"], range_max=arm["range_max"],
@@ -88,7 +85,7 @@ def test_it_sees_its_unit_and_gives_radians(norm_mode: str) -> None:
     assert abs(lift) > 2  # neither radians nor normalised twice
     assert shown.prefix is not None
     wanted = [*shown.prefix, shown.history[0].values["observation.state"], shown.values["observation.state"]]
-    np.testing.assert_allclose(policy.postprocess({"rows": seen}), wanted, atol=1e-6)
+    np.testing.assert_allclose(converted.radians("action", policy.postprocess({"rows": seen})), wanted, atol=1e-6)
 
 
 def test_a_gripper_is_0_at_its_closed_end_in_both_units() -> None:
@@ -129,9 +126,3 @@ def test_no_unit_without_a_calibration() -> None:
     some = {joint: numbers for joint, numbers in CALIBRATION.items() if joint != "elbow_flex"}
     with pytest.raises(CalibrationError, match="joint 'elbow_flex'; it has: shoulder_pan, shoulder_lift"):
         units("degrees", some)
-
-
-class TestPolicyInItsUnits(PolicySuite):
-    @override
-    def make(self, ctx):
-        return PolicyInItsUnits(FakePolicy(ctx), units("range_m100_100"))

@@ -6,10 +6,10 @@ from typing import override
 
 from ibrobot_core.component import Component
 from ibrobot_core.config.schema import ControlMode, InferenceConfig
+from ibrobot_core.contract.joint_units import JointUnits
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.dispatch.dispatcher import Dispatcher
 from ibrobot_core.inference.client import EngineClient, InferenceClient, LockstepClient
-from ibrobot_core.inference.policy_units import PolicyInItsUnits
 from ibrobot_core.interfaces import Engine, ModelContext, Policy
 from ibrobot_core.launch.models import check_model
 from ibrobot_core.launch.session import ActingPolicy, Session
@@ -34,6 +34,8 @@ class LoadedModel(Component):
         self._inference = inference
         self._model = model
         self.contract = Contract.from_config(session.config, model.extra_observations)
+        self.units: JointUnits | None = None
+        """Of the policy's vectors, once started; None for radians."""
         self._policy: Policy | None = None
         self._engine: Engine | None = None
 
@@ -61,11 +63,9 @@ class LoadedModel(Component):
     def start(self) -> None:
         model, session = self._model, self._session
         policy = session.make("policy", model, model.name)
-        units = check_model(session.config, model, policy.spec, session.log)
+        self.units = check_model(session.config, model, policy.spec, session.log)
         topics = {part.topic for key in policy.spec.observations for part in self.contract.parts(key)}
         session.refuse_absent(f"model {model.name!r}", topics.__contains__)
-        if units is not None:
-            policy = PolicyInItsUnits(policy, units)
         self._policy = policy
         engine: Engine = session.make("engine", self._inference, model.name, model=self._context(policy))
         self._engine = engine
@@ -102,68 +102,56 @@ class PolicySource(SourceWorker):
         super().__init__(session, mode, summary, (*needs, model.name))
         self._inference = inference
         self._model = model
-        self._client: InferenceClient | None = None
-        self._dispatcher: Dispatcher | None = None
-
-    @property
-    def dispatcher(self) -> Dispatcher:
-        """The dispatcher, once set up."""
-        assert self._dispatcher is not None
-        return self._dispatcher
 
     @override
     def setup(self) -> None:
         policy, engine, contract = self._model.policy, self._model.engine, self._model.contract
         timeout_s = self._inference.request_timeout
         lockstep = self.session.request.lockstep
+        self._client: InferenceClient
         self._client = LockstepClient(policy, engine) if lockstep else EngineClient(policy, engine, timeout_s)
+        self.on_end.callback(self._client.close)
         self._dispatcher = Dispatcher(
             contract, policy.spec, self.mode.dispatch, self.session.config.robot, self.session.bus, self._client,
-            self._send, timeout_s, self._inference.prompt,
+            self._send, timeout_s, self._inference.prompt, self._model.units,
         )  # fmt: skip
         self._step_ns = contract.step_ns
 
     def toggle_smoothing(self, enabled: bool) -> None:
         """Service: switch the blending of chunks on or off, from the next chunk on."""
         with self.lock:
-            self.dispatcher.toggle_smoothing(enabled)
+            self._dispatcher.toggle_smoothing(enabled)
 
     @override
     def begin_mode(self, seed: int) -> None:
         model = self._model
-        self.session.acting = ActingPolicy(self.dispatcher.stats, model.engine.stats, model.described)
+        self.session.acting = ActingPolicy(self._dispatcher.stats, model.engine.stats, model.described)
         self._next_ns = self.session.bus.snapshot_ns() + self._step_ns
-        self.dispatcher.begin(seed)
+        self._dispatcher.begin(seed)
         self.session.bus.serve(TOGGLE_SMOOTHING, self.toggle_smoothing)
 
     @override
     def end_mode(self) -> None:
         self.session.bus.unserve(TOGGLE_SMOOTHING)
-        self.dispatcher.end()
+        self._dispatcher.end()
         self.session.acting = None
 
     @override
     def work(self, timeout_s: float) -> None:
-        assert self._client is not None
         clock = self.session.clock
         wait_s = min(timeout_s, max(0.0, (self._next_ns - clock.now_ns()) / NS_PER_S)) if self.active else timeout_s
         chunk = self._client.poll(wait_s)
         with self.lock:
             now_ns = self.session.bus.snapshot_ns()
             if chunk is not None:
-                self.dispatcher.accept(chunk, now_ns)
+                self._dispatcher.accept(chunk, now_ns)
             if self.active and now_ns >= self._next_ns:
                 behind = (now_ns - self._next_ns) // self._step_ns
-                self.dispatcher.tick(self._next_ns + behind * self._step_ns)
+                self._dispatcher.tick(self._next_ns + behind * self._step_ns)
                 self._next_ns += (behind + 1) * self._step_ns
                 # In lockstep the answer is there already.
                 if self.session.request.lockstep and (chunk := self._client.poll()) is not None:
-                    self.dispatcher.accept(chunk, now_ns)
-
-    @override
-    def teardown(self) -> None:
-        if self._client is not None:
-            self._client.close()
+                    self._dispatcher.accept(chunk, now_ns)
 
     def _send(self, start_ns: int, step_ns: int, positions: Vector) -> None:
         self.session.send_plan(start_ns, step_ns, self._model.contract.action_joints, positions)
