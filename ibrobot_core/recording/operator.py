@@ -110,7 +110,7 @@ class Operator(RunHooks):
             self._run.log.warning("%s: this run begins and ends its episodes by itself", event)
         elif event == "start":
             self._begin(self._prompt)
-        elif not service.recording:
+        elif not service.running:
             self._refuse(f"{event}: no episode is being recorded")
         elif event == "discard":
             self._end(service.discard)

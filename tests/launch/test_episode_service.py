@@ -207,7 +207,7 @@ class TestOperator:
         for events in (("start",), ("success",), ("start",), ("failure",), ("start",), ("discard",)):
             self.press(run, runs, *events)
             self.step(run, operator, 3)
-            assert run.episode_service.recording == (events == ("start",))
+            assert run.episode_service.running == (events == ("start",))
         assert [event[2] for event in runs.parts.EVENTS if event[0] == "ended"] == ["success", "failure", "discarded"]
         assert run.episode_service.saved == 2
 
@@ -224,7 +224,7 @@ class TestOperator:
         self.step(run, operator, 3)
         self.press(run, runs, "discard")
         self.step(run, operator, 3)
-        assert run.episode_service.recording
+        assert run.episode_service.running
         assert "discard: this run begins and ends its episodes by itself" in caplog.text
 
     def test_unattended_episodes_pause_and_end_with_the_count(self, run: Runtime, runs: Runs):
