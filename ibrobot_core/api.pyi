@@ -229,10 +229,9 @@ from ibrobot_core.config.schema import (
 )
 from ibrobot_core.config.models import ModelError as ModelError, XmlElement as XmlElement, read_xml as read_xml
 from ibrobot_core.config.expand import resolve_path as resolve_path
-from ibrobot_core.config.overrides import apply_overrides as apply_overrides
+from ibrobot_core.config.overrides import apply_overrides as apply_overrides, single_options as single_options
 from ibrobot_core.config.show import dump_yaml as dump_yaml
 from ibrobot_core.config.yaml_nodes import parse_yaml as parse_yaml
-from ibrobot_core.config.single import single_options as single_options
 from ibrobot_core.plugins import (
     Registry as Registry,
     example_type as example_type,

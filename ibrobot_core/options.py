@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Mapping, Sequence
+import operator
+from collections.abc import Callable, Mapping, Sequence
 from difflib import get_close_matches
 from typing import Any
 
@@ -37,6 +38,14 @@ HIDDEN = "***"
 
 def _hidden(value: object) -> str:
     return repr(value if value is None else HIDDEN)
+
+
+_BOUNDS: Mapping[str, tuple[Callable[[Any, Any], bool], str]] = {
+    "ge": (operator.ge, "small, must be at least"),
+    "gt": (operator.gt, "small, must be above"),
+    "le": (operator.le, "large, must be at most"),
+    "lt": (operator.lt, "large, must be below"),
+}
 
 
 def option(
@@ -80,17 +89,10 @@ def option(
             return
         if choices is not None and value not in choices:
             raise ValueError(f"{value!r} is not one of: {', '.join(str(c) for c in choices)}")
-        if any(b is not None for b in bounds.values()):
-            # The comparisons are written so that NaN fails them.
-            suffix = f" {unit}" if unit else ""
-            if ge is not None and not value >= ge:
-                raise ValueError(f"{value} is too small, must be at least {ge}{suffix}")
-            if gt is not None and not value > gt:
-                raise ValueError(f"{value} is too small, must be above {gt}{suffix}")
-            if le is not None and not value <= le:
-                raise ValueError(f"{value} is too large, must be at most {le}{suffix}")
-            if lt is not None and not value < lt:
-                raise ValueError(f"{value} is too large, must be below {lt}{suffix}")
+        for name, bound in bounds.items():
+            fits, words = _BOUNDS[name]
+            if bound is not None and not fits(value, bound):  # so that NaN fits none
+                raise ValueError(f"{value} is too {words} {bound}{f' {unit}' if unit else ''}")
         if isinstance(value, float) and not math.isfinite(value):
             raise ValueError(f"{value} is not a finite number")
 

@@ -63,6 +63,8 @@ _UNTYPED = ("ibrobot_readers", "ibrobot_decoders", "ibrobot_configs", "ibrobot_c
 OFFICIAL = Path(__file__).with_name("official_plugins.json")
 """What this project's own packages offer: package -> kind -> types; kind `default` has the kinds whose default type the
 package brings. A missing plugin can so be named. `python tests/house/official_plugins.py` writes it."""
+EXTRAS = Path(__file__).with_name("official_extras.json")
+"""Extra of `ibrobot` -> the packages that it installs. `python tests/house/official_plugins.py` writes it."""
 
 _log = logging.getLogger("ibrobot.plugins")
 
@@ -244,6 +246,16 @@ def official_plugins() -> Mapping[str, Mapping[str, list[str]]]:
     """What `OFFICIAL` says."""
     found: dict[str, dict[str, list[str]]] = json.loads(OFFICIAL.read_bytes())
     return found
+
+
+def install_command(packages: Iterable[str]) -> str:
+    """One line that installs packages: the smallest extra of `ibrobot` that has all of several, or their names."""
+    wanted = list(dict.fromkeys(packages))
+    extras: dict[str, list[str]] = json.loads(EXTRAS.read_bytes())
+    covering = [name for name, content in extras.items() if len(wanted) > 1 and set(wanted) <= set(content)]
+    if covering:
+        return f'pip install "ibrobot[{min(covering, key=lambda name: len(extras[name]))}]"'
+    return f"pip install {' '.join(wanted)}"
 
 
 def example_type(kind: str) -> str:

@@ -9,7 +9,7 @@ import attrs
 
 from ibrobot_core.config.yaml_nodes import Document, Key
 from ibrobot_core.errors import PluginNotInstalled, plugin_type
-from ibrobot_core.packages import install_command
+from ibrobot_core.plugins import install_command
 
 _OPTIONAL_SENSORS = ("camera",)
 """Kinds of sensors without which a run goes on, where nothing in it needs them."""

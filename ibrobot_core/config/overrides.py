@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
-from ibrobot_core.config.convert import shown
+from ibrobot_core.config.convert import Converter, Faults, error_message, shown
 from ibrobot_core.config.yaml_nodes import Document, Key, Place, parse_yaml
 from ibrobot_core.errors import ConfigError, Problem
 from ibrobot_core.options import did_you_mean
@@ -72,3 +73,32 @@ def _part(holder: Any, word: str) -> str | int:
         return int(word)
     known = [name for name in names if isinstance(name, str)] or [str(i) for i in range(len(holder))]
     raise ValueError(f"the list has no such item{did_you_mean(word, known, 'items')}")
+
+
+def single_options[T](kind: type[T], overrides: Sequence[str], name: str, flag: str = "--set", text: str = "{}") -> T:
+    """An options class, or another attrs class such as a message, checked as a section of a robot YAML.
+
+    Args:
+        kind: the class.
+        overrides: `option=value` texts, e.g. `codec=h264`.
+        name: what errors call the component.
+        flag: which option of the command line the overrides were given by.
+        text: YAML to begin with, e.g. `{data: true}`.
+
+    Raises:
+        ConfigError: with everything that is wrong.
+    """
+    document = parse_yaml(text, name)
+    apply_overrides(document, overrides, flag)
+    document.raise_problems()
+    try:
+        found: T = Converter(Path.cwd()).structure(document.root, kind)
+    except Faults as faults:
+        for key, message in faults.found:
+            document.add(key, message)
+    except (ValueError, TypeError) as error:  # values that do not go together
+        document.add((), error_message(error))
+    else:
+        return found
+    document.raise_problems()
+    raise AssertionError("not reached: there was a fault")

@@ -12,9 +12,8 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from ibrobot_core.config import RobotConfig, from_document
-from ibrobot_core.config.overrides import apply_overrides
+from ibrobot_core.config.overrides import apply_overrides, single_options
 from ibrobot_core.config.show import dump_yaml
-from ibrobot_core.config.single import single_options
 from ibrobot_core.config.yaml_nodes import Document, parse_yaml, scalar
 from ibrobot_core.errors import ConfigError
 from ibrobot_core.options import option

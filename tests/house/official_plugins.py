@@ -11,8 +11,7 @@ import tomllib
 from importlib.metadata import entry_points
 from pathlib import Path
 
-from ibrobot_core.packages import EXTRAS
-from ibrobot_core.plugins import KINDS, OFFICIAL, discover
+from ibrobot_core.plugins import EXTRAS, KINDS, OFFICIAL, discover
 
 CORE = "ibrobot-core"
 DISTRIBUTION = Path(__file__).parents[2] / "plugins" / "ibrobot" / "pyproject.toml"

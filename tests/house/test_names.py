@@ -8,8 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from ibrobot_core.packages import EXTRAS
-from ibrobot_core.plugins import KINDS, OFFICIAL, example_type, official_plugins
+from ibrobot_core.plugins import EXTRAS, KINDS, OFFICIAL, example_type, official_plugins
 
 CORE = OFFICIAL.parent
 ORDINARY = {"gripper", "joint", "keyboard", "process", "trajectory"}
