@@ -207,7 +207,7 @@ class _Panel:
         while not self._pressed.empty():
             self._handle_key(self._pressed.get())
         session = self._runtime.session
-        help_text = session.command_source.help() if session.command_source is not None else ""
+        help_text = session.command_source.help()
         help_text = "\n".join(text for text in (help_text, self._hooks.help()) if text)
         self._rates.sample(session)
         self._display.update(panel(session, self._log, self._rates, help_text, self._hooks.rows()), refresh=True)
@@ -260,8 +260,7 @@ def _tell(runtime: Runtime, hooks: RunHooks, as_json: bool) -> None:
             f"loop       {loop['rate_hz']:.2f} Hz, lateness p50 {loop['lateness_p50_us']:.0f} us, "
             f"p99 {loop['lateness_p99_us']:.0f} us, missed {loop['missed']}"
         )
-    source = runtime.plan.mode.source
-    for heading, text in (*hooks.summary_rows(), *(source.summary_rows() if source is not None else ())):
+    for heading, text in (*hooks.summary_rows(), *runtime.plan.mode.source.summary_rows()):
         echo(f"{heading:10} {text}")
     if runtime.plan.without:
         echo(f"without    {runtime.plan.without}")

@@ -86,8 +86,7 @@ class ControlComponent(Component):
     def _take(self, event: Mapping[str, Any]) -> None:
         session = self._session
         if event["event"] == "goal":
-            if session.command_source is not None:
-                session.command_source.take_goal(event)
+            session.command_source.take_goal(event)
         elif event["event"] == "fault":
             fault = str(event["fault"])
             session.add_fault(fault, int(event["generation"]))

@@ -19,7 +19,7 @@ from ibrobot_core.launch.control import ControlComponent
 from ibrobot_core.launch.outputs.status import Status
 from ibrobot_core.launch.outputs.viewer import ViewerWorker
 from ibrobot_core.launch.perception import SensorWorker
-from ibrobot_core.launch.session import Session
+from ibrobot_core.launch.session import CommandSource, Session
 from ibrobot_core.launch.simulation import SimulatedEpisodes
 from ibrobot_core.launch.sources.planner import PlannerSource
 from ibrobot_core.launch.sources.policy import LoadedModel, PolicySource
@@ -38,11 +38,11 @@ class ModeComponents:
     """What a mode adds to a run."""
 
     models: tuple[LoadedModel, ...]
-    source: SourceWorker | None
+    source: CommandSource
 
     def components(self) -> list[Component]:
         """In starting order."""
-        return [*self.models, *([self.source] if self.source is not None else [])]
+        return [*self.models, *([self.source] if isinstance(self.source, SourceWorker) else [])]
 
 
 @attrs.frozen
@@ -90,7 +90,7 @@ def mode_components(session: Session, name: str, link: TransportLink | None) -> 
         return ModeComponents((), TeleopSource(session, mode, mode.teleop))
     if mode.planner is not None:
         return ModeComponents((), PlannerSource(session, mode, mode.planner))
-    return ModeComponents((), None)
+    return ModeComponents((), CommandSource())
 
 
 def _sensors(session: Session) -> list[PeripheralConfig]:
@@ -137,13 +137,13 @@ def build_plan(session: Session) -> LaunchPlan:
     components += added.models
     components.append(ControlComponent(session, tuple(model.name for model in added.models)))
     components += [SensorWorker(session, peripheral, (CONTROL,)) for peripheral in _sensors(session)]
-    judged = config.simulated and isinstance(added.source, PolicySource)
+    policy = added.source if config.simulated and isinstance(added.source, PolicySource) else None
     episodes = Episodes(session)
     if config.recording is not None:
         worker = RecordingWorker(session, config.recording)
         components.append(worker)
-        episodes = EpisodeService(session, worker, by_mode=judged or not session.request.by_operator)
-    if added.source is not None:
+        episodes = EpisodeService(session, worker, by_mode=policy is not None or not session.request.by_operator)
+    if isinstance(added.source, SourceWorker):
         components.append(added.source)
     components.append(Status(session, (CONTROL,)))
     components += [section.make(options, session) for section, options in session.registry.sections(config)]
@@ -152,8 +152,8 @@ def build_plan(session: Session) -> LaunchPlan:
     if link is not None:
         components += shared
     simulated = None
-    if judged and added.source is not None:
-        simulated = SimulatedEpisodes(session, episodes, (added.source.name,))
+    if policy is not None:
+        simulated = SimulatedEpisodes(session, episodes, (policy.name,))
         components.append(simulated)
     without = describe(session.absent)
     return LaunchPlan(tuple(_ordered(components)), link, added, episodes, simulated, without, config.unavailable)

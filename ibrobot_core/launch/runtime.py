@@ -154,13 +154,10 @@ class Runtime:
             IbrobotError: when the hardware, or what the mode needs, does not answer yet.
         """
         session = self.session
-        if session.command_source is not None:
-            session.command_source.recover()
-            session.command_source.end()
+        session.command_source.recover()
+        session.command_source.end()
         stopped = bool(session.command("reset")["cleared"])
-        session.held = (
-            session.command_source is not None and session.command_source.autonomous and (stopped or session.held)
-        )
+        session.held = session.command_source.autonomous and (stopped or session.held)
         session.begin_source()
         then = f"holding: {session.to_go_on()}" if session.held else f"mode {session.mode} starts over"
         session.log.info("reset; %s", then)
@@ -225,7 +222,7 @@ class Runtime:
             "rates_hz": {name: round(sensor.rate_hz, 2) for name, sensor in session.sensors.items()},
             "drops": session.bus.dropped(),
             "absent": {sensor.name: str(sensor.missing) for sensor in session.absent},
-            **(self.plan.mode.source.facts() if self.plan.mode.source is not None else {}),
+            **self.plan.mode.source.facts(),
         }
 
     def _start(self, component: Component) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import queue
 import threading
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -89,8 +88,8 @@ class SensorFigures:
     """Age of the newest message when it was published, by its stamp; None for messages without one."""
 
 
-class CommandSource(ABC):
-    """What gives the active executors something to do in a mode. It is quiet until `begin`, and after `end`.
+class CommandSource:
+    """What gives the active executors something to do in a mode, from `begin` to `end`. This one gives nothing.
 
     Attributes:
         autonomous: whether it moves the robot without an operator. Such a source does not start again after a reset
@@ -99,17 +98,11 @@ class CommandSource(ABC):
 
     autonomous = False
 
-    @abstractmethod
     def begin(self, seed: int) -> None:
         """Start; called when the mode is entered and after a reset."""
 
-    @abstractmethod
     def end(self) -> None:
         """Stop; called when the mode is left."""
-
-    @abstractmethod
-    def stop(self) -> None:
-        """Release all resources."""
 
     def recover(self) -> None:
         """Recover from a failure; called before a reset.
@@ -153,7 +146,7 @@ class Session:
         finished: set when the run should stop.
         operator_events: what the operator asked for by buttons of a teleoperation device, for what records episodes.
         log: where the run writes its log.
-        command_source: what gives the active executors something to do; None in a mode without one.
+        command_source: what gives the active executors something to do.
         held: whether the robot holds after the reset of a fault, until the operator enters the mode again.
         start_failed: whether the run ended before all of it had started: nothing has moved the robot.
     """
@@ -168,7 +161,7 @@ class Session:
         self.outcome = Outcome()
         self.mode = config.default_control_mode
         self.generation = 0
-        self.command_source: CommandSource | None = None
+        self.command_source = CommandSource()
         self.held = False
         self.start_failed = False
         self.state: ControlState | None = None
@@ -267,13 +260,12 @@ class Session:
 
     def begin_source(self) -> None:
         """Begin the command source of the mode, unless the robot is `held`."""
-        if self.command_source is not None and not self.held:
+        if not self.held:
             self.command_source.begin(self.request.seed)
 
     def pause_feed(self) -> None:
         """End the mode's feed, until `feed`."""
-        if self.command_source is not None:
-            self.command_source.end()
+        self.command_source.end()
 
     @property
     def mode_keys(self) -> dict[str, str]:

@@ -47,8 +47,7 @@ class SimulatedEpisodes(SessionWorker):
         session.command("reset_episode", seed=seed)
         self._begun_ns = session.clock.now_ns()
         self._episodes.begin()
-        if session.command_source is not None:
-            session.command_source.begin(seed)
+        session.command_source.begin(seed)
 
     def _end_episode(self, outcome: str) -> None:
         session = self.session
