@@ -194,9 +194,7 @@ class SectionDescriptor(Descriptor["Component"]):
     runs without its section. Imports what it needs when it is called, and opens nothing."""
     without_section: Callable[[RobotConfig], bool] = attrs.field(default=lambda config: False, kw_only=True)
     """Whether the component also runs with a robot whose file lacks the section."""
-    check_config: Callable[[RobotConfig], Iterable[OptionFault]] = attrs.field(
-        default=lambda config: (), kw_only=True
-    )
+    check_config: Callable[[RobotConfig], Iterable[OptionFault]] = attrs.field(default=lambda config: (), kw_only=True)
     """What is wrong with a robot that it runs with, in any section; opens no device. The `option` of a fault begins at
     the top of the file: `("peripherals", 0, "transform")`."""
 
