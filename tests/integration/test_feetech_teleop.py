@@ -209,6 +209,7 @@ def test_an_unplugged_follower_is_a_fault_and_replugged_a_reset_goes_on(station:
         arms.runtime.session.bus.call(RESET, None)
 
     arms.turn("shoulder_pan", -0.3)
+    arms.follower.settle()  # the servos went on to their goals without the host
     arms.follower.replug()
     stopped = arms.until_at_rest(requests_at_rest=0)
     assert stopped == pytest.approx(0.6, abs=0.05)
