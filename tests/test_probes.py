@@ -74,6 +74,12 @@ def test_a_web_page_under_another_name_learns_nothing(server: ProbeServer, host:
     assert "ibrobot_" not in text
 
 
+def test_request_with_two_hosts_learns_nothing(server: ProbeServer):
+    with socket.create_connection(("127.0.0.1", port(server)), timeout=30) as client:
+        client.sendall(b"GET /metrics HTTP/1.1\r\nHost: localhost\r\nHost: example.org\r\n\r\n")
+        assert b" 403 " in client.recv(100)
+
+
 @pytest.mark.parametrize("host", ["localhost", "LOCALHOST:9464", "127.0.0.1:1", "[::1]:9464"])
 def test_this_machine_may_be_called_by_its_names(server: ProbeServer, host: str):
     assert ask(server, "/metrics", Host=host)[0] == 200

@@ -38,7 +38,7 @@ class WorldOptions:
     padding: float = option(0.005, unit="m", ge=0, help="distance to keep")
     boxes: dict[str, Box] = option(factory=dict, help="boxes by name")
     tip: str = option("pan", help="the joint that carries the tool")
-    token: str = option("", secret=True, help="password of the map server")
+    code: str = option("", secret=True, help="opens the map server")
 
     def __attrs_post_init__(self) -> None:
         if self.table and self.padding > 1:
@@ -87,7 +87,7 @@ def test_an_override_reaches_into_the_section(load_text: Load, base: str) -> Non
         ("{padding: -1}", ": around.padding: -1.0 is too small, must be at least 0 m"),
         ("{padding: wide}", ": around.padding: expected a number, got 'wide'"),
         ("{paddign: 1}", ": around.paddign: unknown key, did you mean 'padding'?"),
-        ("{type: around}", ": around.type: unknown key; known keys: table, padding, boxes, tip, token"),
+        ("{type: around}", ": around.type: unknown key; known keys: table, padding, boxes, tip, code"),
         ("{boxes: {shelf: {size: [1, 2]}}}", ": around.boxes.shelf.size: expected a list of 3 values, got 2"),
         ("{boxes: {shelf: {}}}", ": around.boxes.shelf.size: required key is missing"),
         ("{padding: 2}", ": around: a table does not go with a padding above 1 m"),
@@ -112,16 +112,16 @@ def test_broken_plugins_are_named_beside_an_unknown_section(load_text: Load, bas
 
 
 def test_a_secret_of_a_section_is_not_shown(load_text: Load, base: str) -> None:
-    config = load_text(base + "around: {token: abc123}\n")
-    assert config.plugin_sections["around"].options.token == "abc123"
-    assert config.document["around"]["token"] == "***"
+    config = load_text(base + "around: {code: abc123}\n")
+    assert config.plugin_sections["around"].options.code == "abc123"
+    assert config.document["around"]["code"] == "***"
     assert "abc123" not in to_yaml(config)
 
 
 def test_config_show_has_the_section_with_its_defaults(load_text: Load, base: str) -> None:
     shown = to_yaml(load_text(base + "around: {padding: 0.01}\n"))
     assert yaml.safe_load(shown)["around"] == {
-        "table": True, "padding": 0.01, "boxes": {}, "tip": "pan", "token": "***"
+        "table": True, "padding": 0.01, "boxes": {}, "tip": "pan", "code": "***"
     }  # fmt: skip
 
 
