@@ -258,3 +258,5 @@ class Check:
     found: str
     remedy: str = ""
     """What to do about it, where `ok` is False."""
+    matters: bool = True
+    """Whether `ibrobot doctor` fails where `ok` is False; otherwise it is a note."""

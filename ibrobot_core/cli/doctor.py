@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import glob
 import json
 import os
 import resource
@@ -22,44 +21,29 @@ MLOCK_BYTES = 512 * 1024 * 1024
 """What a control process with a simulation in it locks, with room to spare."""
 
 
-@attrs.frozen
-class Finding:
-    """A check and whether a run is impossible where it fails; otherwise it is a thing to know."""
-
-    check: Check
-    matters: bool
-
-
 @click.command()
 @click.option("--json", "as_json", is_flag=True, help="Print a list of {name, ok, matters, found, remedy}.")
 def doctor(as_json: bool) -> None:
     """Check this machine, with the remedy for what it lacks; exit 1 if something fails that matters."""
-    findings = examine(installed_plugins())
+    checks = examine(installed_plugins())
     if as_json:
-        echo(json.dumps([{**attrs.asdict(f.check), "matters": f.matters} for f in findings], indent=2))
+        echo(json.dumps([attrs.asdict(check) for check in checks], indent=2))
     else:
-        for finding in findings:
-            check = finding.check
-            word = "ok  " if check.ok else ("FAIL" if finding.matters else "note")
+        for check in checks:
+            word = "ok  " if check.ok else ("FAIL" if check.matters else "note")
             echo(f"{word}  {check.name}: {check.found}")
             if not check.ok and check.remedy:
                 echo(f"      {check.remedy}")
-    if any(finding.matters and not finding.check.ok for finding in findings):
+    if any(check.matters and not check.ok for check in checks):
         sys.exit(1)
 
 
-def examine(registry: Registry) -> list[Finding]:
-    """All checks: Python, plugins, their own checks, what types lack, serial ports, real-time permissions, disk."""
+def examine(registry: Registry) -> list[Check]:
+    """All checks: Python, plugins, their own checks, what types lack, real-time permissions, disk."""
     return [
-        Finding(python_version(), True),
-        *(Finding(check, True) for check in plugin_checks(registry)),
-        *(Finding(check, True) for check in registry.doctor()),
-        *(Finding(check, False) for check in types(registry)),
-        *(Finding(check, True) for check in serial_ports()),
-        Finding(realtime(), False),
-        Finding(memory_lock(), False),
-        Finding(disk("."), True),
-    ]
+        python_version(), *plugin_checks(registry), *registry.doctor(), *types(registry), realtime(), memory_lock(),
+        disk("."),
+    ]  # fmt: skip
 
 
 def python_version() -> Check:
@@ -82,7 +66,7 @@ def plugin_checks(registry: Registry) -> list[Check]:
 def types(registry: Registry) -> list[Check]:
     """One check for each installed type that lacks something on this machine, or one for all."""
     lacking = [
-        Check(f"{kind} {type_}", False, missing.missing, missing.remedy)
+        Check(f"{kind} {type_}", False, missing.missing, missing.remedy, matters=False)
         for kind, type_ in sorted(registry.entries)
         for missing in (registry.missing(kind, type_),)
         if missing is not None
@@ -90,38 +74,26 @@ def types(registry: Registry) -> list[Check]:
     return lacking or [Check("libraries", True, "every installed type has what it needs")]
 
 
-def serial_ports(patterns: tuple[str, ...] = ("/dev/ttyACM*", "/dev/ttyUSB*")) -> list[Check]:
-    """Every serial port, and whether this user may open it."""
-    ports = sorted(port for pattern in patterns for port in glob.glob(pattern))
-    if not ports:
-        return [Check("serial ports", True, "none; connect the arm if you expected one")]
-    remedy = "sudo usermod -aG dialout $USER, then log in again"
-    return [
-        Check(f"serial port {port}", ok, "readable and writable" if ok else "no permission", remedy)
-        for port in ports
-        for ok in (os.access(port, os.R_OK | os.W_OK),)
-    ]
-
-
 def realtime() -> Check:
     """Whether the control process and the run's workers may ask for real-time priority."""
-    if os.geteuid() == 0:
-        return Check("real-time priority", True, "permitted (root)")
     limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0] if hasattr(resource, "RLIMIT_RTPRIO") else 0
-    if limit > 0 or limit == resource.RLIM_INFINITY:
-        return Check("real-time priority", True, f"permitted up to {limit if limit > 0 else 99}")
+    if os.geteuid() == 0:
+        found = "permitted (root)"
+    elif limit:
+        found = f"permitted up to {limit if limit > 0 else 99}"
+    else:
+        found = "not permitted; the control loop and pictures may be late under load"
     remedy = "add '@realtime - rtprio 95' to /etc/security/limits.d/ibrobot.conf, join group realtime, log in again"
-    refused = "not permitted; the control loop and pictures may be late under load"
-    return Check("real-time priority", False, refused, remedy)
+    return Check("real-time priority", os.geteuid() == 0 or limit != 0, found, remedy, matters=False)
 
 
 def memory_lock() -> Check:
     """Whether the control process may lock its memory."""
     limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
-    if os.geteuid() == 0 or limit == resource.RLIM_INFINITY:
-        return Check("memory lock", True, "unlimited")
+    unlimited = os.geteuid() == 0 or limit == resource.RLIM_INFINITY
+    found = "unlimited" if unlimited else f"{limit / 1e6:.0f} MB"
     remedy = "add '@realtime - memlock unlimited' to the same file as the real-time priority"
-    return Check("memory lock", limit >= MLOCK_BYTES, f"{limit / 1e6:.0f} MB", remedy)
+    return Check("memory lock", unlimited or limit >= MLOCK_BYTES, found, remedy, matters=False)
 
 
 def disk(folder: str) -> Check:

@@ -1,11 +1,11 @@
-"""The plugin's hooks: hardware `feetech_so101`, teleop `so101_leader`, `ibrobot feetech …`."""
+"""The plugin's hooks: hardware `feetech_so101`, teleop `so101_leader`, `ibrobot feetech …`, serial ports for doctor."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.api import Command, HardwareDescriptor, SensorDescriptor, TeleopDescriptor, hookimpl
+from ibrobot_core.api import Check, Command, HardwareDescriptor, SensorDescriptor, TeleopDescriptor, hookimpl
 from ibrobot_feetech.options import (
     EmulatedSignalOptions,
     FollowerOptions,
@@ -79,3 +79,17 @@ def _commands() -> click.Command:
 def ibrobot_commands() -> Iterable[Command]:
     """`ibrobot feetech …`."""
     yield Command("feetech", "Set up, calibrate, monitor and emulate the servos of an SO-101.", _commands)
+
+
+@hookimpl
+def ibrobot_doctor() -> Iterable[Check]:
+    """Check which serial ports the user may open."""
+    from ibrobot_feetech.usb import usb_ports
+
+    ports = usb_ports()
+    if not ports:
+        yield Check("serial ports", True, "none; connect the arm if you expected one")
+    remedy = "sudo usermod -aG dialout $USER, then log in again"
+    for port in ports:
+        found = "readable and writable" if port.permitted else "no permission"
+        yield Check(f"serial port {port.path}", port.permitted, found, remedy)

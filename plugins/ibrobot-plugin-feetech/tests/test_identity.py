@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import attrs
 import pytest
 from click.testing import CliRunner
+from ibrobot_feetech import ibrobot_doctor
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.calibration import save_calibration
 from ibrobot_feetech.commands import feetech
@@ -159,3 +161,18 @@ class TestPort:
         with pytest.raises(kind, match=told) as refused:
             SerialPort("/dev/ttyACM0", 1_000_000).open()
         assert ("cable" in str(refused.value)) == (kind is PortError)
+
+
+def test_doctor_names_ports_that_the_user_may_not_open(monkeypatch: pytest.MonkeyPatch) -> None:
+    plug_in(monkeypatch, {"/dev/ttyACM0": "A", "/dev/ttyACM1": "B"})
+    monkeypatch.setattr(os, "access", lambda path, mode: path.endswith("0"))
+    free, locked = ibrobot_doctor()
+    assert (free.ok, free.found) == (True, "readable and writable")
+    assert (locked.ok, locked.name) == (False, "serial port /dev/ttyACM1")
+    assert "dialout" in locked.remedy
+
+
+def test_doctor_says_if_there_is_no_port(monkeypatch: pytest.MonkeyPatch) -> None:
+    plug_in(monkeypatch, {})
+    (none,) = ibrobot_doctor()
+    assert (none.ok, none.found) == (True, "none; connect the arm if you expected one")
