@@ -183,7 +183,7 @@ def refuse(name: str, arm: KinematicModel, targets: list[Target], known: list[tu
             refused += 1
             outside += int((error.nearest < arm.lower).any() or (error.nearest > arm.upper).any())
             farther.append(error.position_error - off)
-            if farther[-1] > -1e-5:  # else it is nearer than the known one, and turned otherwise
+            if off < 1e-5:  # the position is within reach
                 more.append(error.rotation_error - turned)
     (median, _), (tail, _), (worst, wall) = np.percentile(took, (50, 99, 100), axis=0) * 1e3
     print(

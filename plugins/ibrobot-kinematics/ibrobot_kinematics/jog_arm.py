@@ -5,11 +5,10 @@ from __future__ import annotations
 import attrs
 import numpy as np
 
-from ibrobot_core.api import Robot, TeleopError, Vector
+from ibrobot_core.api import Robot, TeleopError, Vector, ns
 from ibrobot_kinematics.errors import KinematicsError
-from ibrobot_kinematics.jog import jog
 from ibrobot_kinematics.mjcf import robot_model
-from ibrobot_kinematics.model import KinematicModel
+from ibrobot_kinematics.servo import Servo
 
 _LEVER_M = 0.1
 """Where twists are compared, a turn of one radian counts as this way [m]."""
@@ -34,7 +33,9 @@ class JogArm:
         self.robot = robot
         self.gripper = robot.groups.get(gripper, ())
         self.arm = tuple(name for name in robot.joint_names if name not in self.gripper)
-        self._model: KinematicModel | None = None
+        self._servo: Servo | None = None
+        self._now_ns = 0
+        """The sum of the steps in which the tool moved [ns]."""
 
     def load_model(self, remedy: str) -> None:
         """Load what `move_tool` needs.
@@ -48,9 +49,21 @@ class JogArm:
         if self.robot.description.mjcf is None:
             raise TeleopError(f"Cartesian jog needs robot.description.mjcf: set it, or {remedy}")
         try:
-            self._model = robot_model(self.robot, self.arm)
+            model = robot_model(self.robot, self.arm)
         except KinematicsError as error:
             raise TeleopError(f"Cartesian jog: {error}; set {remedy} to do without it") from error
+        arm = self.robot.indices(self.arm)
+        self._servo = Servo(model, self.robot.max_velocity[arm], self.robot.max_acceleration[arm])
+
+    @property
+    def tool_moves(self) -> bool:
+        """Whether the tool has a velocity from `move_tool`; no twist slows it down to a stop."""
+        return self._servo is not None and bool(self._servo.velocity.any())
+
+    def stop_tool(self) -> None:
+        """Take the tool to be at rest, e.g. since something else holds the arm."""
+        if self._servo is not None:
+            self._servo.reset(self._servo.position)
 
     def move_joints(self, before: Vector, velocity: Vector, dt: float) -> Vector:
         """Setpoints `dt` [s] after `before` [rad], shape (J,), at a velocity [rad/s], shape (J,)."""
@@ -72,10 +85,10 @@ class JogArm:
         return self._bounded(before, before + share * way)
 
     def move_tool(self, before: Vector, linear: Vector, turn: Vector, dt: float) -> Vector:
-        """Setpoints `dt` [s] after `before`, both [rad], shape (J,), where the tool moves.
+        """Setpoints `dt` [s] after `before`, both [rad], shape (J,), where the tool moves, as `Servo` moves it.
 
         Args:
-            before: the setpoints before.
+            before: the setpoints before. Where they are not those of the last call, the tool begins at rest there.
             linear: velocity of the tool in the base frame [m/s], shape (3,).
             turn: angular velocity about the tool's own axes [rad/s], shape (3,). The z axis is where the tool points:
                 roll turns about it, pitch about y, and the heading, about x, is held as well as the arm can.
@@ -84,12 +97,20 @@ class JogArm:
         Raises:
             TeleopError: before `load_model`.
         """
-        if self._model is None:
+        servo = self._servo
+        if servo is None:
             raise TeleopError("the model of the arm is not loaded: load_model comes before move_tool")
         arm = self.robot.indices(self.arm)
-        angular = self._model.forward(before[arm]).rotation @ turn
+        if not np.array_equal(before[arm], servo.position):
+            servo.reset(before[arm])
+        servo.step(self._now_ns)
+        if linear.any() or turn.any():
+            servo.command(linear, servo.tip().rotation @ turn, self._now_ns)
+        else:
+            servo.halt()
+        self._now_ns += ns(dt)
         after = before.copy()
-        after[arm] = jog(self._model, before[arm], linear, angular, dt, self.robot.max_velocity[arm])
+        after[arm] = servo.step(self._now_ns)
         return self._bounded(before, after)
 
     def _bounded(self, before: Vector, after: Vector) -> Vector:
@@ -152,7 +173,7 @@ class VelocityJog:
         assert self._setpoint is not None
         arm = self._arm.robot.indices(self._arm.arm)
         twist = np.concatenate([motion.linear, _LEVER_M * motion.turn])
-        turns_tool = bool(twist.any())
+        turns_tool = bool(twist.any()) or self._arm.tool_moves
         fresh = motion.velocity * self._direction < 0
         moving = motion.velocity != 0
         self._direction = np.where(moving, np.sign(motion.velocity), self._direction)

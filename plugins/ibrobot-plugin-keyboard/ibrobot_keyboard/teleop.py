@@ -59,6 +59,7 @@ class KeyboardTeleop(Teleop):
         self._setpoint = measured.position.copy()
         self._held.clear()
         self._moved_ns = None
+        self._arm.stop_tool()
         while self._next_key() is not None:  # typed for something else
             pass
 
@@ -68,17 +69,18 @@ class KeyboardTeleop(Teleop):
             raise TeleopError(f"{self._ctx.name}: the keyboard is not connected: connect comes before read")
         now_ns = measured.stamp_ns
         self._held = {axis: held for axis, held in self._held.items() if now_ns < held[1]}
-        if not self._held:
+        if not self._moves():
             # What is pressed now begins to move now: a host that stood still does not make up for it in one leap.
             self._moved_ns = None
         while (key := self._next_key()) is not None:
             action = self._keymap.action(self._mode, key)
             if action == "estop":
                 self._held.clear()
+                self._arm.stop_tool()
                 return TeleopCommand(None, estop=True)
             if action is not None:
                 self._press(action, now_ns)
-        if not self._held:
+        if not self._moves():
             return TeleopCommand(None)
         if self._setpoint is None:
             self._setpoint = measured.position.copy()
@@ -124,18 +126,23 @@ class KeyboardTeleop(Teleop):
         robot, options, speed = self._ctx.robot, self._options, self._speed
         velocity = np.zeros(len(robot.joints))
         after = before
-        if _HOME in self._held and self._home is not None:
+        jogs_tool = self._mode == "cartesian" and _HOME not in self._held
+        if self._arm.tool_moves or (jogs_tool and any(axis in self._held for axis in CARTESIAN_AXES)):
+            # Where anything else is asked for, the tool slows down to a stop first.
+            x, y, z, pitch, roll = (self._direction(axis) if jogs_tool else 0 for axis in CARTESIAN_AXES)
+            linear = np.array([x, y, z]) * options.cartesian_speed * speed
+            turn = np.array([0.0, pitch, roll]) * options.joint_speed * speed
+            after = self._arm.move_tool(before, linear, turn, dt)
+        elif _HOME in self._held and self._home is not None:
             after = self._arm.move_towards(before, self._home, options.joint_speed * speed, dt)
         elif self._mode == "joints":
             for i, name in zip(robot.indices(self._arm.arm), self._arm.arm, strict=True):
                 velocity[i] = self._direction(name) * options.joint_speed * speed
-        elif any(axis in self._held for axis in CARTESIAN_AXES):
-            x, y, z, pitch, roll = (self._direction(axis) for axis in CARTESIAN_AXES)
-            linear = np.array([x, y, z]) * options.cartesian_speed * speed
-            turn = np.array([0.0, pitch, roll]) * options.joint_speed * speed
-            after = self._arm.move_tool(before, linear, turn, dt)
         velocity[robot.indices(self._arm.gripper)] = self._direction(_GRIPPER) * options.gripper_speed * speed
         return self._arm.move_joints(after, velocity, dt)
+
+    def _moves(self) -> bool:
+        return bool(self._held) or self._arm.tool_moves
 
     def _direction(self, axis: str) -> int:
         return self._held[axis][0] if axis in self._held else 0

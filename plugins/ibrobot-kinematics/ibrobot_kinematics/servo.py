@@ -1,0 +1,309 @@
+"""Servo: moves the tool along a stream of twists, smoothly and within the limits of the joints.
+
+What any device that jogs a tool uses: keyboards, gamepads, 3D mice, phones, and topics of twists.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from enum import IntEnum
+
+import attrs
+import numpy as np
+
+from ibrobot_core.api import Vector, documented, ns, option, seconds
+from ibrobot_kinematics.model import KinematicModel, TipPose
+from ibrobot_kinematics.quadratic import bounded_minimum
+
+_LEVER_M = 0.1
+"""Turning the tip by a radian weighs as much as moving it by this [m]."""
+_DAMPING = 1e-7
+_MISSED_SLOW, _MISSED_HALT = 0.25, 0.5
+"""Shares of a twist that the tip may miss before it slows down, and where the reach ends and it stands."""
+_LOOK_AHEAD_S = 0.05
+"""How far ahead the arm looks to see whether it approaches a singularity or an obstacle, or leaves it."""
+_LEAVING = 0.1
+"""Least share of the speed at which an arm leaves a singularity, however near it is."""
+_AT_REST = 1e-6
+"""Speed of joints [rad/s or m/s] that counts as none."""
+_LONGEST_TICK_S = 0.1
+"""A longer gap between steps counts as a stop: what was missed is not made up for."""
+
+
+class ServoStatus(IntEnum):
+    """What holds the tool back, by the codes of MoveIt Servo (moveit_servo/status_codes.h, ROS 2 Humble)."""
+
+    INVALID = -1
+    """The last twist was refused."""
+    NO_WARNING = 0
+    DECELERATE_FOR_APPROACHING_SINGULARITY = 1
+    HALT_FOR_SINGULARITY = 2
+    DECELERATE_FOR_COLLISION = 3
+    HALT_FOR_COLLISION = 4
+    JOINT_BOUND = 5
+    """A joint is near its limit, or the tool at the edge of its reach."""
+    DECELERATE_FOR_LEAVING_SINGULARITY = 6
+
+
+@documented
+@attrs.frozen
+class ServoOptions:
+    """When a tool slows down and stops."""
+
+    timeout: float = option(0.1, unit="s", gt=0, le=1, help="how long a twist is valid; then the tool slows to a stop")
+    max_linear: float = option(1.0, unit="m/s", gt=0, help="twists faster than that are refused")
+    max_angular: float = option(6.0, unit="rad/s", gt=0, help="twists that turn faster are refused")
+    lower_singularity_threshold: float = option(
+        30.0, gt=1, help="condition number of the Jacobian, at a lever of 0.1 m, from which the tool slows down"
+    )
+    hard_stop_singularity_threshold: float = option(100.0, gt=1, help="condition number at which it stops")
+    joint_limit_margin: float = option(
+        0.1, unit="rad", gt=0, help="distance from its limit within which a joint slows down from its full speed"
+    )
+    slow_distance: float = option(0.05, unit="m", gt=0, help="distance from an obstacle from which the tool slows down")
+    stop_distance: float = option(0.01, unit="m", ge=0, help="distance from an obstacle at which it stops")
+
+    def __attrs_post_init__(self) -> None:
+        for low, high in (
+            ("lower_singularity_threshold", "hard_stop_singularity_threshold"), ("stop_distance", "slow_distance"),
+        ):  # fmt: skip
+            below, above = attrs.asdict(self)[low], attrs.asdict(self)[high]
+            if not below < above:
+                raise ValueError(f"{low} is {below:g}, must be below {high}, which is {above:g}")
+
+
+@attrs.frozen(eq=False)
+class _Twist:
+    linear: Vector
+    angular: Vector
+    in_tool: bool
+    until_ns: int
+
+
+class Servo:
+    """Joint positions that follow twists of the tool, tick by tick.
+
+    The tip follows the newest twist as well as the arm can. Where it cannot, e.g. at the edge of the reach, it slows
+    down and stands. Speeds and accelerations of joints stay within their limits, and so do positions; a joint beyond
+    its limit only moves inwards. When no twist comes in time, the arm slows down to a stop. Each tick needs the time;
+    nothing here looks at a clock.
+
+    Args:
+        model: the arm.
+        max_velocity: highest speed of each joint [rad/s or m/s], shape (J,).
+        max_acceleration: highest acceleration of each joint [rad/s² or m/s²], shape (J,).
+        options: when it slows down and stops.
+        clearance: joint positions, shape (J,) -> distance to the nearest obstacle [m]; None where nobody knows any.
+        turn_weights: how much turns about the tip's own x, y and z axes count, shape (3,). By default an arm with five
+            joints, which cannot control all of them, gives way about the tip's x axis: the heading of a tool that
+            points along z.
+
+    Attributes:
+        position: joint positions [rad or m], shape (J,).
+        velocity: joint velocities [rad/s or m/s], shape (J,).
+        status: what holds the tool back.
+        refused: reason -> how many twists were refused for it.
+    """
+
+    def __init__(
+        self,
+        model: KinematicModel,
+        max_velocity: Vector,
+        max_acceleration: Vector,
+        options: ServoOptions = ServoOptions(),
+        *,
+        clearance: Callable[[Vector], float] | None = None,
+        turn_weights: Sequence[float] = (0.05, 1.0, 1.0),
+    ) -> None:
+        joints = model.lower.shape
+        for name, limits in (("max_velocity", max_velocity), ("max_acceleration", max_acceleration)):
+            if np.shape(limits) != joints or not (np.isfinite(limits) & (np.asarray(limits) > 0)).all():
+                raise ValueError(f"{name} must be above 0 with shape {joints}, got {np.asarray(limits).tolist()}")
+        self._model = model
+        self._options = options
+        self._clearance = clearance
+        self._max_velocity, self._max_acceleration = max_velocity[model.moving], max_acceleration[model.moving]
+        # From full speed a joint stops within the margin, unless its acceleration is too low for that.
+        braking = self._max_velocity**2 / (2 * options.joint_limit_margin)
+        self._braking = np.minimum(braking, self._max_acceleration)
+        self._weights = np.concatenate([np.ones(3), _LEVER_M * np.asarray(turn_weights, dtype=float)])
+        self.refused: Counter[str] = Counter()
+        self.reset((model.lower + model.upper) / 2)
+
+    def reset(self, position: Vector) -> None:
+        """Stand at a position, and forget all twists.
+
+        Args:
+            position: joint positions [rad or m], shape (J,).
+
+        Raises:
+            ValueError: when it is not finite or has another shape.
+        """
+        if np.shape(position) != self._model.lower.shape or not np.isfinite(position).all():
+            raise ValueError(
+                f"position must be finite with shape {self._model.lower.shape}, got {np.asarray(position).tolist()}"
+            )
+        self.position = np.array(position, dtype=float)
+        self.velocity = np.zeros_like(self.position)
+        self.status = ServoStatus.NO_WARNING
+        self._twist: _Twist | None = None
+        self._last_ns: int | None = None
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether no joint moves, and no twist asks for it."""
+        return self._twist is None and not np.abs(self.velocity).max() > _AT_REST
+
+    def tip(self) -> TipPose:
+        """Where the tip is in the base frame."""
+        return self._model.forward(self.position)
+
+    def command(self, linear: Vector, angular: Vector, now_ns: int, *, in_tool: bool = False) -> str | None:
+        """Follow a twist from now on, until the timeout.
+
+        Args:
+            linear: velocity of the tip's origin [m/s], shape (3,).
+            angular: angular velocity of the tip [rad/s], shape (3,).
+            now_ns: the time [ns].
+            in_tool: whether both are along the axes of the tip, rather than those of the base frame.
+
+        Returns:
+            Why it was refused, and the twist before it stays; None where it was not.
+        """
+        reason = self._fault(np.asarray(linear), np.asarray(angular))
+        if reason is not None:
+            self.refuse(reason)
+            return reason
+        until = now_ns + ns(self._options.timeout)
+        self._twist = _Twist(np.array(linear, dtype=float), np.array(angular, dtype=float), in_tool, until)
+        if self.status is ServoStatus.INVALID:
+            self.status = ServoStatus.NO_WARNING
+        return None
+
+    def refuse(self, reason: str) -> None:
+        """Count a twist that was refused."""
+        self.refused[reason] += 1
+        self.status = ServoStatus.INVALID
+
+    def halt(self) -> None:
+        """Forget the twist: the arm slows down to a stop."""
+        self._twist = None
+
+    def step(self, now_ns: int) -> Vector:
+        """Joint positions at a time, shape (J,).
+
+        Args:
+            now_ns: the time [ns]; where it does not go on, nothing moves.
+        """
+        last, self._last_ns = self._last_ns, now_ns
+        if self._twist is not None and now_ns >= self._twist.until_ns:
+            self._twist = None
+        if last is None or now_ns <= last:
+            return self.position.copy()
+        dt = seconds(now_ns - last)
+        if dt > _LONGEST_TICK_S:
+            self.velocity = np.zeros_like(self.position)
+            return self.position.copy()
+        moving = self._model.moving
+        lowest, highest = self._bounds(dt)
+        wanted = np.zeros(len(moving))
+        if self._twist is not None:
+            wanted = self._wanted(self._twist, np.minimum(lowest, 0), np.maximum(highest, 0))
+        elif self.status is not ServoStatus.INVALID:
+            self.status = ServoStatus.NO_WARNING
+        # All joints change their speeds in step, so that the tool goes straight from one twist to the next.
+        before = self.velocity[moving]
+        change, most = wanted - before, self._max_acceleration * dt
+        share = min(1.0, float(np.min(most / np.maximum(np.abs(change), 1e-12))))
+        after = np.clip(before + share * change, lowest, highest)
+        after = np.clip(after, before - most, before + most)
+        self.velocity[moving] = after
+        self.position[moving] += after * dt
+        return self.position.copy()
+
+    def _fault(self, linear: Vector, angular: Vector) -> str | None:
+        if linear.shape != (3,) or angular.shape != (3,):
+            return "not three numbers each"
+        if not (np.isfinite(linear).all() and np.isfinite(angular).all()):
+            return "not finite"
+        if np.linalg.norm(linear) > self._options.max_linear:
+            return f"faster than {self._options.max_linear:g} m/s"
+        if np.linalg.norm(angular) > self._options.max_angular:
+            return f"turns faster than {self._options.max_angular:g} rad/s"
+        return None
+
+    def _bounds(self, dt: float) -> tuple[Vector, Vector]:
+        """Speeds from which each joint can still stop at its limit; none outwards beyond it."""
+        moving = self._model.moving
+        here, drop = self.position[moving], self._braking * dt
+
+        def stoppable(room: Vector) -> Vector:
+            # What is left after this tick at the speed v, room - v dt, suffices to stop from it.
+            return np.asarray(np.sqrt(drop**2 + 2 * self._braking * np.maximum(room, 0.0)) - drop)
+
+        highest = np.minimum(stoppable(self._model.upper[moving] - here), self._max_velocity)
+        lowest = -np.minimum(stoppable(here - self._model.lower[moving]), self._max_velocity)
+        return lowest, highest
+
+    def _wanted(self, twist: _Twist, lowest: Vector, highest: Vector) -> Vector:
+        """Speeds of the joints that follow a twist, scaled down where need be; and the status."""
+        model = self._model
+        moving = model.moving
+        tip, jacobian = model.forward_and_jacobian(self.position)
+        to_tip = tip.rotation.T
+        linear, angular = twist.linear, twist.angular
+        linear, angular = (tip.rotation @ linear, angular) if twist.in_tool else (linear, to_tip @ angular)
+        # Turns are in the frame of the tip, where their weights are.
+        rates = self._weights[:, None] * np.vstack([jacobian[:3, moving], to_tip @ jacobian[3:, moving]])
+        asked = self._weights * np.concatenate([linear, angular])
+        self.status = ServoStatus.NO_WARNING
+        size = float(np.linalg.norm(asked))
+        if size == 0:
+            return np.zeros(len(moving))
+        hessian, gradient = rates.T @ rates + _DAMPING * np.eye(len(moving)), -rates.T @ asked
+        # A tool that would be too fast goes slower, on the same way.
+        excess = float(np.max(np.abs(np.linalg.solve(hessian, gradient)) / self._max_velocity))
+        slower = 1 / max(excess, 1.0)
+        wanted = bounded_minimum(hessian, slower * gradient, lowest, highest)
+        missed = float(np.linalg.norm(rates @ wanted - slower * asked)) / (slower * size)
+        scale = float(np.clip((_MISSED_HALT - missed) / (_MISSED_HALT - _MISSED_SLOW), 0, 1))
+        near_limit = (wanted <= lowest) & (lowest > -self._max_velocity)
+        near_limit |= (wanted >= highest) & (highest < self._max_velocity)
+        if scale < 1 or near_limit.any():
+            self.status = ServoStatus.JOINT_BOUND
+        ahead = self.position.copy()
+        ahead[moving] += wanted * _LOOK_AHEAD_S
+        scale *= self._scale_for_singularity(jacobian, ahead)
+        if self._clearance is not None:
+            scale *= self._scale_for_obstacles(self._clearance, ahead)
+        return scale * wanted
+
+    def _scale_for_singularity(self, jacobian: Vector, ahead: Vector) -> float:
+        options = self._options
+        condition = self._condition(jacobian)
+        if condition <= options.lower_singularity_threshold:
+            return 1.0
+        way = options.hard_stop_singularity_threshold - options.lower_singularity_threshold
+        scale = float(np.clip((options.hard_stop_singularity_threshold - condition) / way, 0, 1))
+        if self._condition(self._model.jacobian(ahead)) < condition:
+            self.status = ServoStatus.DECELERATE_FOR_LEAVING_SINGULARITY
+            return max(scale, _LEAVING)
+        halts = scale == 0
+        self.status = ServoStatus.HALT_FOR_SINGULARITY if halts else ServoStatus.DECELERATE_FOR_APPROACHING_SINGULARITY
+        return scale
+
+    def _condition(self, jacobian: Vector) -> float:
+        levers = np.array([1.0] * 3 + [_LEVER_M] * 3)
+        values = np.linalg.svd(levers[:, None] * jacobian[:, self._model.moving], compute_uv=False)
+        return float(values[0] / max(values[-1], 1e-12))
+
+    def _scale_for_obstacles(self, clearance: Callable[[Vector], float], ahead: Vector) -> float:
+        options = self._options
+        distance = clearance(self.position)
+        if distance >= options.slow_distance or clearance(ahead) > distance:
+            return 1.0
+        way = options.slow_distance - options.stop_distance
+        scale = float(np.clip((distance - options.stop_distance) / way, 0, 1))
+        self.status = ServoStatus.HALT_FOR_COLLISION if scale == 0 else ServoStatus.DECELERATE_FOR_COLLISION
+        return scale
