@@ -136,8 +136,10 @@ class Child:
             # A session of its own: Ctrl-C in the terminal is for the host, which then ends the child in order.
             self._process = subprocess.Popen(
                 [sys.executable, "-m", module, *map(str, inherited)],
-                pass_fds=inherited, stdin=subprocess.DEVNULL, start_new_session=True,
-            )  # fmt: skip
+                pass_fds=inherited,
+                stdin=subprocess.DEVNULL,
+                start_new_session=True,
+            )
         self.channel = Channel(ours)
         self.failed: Mapping[str, Any] | None = None
         self._waiting: list[Mapping[str, Any]] = []

@@ -14,24 +14,9 @@ from ibrobot_core.options import NoOptions, OptionFault
 if TYPE_CHECKING:
     import click
 
+    from ibrobot_core import interfaces
     from ibrobot_core.component import Component
     from ibrobot_core.config.schema import RobotConfig
-    from ibrobot_core.interfaces import (
-        Context,
-        DatasetWriter,
-        Engine,
-        EpisodeAddress,
-        EpisodeReader,
-        Executor,
-        Hardware,
-        Planner,
-        Policy,
-        Recorder,
-        Sensor,
-        Teleop,
-        Transport,
-        Viewer,
-    )
     from ibrobot_core.launch.session import Session
     from ibrobot_core.launch.transport import TransportLink
     from ibrobot_core.messages import CompressedImage, Image
@@ -48,7 +33,7 @@ class Descriptor[T]:
 
     type: str
     """What the YAML gives as `type`."""
-    make: Callable[[Any, Context], T]
+    make: Callable[[Any, interfaces.Context], T]
     summary: str
     options: builtins.type[Any] = NoOptions
     """A frozen attrs class made with `ibrobot_core.options.option`."""
@@ -70,7 +55,7 @@ class Descriptor[T]:
 
 
 @attrs.frozen
-class HardwareDescriptor(Descriptor["Hardware"]):
+class HardwareDescriptor(Descriptor["interfaces.Hardware"]):
     """Hardware; `simulated` ones are `SimulatedHardware` and may stand in the `simulation:` section."""
 
     simulated: bool = False
@@ -87,7 +72,7 @@ class HardwareDescriptor(Descriptor["Hardware"]):
 
 
 @attrs.frozen
-class SensorDescriptor(Descriptor["Sensor"]):
+class SensorDescriptor(Descriptor["interfaces.Sensor"]):
     """A sensor of a kind, e.g. `camera` or `imu`."""
 
     kind: str = "camera"
@@ -96,17 +81,17 @@ class SensorDescriptor(Descriptor["Sensor"]):
 
 
 @attrs.frozen
-class TeleopDescriptor(Descriptor["Teleop"]):
+class TeleopDescriptor(Descriptor["interfaces.Teleop"]):
     """A teleoperation device."""
 
 
 @attrs.frozen
-class PolicyDescriptor(Descriptor["Policy"]):
+class PolicyDescriptor(Descriptor["interfaces.Policy"]):
     """A policy."""
 
 
 @attrs.frozen
-class EngineDescriptor(Descriptor["Engine"]):
+class EngineDescriptor(Descriptor["interfaces.Engine"]):
     """A place where the model of a policy runs, and `Context.model` is that model.
 
     In the YAML `inference.execution_mode` names the type, and its options stand beside it.
@@ -119,7 +104,7 @@ class EngineDescriptor(Descriptor["Engine"]):
 
 
 @attrs.frozen
-class ExecutorDescriptor(Descriptor["Executor"]):
+class ExecutorDescriptor(Descriptor["interfaces.Executor"]):
     """An executor; `streams` says that it follows setpoints (from policies and teleop) rather than goals.
 
     The options of one that streams derive from `ibrobot_core.executor_options.StreamOptions`.
@@ -132,12 +117,12 @@ class ExecutorDescriptor(Descriptor["Executor"]):
 
 
 @attrs.frozen
-class PlannerDescriptor(Descriptor["Planner"]):
+class PlannerDescriptor(Descriptor["interfaces.Planner"]):
     """A motion planner."""
 
 
 @attrs.frozen
-class TransportDescriptor(Descriptor["Transport"]):
+class TransportDescriptor(Descriptor["interfaces.Transport"]):
     """A transport."""
 
     listen: Callable[[Sequence[str]], Mapping[str, Any]] | None = None
@@ -153,7 +138,7 @@ class TransportDescriptor(Descriptor["Transport"]):
 
 
 @attrs.frozen
-class RecorderDescriptor(Descriptor["Recorder"]):
+class RecorderDescriptor(Descriptor["interfaces.Recorder"]):
     """An episode recorder."""
 
 
@@ -170,7 +155,7 @@ class Flag:
 
 
 @attrs.frozen
-class DatasetDescriptor(Descriptor["DatasetWriter"]):
+class DatasetDescriptor(Descriptor["interfaces.DatasetWriter"]):
     """A dataset writer."""
 
     flags: tuple[Flag, ...] = ()
@@ -178,7 +163,7 @@ class DatasetDescriptor(Descriptor["DatasetWriter"]):
 
 
 @attrs.frozen
-class ViewerDescriptor(Descriptor["Viewer"]):
+class ViewerDescriptor(Descriptor["interfaces.Viewer"]):
     """A viewer."""
 
 
@@ -207,7 +192,7 @@ class ReaderDescriptor:
     summary: str
     reads: Callable[[Path], bool]
     """Whether what lies at a path is of this format; looks at names and first bytes only."""
-    make: Callable[[EpisodeAddress], EpisodeReader]
+    make: Callable[[interfaces.EpisodeAddress], interfaces.EpisodeReader]
     """Opens an episode.
 
     Raises:

@@ -15,16 +15,7 @@ from typing import TYPE_CHECKING, Any
 import attrs
 import pluggy
 
-from ibrobot_core import hookspecs
-from ibrobot_core.descriptors import (
-    Check,
-    Command,
-    ConfigFile,
-    DecoderDescriptor,
-    Descriptor,
-    ReaderDescriptor,
-    SectionDescriptor,
-)
+from ibrobot_core import descriptors, hookspecs
 from ibrobot_core.errors import (
     ContractError,
     MissingDependency,
@@ -89,7 +80,7 @@ class Entry:
     """A descriptor with where it comes from."""
 
     kind: str
-    descriptor: Descriptor[Any]
+    descriptor: descriptors.Descriptor[Any]
     plugin: str
     package: str
     version: str
@@ -101,17 +92,17 @@ class Registry:
 
     entries: dict[tuple[str, str], Entry] = attrs.field(factory=dict)
     failures: list[Failure] = attrs.field(factory=list)
-    configs: list[ConfigFile] = attrs.field(factory=list)
-    readers: list[ReaderDescriptor] = attrs.field(factory=list)
-    decoders: list[DecoderDescriptor] = attrs.field(factory=list)
-    commands: dict[str, Command] = attrs.field(factory=dict)
+    configs: list[descriptors.ConfigFile] = attrs.field(factory=list)
+    readers: list[descriptors.ReaderDescriptor] = attrs.field(factory=list)
+    decoders: list[descriptors.DecoderDescriptor] = attrs.field(factory=list)
+    commands: dict[str, descriptors.Command] = attrs.field(factory=dict)
     managers: dict[str, pluggy.PluginManager] = attrs.field(factory=dict)
 
     def types(self, kind: str) -> list[str]:
         """The types offered of a kind, sorted."""
         return sorted(t for k, t in self.entries if k == kind)
 
-    def of_kind(self, kind: str) -> list[Descriptor[Any]]:
+    def of_kind(self, kind: str) -> list[descriptors.Descriptor[Any]]:
         """The descriptors of a kind, sorted by type."""
         return [self.entries[kind, type_].descriptor for type_ in self.types(kind)]
 
@@ -119,7 +110,7 @@ class Registry:
         """Package -> version, of those that offer something, sorted."""
         return dict(sorted({entry.package: entry.version for entry in self.entries.values()}.items()))
 
-    def find(self, kind: str, type_: str) -> Descriptor[Any]:
+    def find(self, kind: str, type_: str) -> descriptors.Descriptor[Any]:
         """The descriptor of `type_`.
 
         Raises:
@@ -130,11 +121,11 @@ class Registry:
             raise self.not_found(kind, type_)
         return entry.descriptor
 
-    def sections(self, config: RobotConfig) -> Iterator[tuple[SectionDescriptor, Any]]:
+    def sections(self, config: RobotConfig) -> Iterator[tuple[descriptors.SectionDescriptor, Any]]:
         """The plugins' sections that count for a robot, each with its options; None where the file lacks it."""
         for name in self.types("section"):
             descriptor = self.find("section", name)
-            assert isinstance(descriptor, SectionDescriptor)
+            assert isinstance(descriptor, descriptors.SectionDescriptor)
             section = config.plugin_sections.get(name)
             if section is not None or descriptor.without_section(config):
                 yield descriptor, None if section is None else section.options
@@ -222,14 +213,18 @@ class Registry:
         """The plugins that failed, to append to the message that something unknown was asked for."""
         return "".join(f"; {failure}" for failure in self.failures)
 
-    def doctor(self) -> list[Check]:
+    def doctor(self) -> list[descriptors.Check]:
         """The checks of all plugins; a plugin whose check raises is itself a failed check."""
-        checks: list[Check] = []
+        checks: list[descriptors.Check] = []
         for name, manager in self.managers.items():
             try:
                 checks += [check for result in manager.hook.ibrobot_doctor() for check in result]
             except Exception as error:  # noqa: BLE001 - contained: a plugin's fault must not hide the other checks
-                checks.append(Check(f"plugin {name}", False, f"its doctor check failed: {_reason(error)}", "report it"))
+                checks.append(
+                    descriptors.Check(
+                        f"plugin {name}", False, f"its doctor check failed: {_reason(error)}", "report it"
+                    )
+                )
         return checks
 
     def emit(self, event: str, **facts: Any) -> None:
@@ -292,7 +287,9 @@ def _collect(registry: Registry, plugin: str, package: str, version: str, manage
     try:
         for stage in (*KINDS.values(), *_UNTYPED):
             offers[stage] = [each for result in getattr(manager.hook, stage)() for each in result]
-            if stage in KINDS.values() and (wrong := [d for d in offers[stage] if not isinstance(d, Descriptor)]):
+            if stage in KINDS.values() and (
+                wrong := [d for d in offers[stage] if not isinstance(d, descriptors.Descriptor)]
+            ):
                 raise TypeError(f"expected a Descriptor, got {wrong[0]!r}")
     except Exception as error:  # noqa: BLE001 - contained: reported where the plugin is asked for
         registry.failures.append(Failure(plugin, package, stage, _reason(error)))

@@ -48,10 +48,7 @@ def show(type_: str, as_json: bool) -> None:
     if not entries:
         raise PluginError(_unknown(registry, type_))
     found = [
-        {
-            **_row(registry, entry),
-            "options": [attrs.asdict(option) for option in described(entry.descriptor.options)],
-        }
+        {**_row(registry, entry), "options": [attrs.asdict(option) for option in described(entry.descriptor.options)]}
         for entry in entries
     ]
     if as_json:

@@ -9,13 +9,7 @@ from typing import Any
 import attrs
 
 from ibrobot_core.config.models import READERS, DescriptionModel, Limits, ModelError
-from ibrobot_core.config.schema import (
-    ControlConfig,
-    ControlMode,
-    ExecutorConfig,
-    HardwareConfig,
-    InferenceConfig,
-)
+from ibrobot_core.config.schema import ControlConfig, ControlMode, ExecutorConfig, HardwareConfig, InferenceConfig
 from ibrobot_core.config.structure import ParsedComponent, ParsedSections
 from ibrobot_core.config.yaml_nodes import Document, Key
 from ibrobot_core.descriptors import ExecutorDescriptor, TransportDescriptor
@@ -195,10 +189,7 @@ class Checks:
             return
         if pose := control.load_shedding.pose:
             self.document.refer(("control", "load_shedding", "pose"), pose, list(robot.description.poses), "pose")
-        for key, value, words in (
-            ("startup", control.startup, ("hold",)),
-            ("stop", control.stop, ("hold", "relax")),
-        ):
+        for key, value, words in (("startup", control.startup, ("hold",)), ("stop", control.stop, ("hold", "relax"))):
             word, _, pose = value.partition(" ")
             if value in words:
                 continue

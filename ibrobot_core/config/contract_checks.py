@@ -9,14 +9,7 @@ import attrs
 
 from ibrobot_core import messages
 from ibrobot_core.config.checks import streams
-from ibrobot_core.config.schema import (
-    TASK_KEY,
-    ActionSpec,
-    ContractConfig,
-    ExecutorConfig,
-    ObservationSpec,
-    SignalSpec,
-)
+from ibrobot_core.config.schema import TASK_KEY, ActionSpec, ContractConfig, ExecutorConfig, ObservationSpec, SignalSpec
 from ibrobot_core.config.structure import ParsedComponent, ParsedSections
 from ibrobot_core.config.yaml_nodes import Document, Key
 from ibrobot_core.errors import ContractError
@@ -26,7 +19,7 @@ from ibrobot_core.selection import Selection
 
 JOINT_STATES = "/joint_states"
 PERIPHERAL_TOPICS: Mapping[str, tuple[str, type[messages.Message]]] = {
-    "camera": ("/camera/{name}/image_raw", messages.Image),
+    "camera": ("/camera/{name}/image_raw", messages.Image)
 }
 """Peripheral kind -> where its messages go, and their type."""
 

@@ -292,9 +292,7 @@ class SignalSpec:
     type: str = option("", help="ROS 2 message type; of std_msgs, and String, Float32 or Bool, where it is not given")
     select: tuple[str, ...] = option(("data",), help="the path to the text or number in the message")
     align: str = option(
-        "hold",
-        choices=("hold", "next"),
-        help="hold: the newest message received by the tick; next: the first after it",
+        "hold", choices=("hold", "next"), help="hold: the newest message received by the tick; next: the first after it"
     )
 
 

@@ -10,16 +10,7 @@ from typing import Any
 import attrs
 import yaml
 
-from ibrobot_core.config.schema import (
-    SECTIONS,
-    ComponentConfig,
-    ContractConfig,
-    ControlMode,
-    ObservationSpec,
-    PeripheralConfig,
-    RobotConfig,
-    SimulationConfig,
-)
+from ibrobot_core.config import schema
 from ibrobot_core.config.yaml_nodes import is_text
 from ibrobot_core.options import HIDDEN, fields
 from ibrobot_core.outside import without_credentials
@@ -53,24 +44,24 @@ def _without_secrets(value: Any, shown: Mapping[str, str]) -> Any:
 
 
 @plain.register
-def _(value: ObservationSpec) -> dict[str, Any]:
+def _(value: schema.ObservationSpec) -> dict[str, Any]:
     # The topic and type of a peripheral were filled in; a file says either these or the peripheral.
     left_out = ("topic", "type") if value.peripheral is not None else ()
     return {name: item for name, item in _fields(value).items() if name not in left_out}
 
 
-_RESOLVED: Mapping[type, str] = {PeripheralConfig: "sim", SimulationConfig: "default_control_mode"}
+_RESOLVED: Mapping[type, str] = {schema.PeripheralConfig: "sim", schema.SimulationConfig: "default_control_mode"}
 """Component -> a key that loading has resolved: a simulated sensor's options, the mode that a simulation begins in."""
 
 
 @plain.register
-def _(value: ComponentConfig) -> dict[str, Any]:
+def _(value: schema.ComponentConfig) -> dict[str, Any]:
     own = {name: item for name, item in _fields(value).items() if name != _RESOLVED.get(type(value))}
     return {**own, **plain(value.options)}
 
 
 @plain.register
-def _(value: ControlMode) -> dict[str, Any]:
+def _(value: schema.ControlMode) -> dict[str, Any]:
     left_out = ("dispatch",) if value.inference is None else ()
     return {name: item for name, item in _fields(value).items() if item is not None and name not in left_out}
 
@@ -91,14 +82,14 @@ def _(value: Path) -> str:
     return str(value)
 
 
-def document(config: RobotConfig) -> dict[str, Any]:
+def document(config: schema.RobotConfig) -> dict[str, Any]:
     """What a YAML that says everything about this run would hold, with `${…}` or `***` for secrets."""
-    sections = {name: plain(getattr(config, name)) for name in SECTIONS}
+    sections = {name: plain(getattr(config, name)) for name in schema.SECTIONS}
     sections |= {name: plain(section.options) for name, section in config.plugin_sections.items()}
     sections["peripherals"] = list(sections["peripherals"].values())
     if list(config.hardware) == ["hardware"]:
         sections["hardware"] = sections["hardware"]["hardware"]
-    if config.contract == ContractConfig():
+    if config.contract == schema.ContractConfig():
         del sections["contract"]
     given = {name: section for name, section in sections.items() if section not in (None, {}, [])}
     without: dict[str, Any] = _without_secrets(given, config.secrets)
@@ -128,6 +119,6 @@ def dump_yaml(value: Any) -> str:
     return yaml.dump(value, Dumper=_Dumper, sort_keys=False, width=120, allow_unicode=True)
 
 
-def to_yaml(config: RobotConfig) -> str:
+def to_yaml(config: schema.RobotConfig) -> str:
     """The whole config as YAML text."""
     return dump_yaml(document(config))

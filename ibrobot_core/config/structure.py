@@ -10,25 +10,9 @@ from typing import Any
 
 import attrs
 
+from ibrobot_core.config import schema
 from ibrobot_core.config.convert import Converter, Faults, error_message, unknown_key
 from ibrobot_core.config.missing import Missing
-from ibrobot_core.config.schema import (
-    SECTIONS,
-    ComponentConfig,
-    ExecutorConfig,
-    HardwareConfig,
-    InferenceConfig,
-    ModelConfig,
-    NamedComponentConfig,
-    PeripheralConfig,
-    PlannerConfig,
-    RecordingConfig,
-    SimulationConfig,
-    TeleopConfig,
-    TransportConfig,
-    ViewerConfig,
-    component_of,
-)
 from ibrobot_core.config.secrets import note
 from ibrobot_core.config.yaml_nodes import Document, Key
 from ibrobot_core.descriptors import Descriptor, HardwareDescriptor, SensorDescriptor
@@ -40,7 +24,7 @@ _NAME = re.compile(r"[A-Za-z0-9_-]+")
 
 
 @attrs.frozen
-class ParsedComponent[C: ComponentConfig]:
+class ParsedComponent[C: schema.ComponentConfig]:
     """A structured component with its place and its plugin's descriptor."""
 
     key: Key
@@ -55,20 +39,20 @@ class ParsedSections:
     simulated: bool
     plain: dict[str, Any] = attrs.field(factory=dict)
     """Sections that are attrs classes by themselves."""
-    hardware: dict[str, ParsedComponent[HardwareConfig]] = attrs.field(factory=dict)
-    simulation: ParsedComponent[SimulationConfig] | None = None
-    peripherals: dict[str, ParsedComponent[PeripheralConfig]] = attrs.field(factory=dict)
-    executors: dict[str, ParsedComponent[ExecutorConfig]] = attrs.field(factory=dict)
-    models: dict[str, ParsedComponent[ModelConfig]] = attrs.field(factory=dict)
-    teleoperation: dict[str, ParsedComponent[TeleopConfig]] = attrs.field(factory=dict)
-    planners: dict[str, ParsedComponent[PlannerConfig]] = attrs.field(factory=dict)
+    hardware: dict[str, ParsedComponent[schema.HardwareConfig]] = attrs.field(factory=dict)
+    simulation: ParsedComponent[schema.SimulationConfig] | None = None
+    peripherals: dict[str, ParsedComponent[schema.PeripheralConfig]] = attrs.field(factory=dict)
+    executors: dict[str, ParsedComponent[schema.ExecutorConfig]] = attrs.field(factory=dict)
+    models: dict[str, ParsedComponent[schema.ModelConfig]] = attrs.field(factory=dict)
+    teleoperation: dict[str, ParsedComponent[schema.TeleopConfig]] = attrs.field(factory=dict)
+    planners: dict[str, ParsedComponent[schema.PlannerConfig]] = attrs.field(factory=dict)
     """By control mode."""
-    inference: dict[str, ParsedComponent[InferenceConfig]] = attrs.field(factory=dict)
+    inference: dict[str, ParsedComponent[schema.InferenceConfig]] = attrs.field(factory=dict)
     """By control mode."""
-    recording: ParsedComponent[RecordingConfig] | None = None
-    transport: ParsedComponent[TransportConfig] | None = None
-    viewer: ParsedComponent[ViewerConfig] | None = None
-    plugin_sections: dict[str, ParsedComponent[ComponentConfig]] = attrs.field(factory=dict)
+    recording: ParsedComponent[schema.RecordingConfig] | None = None
+    transport: ParsedComponent[schema.TransportConfig] | None = None
+    viewer: ParsedComponent[schema.ViewerConfig] | None = None
+    plugin_sections: dict[str, ParsedComponent[schema.ComponentConfig]] = attrs.field(factory=dict)
     """The sections of plugins."""
     missing: list[Missing] = attrs.field(factory=list)
     """What could not be made for want of a plugin."""
@@ -92,7 +76,7 @@ class _Outline(Converter):
     """Takes components as mappings: they are structured afterwards, by their plugins."""
 
     def structure(self, value: Any, kind: Any) -> Any:
-        component = component_of(kind)
+        component = schema.component_of(kind)
         if component is kind or (component is not None and component.may_be_alone):
             kind = Mapping[str, Any]
         return super().structure(value, kind)
@@ -128,19 +112,19 @@ class SectionParser:
         self._simulation(sections)
         self._hardware(sections)
         self._peripherals(sections)
-        sections.executors = self._named("executors", ExecutorConfig)
-        sections.models = self._named("models", ModelConfig)
-        sections.teleoperation = self._named("teleoperation", TeleopConfig)
+        sections.executors = self._named("executors", schema.ExecutorConfig)
+        sections.models = self._named("models", schema.ModelConfig)
+        sections.teleoperation = self._named("teleoperation", schema.TeleopConfig)
         for name, mode in (sections.plain.get("control_modes") or {}).items():
             if mode.planner is not None:
-                planner = self._component(("control_modes", name, "planner"), PlannerConfig)
+                planner = self._component(("control_modes", name, "planner"), schema.PlannerConfig)
                 sections.planners |= {name: planner} if planner is not None else {}
             if mode.inference is not None:
-                inference = self._component(("control_modes", name, "inference"), InferenceConfig)
+                inference = self._component(("control_modes", name, "inference"), schema.InferenceConfig)
                 sections.inference |= {name: inference} if inference is not None else {}
-        sections.transport = self._component(("transport",), TransportConfig)
-        sections.viewer = self._component(("viewer",), ViewerConfig)
-        sections.recording = self._component(("recording",), RecordingConfig)
+        sections.transport = self._component(("transport",), schema.TransportConfig)
+        sections.viewer = self._component(("viewer",), schema.ViewerConfig)
+        sections.recording = self._component(("recording",), schema.RecordingConfig)
         return sections
 
     def contract(self) -> ParsedSections:
@@ -149,9 +133,9 @@ class SectionParser:
         self._sections(sections, ("contract",))
         return sections
 
-    def _sections(self, sections: ParsedSections, names: Collection[str] = tuple(SECTIONS)) -> None:
+    def _sections(self, sections: ParsedSections, names: Collection[str] = tuple(schema.SECTIONS)) -> None:
         """The file's own level: unknown and missing sections, and those that need no plugin."""
-        known = {name: field for name, field in SECTIONS.items() if name in names}
+        known = {name: field for name, field in schema.SECTIONS.items() if name in names}
         faults = Faults()
         for name, value in self.document.root.items():
             if name not in known:
@@ -166,14 +150,14 @@ class SectionParser:
             if isinstance(error, PluginNotInstalled):
                 self._missing.append(Missing((name,), (name,), error))
             else:
-                known = [*SECTIONS, *self.registry.types("section")]
+                known = [*schema.SECTIONS, *self.registry.types("section")]
                 faults.add((name,), unknown_key(name, known) + self.registry.broken)
         elif value is not None:
             if isinstance(value, Mapping):
                 note(self.document, found.descriptor.options, value, (name,))
             with faults.at(name):
                 options = self._converter.structure(value, found.descriptor.options)
-                section = ComponentConfig(name, options)
+                section = schema.ComponentConfig(name, options)
                 sections.plugin_sections[name] = ParsedComponent((name,), section, found.descriptor)
 
     def _report(self, key: Key, faults: Faults, below_sim: Collection[str] = ()) -> None:
@@ -181,7 +165,7 @@ class SectionParser:
             middle = ("sim",) if inner and inner[0] in below_sim else ()
             self.document.add((*key, *middle, *inner), message)
 
-    def _component[C: ComponentConfig](
+    def _component[C: schema.ComponentConfig](
         self,
         key: Key,
         kind: type[C],
@@ -227,7 +211,7 @@ class SectionParser:
         return ParsedComponent(key, kind(**arguments, **named, **described, options=options), descriptor)
 
     def _find(
-        self, key: Key, kind: type[ComponentConfig], type_: str, needed: bool, faults: Faults
+        self, key: Key, kind: type[schema.ComponentConfig], type_: str, needed: bool, faults: Faults
     ) -> Descriptor[Any] | None:
         if not needed and (kind.plugin_kind, type_) not in self.registry.entries:
             return None
@@ -241,7 +225,7 @@ class SectionParser:
             return None
 
     def _options(
-        self, descriptor: Descriptor[Any], kind: type[ComponentConfig], value: Mapping[str, Any], faults: Faults
+        self, descriptor: Descriptor[Any], kind: type[schema.ComponentConfig], value: Mapping[str, Any], faults: Faults
     ) -> Any:
         own = fields(kind)
         known = {name: field for name, field in fields(descriptor.options).items() if name not in own}
@@ -261,7 +245,7 @@ class SectionParser:
             faults.add((), error_message(error))
             return None
 
-    def _named[C: NamedComponentConfig](self, section: str, kind: type[C]) -> dict[str, ParsedComponent[C]]:
+    def _named[C: schema.NamedComponentConfig](self, section: str, kind: type[C]) -> dict[str, ParsedComponent[C]]:
         found = {}
         for name in self.document.names(section):
             self._check_name((section, name), name)
@@ -277,10 +261,10 @@ class SectionParser:
     def _simulation(self, sections: ParsedSections) -> None:
         if "simulation" not in self.document.root:
             return
-        part = self._component(("simulation",), SimulationConfig, needed=sections.simulated or self._elsewhere)
+        part = self._component(("simulation",), schema.SimulationConfig, needed=sections.simulated or self._elsewhere)
         if part is None:
             return
-        if not SimulationConfig.takes(part.descriptor):
+        if not schema.SimulationConfig.takes(part.descriptor):
             message = f"{part.descriptor.type!r} is not a simulation; it belongs in the hardware section"
             self.document.add(("simulation", "type"), message)
         elif sections.simulated or self._elsewhere:
@@ -299,10 +283,10 @@ class SectionParser:
         for name in value if several else ("hardware",):
             key: Key = ("hardware", name) if several else ("hardware",)
             self._check_name(key, name)
-            part = self._component(key, HardwareConfig, name=name, needed=not sections.simulated)
+            part = self._component(key, schema.HardwareConfig, name=name, needed=not sections.simulated)
             if part is None:
                 continue
-            if not HardwareConfig.takes(part.descriptor):
+            if not schema.HardwareConfig.takes(part.descriptor):
                 message = f"{part.descriptor.type!r} is a simulation; it belongs in the simulation section"
                 self.document.add((*key, "type"), message)
             sections.hardware[name] = part
@@ -327,10 +311,10 @@ class SectionParser:
 
     def _peripheral(
         self, key: Key, item: Mapping[str, Any], stand_in: str | None, *, needed: bool, simulated: bool
-    ) -> ParsedComponent[PeripheralConfig] | None:
+    ) -> ParsedComponent[schema.PeripheralConfig] | None:
         """The sensor as it is, or the simulation's of its kind with the options that both have."""
         before = len(self.document.problems)
-        as_is = self._component(key, PeripheralConfig, needed=needed)
+        as_is = self._component(key, schema.PeripheralConfig, needed=needed)
         if as_is is not None and isinstance(as_is.descriptor, SensorDescriptor):
             kind, type_ = as_is.component.kind, as_is.component.type
             if as_is.descriptor.kind != kind:
@@ -342,10 +326,10 @@ class SectionParser:
         if stand_in is None or len(self.document.problems) > before:
             return as_is
         entry = self.registry.entries.get(("sensor", stand_in))
-        shared = [*fields(PeripheralConfig), *(fields(entry.descriptor.options) if entry else ())]
+        shared = [*fields(schema.PeripheralConfig), *(fields(entry.descriptor.options) if entry else ())]
         kept = {name: value for name, value in item.items() if name in shared}
         added = item.get("sim", {})
-        return self._component(key, PeripheralConfig, {**kept, **added, "type": stand_in}, below_sim=added)
+        return self._component(key, schema.PeripheralConfig, {**kept, **added, "type": stand_in}, below_sim=added)
 
     def _only_simulated(self, kind: str, type_: str) -> bool:
         descriptors = (entry.descriptor for entry in self.registry.entries.values())

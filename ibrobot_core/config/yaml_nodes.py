@@ -20,11 +20,7 @@ from ibrobot_core.outside import redacted
 Key = tuple[str | int, ...]
 """Where a value is in a document: mapping keys and list indices from the top."""
 
-_DEFAULT_TAGS = (
-    BaseResolver.DEFAULT_SCALAR_TAG,
-    BaseResolver.DEFAULT_SEQUENCE_TAG,
-    BaseResolver.DEFAULT_MAPPING_TAG,
-)
+_DEFAULT_TAGS = (BaseResolver.DEFAULT_SCALAR_TAG, BaseResolver.DEFAULT_SEQUENCE_TAG, BaseResolver.DEFAULT_MAPPING_TAG)
 _BOOLS = {"true": True, "True": True, "TRUE": True, "false": False, "False": False, "FALSE": False}
 _NULLS = {"", "~", "null", "Null", "NULL"}
 _INT = re.compile(r"[-+]?[0-9]+")

@@ -115,9 +115,7 @@ def trajectory_goal(message: JointTrajectory) -> dict[str, Any]:
     for index, point in enumerate(message.points):
         if point.effort.size:
             raise GoalRejected(f"point {index} has efforts; only positions, velocities and accelerations are followed")
-        motion = {
-            "positions": point.positions, "velocities": point.velocities, "accelerations": point.accelerations
-        }  # fmt: skip
+        motion = {"positions": point.positions, "velocities": point.velocities, "accelerations": point.accelerations}
         given = {name: values.tolist() for name, values in motion.items() if values.size}
         points.append({"time_from_start_ns": point.time_from_start_ns, **given})
     return {"trajectory": {"joint_names": list(message.joint_names), "points": points}}

@@ -65,9 +65,8 @@ class RecordingWorker(Worker):
 
     def __init__(self, session: Session, config: RecordingConfig) -> None:
         super().__init__(
-            "recording", f"{config.type} into {config.root}", on_failure=session.fail,
-            lockstep=session.request.lockstep,
-        )  # fmt: skip
+            "recording", f"{config.type} into {config.root}", on_failure=session.fail, lockstep=session.request.lockstep
+        )
         self._session = session
         self._config = config
         self._contract = Contract.from_config(session.config)
@@ -258,8 +257,9 @@ class RecordingWorker(Worker):
             there = ", ".join(self._session.bus.topics())
             self._session.log.warning(
                 "recording.topics: nothing of %s has come so far, nor was recorded; available: %s",
-                ", ".join(absent), there,
-            )  # fmt: skip
+                ", ".join(absent),
+                there,
+            )
 
     def _keeps(self, topic: str) -> bool:
         return is_kept(topic, self._config, self._contract)
