@@ -220,11 +220,8 @@ class Registry:
             try:
                 checks += [check for result in manager.hook.ibrobot_doctor() for check in result]
             except Exception as error:  # noqa: BLE001 - contained: a plugin's fault must not hide the other checks
-                checks.append(
-                    descriptors.Check(
-                        f"plugin {name}", False, f"its doctor check failed: {_reason(error)}", "report it"
-                    )
-                )
+                found = f"its doctor check failed: {_reason(error)}"
+                checks.append(descriptors.Check(f"plugin {name}", False, found, "report it"))
         return checks
 
     def emit(self, event: str, **facts: Any) -> None:
@@ -287,9 +284,8 @@ def _collect(registry: Registry, plugin: str, package: str, version: str, manage
     try:
         for stage in (*KINDS.values(), *_UNTYPED):
             offers[stage] = [each for result in getattr(manager.hook, stage)() for each in result]
-            if stage in KINDS.values() and (
-                wrong := [d for d in offers[stage] if not isinstance(d, descriptors.Descriptor)]
-            ):
+            wrong = [each for each in offers[stage] if not isinstance(each, descriptors.Descriptor)]
+            if wrong and stage in KINDS.values():
                 raise TypeError(f"expected a Descriptor, got {wrong[0]!r}")
     except Exception as error:  # noqa: BLE001 - contained: reported where the plugin is asked for
         registry.failures.append(Failure(plugin, package, stage, _reason(error)))
