@@ -29,6 +29,7 @@ html_title = "ibrobot"
 autodoc_member_order = "bysource"
 autodoc_default_options = {"members": True, "show-inheritance": True}
 # Names of other projects, of type parameters, and of what has no page of its own.
+nitpick_ignore = [("py:class", "ibrobot_core.interfaces.planner.Goal")]  # a type alias, which autodoc leaves out
 nitpick_ignore_regex = [("py:.*", r"(?!ibrobot_core\.interfaces\.\w+\.[A-Z]).*")]
 
 

@@ -104,6 +104,7 @@ def trajectory_goal(message: JointTrajectory) -> dict[str, Any]:
     It starts when it is accepted: the stamp of the message is not used.
 
     Returns:
+        Names and points, as
         `{"trajectory": {"joint_names": […], "points": […]}}`. Each point has `time_from_start_ns` and, where the
         message has them, `positions` [rad], `velocities` [rad/s] and `accelerations` [rad/s^2], in the order of the
         names.
