@@ -27,6 +27,14 @@ _SAME = 1e-3
 """Solutions that differ less [rad] count as one."""
 _SEEDS = 12
 """Random configurations from which numerical searches begin, besides the start."""
+_BRANCHES = 8
+"""Most branches of a position with an axis."""
+_AS_NEAR = 0.02
+"""Orientations count as equally near up to this difference [rad]."""
+_POSITION_WEIGHT = 100.0
+"""A centimetre weighs as much as a radian."""
+_TURNS, _SETTLED = 40, 1e-6
+"""Steps of a search for the nearest orientation, and a step [rad] that ends it."""
 _NEARLY_ONE = 1e-3
 """How far from 1 the length of a quaternion may be."""
 
@@ -189,9 +197,8 @@ class Tool:
             return axis
         normal = normal / length
         flat = axis - (axis @ normal) * normal
-        if np.linalg.norm(flat) < 1e-6:
-            raise _unreachable("the tool's axis stands across the arm's plane; arm_plane cannot turn it into the plane")
-        return np.asarray(flat / np.linalg.norm(flat))
+        across = float(np.linalg.norm(flat))
+        return axis if across < 1e-6 else np.asarray(flat / across)
 
     def _at(
         self, position: Vector, axis: Vector | None, start: Vector, tolerance: float, axis_tolerance: float
@@ -231,24 +238,28 @@ class Tool:
 
     def _posed(self, position: Vector, rotation: Vector, start: Vector, tolerance: float) -> list[Candidate]:
         """Configurations at a position, the orientation as near to `rotation` as found, nearest first."""
-        starts = [start]
-        try:
-            starts += solve_all(self.model, Target(position, axis=rotation[:, 2]), start, position_tolerance=tolerance)
-        except KinematicsError:  # out of reach, or no closed form
-            starts += list(self._seeds(start))
-        found = []
-        for begin in starts:
+        found: list[Vector] = []
+        for axis in (rotation[:, 2], self._in_plane(position, rotation[:, 2]), None, *self._pitched(position)):
             try:
-                found.append(
-                    solve(
-                        self.model, Target(position, rotation), begin, position_tolerance=tolerance,
-                        rotation_tolerance=np.pi,
-                    )
-                )  # fmt: skip
+                found += solve_all(self.model, Target(position, axis=axis), start, position_tolerance=tolerance)
             except UnreachableError:
                 continue
-        candidates = [self._compared(q, position, rotation) for q in _distinct(found)]
-        return sorted(candidates, key=lambda each: each.orientation_error)
+            except KinematicsError:  # no closed form
+                found += list(self._seeds(start))
+                break
+        candidates: list[Candidate] = []
+        for begin in (start, *_distinct(found)):
+            q = _turned_towards(self.model, position, rotation, begin)
+            candidates.append(self._compared(q, position, rotation))
+            # The branches of the tool's axis come first: where they meet the orientation, no other is nearer.
+            if len(candidates) > _BRANCHES and min(each.orientation_error for each in candidates) < _SAME:
+                break
+        placed = sorted(
+            (each for each in candidates if each.position_error <= tolerance), key=lambda each: each.orientation_error
+        )
+        best = [each for each in placed if each.orientation_error <= placed[0].orientation_error + _AS_NEAR]
+        kept = _distinct([each.joints for each in best])
+        return [each for each in best if any(each.joints is q for q in kept)]
 
     def _numerical(
         self, target: Target, start: Vector, tolerances: Mapping[str, float]
@@ -274,6 +285,60 @@ class Tool:
     def _compared(self, q: Vector, position: Vector, rotation: Vector | None, axis: Vector | None = None) -> Candidate:
         tip = self.model.forward(q)
         return Candidate(q, float(np.linalg.norm(tip.position - position)), turned(tip, rotation, axis))
+
+
+def _turned_towards(model: KinematicModel, position: Vector, rotation: Vector, start: Vector) -> Vector:
+    """The configuration with the orientation nearest to `rotation` at a position that a search from `start` finds.
+
+    Levenberg-Marquardt steps within the limits; the position weighs so much that its error stays below a tenth of a
+    millimetre where it can be reached.
+    """
+    moving = model.moving
+    lower, upper = model.lower[moving], model.upper[moving]
+
+    def errors(q: Vector) -> tuple[Vector, Vector]:
+        tip, jacobian = model.forward_and_jacobian(q)
+        error = np.concatenate([_POSITION_WEIGHT * (position - tip.position), _vector_of(rotation @ tip.rotation.T)])
+        return error, np.concatenate([_POSITION_WEIGHT * jacobian[:3, moving], jacobian[3:, moving]])
+
+    q, damping = np.clip(start, model.lower, model.upper), 1e-2
+    error, rows = errors(q)
+    for _ in range(_TURNS):
+        free = np.ones(len(moving), dtype=bool)
+        for _ in moving:
+            step = np.zeros(len(moving))
+            some = rows[:, free]
+            step[free] = np.linalg.solve(some.T @ some + damping * np.eye(int(free.sum())), some.T @ error)
+            # Joints that would leave their limits stay there, and the others find their way without them.
+            out = free & (
+                (q[moving] + step < lower) & (q[moving] <= lower) | (q[moving] + step > upper) & (q[moving] >= upper)
+            )
+            if not out.any() or not (free & ~out).any():
+                break
+            free &= ~out
+        trial = q.copy()
+        trial[moving] = np.clip(q[moving] + np.clip(step, -0.5, 0.5), lower, upper)
+        error_there, rows_there = errors(trial)
+        if error_there @ error_there < error @ error:
+            done = np.abs(trial - q).max() < _SETTLED
+            q, error, rows, damping = trial, error_there, rows_there, max(damping / 5, 1e-6)
+            if done:
+                break
+        else:
+            damping *= 4
+            if damping > 1e6:
+                break
+    return q
+
+
+def _vector_of(relative: Vector) -> Vector:
+    """Rotation vector of a rotation matrix [rad], shape (3,)."""
+    skewed = np.array(
+        [relative[2, 1] - relative[1, 2], relative[0, 2] - relative[2, 0], relative[1, 0] - relative[0, 1]]
+    )
+    sine = float(np.linalg.norm(skewed)) / 2
+    angle = float(np.arctan2(sine, (np.trace(relative) - 1) / 2))
+    return np.asarray(skewed / 2 * (angle / sine if sine > 1e-9 else 1.0))
 
 
 def turned(tip: TipPose, rotation: Vector | None, axis: Vector | None = None) -> float:
