@@ -416,7 +416,7 @@ def test_foreign_commands_come_as_what_they_are(tmp_path: Path, told: Callable[[
     np.testing.assert_array_equal(rows(tmp_path / "set")["action"], [[i + 0.5, 1.0, 2.0] for i in range(30)])
     again = run(tmp_path / "set", "--to", "bag", "--out", tmp_path / "again")
     assert again.code == 1
-    assert f"action: no {type_} can be made, which foreign bags have on /commands" in again.err
+    assert f"action: cannot make a {type_} for /commands, because the action is foreign" in again.err
     assert not (tmp_path / "again").exists()
 
 

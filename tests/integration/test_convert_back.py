@@ -175,7 +175,7 @@ def test_a_foreign_dataset_is_described_by_a_robot_yaml(exact: Path, convert: Co
     (tmp_path / "theirs/meta/ibrobot.json").unlink()
     done = convert(tmp_path / "theirs", "--to", "bag", "--out", tmp_path / "back")
     assert done.returncode == 1
-    assert "was not made by ibrobot, so it does not say which robot its vectors are of" in done.stderr
+    assert "was not made by ibrobot, so it does not name its robot" in done.stderr
     assert not (tmp_path / "back").exists()
     robot = {
         "robot": ROBOT["robot"] | {

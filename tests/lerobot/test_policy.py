@@ -208,7 +208,7 @@ def test_a_batch_that_draws_in_unknown_ways_is_run_one_by_one(
         for _ in range(2):
             for tensors, outputs in zip(batch, policy.infer_batch(batch), strict=True):
                 np.testing.assert_array_equal(outputs["action"], policy.infer(tensors)["action"])
-    assert caplog.text.count("requests are run one by one") == 1
+    assert caplog.text.count("so requests run one by one") == 1
 
 
 def test_inference_of_a_batch_leaves_the_processs_random_numbers_alone(folders: dict[str, Path]) -> None:
@@ -238,7 +238,7 @@ def test_half_precision_is_near(folders: dict[str, Path]) -> None:
 def test_a_first_run_that_overflows_is_reported(folders: dict[str, Path], caplog: pytest.LogCaptureFixture) -> None:
     """One joint did not move in the dataset, so that its normalised zero is beyond float16."""
     loaded(folders["act"], dtype="float16")
-    assert "act overflows torch.float16 in a run on zeros; bfloat16 and float32" in caplog.text
+    assert "act overflows torch.float16 for zero inputs; bfloat16 and float32" in caplog.text
 
 
 def test_a_first_run_that_fails_is_reported(folders: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""The plugin's hooks: LeRobot's datasets, written and read without it and torch, and its policies."""
+"""The plugin's hooks: reads and writes LeRobot datasets without LeRobot or torch, and runs LeRobot policies."""
 
 from __future__ import annotations
 
@@ -37,27 +37,27 @@ def _policy(options: Any, ctx: Context) -> Policy:
 
 @hookimpl
 def ibrobot_datasets() -> Iterable[DatasetDescriptor]:
-    """What writes datasets that LeRobot trains on."""
+    """The writer of LeRobot datasets."""
     yield DatasetDescriptor(
         type="lerobot", options=LeRobotOptions, make=_write, default=True, summary="LeRobot v3.0: videos and tables",
         flags=(
-            Flag("--codec", "codec", "Video encoder, e.g. h264; auto takes a GPU's where one opens."),
-            Flag("--crf", "crf", "Video quality; lower is better and larger."),
-            Flag("--no-videos", "videos", "Keep pictures as they are, as PNG in the tables.", "false"),
+            Flag("--codec", "codec", "Video encoder, e.g. h264; auto uses a GPU's if available."),
+            Flag("--crf", "crf", "Video quality; lower values give better quality and larger files."),
+            Flag("--no-videos", "videos", "Store lossless images, as PNG in the tables.", "false"),
         ),
     )  # fmt: skip
 
 
 @hookimpl
 def ibrobot_readers() -> Iterable[ReaderDescriptor]:
-    """What reads episodes of datasets."""
+    """The reader of LeRobot datasets."""
     yield ReaderDescriptor("lerobot", "LeRobot v3.0 datasets, as DATASET:N", _reads, _read, numbered=True)
 
 
 @hookimpl
 def ibrobot_policies() -> Iterable[PolicyDescriptor]:
-    """What runs the policies that LeRobot trains."""
+    """The policy that runs LeRobot checkpoints."""
     yield PolicyDescriptor(
         type="lerobot", options=LeRobotPolicyOptions, make=_policy,
-        summary="a checkpoint of LeRobot's: ACT, Diffusion, VQ-BeT, SmolVLA, pi0, …",
+        summary="a LeRobot checkpoint: ACT, Diffusion, VQ-BeT, SmolVLA, pi0, …",
     )  # fmt: skip

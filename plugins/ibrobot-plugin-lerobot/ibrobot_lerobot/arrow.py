@@ -1,7 +1,7 @@
-"""Arrow arrays of Python values and NumPy arrays, without pandas.
+"""Arrow arrays from Python values and NumPy arrays, without pandas.
 
-`pyarrow.array` imports pandas where that is installed, as beside LeRobot: more than a second and 130 MiB in every
-process, for types of it that are never given here.
+If pandas is installed, as it is with LeRobot, `pyarrow.array` imports it. This would take more than a second and
+130 MiB in every process, for pandas types that are not used here.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ _NUMBERS = {
 
 
 def to_array(values: Any, kind: pa.DataType) -> pa.Array:
-    """The array of type `kind` that has `values`, a sequence of any kind without gaps.
+    """An array of type `kind` with `values`, a sequence without missing values.
 
-    Types are those of the tables: numbers that a feature may have, booleans, text, bytes, lists of any of them, and
-    structs of mappings.
+    Supported types are those of the tables: numeric types of features, booleans, text, bytes, lists of these, and
+    structs from mappings.
     """
     if types.is_struct(kind):
         columns = [to_array([value[field.name] for value in values], field.type) for field in kind]
@@ -45,7 +45,7 @@ def to_array(values: Any, kind: pa.DataType) -> pa.Array:
 
 
 def table_of(rows: Sequence[Mapping[str, Any]], schema: pa.Schema | None = None) -> pa.Table:
-    """The table of `rows`, of this schema, else of the first row's types."""
+    """A table of `rows`, with `schema` or else with the types of the first row."""
     schema = schema or pa.schema([(name, _type_of(value)) for name, value in rows[0].items()])
     return pa.Table.from_arrays(
         [to_array([row[field.name] for row in rows], field.type) for field in schema], schema=schema
@@ -53,7 +53,7 @@ def table_of(rows: Sequence[Mapping[str, Any]], schema: pa.Schema | None = None)
 
 
 def to_numpy(column: pa.ChunkedArray) -> Any:
-    """The values of a column of numbers or of lists of one length: shape (N, D)."""
+    """The values of a column of numbers, or of lists of equal length: shape (N, D)."""
     blocks = [_block(chunk) for chunk in column.chunks]
     return np.concatenate(blocks) if blocks else np.empty((0, 1))
 
@@ -80,7 +80,7 @@ def _flat(values: Any) -> Any:
 
 
 def _offsets(values: Sequence[Any]) -> Any:
-    """Where each begins, and the end of the last."""
+    """The start of each value, and the end of the last."""
     return np.cumsum([0, *map(len, values)], dtype=np.int32)
 
 

@@ -1,4 +1,4 @@
-"""A checkpoint's folder, read without torch: its configuration, its processors, and what it was trained on."""
+"""Reads a checkpoint without torch: its configuration, its processors, and the origin of its training data."""
 
 from __future__ import annotations
 
@@ -38,36 +38,36 @@ _WITHOUT_PROMPT = frozenset({"act", "diffusion", "vqbet", "tdmpc", "gaussian_act
 _REAL_TIME_CHUNKING = frozenset({"evo1", "groot", "molmoact2", "pi0", "pi05", "smolvla"})
 _CHUNK_SIZES = ("chunk_size", "action_chunk_size", "action_horizon", "n_action_steps")
 _SHORTER_CHUNKS = frozenset({"diffusion", "multi_task_dit"})
-"""They predict a horizon, and give `n_action_steps` of it."""
+"""Policies that predict a horizon and return `n_action_steps` of it."""
 _ACTION_HEADS = {"act": "model.action_head.weight", "diffusion": "diffusion.unet.final_conv.1.weight"}
 """Type -> the tensor of weights whose first dimension is the size of an action."""
 _EMPTY_CAMERA = "observation.images.empty_camera_"
-"""Stands for a camera that a pretrained model had and the robot has not; the model fills it in."""
+"""Placeholder for a camera of a pretrained model that the robot does not have; the model fills it in."""
 
 
 @attrs.frozen
 class Checkpoint:
-    """What the files say, but for the weights."""
+    """The contents of a checkpoint's files, without the weights."""
 
     path: Path
     type: str
-    """LeRobot's name of the kind of policy, e.g. `act`."""
+    """LeRobot's name of the policy type, e.g. `act`."""
     config: Mapping[str, Any]
     inputs: Mapping[str, tuple[str, tuple[int, ...]]]
-    """Names within the policy -> kind (STATE, ENV, VISUAL), and shape of the observation: images (H, W, C)."""
+    """Feature name in the policy -> type (STATE, ENV, VISUAL) and shape of the observation; images are (H, W, C)."""
     action_size: int
     chunk_size: int
     n_obs_steps: int
-    """Ticks of observations that it sees at once."""
+    """Number of ticks of observations that the policy uses."""
     processors: Mapping[str, Mapping[str, Any]]
     """File -> its JSON."""
     trained_on: Mapping[str, Any]
-    """The dataset's `meta/ibrobot.json`; empty where it is not known."""
+    """The dataset's `meta/ibrobot.json`; empty if unknown."""
     trained_on_path: Path | None
 
     @property
     def names(self) -> dict[str, str]:
-        """The contract's keys -> names within the policy."""
+        """Key in the contract -> feature name in the policy."""
         renamed: dict[str, str] = {}
         for step in self.processors[PREPROCESSOR]["steps"]:
             if step.get("registry_name") == RENAME:
@@ -76,7 +76,7 @@ class Checkpoint:
         return {back.get(name, name): name for name in self.inputs}
 
     def spec(self, n_action_steps: int | None) -> PolicySpec:
-        """What it needs and gives, with chunks of at most `n_action_steps`."""
+        """Inputs and outputs of the policy, with chunks of at most `n_action_steps`."""
         contract, norm_mode = self._trained()
         return PolicySpec(
             observations={key: self.inputs[name][1] for key, name in self.names.items()},
@@ -99,7 +99,7 @@ class Checkpoint:
             return contract, str(self.trained_on["conversion"]["norm_mode"])
         except (KeyError, TypeError, ValueError, AttributeError, ContractError) as error:
             raise PolicyError(
-                f"{self.trained_on_path}: is not the meta/{NOTE} of `ibrobot convert`'s: {error!r}"
+                f"{self.trained_on_path}: is not a meta/{NOTE} file of `ibrobot convert`: {error!r}"
             ) from None
 
     def fingerprint(self) -> str:
@@ -120,11 +120,11 @@ def read_checkpoint(path: Path, base_models: Collection[str] = ()) -> Checkpoint
 
     Args:
         path: the folder.
-        base_models: what it may have LeRobot load besides, in addition to what LeRobot's own configurations name.
+        base_models: models and folders that LeRobot may load for it, in addition to those in LeRobot's configurations.
 
     Raises:
-        PolicyError: when it is not a checkpoint of LeRobot 0.6's, one that needs something beside it, or one that would
-            run or read what it must not.
+        PolicyError: if it is not a checkpoint of LeRobot 0.6, is incomplete, or would run foreign code or read files
+            outside its folder.
     """
     if not (path / "config.json").exists():
         inner = [each for each in ("pretrained_model", "checkpoints/last/pretrained_model") if (path / each).is_dir()]
@@ -134,7 +134,7 @@ def read_checkpoint(path: Path, base_models: Collection[str] = ()) -> Checkpoint
     config = read_json(path, file.name)
     check_values(file, config, base_models)
     if config.get("use_peft"):
-        raise PolicyError(f"{path} has an adapter only (use_peft); merge it into the model that it adapts")
+        raise PolicyError(f"{path} contains only an adapter (use_peft); merge it into its base model")
     processors = {name: _processor(path, name, base_models) for name in (PREPROCESSOR, POSTPROCESSOR)}
     try:
         kind = check_type(file, config["type"])
@@ -147,7 +147,7 @@ def read_checkpoint(path: Path, base_models: Collection[str] = ()) -> Checkpoint
         sizes = ("n_action_steps",) if kind in _SHORTER_CHUNKS else _CHUNK_SIZES
         size = next(size for size in sizes if config.get(size) is not None)
     except (KeyError, TypeError, ValueError, AttributeError, StopIteration) as error:
-        raise PolicyError(f"{file}: is not a policy's configuration of LeRobot 0.6: {error!r}") from None
+        raise PolicyError(f"{file}: is not a policy configuration of LeRobot 0.6: {error!r}") from None
     chunk_size = whole(file, size, config[size], MAX_ACTIONS)
     n_obs_steps = whole(file, "n_obs_steps", config.get("n_obs_steps", 1), MAX_HISTORY)
     note = _note_path(path)
@@ -158,42 +158,42 @@ def read_checkpoint(path: Path, base_models: Collection[str] = ()) -> Checkpoint
 
 
 def rename_map(path: Path, step: Mapping[str, Any]) -> dict[str, str]:
-    """The robot's names of observations -> the policy's, of a step `RENAME` in the processor at `path`.
+    """The map from the robot's to the policy's observation names, from a step `RENAME` of the processor at `path`.
 
     Raises:
-        PolicyError: when it is none.
+        PolicyError: if it is not a map of names.
     """
     names = step.get("config", {}).get("rename_map", {})
     if not isinstance(names, dict) or not all(isinstance(name, str) for name in names.values()):
-        raise PolicyError(f"{path}: rename_map is {names!r}, must give names to names")
+        raise PolicyError(f"{path}: rename_map is {names!r}, must map names to names")
     return names
 
 
 def check_weights(checkpoint: Checkpoint) -> None:
-    """Check that the checkpoint has weights that can be read without running code and give actions of the right size.
+    """Check that the checkpoint has weights in a safe format whose action size matches the configuration.
 
     Raises:
-        PolicyError: when there are none, in a format that carries code, or for another number of joints.
+        PolicyError: if the weights are missing, in a format that can contain code, or for another number of joints.
     """
     path = checkpoint.path
     if (path / WEIGHTS).exists():
         file, head = own_file(path, WEIGHTS), _ACTION_HEADS.get(checkpoint.type, "")
         try:
-            with safe_open(file, framework="numpy") as weights:  # reads the header alone
+            with safe_open(file, framework="numpy") as weights:  # reads only the header
                 size = weights.get_slice(head).get_shape()[0] if head in weights.keys() else checkpoint.action_size  # noqa: SIM118
         except (OSError, SafetensorError) as error:
             raise PolicyError(f"{file}: cannot be read: {error}") from None
         if size != checkpoint.action_size:
-            raise PolicyError(f"{file}: gives actions of {size} numbers, config.json says {checkpoint.action_size}")
+            raise PolicyError(f"{file}: actions have {size} values, but config.json says {checkpoint.action_size}")
         return
     others = sorted(each.name for each in path.iterdir() if each.suffix in (".bin", ".pt", ".pth", ".ckpt", ".pkl"))
     if others:
         raise PolicyError(
-            f"{path} has its weights in {others[0]}, which can run any code when it is read; "
-            f"ask who made it for {WEIGHTS}"
+            f"{path} has its weights in {others[0]}, which can run any code when it is loaded; "
+            f"ask its author for {WEIGHTS}"
         )
     raise PolicyError(
-        f"{path} has no weights: {WEIGHTS} is missing; on the robot of a distributed setup none is needed"
+        f"{path} has no weights: {WEIGHTS} is missing (a robot with distributed inference does not need it)"
     )
 
 
@@ -204,7 +204,7 @@ def hash_weights(path: Path) -> str:
 
 
 def _note_path(path: Path) -> Path | None:
-    """What tells of the training set: the note beside the checkpoint, else the dataset, where it still lies here."""
+    """The file that describes the training data: beside the checkpoint, or else in the dataset if that still exists."""
     if (path / NOTE).is_file():
         return path / NOTE
     if not (path / TRAINING).is_file():
@@ -223,8 +223,8 @@ def _shape(file: Path, name: str, feature: Mapping[str, Any]) -> tuple[int, ...]
 def _processor(folder: Path, name: str, base_models: Collection[str]) -> dict[str, Any]:
     if not (folder / name).exists():
         raise PolicyError(
-            f"{folder} has no {name}: a checkpoint from before LeRobot 0.4, which "
-            "`python -m lerobot.processor.migrate_policy_normalization` brings up to date"
+            f"{folder} has no {name}: it is from before LeRobot 0.4; "
+            "`python -m lerobot.processor.migrate_policy_normalization` updates it"
         )
     document = read_json(folder, name)
     check_steps(folder / name, document)

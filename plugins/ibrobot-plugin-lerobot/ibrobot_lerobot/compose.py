@@ -1,4 +1,4 @@
-"""Composing: the values of a tick -> messages; the way back from what `select` and `image` took out of them."""
+"""Composes messages from the values of a tick: the inverse of `select` and `image`."""
 
 from __future__ import annotations
 
@@ -26,26 +26,26 @@ from ibrobot_core.api import (
 
 _ACTION = "action"
 _DEPTH: Mapping[str, type[np.generic]] = {"16UC1": np.uint16, "32FC1": np.float32}
-"""Encoding -> element type, of those that are not uint8."""
+"""Encoding -> element type, for encodings that are not uint8."""
 
 
 class Composer:
-    """Makes the messages of a tick, from which the contract's frames are the same values again.
+    """Makes messages from the values of a tick, such that the contract extracts the same values from them.
 
-    Numbers of a message that no path selects are NaN: they are not known.
+    Numbers that no path selects are unknown and become NaN.
 
     Args:
-        contract: which values lie where in which messages.
+        contract: defines which values are in which messages.
 
     Raises:
-        ContractError: for a part whose values do not say where they belong, e.g. two whole arrays in one vector.
+        ContractError: if the position of values in a message is ambiguous, e.g. with two whole arrays in one vector.
     """
 
     def __init__(self, contract: Contract) -> None:
         self._contract = contract
         if foreign := [part for part in contract.action_parts if part.select]:
             raise ContractError(
-                f"{_ACTION}: no {foreign[0].type} can be made, which foreign bags have on {foreign[0].topic}"
+                f"{_ACTION}: cannot make a {foreign[0].type} for {foreign[0].topic}, because the action is foreign"
             )
         self._topics: dict[str, list[ObservationPart]] = {}
         for part in contract.observation_parts:
@@ -57,19 +57,19 @@ class Composer:
                 raise ContractError(f"{key}: the lengths of {len(unknown)} whole arrays cannot be distinguished")
 
     def keys(self, topics: Collection[str]) -> set[str]:
-        """The keys whose values the messages of `topics` are made of."""
+        """The keys whose values are needed for the messages of `topics`."""
         keys = {part.key for part in self._contract.observation_parts if part.topic in topics}
         return keys | ({_ACTION} if any(part.topic in topics for part in self._contract.action_parts) else set())
 
     def __call__(self, values: Mapping[str, NDArray[Any]], stamp_ns: int) -> dict[str, Message]:
-        """Topic -> message, of the topics all of whose keys are in `values`.
+        """Make the messages of all topics whose keys are in `values`; returns topic -> message.
 
         Args:
-            values: key -> value, vectors in SI units, images as the contract's encoding says.
-            stamp_ns: for headers [ns].
+            values: key -> value; vectors in SI units, images in the contract's encoding.
+            stamp_ns: stamp of the headers [ns].
 
         Raises:
-            ContractError: for a value that does not fit the contract.
+            ContractError: if a value does not fit the contract.
         """
         messages: dict[str, Message] = {}
         header = Header(stamp_ns)
@@ -109,7 +109,7 @@ class Composer:
         return messages
 
     def _slice(self, part: ObservationPart, vector: NDArray[Any]) -> NDArray[Any]:
-        """The piece of a key's vector that is the part's."""
+        """The slice of a key's vector that belongs to the part."""
         sizes = {id(each): each.feature.shape[0] for each in self._contract.parts(part.key)}
         known = sum(size for size in sizes.values() if size >= 0)
         rest = len(vector) - known
@@ -126,14 +126,14 @@ class Composer:
 
 def _leaves(part: ObservationPart) -> tuple[Leaf, ...]:
     if part.type not in MESSAGE_TYPES:
-        raise ContractError(f"{part.key}: no {part.type} can be made, which only the bags it was read from define")
+        raise ContractError(f"{part.key}: cannot make a {part.type}, because only the original bags define this type")
     leaves = Selection(part.type, part.select).leaves
     if parts := [leaf.label for leaf in leaves if leaf.kind == "foreign"]:
         raise ContractError(
-            f"{part.key}: no {part.type} can be made of {', '.join(parts)}: the rest of it is not known"
+            f"{part.key}: cannot make a {part.type} from {', '.join(parts)}: its other fields are unknown"
         )
     if len(leaves) > 1 and any(leaf.kind == "array" for leaf in leaves):
-        raise ContractError(f"{part.key}: where {', '.join(part.select)} begin in a vector is unknown")
+        raise ContractError(f"{part.key}: the position of {', '.join(part.select)} in the vector is unknown")
     return leaves
 
 
@@ -159,7 +159,7 @@ def _joint_state(pairs: list[tuple[Leaf, Any]], header: Header) -> JointState:
 
 
 def _fields(pairs: list[tuple[Leaf, Any]]) -> dict[str, Any]:
-    """Path -> value; elements gathered into arrays."""
+    """Path -> value, with elements combined into arrays."""
     known: dict[str, Any] = {}
     for leaf, value in pairs:
         if leaf.kind != "element":
@@ -173,7 +173,7 @@ def _fields(pairs: list[tuple[Leaf, Any]]) -> dict[str, Any]:
 
 
 def _build(owner: type[Any], prefix: str, known: Mapping[str, Any], header: Header) -> Any:
-    """An `owner` with the values whose paths begin with `prefix`."""
+    """An object of class `owner` with the values whose paths begin with `prefix`."""
     given: dict[str, Any] = {}
     for name, kind in _hints(owner).items():
         path = prefix + name
@@ -186,7 +186,7 @@ def _build(owner: type[Any], prefix: str, known: Mapping[str, Any], header: Head
         elif kind in (float, str):
             given[name] = np.nan if kind is float else ""
         elif attrs.fields_dict(owner)[name].default is attrs.NOTHING:
-            raise ContractError(f"no {owner.__name__} can be made of {', '.join(known)}: {path} is not known")
+            raise ContractError(f"cannot make a {owner.__name__} from {', '.join(known)}: {path} is unknown")
     return owner(**given)
 
 
@@ -195,7 +195,7 @@ def _cast(path: str, value: Any, kind: Any) -> Any:
         return kind(value)
     whole = "int" in str(kind)
     if whole and not np.isfinite(value).all():
-        raise ContractError(f"{path}: elements that no path selects are not known, and integers have no NaN")
+        raise ContractError(f"{path}: elements that no path selects are unknown, and integers have no NaN")
     return value
 
 
@@ -205,5 +205,5 @@ def _hints(owner: type[Any]) -> dict[str, Any]:
 
 
 def _is_numeric(kind: type[Any]) -> bool:
-    """Whether a class is all floats, e.g. a Vector3."""
+    """Whether all fields of a class are floats, e.g. of Vector3."""
     return all(each is float or (attrs.has(each) and _is_numeric(each)) for each in _hints(kind).values())

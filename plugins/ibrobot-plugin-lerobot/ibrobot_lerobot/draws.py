@@ -1,4 +1,4 @@
-"""Random numbers of a batch: those of each request come from its own seed, as if it were alone."""
+"""Random numbers in a batch: each request draws with its own seed, as if it ran alone."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ from torch.overrides import TorchFunctionMode
 _OF_SIZE = frozenset({"randn", "rand"})
 _OF_TENSORS = frozenset({"randn_like", "rand_like", "multinomial", "bernoulli", "normal_", "uniform_", "bernoulli_"})
 _NORMAL = "normal"
-"""Of a size or of tensors."""
+"""Random functions that take a size, or tensors."""
 
 type Draw = tuple[str, int]
-"""Name of a function, and the first dimension of what it gave."""
+"""Name of a function, and the first dimension of its result."""
 
 
 class NotByRequest(Exception):
-    """A draw is not made up of as many rows for each request as a request alone draws."""
+    """The rows of a draw cannot be assigned to the requests of a batch."""
 
 
 class Draws(TorchFunctionMode):  # type: ignore[misc]  # torch brings no types here
-    """While it is entered, random functions draw the rows of each request from that request's seed.
+    """A context in which random functions draw the rows of each request with that request's seed.
 
-    A request's rows are those that it would have drawn alone, bit by bit. What draws in a way that is not known here
-    takes from the global generator, see `escaped`.
+    A request's rows equal those that it would draw alone, bit by bit. Unknown functions draw from the global
+    generator; see `escaped`.
 
     Args:
-        seeds: of the requests of the batch, in their order.
-        device: where the network is; its generator is used, beside the CPU's.
-        alone: the draws of a request by itself, as `made` had them. A batch of one may draw anything.
+        seeds: seeds of the requests in the batch, in order.
+        device: device of the network; its generator is used in addition to the CPU's.
+        alone: the draws of a single request, from `made`. A batch of one may draw anything.
     """
 
     def __init__(self, seeds: Sequence[int], device: torch.device, alone: Sequence[Draw] = ()) -> None:
@@ -46,7 +46,7 @@ class Draws(TorchFunctionMode):  # type: ignore[misc]  # torch brings no types h
 
     @property
     def escaped(self) -> bool:
-        """Whether anything drew from the global generator meanwhile."""
+        """Whether a function drew from the global generator."""
         return not all(torch.equal(a, b) for a, b in zip(self._outside, self._state(), strict=True))
 
     @override
@@ -88,14 +88,14 @@ class Draws(TorchFunctionMode):  # type: ignore[misc]  # torch brings no types h
         return args[0] if func.__name__.endswith("_") else torch.cat(parts)
 
     def _rows(self, func: Callable[..., Any], length: int) -> int:
-        """How many of `length` rows are each request's."""
+        """Number of rows per request, out of `length`."""
         name, rows = self._alone[len(self.made)] if len(self.made) < len(self._alone) else ("", 0)
         if name != func.__name__ or rows == 0 or length != rows * len(self._states):
             raise NotByRequest(f"{func.__name__} of {length} rows for {len(self._states)} requests")
         return rows
 
     def _drawn(self, i: int, func: Callable[..., Any], args: Sequence[Any], kwargs: Mapping[str, Any]) -> torch.Tensor:
-        """What a function draws from the generator of request `i`, which goes on from there."""
+        """The result of a random function with the generator of request `i`, whose state advances."""
         outside = self._state()
         self._set(self._states[i])
         result: torch.Tensor = func(*args, **kwargs)

@@ -1,4 +1,4 @@
-"""One episode, written as a LeRobot dataset of its own: what all others are merged from."""
+"""Writes one episode as a separate LeRobot dataset, for merging."""
 
 from __future__ import annotations
 
@@ -22,28 +22,28 @@ from ibrobot_lerobot.video import Encoder, VideoTrack, describe_video
 
 _ROWS_BYTES = 16 << 20
 _ROWS = 1 << 13
-"""Rows are written whenever so many have come together: memory does not grow with the length of an episode."""
+"""Number of rows to write at a time, so that memory does not grow with the length of an episode."""
 
 
 @attrs.frozen
 class Format:
-    """What every episode of a dataset has in common."""
+    """Properties shared by all episodes of a dataset."""
 
     stored: Mapping[str, Column]
     fps: int
     encoder: Encoder | None
     """None without videos."""
     info: Mapping[str, Any]
-    """`info.json` before any episode."""
+    """`info.json` of an empty dataset."""
 
 
 class EpisodeWriter:
-    """Writes the frames of one episode as they come.
+    """Writes the frames of one episode.
 
     Args:
-        root: the dataset that it becomes; its folder must not exist.
-        form: what all episodes have in common.
-        metadata: for `meta/ibrobot.json`.
+        root: folder of the new dataset, which must not exist.
+        form: properties shared by all episodes.
+        metadata: content of `meta/ibrobot.json`.
     """
 
     def __init__(self, root: Path, form: Format, metadata: Mapping[str, Any]) -> None:
@@ -55,7 +55,7 @@ class EpisodeWriter:
         self._rows: list[dict[str, Any]] = []
         self._rows_bytes = 0
         self._vectors: dict[str, list[NDArray[Any]]] = {"task_index": []}
-        """Blocks of rows that have been written, for their statistics."""
+        """Written blocks of rows, for statistics."""
         self._pictures: dict[str, tuple[Any, PictureStats]] = {}
         self._tracks: dict[str, VideoTrack] = {}
         path = root / layout.chunk_file(layout.DATA, 0, "parquet")
@@ -87,10 +87,10 @@ class EpisodeWriter:
         return self._root / layout.chunk_file(f"{layout.VIDEOS}/{key}", 0, "mp4")
 
     def add(self, values: Mapping[str, NDArray[Any]], task: str) -> None:
-        """Append a frame whose values have been checked.
+        """Append a frame with checked values.
 
         Raises:
-            DatasetError: when it cannot be encoded or written.
+            DatasetError: if it cannot be encoded or written.
         """
         number = self._tasks.setdefault(task, len(self._tasks))
         row: dict[str, Any] = {
@@ -127,10 +127,10 @@ class EpisodeWriter:
         return to_array(values, field.type)
 
     def close(self) -> None:
-        """Finish the episode: a dataset that LeRobot loads.
+        """Finish the episode, so that LeRobot can load the dataset.
 
         Raises:
-            DatasetError: when it cannot be written.
+            DatasetError: if it cannot be written.
         """
         try:
             if self._rows:
@@ -144,7 +144,7 @@ class EpisodeWriter:
             self.abort()
 
     def abort(self) -> None:
-        """Let go of everything; what was written is worth nothing unless `close` went well."""
+        """Release all resources; the written files are unusable unless `close` succeeded."""
         for track in self._tracks.values():
             track.abort()
         self._table.close()
@@ -181,7 +181,7 @@ class EpisodeWriter:
 
 
 def counter_stats(frames: int, fps: int, begin: int, episode: int, task_numbers: NDArray[Any]) -> dict[str, Stats]:
-    """Statistics of the columns that the writer fills in itself."""
+    """Statistics of the columns that the writer generates."""
     index = np.arange(frames)
     found = {
         "timestamp": index / fps, "frame_index": index, "episode_index": np.full(frames, episode),

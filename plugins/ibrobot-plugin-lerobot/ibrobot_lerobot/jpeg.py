@@ -1,4 +1,4 @@
-"""JPEG for pictures on their way to a model elsewhere."""
+"""JPEG for images that are sent to a model on another machine."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _SPACES = {3: "RGB", 1: "GRAY"}
 
 
 class Jpeg(PictureCodec):
-    """Every picture as JPEG, colours at half the resolution.
+    """Encodes images as JPEG, with colour at half the resolution.
 
     Args:
         quality: 1 to 100.

@@ -1,4 +1,4 @@
-"""LeRobot v3.0 on disk: paths, `info.json`, table schemas, and what a dataset says of itself."""
+"""LeRobot v3.0 on disk: paths, `info.json`, table schemas and metadata."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ INFO = "meta/info.json"
 STATS = "meta/stats.json"
 TASKS = "meta/tasks.parquet"
 OWN = "meta/ibrobot.json"
-"""The metadata given to `create` and `merge`; LeRobot passes it over."""
+"""The metadata passed to `create` and `merge`; LeRobot ignores it."""
 PIXELS = "meta/ibrobot_pixels.json"
-"""What the statistics of the pictures were made of, so that they can be continued: key -> `PictureStats.state`."""
+"""State of the image statistics, to which episodes can be added later: key -> `PictureStats.state`."""
 DATA = "data"
 EPISODES = "meta/episodes"
 VIDEOS = "videos"
@@ -33,14 +33,14 @@ COUNTERS = {
     "index": "int64",
     "task_index": "int64",
 }
-"""Columns that the writer fills in itself."""
+"""Columns that the writer generates."""
 _VERSION = "v3.0"
 _PICTURE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
 _DEPTH_UNITS = {"uint16": "mm", "float32": "m"}
 
 
 def chunk_file(folder: str, number: int, suffix: str) -> str:
-    """Path of file `number`, from 0, of a folder below the root."""
+    """Path of file `number`, counted from 0, in a folder below the root."""
     chunk, file = divmod(number, FILES_PER_CHUNK)
     return f"{folder}/chunk-{chunk:03d}/file-{file:03d}.{suffix}"
 
@@ -89,22 +89,22 @@ class Column:
 
 
 def columns(features: Mapping[str, Feature], *, videos: bool) -> dict[str, Column]:
-    """How the features are stored, by key.
+    """The columns in which features are stored, by key.
 
     Raises:
-        DatasetError: for one that LeRobot has no place for.
+        DatasetError: if LeRobot cannot store a feature.
     """
     found = {}
     for key, feature in features.items():
         if key in COUNTERS or key == "task" or "/" in key:
-            raise DatasetError(f"feature {key!r}: LeRobot keeps that name for itself, or allows no slash in it")
+            raise DatasetError(f"feature {key!r}: the name is reserved by LeRobot or contains a slash")
         found[key] = Column(key, feature, _storage(key, feature, videos))
     return found
 
 
 def _storage(key: str, feature: Feature, videos: bool) -> str:
     if min(feature.shape, default=0) < 1:
-        raise DatasetError(f"feature {key!r} has shape {feature.shape}, every dimension must be at least 1")
+        raise DatasetError(f"feature {key!r} has shape {feature.shape}; every dimension must be at least 1")
     picture = len(feature.shape) == 3
     if feature.dtype == "image" and picture and feature.shape[2] in (1, 3):
         return "video" if videos and feature.shape[2] == 3 else "image"
@@ -112,7 +112,7 @@ def _storage(key: str, feature: Feature, videos: bool) -> str:
         return "depth"
     if len(feature.shape) == 1 and feature.dtype in ("bool", "float32", "float64", "int32", "int64", "uint8", "uint16"):
         return "vector"
-    raise DatasetError(f"feature {key!r}: {feature.dtype} of shape {feature.shape} is neither a vector nor a picture")
+    raise DatasetError(f"feature {key!r}: {feature.dtype} of shape {feature.shape} is neither a vector nor an image")
 
 
 def table_schema(stored: Mapping[str, Column]) -> pa.Schema:
@@ -158,17 +158,17 @@ def task_table(tasks: list[str]) -> pa.Table:
 
 @attrs.frozen
 class OnDisk:
-    """A whole dataset, opened."""
+    """An open dataset."""
 
     root: Path
     info: dict[str, Any]
     stats: dict[str, Any]
     """Feature -> name -> nested lists; empty without episodes."""
     tasks: list[str]
-    """In the order of their numbers."""
+    """Tasks, ordered by number."""
     metadata: dict[str, Any]
     pixels: dict[str, Any]
-    """Key of a camera -> what its statistics were made of; nothing for a foreign dataset."""
+    """Camera key -> state of its statistics; empty for datasets that ibrobot did not make."""
 
     @property
     def videos(self) -> list[str]:
@@ -197,10 +197,10 @@ class OnDisk:
 
 
 def open_dataset(root: Path) -> OnDisk | None:
-    """The dataset at `root`; None where there is none.
+    """The dataset at `root`; None if there is none.
 
     Raises:
-        DatasetError: when it cannot be read, or is of another version.
+        DatasetError: if it cannot be read, or has another version.
     """
     if not (root / INFO).exists():
         return None
@@ -212,21 +212,21 @@ def open_dataset(root: Path) -> OnDisk | None:
         pixels = json.loads((root / PIXELS).read_bytes()) if (root / PIXELS).exists() else {}
         version = info["codebase_version"]
     except (OSError, ValueError, KeyError, TypeError, pa.ArrowException) as error:
-        raise DatasetError(f"{root}: no dataset of LeRobot's: {error!r}") from error
+        raise DatasetError(f"{root}: is not a LeRobot dataset: {error!r}") from error
     if version != _VERSION:
-        raise DatasetError(f"{root}: is of version {version!r}, must be {_VERSION!r}; LeRobot converts older ones")
+        raise DatasetError(f"{root}: has version {version!r}, must be {_VERSION!r}; LeRobot can convert older versions")
     return OnDisk(root, info, stats, tasks, metadata, pixels)
 
 
 def _read_tasks(path: Path) -> list[str]:
-    """By their numbers."""
+    """The tasks, ordered by number."""
     with pq.ParquetFile(path) as file:
         rows = file.read(["task_index", "task"]).to_pylist()
     return [row["task"] for row in sorted(rows, key=lambda row: row["task_index"])]
 
 
 def write_json(path: Path, document: Any) -> None:
-    """Write a JSON file, and the folder it lies in."""
+    """Write a JSON file, and create its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(document, indent=4, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")
 

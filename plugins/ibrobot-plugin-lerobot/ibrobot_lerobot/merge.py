@@ -1,4 +1,4 @@
-"""Merging datasets: tables renumbered, videos joined without re-encoding; all of it or nothing."""
+"""Merges datasets atomically: renumbers tables and joins videos without re-encoding."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from ibrobot_lerobot.stats import PictureStats, Stats, picture_stats, vector_sta
 from ibrobot_lerobot.video import VideoFile, join_videos
 
 _MERGING = ".merging"
-"""Where a merge is made; worth nothing."""
+"""Folder of a merge in progress; discarded after an interruption."""
 _MERGED = ".merged"
-"""Where a merge is certain: its files need only be moved to their places."""
+"""Folder of a complete merge, whose files only need to be moved."""
 _EPISODES_AT_ONCE = 64
 _MIB = 1 << 20
 
 
 def complete(root: Path) -> None:
-    """Finish a merge that was interrupted once it was certain.
+    """Finish a complete merge whose move was interrupted.
 
     Raises:
-        DatasetError: when a file cannot be moved.
+        DatasetError: if a file cannot be moved.
     """
     merged = root / _MERGED
     if not merged.is_dir():
@@ -50,10 +50,10 @@ def complete(root: Path) -> None:
 
 
 def adopt(root: Path, part: Path) -> None:
-    """Make `part`, which lies below `root`, the dataset at `root`, which has none yet.
+    """Move the dataset `part`, in a folder below `root`, to `root`, which has no dataset yet.
 
     Raises:
-        DatasetError: when a file cannot be moved.
+        DatasetError: if a file cannot be moved.
     """
     try:
         part.rename(root / _MERGED)
@@ -83,7 +83,7 @@ def merge(root: Path, parts: Sequence[Path], metadata: Mapping[str, Any]) -> Non
 
 @attrs.define
 class _Place:
-    """A file that is growing: which one, how much of it there is, and where it began."""
+    """A growing file: its number, present size and first row."""
 
     number: int
     bytes: int = 0
@@ -91,7 +91,7 @@ class _Place:
 
 
 class _Merge:
-    """One merge into the empty folder `target`, after what `old` has."""
+    """A merge into the empty folder `target`, which follows the content of `old`."""
 
     def __init__(self, target: Path, old: OnDisk | None) -> None:
         self._target = target
@@ -132,7 +132,7 @@ class _Merge:
         self._write_meta(metadata)
 
     def _check(self, part: OnDisk) -> None:
-        """Check that a part fits, and take the first one's description where there was none."""
+        """Check that a part is compatible; an empty dataset takes over the first part's description."""
         if not self._info:
             self._info = part.info
         for name in ("fps", "features"):
@@ -172,13 +172,13 @@ class _Merge:
                 continue
             if key not in part.pixels:
                 raise DatasetError(
-                    f"{part.root}: does not keep what the statistics of {key} were made of ({layout.PIXELS}), so they "
-                    "cannot be continued; convert its episodes again"
+                    f"{part.root}: lacks the state of the statistics of {key} ({layout.PIXELS}), so they "
+                    "cannot be extended; convert its episodes again"
                 )
             self._pictures.setdefault(key, picture_stats(feature)).join(part.pixels[key])
 
     def _stats(self) -> dict[str, Stats]:
-        """Of all rows, old and new: one column at a time in memory."""
+        """Statistics of all rows, old and new, with one column at a time in memory."""
         old = self._old.files(layout.DATA, "parquet") if self._old else []
         files = [*old, *sorted((self._target / layout.DATA).glob("chunk-*/file-*.parquet"))]
         found = {}
@@ -190,7 +190,7 @@ class _Merge:
         return found
 
     def _append_table(self, path: Path, tasks: np.ndarray[Any, Any]) -> int:
-        """Append a table of a part, renumbered; returns the number of the file that it became a part of."""
+        """Append a part's table, renumbered; returns the number of the file to which it was added."""
         size = path.stat().st_size
         limit = self._info["data_files_size_in_mb"] * _MIB
         if self._table is not None and self._data.bytes + size > limit:
@@ -211,7 +211,7 @@ class _Merge:
         return self._data.number
 
     def _append_videos(self, part: OnDisk, key: str, rows: list[dict[str, Any]]) -> list[tuple[int, float]]:
-        """Note a part's videos of a camera for joining; returns file and beginning [s] of each."""
+        """Schedule a part's videos of a camera for joining; returns file number and start time [s] of each."""
         limit = self._info["video_files_size_in_mb"] * _MIB
         frames: dict[int, int] = {}
         for row in rows:
@@ -230,7 +230,7 @@ class _Merge:
         return placed
 
     def _join(self, key: str) -> None:
-        """Write the video of a camera that is complete."""
+        """Write the complete video of a camera."""
         path = self._target / layout.chunk_file(f"{layout.VIDEOS}/{key}", self._videos[key].number, "mp4")
         path.parent.mkdir(parents=True, exist_ok=True)
         join_videos(self._joining[key], path, self._info["fps"])
@@ -262,7 +262,7 @@ class _Merge:
 
 
 def _next(old: OnDisk | None, folder: str, suffix: str) -> int:
-    """The number of the first new file: old files are never touched."""
+    """The number of the first new file; existing files are never changed."""
     files = old.files(folder, suffix) if old else []
     if not files:
         return 0
@@ -271,7 +271,7 @@ def _next(old: OnDisk | None, folder: str, suffix: str) -> int:
 
 
 def _number(row: Mapping[str, Any], what: str) -> int:
-    """Which file of a folder an episode's row names."""
+    """The file number in an episode's row."""
     number: int = row[f"{what}/chunk_index"] * layout.FILES_PER_CHUNK + row[f"{what}/file_index"]
     return number
 

@@ -1,4 +1,4 @@
-"""The network of a checkpoint, in torch: loaded by LeRobot, asked for chunks without keeping state between them."""
+"""The network of a checkpoint, in torch: loaded with LeRobot, stateless between chunks."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ from ibrobot_lerobot.steps import Steps
 
 _IMAGES, _IMAGE = "observation.images", "observation.image"
 _OWN = ("seed", "task", "prefix", "delay_steps")
-"""Tensors that are not the network's own inputs."""
+"""Tensors that are not inputs of the network."""
 
 
 class PolicyModel:
     """A loaded network.
 
     Args:
-        checkpoint: with its weights.
-        options: device, arithmetic, threads.
-        steps: of the preprocessor, for `pictures`.
-        pictures: tensors that are cameras' pictures as they are, (H, W, C) or (T, H, W, C) of uint8.
-        log: where to say what it runs on.
+        checkpoint: the checkpoint, with weights.
+        options: device, precision, threads.
+        steps: preprocessor steps to apply to `pictures`.
+        pictures: names of unprocessed camera images, (H, W, C) or (T, H, W, C), uint8.
+        log: logger for the device in use.
 
     Raises:
-        PolicyError: when the device is not there, or LeRobot cannot load the checkpoint.
+        PolicyError: if the device is not available, or LeRobot cannot load the checkpoint.
     """
 
     def __init__(
@@ -55,17 +55,17 @@ class PolicyModel:
         self._autocast = getattr(torch, options.dtype) if options.dtype in ("bfloat16", "float16") else None
         self._chunk = torch.compile(self._policy.predict_action_chunk) if options.compile else None
         self._draws: Sequence[Draw] = ()
-        """What a request draws by itself."""
+        """The random draws of a single request."""
         self._one_by_one = False
-        """Whether its random draws cannot be separated by request."""
+        """Whether random draws cannot be assigned to requests."""
         self._log = log
         log.info("%s on %s, %d threads", checkpoint.type, self._device, threads)
 
     def warm_up(self, tensors: Tensors) -> None:
-        """Run once, and see whether the result is a chunk of actions.
+        """Run the network once and check that it returns an action chunk.
 
         Raises:
-            PolicyError: when it fails, or is none, as with a policy that plans step by step.
+            PolicyError: if it fails, or does not return a chunk, e.g. because the policy plans step by step.
         """
         try:
             [action] = self.predict([tensors])
@@ -76,20 +76,20 @@ class PolicyModel:
         size, length = self._checkpoint.action_size, self._checkpoint.chunk_size
         if action.ndim != 3 or action.shape[0] != 1 or action.shape[2] != size or not 1 <= action.shape[1] <= length:
             raise PolicyError(
-                f"{self._checkpoint.path}: {self._checkpoint.type} gives actions of shape {action.shape}, "
+                f"{self._checkpoint.path}: {self._checkpoint.type} returns actions of shape {action.shape}; "
                 f"a chunk has (1, up to {length}, {size})"
             )
         if self._autocast is not None and not np.isfinite(action).all():
             self._log.warning(
-                "%s: %s overflows %s in a run on zeros; bfloat16 and float32 have a larger range",
+                "%s: %s overflows %s for zero inputs; bfloat16 and float32 have a larger range",
                 self._checkpoint.path, self._checkpoint.type, self._autocast,
             )  # fmt: skip
 
     def predict(self, batch: Sequence[Tensors]) -> list[NDArray[np.float32]]:
-        """Chunks, each of shape (1, N, A), of requests whose tensors have equal names and shapes.
+        """Compute the chunks of requests whose tensors have equal names and shapes; each has shape (1, N, A).
 
-        They are one run of the network: noise is drawn for each request by its own seed. Requests with a prefix, which
-        may have different delays, are run one by one.
+        The requests form one batch, in which each draws noise with its own seed. Requests with a prefix run one by
+        one, because their delays may differ.
         """
         if len(batch) > 1 and (self._one_by_one or "prefix" in batch[0]):
             return [self.predict([tensors])[0] for tensors in batch]
@@ -98,7 +98,7 @@ class PolicyModel:
         with torch.random.fork_rng(devices), torch.no_grad(), self._arithmetic():
             draws = Draws([int(tensors["seed"][0]) for tensors in batch], self._device, self._draws)
             try:
-                with draws if self._chunk is None else nullcontext():  # a compiled network draws where we cannot see it
+                with draws if self._chunk is None else nullcontext():  # a compiled network cannot be intercepted
                     actions = self._run(inputs, batch)
                 escaped = draws.escaped and len(batch) > 1
             except NotByRequest:
@@ -106,7 +106,7 @@ class PolicyModel:
         if escaped:
             self._one_by_one = True
             self._log.info(
-                "%s draws random numbers that belong to no one request: requests are run one by one",
+                "%s draws random numbers that cannot be assigned to requests, so requests run one by one",
                 self._checkpoint.type,
             )  # fmt: skip
             return self.predict(batch)
@@ -116,7 +116,7 @@ class PolicyModel:
         return [np.array(result[i : i + 1]) for i in range(len(batch))]
 
     def inputs(self, batch: Sequence[Tensors]) -> dict[str, Any]:
-        """What the network sees of requests: their tensors on its device, pictures normalised."""
+        """The network's inputs: the requests' tensors on its device, with normalised images."""
         found: dict[str, Any] = {
             name: torch.from_numpy(np.concatenate([tensors[name] for tensors in batch])).to(self._device)
             for name in batch[0]
@@ -125,7 +125,7 @@ class PolicyModel:
         return found | self._steps({name: self._seen([tensors[name] for tensors in batch]) for name in self._pictures})
 
     def _seen(self, pictures: Sequence[NDArray[Any]]) -> torch.Tensor:
-        """Pictures as LeRobot has them, (B, ..., C, H, W) from 0 to 1."""
+        """Images in LeRobot's layout, (B, ..., C, H, W), from 0 to 1."""
         pixels = torch.from_numpy(np.stack(pictures)).to(self._device)
         return pixels.movedim(-1, -3).contiguous().to(torch.float32) / 255
 
@@ -143,7 +143,7 @@ class PolicyModel:
         return actions
 
     def _fill_queues(self, inputs: dict[str, Any]) -> None:
-        """Where LeRobot keeps the last observations in queues, put in those of the request, oldest first."""
+        """Fill LeRobot's queues of past observations with those of the request, oldest first."""
         queues = {key: queue for key, queue in getattr(self._policy, "_queues", {}).items() if key != ACTION}
         cameras = [inputs[key] for key in self._policy.config.image_features if key in inputs]
         if not queues:
@@ -164,10 +164,10 @@ class PolicyModel:
         path = self._checkpoint.path
         try:
             config = PreTrainedConfig.from_pretrained(path)
-            config.pretrained_path = path  # the file may name another
+            config.pretrained_path = path  # the file may have another path
             config.device = str(self._device)
             if hasattr(config, "pretrained_backbone_weights"):
-                config.pretrained_backbone_weights = None  # they are in the checkpoint, and would be downloaded
+                config.pretrained_backbone_weights = None  # the checkpoint contains them; avoid a download
             chunked = hasattr(config, "rtc_config")
             if chunked:
                 config.rtc_config = config.rtc_config or RTCConfig()
@@ -194,5 +194,5 @@ def _device(asked: str) -> str:
         return next(name for name, found in there.items() if found)
     if not there[asked]:
         has = ", ".join(name for name, found in there.items() if found)
-        raise PolicyError(f"torch finds no device {asked!r} here; available: {has}")
+        raise PolicyError(f"torch finds no device {asked!r} on this machine; available: {has}")
     return asked

@@ -15,41 +15,37 @@ CODECS = ("libsvtav1", "h264", "hevc", "h264_nvenc", "hevc_nvenc", "h264_videoto
 @documented
 @attrs.frozen
 class LeRobotOptions:
-    """How pictures are stored, and how large files become."""
+    """Image storage and file sizes."""
 
-    videos: bool = option(True, help="cameras as videos; false: as PNG pictures in the tables, without loss")
+    videos: bool = option(True, help="store images as videos; false: as lossless PNG in the tables")
     codec: str = option(
-        "libsvtav1", choices=("auto", *CODECS), help="video encoder; auto: a GPU's where one opens, else libsvtav1"
+        "libsvtav1", choices=("auto", *CODECS), help="video encoder; auto: a GPU's if available, else libsvtav1"
     )
-    crf: int = option(30, ge=0, le=63, help="quality of videos; lower is better and larger")
-    preset: str = option(
-        "", help="the encoder's own name for speed against size; empty: 12 for libsvtav1, else its own"
-    )
-    gop: int = option(2, unit="pictures", ge=1, help="from key picture to key picture; short ones are found quickly")
-    threads: int = option(1, ge=1, help="threads of each encoder; equal numbers give equal bytes")
-    table_file_mb: int = option(100, unit="MiB", ge=1, help="size at which a new table begins")
-    video_file_mb: int = option(200, unit="MiB", ge=1, help="size at which a new video begins")
+    crf: int = option(30, ge=0, le=63, help="video quality; lower values give better quality and larger files")
+    preset: str = option("", help="the encoder's speed preset; empty: 12 for libsvtav1, else the encoder's default")
+    gop: int = option(2, unit="frames", ge=1, help="distance between key frames; a short one makes random access fast")
+    threads: int = option(1, ge=1, help="threads per encoder; the same number gives the same bytes")
+    table_file_mb: int = option(100, unit="MiB", ge=1, help="size at which a new table file begins")
+    video_file_mb: int = option(200, unit="MiB", ge=1, help="size at which a new video file begins")
 
 
 @documented
 @attrs.frozen
 class LeRobotPolicyOptions:
-    """Which checkpoint, and how it is computed."""
+    """Checkpoint, device and precision."""
 
-    path: Path = option(help="folder of the checkpoint: config.json, the processors, and to load it, model.safetensors")
-    device: str = option(
-        "auto", choices=("auto", "cuda", "mps", "cpu"), help="auto: a GPU where there is one, else the CPU"
-    )
+    path: Path = option(help="folder of the checkpoint: config.json, processors and, for inference, model.safetensors")
+    device: str = option("auto", choices=("auto", "cuda", "mps", "cpu"), help="auto: a GPU if available, else the CPU")
     dtype: str = option(
         "auto", choices=("auto", "float32", "bfloat16", "float16"),
-        help="of the arithmetic; auto: as the checkpoint has it",
+        help="precision of the computation; auto: the checkpoint's",
     )  # fmt: skip
-    compile: bool = option(False, help="torch.compile: a slow start, then faster")
+    compile: bool = option(False, help="use torch.compile: slow to load, faster inference")
     threads: int | None = option(
-        None, ge=1, help="CPU threads of torch; by default one less than the cores, at least 1"
+        None, ge=1, help="CPU threads of torch; by default one fewer than the cores, at least 1"
     )
-    n_action_steps: int | None = option(None, ge=1, help="actions of a chunk that are used; by default all")
+    n_action_steps: int | None = option(None, ge=1, help="number of actions of a chunk to use; by default all")
     base_models: tuple[str, ...] = option(
         (),
-        help="models or folders that the checkpoint may load besides itself; not needed for LeRobot's own",
+        help="additional models or folders that the checkpoint may load; LeRobot's own are always allowed",
     )

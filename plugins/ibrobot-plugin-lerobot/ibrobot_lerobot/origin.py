@@ -1,4 +1,4 @@
-"""Where the episodes of a dataset come from: what `ibrobot convert` kept in it, or what the caller states."""
+"""Origin of a dataset's episodes, as stored by `ibrobot convert` or given by the caller."""
 
 from __future__ import annotations
 
@@ -14,34 +14,34 @@ from ibrobot_core.api import CalibrationError, Contract, ContractError, Recorder
 
 @attrs.frozen
 class Origin:
-    """Where an episode of a dataset comes from."""
+    """Origin of an episode in a dataset."""
 
     metadata: Mapping[str, str]
-    """As the recorder was given: contract, fingerprint, config, calibration, prompt, seed, …"""
+    """The recording's metadata: contract, fingerprint, config, calibration, prompt, seed, …"""
     contract: Contract
     document: Mapping[str, Any]
-    """The robot YAML as plain values; empty where it is not known."""
+    """The robot YAML as plain values; empty if unknown."""
     calibration: Mapping[str, Mapping[str, Any]]
-    """Joint -> fields of `JointCalibration`; empty where it is not known."""
+    """Joint -> fields of `JointCalibration`; empty if unknown."""
     norm_mode: str
     """The unit of the dataset's joint positions."""
     outcome: str = "unknown"
     start_ns: int | None = None
-    """Receipt of the first message of the recording [ns]."""
+    """Time of receipt of the recording's first message [ns]."""
 
 
 def episode_origin(root: Path, metadata: Mapping[str, Any], number: int, given: Mapping[str, str]) -> Origin:
-    """Where episode `number` of a dataset comes from.
+    """The origin of episode `number` of a dataset.
 
     Args:
         root: the dataset, for errors.
-        metadata: what the dataset keeps; empty for one that `convert` did not make, which goes by `given`.
-        number: from 0.
-        given: as in `EpisodeAddress`.
+        metadata: the dataset's metadata; if empty, because `convert` did not make the dataset, `given` is used.
+        number: episode number, from 0.
+        given: values given by the caller, as in `EpisodeAddress`.
 
     Raises:
-        ContractError: when neither says what the vectors are.
-        RecorderError: for metadata that cannot be read.
+        ContractError: if neither describes the vectors.
+        RecorderError: if the metadata cannot be read.
     """
     if "conversion" not in metadata:
         return _origin_as_given(root, given)
@@ -55,7 +55,7 @@ def episode_origin(root: Path, metadata: Mapping[str, Any], number: int, given: 
         told_apart = {"prompt": episode["prompt"], "source": f"{root.resolve().name}:{number}"}
         outcome, start_ns = episode["outcome"], episode["start_ns"]
     except (KeyError, IndexError, TypeError) as error:
-        raise RecorderError(f"{root}: what it keeps of episode {number} cannot be read: {error!r}") from None
+        raise RecorderError(f"{root}: the metadata of episode {number} cannot be read: {error!r}") from None
     recorded |= told_apart | robot_metadata(contract, document, {"converted": calibration} if calibration else {})
     return Origin(recorded, contract, document, calibration, norm_mode, outcome, start_ns)
 
@@ -63,13 +63,13 @@ def episode_origin(root: Path, metadata: Mapping[str, Any], number: int, given: 
 def _origin_as_given(root: Path, given: Mapping[str, str]) -> Origin:
     if "contract" not in given:
         raise ContractError(
-            f"{root}: was not made by ibrobot, so it does not say which robot its vectors are of; "
-            "name a robot YAML whose contract fits it"
+            f"{root}: was not made by ibrobot, so it does not name its robot; "
+            "give a robot YAML with a matching contract"
         )
     if "norm_mode" not in given:
         raise CalibrationError(
-            f"{root}: was not made by ibrobot, so it does not say the unit of its joints; "
-            "--norm-mode does: radians, degrees or range_m100_100"
+            f"{root}: was not made by ibrobot, so it does not state the unit of its joints; "
+            "set it by --norm-mode: radians, degrees or range_m100_100"
         )
     contract = Contract.from_canonical(json.loads(given["contract"]))
     calibrations = json.loads(given.get("calibration", "{}"))

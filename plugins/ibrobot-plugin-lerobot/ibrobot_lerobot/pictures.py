@@ -1,4 +1,4 @@
-"""Single pictures as PNG, depth as TIFF: both without loss, and as LeRobot reads them."""
+"""Single images as PNG, depth as TIFF: both lossless and readable by LeRobot."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ _TIFF_SAMPLES = {np.dtype(np.uint16): 1, np.dtype(np.float32): 3}
 
 
 class PngEncoder:
-    """Encodes pictures of one size.
+    """Encodes images of one size.
 
     Args:
-        height: of every picture [px].
-        width: likewise.
+        height: image height [px].
+        width: image width [px].
         channels: 3 for RGB, 1 for grey.
     """
 
@@ -36,7 +36,7 @@ class PngEncoder:
         self._codec = codec
 
     def __call__(self, image: NDArray[np.uint8]) -> bytes:
-        """A file of `image`, shape (H, W, C)."""
+        """Encode `image`, shape (H, W, C), as a PNG file."""
         pixels = image[..., 0] if self._format == "gray" else image
         packets = self._codec.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels), self._format))
         return b"".join(bytes(packet) for packet in packets)
@@ -50,23 +50,23 @@ _TIFF_KINDS = {1: "B", 3: "H", 4: "I"}
 
 
 def decode_picture(content: bytes, feature: Feature) -> NDArray[Any]:
-    """The pixels of a file in a table.
+    """Decode an image file from a table.
 
     Args:
         content: a PNG, JPEG or uncompressed TIFF file.
-        feature: its shape (H, W, C), and the type of its elements.
+        feature: expected shape (H, W, C) and element type.
 
     Raises:
-        DatasetError: when it cannot be read, or is not such a picture.
+        DatasetError: if it cannot be decoded or does not match `feature`.
     """
     codec = next((name for begin, name in _DECODERS.items() if content.startswith(begin)), None)
     try:
         array = _decode_tiff(content, feature) if codec is None else _decode(content, codec, feature)
     except (av.error.FFmpegError, ValueError, struct.error) as error:
-        raise DatasetError(f"a picture of {len(content)} bytes cannot be decoded: {error}") from error
+        raise DatasetError(f"an image of {len(content)} bytes cannot be decoded: {error}") from error
     array = array.reshape(*array.shape[:2], -1)
     if array.shape != feature.shape:
-        raise DatasetError(f"a picture has shape {array.shape}, must be {feature.shape}")
+        raise DatasetError(f"an image has shape {array.shape}, must be {feature.shape}")
     return array
 
 
@@ -75,13 +75,13 @@ def _decode(content: bytes, codec: str, feature: Feature) -> NDArray[Any]:
     decoder: Any = av.CodecContext.create(codec, "r")
     frame: Any = next(iter([*decoder.decode(av.Packet(content)), *decoder.decode(None)]), None)
     if frame is None or feature.dtype not in pixels:
-        raise ValueError(f"it has no picture of {feature.dtype}")
+        raise ValueError(f"it has no image of {feature.dtype}")
     array: NDArray[Any] = frame.to_ndarray(format=pixels[feature.dtype])
     return array
 
 
 def _decode_tiff(content: bytes, feature: Feature) -> NDArray[Any]:
-    """FFmpeg's decoder knows no float32."""
+    """Decode a TIFF here, because FFmpeg's decoder does not support float32."""
     order = _TIFF_ORDERS.get(content[:4])
     if order is None:
         raise ValueError(f"it begins with {content[:4]!r}, which is neither PNG, JPEG nor TIFF")
@@ -104,7 +104,7 @@ def _decode_tiff(content: bytes, feature: Feature) -> NDArray[Any]:
 
 
 def tiff(depth: NDArray[Any]) -> bytes:
-    """A file of a depth picture, uint16 or float32, shape (H, W, 1): one uncompressed strip, little-endian."""
+    """Encode a depth image, uint16 or float32, shape (H, W, 1), as TIFF: one uncompressed strip, little-endian."""
     height, width = depth.shape[:2]
     pixels = np.ascontiguousarray(depth[..., 0]).astype(depth.dtype.newbyteorder("<"), copy=False).tobytes()
     entries = (

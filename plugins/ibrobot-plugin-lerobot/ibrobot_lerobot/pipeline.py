@@ -1,4 +1,4 @@
-"""LeRobot's own processors, for steps that are not standard, e.g. a tokeniser; needs LeRobot and torch."""
+"""LeRobot's own processors, for non-standard steps such as a tokeniser; needs LeRobot and torch."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ _DEVICE = {"device_processor": {"device": "cpu"}}
 
 
 class LeRobotSteps:
-    """The saved processors, run by LeRobot on the CPU.
+    """The saved processors, which LeRobot runs on the CPU.
 
     Raises:
-        PolicyError: when LeRobot cannot make them, e.g. for want of a tokeniser's files, or when a step is none.
+        PolicyError: if LeRobot cannot create them, e.g. because a tokeniser's files are missing, or a step is invalid.
     """
 
     def __init__(self, checkpoint: Checkpoint) -> None:
@@ -39,19 +39,19 @@ class LeRobotSteps:
         }
         try:
             config = PreTrainedConfig.from_pretrained(checkpoint.path)
-            config.pretrained_path = checkpoint.path  # the file may name another
+            config.pretrained_path = checkpoint.path  # the file may have another path
             self._pre, self._post = make_pre_post_processors(
                 config, pretrained_path=str(checkpoint.path), preprocessor_overrides=overrides[PREPROCESSOR],
                 postprocessor_overrides=overrides[POSTPROCESSOR],
             )  # fmt: skip
         except Exception as error:
-            raise PolicyError(f"{checkpoint.path}: LeRobot cannot make its processors: {error}") from error
+            raise PolicyError(f"{checkpoint.path}: LeRobot cannot create its processors: {error}") from error
 
     def preprocess(self, batch: Mapping[str, NDArray[Any]], prompt: str, robot_type: str) -> dict[str, NDArray[Any]]:
-        """A batch of one through the preprocessor: arrays in, arrays out.
+        """Run a batch of one through the preprocessor.
 
         Raises:
-            PolicyError: when a step gives what is not an array, and so cannot travel to a model elsewhere.
+            PolicyError: if a step returns a value that is not an array, and so cannot be sent to a model.
         """
         tensors: dict[str, Any] = {key: torch.from_numpy(np.array(value)) for key, value in batch.items()}
         found = self._pre({**tensors, "task": prompt, "robot_type": robot_type})
@@ -65,13 +65,13 @@ class LeRobotSteps:
         return result
 
     def postprocess(self, action: NDArray[Any]) -> NDArray[Any]:
-        """Actions, shape (1, N, A), through the postprocessor."""
+        """Run actions, shape (1, N, A), through the postprocessor."""
         found = self._post(torch.from_numpy(np.array(action)))
         return np.array(found.numpy(force=True))
 
 
 def _check_class(path: Path, name: str) -> None:
-    """Refuse a class below `lerobot` that is no processor step, before LeRobot calls it."""
+    """Refuse a class below `lerobot` that is not a processor step, before LeRobot calls it."""
     module, _, attribute = name.rpartition(".")
     try:
         found = vars(import_module(module)).get(attribute)

@@ -1,4 +1,4 @@
-"""Policy `lerobot`: a checkpoint of LeRobot's in three pure steps; only `load` and `infer` need torch."""
+"""Policy `lerobot`: a LeRobot checkpoint in three pure steps; only `load` and `infer` need torch."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from ibrobot_lerobot.pipeline import LeRobotSteps
 
 SEED = "seed"
-"""What the model's noise is drawn from, shape (1,)."""
+"""Seed of the model's noise, shape (1,)."""
 TASK = "task"
 """The prompt in UTF-8, shape (1, L)."""
 PREFIX = "prefix"
@@ -29,18 +29,18 @@ DELAY = "delay_steps"
 
 
 class LeRobotPolicy(Policy):
-    """Runs what LeRobot trained, with the processors that were saved with it.
+    """Runs a LeRobot checkpoint with its saved processors.
 
-    Standard processor steps (rename, batch, device, normalise, unnormalise) are done in NumPy; where there are others,
-    LeRobot runs the processor. With standard steps, cameras' pictures stay as they are until `infer`, which normalises
-    them: a quarter of the bytes on the way to a model elsewhere.
+    Standard processor steps (rename, batch, device, normalise, unnormalise) run in NumPy; if there are others, LeRobot
+    runs the processor. With standard steps, camera images are not normalised before `infer`, which reduces requests to
+    a quarter of their size.
 
     Args:
-        options: which checkpoint, and how it is computed.
-        ctx: for the log, the robot's type and the seed.
+        options: checkpoint, device and precision.
+        ctx: provides the log, the robot's type and the seed.
 
     Raises:
-        PolicyError: when the folder is not a checkpoint, or LeRobot is needed and missing.
+        PolicyError: if the folder is not a checkpoint, or LeRobot is needed but not installed.
     """
 
     def __init__(self, options: LeRobotPolicyOptions, ctx: Context) -> None:
@@ -52,17 +52,17 @@ class LeRobotPolicy(Policy):
         self._post = read_steps(checkpoint, POSTPROCESSOR)
         others = {PREPROCESSOR: self._pre.others, POSTPROCESSOR: self._post.others}
         if "absolute_actions_processor" in self._post.others:
-            raise PolicyError(f"{options.path}: actions relative to the state (use_relative_actions) are not known")
+            raise PolicyError(f"{options.path}: actions relative to the state (use_relative_actions) are not supported")
         self._lerobot: LeRobotSteps | None = None
         if any(others.values()):
-            told = "; ".join(f"{file}: {', '.join(names)}" for file, names in others.items() if names)
-            ctx.log.info("%s has steps that only LeRobot runs, so this process loads torch (%s)", options.path, told)
+            steps = "; ".join(f"{file}: {', '.join(names)}" for file, names in others.items() if names)
+            ctx.log.info("%s has steps that only LeRobot runs, so this process loads torch (%s)", options.path, steps)
             self._lerobot = _import("pipeline").LeRobotSteps(checkpoint)
         self._pictures: tuple[str, ...] = () if self._pre.others else _pictures(self.spec)
         """Observations that `infer` normalises."""
         self._model: PolicyModel | None = None
         self._taken: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {}
-        """Tensors of a request without a prefix: their dtypes and shapes; -1 stands for any size."""
+        """Tensors of a request without a prefix: dtypes and shapes, with -1 for any size."""
         self._seed = ctx.seed
         self._weights = ""
 
@@ -77,7 +77,7 @@ class LeRobotPolicy(Policy):
         model = _import("model").PolicyModel(self._checkpoint, self._options, self._pre, self._pictures, self._ctx.log)
         tensors = self.preprocess(self._zeros())
         model.warm_up(tensors)
-        # How long a text is, and what LeRobot's own steps make of it, is not known beforehand.
+        # The length of a text, and the output of LeRobot's own steps for it, are not known in advance.
         self._taken = {
             name: (array.dtype, (-1,) * array.ndim if self._pre.others and name != SEED else array.shape)
             for name, array in tensors.items()
@@ -111,9 +111,9 @@ class LeRobotPolicy(Policy):
     @override
     def preprocess(self, frame: Frame) -> Tensors:
         if self.spec.prompt and not frame.prompt:
-            raise PolicyError(f"{self._checkpoint.type} wants a prompt: what is the robot to do?")
+            raise PolicyError(f"{self._checkpoint.type} needs a prompt that describes the task")
         frames = [*frame.history[-self.spec.history :], frame] if self.spec.history else [frame]
-        # An episode's first frame stands for those before it, as in LeRobot.
+        # Repeat an episode's first frame to fill the history, as in LeRobot.
         frames = [frames[0]] * (self._checkpoint.n_obs_steps - len(frames)) + frames
         each = [self._run_pre(self._batch(one), frame.prompt) for one in frames[:-1]]
         tensors = self._run_pre(self._batch(frames[-1], frame.prefix), frame.prompt)
@@ -151,7 +151,7 @@ class LeRobotPolicy(Policy):
         return action[0, : self.spec.chunk_size].astype(np.float64)
 
     def _check(self, tensors: Tensors) -> None:
-        """Check that a request, which may come from anywhere, has what `preprocess` makes."""
+        """Check that a request, which may be from an untrusted client, has the tensors that `preprocess` makes."""
         taken = dict(self._taken)
         if self.spec.prompt:
             taken[TASK] = (np.dtype(np.uint8), (1, -1))
@@ -165,7 +165,7 @@ class LeRobotPolicy(Policy):
                 got = "is missing" if array is None else f"is {array.dtype} {array.shape}"
                 wrong.append(f"{name} {got}, must be {dtype} {shape}")
         if not self._pre.others:
-            wrong += [f"{name} is not known" for name in tensors if name not in taken]
+            wrong += [f"{name} is unknown" for name in tensors if name not in taken]
         if not wrong and PREFIX in taken:
             delay, length, most = int(tensors[DELAY][0]), tensors[PREFIX].shape[1], self._checkpoint.chunk_size
             if not 0 <= delay <= length <= most:
@@ -176,7 +176,7 @@ class LeRobotPolicy(Policy):
             raise PolicyError(f"the request's tensors: {'; '.join(wrong)}")
 
     def _batch(self, frame: Frame, prefix: NDArray[Any] | None = None) -> dict[str, NDArray[Any]]:
-        """A batch of one, as LeRobot makes it of an observation: images (1, C, H, W) from 0 to 1."""
+        """A batch of one in LeRobot's layout: images (1, C, H, W) from 0 to 1."""
         batch: dict[str, NDArray[Any]] = {}
         for key, shape in self.spec.observations.items():
             if key not in frame.values:
@@ -186,7 +186,7 @@ class LeRobotPolicy(Policy):
                 raise PolicyError(f"the policy needs {key} of shape {shape}, got {value.shape}")
             if len(shape) == 3:
                 if value.dtype != np.uint8:
-                    raise PolicyError(f"the policy needs {key} with pixels of 8 bit, got {value.dtype}")
+                    raise PolicyError(f"the policy needs {key} with 8-bit pixels, got {value.dtype}")
                 if key in self._pictures:
                     continue
                 value = np.ascontiguousarray(value.transpose(2, 0, 1)).astype(np.float32) / np.float32(255)
@@ -201,7 +201,7 @@ class LeRobotPolicy(Policy):
         return self._pre(batch)
 
     def _zeros(self) -> Frame:
-        """A frame of the right shapes, to warm up with."""
+        """A frame of zeros with the right shapes, for the warm-up."""
         values: dict[str, NDArray[np.generic]] = {
             key: np.zeros(shape, np.uint8 if len(shape) == 3 else np.float32)
             for key, shape in self.spec.observations.items()
@@ -214,24 +214,24 @@ def _pictures(spec: PolicySpec) -> tuple[str, ...]:
 
 
 def _fits(shape: tuple[int, ...], wanted: tuple[int, ...]) -> bool:
-    """Whether a shape is as wanted, where -1 stands for any size but 0."""
+    """Whether a shape matches `wanted`, in which -1 means any size except 0."""
     return len(shape) == len(wanted) and all(n == m or (m == -1 and n > 0) for n, m in zip(shape, wanted, strict=True))
 
 
 def _seed(episode: int, stamp_ns: int) -> NDArray[np.int64]:
-    """A seed for one request: of the episode's, and another one at each tick."""
+    """The seed of a request, derived from the episode's seed and the tick."""
     words = np.random.SeedSequence([episode % 2**64, stamp_ns % 2**64]).generate_state(1, np.uint64)
     return (words >> np.uint64(1)).astype(np.int64)
 
 
 def _import(name: str) -> Any:
-    """A module of this plugin that needs torch."""
-    # Threads that wait by spinning make torch slower by a multiple where they share cores with anything. OpenMP reads
-    # this when torch loads it.
+    """Import a module of this plugin that needs torch."""
+    # Spinning threads slow torch down several times if they share cores with other work. OpenMP reads this variable
+    # when torch loads it.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
         return import_module(f"ibrobot_lerobot.{name}")
     except ImportError as error:
         raise PolicyError(
-            f"policies of LeRobot need LeRobot ({error}); install it with: pip install 'lerobot>=0.6.1,<0.7'"
+            f"LeRobot policies need LeRobot ({error}); install it with: pip install 'lerobot>=0.6.1,<0.7'"
         ) from error

@@ -1,4 +1,4 @@
-"""Reader `lerobot`: an episode of a dataset, as the messages that its contract would make the same rows of."""
+"""Reader `lerobot`: reads an episode of a dataset as messages that its contract would convert to the same rows."""
 
 from __future__ import annotations
 
@@ -31,16 +31,15 @@ from ibrobot_lerobot.rows import EpisodeRows
 
 
 class LeRobotReader(EpisodeReader):
-    """Reads an episode of a dataset in LeRobot's format v3.0: at every tick one message of each topic of the contract.
+    """Reads an episode of a LeRobot v3.0 dataset: one message of each topic of the contract at every tick.
 
-    Datasets of `ibrobot convert` say themselves which contract, units, robot and prompt an episode has; for others
-    the caller states them. Stamps count from when the episode was recorded; where that is
-    not known, from the dataset's first frame.
+    Datasets of `ibrobot convert` contain the contract, unit, robot and prompt of each episode; for others the caller
+    provides them. Stamps begin at the time of the recording or, if it is unknown, at the dataset's first frame.
 
     Raises:
-        RecorderError: when it cannot be read, or the address has no number.
-        ContractError: when the dataset's features are not the contract's.
-        CalibrationError: when the unit of the joints needs a calibration that is missing.
+        RecorderError: if it cannot be read, or the address has no episode number.
+        ContractError: if the dataset's features do not match the contract.
+        CalibrationError: if the unit of the joints needs a calibration that is missing.
     """
 
     def __init__(self, address: EpisodeAddress) -> None:
@@ -50,7 +49,7 @@ class LeRobotReader(EpisodeReader):
             assert dataset is not None
             total = dataset.info["total_episodes"]
             if address.number is None:
-                raise RecorderError(f"{root}: is a dataset of {total} episodes; name one, e.g. {root}:0")
+                raise RecorderError(f"{root}: is a dataset of {total} episodes; choose one, e.g. {root}:0")
             self._rows = EpisodeRows(dataset, address.number)
         except DatasetError as error:
             raise RecorderError(str(error)) from error
@@ -88,7 +87,7 @@ class LeRobotReader(EpisodeReader):
 
     @override
     def digest(self) -> str:
-        """Of the vectors; pictures, which would have to be decoded, have none of an episode's own."""
+        """Digest of the vectors only, because images would have to be decoded."""
         features = self._contract.features()
         found = hashlib.sha256(f"{self._start_ns}".encode())
         try:
@@ -104,11 +103,11 @@ class LeRobotReader(EpisodeReader):
         pass
 
     def _delay_ns(self, topic: str) -> int:
-        """Of a row's message behind its tick [ns]: a command that has to follow the tick does."""
+        """Delay of a row's message after its tick [ns], for commands that must follow the tick."""
         return int(any(part.topic == topic and part.align == "next" for part in self._contract.action_parts))
 
     def _in_radians(self, values: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-        """In full precision, so that the unit's own values come out again."""
+        """Convert to radians in full precision, so that converting back gives the same values."""
         return {
             key: self._units.radians(key, value.astype(np.float64)) if value.ndim == 1 else value
             for key, value in values.items()
@@ -116,12 +115,12 @@ class LeRobotReader(EpisodeReader):
 
 
 def _check_features(root: Path, features: Mapping[str, Feature], contract: Contract) -> None:
-    """Check that what the contract has is there, in the same order."""
+    """Check that the dataset has the contract's features, in the same order."""
     for key, wanted in contract.features().items():
         found = features.get(key)
         if found is None:
             raise ContractError(
-                f"{root}: has no {key}, which the contract has; it has: {', '.join(features)}; "
+                f"{root}: lacks {key} of the contract; available: {', '.join(features)}; "
                 f"the contract: {', '.join(contract.features())}"
             )
         named = len(wanted.shape) == 1 and len(found.names) == len(wanted.names) == found.shape[0]
@@ -129,7 +128,7 @@ def _check_features(root: Path, features: Mapping[str, Feature], contract: Contr
         same = len(wanted.shape) == len(found.shape) and all(a in (-1, b) for a, b in shapes)
         if not same or (named and found.names != wanted.names):
             raise ContractError(
-                f"{root}: {key} is not what the contract says:\n"
+                f"{root}: {key} does not match the contract:\n"
                 f"   dataset: {found.shape} {', '.join(found.names)}\n"
                 f"  contract: {wanted.shape} {', '.join(wanted.names)}"
             )

@@ -1,4 +1,4 @@
-"""The rows of an episode on disk: vectors and pictures from the tables, pictures from the videos, in step."""
+"""Reads the rows of an episode: vectors and images from tables, and the matching images from videos."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class EpisodeRows:
         number: the episode, from 0.
 
     Raises:
-        DatasetError: when there is no such episode.
+        DatasetError: if there is no such episode.
     """
 
     def __init__(self, dataset: OnDisk, number: int) -> None:
@@ -45,13 +45,13 @@ class EpisodeRows:
         self.length: int = found["length"]
         self.tasks: list[str] = list(found["tasks"])
         self.begin: int = found["dataset_from_index"]
-        """Frames of the dataset before it."""
+        """Number of frames in the dataset before this episode."""
 
     def read(self, keys: Collection[str]) -> Iterator[dict[str, NDArray[Any]]]:
-        """Key -> value of each row: vectors as they are stored, shape (N,), pictures (H, W, C).
+        """Yield each row as key -> value: stored vectors, shape (N,), and images, shape (H, W, C).
 
         Raises:
-            DatasetError: for a file that cannot be read, or has fewer rows or pictures than the episode.
+            DatasetError: if a file cannot be read, or has fewer rows or images than the episode.
         """
         videos = [key for key in self._dataset.videos if key in keys]
         features = {key: each for key, each in self._dataset.features.items() if key in keys and key not in videos}
@@ -106,11 +106,11 @@ class EpisodeRows:
                         return
         except (av.error.FFmpegError, OSError) as error:
             raise DatasetError(f"{path}: cannot be read: {error}") from error
-        raise DatasetError(f"{path}: has no picture at {wanted / fps:.3f} s, within episode {self._number}")
+        raise DatasetError(f"{path}: has no image at {wanted / fps:.3f} s, within episode {self._number}")
 
 
 def _decoded(container: Any, begin_s: float) -> Generator[Any]:
-    """The pictures from the last key picture before `begin_s` [s] on."""
+    """Decode images, starting with the last key frame before `begin_s` [s]."""
     stream = container.streams.video[0]
     container.seek(max(0, int(begin_s / stream.time_base)), stream=stream)
     yield from container.decode(stream)
@@ -120,6 +120,6 @@ def _value(key: str, stored: Any, feature: Feature) -> NDArray[Any]:
     if len(feature.shape) == 3:
         content = (stored or {}).get("bytes")
         if content is None:
-            raise DatasetError(f"{key}: its pictures do not lie in the tables")
+            raise DatasetError(f"{key}: its images are not in the tables")
         return decode_picture(content, feature)
     return np.asarray(stored, np.dtype(feature.dtype)).reshape(-1)

@@ -1,7 +1,7 @@
-"""Statistics of features, by LeRobot's names and shapes: of all rows of a dataset, whole pictures never in memory.
+"""Statistics of features over all rows of a dataset, with LeRobot's names and shapes, without keeping images in memory.
 
-LeRobot 0.6.1 takes the mean of the episodes' quantiles for those of the dataset. Where episodes differ, much of a
-column then lies outside of [q01, q99]. Here quantiles are those of all rows.
+LeRobot 0.6.1 averages the quantiles of the episodes. If episodes differ, many values are then outside [q01, q99]. Here,
+quantiles are computed over all rows.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ def vector_stats(values: NDArray[Any]) -> Stats:
 
 
 class PixelStats:
-    """Statistics of the pixels of uint8 pictures, per channel and over 255: each of shape (C, 1, 1). All are exact.
+    """Exact statistics of the pixels of uint8 images, per channel, divided by 255: each of shape (C, 1, 1).
 
-    Every picture counts, large ones thinned out as LeRobot does it, to about 150 pixels along the longer side.
+    All images are included; large ones are subsampled as in LeRobot, to about 150 pixels along the longer side.
     """
 
     def __init__(self, channels: int) -> None:
@@ -43,7 +43,7 @@ class PixelStats:
         self._pictures = 0
 
     def add(self, image: NDArray[np.uint8]) -> None:
-        """Count a picture, shape (H, W, C)."""
+        """Add an image, shape (H, W, C)."""
         step = thinning(*image.shape[:2])
         thinned = image[::step, ::step]
         for channel in range(len(self._histogram)):
@@ -51,7 +51,7 @@ class PixelStats:
         self._pictures += 1
 
     def stats(self) -> Stats:
-        """Of what was counted, at least one picture."""
+        """The statistics, after at least one image."""
         values = np.arange(256) / 255.0
         share = self._histogram / self._histogram.sum(1, keepdims=True)
         mean = share @ values
@@ -67,20 +67,20 @@ class PixelStats:
         return shaped | {"count": np.array([self._pictures])}
 
     def state(self) -> dict[str, Any]:
-        """What was counted, as JSON values; `join` takes it."""
+        """The counts as JSON values, for `join`."""
         return {"pictures": self._pictures, "histogram": self._histogram.tolist()}
 
     def join(self, state: Mapping[str, Any]) -> None:
-        """Count what another one counted."""
+        """Add the counts of another object."""
         self._histogram += np.array(state["histogram"], np.int64)
         self._pictures += state["pictures"]
 
 
 class DepthStats:
-    """Statistics of depth pictures in their own unit: each of shape (1, 1, 1).
+    """Statistics of depth images in their own unit: each of shape (1, 1, 1).
 
-    Quantiles of uint16 are exact. Those of float32 are right to 0.4 %: values are counted by their upper 16 bits, which
-    order as they do, and a quantile is the middle of such a bin, 2**-7 of its value wide.
+    Quantiles of uint16 are exact. Those of float32 have an error of at most 0.4 %: values are counted in bins by their
+    upper 16 bits, which preserve the order. A quantile is the centre of a bin, whose width is 2**-7 of its value.
     """
 
     def __init__(self, dtype: str) -> None:
@@ -92,11 +92,11 @@ class DepthStats:
         self._pictures = 0
 
     def add(self, depth: NDArray[Any]) -> None:
-        """Count a picture, shape (H, W, 1)."""
+        """Add a depth image, shape (H, W, 1)."""
         step = thinning(*depth.shape[:2])
         values = np.ascontiguousarray(depth[::step, ::step]).astype(self._dtype, copy=False).ravel()
         if self._dtype.kind == "f" and not (np.isfinite(values) & (values >= 0)).all():
-            raise DatasetError("a depth picture has values that are negative or not finite")
+            raise DatasetError("a depth image has values that are negative or not finite")
         bins = values if self._dtype.kind == "u" else np.abs(values).view(np.uint32) >> 16
         self._histogram[0] += np.bincount(bins, minlength=1 << 16)
         exact = values.astype(np.float64)
@@ -105,7 +105,7 @@ class DepthStats:
         self._pictures += 1
 
     def stats(self) -> Stats:
-        """Of what was counted, at least one picture."""
+        """The statistics, after at least one image."""
         mean, square = self._moments / self._histogram.sum()
         stats = {"min": self._range[0], "max": self._range[1], "mean": mean, "std": np.sqrt(max(square - mean**2, 0.0))}
         for name, share in QUANTILES.items():
@@ -114,7 +114,7 @@ class DepthStats:
         return shaped | {"count": np.array([self._pictures])}
 
     def state(self) -> dict[str, Any]:
-        """What was counted, as JSON values; `join` takes it."""
+        """The counts as JSON values, for `join`."""
         (bins,) = self._histogram[0].nonzero()
         return {
             "pictures": self._pictures, "moments": self._moments.tolist(), "range": self._range.tolist(),
@@ -122,7 +122,7 @@ class DepthStats:
         }  # fmt: skip
 
     def join(self, state: Mapping[str, Any]) -> None:
-        """Count what another one counted."""
+        """Add the counts of another object."""
         self._histogram[0, state["bins"]] += np.array(state["histogram"], np.int64)
         self._moments += state["moments"]
         low, high = state["range"]
@@ -130,7 +130,7 @@ class DepthStats:
         self._pictures += state["pictures"]
 
     def _value(self, number: NDArray[np.intp]) -> NDArray[np.float64]:
-        """What a bin stands for."""
+        """The centre of a bin."""
         if self._dtype.kind == "u":
             return number.astype(np.float64)
         edges = [((number + i).astype(np.uint32) << 16).view(np.float32).astype(np.float64) for i in (0, 1)]
@@ -141,17 +141,17 @@ PictureStats = PixelStats | DepthStats
 
 
 def picture_stats(feature: Feature) -> PictureStats:
-    """Empty statistics of a camera's pictures."""
+    """Empty statistics of a camera's images."""
     return PixelStats(feature.shape[2]) if feature.dtype == "image" else DepthStats(feature.dtype)
 
 
 def thinning(height: int, width: int) -> int:
-    """Which pixels of a picture count for its statistics: every n-th along both sides."""
+    """The subsampling factor of an image for its statistics: every n-th pixel along both sides."""
     longer = max(height, width)
     return 1 if longer < _LARGE else longer // _SAMPLED
 
 
 def _below(histogram: NDArray[np.int64], share: float) -> NDArray[np.intp]:
-    """The first bin of each row by which `share` of the row's counts have come."""
+    """The first bin of each row at which the cumulative count reaches `share` of the row's total."""
     counted = np.cumsum(histogram, 1)
     return (counted >= share * counted[:, -1:]).argmax(1)

@@ -1,4 +1,4 @@
-"""LeRobot's standard processor steps, for arrays of any library: rename, normalise and back; equal bit for bit."""
+"""LeRobot's standard processor steps for arrays of any library: rename, normalise, unnormalise; equal bit by bit."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _STATISTICS = {"MEAN_STD": ("mean", "std"), **_SPANS}
 
 @attrs.frozen
 class Rename:
-    """Observations by the policy's names."""
+    """Renames observations to the policy's names."""
 
     names: Mapping[str, str]
 
@@ -36,19 +36,19 @@ class Rename:
 
 @attrs.frozen(eq=False)
 class Normalise:
-    """Observations and action to what the network was trained on; or back.
+    """Normalises observations and action, or unnormalises them.
 
-    Every operation is LeRobot's, in its order and in single precision, so that the bits agree.
+    The operations are those of LeRobot, in the same order and in single precision, so that the results are equal.
     """
 
     modes: Mapping[str, str]
-    """Key -> how; only of keys with statistics."""
+    """Key -> mode, only for keys with statistics."""
     statistics: Mapping[str, tuple[Any, Any]]
-    """Key -> mean and what is divided by, or the lower end and the length of the range; float32."""
+    """Key -> mean and divisor, or lower end and length of the range; float32."""
     inverse: bool
 
     def __call__(self, batch: Mapping[str, Any]) -> dict[str, Any]:
-        """The batch with what has statistics normalised; the rest as it is."""
+        """Normalise the values that have statistics; others are unchanged."""
         return {key: self._apply(key, value) if key in self.modes else value for key, value in batch.items()}
 
     def _apply(self, key: str, value: Any) -> Any:
@@ -65,21 +65,21 @@ type Step = Rename | Normalise
 
 @attrs.frozen
 class Steps:
-    """A processor: what NumPy does of it, and what it cannot."""
+    """A processor: the steps that run in NumPy, and those that do not."""
 
     steps: Sequence[Step]
     others: Sequence[str]
-    """Steps that are not standard, by LeRobot's names; where there are any, LeRobot must run the whole processor."""
+    """Non-standard steps, by LeRobot's names; if there are any, LeRobot must run the whole processor."""
 
     def __call__(self, batch: Mapping[str, Any]) -> dict[str, Any]:
-        """All steps, one after the other."""
+        """Run all steps in order."""
         result = dict(batch)
         for step in self.steps:
             result = step(result)
         return result
 
     def of(self, convert: Callable[[Array], Any]) -> Steps:
-        """The same steps for arrays of another library, to which `convert` takes the statistics."""
+        """The same steps for arrays of another library; `convert` converts the statistics."""
 
         def converted(step: Step) -> Step:
             if isinstance(step, Rename):
@@ -94,11 +94,11 @@ def read_steps(checkpoint: Checkpoint, file: str) -> Steps:
     """The steps of a processor.
 
     Args:
-        checkpoint: whose processor.
+        checkpoint: the checkpoint of the processor.
         file: `PREPROCESSOR` or `POSTPROCESSOR`.
 
     Raises:
-        PolicyError: when its statistics cannot be read.
+        PolicyError: if its statistics cannot be read.
     """
     steps: list[Step] = []
     others = []
@@ -117,7 +117,7 @@ def read_steps(checkpoint: Checkpoint, file: str) -> Steps:
 
 
 def _does_nothing(name: str, config: Mapping[str, Any]) -> bool:
-    """Whether a step changes no number here: there is one device, and a batch of one already."""
+    """Whether a step changes no values: there is only one device, and the batch already exists."""
     if name == "device_processor":
         return config.get("float_dtype") in (None, "float32", "float")
     return name == "to_batch_processor" or (name == "absolute_actions_processor" and not config.get("enabled"))
@@ -157,7 +157,7 @@ def _normalise(path: Path, entry: Mapping[str, Any], *, inverse: bool) -> Normal
 
 
 def _check_sizes(file: Path, statistics: Mapping[str, Array], kind: str, shape: Sequence[int]) -> None:
-    """Check that statistics have a number for each of a feature's, or for each of a camera's channels."""
+    """Check that statistics have one value per element of a feature, or per channel of a camera."""
     wanted = {math.prod(shape), *shape[:1]} if kind == "VISUAL" else {math.prod(shape)}
     for name, statistic in statistics.items():
         if statistic.size not in wanted:
@@ -165,5 +165,5 @@ def _check_sizes(file: Path, statistics: Mapping[str, Array], kind: str, shape: 
 
 
 def _of_channels(statistic: Array, kind: str) -> Array:
-    """A camera's statistic with a number for each channel, to go with (C, H, W)."""
+    """A camera's per-channel statistic in a shape that broadcasts with (C, H, W)."""
     return statistic.reshape(-1, 1, 1) if kind == "VISUAL" and statistic.ndim == 1 else statistic

@@ -1,4 +1,4 @@
-"""A checkpoint is input from outside: what of it is read, and which of its steps and references are allowed."""
+"""Checks of untrusted checkpoints: which files may be read, and which steps and references are allowed."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ from ibrobot_core.api import PolicyError
 MAX_ACTIONS = 10_000
 """Of a chunk."""
 MAX_HISTORY = 1_000
-"""Ticks of observations that a policy sees at once."""
+"""Maximum number of ticks of observations that a policy uses."""
 _MAX_JSON = 8 << 20
 _MAX_STATISTICS = 64 << 20
 _MAX_DEPTH = 32
 _MAX_NUMBER = 10_000_000
-"""Larger than any dimension of a network that LeRobot has."""
+"""Upper bound on the dimensions of LeRobot's networks."""
 _MAX_ELEMENTS = 1 << 26
-"""Of one observation."""
+"""Maximum number of elements of an observation."""
 
 _STATE_FILE = re.compile(r"\w[\w.-]*\.safetensors", re.ASCII)
 _LEROBOTS_CLASS = re.compile(r"lerobot(\.[A-Za-z_]\w*)+", re.ASCII)
 _TRAINING = ("optimizer_", "scheduler_")
-"""Beginnings of keys whose numbers are no sizes."""
+"""Prefixes of keys whose numbers are not sizes."""
 _REMOTE_CODE_TYPES = frozenset({"gaussian_actor", "groot", "pi0_fast", "wall_x"})
 _REMOTE_CODE_STEPS = re.compile(r"action_tokenizer_processor|groot_.*|reward_classifier_processor|.*_encoder")
-"""LeRobot sets `trust_remote_code` for what these load."""
+"""Steps and policies for which LeRobot sets `trust_remote_code`."""
 _NAMES_A_MODEL = re.compile(
     r"(.*_)?(tokenizer|vlm_base|vlm_model|base_model|(model|tokenizer|encoder|processor|vlm|base|backbone)_name"
     r"|(name_or|checkpoint|model|pretrained|tokenizer)_path|(model|encoder|assets|hub|tokenizer)_(id|repo)|\w*_dir)"
 )
-"""Keys whose text says what is loaded besides the checkpoint."""
+"""Keys that name additional models or files to load."""
 _LOOKS_LIKE_A_PATH = re.compile(r"[~.]|.*[/\\]", re.DOTALL)
 _NOT_LOADED = frozenset({"pretrained_path", "repo_id", "license", "tags"})
-"""Notes of `lerobot-train`."""
+"""Keys that `lerobot-train` only records."""
 _PROSE = re.compile(r".*(prompt|template|instruction).*")
 BASE_MODELS = frozenset(
     {
@@ -58,15 +58,15 @@ BASE_MODELS = frozenset(
         "robbyant/lingbot-va-base",
     }
 )
-"""What LeRobot's own configurations name; none of it runs code of its own."""
+"""Models named in LeRobot's own configurations; none of them runs code."""
 
 
 def read_json(folder: Path, name: str) -> dict[str, Any]:
-    """A JSON object in a checkpoint's folder.
+    """Read a JSON object from a checkpoint's folder.
 
     Raises:
-        PolicyError: for a file that is missing, a link out of the folder, no regular file, too large, nested too deep,
-            or no JSON object.
+        PolicyError: if the file is missing, links outside the folder, is not a regular file, is too large or nested
+            too deep, or does not contain a JSON object.
     """
     path = own_file(folder, name, _MAX_JSON)
     try:
@@ -88,11 +88,11 @@ def own_file(folder: Path, name: str, max_size: int | None = None) -> Path:
 
     Args:
         folder: the checkpoint.
-        name: of the file.
-        max_size: the most bytes that it may have; None: any number.
+        name: name of the file.
+        max_size: maximum size [bytes]; None: unlimited.
 
     Raises:
-        PolicyError: when it is not a regular file, a link out of the folder, or too large.
+        PolicyError: if it is not a regular file, links outside the folder, or is too large.
     """
     path, root = folder / name, folder.resolve()
     try:
@@ -100,31 +100,31 @@ def own_file(folder: Path, name: str, max_size: int | None = None) -> Path:
         status = real.stat()
     except (OSError, RuntimeError) as error:
         raise PolicyError(f"{path}: cannot be read: {error}") from None
-    # The cache of Hugging Face has MODEL/snapshots/REVISION/config.json -> ../../blobs/HASH.
+    # The Hugging Face cache has MODEL/snapshots/REVISION/config.json -> ../../blobs/HASH.
     blobs = [root.parents[1] / "blobs"] if root.parent.name == "snapshots" else []
     if not any(real.is_relative_to(allowed) for allowed in (root, *blobs)):
-        raise PolicyError(f"{path}: links to {real}, outside of the checkpoint; put the file itself there")
+        raise PolicyError(f"{path}: links to {real}, outside the checkpoint; replace the link by the file")
     if not stat.S_ISREG(status.st_mode):
         raise PolicyError(f"{path}: is not a regular file")
     if max_size is not None and status.st_size > max_size:
-        raise PolicyError(f"{path}: has {status.st_size} bytes, at most {max_size} are read")
+        raise PolicyError(f"{path}: has {status.st_size} bytes, must have at most {max_size}")
     return path
 
 
 def statistics_file(folder: Path, name: str) -> Path:
-    """The path of the statistics that a processor step names, as `own_file` checks it."""
+    """The path of a processor step's statistics, checked with `own_file`."""
     return own_file(folder, name, _MAX_STATISTICS)
 
 
 def check_steps(path: Path, document: Mapping[str, Any]) -> None:
-    """Check that each step of a processor is LeRobot's, runs no code from elsewhere, and reads its own files alone.
+    """Check that each step of a processor is LeRobot's, runs no foreign code, and reads only its own files.
 
     Args:
         path: the processor's file.
-        document: what is in it.
+        document: its content.
 
     Raises:
-        PolicyError: for any other step.
+        PolicyError: if a step is not allowed.
     """
     steps = document.get("steps")
     if not isinstance(steps, list):
@@ -135,10 +135,10 @@ def check_steps(path: Path, document: Mapping[str, Any]) -> None:
         key = "registry_name" if "registry_name" in entry else "class"
         name = entry.get(key)
         if not isinstance(name, str) or not name:
-            raise PolicyError(f"{path}: the {key} of a step is {name!r}, must be the name of a step of LeRobot's")
+            raise PolicyError(f"{path}: the {key} of a step is {name!r}, must be the name of a LeRobot step")
         if key == "class" and not _LEROBOTS_CLASS.fullmatch(name):
             raise PolicyError(
-                f"{path}: step {name!r} is not a processor step of LeRobot; nothing else is run from a checkpoint"
+                f"{path}: step {name!r} is not a processor step of LeRobot; no other code of a checkpoint is run"
             )
         check_step_name(path, name)
         if not isinstance(entry.get("config", {}), dict):
@@ -149,13 +149,13 @@ def check_steps(path: Path, document: Mapping[str, Any]) -> None:
 
 
 def check_step_name(path: Path, name: str) -> None:
-    """Refuse a registered step that has LeRobot run code from elsewhere.
+    """Refuse a registered step for which LeRobot runs foreign code.
 
     Raises:
-        PolicyError: for such a step.
+        PolicyError: if the step is not allowed.
     """
     if _REMOTE_CODE_STEPS.fullmatch(name):
-        raise PolicyError(f"{path}: step {name!r} runs code that it loads from elsewhere; such policies are not run")
+        raise PolicyError(f"{path}: step {name!r} runs downloaded code; such policies are not supported")
 
 
 def check_values(path: Path, document: Mapping[str, Any], base_models: Collection[str]) -> None:
@@ -163,52 +163,52 @@ def check_values(path: Path, document: Mapping[str, Any], base_models: Collectio
 
     Args:
         path: the file.
-        document: what is in it.
-        base_models: what the user trusts besides `BASE_MODELS`.
+        document: its content.
+        base_models: models that the user trusts in addition to `BASE_MODELS`.
 
     Raises:
-        PolicyError: for a number that is larger than any network, a wish to run code from elsewhere, and a file or
-            model outside of the checkpoint that is not trusted.
+        PolicyError: if a number is implausibly large, a value would run foreign code, or a file or model outside the
+            checkpoint is not trusted.
     """
     for place, value in _leaves(document):
         where = f"{path}: {'.'.join(map(str, place))}"
         key = next((str(each) for each in reversed(place) if isinstance(each, str)), "")
         if key == "trust_remote_code" and value:
-            raise PolicyError(f"{where}: would run code that comes with a model; such policies are not run")
+            raise PolicyError(f"{where}: would run code that comes with a model; such policies are not supported")
         if isinstance(value, int | float) and not key.startswith(_TRAINING) and not abs(value) <= _MAX_NUMBER:
             raise PolicyError(f"{where} is {value}, must be at most {_MAX_NUMBER}")
         if isinstance(value, str) and names_a_model(key, value) and value not in {*BASE_MODELS, *base_models}:
             raise PolicyError(
-                f"{where} names {value!r} to load besides the checkpoint; if you trust it, allow it in the robot YAML "
+                f"{where} loads {value!r} in addition to the checkpoint; if you trust it, allow it in the robot YAML "
                 f"with the model's base_models: [{value}]"
             )
 
 
 def names_a_model(key: str, value: str) -> bool:
-    """Whether LeRobot may take the value of a key for a folder or a model of a hub, and load it."""
+    """Whether LeRobot may interpret the value of a key as a folder or a hub model, and load it."""
     if not value or key in _NOT_LOADED or _PROSE.fullmatch(key):
         return False
     return bool(_NAMES_A_MODEL.fullmatch(key) or _LOOKS_LIKE_A_PATH.match(value))
 
 
 def check_type(path: Path, kind: Any) -> str:
-    """The type of a policy.
+    """Check the type of a policy.
 
     Raises:
-        PolicyError: when LeRobot would run code from elsewhere for it.
+        PolicyError: if LeRobot would run foreign code for it.
     """
     if not isinstance(kind, str):
-        raise PolicyError(f"{path}: type is {kind!r}, must be the name of a policy of LeRobot's")
+        raise PolicyError(f"{path}: type is {kind!r}, must be the name of a LeRobot policy")
     if kind in _REMOTE_CODE_TYPES:
-        raise PolicyError(f"{path}: policies of type {kind!r} run code that they load from elsewhere; none is run")
+        raise PolicyError(f"{path}: policies of type {kind!r} run downloaded code and are not supported")
     return kind
 
 
 def whole(path: Path, name: str, value: Any, most: int) -> int:
-    """A whole number from 1 to `most`.
+    """Check that a value is a whole number from 1 to `most`.
 
     Raises:
-        PolicyError: for anything else.
+        PolicyError: if it is not.
     """
     if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:
         raise PolicyError(f"{path}: {name} is {value!r}, must be a whole number from 1 to {most}")
@@ -216,10 +216,10 @@ def whole(path: Path, name: str, value: Any, most: int) -> int:
 
 
 def shape(path: Path, name: str, value: Any) -> tuple[int, ...]:
-    """The shape of a feature.
+    """Check the shape of a feature.
 
     Raises:
-        PolicyError: when it is none, or of more numbers than an observation has.
+        PolicyError: if it is not a shape, or has too many elements.
     """
     elements = 1
     for n in value if isinstance(value, list) and value else [0]:
@@ -232,7 +232,7 @@ def shape(path: Path, name: str, value: Any) -> tuple[int, ...]:
 
 
 def _leaves(document: Any) -> Iterator[tuple[tuple[str | int, ...], Any]]:
-    """Places and values that are neither object nor list; not recursive, since the file chooses the depth."""
+    """Yield paths and values of all scalars; not recursive, because the file determines the depth."""
     waiting: list[tuple[tuple[str | int, ...], Any]] = [((), document)]
     while waiting:
         place, value = waiting.pop()

@@ -1,4 +1,4 @@
-"""Videos: pictures encoded one by one in a thread of their own, and files joined without re-encoding."""
+"""Videos: encodes images in a thread, and joins files without re-encoding."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from ibrobot_lerobot.stats import PixelStats
 PIXEL_FORMAT = "yuv420p"
 _GPU = ("h264_nvenc", "hevc_nvenc", "h264_videotoolbox", "hevc_videotoolbox")
 _QUEUED = 8
-"""Pictures that may wait for their encoder; a writer that is faster waits."""
+"""Number of images that may wait for their encoder; a faster writer waits."""
 _SVT_PRESET = "12"
 
-os.environ.setdefault("SVT_LOG", "1")  # libsvtav1 tells about every file on stderr otherwise
+os.environ.setdefault("SVT_LOG", "1")  # otherwise libsvtav1 logs every file to stderr
 
 
 @attrs.frozen
@@ -36,14 +36,14 @@ class Encoder:
     codec: str
     options: dict[str, str]
     described: dict[str, Any]
-    """What `info.json` says of it, by LeRobot's names."""
+    """Its description in `info.json`, with LeRobot's names."""
 
 
 def choose_encoder(options: LeRobotOptions) -> Encoder:
-    """The encoder that the options ask for.
+    """The encoder selected by the options.
 
     Raises:
-        DatasetError: when it does not open on this machine.
+        DatasetError: if it is not available on this machine.
     """
     if options.codec == "auto":
         found = (encoder for codec in _GPU if _opens(encoder := _encoder(codec, options)) is None)
@@ -51,7 +51,7 @@ def choose_encoder(options: LeRobotOptions) -> Encoder:
     encoder = _encoder(options.codec, options)
     if (reason := _opens(encoder)) is not None:
         raise DatasetError(
-            f"codec {encoder.codec} does not open here: {reason}; codec: auto takes the first that does, "
+            f"codec {encoder.codec} is not available: {reason}; codec: auto uses the first available one, "
             "libsvtav1 needs no GPU"
         )
     return encoder
@@ -59,30 +59,30 @@ def choose_encoder(options: LeRobotOptions) -> Encoder:
 
 def _encoder(codec: str, options: LeRobotOptions) -> Encoder:
     preset = options.preset or (_SVT_PRESET if codec == "libsvtav1" else "")
-    told = {"g": str(options.gop)} | ({"preset": preset} if preset else {})
+    settings = {"g": str(options.gop)} | ({"preset": preset} if preset else {})
     described: dict[str, Any] = {
         "video.g": options.gop, "video.crf": options.crf,
         "video.preset": int(preset) if preset.isdigit() else preset or None,
         "video.fast_decode": 0, "video.video_backend": "pyav", "video.extra_options": {},
     }  # fmt: skip
     if codec == "libsvtav1":
-        told |= {"crf": str(options.crf), "svtav1-params": f"fast-decode=0:lp={options.threads}"}
-        return Encoder(codec, told, described)
-    # Pictures in the order of display, so that files can be joined at any of them.
-    told["bf"] = "0"
+        settings |= {"crf": str(options.crf), "svtav1-params": f"fast-decode=0:lp={options.threads}"}
+        return Encoder(codec, settings, described)
+    # Keep images in display order, so that files can be joined anywhere.
+    settings["bf"] = "0"
     if codec in ("h264", "hevc"):
-        told |= {"crf": str(options.crf), "threads": str(options.threads)}
+        settings |= {"crf": str(options.crf), "threads": str(options.threads)}
         if codec == "hevc":
-            told["x265-params"] = f"log-level=error:bframes=0:pools={options.threads}"
+            settings["x265-params"] = f"log-level=error:bframes=0:pools={options.threads}"
     elif codec.endswith("nvenc"):
-        told |= {"rc": "constqp", "qp": str(options.crf)}
+        settings |= {"rc": "constqp", "qp": str(options.crf)}
     else:
-        told["q:v"] = str(max(1, 100 - 2 * options.crf))
-    return Encoder(codec, told, described)
+        settings["q:v"] = str(max(1, 100 - 2 * options.crf))
+    return Encoder(codec, settings, described)
 
 
 def _opens(encoder: Encoder) -> str | None:
-    """Why an encoder does not encode a picture here; None when it does."""
+    """The reason why an encoder does not work on this machine; None if it works."""
     try:
         context: Any = av.CodecContext.create(encoder.codec, "w")
         context.width, context.height, context.pix_fmt = 256, 256, PIXEL_FORMAT
@@ -96,16 +96,16 @@ def _opens(encoder: Encoder) -> str | None:
 
 
 class VideoTrack:
-    """One camera's pictures of an episode, on their way into a file. No picture is ever dropped: `add` waits.
+    """Writes the images of one camera in an episode to a file. No image is ever dropped: `add` waits.
 
     Args:
         path: the file, which must not exist.
         fps: pictures per second.
-        shape: (H, W, 3) of every picture.
-        encoder: how to encode them.
+        shape: image shape, (H, W, 3).
+        encoder: the encoder.
 
     Raises:
-        DatasetError: when the file cannot be made.
+        DatasetError: if the file cannot be created.
     """
 
     def __init__(self, path: Path, fps: int, shape: tuple[int, ...], encoder: Encoder) -> None:
@@ -127,10 +127,10 @@ class VideoTrack:
         self._thread.start()
 
     def add(self, image: NDArray[np.uint8]) -> None:
-        """Append a picture, shape (H, W, 3), RGB; it is copied.
+        """Append an image, shape (H, W, 3), RGB; it is copied.
 
         Raises:
-            DatasetError: when an earlier one could not be written.
+            DatasetError: if an earlier one could not be written.
         """
         frame: Any = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), "rgb24")
         frame.pts, frame.time_base = self._count, self._time_base
@@ -141,7 +141,7 @@ class VideoTrack:
         """Finish the file; returns the statistics of its pixels.
 
         Raises:
-            DatasetError: when a picture could not be written.
+            DatasetError: if an image could not be written.
         """
         self._put(None)
         self._thread.join()
@@ -150,7 +150,7 @@ class VideoTrack:
         return self._stats
 
     def abort(self) -> None:
-        """Give the file up. Safe after `close`."""
+        """Discard the file. Safe after `close`."""
         self._failure = self._failure or DatasetError("given up")
         while self._thread.is_alive():
             try:
@@ -170,14 +170,14 @@ class VideoTrack:
             return
 
     def _failed(self) -> DatasetError:
-        return DatasetError(f"{self._path}: picture {self._count} could not be encoded or written: {self._failure}")
+        return DatasetError(f"{self._path}: image {self._count} could not be encoded or written: {self._failure}")
 
     def _run(self) -> None:
         try:
             with self._container:
                 while (frame := self._queue.get()) is not None:
                     if self._failure is not None:
-                        self._stream.encode(None)  # an encoder that is not flushed complains on stderr
+                        self._stream.encode(None)  # without a flush, the encoder prints warnings to stderr
                         return
                     self._stats.add(frame.to_ndarray())
                     self._container.mux(self._stream.encode(frame))
@@ -188,22 +188,22 @@ class VideoTrack:
 
 @attrs.frozen
 class VideoFile:
-    """A part of a video to be."""
+    """A part of a joined video."""
 
     path: Path
     frames: int
 
 
 def join_videos(parts: Sequence[VideoFile], path: Path, fps: int) -> None:
-    """Write the pictures of `parts` one after the other, as they are encoded.
+    """Join videos without re-encoding.
 
     Args:
-        parts: videos of the same encoder and size, with the pictures that each has.
+        parts: videos of the same encoder and size, with their numbers of images.
         path: the new file.
-        fps: pictures per second.
+        fps: images per second.
 
     Raises:
-        DatasetError: for a part that cannot be read or has another number of pictures, or a full disk.
+        DatasetError: if a part cannot be read or has an unexpected number of images, or the disk is full.
     """
     begin = 0
     stream: Any = None
@@ -225,14 +225,14 @@ def join_videos(parts: Sequence[VideoFile], path: Path, fps: int) -> None:
                         joined.mux(packet)
                         found += 1
                 if found != part.frames:
-                    raise DatasetError(f"{part.path}: has {found} pictures, its table {part.frames} rows")
+                    raise DatasetError(f"{part.path}: has {found} images, its table {part.frames} rows")
                 begin += part.frames
     except (av.error.FFmpegError, OSError) as error:
         raise DatasetError(f"{path}: cannot be joined: {error}") from error
 
 
 def describe_video(path: Path, fps: int, encoder: Encoder) -> dict[str, Any]:
-    """What `info.json` says of a video, by LeRobot's names."""
+    """The description of a video in `info.json`, with LeRobot's names."""
     with av.open(str(path)) as container:
         stream: Any = container.streams.video[0]
         return {

@@ -1,4 +1,4 @@
-"""Dataset writer `lerobot`: every episode a dataset of its own, merged by `finalize`."""
+"""Dataset writer `lerobot`: writes every episode as a separate dataset; `finalize` merges them."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from ibrobot_lerobot.options import LeRobotOptions
 from ibrobot_lerobot.video import choose_encoder
 
 _SAVED = ".episodes"
-"""Where the saved episodes of a dataset lie that was not finalised."""
+"""Folder of saved episodes before `finalize`."""
 
 
 class LeRobotDatasetWriter(DatasetWriter):
     """Writes LeRobot's format v3.0.
 
-    Saved episodes lie in `ROOT/.episodes/000000`, …, each a dataset that LeRobot loads, until `finalize` merges them;
-    so a process that is killed loses none of them.
+    Saved episodes are separate LeRobot datasets in `ROOT/.episodes/000000`, … until `finalize` merges them. So a killed
+    process loses none of them.
 
-    `metadata` has `robot_type`; all of it comes back from `meta/ibrobot.json`.
+    `metadata` contains `robot_type` and is stored in `meta/ibrobot.json`.
     """
 
     def __init__(self, options: LeRobotOptions) -> None:
@@ -43,7 +43,7 @@ class LeRobotDatasetWriter(DatasetWriter):
     def create(self, root: Path, fps: float, features: Mapping[str, Feature], metadata: Mapping[str, Any]) -> None:
         options = self._options
         if fps != int(fps) or fps < 1:
-            raise DatasetError(f"LeRobot's fps is a whole number; contract.rate_hz is {fps:g}")
+            raise DatasetError(f"LeRobot needs a whole number of frames per second; contract.rate_hz is {fps:g}")
         stored = layout.columns(features, videos=options.videos)
         videos = any(column.storage == "video" for column in stored.values())
         encoder = choose_encoder(options) if videos else None
@@ -55,7 +55,7 @@ class LeRobotDatasetWriter(DatasetWriter):
             raise DatasetError(f"metadata cannot be written as JSON: {error}") from error
         try:
             if root.exists() and any(root.iterdir()):
-                raise DatasetError(f"{root} is not empty: a dataset begins in an empty or new directory")
+                raise DatasetError(f"{root} is not empty: a new dataset needs an empty or new folder")
             (root / _SAVED).mkdir(parents=True)
         except OSError as error:
             raise DatasetError(f"cannot create a dataset in {root}: {error}") from error
@@ -66,7 +66,7 @@ class LeRobotDatasetWriter(DatasetWriter):
     def add_frame(self, values: Mapping[str, NDArray[np.generic]], task: str) -> None:
         root, form = self._created()
         for key in sorted(form.stored.keys() ^ values.keys()):
-            raise DatasetError(f"{key} is {'missing' if key in form.stored else 'no feature of this dataset'}")
+            raise DatasetError(f"{key} is {'missing' if key in form.stored else 'not a feature of this dataset'}")
         frame = {key: _fitting(key, column.feature, values[key]) for key, column in form.stored.items()}
         if self._open is None:
             path = root / _SAVED / f"{len(self._saved):06d}.open"
@@ -81,7 +81,7 @@ class LeRobotDatasetWriter(DatasetWriter):
     def save_episode(self) -> int:
         root, _ = self._created()
         if self._open is None:
-            raise DatasetError("the episode has no frames: add_frame comes before save_episode")
+            raise DatasetError("the episode has no frames: call add_frame before save_episode")
         episode, self._open = self._open, None
         episode.close()
         number = len(self._saved)
@@ -122,12 +122,12 @@ class LeRobotDatasetWriter(DatasetWriter):
 
     def _created(self) -> tuple[Path, Format]:
         if self._root is None or self._form is None:
-            raise DatasetError("no dataset is open: create comes first, finalize last")
+            raise DatasetError("no dataset is open: call create first, finalize last")
         return self._root, self._form
 
 
 def _fitting(key: str, feature: Feature, value: NDArray[np.generic]) -> NDArray[Any]:
-    """The value as it is stored."""
+    """The value in its stored form."""
     value = np.asarray(value)
     dtype = np.dtype("uint8" if feature.dtype == "image" else feature.dtype)
     if value.shape != feature.shape:

@@ -136,8 +136,8 @@ def _features(**changes: Any) -> Callable[[Path, Path], None]:
     )
 
 
-_OUTSIDE = r"links to .*, outside of the checkpoint"
-_NAMES_ANOTHER = r"names .* to load besides the checkpoint"
+_OUTSIDE = r"links to .*, outside the checkpoint"
+_NAMES_ANOTHER = r"loads .* in addition to the checkpoint"
 
 ATTACKS = {
     "shell": Attack(_step(PRE, _shell), r"step 'os.system' is not a processor step of LeRobot"),
@@ -165,15 +165,15 @@ ATTACKS = {
     ),
     "step_that_runs_remote_code": Attack(
         _step(PRE, lambda canary: {"registry_name": "action_tokenizer_processor", "config": _remote_code(canary)}),
-        r"step 'action_tokenizer_processor' runs code",
+        r"step 'action_tokenizer_processor' runs downloaded code",
     ),
     "remote_code_by_default": Attack(
         _step(PRE, lambda canary: {"registry_name": "topreward_encoder", "config": {"vlm_name": "any/body"}}),
-        r"step 'topreward_encoder' runs code",
+        r"step 'topreward_encoder' runs downloaded code",
     ),
     "trust_remote_code": Attack(_config(trust_remote_code=True), r"trust_remote_code"),
     "trust_remote_code_below": Attack(_config(a={"b": [{"trust_remote_code": 1}]}), r"a.b.0.trust_remote_code"),
-    "policy_that_runs_remote_code": Attack(_config(type="groot"), r"policies of type 'groot' run code"),
+    "policy_that_runs_remote_code": Attack(_config(type="groot"), r"policies of type 'groot' run downloaded code"),
     "type_that_is_no_text": Attack(_config(type=["act"]), r"type is \['act'\]"),
     "tokenizer_in_a_folder": Attack(
         _step(PRE, lambda canary: {"registry_name": "tokenizer_processor", "config": {"tokenizer_name": "/tmp/x"}}),
@@ -181,13 +181,13 @@ ATTACKS = {
     ),
     "tokenizer_of_anybody": Attack(
         _step(PRE, lambda canary: {"registry_name": "tokenizer_processor", "config": {"tokenizer_name": "evil"}}),
-        r"tokenizer_name names 'evil' to load besides the checkpoint",
+        r"tokenizer_name loads 'evil' in addition to the checkpoint",
     ),
-    "vlm_of_anybody": Attack(_config(vlm_model_name="any/body"), r"vlm_model_name names 'any/body' to load besides"),
+    "vlm_of_anybody": Attack(_config(vlm_model_name="any/body"), r"vlm_model_name loads 'any/body' in addition to"),
     "vlm_up_and_out": Attack(_config(vlm_model_name="../other"), r"vlm_model_name " + _NAMES_ANOTHER),
-    "a_path_in_any_field": Attack(_config(whatever="/etc/passwd"), r"whatever names '/etc/passwd' to load besides"),
-    "a_url_in_any_field": Attack(_config(whatever="http://x"), r"whatever names 'http://x' to load besides"),
-    "a_home_in_any_field": Attack(_config(whatever="~root"), r"whatever names '~root' to load besides"),
+    "a_path_in_any_field": Attack(_config(whatever="/etc/passwd"), r"whatever loads '/etc/passwd' in addition to"),
+    "a_url_in_any_field": Attack(_config(whatever="http://x"), r"whatever loads 'http://x' in addition to"),
+    "a_home_in_any_field": Attack(_config(whatever="~root"), r"whatever loads '~root' in addition to"),
     "state_file_absolute": Attack(_state_file("/etc/passwd"), r"state_file '/etc/passwd' is not the plain name"),
     "state_file_up_and_out": Attack(_state_file("../x.safetensors"), r"state_file '../x.safetensors' is not the plain"),
     "state_file_in_a_folder": Attack(_state_file("a/x.safetensors"), r"state_file 'a/x.safetensors' is not the plain"),
@@ -198,9 +198,9 @@ ATTACKS = {
     "processor_linked_out": Attack(_linked(PRE, lambda path: path.parent / "outside.json"), _OUTSIDE),
     "config_is_a_device": Attack(_linked("config.json", lambda _: Path("/dev/zero")), _OUTSIDE),
     "config_is_a_pipe": Attack(_fifo, r"config.json: is not a regular file"),
-    "config_is_large": Attack(_sparse("config.json", 1 << 34), r"config.json: has 17179869184 bytes, at most"),
+    "config_is_large": Attack(_sparse("config.json", 1 << 34), r"config.json: has 17179869184 bytes, must have at most"),
     "statistics_are_large": Attack(
-        lambda path, canary: _sparse(_statistics(path).name, 1 << 36)(path, canary), r"has 68719476736 bytes, at most"
+        lambda path, canary: _sparse(_statistics(path).name, 1 << 36)(path, canary), r"has 68719476736 bytes, must have at most"
     ),
     "statistics_are_pickled": Attack(_pickled_statistics, r"safetensors: cannot be read"),
     "statistics_are_torchs": Attack(

@@ -142,7 +142,7 @@ def test_history_begins_with_the_oldest_available_frame(tmp_path: Path) -> None:
 
 def test_a_prompt_and_the_plan_travel_with_the_observation(tmp_path: Path) -> None:
     policy = make(write(tmp_path / "pi0", type="pi0"))
-    with pytest.raises(PolicyError, match="pi0 wants a prompt"):
+    with pytest.raises(PolicyError, match="pi0 needs a prompt"):
         policy.preprocess(frame())
     plain = policy.preprocess(frame(prompt="piştir"))
     assert plain["task"].tobytes().decode() == "piştir"
@@ -172,7 +172,7 @@ def test_a_seed_for_each_tick_of_each_episode(tmp_path: Path) -> None:
     [
         ({TOP: None}, "needs observation.images.top, which the frame at"),
         ({STATE: np.zeros(7, np.float32)}, r"needs observation.state of shape \(6,\), got \(7,\)"),
-        ({TOP: np.zeros((4, 5, 3), np.uint16)}, "with pixels of 8 bit, got uint16"),
+        ({TOP: np.zeros((4, 5, 3), np.uint16)}, "with 8-bit pixels, got uint16"),
     ],
 )
 def test_frames_that_do_not_fit(tmp_path: Path, values: dict[str, Any], message: str) -> None:
@@ -197,7 +197,7 @@ def test_what_it_was_trained_on(tmp_path: Path) -> None:
     (tmp_path / "set/meta/ibrobot.json").unlink()
     assert make(by_dataset).spec.actions is None
     (beside / "ibrobot.json").write_text('{"contract": {}}')
-    with pytest.raises(PolicyError, match=r"beside/ibrobot.json: is not the meta/ibrobot.json of `ibrobot convert`'s"):
+    with pytest.raises(PolicyError, match=r"beside/ibrobot.json: is not a meta/ibrobot.json file of `ibrobot convert`"):
         make(beside)
 
 
@@ -266,7 +266,7 @@ def test_weights_are_compared_with_the_configuration_without_torch(tmp_path: Pat
     if fits:
         policy.check_weights()
     else:
-        with pytest.raises(PolicyError, match=r"safetensors: gives actions of 7 numbers, config.json says 6"):
+        with pytest.raises(PolicyError, match=r"safetensors: actions have 7 values, but config.json says 6"):
             policy.check_weights()
 
 
@@ -275,10 +275,10 @@ def test_weights_are_compared_with_the_configuration_without_torch(tmp_path: Pat
     [
         (_empty, "is not a folder with a checkpoint: it has no config.json; lerobot-train writes it to"),
         (_inner, "did you mean .*/checkpoints/last/pretrained_model"),
-        (_old, "has no policy_preprocessor.json: a checkpoint from before LeRobot 0.4"),
+        (_old, "has no policy_preprocessor.json: it is from before LeRobot 0.4"),
         (_cut, "config.json: cannot be read"),
-        (_no_features, "config.json: is not a policy's configuration of LeRobot 0.6: KeyError"),
-        (_adapter, "has an adapter only"),
+        (_no_features, "config.json: is not a policy configuration of LeRobot 0.6: KeyError"),
+        (_adapter, "contains only an adapter"),
         (_no_statistics, "policy_preprocessor.safetensors: cannot be read"),
         (_too_few, "MIN_MAX needs observation.state.max, which is missing"),
         (_statistics_of_another_robot, r"action.mean has shape \(7,\), its feature \(6,\)"),

@@ -117,7 +117,7 @@ def test_a_video_that_lacks_pictures_is_refused(tmp_path: Path) -> None:
     one, two = parts(tmp_path / "parts", (4, 3))
     video = "videos/observation.images.top/chunk-000/file-000.mp4"
     shutil.copy(one / video, two / video)
-    with pytest.raises(DatasetError, match="has 4 pictures, its table 3 rows"):
+    with pytest.raises(DatasetError, match="has 4 images, its table 3 rows"):
         merging.merge(tmp_path / "set", [one, two], {})
     assert not (tmp_path / "set/meta").exists()
 

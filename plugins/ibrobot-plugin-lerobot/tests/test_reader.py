@@ -130,9 +130,9 @@ def test_joints_come_in_radians(tmp_path: Path):
         (
             {"nothing": "x"},
             ContractError,
-            "was not made by ibrobot, .*name a robot YAML whose contract fits",
+            "was not made by ibrobot, .*give a robot YAML with a matching contract",
         ),
-        ({"contract": told()["contract"]}, CalibrationError, "does not say the unit of its joints; --norm-mode does"),
+        ({"contract": told()["contract"]}, CalibrationError, "does not state the unit of its joints; set it by --norm-mode"),
         (told(norm_mode="degrees"), CalibrationError, "degrees needs the calibration of joint 'a'"),
         (
             told(contract(("a", "c", "b"))),
@@ -148,14 +148,14 @@ def test_a_foreign_dataset_says_what_it_needs(tmp_path: Path, more: dict[str, st
 
 def test_what_the_contract_has_and_the_dataset_lacks_is_named(tmp_path: Path):
     root = write(tmp_path / "set", {"observation.state": FEATURES["observation.state"]}, (2,))
-    with pytest.raises(ContractError, match=r"has no observation.images.top, which the contract has; it has: observ"):
+    with pytest.raises(ContractError, match=r"lacks observation.images.top of the contract; available: observ"):
         read(root, 0)
 
 
 def test_an_episode_goes_by_its_number(tmp_path: Path):
     foreign(tmp_path / "set", videos=False)
     registry = installed_plugins()
-    with pytest.raises(RecorderError, match=r"set: is a dataset of 3 episodes; name one, e.g. .*set:0"):
+    with pytest.raises(RecorderError, match=r"set: is a dataset of 3 episodes; choose one, e.g. .*set:0"):
         registry.open_episode(tmp_path / "set", told())
     with pytest.raises(RecorderError, match=r"set: has no episode 3; available: 0 to 2"):
         registry.open_episode(tmp_path / "set:3", told())
@@ -201,7 +201,7 @@ def test_jpegs_are_decoded():
 
 @pytest.mark.parametrize("content", [b"GIF89a", b"\x89PNG\r\n\x1a\n\0\0"])
 def test_bytes_without_a_picture_are_refused(content: bytes):
-    with pytest.raises(DatasetError, match="picture"):
+    with pytest.raises(DatasetError, match="image"):
         decode_picture(content, CAMERA)
 
 

@@ -101,7 +101,7 @@ def test_a_dataset_that_keeps_no_counts_of_its_pictures_cannot_grow(tmp_path: Pa
     (tmp_path / "set" / PIXELS).unlink()
     kept = stats(tmp_path / "set")
     with pytest.raises(
-        DatasetError, match=r"does not keep what the statistics of observation.*convert its episodes again"
+        DatasetError, match=r"lacks the state of the statistics of observation.*convert its episodes again"
     ):
         merging.merge(tmp_path / "set", parts[1:], {})
     assert stats(tmp_path / "set") == kept

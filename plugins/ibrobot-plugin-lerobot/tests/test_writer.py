@@ -120,11 +120,11 @@ def test_memory_does_not_hold_a_table_of_pictures(tmp_path: Path, monkeypatch: p
 @pytest.mark.parametrize(
     ("key", "feature", "message"),
     [
-        ("timestamp", STATE, "LeRobot keeps that name"),
-        ("a/b", STATE, "no slash"),
+        ("timestamp", STATE, "the name is reserved by LeRobot"),
+        ("a/b", STATE, "contains a slash"),
         ("x", Feature("image", (-1, -1, 3)), "at least 1"),
-        ("x", Feature("float32", (2, 2)), "neither a vector nor a picture"),
-        ("x", Feature("complex64", (2,)), "neither a vector nor a picture"),
+        ("x", Feature("float32", (2, 2)), "neither a vector nor an image"),
+        ("x", Feature("complex64", (2,)), "neither a vector nor an image"),
     ],
 )
 def test_refuses_features_without_a_place(tmp_path: Path, key: str, feature: Feature, message: str) -> None:
@@ -136,7 +136,7 @@ def test_refuses_features_without_a_place(tmp_path: Path, key: str, feature: Fea
 
 def test_refuses_a_rate_that_lerobot_cannot_have(tmp_path: Path) -> None:
     writer = LeRobotDatasetWriter(LeRobotOptions())
-    with pytest.raises(DatasetError, match=r"whole number; contract.rate_hz is 12.5"):
+    with pytest.raises(DatasetError, match=r"whole number of frames per second; contract.rate_hz is 12.5"):
         writer.create(tmp_path / "set", 12.5, {"observation.state": STATE}, {})
 
 
@@ -144,7 +144,7 @@ def test_an_encoder_that_does_not_open_is_reported(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(
         "ibrobot_lerobot.video._opens", lambda encoder: "no device" if "nvenc" in encoder.codec else None
     )
-    with pytest.raises(DatasetError, match="h264_nvenc does not open here: no device"):
+    with pytest.raises(DatasetError, match="h264_nvenc is not available: no device"):
         choose_encoder(LeRobotOptions(codec="h264_nvenc"))
 
 
