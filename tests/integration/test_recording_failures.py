@@ -376,7 +376,7 @@ class TestMissingTopic:
     def test_verify_names_it(self, run: Run, silent: Path):
         done = run("episodes", "verify", silent)
         assert done.code == 1
-        assert "no message of /top, which its contract has; no message of /commands" in done.out
+        assert "no message of /top, which is in its contract; no message of /commands" in done.out
 
     def test_replay_names_it(self, run: Run, picks: Path, tmp_path: Path):
         reader = installed_plugins().open_episode(picks / "episodes/episode_000001")

@@ -132,7 +132,7 @@ def test_joints_come_in_radians(tmp_path: Path):
             ContractError,
             "was not made by ibrobot, .*give a robot YAML with a matching contract",
         ),
-        ({"contract": told()["contract"]}, CalibrationError, "does not state the unit of its joints; set it by --norm-mode"),
+        ({"contract": told()["contract"]}, CalibrationError, "does not state the unit .*; set it by --norm-mode"),
         (told(norm_mode="degrees"), CalibrationError, "degrees needs the calibration of joint 'a'"),
         (
             told(contract(("a", "c", "b"))),

@@ -35,7 +35,7 @@ def _read(address: EpisodeAddress) -> EpisodeReader:
 
 @hookimpl
 def ibrobot_recorders() -> Iterable[RecorderDescriptor]:
-    """What writes bags."""
+    """The recorder of bags."""
     yield RecorderDescriptor(
         type="mcap",
         options=McapOptions,
@@ -47,7 +47,7 @@ def ibrobot_recorders() -> Iterable[RecorderDescriptor]:
 
 @hookimpl
 def ibrobot_readers() -> Iterable[ReaderDescriptor]:
-    """Reads bags, foreign ones included."""
+    """The reader of bags, including foreign ones."""
     yield ReaderDescriptor("rosbag2", "ROS 2 bags: MCAP, also unfinished, and sqlite3", _reads, _read)
 
 
@@ -59,7 +59,7 @@ def _decoder() -> Callable[[CompressedImage], Image | None]:
 
 @hookimpl
 def ibrobot_decoders() -> Iterable[DecoderDescriptor]:
-    """Of the pictures that bags have."""
+    """The decoder of compressed images in bags."""
     yield DecoderDescriptor(("jpeg", "png", "compressedDepth png"), _decoder)
 
 
@@ -78,5 +78,5 @@ def _contract() -> click.Command:
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
     """`ibrobot episodes …` and `ibrobot contract init`."""
-    yield Command("episodes", "List, check, mend, cut, plot and export recorded episodes.", _commands)
+    yield Command("episodes", "List, check, repair, trim, plot and export recorded episodes.", _commands)
     yield Command("contract", "Draft a contract for foreign bags.", _contract)

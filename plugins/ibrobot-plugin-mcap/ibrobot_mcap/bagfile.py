@@ -1,4 +1,4 @@
-"""One MCAP file of an episode as it is written."""
+"""Writes one MCAP file of an episode."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _COMPRESSION = {"none": CompressionType.NONE, "lz4": CompressionType.LZ4, "zstd"
 
 @attrs.frozen
 class Item:
-    """A message as it goes into a file."""
+    """A message to be written to a file."""
 
     topic: Topic
     data: memoryview
@@ -35,10 +35,10 @@ class Item:
 class BagFile:
     """Writes one file: profile `ros2`, `ros2msg` schemas, CDR messages in chunks.
 
-    Every method that writes leaves a file of whole records when it fails.
+    If a write fails, the file still contains only complete records.
 
     Raises:
-        OSError: when it cannot be made or written; the same goes for its methods.
+        OSError: if the file cannot be created or written; so do all methods.
     """
 
     def __init__(self, path: Path, options: McapOptions, facts: Mapping[str, Any]) -> None:
@@ -58,20 +58,20 @@ class BagFile:
 
     @property
     def size(self) -> int:
-        """Bytes in the file."""
+        """Size of the file [bytes]."""
         return self._output.size
 
     def chunk_age_ns(self, received_ns: int) -> int:
-        """Time from the first message that is not in the file yet to `received_ns` [ns]; 0 without one."""
+        """Time from the first unwritten message to `received_ns` [ns]; 0 if there is none."""
         return 0 if self._chunk_start_ns is None else received_ns - self._chunk_start_ns
 
     @property
     def waiting(self) -> bool:
-        """Whether there are messages that are not in the file yet."""
+        """Whether there are unwritten messages."""
         return self._chunk_start_ns is not None
 
     def announce(self, topic: Topic) -> None:
-        """Let the file have `topic`, with or without messages."""
+        """Add `topic` to the file, with or without messages."""
         if topic in self._channels:
             return
         if topic.type not in self._schemas:
@@ -88,7 +88,7 @@ class BagFile:
         self.counts.setdefault(topic, 0)
 
     def add(self, item: Item) -> None:
-        """Add a message; it is in the file when its chunk is full, or at the next `flush`."""
+        """Add a message; it is written when its chunk is full, or at the next `flush`."""
         self.announce(item.topic)
         size = self.size
         with _whole_records(self._output):
@@ -104,7 +104,7 @@ class BagFile:
             self._chunk_start_ns = item.received_ns
 
     def add_repeated(self, items: list[Item]) -> None:
-        """Add copies of messages of the file before, in a chunk of their own that says so."""
+        """Add copies of messages from the previous file, in a separate chunk that is marked as such."""
         with _whole_records(self._output):
             self._writer.add_metadata(REPEATED, {"messages": str(len(items))})
         for item in items:
@@ -112,13 +112,13 @@ class BagFile:
         self.flush()
 
     def flush(self) -> None:
-        """Put everything into the file."""
+        """Write all messages to the file."""
         with _whole_records(self._output):
             self._writer.flush()
         self._chunk_start_ns = None
 
     def sync_aside(self) -> None:
-        """Begin to put what is in the file onto the disk; see `Output.sync_aside`."""
+        """Begin to sync the file to the disk; see `Output.sync_aside`."""
         self._output.sync_aside()
 
     def finish(self, facts: Mapping[str, Any]) -> None:
@@ -131,7 +131,7 @@ class BagFile:
         self._output.close()
 
     def abandon(self) -> None:
-        """Close as it is. Safe to call twice, and after `finish`."""
+        """Close without finishing. Safe to call twice, and after `finish`."""
         self._output.close()
 
     def _add_facts(self, facts: Mapping[str, Any]) -> None:
@@ -140,7 +140,7 @@ class BagFile:
 
 @contextmanager
 def _whole_records(output: Output) -> Iterator[None]:
-    """What fails within leaves no part of a record behind."""
+    """A context that removes incomplete records if an error occurs."""
     size = output.size
     try:
         yield

@@ -1,4 +1,4 @@
-"""What can be wrong with a recorded episode, found by reading all of it."""
+"""Checks a recorded episode by reading all of it."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from ibrobot_mcap.metadata import METADATA
 from ibrobot_mcap.reader import Rosbag2Reader
 
 _FEW = 8
-"""Messages that a topic must have before its period means something."""
+"""Minimum number of messages to compute the period of a topic."""
 
 
 def problems_of(path: Path, longest_gap: float) -> list[str]:
-    """Everything that is wrong with an episode; nothing for a good one.
+    """List all problems of an episode.
 
     Args:
         path: the episode.
-        longest_gap: longest pause within a topic, in its median periods.
+        longest_gap: longest acceptable pause in a topic, in multiples of its median period.
     """
     try:
         reader = Rosbag2Reader(path)
@@ -47,7 +47,7 @@ def problems_of(path: Path, longest_gap: float) -> list[str]:
     finally:
         reader.close()
     absent = [topic for topic in _required(summary.metadata) if not stamps[topic]]
-    problems += [f"no message of {topic}, which its contract has" for topic in absent]
+    problems += [f"no message of {topic}, which is in its contract" for topic in absent]
     for topic, stated in reader.stated.items():
         known = summary.topics.get(topic)
         found = (known.count if known is not None else 0) + repeated.get(topic, 0)
@@ -65,7 +65,7 @@ def problems_of(path: Path, longest_gap: float) -> list[str]:
 
 
 def contract_of(metadata: Mapping[str, str]) -> Contract | None:
-    """The contract that an episode was recorded by; None for one without."""
+    """The contract of a recorded episode; None if it has none."""
     if "contract" not in metadata:
         return None
     try:
@@ -75,13 +75,13 @@ def contract_of(metadata: Mapping[str, str]) -> Contract | None:
 
 
 def _required(metadata: Mapping[str, str]) -> Collection[str]:
-    """The topics of the contract that an episode was recorded by; nothing for one without."""
+    """The topics of an episode's contract; empty if it has none."""
     contract = contract_of(metadata)
     return () if contract is None else contract.topics
 
 
 def _pause(topic: str, stamps: list[int], longest_gap: float, start_ns: int) -> list[str]:
-    """The longest pause of a topic, where it is too long."""
+    """A problem if the longest pause of a topic is too long."""
     if len(stamps) < _FEW:
         return []
     pauses = np.diff(stamps) / 1e6

@@ -1,4 +1,4 @@
-"""Compression of rosbag2's own, around whole files or single messages; MCAP's chunks see to theirs themselves."""
+"""rosbag2's own compression of whole files or single messages, as opposed to that of MCAP chunks."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _BLOCK = 1 << 20
 
 
 class Expanded:
-    """Files without their compression, in a temporary folder until `close`."""
+    """Decompressed files, in a temporary folder until `close`."""
 
     def __init__(self, paths: Sequence[Path]) -> None:
         self._folder = TemporaryDirectory(prefix="ibrobot-bag-")
@@ -33,12 +33,12 @@ class Expanded:
             raise
 
     def close(self) -> None:
-        """Remove them. Safe to call twice."""
+        """Remove the files. Safe to call twice."""
         self._folder.cleanup()
 
 
 class MessageCompressed(Source):
-    """A source whose messages are compressed one by one."""
+    """A source whose messages are compressed individually."""
 
     def __init__(self, path: Path, source: Source) -> None:
         self._path, self._source = path, source

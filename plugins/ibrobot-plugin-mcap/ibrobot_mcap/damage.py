@@ -1,4 +1,4 @@
-"""What is raised when outside data cannot be read."""
+"""Errors for unreadable data."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ _PARSING = (
     struct.error, ValueError, LookupError, TypeError, AttributeError, EOFError, OverflowError, RecursionError,
     MemoryError, RuntimeError, McapError, zstandard.ZstdError, sqlite3.Error,
 )  # fmt: skip
-"""What parsers raise for bytes that are not what they expect; lz4 raises RuntimeError."""
+"""Exceptions that parsers raise for invalid bytes; lz4 raises RuntimeError."""
 
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """Whatever a parser raises within becomes a `RecorderError` that names the file."""
+    """A context that turns errors of parsers into a `RecorderError` that names the file."""
     try:
         yield
     except OSError as error:
         raise RecorderError(f"{path}: cannot be read: {error.strerror or error}") from error
     except _PARSING as error:
-        what = f"{error}".strip() or "no more is known"
+        what = f"{error}".strip() or "unknown error"
         raise RecorderError(f"{path}: is damaged: {what} ({type(error).__name__})") from error

@@ -1,4 +1,4 @@
-"""A contract drafted from the topics of a bag, with comments where a person must choose."""
+"""Drafts a contract from the topics of a bag, with comments where the user must choose."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from ibrobot_core.api import (
 from ibrobot_mcap.reader import Rosbag2Reader
 
 _COMMAND = re.compile(r"command|cmd|action|goal|target|leader|trajectory|desired")
-"""In the names of topics that rather tell a robot something than what it is."""
+"""Words in the names of command topics."""
 _COMMON = frozenset(
     ("camera", "image", "image_raw", "image_rect", "compressed", "compresseddepth", "color", "rgb", "raw")
 )
@@ -34,20 +34,20 @@ _SIGNALS = {
     "next.done": re.compile(r"done|terminal|terminated|truncated|finished|success|succeeded"),
     "task": re.compile(r"task|prompt|instruction|language"),
 }
-"""Key of a signal -> words in the names of topics that may have it."""
+"""Key of a signal -> words in the names of its topics."""
 _LOOKED_AT = 30
-"""Messages of a topic that tell its rate."""
+"""Number of messages from which to estimate a topic's rate."""
 _MOST = 64
-"""Numbers of a message that a draft lists."""
+"""Maximum number of values of a message to list."""
 _HEAD = """\
 # A draft by `ibrobot contract init` from {bag}.
-# Read every line marked CHOOSE. Units are to be SI: a dataset has the numbers as they are in the bag.
+# Read every line marked CHOOSE. Units must be SI: values are copied from the bag without conversion.
 """
 
 
 @attrs.frozen
 class _Topic:
-    """A topic of the bag, and its first message."""
+    """A topic of the bag and its first message."""
 
     name: str
     type: str
@@ -57,7 +57,7 @@ class _Topic:
 
     @property
     def signal(self) -> str:
-        """The key of the signal that it looks like; empty where it does not."""
+        """The key of the signal that the topic resembles; empty if none."""
         words = re.split(r"[^a-z]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", self.name).lower())
         if not isinstance(self.first, String) and len(_paths(self)) != 1:
             return ""
@@ -66,15 +66,15 @@ class _Topic:
 
     @property
     def is_command(self) -> bool:
-        """Whether it looks like one that tells a robot something."""
+        """Whether the topic resembles commands."""
         return _COMMAND.search(self.name.lower()) is not None
 
 
 def draft(reader: Rosbag2Reader) -> str:
-    """A contract as YAML.
+    """Draft a contract as YAML.
 
     Raises:
-        RecorderError: when the bag has nothing that a contract could have.
+        RecorderError: if the bag has no suitable topics.
     """
     summary = reader.summary()
     found = [topic for name, each in summary.topics.items() if (topic := _topic(reader, name, each.count))]
@@ -83,12 +83,12 @@ def draft(reader: Rosbag2Reader) -> str:
     cameras = [topic for topic in topics if isinstance(topic.first, Image)]
     vectors = [topic for topic in topics if topic not in cameras and any(_numbers(topic.first))]
     if not cameras and not vectors:
-        raise RecorderError(f"{summary.path}: has no topic with pictures or numbers")
+        raise RecorderError(f"{summary.path}: has no topic with images or numbers")
     actions = [topic for topic in vectors if topic.is_command]
     states = [topic for topic in vectors if topic not in actions]
     rate_hz = round(min((topic.rate_hz for topic in cameras), default=30.0)) or 1
     lines = [_HEAD.format(bag=summary.path.name) + "contract:"]
-    lines.append(f"  rate_hz: {rate_hz}  # CHOOSE: rows in a second; a whole number, at most the slowest camera's rate")
+    lines.append(f"  rate_hz: {rate_hz}  # CHOOSE: rows per second; a whole number, at most the slowest camera's rate")
     lines.append("  observations:")
     for topic in states:
         lines += _state(topic)
@@ -104,7 +104,7 @@ def draft(reader: Rosbag2Reader) -> str:
 
 
 def _topic(reader: Rosbag2Reader, name: str, messages: int) -> _Topic | None:
-    """What is known of a topic; None without a message that can be read."""
+    """A topic with its first message; None if no message can be read."""
     try:
         found = list(islice(reader.messages({name}), _LOOKED_AT))
     except RecorderError:
@@ -120,9 +120,9 @@ def _state(topic: _Topic) -> list[str]:
     numbers = _paths(topic)
     if isinstance(topic.first, JointState):
         numbers = [path for path in numbers if path.startswith("position.")] or numbers
-        key, remark = "observation.state", "the joints, in the order that the policy shall see"
+        key, remark = "observation.state", "the joints, in the order for the policy"
     else:
-        key, remark = f"observation.{_name(topic.name)}", "which of its numbers a policy shall see, or leave it out"
+        key, remark = f"observation.{_name(topic.name)}", "the values for the policy; or remove this observation"
     align = "header" if hasattr(topic.first, "header") else "receive"
     return [
         f"    - key: {_quoted(key)}  # CHOOSE: {remark}",
@@ -133,10 +133,10 @@ def _state(topic: _Topic) -> list[str]:
 
 
 def _camera(topic: _Topic, *, alone: bool) -> list[str]:
-    """Of a camera's topic; `alone`: no other has the same short name."""
+    """Lines for a camera's topic; `alone`: no other topic has the same short name."""
     picture: Any = topic.first
     name = _name(topic.name) if alone else "_".join(topic.name.strip("/").split("/"))
-    remark = "" if alone else "  # CHOOSE: another topic has the same camera, it seems; keep one"
+    remark = "" if alone else "  # CHOOSE: another topic seems to be from the same camera; keep one"
     tolerance_ms = round(3000 / max(topic.rate_hz, 1))
     lines = [f"    - key: {_quoted(f'observation.images.{name}')}{remark}", *_source(topic)]
     if picture.encoding in ("16UC1", "32FC1", "mono8"):
@@ -166,10 +166,10 @@ def _action(topic: _Topic, unnamed: Iterator[int]) -> list[str]:
 
 
 def _signals(topics: Sequence[_Topic]) -> Iterator[str]:
-    """Commented out: rows begin with the first message of a signal, so a wrong one may cost all of them."""
+    """Lines for signals, commented out, because rows begin only when every signal has a message."""
     if topics:
-        yield "  # CHOOSE: uncomment what each row of the dataset shall have; rows begin when every signal has come."
-        yield "  # hold is the newest message at a row; next is the first after it, as of a reward for each step."
+        yield "  # CHOOSE: uncomment the signals for each row of the dataset; rows begin when all signals have one."
+        yield "  # hold is the newest message at a row; next is the first one after it, as for a reward per step."
         yield "  # signals:"
     for topic in sorted(topics, key=lambda topic: list(_SIGNALS).index(topic.signal)):
         path = "data" if topic.signal == "task" else _paths(topic)[0]
@@ -181,7 +181,7 @@ def _signals(topics: Sequence[_Topic]) -> Iterator[str]:
 
 
 def _rate(topic: _Topic) -> str:
-    """How often it speaks: a few messages have no rate."""
+    """The rate of a topic; unknown if it has only a few messages."""
     return f"{topic.rate_hz:.1f} Hz" if topic.count >= _LOOKED_AT else f"messages: {topic.count}"
 
 
@@ -197,7 +197,7 @@ def _paths(topic: _Topic) -> list[str]:
 
 
 def _numbers(value: Any, path: str = "") -> Iterator[str]:
-    """Paths to the numbers of a message; stamps left out, joints by their names."""
+    """Yield paths to the numbers of a message, without stamps; joints by name."""
     if isinstance(value, JointState):
         for field in ("position", "velocity", "effort"):
             if len(getattr(value, field)) == len(value.name):
@@ -215,7 +215,7 @@ def _numbers(value: Any, path: str = "") -> Iterator[str]:
 
 
 def _name(topic: str) -> str:
-    """A short name of a topic: what is not common to all."""
+    """A short name of a topic, without generic parts."""
     parts = [part for part in topic.lower().strip("/").split("/") if part]
     return "_".join([part for part in parts if part not in _COMMON] or parts[-1:] or ["topic"])
 

@@ -1,4 +1,4 @@
-"""What a bag says of itself: `metadata.yaml`, or the same in a metadata record of an MCAP file."""
+"""Metadata of a bag: `metadata.yaml`, or the equivalent record in an MCAP file."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ _PLAIN = (str, int, float)
 
 @attrs.frozen
 class Facts:
-    """What a bag says of itself."""
+    """Metadata of a bag."""
 
     files: tuple[str, ...] = ()
     counts: Mapping[str, int] = attrs.field(factory=dict)
-    """Topic -> messages, with the copies that later files have."""
+    """Topic -> number of messages, including copies in later files."""
     types: Mapping[str, str] = attrs.field(factory=dict)
     """Topic -> type."""
     custom: Mapping[str, str] = attrs.field(factory=dict)
     """`custom_data`."""
     compressed: str = ""
-    """`message` or `file`; empty where neither is. Chunks tell themselves how they are compressed."""
+    """`message`, `file`, or empty if neither is compressed. The compression of chunks is stated in each chunk."""
 
 
 def read_facts(path: Path) -> Facts | None:
-    """What a `metadata.yaml` says; None where there is none.
+    """Read a `metadata.yaml`; None if there is none.
 
     Raises:
-        RecorderError: when it cannot be read.
+        RecorderError: if it cannot be read.
     """
     try:
         return parse_facts(path.read_text(encoding="utf-8"), path)
@@ -46,14 +46,14 @@ def read_facts(path: Path) -> Facts | None:
 
 
 def parse_facts(text: str, path: Path) -> Facts:
-    """The facts in a YAML text.
+    """Parse metadata from YAML.
 
     Args:
-        text: of a whole document, or of what is below its first key.
-        path: where it is from, for errors.
+        text: the whole document, or the part below its first key.
+        path: the file, for errors.
 
     Raises:
-        RecorderError: when it is not that of a rosbag2.
+        RecorderError: if it is not metadata of a rosbag2.
     """
     try:
         document = yaml.load(text, getattr(yaml, "CSafeLoader", yaml.SafeLoader))
@@ -72,14 +72,14 @@ def parse_facts(text: str, path: Path) -> Facts:
             _compressed(found),
         )
     except (yaml.YAMLError, AttributeError, LookupError, TypeError, ValueError, RecursionError) as error:
-        raise RecorderError(f"{path}: its metadata is not that of a rosbag2: {error}") from error
+        raise RecorderError(f"{path}: is not metadata of a rosbag2: {error}") from error
 
 
 def set_custom(directory: Path, values: Mapping[str, str]) -> None:
-    """Set keys of `custom_data` in the `metadata.yaml` of a bag; all else stays.
+    """Set keys of `custom_data` in the `metadata.yaml` of a bag, without changing anything else.
 
     Raises:
-        RecorderError: when it cannot be read or written.
+        RecorderError: if it cannot be read or written.
     """
     path = directory / METADATA
     facts = read_facts(path)
@@ -99,7 +99,7 @@ def _compressed(found: Mapping[str, Any]) -> str:
     if mode not in ("message", "file"):
         return ""
     if format_ != "zstd":
-        raise ValueError(f"compression_format {format_!r} is not known, zstd is")
+        raise ValueError(f"compression_format {format_!r} is not supported; use zstd")
     return mode
 
 

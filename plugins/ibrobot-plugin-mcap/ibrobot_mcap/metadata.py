@@ -1,4 +1,4 @@
-"""`metadata.yaml` of a rosbag2 directory, version 9, and the QoS that goes with a topic."""
+"""`metadata.yaml` of a rosbag2 directory, version 9, and the QoS of topics."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ METADATA = "metadata.yaml"
 INFORMATION = "rosbag2_bagfile_information"
 RECORD = "rosbag2"
 RECORD_KEY = "serialized_metadata"
-"""Name and key of the metadata record that has the same within an MCAP file."""
+"""Name and key of the equivalent metadata record in an MCAP file."""
 OUTCOME = "outcome"
 DROPPED = "dropped"
-"""Keys that the recorder adds to `custom_data`: a word, and JSON topic -> number of messages."""
+"""Keys that the recorder adds to `custom_data`: the outcome, and JSON topic -> number of lost messages."""
 MISSING = "missing"
-"""Key that a repair adds: JSON topic -> messages that the recorder wrote and that could not be read any more."""
+"""Key that a repair adds: JSON topic -> number of recorded messages that could not be read."""
 
 _FOR_EVER = {"sec": 9223372036, "nsec": 854775807}
 
 MARKED = "marked"
-"""Key that says that a person set the outcome afterwards."""
+"""Key that states that the outcome was set by hand."""
 
 
 @attrs.define
 class Counted:
-    """Messages of a file."""
+    """Message count and time span of a file."""
 
     count: int = 0
     start_ns: int = 0
@@ -45,23 +45,23 @@ class Counted:
 
 @attrs.frozen
 class Topic:
-    """A topic as the bag has it."""
+    """A topic in a bag."""
 
     name: str
     type: str
     latched: bool
     definition: str = ""
-    """`ros2msg` or `ros2idl` text, of a topic that is copied from a bag that has it; else ROS 2's own."""
+    """`ros2msg` or `ros2idl` definition of a topic copied from a bag; otherwise ROS 2's own is used."""
     hash: str = ""
-    """Of the type so defined; empty where the text cannot be read."""
+    """Hash of the type with that definition; empty if the definition cannot be parsed."""
 
     def type_hash(self) -> str:
-        """As rosbag2 writes it; empty where it is not known."""
+        """The type hash in rosbag2's format; empty if unknown."""
         return self.hash if self.definition else type_hash(self.type)
 
 
 class _Text(str):
-    """Text that is quoted, so that no reader takes it for a number or a boolean."""
+    """Text to be quoted, so that readers do not parse it as a number or boolean."""
 
     __slots__ = ()
 
@@ -87,13 +87,13 @@ def offered_qos(latched: bool) -> list[dict[str, Any]]:
 def information(
     files: Mapping[str, Counted], topics: Mapping[Topic, int], custom: Mapping[str, str], start_ns: int
 ) -> dict[str, Any]:
-    """What `metadata.yaml` says of a bag.
+    """The content of a bag's `metadata.yaml`.
 
     Args:
         files: file name -> its messages, in order.
         topics: topic -> number of messages.
         custom: `custom_data`.
-        start_ns: when the episode began [ns], for a bag without messages.
+        start_ns: start of the episode [ns], for a bag without messages.
     """
     total = Counted()
     for counted in files.values():
@@ -136,7 +136,7 @@ def _topic(topic: Topic) -> dict[str, Any]:
 
 
 def quoted(custom: Mapping[str, str]) -> dict[str, str]:
-    """`custom_data` as texts, whatever they look like."""
+    """`custom_data` with all values quoted as text."""
     return {_Text(key): _Text(value) for key, value in custom.items()}
 
 
@@ -146,10 +146,10 @@ def dump(document: dict[str, Any] | Sequence[Any]) -> str:
 
 
 def write_metadata(directory: Path, facts: dict[str, Any]) -> None:
-    """Write `metadata.yaml` whole or not at all, and onto the disk.
+    """Write `metadata.yaml` atomically, and sync it to the disk.
 
     Raises:
-        OSError: when it cannot be written.
+        OSError: if it cannot be written.
     """
     temporary = directory / f".{METADATA}"
     with temporary.open("w", encoding="utf-8") as file:

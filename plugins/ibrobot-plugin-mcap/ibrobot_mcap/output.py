@@ -1,4 +1,4 @@
-"""A file as it is written: beside the page cache where the file system can."""
+"""Writes a file, bypassing the page cache if the file system supports it."""
 
 from __future__ import annotations
 
@@ -9,36 +9,36 @@ import threading
 from pathlib import Path
 
 _BLOCK = 4096
-"""What a write beside the page cache begins and ends at a multiple of [bytes]."""
+"""Alignment of writes that bypass the page cache [bytes]."""
 _PIECE = 1024 * 1024
-"""The most that is written at a time [bytes]."""
-# Not everywhere is there a sync that leaves the file's times alone.
+"""Maximum size of a write [bytes]."""
+# Not every system has a sync without the file's times.
 _sync = getattr(os, "fdatasync", os.fsync)
 
 
 class Output:
-    """A file whose content is with the operating system after `hand_over`, and survives the process from then on.
+    """A file whose content survives the end of the process after `hand_over`.
 
-    Whole blocks go to the disk at once. Of what the kernel gathers in its page cache it writes gigabytes at a time,
-    and even processes of real-time priority wait meanwhile: a control loop was 2 ms late in one of a hundred ticks.
-    The end of the file, less than a block, goes through the page cache, as all does where there is no way beside it.
+    Whole blocks go directly to the disk. The kernel would collect gigabytes in its page cache before writing them, and
+    even real-time processes wait meanwhile: a control loop was 2 ms late in one of a hundred ticks. The end of the
+    file, less than a block, goes through the page cache, as does everything if direct writes are not supported.
     """
 
     def __init__(self, path: Path) -> None:
         self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
         self._direct = _open_direct(path)
-        self._buffer = memoryview(mmap.mmap(-1, _PIECE))  # begins at a page, as such writes must
+        self._buffer = memoryview(mmap.mmap(-1, _PIECE))  # page-aligned, as direct writes require
         self._written = 0
-        """Up to here all is with the disk [bytes]."""
+        """Number of bytes written to the disk."""
         self._filled = 0
-        """Of the buffer, which has what follows [bytes]."""
+        """Number of bytes in the buffer, which follow these."""
         self._closed = False
         self._aside: threading.Thread | None = None
         self._failure: OSError | None = None
 
     @property
     def size(self) -> int:
-        """Bytes in the file, buffered ones included."""
+        """Size of the file, including the buffer [bytes]."""
         return self._written + self._filled
 
     def write(self, data: bytes) -> int:
@@ -58,10 +58,10 @@ class Output:
         return self.size
 
     def flush(self) -> None:
-        """Nothing: `hand_over` does it, when the records are whole."""
+        """Do nothing; `hand_over` flushes complete records."""
 
     def hand_over(self) -> None:
-        """Give everything to the operating system."""
+        """Pass all data to the operating system."""
         self._write_blocks()
         _write_all(self._descriptor, self._buffer[: self._filled], self._written)
 
@@ -71,7 +71,7 @@ class Output:
             return
         if not self._written_directly(size):
             _write_all(self._descriptor, self._buffer[:size], self._written)
-            if hasattr(os, "posix_fadvise"):  # begins to write it to the disk, now and not gigabytes later
+            if hasattr(os, "posix_fadvise"):  # start writing to the disk now, not gigabytes later
                 os.posix_fadvise(self._descriptor, self._written, size, os.POSIX_FADV_DONTNEED)
         left = self._filled - size
         self._buffer[:left] = self._buffer[size : self._filled]
@@ -86,24 +86,24 @@ class Output:
         except OSError as error:
             if error.errno != errno.EINVAL:
                 raise
-            self._close_direct()  # a file system that takes such writes only at its own boundaries
+            self._close_direct()  # the file system needs another alignment
             return False
         return True
 
     def sync(self) -> None:
-        """Put what is in the file onto the disk.
+        """Sync the file to the disk.
 
         Raises:
-            OSError: when the disk refuses it now, or refused it aside.
+            OSError: if this or an earlier background sync fails.
         """
         self._wait_aside()
         _sync(self._descriptor)
 
     def sync_aside(self) -> None:
-        """Begin a sync in a thread: a busy disk takes seconds for it, in which messages must be written.
+        """Start a sync in a background thread, because it can take seconds on a busy disk.
 
         Raises:
-            OSError: when an earlier one failed.
+            OSError: if an earlier one failed.
         """
         if self._aside is not None and self._aside.is_alive():
             return
@@ -127,13 +127,13 @@ class Output:
             raise self._failure
 
     def cut(self, size: int) -> None:
-        """Leave the first `size` bytes, of which all were handed over."""
+        """Truncate the file to `size` bytes, all of which were handed over."""
         os.ftruncate(self._descriptor, size)
-        self._close_direct()  # what follows does not begin at a block
+        self._close_direct()  # the end is no longer aligned
         self._written, self._filled = size, 0
 
     def close(self) -> None:
-        """Close as it is; what was not handed over is lost. Safe to call twice."""
+        """Close the file; data that was not handed over is lost. Safe to call twice."""
         if self._aside is not None:
             self._aside.join()
         if not self._closed:
@@ -148,7 +148,7 @@ class Output:
 
 
 def _open_direct(path: Path) -> int | None:
-    """The file for writes beside the page cache; None where there are none (macOS, some network file systems)."""
+    """Open the file for direct writes; None if unsupported (macOS, some network file systems)."""
     try:
         return os.open(path, os.O_WRONLY | os.O_DIRECT)
     except (AttributeError, OSError):

@@ -1,4 +1,4 @@
-"""Reader `rosbag2`: episodes of recorder `mcap`, finished or not, and bags from elsewhere."""
+"""Reader `rosbag2`: episodes of recorder `mcap`, finished or not, and foreign bags."""
 
 from __future__ import annotations
 
@@ -32,23 +32,23 @@ from ibrobot_mcap.sources import McapSource, Raw, Source
 from ibrobot_mcap.sqlite_source import SqliteSource
 
 _SOURCES: Mapping[str, Callable[[Sequence[Path]], Source]] = {".mcap": McapSource, ".db3": SqliteSource}
-"""Suffix -> what reads such files."""
+"""Suffix -> source class for such files."""
 
 
 def is_rosbag2(path: Path) -> bool:
-    """Whether a bag lies at `path`: its folder, or one of its files."""
+    """Whether `path` is a bag: its folder, or one of its files."""
     if path.is_dir():
         return (path / METADATA).is_file() or any(_storage_files(path))
     return path.suffix in _SOURCES
 
 
 class Rosbag2Reader(EpisodeReader):
-    """Reads a rosbag2 directory or a single file of one. Pictures come as `Image`, as a contract asks for them.
+    """Reads a rosbag2 directory or one of its files.
 
-    JPEG, PNG and the PNG of `compressedDepth` do; other formats stay `CompressedImage`.
+    JPEG, PNG and PNG `compressedDepth` images are delivered as `Image`; other formats remain `CompressedImage`.
 
     Raises:
-        RecorderError: when it cannot be read.
+        RecorderError: if it cannot be read.
     """
 
     def __init__(self, path: Path) -> None:
@@ -67,17 +67,17 @@ class Rosbag2Reader(EpisodeReader):
             raise
         self._is_part = not path.is_dir() and len(facts.files) > 1
         self.stated: Mapping[str, int] = facts.counts if path.is_dir() else self._source.stated
-        """Topic -> number of messages that the bag says it has, with the copies in later files."""
+        """Topic -> number of messages according to the bag's metadata, including copies in later files."""
         self._stated_types = facts.types
         self._custom = dict(facts.custom or self._source.custom)
 
     @property
     def finished(self) -> bool:
-        """Whether its writer ended it, and no file was cut since."""
+        """Whether its writer finished it, and no file is truncated."""
         return self._finished and self._source.finished
 
     def short(self) -> dict[str, int]:
-        """Topic -> messages that the bag says it has and that cannot be found."""
+        """Topic -> number of messages in the metadata that are missing from the files."""
         found = Counter(self._source.counts) + Counter(self._source.repeated)
         return {topic: stated - found[topic] for topic, stated in self.stated.items() if stated > found[topic]}
 
@@ -102,10 +102,10 @@ class Rosbag2Reader(EpisodeReader):
     @override
     def messages(self, topics: Collection[str] | None = None) -> Iterator[Recorded]:
         source, short = self._source, self.short()
-        if short and source.finished:  # not at its end, so what is left would not be what was recorded
-            told = ", ".join(f"{count} of {self.stated[topic]} of {topic}" for topic, count in short.items())
+        if short and source.finished:  # in the middle, so the rest would not match the recording
+            missing = ", ".join(f"{count} of {self.stated[topic]} of {topic}" for topic, count in short.items())
             raise RecorderError(
-                f"{self._path}: is damaged: messages are missing from within it: {told}; "
+                f"{self._path}: is damaged: messages are missing in the middle: {missing}; "
                 "`ibrobot episodes repair` keeps what can be read"
             )
         for raw in source.messages(frozenset(source.types if topics is None else topics)):
@@ -126,16 +126,16 @@ class Rosbag2Reader(EpisodeReader):
         return found.hexdigest()
 
     def raw(self) -> Iterator[Raw]:
-        """The messages as they are stored, in the order of receipt."""
+        """The stored messages, not decoded, in the order of receipt."""
         return self._source.messages(frozenset(self._source.types))
 
     @property
     def topics(self) -> Collection[str]:
-        """The topics that its files know, with or without messages."""
+        """The topics in its files, with or without messages."""
         return self._source.types.keys()
 
     def stored(self, topic: str) -> Topic:
-        """A topic as it is stored (compressed pictures are `CompressedImage`), with what the bag has of its type."""
+        """A stored topic (compressed images are `CompressedImage`), with the bag's definition of its type."""
         source, type_ = self._source, self._source.types[topic]
         definition = source.definitions.get(type_, "")
         try:
@@ -143,19 +143,19 @@ class Rosbag2Reader(EpisodeReader):
         except CodecError:
             if not definition:
                 raise
-            type_hash = ""  # a definition that only others can read
+            type_hash = ""  # a definition in an unknown format
         return Topic(topic, type_, topic in source.latched, definition, type_hash)
 
     def repeated(self) -> Mapping[str, int]:
-        """Topic -> copies in the later files of a split episode, which `messages` passes over."""
+        """Topic -> number of copies in later files of a split episode, which `messages` skips."""
         return self._source.repeated
 
     def compression(self) -> str:
-        """Of its chunks, as the recorder's option has it; `none` where that has no such."""
+        """Compression of its chunks, as a value of the recorder's option; `none` if that has no equivalent."""
         return self._source.compression if self._source.compression in COMPRESSIONS else "none"
 
     def latched(self) -> frozenset[str]:
-        """Topics whose offered QoS is transient local."""
+        """Topics with offered QoS transient local."""
         return self._source.latched
 
     @override
@@ -163,7 +163,7 @@ class Rosbag2Reader(EpisodeReader):
         self._closing.close()
 
     def _delivered(self, topic: str, type_: str) -> str:
-        """The type of the messages that `messages` gives of a topic: its first one tells the format of pictures."""
+        """The type in which `messages` delivers a topic; for compressed images, the first one determines it."""
         if type_ != CompressedImage.ros_type:
             return type_
         first = next(self._source.messages({topic}), None)
@@ -172,11 +172,11 @@ class Rosbag2Reader(EpisodeReader):
         try:
             message = self._codec.decode(type_, first.data)
         except CodecError:
-            return type_  # reading it tells what is wrong
+            return type_  # reading it will raise the error
         return Image.ros_type if isinstance(message, CompressedImage) and is_known(message) else type_
 
     def _recorded(self) -> Facts | None:
-        """What the newest metadata record says, for an episode without `metadata.yaml`."""
+        """The newest metadata record, for an episode without `metadata.yaml`."""
         source = self._source
         texts = [
             record.metadata[RECORD_KEY]

@@ -1,4 +1,4 @@
-"""Recorder `mcap`: an episode as a rosbag2 directory."""
+"""Recorder `mcap`: writes episodes as rosbag2 directories."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ from ibrobot_mcap.thread import WriterThread
 class McapRecorder(Recorder):
     """Writes MCAP files and `metadata.yaml`.
 
-    In real time messages go through a bounded queue to a thread that writes, so that a slow disk costs messages, which
-    are counted, and never time. In lockstep they are written at once: equal runs give equal files.
+    In real time, messages go through a bounded queue to a writer thread, so that a slow disk never delays the run; lost
+    messages are counted. In lockstep they are written at once, so equal runs give equal files.
     """
 
     def __init__(self, options: McapOptions, ctx: Context) -> None:
@@ -92,13 +92,13 @@ class McapRecorder(Recorder):
 
     @override
     def size_of(self, message: Message) -> int:
-        """Before its chunk is compressed."""
+        """Size before compression of its chunk."""
         try:
             if isinstance(message, Image) and self._options.images == "jpeg" and fits_jpeg(message):
                 message = to_jpeg(message, self._options.jpeg_quality)
             return len(encode(message))
         except (CodecError, ContractError, RecorderError):
-            return super().size_of(message)  # writing it tells what is wrong
+            return super().size_of(message)  # writing it will raise the error
 
     @override
     def waiting(self) -> int:
@@ -125,7 +125,7 @@ class McapRecorder(Recorder):
             kept = self._topics[topic] = self._topic(topic, message.ros_type)
         if message.ros_type != kept.type:
             raise RecorderError(f"carries {message.ros_type}, was {kept.type} before")
-        # Encoded here and now, so that arrays may change afterwards.
+        # Encode it now, because the caller may change arrays afterwards.
         return Item(kept, encode(message), received_ns, received_ns)
 
     def _topic(self, topic: str, type_: str) -> Topic:

@@ -1,4 +1,4 @@
-"""Rewrites an episode: whole from what a killed recorder left, or a part of it; messages are copied, not decoded."""
+"""Rewrites an episode, to repair an unfinished one or to copy a part; messages are copied, not decoded."""
 
 from __future__ import annotations
 
@@ -19,35 +19,35 @@ from ibrobot_mcap.reader import Rosbag2Reader
 from ibrobot_mcap.storage import Storage
 
 REPAIRED = "repaired"
-"""Key of `custom_data` that says that an episode was made whole afterwards."""
+"""Key of `custom_data` that states that an episode was repaired."""
 STATED = "stated_outcome"
-"""Key of what was its outcome before."""
+"""Key of the outcome before the repair."""
 
 
 @attrs.frozen
 class Rewritten:
-    """What came of it."""
+    """The result of a rewrite."""
 
     path: Path
     summary: EpisodeSummary
-    """Of the new episode."""
+    """Summary of the new episode."""
 
 
 def rewrite(
     source: Path, target: Path, *, begin_ns: int | None = None, end_ns: int | None = None,
     marks: Mapping[str, str] | None = None,
 ) -> Rewritten:  # fmt: skip
-    """Copy the messages of an episode into a new one.
+    """Copy the messages of an episode to a new one.
 
     Args:
         source: an episode, finished or not.
-        target: where the new one goes; its name becomes part of its files' names.
-        begin_ns: receipt of the first message to copy [ns]; a latched topic's message from before it is kept.
-        end_ns: receipt of the last [ns].
-        marks: what to add to the metadata.
+        target: folder of the new episode; its name becomes part of the file names.
+        begin_ns: time of receipt of the first message to copy [ns]; earlier messages of latched topics are kept.
+        end_ns: time of receipt of the last message to copy [ns].
+        marks: keys to add to the metadata.
 
     Raises:
-        RecorderError: when one cannot be read or the other not be written; then nothing is left of it.
+        RecorderError: if `source` cannot be read or `target` cannot be written; `target` is then removed.
     """
     with ExitStack() as stack:
         reader = Rosbag2Reader(source)
@@ -57,7 +57,7 @@ def rewrite(
         topics = {name: reader.stored(name) for name in reader.topics}
         start_ns = summary.start_ns if begin_ns is None else begin_ns
         metadata = {**summary.metadata, **(marks or {})}
-        if begin_ns is not None or end_ns is not None:  # another episode than the whole one
+        if begin_ns is not None or end_ns is not None:  # a part needs its own UUID
             metadata["uuid"] = str(uuid5(NAMESPACE_OID, f"{metadata.get('uuid', source.name)} {begin_ns} {end_ns}"))
         if missing := {name: topic.missing for name, topic in summary.topics.items() if topic.missing}:
             metadata[MISSING] = json.dumps(missing)
@@ -86,13 +86,13 @@ def rewrite(
 
 
 def repair(path: Path) -> Rewritten | None:
-    """Make an episode whole that is unfinished or lacks messages, in its place; None when it is whole already.
+    """Repair an unfinished or incomplete episode in place; returns None if it is already complete.
 
-    What is missing stays written in its metadata, with the outcome that its recorder stated; its outcome is unknown.
-    The original is moved aside as `.NAME.unfinished` until the new one has been read back and has every message.
+    The metadata records the missing messages and the former outcome; the new outcome is unknown. The original is
+    renamed to `.NAME.unfinished` until the new episode has been read back and has every message.
 
     Raises:
-        RecorderError: when it cannot be read or written; the original is then where it was.
+        RecorderError: if it cannot be read or written; the original is then restored.
     """
     reader = Rosbag2Reader(path)
     try:
@@ -106,7 +106,7 @@ def repair(path: Path) -> Rewritten | None:
     staging = path.with_name(f".{path.name}.repairing")
     aside = path.with_name(f".{path.name}.unfinished")
     if aside.exists():
-        raise RecorderError(f"{aside} is there already, from a repair that was broken off; see which one to keep")
+        raise RecorderError(f"{aside} exists already, from an interrupted repair; decide which one to keep")
     try:
         shutil.rmtree(staging, ignore_errors=True)
         staging.mkdir()

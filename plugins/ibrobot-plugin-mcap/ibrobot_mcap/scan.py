@@ -1,4 +1,4 @@
-"""What is in an MCAP file, found by walking over its records: works on unfinished files as on whole ones."""
+"""Reads an MCAP file by scanning its records, which also works for unfinished files."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from ibrobot_core.api import RecorderError
 from ibrobot_mcap.damage import reading
 
 REPEATED = "ibrobot.repeated"
-"""Name of the metadata record ahead of a chunk with copies of latched messages from the file before."""
+"""Name of the metadata record before a chunk with copies of latched messages from the previous file."""
 
 _RECORD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQII")
@@ -31,9 +31,9 @@ _INDEX = np.dtype([("received_ns", "<u8"), ("offset", "<u8")])
 _INDEX_HEAD = struct.Struct("<HI")
 _MESSAGE = struct.Struct("<HIQQ")
 _LOOSE_SIZE = 4 << 20
-"""Messages outside of chunks are taken in blocks of this size [bytes]."""
+"""Messages outside chunks are read in blocks of this size [bytes]."""
 _LARGEST = 4 << 30
-"""No chunk is larger than this [bytes], by the format's own libraries."""
+"""Maximum size of a chunk in the format's own libraries [bytes]."""
 _KNOWN = range(1, Opcode.DATA_END + 1)
 _PRIVATE = range(0x80, 0x100)
 """Opcodes that a file can have."""
@@ -41,7 +41,7 @@ _PRIVATE = range(0x80, 0x100)
 
 @attrs.frozen
 class Entry:
-    """A message as it lies in the file."""
+    """A stored message."""
 
     channel: int
     received_ns: int
@@ -51,10 +51,10 @@ class Entry:
 
 @attrs.define
 class Block:
-    """A chunk, or a run of messages outside of chunks."""
+    """A chunk, or consecutive messages outside chunks."""
 
     offset: int
-    """Where its records begin in the file; compressed where it is a chunk that says so."""
+    """Offset of its records in the file; compressed if it is a chunk with compression."""
     length: int
     start_ns: int = 2**63
     end_ns: int = 0
@@ -63,11 +63,11 @@ class Block:
     counts: dict[int, int] = attrs.field(factory=dict)
     """Channel -> number of messages."""
     indices: dict[int, tuple[int, int]] = attrs.field(factory=dict)
-    """Channel -> where the times of its messages lie in the file, and how many bytes they take."""
+    """Channel -> offset and size of the index of its message times."""
 
 
 def records(content: memoryview) -> Iterator[tuple[int, memoryview]]:
-    """Opcode and content of each whole record."""
+    """Yield opcode and content of each complete record."""
     position = 0
     while position + _RECORD.size <= len(content):
         opcode, length = _RECORD.unpack_from(content, position)
@@ -79,10 +79,10 @@ def records(content: memoryview) -> Iterator[tuple[int, memoryview]]:
 
 
 class McapFile:
-    """One file: its channels and schemas, where its messages are, and whether its writer finished it.
+    """One file: its channels, schemas and blocks of messages, and whether its writer finished it.
 
     Raises:
-        RecorderError: when it cannot be read or is not an MCAP file.
+        RecorderError: if it cannot be read or is not an MCAP file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -93,10 +93,10 @@ class McapFile:
         self.metadata: list[Metadata] = []
         self.library = ""
         self.stated: dict[int, int] = {}
-        """Channel -> number of messages, as the file's own statistics say; nothing where it has none."""
+        """Channel -> number of messages in the file's statistics; empty if it has none."""
         self.finished = False
         self.size = 0
-        """Bytes up to the end of the last whole record."""
+        """Number of bytes up to the end of the last complete record."""
         try:
             self._file: BinaryIO = path.open("rb")
         except OSError as error:
@@ -114,10 +114,10 @@ class McapFile:
         self._file.close()
 
     def read(self, block: Block) -> memoryview:
-        """The block's records, uncompressed and checked.
+        """Read a block's records, decompressed and with verified checksum.
 
         Raises:
-            RecorderError: when they are damaged.
+            RecorderError: if they are damaged.
         """
         content = memoryview(os.pread(self._file.fileno(), block.length, block.offset))
         if not block.chunk:
@@ -134,7 +134,7 @@ class McapFile:
         return content
 
     def compression(self, block: Block) -> str:
-        """Of a block, as the file says it; empty for none."""
+        """Compression of a block, as named in the file; empty for none."""
         if not block.chunk:
             return ""
         head = os.pread(self._file.fileno(), min(block.length, _CHUNK.size + 16), block.offset)
@@ -142,10 +142,10 @@ class McapFile:
         return head[_CHUNK.size : _CHUNK.size + name].decode("ascii", "replace")
 
     def entries(self, block: Block) -> Iterator[Entry]:
-        """The messages of a block, in the order written.
+        """Yield the messages of a block in the order of writing.
 
         Raises:
-            RecorderError: when it is damaged.
+            RecorderError: if it is damaged.
         """
         received: dict[int, list[int]] = {}
         with reading(self.path):
@@ -160,21 +160,21 @@ class McapFile:
                     self._note(opcode, content)
         counts = {channel: len(times) for channel, times in received.items()}
         if counts != {channel: count for channel, count in block.counts.items() if count}:
-            raise self._damaged(block, "it has other messages than its index says")
+            raise self._damaged(block, "its messages do not match its index")
         with reading(self.path):
             for channel, times in received.items():
                 if channel in block.indices and sorted(times) != self._indexed(block, channel):
                     topic = self.channels[channel].topic
-                    raise self._damaged(block, f"messages of {topic} have other times than its index says")
+                    raise self._damaged(block, f"the times of messages of {topic} do not match its index")
 
     def _indexed(self, block: Block, channel: int) -> list[int]:
-        """The times of a channel's messages by the block's index [ns], ascending."""
+        """The times of a channel's messages in the block's index [ns], ascending."""
         offset, size = block.indices[channel]
         index = np.frombuffer(os.pread(self._file.fileno(), size, offset), _INDEX)
         return np.sort(index["received_ns"]).tolist()
 
     def _scan(self, end: int) -> None:
-        """Walk over the records, looking into small ones only."""
+        """Scan the records, reading only small ones."""
         file = self._file
         start = file.read(len(MAGIC))
         if start != MAGIC[: len(start)]:
@@ -186,7 +186,7 @@ class McapFile:
             opcode, length = _RECORD.unpack(file.read(_RECORD.size))
             content, position = position + _RECORD.size, position + _RECORD.size + length
             if position > end or not (opcode in _KNOWN or opcode in _PRIVATE):
-                return  # what comes was never written whole
+                return  # the rest was not written completely
             if opcode == Opcode.CHUNK:
                 start_ns, end_ns = struct.unpack("<QQ", file.read(16))
                 self.blocks.append(Block(content, length, start_ns, end_ns, repeated=repeated))
@@ -206,7 +206,7 @@ class McapFile:
                 return
 
     def _add_loose(self, content: int, length: int) -> None:
-        """A message outside of chunks: joins the run just before it, where there is one."""
+        """Add a message outside chunks to the preceding block, if it is adjacent."""
         channel, _, received_ns, _ = _MESSAGE.unpack(self._file.read(_MESSAGE.size))
         begin = content - _RECORD.size
         last = self.blocks[-1] if self.blocks else None
@@ -218,7 +218,7 @@ class McapFile:
         last.counts[channel] = last.counts.get(channel, 0) + 1
 
     def _note(self, opcode: int, content: memoryview) -> bool:
-        """Keep what a record says; returns whether it announces repeated messages."""
+        """Process a record; returns whether it announces repeated messages."""
         stream = ReadDataStream(BytesIO(content))
         if opcode == Opcode.SCHEMA:
             schema = Schema.read(stream)
@@ -237,7 +237,7 @@ class McapFile:
         return False
 
     def _define[T: McapRecord](self, known: dict[int, T], number: int, record: T) -> None:
-        """Keep a schema or a channel; files repeat them, and always alike."""
+        """Store a schema or channel; repetitions in a file must be equal."""
         if known.setdefault(number, record) != record:
             raise RecorderError(
                 f"{self.path}: is damaged: {type(record).__name__.lower()} {number} is {record!r:.200} and "
@@ -249,7 +249,7 @@ class McapFile:
         return RecorderError(f"{self.path}: {what} at byte {block.offset} is damaged: {why}")
 
     def _look_inside(self) -> None:
-        """Read the chunks whose channels or counts are not known from outside; unfinished files have some."""
+        """Read the chunks without an index, as in unfinished files."""
         for block in list(self.blocks):
             last_of_unfinished = not self.finished and block is self.blocks[-1]
             if block.counts and block.counts.keys() <= self.channels.keys() and not last_of_unfinished:
@@ -265,7 +265,7 @@ class McapFile:
             except RecorderError:
                 if not last_of_unfinished:
                     raise
-                self.blocks.remove(block)  # it was being written when its writer ended
+                self.blocks.remove(block)  # its writer ended while writing it
                 break
             block.counts = counts
         for block in self.blocks:
@@ -277,13 +277,13 @@ def _expand(compression: str, data: memoryview, size: int) -> memoryview:
     if compression == "":
         return data
     if size > _LARGEST:
-        raise ValueError(f"{size} bytes are said to be in it, at most {_LARGEST} can be")
+        raise ValueError(f"it declares {size} bytes; the maximum is {_LARGEST}")
     if compression == "zstd":
         content = memoryview(zstandard.ZstdDecompressor().decompress(data, max_output_size=size))
     elif compression == "lz4":
         content = memoryview(lz4.frame.decompress(data))
     else:
-        raise ValueError(f"compression {compression!r} is not known; zstd and lz4 are")
+        raise ValueError(f"compression {compression!r} is not supported; use zstd or lz4")
     if len(content) != size:
-        raise ValueError(f"{size} bytes are said to be in it, {len(content)} are")
+        raise ValueError(f"it declares {size} bytes but has {len(content)}")
     return content

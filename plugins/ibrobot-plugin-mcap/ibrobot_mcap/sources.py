@@ -1,4 +1,4 @@
-"""Where an episode's messages come from: MCAP files walked over, or other sources."""
+"""Sources of an episode's messages: scanned MCAP files, or others."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ibrobot_mcap.scan import Entry, McapFile
 
 @attrs.frozen
 class Raw:
-    """A message, not yet decoded."""
+    """An undecoded message."""
 
     topic: str
     type: str
@@ -27,7 +27,7 @@ class Raw:
 
 
 class Source(ABC):
-    """Raw messages, and what is known of them."""
+    """Raw messages and metadata of a bag."""
 
     finished: bool
     custom: Mapping[str, str]
@@ -37,21 +37,21 @@ class Source(ABC):
     counts: Mapping[str, int]
     """Topic -> number of messages."""
     stated: Mapping[str, int] = {}
-    """Topic -> number of messages by the files' own statistics; nothing where they have none."""
+    """Topic -> number of messages in the files' statistics; empty if they have none."""
     definitions: Mapping[str, str]
-    """Type -> its definition, where the bag has it."""
+    """Type -> definition, if the bag has it."""
     compression: str = ""
-    """Of the first chunk: `zstd`, `lz4`, or none."""
+    """Compression of the first chunk: `zstd`, `lz4`, or empty."""
     repeated: Mapping[str, int] = {}
-    """Topic -> copies in later files, which `counts` and `messages` leave out."""
+    """Topic -> number of copies in later files, which `counts` and `messages` exclude."""
     latched: frozenset[str] = frozenset()
-    """Topics that were offered as transient local."""
+    """Topics offered as transient local."""
     start_ns: int
     end_ns: int
 
     @abstractmethod
     def messages(self, topics: Collection[str]) -> Iterator[Raw]:
-        """The messages of these topics, in the order of receipt."""
+        """Yield the messages of these topics in the order of receipt."""
 
     @abstractmethod
     def close(self) -> None:
@@ -59,7 +59,7 @@ class Source(ABC):
 
 
 class McapSource(Source):
-    """MCAP files, whole or not. Messages that a file repeats from the one before are passed over."""
+    """MCAP files, finished or not. Messages that a file repeats from the previous one are skipped."""
 
     def __init__(self, paths: Sequence[Path]) -> None:
         self._files: list[McapFile] = []
@@ -69,7 +69,7 @@ class McapSource(Source):
         except BaseException:
             self.close()
             raise
-        # What the first file repeats lies in none that is read here.
+        # The originals of messages that the first file repeats are not among these files.
         blocks = [
             (block.start_ns, number, block)
             for number, file in enumerate(self._files)
@@ -116,7 +116,7 @@ class McapSource(Source):
 
     @override
     def messages(self, topics: Collection[str]) -> Iterator[Raw]:
-        # Equal stamps stay in the order written: file, chunk, place in it.
+        # Equal stamps keep the order of writing: file, chunk, position.
         waiting: list[tuple[int, int, int, int, Entry]] = []
         for index, (_, number, block) in enumerate(self._blocks):
             file = self._files[number]
@@ -125,14 +125,14 @@ class McapSource(Source):
                 for place, entry in enumerate(file.entries(block)):
                     if entry.channel in wanted:
                         heapq.heappush(waiting, (entry.received_ns, number, block.offset, place, entry))
-            # Nothing that comes later begins before this.
+            # No later block begins before this time.
             bound = self._blocks[index + 1][0] if index + 1 < len(self._blocks) else 2**64
             while waiting and waiting[0][0] < bound:
                 _, origin, _, _, entry = heapq.heappop(waiting)
                 yield self._raw(self._files[origin].channels[entry.channel], entry)
 
     def _raw(self, channel: Channel, entry: Entry) -> Raw:
-        # A copy: a view would keep its whole chunk in memory.
+        # Copy, because a view would keep the whole chunk in memory.
         return Raw(
             channel.topic, self.types[channel.topic], bytes(entry.data), entry.received_ns, entry.published_ns
         )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Messages of sqlite3 files, as rosbag2 writes them by its storage plugin `sqlite3`."""
+"""Messages of sqlite3 files, written by rosbag2's storage plugin `sqlite3`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ibrobot_mcap.sources import Raw, Source
 
 
 class SqliteSource(Source):
-    """Files of a bag; each has the tables `topics` and `messages`, newer ones `message_definitions` too."""
+    """The sqlite3 files of a bag, with the tables `topics`, `messages` and, in newer ones, `message_definitions`."""
 
     def __init__(self, paths: Sequence[Path]) -> None:
         self._files: list[tuple[Path, sqlite3.Connection, dict[int, str]]] = []
@@ -44,13 +44,13 @@ class SqliteSource(Source):
         self._files.append((path, file, topics))
         columns = {row[1] for row in file.execute("PRAGMA table_info(topics)")}
         if not {"id", "name", "type", "serialization_format"} <= columns:
-            raise RecorderError(f"{path}: has no table of topics as rosbag2 writes it")
+            raise RecorderError(f"{path}: lacks the table of topics of a rosbag2")
         qos = "offered_qos_profiles" if "offered_qos_profiles" in columns else "''"
         for key, name, type_, format_, profiles in file.execute(
             f"SELECT id, name, type, serialization_format, {qos} FROM topics ORDER BY id"
         ):
             if format_ != "cdr":
-                raise RecorderError(f"{path}: {name!r} is serialised as {format_!r}; cdr can be read")
+                raise RecorderError(f"{path}: {name!r} is serialised as {format_!r}; only cdr is supported")
             topics[_of(int, key)] = _of(str, name)
             self.types = {**self.types, name: _of(str, type_)}
             if "transient_local" in _of(str, profiles):
@@ -86,17 +86,17 @@ class SqliteSource(Source):
 
 
 def _check_times(path: Path, file: sqlite3.Connection) -> None:
-    """Compare the times of the messages with the index that rosbag2 makes of them; there are no checksums."""
+    """Compare the times of the messages with rosbag2's index, since there are no checksums."""
     if file.execute("SELECT 1 FROM sqlite_master WHERE type = 'index' AND name = 'timestamp_idx'").fetchone() is None:
         return
     by_table = file.execute("SELECT timestamp, id FROM messages NOT INDEXED ORDER BY timestamp, id")
     by_index = file.execute("SELECT timestamp, id FROM messages INDEXED BY timestamp_idx ORDER BY timestamp, id")
-    if any(mine != other for mine, other in zip_longest(by_table, by_index)):
-        raise RecorderError(f"{path}: is damaged: its messages have other times than its index says")
+    if any(in_table != in_index for in_table, in_index in zip_longest(by_table, by_index)):
+        raise RecorderError(f"{path}: is damaged: the times of its messages do not match its index")
 
 
 def _of[T](type_: type[T], value: Any) -> T:
-    """The value, which a damaged file may have as another type."""
+    """Check the type of a value, which may be wrong in a damaged file."""
     if not isinstance(value, type_):
         raise TypeError(f"a cell has {value!r:.40}, must have {type_.__name__}")
     return value

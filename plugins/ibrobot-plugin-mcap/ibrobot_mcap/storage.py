@@ -1,4 +1,4 @@
-"""An episode's folder as it is written: files that follow one another, and `metadata.yaml` at the end."""
+"""Writes an episode's folder: consecutive files, and `metadata.yaml` at the end."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from ibrobot_mcap.metadata import DROPPED, OUTCOME, Counted, Topic, information,
 from ibrobot_mcap.options import MIB, McapOptions
 
 _LOOK_SIZE = 16 * MIB
-"""Free space is looked at whenever this much was written [bytes]."""
+"""Number of written bytes between checks of the free space."""
 
 
 class Storage:
     """Writes an episode. Used by one thread at a time.
 
-    A chunk goes to the operating system when it is full or `chunk_period_s` old, which is what a killed process
-    leaves behind; to the disk every `sync_period_s`, which is what a power failure leaves behind.
+    A chunk is passed to the operating system when it is full or `chunk_period_s` old, so that it survives the end of
+    the process, and synced to the disk every `sync_period_s`, so that it survives a power failure.
 
     Raises:
-        RecorderError: when the folder exists or cannot be written, or the disk has too little space.
+        RecorderError: if the folder exists or cannot be written, or the disk has too little space.
     """
 
     def __init__(self, episode: EpisodeStart, options: McapOptions) -> None:
@@ -37,10 +37,10 @@ class Storage:
         self._topics: dict[Topic, int] = {}
         self._latched: dict[str, Item] = {}
         self._looked_at = 0
-        """Size of the present file when free space was last looked at [bytes]."""
+        """Size of the present file at the last check of the free space [bytes]."""
         self._synced_s = time.monotonic()
         self._waits_since_s: float | None = None
-        """When the oldest message that is not in the file yet came, by wall time [s]."""
+        """Wall time at which the oldest unwritten message arrived [s]."""
         self._broken: RecorderError | None = None
         self._check_space(self._directory.parent)
         try:
@@ -54,14 +54,14 @@ class Storage:
             raise RecorderError(f"cannot record into {self._directory}: {error.strerror}") from error
 
     def announce(self, topic: Topic) -> None:
-        """Let the episode have `topic`, with or without messages."""
+        """Add `topic` to the episode, with or without messages."""
         self._topics.setdefault(topic, 0)
 
     def write(self, item: Item) -> None:
         """Add a message.
 
         Raises:
-            RecorderError: when the disk refuses it, or has less than `min_free` left.
+            RecorderError: if the write fails, or less than `min_free` is left.
         """
         try:
             if self._is_full(item):
@@ -85,16 +85,16 @@ class Storage:
             self._waits_since_s = time.monotonic()
 
     def due_in_s(self) -> float | None:
-        """Time until `flush_due` has something to do, by wall time [s]; None where nothing waits."""
+        """Wall time until `flush_due` must be called [s]; None if there are no unwritten messages."""
         if self._waits_since_s is None:
             return None
         return max(0.0, self._waits_since_s + self._options.chunk_period_s - time.monotonic())
 
     def flush_due(self) -> None:
-        """Put messages into the file that have waited for `chunk_period_s` by wall time, also when no more come.
+        """Write messages that have waited for `chunk_period_s` of wall time, even if no more arrive.
 
         Raises:
-            RecorderError: when the disk refuses them.
+            RecorderError: if the write fails.
         """
         if self.due_in_s() != 0.0:
             return
@@ -109,10 +109,10 @@ class Storage:
             self._fail(error)
 
     def finish(self, outcome: str, dropped: Mapping[str, int]) -> None:
-        """Make the episode whole: the files' indices, then `metadata.yaml`, which says that it is.
+        """Finish the episode: write the files' indices, then `metadata.yaml`, which marks it as complete.
 
         Raises:
-            RecorderError: when the disk refuses it; the episode stays unfinished, and readable.
+            RecorderError: if the write fails; the episode then remains unfinished but readable.
         """
         if self._broken is not None:
             self._file.abandon()
@@ -130,7 +130,7 @@ class Storage:
         """Remove the episode.
 
         Raises:
-            RecorderError: when it cannot be removed.
+            RecorderError: if it cannot be removed.
         """
         self._file.abandon()
         try:
@@ -159,7 +159,7 @@ class Storage:
         return full or (duration is not None and item.received_ns - self._file.counted.start_ns >= duration * NS_PER_S)
 
     def _repeat(self, received_ns: int) -> None:
-        """Begin a file with what is latched, so that it can be played without the one before."""
+        """Begin a file with latched messages, so that it can be played without the previous one."""
         items = [Item(i.topic, i.data, received_ns, i.published_ns) for i in self._latched.values()]
         if items:
             self._file.add_repeated(items)

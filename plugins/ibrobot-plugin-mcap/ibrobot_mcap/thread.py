@@ -1,4 +1,4 @@
-"""The thread that writes: what is given to it never waits, and finds a bounded queue."""
+"""A writer thread with a bounded queue; producers never wait."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from ibrobot_mcap.bagfile import Item
 from ibrobot_mcap.storage import Storage
 
 _OVERHEAD = 256
-"""What an item costs beside its data [bytes], roughly."""
+"""Approximate overhead of an item [bytes]."""
 
 
 class WriterThread:
-    """Hands items to a storage in a thread of its own.
+    """Passes items to a storage in a background thread.
 
     Args:
-        storage: used by nobody else until `stop`.
-        limit: of the data that waits [bytes]. An item that would exceed it is dropped and counted.
+        storage: the storage, for exclusive use until `stop`.
+        limit: maximum size of waiting data [bytes]. An item that would exceed it is dropped and counted.
     """
 
     def __init__(self, storage: Storage, limit: int) -> None:
         self.dropped: dict[str, int] = {}
-        """Topic -> messages that were dropped."""
+        """Topic -> number of dropped messages."""
         self._storage = storage
         self._limit = limit
         self._items: deque[Item] = deque()
         self._size = 0
-        """Of what waits and what is being written [bytes]."""
+        """Size of the items that wait or are being written [bytes]."""
         self._changed = threading.Condition()
         self._ending = False
         self._failure: RecorderError | None = None
@@ -37,14 +37,14 @@ class WriterThread:
 
     @property
     def size(self) -> int:
-        """Of what waits and is being written [bytes]."""
+        """Size of the items that wait or are being written [bytes]."""
         return self._size
 
     def put(self, item: Item) -> None:
-        """Queue an item, or drop it where there is no room.
+        """Queue an item, or drop it if the queue is full.
 
         Raises:
-            RecorderError: what the storage raised; nothing is written any more.
+            RecorderError: the error of the storage, after which nothing is written.
         """
         with self._changed:
             if self._failure is not None:
@@ -58,7 +58,7 @@ class WriterThread:
             self._changed.notify()
 
     def stop(self, *, discard: bool = False) -> RecorderError | None:
-        """Write what waits (or drop it), end the thread, and tell what the storage raised, if it did."""
+        """Write (or discard) waiting items and end the thread; returns the error of the storage, if any."""
         with self._changed:
             self._ending = True
             if discard:

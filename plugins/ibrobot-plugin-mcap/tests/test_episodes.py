@@ -103,7 +103,7 @@ def test_info_needs_no_repair(tmp_path):
     assert "unfinished; `ibrobot episodes repair` makes it whole" in output
     assert "/joint_states" in output
     assert "prompt: pick" in output
-    with pytest.raises(RecorderError, match=r"is a folder with an episode in it; name one, e\.g\. .*episode_000001"):
+    with pytest.raises(RecorderError, match=r"is a folder with an episode; choose one, e\.g\. .*episode_000001"):
         run("info", tmp_path)
     assert json.loads(run("info", path, "--json"))["metadata"]["prompt"] == "pick"
 
@@ -134,7 +134,7 @@ def test_a_cut_episode_does_not_count_as_success_and_keeps_what_is_missing_until
     assert missing > 0
     assert (before.outcome, before.finished, before.topics[JOINTS].missing) == ("unknown", False, missing)
     assert f"{JOINTS}: {len(messages)} messages, metadata.yaml says 3000" in run("verify", path, code=1)
-    with pytest.raises(RecorderError, match="is unfinished, or lacks messages; `ibrobot episodes repair` first"):
+    with pytest.raises(RecorderError, match="is unfinished, or lacks messages; run `ibrobot episodes repair` first"):
         run("mark", path, "success")
     assert f"{missing} are missing; its outcome was success, now it is unknown" in run("repair", path)
     assert "is whole" in run("repair", path)
@@ -157,7 +157,7 @@ def test_messages_that_are_missing_from_within_keep_an_episode_from_being_read(t
     text = (path / "metadata.yaml").read_text()
     (path / "metadata.yaml").write_text(text.replace("message_count: 100", "message_count: 103"))
     assert "100 messages, metadata.yaml says 103" in run("verify", path, code=1)
-    with pytest.raises(RecorderError, match=r"missing from within it: 3 of 103 of /joint_states; `ibrobot episodes re"):
+    with pytest.raises(RecorderError, match=r"missing in the middle: 3 of 103 of /joint_states; `ibrobot episodes re"):
         contents(path)
     assert "repaired, 100 messages, 0.99 s, 3 are missing" in run("repair", path)
     assert len(contents(path)[1]) == 100
@@ -215,7 +215,7 @@ def test_trim_copies_a_part(tmp_path):
     assert messages[0][1] == joints(30)
     assert summary.finished
     assert summary.metadata["trimmed"] == "0.3 s to 0.5 s of episode_000001"
-    with pytest.raises(RecorderError, match=r"is 0\.99 s long; --from 0\.5 --to 0\.2 is not part of it"):
+    with pytest.raises(RecorderError, match=r"is 0\.99 s long; --from 0\.5 --to 0\.2 is outside it"):
         run("trim", path, "--from", "0.5", "--to", "0.2", "-o", tmp_path / "none")
 
 
@@ -272,9 +272,9 @@ def test_export_writes_numbers_by_joint(tmp_path):
         rows = list(csv.DictReader(file))
     assert [float(row["position.tilt"]) for row in rows] == [0.0, -1.0, -2.0]
     assert int(rows[1]["header.stamp_ns"]) == stamp(1)
-    with pytest.raises(RecorderError, match="is there already"):
+    with pytest.raises(RecorderError, match="exists already"):
         run("export", path, JOINTS, "-o", tmp_path / "joints.csv")
-    with pytest.raises(RecorderError, match=r"has no topic '/imu'; it has: /joint_states"):
+    with pytest.raises(RecorderError, match=r"has no topic '/imu'; available: /joint_states"):
         run("export", path, "/imu", "-o", tmp_path / "imu.csv")
 
 
@@ -345,5 +345,5 @@ def test_delete_asks_and_takes_nothing_but_episodes(tmp_path):
 def test_what_is_not_there_is_reported(tmp_path):
     with pytest.raises(RecorderError, match="there is no such file or folder"):
         run("list", tmp_path / "none")
-    with pytest.raises(RecorderError, match="has no episode in it"):
+    with pytest.raises(RecorderError, match="contains no episode"):
         run("list", tmp_path)

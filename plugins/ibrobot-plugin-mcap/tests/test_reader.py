@@ -141,7 +141,7 @@ def test_other_folders_and_files_are_refused_as_bags(tmp_path, name, content, re
 @pytest.mark.parametrize("text", ["- 1\n", "{", "rosbag2_bagfile_information: 5\n"])
 def test_metadata_that_is_none_is_refused(tmp_path, text):
     (tmp_path / "metadata.yaml").write_text(text)
-    with pytest.raises(RecorderError, match=r"metadata.yaml: its metadata is not that of a rosbag2"):
+    with pytest.raises(RecorderError, match=r"metadata.yaml: is not metadata of a rosbag2"):
         Rosbag2Reader(tmp_path)
 
 
@@ -267,7 +267,7 @@ def test_sqlite_message_with_another_time_than_its_index_is_damage(tmp_path, whe
     other = struct.pack(">q", stamp(index) ^ 128)
     first, second = (other, time) if where == "table" else (time, other)
     file.write_bytes(before + first + middle + second + after)
-    with pytest.raises(RecorderError, match="is damaged: its messages have other times than its index says"):
+    with pytest.raises(RecorderError, match="is damaged: the times of its messages do not match its index"):
         read(tmp_path / "bag")
 
 

@@ -1,4 +1,4 @@
-"""`ibrobot episodes …`: what was recorded; one file a command."""
+"""`ibrobot episodes …`: manages recorded episodes; one file per command."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from ibrobot_mcap.commands.verify import verify
 
 @click.group()
 def episodes() -> None:
-    """List, check, mend, mark, cut and export recorded episodes.
+    """List, check, repair, mark, trim and export recorded episodes.
 
-    An episode is a folder such as episodes/pick_cube/episodes/episode_000001; where several are meant, a dataset or the
-    folder of all of them does too.
+    An episode is a folder such as episodes/pick_cube/episodes/episode_000001. Commands that take several episodes also
+    accept a dataset, or the folder of all datasets.
     """
 
 

@@ -16,12 +16,12 @@ def contract() -> None:
 
 @contract.command()
 @click.argument("bag", type=click.Path(path_type=Path))
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="The new file; printed when left out.")
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="The new file; by default, print the contract.")
 @wrong_input()
 def init(bag: Path, output: Path | None) -> None:
-    """Draft a contract for BAG, by its topics and their first messages.
+    """Draft a contract for BAG from its topics and their first messages.
 
-    The draft is a YAML file for `ibrobot convert --config`. Lines marked CHOOSE need a person: read them all.
+    The draft is a YAML file for `ibrobot convert --config`. Lines marked CHOOSE need a decision: read them all.
     """
     from ibrobot_mcap.commands.found import opened
     from ibrobot_mcap.draft import draft

@@ -15,7 +15,7 @@ from ibrobot_core.api import Declined, RecorderError, echo, wrong_input
 @click.option("--yes", is_flag=True, help="Do not ask.")
 @wrong_input()
 def delete(episodes: tuple[Path, ...], yes: bool) -> None:
-    """Delete EPISODES, after asking. Only folders of episodes are deleted."""
+    """Delete EPISODES after asking. Other folders are never deleted."""
     from ibrobot_mcap.commands.found import size_of, told_size
     from ibrobot_mcap.reader import is_rosbag2
 

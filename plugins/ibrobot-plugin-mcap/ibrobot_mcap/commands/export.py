@@ -15,26 +15,26 @@ import numpy as np
 from ibrobot_core.api import Image, Message, RecorderError, echo, wrong_input
 
 _TO_RGB = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2, 3), "bgra8": (2, 1, 0, 3)}
-"""Encoding -> its channels in the order of a PNG."""
+"""Encoding -> its channels in PNG order."""
 
 
 @click.command()
 @click.argument("episode", type=click.Path(path_type=Path))
 @click.argument("topic")
 @click.option(
-    "-o", "--output", type=click.Path(path_type=Path), required=True, help="A .csv, or a folder for pictures."
+    "-o", "--output", type=click.Path(path_type=Path), required=True, help="A .csv file, or a folder for images."
 )
 @wrong_input()
 def export(episode: Path, topic: str, output: Path) -> None:
-    """Export one TOPIC of an EPISODE: numbers and texts to a CSV file, pictures to PNG files with their stamps."""
+    """Export a TOPIC of an EPISODE: numbers and texts to a CSV file, images to PNG files with their stamps."""
     from ibrobot_mcap.commands.found import opened
 
     with opened(episode) as reader:
         topics = reader.summary().topics
         if topic not in topics:
-            raise RecorderError(f"{episode}: has no topic {topic!r}; it has: {', '.join(topics)}")
+            raise RecorderError(f"{episode}: has no topic {topic!r}; available: {', '.join(topics)}")
         if output.exists():
-            raise RecorderError(f"{output}: is there already")
+            raise RecorderError(f"{output}: exists already")
         items = ((item.received_ns, item.message) for item in reader.messages({topic}))
         making = output.with_name(f".{output.name}.making")
         _remove(making)
@@ -49,7 +49,7 @@ def export(episode: Path, topic: str, output: Path) -> None:
 
 
 def _remove(making: Path) -> None:
-    """Leave nothing of an export that did not come to its end."""
+    """Remove an incomplete export."""
     if making.is_dir():
         shutil.rmtree(making)
     else:
@@ -66,14 +66,16 @@ def _rows(items: Iterator[tuple[int, Message]], output: Path) -> int:
                 writer = csv.DictWriter(file, list(row))
                 writer.writeheader()
             if row.keys() - set(writer.fieldnames):
-                raise RecorderError(f"message {count} has other fields than the first: it cannot be a row of one table")
+                raise RecorderError(
+                    f"message {count} has other fields than the first, so they do not fit into one table"
+                )
             writer.writerow(row)
             count += 1
     return count
 
 
 def _flat(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """The numbers and texts of a message, by dotted paths; an array's by index, a joint's by its name."""
+    """Yield dotted paths and values of a message's numbers and texts; arrays by index, joints by name."""
     if attrs.has(type(value)):
         names = getattr(value, "name", None) if isinstance(getattr(value, "name", None), tuple) else None
         for field in attrs.fields(type(value)):
@@ -105,10 +107,10 @@ def _pictures(items: Iterator[tuple[int, Message]], output: Path) -> int:
 
 
 def save_png(image: Image, path: Path) -> None:
-    """Save a picture, lossless; depth as 16-bit grey.
+    """Save an image without loss; depth as 16-bit grey.
 
     Raises:
-        RecorderError: for an encoding that PNG has not.
+        RecorderError: if PNG does not support the encoding.
     """
     from PIL import Image as Png
 
@@ -116,10 +118,10 @@ def save_png(image: Image, path: Path) -> None:
 
 
 def pixels_of(image: Image) -> np.ndarray[Any, Any]:
-    """A picture as (H, W) grey or depth, or (H, W, C) with red first.
+    """An image as (H, W) grey or depth, or (H, W, C) RGB.
 
     Raises:
-        RecorderError: for an encoding that PNG has not.
+        RecorderError: if PNG does not support the encoding.
     """
     rows = image.data.reshape(image.height, image.step)
     if image.encoding in ("16UC1", "mono16"):
@@ -127,6 +129,6 @@ def pixels_of(image: Image) -> np.ndarray[Any, Any]:
     if image.encoding == "mono8":
         return rows[:, : image.width]
     if image.encoding not in _TO_RGB:
-        raise RecorderError(f"{image.encoding} pictures cannot become PNG")
+        raise RecorderError(f"{image.encoding} images cannot be saved as PNG")
     order = _TO_RGB[image.encoding]
     return rows[:, : len(order) * image.width].reshape(image.height, image.width, len(order))[:, :, order]

@@ -1,4 +1,4 @@
-"""The episodes that a command line means."""
+"""Finds the episodes that a command line names."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from ibrobot_mcap.reader import Rosbag2Reader, is_rosbag2
 
 
 def episodes_in(path: Path) -> list[Path]:
-    """The episode at `path`, or all of the dataset, or of the folder of datasets, there; sorted.
+    """The episode at `path`, or all episodes of a dataset or a folder of datasets there; sorted.
 
     Raises:
-        RecorderError: when there is none.
+        RecorderError: if there is none.
     """
     if not path.exists():
         raise RecorderError(f"{path}: there is no such file or folder")
@@ -25,23 +25,23 @@ def episodes_in(path: Path) -> list[Path]:
     found = {p for pattern in patterns for p in path.glob(pattern) if p.is_dir() and not p.name.startswith(".")}
     episodes = sorted(folder for folder in found if is_rosbag2(folder))
     if not episodes:
-        raise RecorderError(f"{path}: has no episode in it")
+        raise RecorderError(f"{path}: contains no episode")
     return episodes
 
 
 @contextmanager
 def opened(path: Path) -> Iterator[Rosbag2Reader]:
-    """A reader of an episode.
+    """Open a reader of an episode.
 
     Raises:
-        RecorderError: when it cannot be read.
+        RecorderError: if it cannot be read.
     """
     if not path.exists():
         raise RecorderError(f"{path}: there is no such episode")
     if path.is_dir() and not is_rosbag2(path):
         episodes = episodes_in(path)
         count = "an episode" if len(episodes) == 1 else f"{len(episodes)} episodes"
-        raise RecorderError(f"{path}: is a folder with {count} in it; name one, e.g. {episodes[0]}")
+        raise RecorderError(f"{path}: is a folder with {count}; choose one, e.g. {episodes[0]}")
     reader = Rosbag2Reader(path)
     try:
         yield reader
@@ -50,35 +50,35 @@ def opened(path: Path) -> Iterator[Rosbag2Reader]:
 
 
 def summary_of(path: Path) -> EpisodeSummary:
-    """What is in an episode.
+    """The summary of an episode.
 
     Raises:
-        RecorderError: when it cannot be read.
+        RecorderError: if it cannot be read.
     """
     with opened(path) as reader:
         return reader.summary()
 
 
 def size_of(path: Path) -> int:
-    """Bytes of all files of an episode."""
+    """Total size of an episode's files [bytes]."""
     files = path.rglob("*") if path.is_dir() else (path,)
     return sum(file.stat().st_size for file in files if file.is_file())
 
 
 def duration_s(summary: EpisodeSummary) -> float:
-    """From the first to the last message [s]."""
+    """Time from the first to the last message [s]."""
     return (summary.end_ns - summary.start_ns) / NS_PER_S
 
 
 def date_of(summary: EpisodeSummary) -> str:
-    """When the episode began, in UTC; empty for one without messages."""
+    """The start of an episode, in UTC; empty if it has no messages."""
     if not summary.start_ns:
         return ""
     return datetime.fromtimestamp(summary.start_ns / NS_PER_S, UTC).strftime("%Y-%m-%d %H:%M")
 
 
 def told_size(size: int) -> str:
-    """Bytes for people."""
+    """A human-readable size."""
     number = float(size)
     for unit in ("B", "kB", "MB"):
         if number < 1000:

@@ -13,7 +13,7 @@ from rich.table import Table
 from ibrobot_core.api import Screen, echo, wrong_input
 
 _LONG = 200
-"""Of metadata longer than this only the length is printed [characters]."""
+"""For longer metadata, only the length is printed [characters]."""
 
 
 @click.command()
@@ -21,7 +21,7 @@ _LONG = 200
 @click.option("--json", "as_json", is_flag=True, help="Print JSON, with all metadata.")
 @wrong_input()
 def info(episode: Path, as_json: bool) -> None:
-    """Show what is in an EPISODE: topics, counts, losses and metadata. An unfinished one needs no repair for it."""
+    """Show the topics, counts, losses and metadata of an EPISODE, which may be unfinished."""
     from ibrobot_mcap.commands.found import date_of, duration_s, size_of, summary_of, told_size
 
     summary = summary_of(episode)
@@ -35,7 +35,7 @@ def info(episode: Path, as_json: bool) -> None:
     console.print(f"{began}, {duration_s(summary):.2f} s, {told_size(size_of(episode))}")
     table = Table(box=None, padding=(0, 1))
     for heading in ("topic", "type", "messages", "Hz", "lost"):
-        # Names are folded rather than cut: `export` wants them whole.
+        # Names are folded rather than truncated, because `export` needs complete ones.
         left = heading in ("topic", "type")
         table.add_column(heading, justify="left" if left else "right", overflow="fold", no_wrap=not left)
     span_s = duration_s(summary)

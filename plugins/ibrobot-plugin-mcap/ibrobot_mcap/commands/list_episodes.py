@@ -12,7 +12,7 @@ from rich.table import Table
 from ibrobot_core.api import RecorderError, Screen, echo, styled, wrong_input
 
 _WIDE = 100
-"""Columns of a terminal in which prompts and years have room."""
+"""Width of a terminal with enough room for prompts and years [columns]."""
 
 
 @click.command("list")
@@ -20,7 +20,7 @@ _WIDE = 100
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 @wrong_input()
 def list_episodes(path: Path, as_json: bool) -> None:
-    """List the episodes in PATH: a folder of datasets (`episodes` when left out), a dataset, or an episode."""
+    """List the episodes in PATH: a folder of datasets (by default `episodes`), a dataset, or an episode."""
     from ibrobot_mcap.commands.found import date_of, duration_s, episodes_in, size_of, summary_of, told_size
 
     rows = []
@@ -73,7 +73,7 @@ def list_episodes(path: Path, as_json: bool) -> None:
 
 
 def _shown(episode: Path, folder: Path) -> str:
-    """An episode's path within the folder that was asked for, without what all have."""
+    """An episode's path within the listed folder, without the parts common to all episodes."""
     if episode == folder:
         return episode.name
     parts = [part for part in episode.relative_to(folder).parts if part != "episodes"]

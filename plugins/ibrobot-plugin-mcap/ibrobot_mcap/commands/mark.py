@@ -14,7 +14,7 @@ from ibrobot_core.api import RecorderError, echo, wrong_input
 @click.argument("outcome", type=click.Choice(("success", "failure", "unknown")))
 @wrong_input()
 def mark(episodes: tuple[Path, ...], outcome: str) -> None:
-    """Set the OUTCOME of EPISODES, e.g. after a repair: what you say counts, and that you said it is written down."""
+    """Set the OUTCOME of EPISODES, e.g. after a repair. The episode records that its outcome was set by hand."""
     from ibrobot_mcap.facts import set_custom
     from ibrobot_mcap.metadata import MARKED, OUTCOME
     from ibrobot_mcap.reader import Rosbag2Reader
@@ -26,6 +26,6 @@ def mark(episodes: tuple[Path, ...], outcome: str) -> None:
         finally:
             reader.close()
         if not whole:
-            raise RecorderError(f"{episode}: is unfinished, or lacks messages; `ibrobot episodes repair` first")
+            raise RecorderError(f"{episode}: is unfinished, or lacks messages; run `ibrobot episodes repair` first")
         set_custom(episode, {OUTCOME: outcome, MARKED: "true"})
         echo(f"{episode}: {outcome}")

@@ -1,4 +1,4 @@
-"""`ibrobot episodes plot`: an episode at a glance, as one PNG."""
+"""`ibrobot episodes plot`: plots an overview of an episode as PNG."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ _THUMBNAILS = 8
 
 @click.command()
 @click.argument("episode", type=click.Path(path_type=Path))
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="A .png; NAME.png when left out.")
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="A .png file; by default NAME.png.")
 @wrong_input()
 def plot(episode: Path, output: Path | None) -> None:
-    """Draw an EPISODE: joints and actions over time, rates and gaps of every topic, pictures along it."""
+    """Plot an EPISODE: joints and actions over time, rates and gaps of every topic, and some images."""
     try:
         import matplotlib as mpl
     except ImportError:
@@ -33,7 +33,7 @@ def plot(episode: Path, output: Path | None) -> None:
 
 
 class Facts:
-    """All of an episode that the picture shows."""
+    """The data of an episode to plot."""
 
     def __init__(self, episode: Path) -> None:
         from ibrobot_mcap.commands.export import pixels_of
@@ -42,10 +42,10 @@ class Facts:
         self.name = episode.name
         self.stamps: dict[str, list[int]] = defaultdict(list)
         self.joints: dict[tuple[str, str], list[tuple[float, float]]] = defaultdict(list)
-        """Topic and joint -> its positions."""
+        """Topic and joint -> positions."""
         self.vectors: dict[str, list[tuple[float, list[float]]]] = defaultdict(list)
         self.pictures: dict[str, dict[int, tuple[float, np.ndarray[Any, Any]]]] = defaultdict(dict)
-        """Topic -> place along the episode, from 0 -> the picture there."""
+        """Topic -> position in the episode, from 0 -> image."""
         newest: dict[str, tuple[float, Image]] = {}
         with opened(episode) as reader:
             self.summary = summary = reader.summary()
@@ -55,7 +55,7 @@ class Facts:
                 self.stamps[item.topic].append(item.received_ns)
                 message = item.message
                 if isinstance(message, JointState):
-                    # A sender may leave the positions out.
+                    # A sender may omit the positions.
                     for joint, position in zip(message.name, message.position.tolist(), strict=False):
                         self.joints[item.topic, joint].append((at_s, position))
                 elif isinstance(message, Float64MultiArray):
@@ -65,13 +65,13 @@ class Facts:
                     place = (item.received_ns - start_ns) * (_THUMBNAILS - 1) // span_ns
                     if place not in shown and place < _THUMBNAILS - 1:
                         shown[place] = (at_s, pixels_of(message))
-        for topic, (at_s, message) in newest.items():  # the end, which shows what became of it
+        for topic, (at_s, message) in newest.items():  # the last images, which show the outcome
             self.pictures[topic][_THUMBNAILS - 1] = (at_s, pixels_of(message))
         self.actions = actions_of(self.summary.metadata, self.vectors)
 
 
 def actions_of(metadata: Mapping[str, str], topics: Collection[str]) -> dict[str, tuple[str, ...]]:
-    """Topic of an action -> its joints: by the recorded contract; without one by the names that controllers have."""
+    """Topic of an action -> joints, from the recorded contract or else from the names of controllers."""
     contract = contract_of(metadata)
     if contract is not None:
         return {part.topic: part.joints for part in contract.action_parts}
@@ -129,7 +129,7 @@ def _draw(facts: Facts, output: Path) -> None:
             axes.set_axis_off()
             axes.set_title(f"{topic}\n{at:.1f} s" if column == first else f"{at:.1f} s", fontsize="small", loc="left")
     try:
-        figure.savefig(output, dpi=80, format=output.suffix[1:] or "png")  # a name stays as it was given
+        figure.savefig(output, dpi=80, format=output.suffix[1:] or "png")  # keep the given name
     except (OSError, ValueError) as error:
         raise RecorderError(f"{output}: cannot be written: {error}") from error
     finally:

@@ -13,11 +13,11 @@ from ibrobot_core.api import EpisodeSummary, RecorderError, echo, wrong_input
 @click.argument("path", type=click.Path(path_type=Path))
 @wrong_input()
 def repair(path: Path) -> None:
-    """Make episodes in PATH whole that are unfinished or lack messages: index and metadata.yaml, of all that is there.
+    """Repair unfinished or incomplete episodes in PATH: write index and metadata.yaml for the readable part.
 
-    What is missing stays written in the episode, and `verify` reports it. The outcome becomes unknown, since the end
-    may be missing: look at the episode, and set it by `mark`. An original is removed when the new episode has been
-    read back and has every message of it.
+    The episode records the missing messages, and `verify` reports them. The outcome becomes unknown, since the end
+    may be missing: look at the episode, and set it with `mark`. The original is removed only after the new episode has
+    been read back and has all its messages.
     """
     from ibrobot_mcap import rewrite
     from ibrobot_mcap.commands.found import duration_s, episodes_in
@@ -34,13 +34,13 @@ def repair(path: Path) -> None:
             echo(f"{episode}: is whole")
         else:
             count = sum(topic.count for topic in made.summary.topics.values())
-            echo(f"{episode}: repaired, {count} messages, {duration_s(made.summary):.2f} s{_told(made.summary)}")
+            echo(f"{episode}: repaired, {count} messages, {duration_s(made.summary):.2f} s{_description(made.summary)}")
     if failed:
         raise SystemExit(1)
 
 
-def _told(summary: EpisodeSummary) -> str:
-    """What is missing, and what its outcome was."""
+def _description(summary: EpisodeSummary) -> str:
+    """A description of missing messages, and the former outcome."""
     from ibrobot_mcap.rewrite import STATED
 
     missing = sum(topic.missing for topic in summary.topics.values())

@@ -14,11 +14,11 @@ from ibrobot_core.api import echo, wrong_input
 @click.option("--gap", type=click.FloatRange(min=1), default=5.0, show_default=True, help="Longest pause, in periods.")
 @wrong_input()
 def verify(path: Path, gap: float) -> None:
-    """Read every message of the episodes in PATH, and say what is wrong; exits with 1 if something is.
+    """Read every message of the episodes in PATH and print problems; exits with 1 if there are any.
 
-    Wrong are: an unfinished episode, a message that cannot be decoded, counts that differ from metadata.yaml, losses, a
-    topic of its contract without a message, header stamps that go back, a pause in a topic longer than --gap of its
-    median period, and episodes of one dataset with different contracts.
+    Problems are: unfinished episodes, messages that cannot be decoded, counts that differ from metadata.yaml, lost
+    messages, topics of the contract without messages, header stamps that decrease, pauses in a topic longer than --gap
+    times its median period, and different contracts within one dataset.
     """
     from ibrobot_mcap.checks import problems_of
     from ibrobot_mcap.commands.found import episodes_in, summary_of
