@@ -143,7 +143,7 @@ class PolicyModel:
         return actions
 
     def _fill_queues(self, inputs: dict[str, Any]) -> None:
-        """Fill LeRobot's queues of past observations with those of the request, oldest first."""
+        """Fill LeRobot's queues of past observations with the request's, oldest first."""
         queues = {key: queue for key, queue in getattr(self._policy, "_queues", {}).items() if key != ACTION}
         cameras = [inputs[key] for key in self._policy.config.image_features if key in inputs]
         if not queues:
