@@ -56,7 +56,7 @@ def test_a_topic_that_nothing_publishes_is_reported_once(runs: Runs, network: No
     for _ in range(300):
         runtime.step()
     runtime.stop()
-    said = "/joint_state is not shared: nothing publishes it so far, did you mean '/joint_states'?"
+    said = "/joint_state is not shared: it has no publisher so far, did you mean '/joint_states'?"
     assert [said] == [record.message for record in caplog.records if "is not shared" in record.message]
 
 
@@ -100,7 +100,7 @@ def test_what_others_publish_comes_in(runs: Runs, network: None, caplog: pytest.
 
 
 def test_nothing_comes_in_in_lockstep(runs: Runs, network: None):
-    with pytest.raises(NotSupported, match=r"transport\.share\.subscribe: in lockstep nothing may come"):
+    with pytest.raises(NotSupported, match=r"transport\.share\.subscribe: a lockstep run cannot receive"):
         runs.make("transport={type: network, share: {subscribe: [/lamp]}}", lockstep=True)
 
 
@@ -109,7 +109,7 @@ def test_nothing_comes_in_in_lockstep(runs: Runs, network: None):
     [
         ("{type: local, share: {publish: [/a]}}", "unknown key"),
         ("{type: network, share: {publish: [a]}}", "'a' is not a full topic name, did you mean '/a'?"),
-        ("{type: network, share: {publish: [/a, /a]}}", "/a is given twice"),
+        ("{type: network, share: {publish: [/a, /a]}}", "/a is listed twice"),
         ("{type: network, share: {publish: [/a], subscribe: [/a]}}", "/a is both published and subscribed"),
         ("{type: network, share: {publishes: [/a]}}", "did you mean 'publish'?"),
     ],

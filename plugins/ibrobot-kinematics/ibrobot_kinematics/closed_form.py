@@ -1,7 +1,7 @@
 """Closed-form inverse kinematics of an arm with a pan joint, three parallel joints and a roll about the tool.
 
-The parallel joints move the tip in a plane that the pan turns. Points of that plane are complex numbers: the real part
-points away from the pan's axis, the imaginary part along it.
+The parallel joints move the tip in a plane, which the pan rotates. Points in that plane are complex numbers: the real
+part points away from the pan's axis, the imaginary part along it.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from ibrobot_kinematics.model import KinematicModel
 from ibrobot_kinematics.rotations import cross
 
 _PARALLEL = 1e-4
-"""Sine of the angle up to which axes count as parallel; a last step on the model itself takes up the difference."""
+"""Sine of the angle up to which axes count as parallel; a final step with the exact model corrects the difference."""
 _NO_LENGTH = 1e-9
 _NEARLY_VERTICAL = 0.02
-"""Horizontal part of a direction below which the pan is hardly determined and its whole family is tried."""
+"""Horizontal part of a direction below which the pan is nearly undetermined and is sampled."""
 _TURN = 2 * np.pi
 
 type Complex = np.ndarray[tuple[int, ...], np.dtype[np.complex128]]
@@ -34,7 +34,7 @@ class Candidates:
     off: Vector
     """Distance of the tip from the target [m], shape (N,)."""
     turned: Vector
-    """Angle between the tool and the asked direction [rad], shape (N,); 0 for a target without one."""
+    """Angle between the tool and the target direction [rad], shape (N,); 0 for a target without one."""
     branch: np.ndarray[tuple[int], np.dtype[np.intp]]
     """Number of the branch, shape (N,)."""
 
@@ -48,7 +48,7 @@ class PanPlanarRoll:
     origin: Vector
     """A point on the pan's axis [m], shape (3,)."""
     signs: Vector
-    """Which way each joint turns, shape (5,)."""
+    """Sign of each joint's rotation, shape (5,)."""
     reference: Vector
     lower: Vector
     upper: Vector
@@ -65,17 +65,17 @@ class PanPlanarRoll:
     lateral: float
     """Roll's axis along the parallel axes, seen from the pan's axis [m]."""
     points: float
-    """1 where the tip's z axis points along the roll's axis, -1 where against it, 0 otherwise."""
+    """1 if the tip's z axis is parallel to the roll's axis, -1 if antiparallel, otherwise 0."""
 
     def with_axis(self, position: Vector, axis: Vector, start: Vector) -> Candidates:
         """Up to eight branches: two of the pan, two of the roll, two of the elbow.
 
-        For a vertical axis every pan is possible: the family is sampled.
+        For a vertical axis every pan is possible, so the pan is sampled.
 
         Args:
-            position: where the tip shall be in the base frame [m], shape (3,).
-            axis: direction of the tip's z axis there, shape (3,).
-            start: chain's joint positions [rad] that solutions shall be near to, shape (5,).
+            position: target position of the tip in the base frame [m], shape (3,).
+            axis: target direction of the tip's z axis, shape (3,).
+            start: joint positions of the chain [rad]; solutions near them are preferred, shape (5,).
         """
         x, y, _ = self.frame @ (position - self.origin)
         ax, ay, az = self.points * (self.frame @ axis)
@@ -99,7 +99,7 @@ class PanPlanarRoll:
     def at(self, position: Vector, axis: Vector | None, start: Vector, *, pitches: int, rolls: int) -> Candidates:
         """Four branches, two of the pan and two of the elbow; the free pitch and roll are sampled.
 
-        The first sample is that of `start`. The arguments are as in `with_axis`; an axis counts in `turned` alone.
+        The first sample is that of `start`. The arguments are as in `with_axis`; an axis only affects `turned`.
         """
         x, y, _ = self.frame @ (position - self.origin)
         at_start = self._turned(start)
@@ -111,7 +111,7 @@ class PanPlanarRoll:
         return self._solved(position, axis, start, pan, np.tile(pitch, len(pan) // pitches), roll, branch)
 
     def _turned(self, joints: Vector) -> Vector:
-        """How far joints are from the reference position, about the axes of the frame."""
+        """Rotation of the joints from the reference position, about the axes of the frame."""
         return np.asarray((joints - self.reference) * self.signs)
 
     def _rolls(self, start: Vector, number: int) -> Vector:
@@ -120,7 +120,7 @@ class PanPlanarRoll:
         return np.asarray((np.append(start[4], among) - self.reference[4]) * self.signs[4])
 
     def _pans(self, x: float, y: float, roll: Vector) -> tuple[Vector, Vector]:
-        """Both pans at which the arm's plane, with this roll, contains the target."""
+        """Both pan angles at which the arm's plane, with this roll, contains the target."""
         lateral = self.lateral + (self.offset * np.exp(1j * roll)).real
         ahead = np.sqrt(np.maximum(x * x + y * y - lateral * lateral, 0.0))
         heading = np.arctan2(y, x)
@@ -139,7 +139,7 @@ class PanPlanarRoll:
         bend = np.arccos(np.clip(cosine, -1, 1))
         elbow = np.angle(far / near) + np.concatenate([bend, -bend])
         pan, pitch, roll, wrist = (np.concatenate([each, each]) for each in (pan, pitch, roll, wrist))
-        # A wrist on the shoulder leaves the lift free; angle(0) is as good as any.
+        # If the wrist is on the shoulder, the lift is free, and angle(0) is a valid choice.
         lift = np.angle((near + np.exp(-1j * elbow) * far) * np.conj(wrist))
         joints = self.reference + self.signs * np.stack([pan, lift, elbow, pitch - lift - elbow, roll], axis=1)
         joints = self._within(joints, start)
@@ -147,7 +147,7 @@ class PanPlanarRoll:
         return Candidates(joints, off, turned, np.concatenate([2 * branch, 2 * branch + 1]))
 
     def _within(self, joints: Vector, start: Vector) -> Vector:
-        """The same angles near to `start` where the limits allow that, else the nearest within them."""
+        """Equivalent angles near `start` if the limits permit, otherwise the nearest ones within them."""
         by_start = joints - _TURN * np.round((joints - start) / _TURN)
         middle = (self.lower + self.upper) / 2
         by_middle = joints - _TURN * np.round((joints - middle) / _TURN)
@@ -155,7 +155,7 @@ class PanPlanarRoll:
         return np.clip(np.where(inside, by_start, by_middle), self.lower, self.upper)
 
     def _reach(self, roll: Vector) -> Complex:
-        """Tip from the third parallel axis at a pitch of zero [m]."""
+        """Vector from the third parallel axis to the tip at a pitch of zero [m]."""
         return np.asarray(self.tool + 1j * self.roll * (self.offset * np.exp(1j * roll)).imag)
 
     def _missed(self, joints: Vector, position: Vector, axis: Vector | None) -> tuple[Vector, Vector]:
@@ -167,7 +167,7 @@ class PanPlanarRoll:
         near, far = self.links
         tip = self.shoulder + np.exp(-1j * lift) * near + np.exp(-1j * forearm) * far
         tip += np.exp(-1j * pitch) * self._reach(roll)
-        # The target seen from the turned plane.
+        # The target in the rotated plane.
         target = (x + 1j * y) * np.exp(-1j * pan)
         aside = target.imag - self.lateral - (self.offset * np.exp(1j * roll)).real
         off = np.sqrt((target.real - tip.real) ** 2 + aside**2 + (z - tip.imag) ** 2)

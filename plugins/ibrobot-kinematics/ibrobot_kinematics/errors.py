@@ -1,4 +1,4 @@
-"""What kinematics raises."""
+"""Errors of kinematics."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from ibrobot_core.api import IbrobotError, Vector
 
 
 class KinematicsError(IbrobotError):
-    """A model that cannot be used, e.g. an MJCF without the tip's site."""
+    """A model is unusable, e.g. an MJCF lacks the tip's site."""
 
 
 class UnreachableError(KinematicsError):
-    """A target that the arm cannot reach within its joint limits and the tolerances.
+    """The arm cannot reach a target within its joint limits and the tolerances.
 
-    The nearest point is nearest in position; where the arm reaches the position, it has the nearest orientation there.
+    The nearest point minimises the position error; if the arm reaches the position, it minimises the orientation error.
 
     Args:
         tip: name of the tip's frame.
-        target: the position asked for [m], shape (3,).
+        target: position of the target [m], shape (3,).
         nearest: joint positions [rad or m] of the nearest point, shape (J,).
-        position: the tip there [m], shape (3,).
+        position: position of the tip there [m], shape (3,).
         position_error: distance [m] of the tip from the target there.
         rotation_error: angle [rad] between the tip and the target there; 0 for a target without an orientation.
     """

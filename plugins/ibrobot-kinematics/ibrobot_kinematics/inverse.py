@@ -18,20 +18,20 @@ ROTATION_TOLERANCE_RAD = 0.01
 _EXACT_M = 1e-6
 _EXACT_RAD = 1e-6
 _POLISHING = 15
-"""Iterations that take up the difference between the arm and its ideal geometry."""
+"""Iterations that correct the difference between the arm and its ideal geometry."""
 _NEAR_MISSES = 2
-"""Searches from the nearest misses of each branch of the closed form."""
+"""Number of searches from the candidates with the smallest errors, per branch of the closed form."""
 _ROUNDS = (16, 100)
-"""Searches side by side that follow one from the start."""
+"""Number of parallel searches after the one from the start."""
 _SHORT, _LONG = 5, 15
-"""Iterations of all of them, and of the best."""
+"""Iterations of all searches, and of the best ones."""
 _BEST = 4
 _LEAST_WEIGHT, _WEIGHT, _GREAT_WEIGHT = 10.0, 100.0, 1e4
-"""Radians that a metre counts: at least; where searches begin at the position already; where position comes first."""
+"""Weights of position errors [rad/m]: minimum; if searches begin at the position; if position has priority."""
 _SHIFTS = 3
-"""How often the target is shifted until its position is met and the orientation nearest."""
+"""How often to shift the target until its position is met with the nearest orientation."""
 _ONE = 0.02
-"""Solutions that differ in no joint by more [rad or m] are one."""
+"""Solutions whose joints all differ by less count as equal [rad or m]."""
 
 type Indices = np.ndarray[tuple[int], np.dtype[np.intp]]
 
@@ -46,26 +46,26 @@ def solve(
 ) -> Vector:
     """Joint positions within the limits that bring the tip to `target`.
 
-    In closed form for an arm with a pan joint, three parallel joints and a roll about the tool, as the SO-101, and a
-    target without a rotation: a branch near `start`, see `solve_all`. Numerical otherwise: damped Newton searches
-    within the limits, from `start`, then from configurations all over the limits whose tips are near the target. Equal
-    arguments give equal bits.
+    For an arm with a pan joint, three parallel joints and a roll about the tool, such as the SO-101, and a target
+    without a rotation, the solution is in closed form, on a branch near `start`; see `solve_all`. Otherwise it is
+    numerical: damped Newton searches within the limits, from `start`, then from configurations throughout the limits
+    whose tips are near the target. Equal arguments give equal results, bit by bit.
 
     Args:
         model: the arm.
-        target: where to bring the tip.
-        start: where joints are, shape (J,); of several solutions one near it is likely. Joints that do not move the
-            tip stay there.
-        position_tolerance: how far [m] from the target the tip may be.
-        rotation_tolerance: how far [rad] the tip may turn away from the target's rotation or axis where the arm cannot
-            do better.
+        target: target of the tip.
+        start: initial joint positions [rad or m], shape (J,); a solution near them is preferred. Joints that do not
+            move the tip keep their position.
+        position_tolerance: allowed distance of the tip from the target [m].
+        rotation_tolerance: allowed angle between the tip and the target's rotation or axis [rad], if the arm cannot
+            reach it exactly.
 
     Returns:
         Joint positions [rad or m], shape (J,).
 
     Raises:
-        ValueError: for a start that is not finite or has another shape, or a tolerance that is not above zero.
-        UnreachableError: when no search ends within the tolerances; it has the nearest point that the arm can reach.
+        ValueError: if `start` is not finite or has a wrong shape, or a tolerance is not positive.
+        UnreachableError: if no solution is within the tolerances; has the nearest point that the arm can reach.
     """
     return _solutions(model, target, start, position_tolerance, rotation_tolerance, every=False)[0]
 
@@ -80,16 +80,17 @@ def solve_all(
 ) -> list[Vector]:
     """Different solutions within the limits, the nearest to `start` first.
 
-    In closed form, as in `solve`, there is one of each branch. A position with an axis has up to eight: two of the pan,
-    the roll and the elbow each. Where the target leaves joints free, i.e. the pitch and roll at a position alone, or
-    the pan at an axis along the pan's, they are sampled, and each branch gives its sample nearest to `start`.
-    Numerically, the solutions are those that searches from all over the limits find; an arm with joints to spare has
-    endlessly many.
+    In closed form (see `solve`), there is one solution per branch. A position with an axis has up to eight: two values
+    each of pan, roll and elbow. If the target leaves joints free, they are sampled, and each branch returns its sample
+    nearest to `start`. This concerns pitch and roll for a position alone, and the pan for an axis parallel to the
+    pan's. Numerically, the solutions are those found by searches throughout the limits; a redundant arm has infinitely
+    many.
 
     Args:
         model: the arm.
-        target: where to bring the tip.
-        start: where joints are, shape (J,); None: the middle of the limits. Joints that do not move the tip stay there.
+        target: target of the tip.
+        start: initial joint positions [rad or m], shape (J,); None: the middle of the limits. Joints that do not move
+            the tip keep their position.
         position_tolerance: as in `solve`.
         rotation_tolerance: as in `solve`.
 
@@ -144,7 +145,7 @@ def _solutions(
 
 
 def _rounds(model: KinematicModel, target: Target, start: Vector, near_misses: Vector, every: bool) -> Iterator[Vector]:
-    """Where searches begin, round after round."""
+    """Yield the starting points of searches, round by round."""
     if len(near_misses):
         yield np.concatenate([near_misses, starts_from_table(model, target, start, _ROUNDS[0])])
         return
@@ -164,7 +165,7 @@ def _closed_form_for(model: KinematicModel, target: Target) -> PanPlanarRoll | N
 def _by_closed_form(
     model: KinematicModel, arm: PanPlanarRoll, target: Target, start: Vector, every: bool
 ) -> tuple[list[Vector], Vector]:
-    """Exact solutions, one of each branch, and where there are none the nearest misses, shape (N, J)."""
+    """Exact solutions, one per branch, and the candidates with the smallest errors otherwise, shape (N, J)."""
     chain = start[model.moving]
     near_misses = []
     for candidates in _samples(arm, target, chain, every):
@@ -176,7 +177,7 @@ def _by_closed_form(
             solutions = _placed(model, start, candidates.joints[ranked[np.sort(first)]])
             off, turned = target.missed(model.forward(solutions[0]))
             if off > _EXACT_M or turned > _EXACT_RAD:
-                # The model deviates from the ideal geometry within its rounding.
+                # The model deviates slightly from the ideal geometry, within its rounding.
                 solutions = search(model, target, solutions, position_weight=_WEIGHT, iterations=_POLISHING).joints
             return list(solutions), solutions
         ranks = (
@@ -189,12 +190,12 @@ def _by_closed_form(
 
 
 def _ranked(off: Vector, turned: Vector, weight: float) -> Indices:
-    """Indices of what misses by these distances [m] and angles [rad], least first; `weight` is in [rad/m]."""
+    """Indices sorted by error, from distances [m] and angles [rad]; `weight` is in [rad/m]."""
     return np.argsort(np.hypot(weight * off, turned), kind="stable")
 
 
 def _first_of_each(branch: Indices, ranked: Indices, number: int = _NEAR_MISSES) -> Indices:
-    """The first few of `ranked` of each branch."""
+    """The first few indices of `ranked` in each branch."""
     order = np.argsort(branch[ranked], kind="stable")
     _, begins = np.unique(branch[ranked][order], return_index=True)
     rank_within = np.arange(len(ranked)) - np.repeat(begins, np.diff(np.append(begins, len(ranked))))
@@ -202,7 +203,7 @@ def _first_of_each(branch: Indices, ranked: Indices, number: int = _NEAR_MISSES)
 
 
 def _samples(arm: PanPlanarRoll, target: Target, chain: Vector, every: bool) -> Iterator[Candidates]:
-    """Candidates, ever more."""
+    """Yield candidates, with increasingly fine sampling."""
     if target.axis is not None:
         yield arm.with_axis(target.position, target.axis, chain)
     elif not every:
@@ -211,7 +212,7 @@ def _samples(arm: PanPlanarRoll, target: Target, chain: Vector, every: bool) -> 
 
 
 def _placed(model: KinematicModel, start: Vector, joints: Vector) -> Vector:
-    """Positions of all joints, shape (N, J), with these of the chain's, shape (N, n)."""
+    """Positions of all joints, shape (N, J), with the given positions of the chain, shape (N, n)."""
     q = np.tile(start, (len(joints), 1))
     q[:, model.moving] = joints
     return q
@@ -226,11 +227,11 @@ def _distinct(solutions: Vector) -> list[Vector]:
 
 
 def _nearest(model: KinematicModel, target: Target, near: Vector) -> Vector:
-    """The joint positions nearest to the target, searched from the best of those given, shape (N, J).
+    """The joint positions nearest to the target, searched from the best of `near`, shape (N, J).
 
-    Its position is the nearest, and its orientation the nearest at that position. A great weight of the position alone
-    would make searches slow. Hence the target is first shifted by what was missed, again and again (M. Hestenes,
-    Multiplier and gradient methods, 1969).
+    Minimises the position error first, then the orientation error. A large weight of the position would make searches
+    slow, so the target is repeatedly shifted by the remaining error instead (M. Hestenes, Multiplier and gradient
+    methods, 1969).
     """
     off, turned = target.missed(model.forward(near))
     near = np.concatenate([near[_ranked(off, turned, weight)[:_BEST]] for weight in (_WEIGHT, _GREAT_WEIGHT)])

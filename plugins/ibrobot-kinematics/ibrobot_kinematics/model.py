@@ -13,7 +13,7 @@ from ibrobot_kinematics.rotations import cross, skew
 
 @attrs.frozen(eq=False)
 class TipPose:
-    """Where the tip is in the base frame."""
+    """Pose of the tip in the base frame."""
 
     position: Vector
     """Origin of the tip [m], shape (3,)."""
@@ -23,18 +23,18 @@ class TipPose:
 
 @attrs.frozen(eq=False)
 class ChainJoint:
-    """One joint on the way from the base to the tip."""
+    """A joint between the base and the tip."""
 
     index: int
-    """Position of the joint in `KinematicModel.joint_names`."""
+    """Index of the joint in `KinematicModel.joint_names`."""
     position: Vector
-    """Origin of the joint in the frame of the joint before it, or of the base [m], shape (3,)."""
+    """Origin of the joint in the frame of the previous joint, or of the base [m], shape (3,)."""
     rotation: Vector
     """Axes of the joint in that frame, as columns, at the reference position, shape (3, 3)."""
     axis: Vector
-    """Unit vector of the joint's axis in its own frame, shape (3,)."""
+    """Unit vector along the joint's axis in its own frame, shape (3,)."""
     reference: float = 0.0
-    """Joint position [rad or m] at which the joint moves nothing."""
+    """Reference position of the joint [rad or m], at which it causes no displacement."""
     slides: bool = False
     """Whether it is prismatic; revolute otherwise."""
 
@@ -48,7 +48,7 @@ class KinematicModel:
     """
 
     joint_names: tuple[str, ...]
-    """All joints, J in number. Those that are not in `chain` do not move the tip."""
+    """All J joints. Joints that are not in `chain` do not move the tip."""
     lower: Vector
     """Lower position limits, shape (J,)."""
     upper: Vector
@@ -64,7 +64,7 @@ class KinematicModel:
         """Pose of the tip in the base frame.
 
         Args:
-            q: joint positions, shape (…, J): one configuration, or many at once.
+            q: joint positions, shape (…, J): one or many configurations.
 
         Returns:
             Position and rotation of shapes (…, 3) and (…, 3, 3).
@@ -72,7 +72,7 @@ class KinematicModel:
         return self._frames(q)[0]
 
     def jacobian(self, q: Vector) -> Vector:
-        """How the tip moves with the joints.
+        """Jacobian of the tip.
 
         Args:
             q: joint positions, shape (…, J).
@@ -84,7 +84,7 @@ class KinematicModel:
         return self.forward_and_jacobian(q)[1]
 
     def forward_and_jacobian(self, q: Vector) -> tuple[TipPose, Vector]:
-        """`forward(q)` and `jacobian(q)` for little more than the time of one."""
+        """`forward(q)` and `jacobian(q)`, in little more time than one of them."""
         tip, origins, axes = self._frames(q)
         jacobian = np.zeros((*q.shape[:-1], 6, len(self.joint_names)))
         slides = self._slides[:, None]

@@ -22,7 +22,7 @@ def bounded_minimum(hessian: Vector, gradient: Vector, lower: Vector, upper: Vec
     x = np.zeros_like(gradient)
     held = np.zeros(len(x), dtype=bool)
     tolerance = 1e-12 * (1 + np.abs(gradient).max())
-    # Each round holds or releases one entry; rounding could make it go in circles, hence an end.
+    # Each round fixes or releases one entry. Rounding could cause cycles, so the number of rounds is bounded.
     for _ in range(10 * len(x)):
         free = ~held
         step = np.zeros_like(x)
@@ -38,7 +38,7 @@ def bounded_minimum(hessian: Vector, gradient: Vector, lower: Vector, upper: Vec
             continue
         x += step
         slope = hessian @ x + gradient
-        # What a held entry would gain by going back inwards.
+        # The gain from moving a fixed entry back inwards.
         gain = np.where(held & (lower < upper), np.where(x <= lower, -slope, slope), 0.0)
         first = int(np.argmax(gain))
         if gain[first] <= tolerance:

@@ -7,7 +7,7 @@ import numpy as np
 from ibrobot_core.api import Vector
 
 _NO_SINE = 1e-6
-"""Below this sine of the angle the antisymmetric part of a matrix no longer gives the axis."""
+"""Sine of the angle below which the antisymmetric part of a matrix does not determine the axis."""
 
 
 def cross(a: Vector, b: Vector) -> Vector:
@@ -25,7 +25,7 @@ def exp(v: Vector) -> Vector:
     """Matrix, shape (3, 3), of a rotation vector, shape (3,)."""
     angle = float(np.linalg.norm(v))
     k = skew(v)
-    # sinc keeps both factors exact down to no rotation at all.
+    # sinc keeps both factors exact for small angles, including zero.
     first, second = np.sinc(angle / np.pi), np.sinc(angle / (2 * np.pi)) ** 2 / 2
     return np.asarray(np.eye(3) + first * k + second * k @ k)
 
@@ -40,7 +40,7 @@ def log(rotation: Vector) -> Vector:
     vector = np.asarray(sine * np.where(small, 1.0, angle / np.where(small, 1.0, length))[..., None])
     half = small & (cosine <= 0)
     if half.any():
-        # Near half a turn the symmetric part, cos I + (1 - cos) a aT, has the axis.
+        # Near half a turn, the symmetric part, cos I + (1 - cos) a aT, determines the axis.
         symmetric = (r + r.mT)[half] / 2 - cosine[half][:, None, None] * np.eye(3)
         largest = np.argmax(np.diagonal(symmetric, axis1=-2, axis2=-1), axis=-1)
         axis = np.take_along_axis(symmetric, largest[:, None, None], axis=-1)[..., 0]

@@ -1,4 +1,4 @@
-"""Numerical inverse kinematics: searches within the limits by Newton's method, many side by side."""
+"""Numerical inverse kinematics: many parallel searches within the limits by Newton's method."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from ibrobot_kinematics.rotations import cross
 from ibrobot_kinematics.target import Target
 
 _LONGEST_STEP = 0.5
-"""No joint moves further in one step [rad or m], so that a search stays on the branch where it begins."""
+"""Maximum change of a joint per step [rad or m], so that a search stays on its branch."""
 _CONVERGED = 1e-7
-"""A step of no joint beyond this [rad or m] ends a search,"""
+"""A search ends if no joint changes by more than this in a step [rad or m],"""
 _NO_GAIN = 1e-9
-"""and so does one that gains less than this share of what it minimises."""
+"""or if the relative improvement of a step is smaller than this."""
 _DAMPING, _LEAST_DAMPING = 1e-2, 1e-9
 _BOUND_PASSES = 2
 _TABLE_SIZE = 4096
 _TABLE_LEVER_M = 0.3
-"""Turning by a radian weighs as much as moving by this [m] when starts are looked up."""
+"""Weight of rotation when looking up starting points: a radian counts as much as this distance [m]."""
 
 type Flags = np.ndarray[tuple[int], np.dtype[np.bool_]]
 
 
 @attrs.frozen(eq=False)
 class Found:
-    """Where searches ended."""
+    """Results of searches."""
 
     joints: Vector
     """Joint positions [rad or m], shape (N, J)."""
@@ -39,11 +39,11 @@ class Found:
     """Angle between the tip and the target [rad], shape (N,)."""
 
     def within(self, off: float, turned: float) -> Flags:
-        """Which of them meet the target, shape (N,)."""
+        """Whether each result meets the target, shape (N,)."""
         return np.asarray((self.off <= off) & (self.turned <= turned))
 
     def best(self, number: int, position_weight: float) -> Vector:
-        """Joint positions of those that miss least by `search`'s measure, best first, shape (at most number, J)."""
+        """Joint positions with the smallest errors by `search`'s measure, best first, shape (at most number, J)."""
         missed = np.hypot(position_weight * self.off, self.turned)
         return np.asarray(self.joints[np.argsort(missed, kind="stable")[:number]])
 
@@ -58,20 +58,20 @@ def search(
     stop_within: tuple[float, float] | None = None,
     shifts: Vector | None = None,
 ) -> Found:
-    """The configurations nearest to the target that searches from `starts` find.
+    """Search for the configurations nearest to the target from `starts`.
 
-    A search minimises `(position_weight * distance)**2 + turn**2`, where the turn is the chord that belongs to the
-    angle. Its steps are Newton's with the exact second derivatives, made positive definite and damped. All searches end
-    once one of them meets the target.
+    A search minimises `(position_weight * distance)**2 + turn**2`, where the turn is the chord of the angle. It takes
+    Newton steps with exact second derivatives, made positive definite and damped. All searches end as soon as one of
+    them meets the target.
 
     Args:
         model: the arm.
         target: where to bring the tip.
         starts: joint positions within the limits [rad or m], shape (N, J).
-        position_weight: how many radians a metre counts [rad/m].
-        iterations: at most.
-        stop_within: distance [m] and angle [rad] within which a tip meets the target.
-        shifts: how far each search shifts the target [m], shape (N, 3).
+        position_weight: weight of position errors [rad/m].
+        iterations: maximum number of iterations.
+        stop_within: distance [m] and angle [rad] within which the target is met.
+        shifts: shift of the target in each search [m], shape (N, 3).
     """
     moving = model.moving
     lower, upper = model.lower[moving], model.upper[moving]
@@ -83,18 +83,18 @@ def search(
     after = np.triu(np.ones((len(moving), len(moving)), dtype=bool))
 
     def derivatives(q: Vector) -> tuple[TipPose, Vector, Vector, Vector]:
-        """The tip, what is minimised, shape (N,), and its first and second derivatives by the joints, halved."""
+        """The tip, the objective, shape (N,), and half of its first and second derivatives by the joints."""
         tip, jacobian = model.forward_and_jacobian(q)
         linear, axes = jacobian[:, :3, moving].mT, jacobian[:, 3:, moving].mT
         columns = target.columns_of(tip)
         error = weights[:, None] * (columns - asked)
-        # How each column moves with each joint, shape (N, n, K, 3).
+        # Derivative of each column by each joint, shape (N, n, K, 3).
         rates = cross(axes[:, :, None], columns[:, None])
         rates[:, :, 0] = linear
         rates *= weights[:, None]
         flat = rates.reshape(*rates.shape[:2], -1)
         gradient = (flat @ error.reshape(len(q), -1, 1))[..., 0]
-        # A joint turns the rates of itself and of all joints after it.
+        # A joint rotates the derivatives of itself and of all following joints.
         bent = axes @ cross(rates, error[:, None]).sum(axis=2).mT
         hessian = flat @ flat.mT + np.where(after, bent, bent.mT)
         return tip, (error**2).sum(axis=(1, 2)), gradient, hessian
@@ -130,10 +130,10 @@ def search(
 
 
 def _bounded_step(hessian: Vector, gradient: Vector, damping: Vector, lower: Vector, upper: Vector) -> Vector:
-    """Steps that reduce `x @ hessian @ x / 2 + gradient @ x` between bounds: joints that meet a bound stay there.
+    """Steps that reduce `x @ hessian @ x / 2 + gradient @ x` within bounds; joints that reach a bound stay there.
 
     Args:
-        hessian: symmetric, shape (N, n, n); its negative eigenvalues count as positive.
+        hessian: symmetric, shape (N, n, n); the absolute values of its eigenvalues are used.
         gradient: shape (N, n).
         damping: added to its eigenvalues, shape (N,).
         lower: at most 0, shape (N, n).
@@ -166,8 +166,8 @@ def starts_from_table(model: KinematicModel, target: Target, start: Vector, numb
     Args:
         model: the arm.
         target: where to bring the tip.
-        start: where joints are that do not move the tip, shape (J,).
-        number: how many, at most the size of the table.
+        start: positions of the joints that do not move the tip, shape (J,).
+        number: number of configurations, at most the size of the table.
     """
     joints, tips = _table(model)
     off, turned = target.missed(tips)
@@ -179,7 +179,7 @@ def starts_from_table(model: KinematicModel, target: Target, start: Vector, numb
 
 @lru_cache(maxsize=16)
 def _table(model: KinematicModel) -> tuple[Vector, TipPose]:
-    """Configurations all over the limits, shape (N, n), and their tips."""
+    """Configurations throughout the limits, shape (N, n), and their tips."""
     lower, upper = model.lower[model.moving], model.upper[model.moving]
     joints = lower + _halton(_TABLE_SIZE, len(lower)) * (upper - lower)
     q = np.zeros((_TABLE_SIZE, len(model.joint_names)))
@@ -188,7 +188,7 @@ def _table(model: KinematicModel) -> tuple[Vector, TipPose]:
 
 
 def _halton(number: int, dimensions: int) -> Vector:
-    """Points that fill the unit cube evenly, shape (number, dimensions) (J. Halton, 1964)."""
+    """Points that fill the unit cube evenly, shape (number, dimensions). Source: J. Halton, 1964."""
     primes = [n for n in range(2, 100) if all(n % divisor for divisor in range(2, n))][:dimensions]
     columns = []
     for base in primes:

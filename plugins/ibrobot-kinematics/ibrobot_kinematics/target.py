@@ -1,4 +1,4 @@
-"""What inverse kinematics is asked for, and how far the tip is from it."""
+"""Targets of inverse kinematics, and the distance of the tip from them."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ _ORTHONORMAL = 1e-6
 
 @attrs.frozen(eq=False)
 class Target:
-    """Where to bring the tip: a position, alone or with an orientation or the direction of one axis.
+    """A target of the tip: a position, alone or with an orientation or the direction of one axis.
 
     Raises:
-        ValueError: when a value has another shape, is not finite, is not a rotation matrix or unit vector, or when both
+        ValueError: if a value has a wrong shape, is not finite, or is not a rotation matrix or unit vector, or if both
             `rotation` and `axis` are given.
     """
 
@@ -25,7 +25,7 @@ class Target:
     rotation: Vector | None = attrs.field(default=None, converter=attrs.converters.optional(np.asarray))
     """Axes of the tip in the base frame, as columns, shape (3, 3)."""
     axis: Vector | None = attrs.field(default=None, converter=attrs.converters.optional(np.asarray))
-    """Direction of the tip's z axis in the base frame, a unit vector, shape (3,): what an arm of five joints can do."""
+    """Direction of the tip's z axis in the base frame, a unit vector, shape (3,); suits five joints."""
 
     def __attrs_post_init__(self) -> None:
         for name, value, shape in (
@@ -45,13 +45,13 @@ class Target:
 
     @property
     def columns(self) -> Vector:
-        """The position, and each direction asked for, shape (K, 3)."""
+        """The position and the specified directions, shape (K, 3)."""
         if self.rotation is not None:
             return np.vstack([self.position, self.rotation.T])
         return self.position[None] if self.axis is None else np.vstack([self.position, self.axis])
 
     def columns_of(self, tip: TipPose) -> Vector:
-        """What `columns` is at a tip, shape (…, K, 3)."""
+        """The equivalent of `columns` for a tip, shape (…, K, 3)."""
         position = tip.position[..., None, :]
         if self.rotation is not None:
             return np.concatenate([position, tip.rotation.mT], axis=-2)
@@ -61,6 +61,6 @@ class Target:
         """Distance [m] and angle [rad] of the tip from the target, both of shape (…)."""
         difference = self.columns_of(tip) - self.columns
         chord = np.sqrt((difference[..., 1:, :] ** 2).sum(axis=(-2, -1)))
-        # Turned by an angle, three axes together miss theirs by as much as one axis across, times the root of 2.
+        # The total error of three axes is that of one perpendicular axis times the square root of 2.
         diameter = 2.0 if self.rotation is None else 2.0 * np.sqrt(2)
         return np.linalg.norm(difference[..., 0, :], axis=-1), 2 * np.arcsin(np.minimum(chord / diameter, 1.0))

@@ -44,7 +44,7 @@ def test_tool_needs_a_model():
     arm = JogArm(make_robot(), "gripper")
     with pytest.raises(TeleopError, match=r"needs robot\.description\.mjcf: set it, or tool: false$"):
         arm.load_model("tool: false")
-    with pytest.raises(TeleopError, match="load_model comes before move_tool"):
+    with pytest.raises(TeleopError, match="call load_model before move_tool"):
         arm.move_tool(STILL, np.ones(3), np.zeros(3), DT)
 
 

@@ -52,5 +52,5 @@ def ibrobot_recorders() -> Iterable[RecorderDescriptor]:
 
 @hookimpl
 def ibrobot_datasets() -> Iterable[DatasetDescriptor]:
-    """What writes frames as arrays."""
-    yield DatasetDescriptor(type="npz", make=_npz, summary="one NumPy .npz file an episode")
+    """The writer of NumPy datasets."""
+    yield DatasetDescriptor(type="npz", make=_npz, summary="one NumPy .npz file per episode")

@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all."""
+"""Atomic replacement of files."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from typing import BinaryIO
 
 
 def replace_file(path: Path, content: bytes | Callable[[BinaryIO], None]) -> None:
-    """Write `path` so that a crash leaves the old content or the new, never a part.
+    """Write `path` atomically: a crash leaves either the old or the new content.
 
     Args:
         path: the file.
-        content: its bytes, or what writes them into the open file.
+        content: the bytes, or a function that writes them to the open file.
 
     Raises:
-        OSError: e.g. a full disk; the old content stays.
+        OSError: e.g. if the disk is full; the old content remains.
     """
     partial = path.with_name(f".{path.name}.partial")
     try:

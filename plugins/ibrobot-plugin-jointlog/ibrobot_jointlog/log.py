@@ -32,7 +32,7 @@ def header(joints: Sequence[str]) -> str:
 
 
 def row(time_ns: int, positions: Iterable[float]) -> str:
-    """A line of a log; reading it gives back the same floats, and the time to the nanosecond."""
+    """A line of a log, from which the same floats and the exact time in nanoseconds can be read."""
     sign, time_ns = ("-", -time_ns) if time_ns < 0 else ("", time_ns)
     time = f"{sign}{time_ns // 1_000_000_000}.{time_ns % 1_000_000_000:09d}"
     return ",".join((time, *(repr(float(p)) for p in positions))) + "\n"
@@ -42,10 +42,10 @@ def read_log(path: Path) -> JointLog:
     """Read a log.
 
     Raises:
-        RecorderError: with file:line, when it cannot be read, or the header or a row does not fit.
+        RecorderError: if it cannot be read, or the header or a row is invalid; with file:line.
     """
     try:
-        # With or without the byte order mark that spreadsheets write.
+        # Accept the byte order mark that spreadsheets write.
         first, *rows = path.read_text(encoding="utf-8-sig").removesuffix("\n").split("\n")
     except (OSError, UnicodeDecodeError) as error:
         raise RecorderError(f"{path}: cannot be read: {error}") from None
@@ -57,11 +57,11 @@ def read_log(path: Path) -> JointLog:
         where, cells = f"{path}:{number}", line.split(",")
         values = _numbers(where, names, cells)
         if times and values[0] <= times[-1]:
-            raise RecorderError(f"{where}: time_s is {values[0]}, must be above {times[-1]} of the row before")
+            raise RecorderError(f"{where}: time_s is {values[0]}, must be greater than {times[-1]} of the previous row")
         times.append(values[0])
         samples.append(values[1:])
     if not times:
-        raise RecorderError(f"{path}:1: no row follows the header, there must be at least one")
+        raise RecorderError(f"{path}:1: has no row after the header")
     return JointLog(tuple(names[1:]), np.array(times), np.array(samples))
 
 

@@ -1,4 +1,4 @@
-"""Dataset writer `npz`: one NumPy file an episode, one JSON file for the rest; and what reads them."""
+"""Dataset writer `npz`: one NumPy file per episode and one JSON file for metadata; and their reader."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ibrobot_jointlog.files import replace_file
 
 Values = Mapping[str, NDArray[np.generic]]
 TASK = "task"
-"""The column of tasks, beside the features."""
+"""The column of tasks, in addition to the features."""
 
 
 def _dtype(key: str, feature: Feature) -> np.dtype[Any]:
@@ -32,7 +32,7 @@ def _dtype(key: str, feature: Feature) -> np.dtype[Any]:
 
 
 def _write_arrays(file: BinaryIO, arrays: Values) -> None:
-    # As numpy.savez does, which takes some names for its arguments and would pickle what it does not know.
+    # Like numpy.savez, which cannot store some names, and pickles unknown types.
     with ZipFile(file, "w") as archive:
         for key, array in arrays.items():
             with archive.open(f"{key}.npy", "w", force_zip64=True) as member:
@@ -40,9 +40,9 @@ def _write_arrays(file: BinaryIO, arrays: Values) -> None:
 
 
 class NpzDatasetWriter(DatasetWriter):
-    """Writes `meta.json` and an `episode_000000.npz` each: an array (frames, *feature shape) a feature, and the tasks.
+    """Writes `meta.json` and an `episode_000000.npz` per episode: an array (frames, *shape) per feature, and the tasks.
 
-    Every file appears whole or not at all, and nothing in them is pickled.
+    All files are written atomically and without pickle.
     """
 
     def __init__(self) -> None:
@@ -56,7 +56,7 @@ class NpzDatasetWriter(DatasetWriter):
     def create(self, root: Path, fps: float, features: Mapping[str, Feature], metadata: Mapping[str, Any]) -> None:
         for key, feature in features.items():
             if key == TASK:
-                raise DatasetError(f"no feature may be called {TASK!r}: the tasks are stored under that name")
+                raise DatasetError(f"no feature may be named {TASK!r}: this name is reserved for the tasks")
             _dtype(key, feature)
         facts = {
             "format": "npz",
@@ -70,7 +70,7 @@ class NpzDatasetWriter(DatasetWriter):
             raise DatasetError(f"metadata cannot be written as JSON: {error}") from error
         try:
             if root.exists() and any(root.iterdir()):
-                raise DatasetError(f"{root} is not empty: a dataset begins in an empty or new directory")
+                raise DatasetError(f"{root} is not empty: a new dataset needs an empty or new folder")
             root.mkdir(parents=True, exist_ok=True)
             replace_file(root / "meta.json", content)
         except OSError as error:
@@ -81,7 +81,7 @@ class NpzDatasetWriter(DatasetWriter):
     def add_frame(self, values: Values, task: str) -> None:
         self._open()
         for key in sorted(self._features.keys() ^ values.keys()):
-            raise DatasetError(f"{key} is {'missing' if key in self._features else 'no feature of this dataset'}")
+            raise DatasetError(f"{key} is {'missing' if key in self._features else 'not a feature of this dataset'}")
         frame: dict[str, NDArray[np.generic]] = {}
         for key, feature in self._features.items():
             value, dtype = np.asarray(values[key]), _dtype(key, feature)
@@ -97,7 +97,7 @@ class NpzDatasetWriter(DatasetWriter):
     def save_episode(self) -> int:
         root = self._open()
         if not self._frames:
-            raise DatasetError("the episode has no frames: add_frame comes before save_episode")
+            raise DatasetError("the episode has no frames: call add_frame before save_episode")
         columns = {key: np.stack([frame[key] for frame in self._frames]) for key in self._features}
         columns[TASK] = np.array(self._tasks)
         path = root / f"episode_{self._saved:06d}.npz"
@@ -115,13 +115,13 @@ class NpzDatasetWriter(DatasetWriter):
 
     def _open(self) -> Path:
         if self._root is None:
-            raise DatasetError("no dataset is open: create comes first, finalize last")
+            raise DatasetError("no dataset is open: call create first, finalize last")
         return self._root
 
 
 @attrs.frozen
 class NpzDataset:
-    """A dataset on disk; episodes are read when they are asked for."""
+    """A dataset on disk; episodes are read on demand."""
 
     root: Path
     fps: float
@@ -134,7 +134,7 @@ class NpzDataset:
         """Episode `index`: key -> its frames, shape (frames, *feature shape), and `task`, shape (frames,).
 
         Raises:
-            DatasetError: for an index out of range, or a file that is not an episode of this dataset.
+            DatasetError: if the index is out of range, or the file is not an episode of this dataset.
         """
         if not 0 <= index < len(self.episodes):
             raise DatasetError(f"no episode {index} in {self.root}; it has {len(self.episodes)}, counted from 0")
@@ -155,7 +155,7 @@ def read_npz(root: Path) -> NpzDataset:
     """Open a dataset, finalised or not.
 
     Raises:
-        DatasetError: when there is none in `root`.
+        DatasetError: if there is none in `root`.
     """
     path = root / "meta.json"
     try:
@@ -165,5 +165,5 @@ def read_npz(root: Path) -> NpzDataset:
         }
         fps, metadata = facts["fps"], facts["metadata"]
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise DatasetError(f"{path}: no dataset of format npz: {error!r}") from error
+        raise DatasetError(f"{path}: is not an npz dataset: {error!r}") from error
     return NpzDataset(root, fps, features, metadata, tuple(sorted(root.glob("episode_*.npz"))))

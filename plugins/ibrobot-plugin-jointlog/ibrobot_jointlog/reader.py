@@ -1,4 +1,4 @@
-"""Reader `joint_log`: a joint log as an episode, so that `ibrobot replay` plays it."""
+"""Reader `joint_log`: reads a joint log as an episode, for `ibrobot replay`."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ def is_joint_log(path: Path) -> bool:
 class JointLogReader(EpisodeReader):
     """Reads a joint log, alone or in the folder of an episode.
 
-    A log has no commands. If the address brings a robot's contract, the reader gives the positions as the commands of
-    its actions too, to be replayed. Otherwise it does not, so that none gets into a dataset.
+    A log has no commands. If the address contains a robot's contract, the positions are also delivered as commands of
+    its actions, for replay. Otherwise they are not, so that they do not become actions of a dataset.
 
     Raises:
-        RecorderError: when the log does not fit its format, or lacks a joint of the contract's actions.
+        RecorderError: if the log is invalid, or lacks a joint of the contract's actions.
     """
 
     def __init__(self, address: EpisodeAddress) -> None:
@@ -52,8 +52,8 @@ class JointLogReader(EpisodeReader):
         self._file = self._path / LOG if self._path.is_dir() else self._path
         self._facts = _facts(self._path / METADATA) if self._path.is_dir() else {}
         self._log = read_log(self._file)
-        told = address.given.get("contract")
-        parts = Contract.from_canonical(json.loads(told)).action_parts if told is not None else ()
+        contract = address.given.get("contract")
+        parts = Contract.from_canonical(json.loads(contract)).action_parts if contract is not None else ()
         for part in parts:
             if missing := [joint for joint in part.joints if joint not in self._log.joints]:
                 raise RecorderError(f"{self._file}:1: joint {missing[0]!r} of {part.topic} is missing")
@@ -94,7 +94,7 @@ class JointLogReader(EpisodeReader):
 
 
 def _facts(path: Path) -> Mapping[str, Any]:
-    """What the recorder wrote beside the log; empty where it wrote nothing."""
+    """The recorder's metadata for the log; empty if there is none."""
     try:
         found = json.loads(path.read_bytes())
     except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""Recorder `joint_log`: the joint positions of an episode, as a CSV that `replay` plays."""
+"""Recorder `joint_log`: writes the joint positions of an episode as CSV, for `replay`."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from ibrobot_jointlog.log import header, row
 
 TOPIC = "/joint_states"
 FLUSH_NS = NS_PER_S
-"""Rows wait no longer than this, by their own stamps, before they are written."""
+"""Maximum age of unwritten rows, by their stamps [ns]."""
 
 
 @attrs.define
 class _Episode:
-    """An open episode. Rows are written in whole lines, so that a process killed at any time leaves a valid log."""
+    """An open episode. Rows are written as whole lines, so a process killed at any time leaves a valid log."""
 
     start: EpisodeStart
     descriptor: int
@@ -83,7 +83,7 @@ class JointLogRecorder(Recorder):
             raise RecorderError(f"{TOPIC} carries {message.ros_type}, must be {JointState.ros_type}")
         stamp_ns = message.header.stamp_ns
         if episode.newest_ns is not None and stamp_ns <= episode.newest_ns:
-            # A reading that was lost on the bus is published again under its old stamp: nothing new in it.
+            # After a lost reply, the last reading is published again with its old stamp; skip it.
             episode.repeated += 1
             return
         line = row(stamp_ns - episode.start.stamp_ns, self._positions(message))

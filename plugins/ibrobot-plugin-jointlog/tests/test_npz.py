@@ -83,7 +83,7 @@ def test_values_of_another_kind_are_refused(tmp_path):
 @pytest.mark.parametrize(
     ("key", "dtype", "message"),
     [
-        ("task", "float32", "no feature may be called 'task'"),
+        ("task", "float32", "no feature may be named 'task'"),
         ("state", "object", "feature 'state' has dtype 'object', must be bool, integer, float or image"),
         ("state", "floaty", "feature 'state' has dtype 'floaty', must be a NumPy type or image"),
     ],
@@ -119,7 +119,7 @@ def test_a_failed_save_leaves_no_part_of_a_file_and_can_be_repeated(tmp_path, mo
 def test_nothing_is_taken_after_finalize(tmp_path):
     writer = created(tmp_path)
     writer.finalize()
-    with pytest.raises(DatasetError, match="create comes first"):
+    with pytest.raises(DatasetError, match="call create first"):
         writer.add_frame({"state": np.zeros(2)}, "wave")
 
 
@@ -148,7 +148,7 @@ def test_an_episode_of_another_dataset_is_refused(tmp_path):
 @pytest.mark.parametrize("content", ["", "{}", "[]", json.dumps({"fps": 1, "features": {"a": {}}, "metadata": {}})])
 def test_a_directory_without_a_dataset_is_refused(tmp_path, content):
     (tmp_path / "meta.json").write_text(content)
-    with pytest.raises(DatasetError, match="no dataset of format npz"):
+    with pytest.raises(DatasetError, match="is not an npz dataset"):
         read_npz(tmp_path)
 
 

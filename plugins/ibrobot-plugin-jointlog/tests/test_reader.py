@@ -89,14 +89,14 @@ BAD = {
     "joint twice": (
         HEADER.replace("elbow_flex", "gripper"), "1: joint 'gripper' has 2 columns, must have one"
     ),
-    "no rows": (HEADER, "1: no row follows the header, there must be at least one"),
+    "no rows": (HEADER, "1: has no row after the header"),
     "short row": (HEADER + "0" + NUMBERS + "1,0,0\n", "3: 3 values, must be 7 as in the header"),
     "blank row": (HEADER + "0" + NUMBERS + "\n" + "1" + NUMBERS, "3: 1 values, must be 7 as in the header"),
     "text": (HEADER + "0,0,x,0,0,0,0\n", "2: shoulder_lift is 'x', must be a number"),
     "not finite": (HEADER + "0" + NUMBERS + "1,0,0,0,0,nan,0\n", "3: wrist_roll is nan, must be finite"),
     "time not finite": (HEADER + "inf" + NUMBERS, "2: time_s is inf, must be finite"),
-    "time stands": (HEADER + "1" + NUMBERS + "1" + NUMBERS, "3: time_s is 1.0, must be above 1.0 of the row before"),
-    "time runs back": (HEADER + "2" + NUMBERS + "1" + NUMBERS, "3: time_s is 1.0, must be above 2.0 of the row before"),
+    "time stands": (HEADER + "1" + NUMBERS + "1" + NUMBERS, "3: time_s is 1.0, must be greater than 1.0"),
+    "time runs back": (HEADER + "2" + NUMBERS + "1" + NUMBERS, "3: time_s is 1.0, must be greater than 2.0"),
 }  # fmt: skip
 
 

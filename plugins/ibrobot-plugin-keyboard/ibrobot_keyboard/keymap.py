@@ -1,4 +1,4 @@
-"""Which key does what: the defaults, and what the YAML changes of them."""
+"""The key bindings: defaults, and changes from the YAML."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ibrobot_keyboard.options import KeyboardOptions
 Mode = Literal["joints", "cartesian"]
 
 _JOINT_KEYS = (("w", "s"), ("e", "d"), ("r", "f"), ("t", "g"), ("y", "h"), ("u", "j"), ("i", "k"))
-"""Of each joint: up and down the column of keys."""
+"""The keys of each joint: up and down in a column of the keyboard."""
 _CARTESIAN_KEYS = {"x": ("w", "s"), "y": ("a", "d"), "z": ("r", "f"), "pitch": ("g", "t"), "roll": ("y", "h")}
 """Pitch is positive downwards, so the lower key is its plus."""
 CARTESIAN_AXES = tuple(_CARTESIAN_KEYS)
@@ -27,14 +27,14 @@ class Keymap:
     """Actions and their keys. A motion along an axis is the action `AXIS+` or `AXIS-`."""
 
     joints: Mapping[str, str]
-    """Action -> key, while joints are jogged."""
+    """Action -> key, in joint jog."""
     cartesian: Mapping[str, str]
-    """Action -> key, while the tool is jogged; empty where that is not possible."""
+    """Action -> key, in Cartesian jog; empty if it is not available."""
     common: Mapping[str, str]
-    """Action -> key, always."""
+    """Action -> key, in both."""
 
     def action(self, mode: Mode, key: str) -> str | None:
-        """What `key` does in `mode`."""
+        """The action of `key` in `mode`."""
         actions = {**(self.joints if mode == "joints" else self.cartesian), **self.common}
         return next((action for action, its_key in actions.items() if its_key == key), None)
 
@@ -55,17 +55,17 @@ def _pairs(actions: Mapping[str, str]) -> str:
 def make_keymap(
     joints: Sequence[str], *, cartesian: bool, gripper: bool, home: bool, overrides: Mapping[str, str]
 ) -> Keymap:
-    """The keys of a robot.
+    """Make the key bindings of a robot.
 
     Args:
         joints: the joints to jog one by one.
         cartesian: whether the tool can be jogged.
-        gripper: whether there is a gripper.
-        home: whether there is a pose to go home to.
-        overrides: action -> key, in place of the default.
+        gripper: whether the robot has a gripper.
+        home: whether the robot has a home pose.
+        overrides: action -> key, instead of the default.
 
     Raises:
-        TeleopError: for an unknown action, a joint left without keys, or a key that does two things at once.
+        TeleopError: if an action is unknown, a joint has no keys, or a key has two actions.
     """
     defaults = dict(zip(joints, _JOINT_KEYS, strict=False))
     motions: dict[str, str] = {}
@@ -73,7 +73,9 @@ def make_keymap(
         for sign, default in zip("+-", defaults.get(joint, (None, None)), strict=True):
             key = overrides.get(joint + sign, default)
             if key is None:
-                raise TeleopError(f"no key is left for {joint}{sign}: give it one under keys, e.g. {joint}{sign}: '1'")
+                raise TeleopError(
+                    f"no default key is left for {joint}{sign}: set one under keys, e.g. {joint}{sign}: '1'"
+                )
             motions[joint + sign] = key
     tool = (
         {a + s: k for a, pair in _CARTESIAN_KEYS.items() for s, k in zip("+-", pair, strict=True)} if cartesian else {}
@@ -99,7 +101,7 @@ def make_keymap(
 
 
 def keymap_of(options: KeyboardOptions, robot: Robot) -> Keymap:
-    """The keys that options give a robot.
+    """The key bindings of a robot with these options.
 
     Raises:
         TeleopError: as `make_keymap`.
@@ -115,7 +117,7 @@ def keymap_of(options: KeyboardOptions, robot: Robot) -> Keymap:
 
 
 def check_keys(options: KeyboardOptions, robot: Robot) -> Iterator[OptionFault]:
-    """Each joint has its keys, each key one meaning, and Cartesian jog a model."""
+    """Check that each joint has keys, that each key has one action, and that Cartesian jog has a model."""
     if options.cartesian and robot.description.mjcf is None:
         yield OptionFault(("cartesian",), "Cartesian jog needs robot.description.mjcf: set it, or cartesian: false")
     try:
@@ -128,5 +130,5 @@ def _check_single(actions: Mapping[str, str]) -> None:
     taken: dict[str, str] = {}
     for action, key in actions.items():
         if key in taken:
-            raise TeleopError(f"keys: {key!r} is both {taken[key]} and {action}, must be one of them")
+            raise TeleopError(f"keys: {key!r} is assigned to both {taken[key]} and {action}")
         taken[key] = action

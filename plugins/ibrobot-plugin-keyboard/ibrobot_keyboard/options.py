@@ -1,4 +1,4 @@
-"""What the YAML may say under a `type: keyboard` of teleoperation."""
+"""Options of `type: keyboard`."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ RESERVED = ("q", "esc", "tab", *(f"f{n}" for n in range(1, 13)))
 def _check_keys(instance: Any, attribute: attrs.Attribute[Any], keys: Mapping[str, str]) -> None:
     for action, key in keys.items():
         if key in RESERVED:
-            raise ValueError(f"{action}: key {key!r} is taken by ibrobot itself; so are {', '.join(RESERVED)}")
+            raise ValueError(f"{action}: key {key!r} is reserved by ibrobot; reserved keys are {', '.join(RESERVED)}")
 
 
 @documented
 @attrs.frozen
 class KeyboardOptions:
-    """Options of `type: keyboard`; the joints' own limits bound every speed."""
+    """Options of `type: keyboard`; the joints' limits bound every speed."""
 
     joint_speed: float = option(0.5, unit="rad/s", gt=0, help="speed of joints, and of turning the tool")
     cartesian_speed: float = option(0.1, unit="m/s", gt=0, help="speed of the tool")
@@ -30,8 +30,6 @@ class KeyboardOptions:
     hold: float = option(
         0.15, unit="s", gt=0, le=1, help="how long one key press moves; must exceed the terminal's auto-repeat interval"
     )
-    cartesian: bool = option(True, help="whether there is Cartesian jog; it needs robot.description.mjcf")
-    gripper: str = option("gripper", help="group of joints that the gripper keys move")
-    keys: Mapping[str, str] = option(
-        factory=dict, help="action -> key, where another than the default is wanted", validator=_check_keys
-    )
+    cartesian: bool = option(True, help="whether Cartesian jog is available; it needs robot.description.mjcf")
+    gripper: str = option("gripper", help="joint group that the gripper keys move")
+    keys: Mapping[str, str] = option(factory=dict, help="action -> key, instead of the default", validator=_check_keys)

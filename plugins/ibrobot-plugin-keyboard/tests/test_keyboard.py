@@ -260,7 +260,7 @@ WRONG_KEYS = {
         {"zzz": "1"},
         "keys: no action 'zzz', the actions are: elbow_flex+, elbow_flex-, estop, faster",
     ),
-    "taken": ({"shoulder_pan+": "o"}, "keys: 'o' is both shoulder_pan+ and gripper_open, must be one of them"),
+    "taken": ({"shoulder_pan+": "o"}, "keys: 'o' is assigned to both shoulder_pan+ and gripper_open"),
 }
 
 
@@ -272,13 +272,15 @@ def test_keys_that_make_no_sense_are_refused(keys, message):
 
 
 def test_keys_of_the_runtime_cannot_be_given_away():
-    with pytest.raises(ValueError, match=r"estop: key 'q' is taken by ibrobot itself; so are q, esc, tab, f1, .*f12$"):
+    with pytest.raises(
+        ValueError, match=r"estop: key 'q' is reserved by ibrobot; reserved keys are q, esc, tab, f1, .*f12$"
+    ):
         KeyboardOptions(keys={"estop": "q"})
 
 
 def test_more_joints_than_keys_need_keys_of_their_own():
     robot = Robot("long", tuple(Joint(f"j{i}", -1, 1, 1, 1) for i in range(8)))
-    with pytest.raises(TeleopError, match=r"no key is left for j7\+: give it one under keys, e\.g\. j7\+: '1'"):
+    with pytest.raises(TeleopError, match=r"no default key is left for j7\+: set one under keys, e\.g\. j7\+: '1'"):
         KeyboardTeleop(KeyboardOptions(cartesian=False), host_context(robot=robot))
     options = KeyboardOptions(cartesian=False, keys={"j7+": "1", "j7-": "2"})
     assert "1/2 j7" in KeyboardTeleop(options, host_context(robot=robot)).help()

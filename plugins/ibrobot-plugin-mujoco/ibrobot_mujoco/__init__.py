@@ -74,7 +74,7 @@ def ibrobot_sensors() -> Iterable[SensorDescriptor]:
 
 @hookimpl
 def ibrobot_policies() -> Iterable[PolicyDescriptor]:
-    """An expert that needs no training."""
+    """A scripted expert."""
     yield PolicyDescriptor(
         type="scripted_pick", options=ScriptedPickOptions, make=_scripted_pick, check_options=check_pick,
         summary="picks the cube and puts it into the bin, by inverse kinematics and the scene's ground truth",
@@ -89,7 +89,7 @@ def _decoder() -> Callable[[CompressedImage], Image | None]:
 
 @hookimpl
 def ibrobot_decoders() -> Iterable[DecoderDescriptor]:
-    """Of the pictures that simulated cameras give."""
+    """The decoder of images from simulated cameras."""
     yield DecoderDescriptor(("jpeg", "png", "compressedDepth png"), _decoder)
 
 

@@ -27,18 +27,18 @@ from ibrobot_mujoco.options import CameraOptions, MujocoOptions
 from ibrobot_mujoco.render import Renderer
 from ibrobot_mujoco.state import PHYSICS_TOPIC, newest, pose_scene, stamp_of
 
-# A second of states at 100 Hz: what arrives while a picture is drawn is skipped over, not lost from the queue.
+# One second of states at 100 Hz; states that arrive during rendering are skipped, not lost from the queue.
 _QUEUE = 100
 
 
 class MujocoCamera(Sensor):
-    """Renders in the thread of `open` and `read`; pictures that there was no time for are counted, not queued."""
+    """Renders in the thread of `open` and `read`; images for which there is no time are counted, not queued."""
 
     def __init__(self, options: CameraOptions, ctx: Context) -> None:
         self.message_type = CompressedImage if options.encoding == "jpeg" else Image
         self.topic = f"/camera/{ctx.name}/image_raw"
         self.skipped = 0
-        """Pictures that were due and never drawn."""
+        """Number of images that were due but not rendered."""
         self._options = options
         self._ctx = ctx
         self._period_ns = ns(1.0 / options.fps)
@@ -89,7 +89,7 @@ class MujocoCamera(Sensor):
                 return None
 
     def _is_due(self, stamp_ns: int) -> bool:
-        """Whether a state is the first in its slot of the camera's time grid, which begins at stamp 0."""
+        """Whether a state is the first one in its period of the camera; periods begin at stamp 0."""
         slot, last = stamp_ns // self._period_ns, self._last_slot
         if last is not None and slot <= last:
             return False

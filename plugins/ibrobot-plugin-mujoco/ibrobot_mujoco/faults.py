@@ -1,4 +1,4 @@
-"""Fault injection: which of the configured faults are in progress at a time of the episode."""
+"""Fault injection: determines the active faults at a time of the episode."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ class Faults:
         self._over: set[int] = set()
 
     def restart(self) -> None:
-        """A new episode begins: all faults come again."""
+        """Begin a new episode, in which all faults occur again."""
         self._over.clear()
 
     def clear(self, now_ns: int) -> None:
-        """End the faults in progress."""
+        """End the active faults."""
         self._over.update(i for i, _ in self._in_progress(now_ns))
 
     def active(self, kind: str, now_ns: int) -> bool:
-        """Whether a fault of `kind` is in progress."""
+        """Whether a fault of `kind` is active."""
         return any(fault.kind == kind for _, fault in self._in_progress(now_ns))
 
     def frozen(self, now_ns: int) -> list[int]:
-        """Positions, in joint order, of the joints that ignore commands."""
+        """Indices of the joints that ignore commands."""
         return [self._order[fault.joint] for _, fault in self._in_progress(now_ns) if fault.joint is not None]
 
     def _in_progress(self, now_ns: int) -> list[tuple[int, Fault]]:

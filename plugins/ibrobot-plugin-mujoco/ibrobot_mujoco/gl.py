@@ -1,4 +1,4 @@
-"""Which OpenGL backend renders off-screen here; loads system libraries only, and imports no MuJoCo."""
+"""Finds an OpenGL backend for off-screen rendering; loads system libraries only, and does not import MuJoCo."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from functools import cache
 
 from ibrobot_core.api import MissingDependency
 
-# What each backend loads, any name of a group; as MuJoCo's own context classes need it.
+# Libraries of each backend, any name of a group, as in MuJoCo's context classes.
 _LIBRARIES = {
     "egl": (("libEGL.so.1",), ("libOpenGL.so.0", "libGL.so.1", "libGL.so")),
     "osmesa": (("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so"),),
 }
 PACKAGES = ("libegl1", "libopengl0", "libgl1-mesa-dri")
-"""Debian packages that bring EGL with a renderer in software, for a machine without a display."""
+"""Debian packages with EGL and a software renderer, for a machine without a display."""
 _EGL_PLATFORM_DEVICE_EXT = 0x313F
 _MOST_DEVICES = 16
 
@@ -30,7 +30,7 @@ def _loads(name: str) -> bool:
 
 @cache
 def _egl_has_a_driver() -> bool:
-    """Whether EGL can render on any device: its library alone, without drivers, cannot."""
+    """Whether EGL has a device to render on; the library without drivers has none."""
     egl = ctypes.CDLL("libEGL.so.1")
     egl.eglGetProcAddress.restype = ctypes.c_void_p
     find_devices = egl.eglGetProcAddress(b"eglQueryDevicesEXT")
@@ -43,12 +43,12 @@ def _egl_has_a_driver() -> bool:
     devices, count = (pointer * _MOST_DEVICES)(), ctypes.c_int()
     query(find_devices)(_MOST_DEVICES, devices, ctypes.byref(count))
     displays = [display_of(_EGL_PLATFORM_DEVICE_EXT, device, None) for device in devices[: count.value]]
-    # Never terminated: renderers in this process may share the display.
+    # Do not terminate the display: renderers in this process may share it.
     return any(display and egl.eglInitialize(pointer(display), None, None) for display in displays)
 
 
 def usable() -> tuple[str, ...]:
-    """The backends that work here, best first."""
+    """The backends that work on this machine, best first."""
     if sys.platform == "darwin":
         return ("cgl",)
     found = [
@@ -62,12 +62,12 @@ def usable() -> tuple[str, ...]:
 
 
 def check_asked() -> str:
-    """The backend that `MUJOCO_GL` asks for, empty where it asks for none.
+    """The backend that `MUJOCO_GL` selects; empty if it is not set.
 
-    To be called ahead of importing MuJoCo, whose import fails obscurely on one that does not load.
+    Call it before importing MuJoCo, whose import fails with an obscure error if the backend does not load.
 
     Raises:
-        MissingDependency: when there is no such backend, or it does not work here.
+        MissingDependency: if there is no such backend, or it does not work on this machine.
     """
     asked = os.environ.get("MUJOCO_GL", "").strip().lower()
     known = ("cgl",) if sys.platform == "darwin" else ("egl", "osmesa", "glfw")
@@ -76,15 +76,15 @@ def check_asked() -> str:
         raise MissingDependency(f"MUJOCO_GL is {asked!r}, which is not an OpenGL backend", remedy=remedy)
     if asked in _LIBRARIES and asked not in usable():
         packages = PACKAGES if asked == "egl" else ("libosmesa6",)
-        raise MissingDependency(f"MUJOCO_GL={asked}, which does not work here (or unset it)", apt=packages)
+        raise MissingDependency(f"MUJOCO_GL={asked} does not work on this machine (or unset it)", apt=packages)
     return asked
 
 
 def choose() -> str:
-    """The backend to render with: what `MUJOCO_GL` says, or else the best that is usable.
+    """The backend to render with: that of `MUJOCO_GL`, or else the best usable one.
 
     Raises:
-        MissingDependency: when there is none, or not the one of `MUJOCO_GL`.
+        MissingDependency: if there is none, or the one of `MUJOCO_GL` does not work.
     """
     asked = check_asked()
     if asked:

@@ -1,4 +1,4 @@
-"""The robot in MuJoCo as hardware: servos with latency, noise, limits and injected faults, and physics in our time."""
+"""The robot in MuJoCo as hardware: servos with latency, noise, limits and injected faults, in the run's time."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _RELAXED = int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
 
 @attrs.frozen(eq=False)
 class _Sample:
-    """The joints at a time of the episode, as the servos measured them."""
+    """Joint positions measured by the servos at a time of the episode."""
 
     time_ns: int
     position: Vector
@@ -41,10 +41,10 @@ class _Sample:
 
 
 class MujocoHardware(SimulatedHardware):
-    """The joints of an MJCF. The model is built here, so that `signals` are known before `connect`.
+    """The joints of an MJCF. The constructor builds the model, so that `signals` are known before `connect`.
 
     Raises:
-        HardwareError: when the MJCF, or a joint or position actuator in it, is missing.
+        HardwareError: if the MJCF, or a joint or position actuator in it, is missing.
     """
 
     def __init__(self, options: MujocoOptions, ctx: Context) -> None:
@@ -124,12 +124,12 @@ class MujocoHardware(SimulatedHardware):
 
     @override
     def relax(self) -> Torque:
-        """Take torque off every servo of the model."""
+        """Switch off the torque of every servo in the model."""
         self._connected()
         return Torque.OFF if self._send(None) else Torque.UNKNOWN
 
     def _send(self, command: Vector | None) -> bool:
-        """Put a command (None: torque off) on its way; False where a silent bus swallows it."""
+        """Send a command (None: torque off); returns False if the bus is silent and loses it."""
         if self._faults.active("silent", self._now_ns):
             return False
         self._commands.append((self._now_ns + self._latency_ns, command))
@@ -145,7 +145,7 @@ class MujocoHardware(SimulatedHardware):
         physics = self._connected()
         end_ns = self._now_ns + step_ns
         frozen = self._faults.frozen(self._now_ns)
-        # What remains of a step that is no multiple of the timestep is made up for by the next.
+        # The remainder of a step that is not a multiple of the timestep is added to the next one.
         while self._stepped_ns + self._timestep_ns <= end_ns:
             self._drive(physics, frozen)
             mujoco.mj_step(self._model, physics)
@@ -158,7 +158,7 @@ class MujocoHardware(SimulatedHardware):
         self._stamp_ns += step_ns
 
     def _drive(self, physics: mujoco.MjData, frozen: list[int]) -> None:
-        """Take the commands that have arrived, and move the servos' setpoints towards the last of them."""
+        """Receive the commands that have arrived, and move the servos' setpoints towards the last one."""
         while self._commands and self._commands[0][0] <= self._stepped_ns:
             command = self._commands.popleft()[1]
             if command is None:
@@ -169,7 +169,7 @@ class MujocoHardware(SimulatedHardware):
                 self._setpoint = physics.qpos[self._qpos]
             command[frozen] = self._target[frozen]
             self._target = command
-        # Half the time of np.clip, and this runs at every timestep.
+        # This runs at every timestep, and takes half the time of np.clip.
         self._setpoint += np.minimum(np.maximum(self._target - self._setpoint, -self._stride), self._stride)
         physics.ctrl[self._servos] = self._setpoint
 
@@ -204,7 +204,7 @@ def _addresses(model: mujoco.MjModel, joints: tuple[str, ...], table: NDArray[np
 
 
 def _servos(model: mujoco.MjModel, joints: tuple[str, ...]) -> NDArray[np.intp]:
-    """The actuators of `joints`, found by what they drive: an MJCF may call them otherwise."""
+    """The actuators that drive `joints`; their names in the MJCF may differ."""
     driven = {
         int(model.actuator_trnid[i, 0]): i
         for i in range(model.nu)
@@ -214,7 +214,7 @@ def _servos(model: mujoco.MjModel, joints: tuple[str, ...]) -> NDArray[np.intp]:
 
 
 def _start_pose(options: MujocoOptions, ctx: Context) -> Vector:
-    """Positions of all the robot's joints at the beginning of an episode [rad], in robot order."""
+    """Positions of all joints at the beginning of an episode [rad], in robot order."""
     try:
         return ctx.robot.pose(options.start_pose)
     except KeyError as error:

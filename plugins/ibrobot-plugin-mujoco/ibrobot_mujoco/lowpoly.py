@@ -1,4 +1,4 @@
-"""Low-poly meshes for rendering: vertices clustered on a grid, so that small machines render several cameras."""
+"""Low-poly meshes for rendering, so that small machines can render several cameras: clusters vertices on a grid."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def read_stl(path: Path) -> NDArray[np.float64]:
     """The triangles of a binary STL file [file units], shape (F, 3, 3): face, corner, axis.
 
     Raises:
-        HardwareError: for a file that is no binary STL.
+        HardwareError: if the file is not a binary STL.
     """
     content = path.read_bytes()
     count = int.from_bytes(content[80:_STL_HEADER], "little")
@@ -29,7 +29,7 @@ def read_stl(path: Path) -> NDArray[np.float64]:
 
 
 def cluster(triangles: NDArray[np.float64], grid: float) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    """Merge all corners within a cell of `grid` into their mean; triangles that collapse or repeat are left out.
+    """Replace all corners within a cell of `grid` by their mean; removes degenerate and duplicate triangles.
 
     Args:
         triangles: shape (F, 3, 3): face, corner, axis.
@@ -48,7 +48,7 @@ def cluster(triangles: NDArray[np.float64], grid: float) -> tuple[NDArray[np.flo
     faces = index.reshape(-1, 3)
     first, second, third = faces.T
     faces = faces[(first != second) & (second != third) & (third != first)]
-    # Equal triangles start at any of their corners: rolled so that the least index comes first they compare equal.
+    # Equal triangles may start at different corners; roll the smallest index to the front to compare them.
     start = faces.argmin(axis=1)[:, None]
     faces = np.unique(np.take_along_axis(faces, (start + np.arange(3)) % 3, axis=1), axis=0)
     return vertices, faces.astype(np.int32)
@@ -56,5 +56,5 @@ def cluster(triangles: NDArray[np.float64], grid: float) -> tuple[NDArray[np.flo
 
 @lru_cache(maxsize=256)
 def low_poly(path: Path, grid: float) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    """The clustered vertices and faces of an STL file, kept for the next camera that asks."""
+    """The clustered vertices and faces of an STL file, cached for further cameras."""
     return cluster(read_stl(path), grid)

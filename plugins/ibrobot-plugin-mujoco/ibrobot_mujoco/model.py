@@ -1,6 +1,6 @@
 """The scene as a MuJoCo model: the robot's MJCF, a table, and for `pick_cube` a cube and a bin.
 
-The physics model has no visual meshes, the visual model has low-poly ones; their qpos and qvel have one layout.
+The physics model has no visual meshes, the visual model has low-poly ones; both have the same layout of qpos and qvel.
 """
 
 from __future__ import annotations
@@ -31,23 +31,23 @@ CAMERAS = (
     SceneCamera(name="top", pos=(0.16, 0.04, 0.80), lookat=(0.16, 0.04, 0.0), fovy=42.0),
     SceneCamera(name="front", pos=(0.75, -0.25, 0.42), lookat=(0.14, 0.05, 0.07), fovy=42.0),
 )
-"""The cameras of every scene, beside the MJCF's own."""
+"""The cameras of every scene, in addition to those of the MJCF."""
 
 _Mesh = mujoco.mjtGeom.mjGEOM_MESH
 _Box = mujoco.mjtGeom.mjGEOM_BOX
 
 
 def build_model(options: MujocoOptions, robot: Robot, *, visual: bool) -> mujoco.MjModel:
-    """The compiled scene: for rendering when `visual`, for physics otherwise.
+    """The compiled scene: for rendering if `visual`, otherwise for physics.
 
     Raises:
-        HardwareError: e.g. no MJCF, or one without a position actuator for a joint.
+        HardwareError: e.g. if there is no MJCF, or it has no position actuator for a joint.
     """
     spec = build_spec(options, robot)
     if visual:
-        # Multisampling costs a software renderer twice the time.
+        # Multisampling doubles the time of a software renderer.
         spec.visual.quality.offsamples = 0
-        spec.visual.quality.shadowsize = 2048  # a third cheaper than the default, and no worse at this distance
+        spec.visual.quality.shadowsize = 2048  # a third cheaper than the default, looks the same
         _simplify(spec)
     else:
         _strip(spec)
@@ -61,17 +61,17 @@ def build_spec(options: MujocoOptions, robot: Robot) -> mujoco.MjSpec:
     """The editable scene, with the MJCF's full meshes.
 
     Raises:
-        HardwareError: e.g. no MJCF, or one without a position actuator for a joint.
+        HardwareError: e.g. if there is no MJCF, or it has no position actuator for a joint.
     """
     path = robot.description.mjcf
     if path is None:
-        raise HardwareError(f"robot {robot.name!r} has no MJCF to simulate: robot.description.mjcf must name one")
+        raise HardwareError(f"robot {robot.name!r} has no MJCF to simulate: set robot.description.mjcf")
     try:
         spec = mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
         raise HardwareError(f"{path} cannot be loaded: {error}") from error
     spec.option.timestep = ns(options.timestep) / NS_PER_S
-    # Grasping needs both: with the pyramidal cone, or an impedance ratio of 1, the cube slips out.
+    # Grasping needs both: with a pyramidal cone, or an impedance ratio of 1, the cube slips out.
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 10
     _tune_servos(spec, options, robot)
@@ -89,7 +89,7 @@ def build_spec(options: MujocoOptions, robot: Robot) -> mujoco.MjSpec:
 
 
 def _tune_servos(spec: mujoco.MjSpec, options: MujocoOptions, robot: Robot) -> None:
-    """Find each joint's position actuator, and set what the options override."""
+    """Find each joint's position actuator, and apply the options."""
     joints = {joint.name: joint for joint in spec.joints}
     actuators = {a.target: a for a in spec.actuators if a.trntype == mujoco.mjtTrn.mjTRN_JOINT}
     for name in robot.joint_names:
@@ -112,7 +112,7 @@ def _tune_servos(spec: mujoco.MjSpec, options: MujocoOptions, robot: Robot) -> N
 
 
 def _set_joint(joint: mujoco.MjsJoint, field: str, value: float) -> None:
-    # Damping is a polynomial's coefficients in newer versions of MuJoCo, a number in older ones.
+    # In newer versions of MuJoCo, damping is a list of polynomial coefficients; in older ones a number.
     old = getattr(joint, field)
     setattr(joint, field, value if np.ndim(old) == 0 else [value, *np.zeros(len(old) - 1)])
 
@@ -123,7 +123,7 @@ def _add_surroundings(spec: mujoco.MjSpec) -> None:
         name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
         rgb1=[0.75, 0.82, 0.9], rgb2=[0.4, 0.48, 0.58], width=64, height=384,
     )  # fmt: skip
-    # The part of the scene that matters; shadows and the near plane of cameras are scaled by it.
+    # The relevant part of the scene; it scales shadows and the cameras' near plane.
     spec.stat.center, spec.stat.extent = [0.15, 0.0, 0.1], 0.6
     spec.visual.map.shadowclip = 2
     spec.visual.headlight.ambient = [0.4, 0.4, 0.4]
@@ -133,7 +133,7 @@ def _add_surroundings(spec: mujoco.MjSpec) -> None:
         name="lamp", type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, pos=[0.45, -0.4, 1.1], dir=[-0.3, 0.4, -1.0],
         diffuse=[0.6, 0.6, 0.58], specular=[0.15, 0.15, 0.15], castshadow=True,
     )  # fmt: skip
-    # A plane bears contacts wherever it is looked at; its size is only what is drawn.
+    # A plane has contacts everywhere; its size only affects rendering.
     world.add_geom(
         name=TABLE, type=mujoco.mjtGeom.mjGEOM_PLANE, pos=[0.15, 0, 0], size=[0.6, 0.6, 0.05],
         rgba=[0.72, 0.70, 0.66, 1], friction=[1, 0.005, 0.0001],
@@ -178,7 +178,7 @@ def _look_at(camera: SceneCamera) -> NDArray[np.float64]:
     """Orientation of a camera (which looks along its -z, with y up) as a quaternion wxyz, shape (4,)."""
     backward = np.subtract(camera.pos, camera.lookat)
     backward /= np.linalg.norm(backward)
-    # Straight down, "up" in the image is the robot's forward.
+    # For a camera that looks straight down, "up" in the image is the robot's forward direction.
     up = np.array([1.0, 0.0, 0.0]) if abs(backward[2]) > 0.999 else np.array([0.0, 0.0, 1.0])
     right = np.cross(up, backward)
     right /= np.linalg.norm(right)
@@ -189,7 +189,7 @@ def _look_at(camera: SceneCamera) -> NDArray[np.float64]:
 
 
 def _strip(spec: mujoco.MjSpec) -> None:
-    """Remove what has no effect on the motion. A visual geom that gives its body mass stays."""
+    """Remove elements without effect on the motion. Visual geoms that contribute mass are kept."""
     for geom in list(spec.geoms):
         if geom.type == _Mesh and not geom.contype and not geom.conaffinity and geom.parent.explicitinertial:
             spec.delete(geom)
@@ -197,7 +197,7 @@ def _strip(spec: mujoco.MjSpec) -> None:
 
 
 def _simplify(spec: mujoco.MjSpec) -> None:
-    """Replace visual STL meshes by low-poly ones; meshes in other formats stay as they are."""
+    """Replace visual STL meshes by low-poly ones; meshes in other formats are unchanged."""
     _delete_unused_meshes(spec)
     colliding = {g.meshname for g in spec.geoms if g.type == _Mesh and (g.contype or g.conaffinity)}
     directory = Path(spec.modelfiledir) / spec.meshdir
@@ -209,7 +209,7 @@ def _simplify(spec: mujoco.MjSpec) -> None:
         vertices, faces = low_poly(directory / mesh.file, GRID_M / scale)
         mesh.name, mesh.file = name, ""
         mesh.uservert, mesh.userface = vertices.ravel(), faces.ravel()
-        # Clustered meshes are not closed, so they have no volume to take an inertia from.
+        # Clustered meshes are not closed, so their inertia cannot be computed from a volume.
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
 
 

@@ -1,4 +1,4 @@
-"""What the YAML may say about the simulation and its cameras; light, so that listing plugins imports no MuJoCo."""
+"""Options of the simulation and its cameras; listing plugins does not import MuJoCo."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ Range = tuple[float, float]
 
 def _ordered(instance: Any, attribute: attrs.Attribute[Any], value: Range) -> None:
     if not value[0] <= value[1]:
-        raise ValueError(f"[{value[0]}, {value[1]}] is not a valid range, the first must not exceed the second")
+        raise ValueError(f"[{value[0]}, {value[1]}] is not a valid range: the first value must not exceed the second")
 
 
 @documented
 @attrs.frozen
 class SceneCamera:
-    """A camera added to the scene. Without `parent` it stands still in the robot's base frame."""
+    """A camera added to the scene. Without `parent` it is fixed in the robot's base frame."""
 
-    name: str = option(help="what a peripheral's `camera` says")
-    pos: Vec3 = option(unit="m", help="where it is, in the parent's frame")
-    lookat: Vec3 = option(unit="m", help="the point that it looks at, in the parent's frame")
+    name: str = option(help="name for a peripheral's `camera`")
+    pos: Vec3 = option(unit="m", help="position, in the parent's frame")
+    lookat: Vec3 = option(unit="m", help="point that it looks at, in the parent's frame")
     fovy: float = option(45.0, unit="deg", gt=0, lt=180, help="vertical field of view")
-    parent: str = option("world", help="the MJCF body that carries it")
+    parent: str = option("world", help="MJCF body to which it is attached")
 
     def __attrs_post_init__(self) -> None:
         if self.pos == self.lookat:
@@ -42,14 +42,14 @@ class SceneCamera:
 class Fault:
     """A fault to inject, at a time counted from the beginning of each episode."""
 
-    at: float = option(unit="s", ge=0, help="when it begins")
+    at: float = option(unit="s", ge=0, help="start time")
     kind: str = option(
         choices=("silent", "freeze_joint", "read_error"),
         help="silent: no replies, readings go stale and commands are lost; freeze_joint: one servo ignores commands; "
         "read_error: reading raises",
     )
-    joint: str | None = option(None, help="which joint, for freeze_joint")
-    duration: float | None = option(None, unit="s", gt=0, help="how long; None: until faults are reset")
+    joint: str | None = option(None, help="joint, for freeze_joint")
+    duration: float | None = option(None, unit="s", gt=0, help="duration; None: until faults are reset")
 
     def __attrs_post_init__(self) -> None:
         if (self.kind == "freeze_joint") != (self.joint is not None):
@@ -60,9 +60,9 @@ class Fault:
 @documented
 @attrs.frozen
 class MujocoOptions:
-    """Options of the simulation. Servo values that are None are those of the MJCF."""
+    """Options of the simulation. Servo values of None use those of the MJCF."""
 
-    scene: str = option("pick_cube", choices=("empty", "pick_cube"), help="what stands on the table")
+    scene: str = option("pick_cube", choices=("empty", "pick_cube"), help="objects on the table")
     timestep: float = option(0.002, unit="s", ge=1e-4, le=0.02, help="step of the physics")
     start_pose: str = option("rest", help="named pose of the robot at the beginning of an episode")
 
@@ -71,19 +71,21 @@ class MujocoOptions:
     damping: float | None = option(None, unit="Nm s/rad", ge=0, help="viscous friction of the joints")
     frictionloss: float | None = option(None, unit="Nm", ge=0, help="dry friction of the joints")
     armature: float | None = option(None, unit="kg m^2", ge=0, help="rotor inertia seen by the joints")
-    torque_limit: float | None = option(None, unit="Nm", gt=0, help="torque that no servo exceeds")
-    velocity_limit: float = option(4.7, unit="rad/s", gt=0, help="speed of the servos' own setpoint")
+    torque_limit: float | None = option(None, unit="Nm", gt=0, help="maximum torque of every servo")
+    velocity_limit: float = option(4.7, unit="rad/s", gt=0, help="maximum speed of the servos' internal setpoint")
 
     latency: float = option(0.0, unit="s", ge=0, le=1, help="delay of commands, and of readings")
     noise: float = option(0.0, unit="rad", ge=0, help="standard deviation of the measured positions")
     faults: tuple[Fault, ...] = option((), help="faults to inject")
 
     cube_size: float = option(0.025, unit="m", gt=0, le=0.1, help="edge of the cube")
-    cube_distance: Range = option((0.20, 0.27), unit="m", validator=_ordered, help="cube from the base's origin")
-    cube_bearing: Range = option((-0.7, 0.5), unit="rad", validator=_ordered, help="cube's direction; 0 is ahead")
+    cube_distance: Range = option(
+        (0.20, 0.27), unit="m", validator=_ordered, help="distance of the cube from the base's origin"
+    )
+    cube_bearing: Range = option((-0.7, 0.5), unit="rad", validator=_ordered, help="direction of the cube; 0 is ahead")
     cube_yaw: Range = option((-3.14159, 3.14159), unit="rad", validator=_ordered, help="cube's rotation")
     bin_position: Range = option((0.10, 0.24), unit="m", help="x and y of the bin's centre")
-    cameras: tuple[SceneCamera, ...] = option((), help="cameras beside `top`, `front` and those of the MJCF")
+    cameras: tuple[SceneCamera, ...] = option((), help="cameras in addition to `top`, `front` and those of the MJCF")
 
 
 @documented
@@ -91,25 +93,29 @@ class MujocoOptions:
 class CameraOptions:
     """Options of a simulated camera."""
 
-    camera: str | None = option(None, help="camera in the scene; None: the one of the peripheral's name (or NAME_cam)")
+    camera: str | None = option(
+        None, help="camera in the scene; None: the one with the peripheral's name (or NAME_cam)"
+    )
     width: int = option(640, unit="px", ge=1, le=8192, help="width of the image")
     height: int = option(480, unit="px", ge=1, le=8192, help="height of the image")
-    fps: float = option(30.0, unit="Hz", gt=0, le=1000, help="images a second of simulated time")
-    encoding: str = option("jpeg", choices=("jpeg", "raw"), help="of what is published; raw is 15 times the size")
-    jpeg_quality: int = option(90, ge=1, le=100, help="of encoding jpeg")
+    fps: float = option(30.0, unit="Hz", gt=0, le=1000, help="images per second of simulated time")
+    encoding: str = option(
+        "jpeg", choices=("jpeg", "raw"), help="encoding of messages; raw is 15 times the size of jpeg"
+    )
+    jpeg_quality: int = option(90, ge=1, le=100, help="JPEG quality")
     shadows: bool = option(False, help="whether to render shadows (three times the cost)")
 
 
 def _unusable(options: MujocoOptions, robot: Robot) -> Iterator[OptionFault]:
-    """What MuJoCo refuses: its own rules for MJCF, joints and actuators that are missing, cameras of the options."""
-    # The scene is built only to be checked, so MuJoCo is imported only where a run would simulate.
+    """Faults that MuJoCo reports: an invalid MJCF, missing joints and actuators, wrong cameras in the options."""
+    # Building the scene imports MuJoCo, so do it only if a run would simulate.
     from ibrobot_core.api import HardwareError, MissingDependency
     from ibrobot_mujoco.gl import check_asked
 
     try:
         check_asked()
     except MissingDependency:
-        return  # MuJoCo cannot be imported; a run says why
+        return  # MuJoCo cannot be imported; a run reports the reason
     from ibrobot_mujoco.model import build_spec
 
     try:
@@ -119,10 +125,10 @@ def _unusable(options: MujocoOptions, robot: Robot) -> Iterator[OptionFault]:
 
 
 def check_world(options: MujocoOptions, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:
-    """There is a model to simulate, and the pose and joints that options name."""
+    """Check that the robot has an MJCF, and that the pose and joints in the options exist."""
     poses = list(robot.description.poses)
     if robot.description.mjcf is None:
-        yield OptionFault((), f"robot {robot.name!r} has no MJCF to simulate: robot.description.mjcf must name one")
+        yield OptionFault((), f"robot {robot.name!r} has no MJCF to simulate: set robot.description.mjcf")
     elif robot.description.mjcf.is_file():  # core has reported a missing one
         yield from _unusable(options, robot)
     if options.start_pose not in poses:
@@ -135,5 +141,5 @@ def check_world(options: MujocoOptions, robot: Robot, joints: tuple[str, ...]) -
 
 
 def picture_size(options: CameraOptions) -> tuple[int, int]:
-    """Height and width of the pictures [px]."""
+    """Height and width of the images [px]."""
     return options.height, options.width

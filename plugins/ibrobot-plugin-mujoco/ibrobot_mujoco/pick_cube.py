@@ -1,4 +1,4 @@
-"""The task of scene `pick_cube`: where the cube begins, and whether it has been put into the bin."""
+"""The task of scene `pick_cube`: the initial pose of the cube, and whether it is in the bin."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from ibrobot_mujoco.model import BIN, BIN_HEIGHT, BIN_INNER, CUBE, TABLE
 from ibrobot_mujoco.options import MujocoOptions
 
 CLEARANCE = 0.03
-"""Least distance between the cube's first pose and everything but the table [m]."""
+"""Minimum distance between the cube's initial pose and everything except the table [m]."""
 REST_SPEED = 0.05
-"""Speed below which the cube counts as lying [m/s]."""
+"""Speed below which the cube counts as at rest [m/s]."""
 _TRIES = 1000
 
 
 class PickCube:
-    """Places, watches and judges the cube of one model."""
+    """Places the cube of a model, observes it, and judges success."""
 
     def __init__(self, options: MujocoOptions, model: mujoco.MjModel) -> None:
         self._options = options
@@ -35,10 +35,10 @@ class PickCube:
         self._obstacles = [int(i) for i in np.flatnonzero(solid)]
 
     def place(self, physics: mujoco.MjData, rng: np.random.Generator) -> None:
-        """Lay the cube on the table at random, clear of the robot's present pose and of the bin.
+        """Place the cube on the table at random, clear of the robot's present pose and of the bin.
 
         Raises:
-            HardwareError: when the options leave no such place.
+            HardwareError: if the options leave no such place.
         """
         options = self._options
         for _ in range(_TRIES):

@@ -11,9 +11,9 @@ from ibrobot_mujoco.policy_options import ScriptedPickOptions
 from ibrobot_mujoco.trajectory import Limits, Segment, move, rest
 
 SETTLE_S = 0.2
-"""Rest after the gripper has closed or opened."""
+"""Pause after the gripper has closed or opened [s]."""
 GRASP_TURN_RAD, HOVER_TURN_RAD = 0.35, 1.2
-"""How far the gripper may lean away from straight down, where the arm cannot do better."""
+"""Allowed deviation of the gripper from vertical, if the arm cannot reach vertical [rad]."""
 
 
 @attrs.frozen(eq=False)
@@ -26,7 +26,7 @@ class Scene:
 
     @classmethod
     def parse(cls, values: Vector) -> Scene:
-        """From an observation, shape (SCENE_SIZE,)."""
+        """Parse an observation, shape (SCENE_SIZE,)."""
         w, x, y, z = values[3:7] / np.linalg.norm(values[3:7])
         axes = np.array([
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -38,7 +38,7 @@ class Scene:
 
 @attrs.frozen(eq=False)
 class PickPlanner:
-    """Plans from the model of the robot alone; `gripper` is the index of the gripper's joint."""
+    """Plans with the robot's model; `gripper` is the index of the gripper's joint."""
 
     arm: KinematicModel
     options: ScriptedPickOptions
@@ -49,7 +49,7 @@ class PickPlanner:
         """The segments that pick the cube from `start`, put it into the bin, and go `home`; both shape (J,) [rad].
 
         Raises:
-            UnreachableError: when the cube or the bin is out of reach.
+            UnreachableError: if the cube or the bin is out of reach.
         """
         opened, closed = self.options.gripper_open, self.options.gripper_closed
         above = scene.cube + np.array([0.0, 0.0, self.options.hover_height])

@@ -1,4 +1,4 @@
-"""What the YAML may say about the scripted pick; light, so that listing plugins imports no MuJoCo."""
+"""Options of the scripted pick; listing plugins does not import MuJoCo."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ if TYPE_CHECKING:
 class ScriptedPickOptions:
     """Options of the scripted pick. The gripper's positions suit the SO-101 and a cube of 2 to 3 cm."""
 
-    chunk_size: int = option(50, ge=1, le=1000, help="actions in a chunk")
-    rate_hz: float = option(30.0, unit="Hz", gt=0, le=1000, help="rate of the actions; must be the contract's")
-    speed: float = option(0.9, gt=0, le=1, help="fraction of the joints' velocity and acceleration limits that it uses")
+    chunk_size: int = option(50, ge=1, le=1000, help="number of actions in a chunk")
+    rate_hz: float = option(30.0, unit="Hz", gt=0, le=1000, help="rate of the actions; must equal the contract's")
+    speed: float = option(0.9, gt=0, le=1, help="fraction of the joints' velocity and acceleration limits to use")
     hover_height: float = option(0.07, unit="m", gt=0, le=0.2, help="height above the cube before and after grasping")
     release_height: float = option(0.07, unit="m", gt=0, le=0.3, help="height above the bin's centre at the release")
-    gripper_open: float = option(0.6, unit="rad", help="gripper while it is open")
-    gripper_closed: float = option(-0.1, unit="rad", help="gripper while it is closed; the cube stops it short of this")
+    gripper_open: float = option(0.6, unit="rad", help="position of the open gripper")
+    gripper_closed: float = option(-0.1, unit="rad", help="goal of the closing gripper; the cube stops it before")
 
 
 def check_pick(options: ScriptedPickOptions, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:
-    """The robot has a gripper of one joint."""
+    """Check that the robot has a gripper with one joint."""
     gripper = robot.groups.get("gripper", ())
     if len(gripper) != 1:
         yield OptionFault((), f"scripted_pick needs one joint in robot.groups.gripper, got {list(gripper)}")

@@ -1,4 +1,4 @@
-"""Off-screen rendering of a scene, with the OpenGL backend that this machine has."""
+"""Off-screen rendering of a scene, with an available OpenGL backend."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from numpy.typing import NDArray
 from ibrobot_core.api import SensorError
 from ibrobot_mujoco import gl
 
-# EGL's display is global and initialised by the first context: two threads must not both be the first.
+# EGL's display is global and initialised with the first context, which two threads must not create at once.
 _creating = threading.Lock()
 
 
 class Renderer:
-    """Draws one camera's view. Made, used and closed in one thread, for that is where the OpenGL context lives.
+    """Renders the view of one camera. Create, use and close it in the same thread, to which its OpenGL context belongs.
 
-    MuJoCo's own renderer settles on a backend when `mujoco` is first imported; this one when it is made.
+    MuJoCo's own renderer selects a backend when `mujoco` is first imported; this one when it is created.
 
     Raises:
-        MissingDependency: when no backend works here.
-        SensorError: when the backend cannot make a context.
+        MissingDependency: if no backend works on this machine.
+        SensorError: if the backend cannot create a context.
     """
 
     def __init__(self, model: mujoco.MjModel, camera: int, width: int, height: int, *, shadows: bool) -> None:
@@ -44,7 +44,7 @@ class Renderer:
         self._rect = mujoco.MjrRect(0, 0, width, height)
 
     def render(self, drawn: mujoco.MjData) -> NDArray[np.uint8]:
-        """The camera's picture of `drawn`, shape (height, width, 3), RGB, top row first."""
+        """The camera's image of `drawn`, shape (height, width, 3), RGB, top row first."""
         self._context.make_current()
         everything = mujoco.mjtCatBit.mjCAT_ALL
         mujoco.mjv_updateScene(self._model, drawn, self._option, None, self._view, everything, self._scene)

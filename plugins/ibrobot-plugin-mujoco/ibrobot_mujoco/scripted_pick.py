@@ -21,22 +21,22 @@ STAMP = "stamp_ns"
 ACTION = "action"
 
 LIMIT_MARGIN_RAD = 1e-3
-"""Plans keep this far from the joint limits: a setpoint that rounding puts beyond one counts as an intervention."""
+"""Distance of plans from the joint limits, so that rounding never causes an intervention of the safety layer [rad]."""
 LEAD_IN_S = 0.2
-"""Rest before the first motion, so that a chunk which comes late still begins at rest."""
+"""Pause before the first motion, so that a late chunk still begins at rest [s]."""
 MOVED_M = 0.01
-"""A cube further than this from where its grasp was planned has moved."""
+"""A cube further than this from its planned grasp has moved [m]."""
 LOST_M = 0.03
-"""A cube further than this from the tip is not held."""
+"""A cube further than this from the tip is not held [m]."""
 DELIVERED_M = 0.07
-"""A cube nearer than this to the bin's centre, seen from above, is in the bin."""
+"""A cube with a smaller horizontal distance to the bin's centre is in the bin [m]."""
 CLEAR = frozenset({"hover", "lift", "carry", "open", "return"})
-"""Segments at whose end the gripper is clear of the table, so that another plan may begin there."""
+"""Segments that end with the gripper clear of the table, so that another plan can begin there."""
 
 
 @attrs.define(eq=False)
 class _Episode:
-    """What an episode has planned so far. Times are since its first frame."""
+    """The plans of an episode. Times are relative to its first frame."""
 
     start_ns: int
     home: Vector
@@ -44,23 +44,23 @@ class _Episode:
     first: int
     """Index of the first segment of the latest plan."""
     cube: Vector
-    """Where the cube was when that plan was made [m], shape (3,)."""
+    """Position of the cube for that plan [m], shape (3,)."""
     issued_s: float = 0.0
-    """Time of the last action given away."""
+    """Time of the last action returned."""
 
 
 class ScriptedPick(Policy):
-    """Plans the whole motion on an episode's first frame; chunks are windows of it by time, so they agree exactly.
+    """Plans the whole motion on an episode's first frame; chunks are time windows of it, so they agree exactly.
 
-    Where the cube is not where it should be (pushed away, dropped, beside the bin) it plans again, from the next
-    waypoint that is clear of the table and that no chunk has covered yet.
+    If the cube is not where the plan has it (pushed away, dropped, beside the bin), it plans again, from the next
+    waypoint that is clear of the table and not yet part of a chunk.
 
     Args:
         options: gripper positions, heights, speed and the shape of chunks.
-        ctx: `ctx.robot` gives joints, limits and the model; its group `gripper` names the gripper's one joint.
+        ctx: `ctx.robot` has joints, limits and the model; its group `gripper` contains the gripper's joint.
 
     Raises:
-        PolicyError: when the robot has no such group.
+        PolicyError: if the robot has no such group.
     """
 
     def __init__(self, options: ScriptedPickOptions, ctx: Context) -> None:
@@ -138,8 +138,8 @@ class ScriptedPick(Policy):
         if self._failed(episode, now_s, state, scene):
             kept = _kept(episode.trajectory, episode.issued_s)
             episode.trajectory, episode.first, episode.cube = self._extended(kept, scene, episode.home)
-        # The grid of actions begins with the episode: jitter of the observations' stamps must not shift one chunk
-        # against another.
+        # The time grid of actions begins with the episode, so that jitter of the observations' stamps does not shift
+        # chunks relative to one another.
         tick = round(now_s * self._options.rate_hz)
         times_s = (tick + np.arange(self._options.chunk_size)) / self._options.rate_hz
         episode.issued_s = float(times_s[-1])
@@ -150,7 +150,7 @@ class ScriptedPick(Policy):
         return np.asarray(tensors[ACTION], dtype=np.float64)
 
     def _extended(self, kept: list[Segment], scene: Scene, home: Vector) -> tuple[Trajectory, int, Vector]:
-        """The trajectory of `kept` and a new plan after it, the plan's first segment, and the cube that it is for."""
+        """The trajectory of `kept` followed by a new plan, the plan's first segment, and its cube position."""
         assert self._planner is not None
         try:
             plan = self._planner.plan(kept[-1].end, scene, home)
@@ -160,7 +160,7 @@ class ScriptedPick(Policy):
         return Trajectory([*kept, *plan]), len(kept), scene.cube
 
     def _failed(self, episode: _Episode, now_s: float, state: Vector, scene: Scene) -> bool:
-        """Whether the cube is not where the plan has it by now."""
+        """Whether the cube is not where the plan expects it at this time."""
         assert self._planner is not None
         index = int(episode.trajectory.index(np.array([now_s]))[0])
         name = episode.trajectory.segments[index].name
@@ -172,7 +172,7 @@ class ScriptedPick(Policy):
 
 
 def _kept(trajectory: Trajectory, issued_s: float) -> list[Segment]:
-    """The segments up to the first waypoint at or after `issued_s` [s] that is clear; a rest where none is."""
+    """The segments up to the first clear waypoint at or after `issued_s` [s], or a pause if there is none."""
     for i, segment in enumerate(trajectory.segments):
         if segment.name in CLEAR and trajectory.ends_s[i] >= issued_s:
             return list(trajectory.segments[: i + 1])

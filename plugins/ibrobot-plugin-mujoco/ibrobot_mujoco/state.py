@@ -1,4 +1,4 @@
-"""What the simulation publishes: the physics state that cameras and viewers draw, and the scene's ground truth."""
+"""Signals of the simulation: the physics state, for cameras and viewers, and the scene's ground truth."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ SCENE_TOPIC = "/simulation/scene"
 """Cube position [m] (3), cube orientation as a quaternion wxyz (4), centre of the bin [m] (3); base frame."""
 SCENE_SIZE = 10
 _STAMP_SIZE = 2
-# Positions say all that is to be drawn.
+# Positions are sufficient for rendering.
 _STATE = mujoco.mjtState.mjSTATE_QPOS
 
 
 def physics_size(model: mujoco.MjModel) -> int:
-    """Numbers in a message on `PHYSICS_TOPIC`."""
+    """Number of values in a message on `PHYSICS_TOPIC`."""
     return _STAMP_SIZE + int(mujoco.mj_stateSize(model, _STATE))
 
 
@@ -34,13 +34,13 @@ def stamp_of(vector: Vector) -> int:
 
 
 def pose_scene(model: mujoco.MjModel, drawn: mujoco.MjData, vector: Vector) -> None:
-    """Put `drawn` into a physics state, as far as drawing needs it: bodies, cameras and lights.
+    """Set `drawn` to a physics state, as far as rendering needs it: bodies, cameras and lights.
 
     Raises:
-        SensorError: for a state of another scene.
+        SensorError: if the state is from another scene.
     """
     if vector.size != physics_size(model):
-        raise SensorError(f"{PHYSICS_TOPIC} has {vector.size} numbers, this scene's has {physics_size(model)}")
+        raise SensorError(f"{PHYSICS_TOPIC} has {vector.size} values, but this scene has {physics_size(model)}")
     mujoco.mj_setState(model, drawn, np.ascontiguousarray(vector[_STAMP_SIZE:]), _STATE)
     mujoco.mj_kinematics(model, drawn)
     mujoco.mj_comPos(model, drawn)
@@ -48,7 +48,7 @@ def pose_scene(model: mujoco.MjModel, drawn: mujoco.MjData, vector: Vector) -> N
 
 
 def newest(subscription: Subscription, timeout_s: float | None = 0.0) -> Vector | None:
-    """The newest physics state waiting, shape (physics_size,); None when none comes within `timeout_s` [s]."""
+    """The newest queued physics state, shape (physics_size,); None if none arrives within `timeout_s` [s]."""
     first = subscription.get(timeout_s)
     if first is None:
         return None

@@ -1,4 +1,4 @@
-"""Joint trajectories made of segments, each from rest to rest, timed within velocity and acceleration limits."""
+"""Joint trajectories of segments from rest to rest, within velocity and acceleration limits."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Segment:
 
 @attrs.frozen(eq=False)
 class Limits:
-    """What no joint exceeds: velocity [rad/s] and acceleration [rad/s^2], each shape (J,)."""
+    """Joint limits: velocity [rad/s] and acceleration [rad/s^2], each shape (J,)."""
 
     velocity: Vector
     acceleration: Vector
@@ -50,10 +50,10 @@ def rest(name: str, position: Vector, duration_s: float) -> Segment:
 
 
 class Trajectory:
-    """Segments one after another; it holds the first position before, and the last one after.
+    """Consecutive segments; holds the first position before, and the last one after.
 
     Args:
-        segments: at least one; each begins where the one before ends.
+        segments: at least one; each begins where the previous one ends.
     """
 
     def __init__(self, segments: Sequence[Segment]) -> None:
@@ -65,11 +65,11 @@ class Trajectory:
         self._end = np.stack([segment.end for segment in segments])
 
     def index(self, times_s: Vector) -> NDArray[np.intp]:
-        """Which segment each of `times_s` [s], shape (N,), falls into; the last one for all that is later."""
+        """Index of the segment at each of `times_s` [s], shape (N,); the last one for later times."""
         return np.minimum(np.searchsorted(self.ends_s, times_s), len(self.segments) - 1)
 
     def at(self, times_s: Vector) -> Vector:
-        """Positions [rad], shape (N, J), at `times_s` since the beginning [s], shape (N,)."""
+        """Positions [rad], shape (N, J), at times since the beginning [s], shape (N,)."""
         i = self.index(times_s)
         begins_s = self.ends_s[i] - self._durations_s[i]
         u = np.clip((times_s - begins_s) / self._durations_s[i], 0.0, 1.0)[:, None]

@@ -1,4 +1,4 @@
-"""A window on a desktop that shows the simulated scene; the mouse turns and zooms the view."""
+"""A desktop window that shows the simulated scene; the mouse rotates and zooms the view."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _CLOSING_S = 5.0
 
 
 class MujocoViewer(Viewer):
-    """Shows the physics state on the bus. It looks only: nothing that is done in the window reaches the simulation."""
+    """Shows the physics state on the bus. Actions in the window do not affect the simulation."""
 
     def __init__(self, ctx: Context) -> None:
         self._ctx = ctx
@@ -30,13 +30,13 @@ class MujocoViewer(Viewer):
         simulation, bus = self._ctx.simulation, self._ctx.bus
         if not isinstance(simulation, MujocoOptions) or bus is None:
             raise IbrobotError("viewer type mujoco needs a running simulation: {type: mujoco}")
-        # Imported here: they open the window system, which only this viewer needs.
+        # Import late, because these modules open the window system, which only this viewer needs.
         import glfw
         from mujoco import viewer
 
         with warnings.catch_warnings(record=True) as reasons:
             warnings.simplefilter("always")
-            # Asked first, since MuJoCo's viewer would wait for ever for a window that cannot come.
+            # Check first, because MuJoCo's viewer would wait for its window forever.
             if not glfw.init():
                 why = "; ".join(str(reason.message) for reason in reasons)
                 raise IbrobotError(f"no display for the viewer's window, see DISPLAY and WAYLAND_DISPLAY: {why}")
@@ -68,7 +68,7 @@ class MujocoViewer(Viewer):
             self._states = None
         if self._window is not None:
             self._window.close()
-            # A process that ends while the window is still closing crashes.
+            # A process that exits while the window is still closing crashes.
             for thread in self._threads:
                 thread.join(_CLOSING_S)
             self._window = None

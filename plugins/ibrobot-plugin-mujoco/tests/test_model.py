@@ -61,7 +61,7 @@ def test_state_travels_from_physics_to_picture() -> None:
 
 def test_state_of_another_scene_is_refused() -> None:
     empty = build_model(MujocoOptions(scene="empty"), ROBOT, visual=False)
-    with pytest.raises(SensorError, match=r"/simulation/physics has 15 numbers, this scene's has 8"):
+    with pytest.raises(SensorError, match=r"/simulation/physics has 15 values, but this scene has 8"):
         pose_scene(empty, mujoco.MjData(empty), np.zeros(15))
 
 
@@ -134,7 +134,7 @@ def test_a_missing_joint_is_named(tmp_path: Path) -> None:
 
 
 def test_a_missing_or_broken_mjcf_is_named(tmp_path: Path) -> None:
-    with pytest.raises(HardwareError, match=r"robot 'so101' has no MJCF to simulate: robot\.description\.mjcf must"):
+    with pytest.raises(HardwareError, match=r"robot 'so101' has no MJCF to simulate: set robot\.description\.mjcf"):
         build_model(MujocoOptions(), attrs.evolve(ROBOT, description=Description()), visual=False)
     path = tmp_path / "broken.xml"
     path.write_text("<mujoco><world/></mujoco>")

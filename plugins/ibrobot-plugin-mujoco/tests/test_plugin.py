@@ -55,7 +55,7 @@ def test_the_so101_of_scripts_is_that_of_the_robot_yaml() -> None:
         (lambda: MujocoOptions(scene="kitchen"), "'kitchen' is not one of: empty, pick_cube"),
         (
             lambda: MujocoOptions(cube_distance=(0.3, 0.2)),
-            r"\[0.3, 0.2\] is not a valid range, the first must not exceed",
+            r"\[0.3, 0.2\] is not a valid range: the first value must not exceed",
         ),
         (lambda: MujocoOptions(timestep=1.0), "1.0 is too large, must be at most 0.02 s"),
         (lambda: SceneCamera(name="c", pos=(0, 0, 1), lookat=(0, 0, 1)), "lookat must differ from pos"),
@@ -128,7 +128,7 @@ class TestOpenGl:
     ) -> None:
         self.have(monkeypatch, "libEGL.so.1", "libGL.so.1")
         monkeypatch.setenv("MUJOCO_GL", "osmesa")
-        told = r"MUJOCO_GL=osmesa, which does not work here \(or unset it\); sudo apt-get install libosmesa6"
+        told = r"MUJOCO_GL=osmesa does not work on this machine \(or unset it\); sudo apt-get install libosmesa6"
         policy = installed_plugins().find("policy", "scripted_pick")
         with pytest.raises(MissingDependency, match=told):
             policy.make(ScriptedPickOptions(), control_context("pick"))

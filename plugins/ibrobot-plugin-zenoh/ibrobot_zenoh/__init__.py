@@ -32,7 +32,7 @@ def ibrobot_transports() -> Iterable[TransportDescriptor]:
     yield TransportDescriptor(
         type="zenoh", options=ZenohOptions, make=_zenoh, default=True, listen=server_options, components=_components,
         used=lambda options: options.share != Share(),
-        summary="between machines; ROS 2 nodes with rmw_zenoh join in",
+        summary="between machines, including ROS 2 nodes with rmw_zenoh",
     )  # fmt: skip
 
 
@@ -44,7 +44,7 @@ def _decoder() -> Callable[[CompressedImage], Image | None]:
 
 @hookimpl
 def ibrobot_decoders() -> Iterable[DecoderDescriptor]:
-    """Of the pictures that ROS 2 nodes send."""
+    """The decoder of compressed images from ROS 2 nodes."""
     yield DecoderDescriptor(("jpeg", "png", "compressedDepth png"), _decoder)
 
 
@@ -62,6 +62,6 @@ def _topic() -> click.Command:
 
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
-    """What a lab's network needs."""
+    """Commands for topics and certificates."""
     yield Command("topic", "List, show, measure and publish topics shared over the network.", _topic)
     yield Command("certs", "Make certificates for a server and its robots.", _certs)

@@ -1,7 +1,7 @@
-"""The access list of a server: deny by default; robots may ask, hear shared topics, and publish under their own name.
+"""The access list of a server: deny by default; robots may ask, receive shared topics, and publish in their own name.
 
-Zenoh enforces it by the name in a peer's certificate, or by the user name that its password proved. What a peer may say
-is a key under its own name, so that the key of a request tells the server who asks.
+Zenoh enforces it with the name in a peer's certificate, or the user name proved by its password. A peer may only use
+keys below its own name, so a server identifies the sender of a request by its key.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from ibrobot_zenoh.ros2 import ADMIN
 SERVICES, SERVED, TOPICS = "ibrobot/service", "ibrobot/served", "ibrobot/topic"
 """Keys are SERVICES/WHO/NAME for requests, SERVED/NAME/ID for tokens of servers, TOPICS/NAME for plain payloads."""
 ANYBODY = "anybody"
-"""Who asks, where nothing proves a name."""
+"""Name of a sender without a proved name."""
 
 _ALL = [
     "put", "delete", "declare_subscriber", "query", "reply", "declare_queryable",
@@ -32,13 +32,13 @@ _ALL = [
 
 @attrs.frozen
 class Peers:
-    """Who may connect.
+    """The peers that may connect.
 
     Attributes:
-        robots: their names.
-        proof: what proves a name to Zenoh: `cert_common_names` or `usernames`.
-        server: the name in this server's own certificate, whose holder may do everything, e.g. the command line on
-            the same machine; empty for none.
+        robots: names of the robots.
+        proof: how Zenoh verifies names: `cert_common_names` or `usernames`.
+        server: the name in this server's certificate, which has all permissions, e.g. for the command line on the same
+            machine; empty for none.
     """
 
     robots: tuple[str, ...]
@@ -47,12 +47,12 @@ class Peers:
 
 
 def restrict(config: zenoh.Config, options: ZenohOptions) -> bool:
-    """Put the access list into Zenoh's settings; whether it is there, so that a request's key proves who asks.
+    """Add the access list to Zenoh's settings; returns whether the key of a request proves its sender.
 
-    It is not where nothing proves who connects, nor where the user's own settings have a list.
+    It does not if names are not verified, or if the user's own settings have an access list.
 
     Raises:
-        TransportError: for a file that is missing or says something impossible, or a certificate of the wrong role.
+        TransportError: if a file is missing or invalid, or a certificate has the wrong role.
     """
     by_password = None if options.users is None else Peers(_users(options.users), "usernames")
     if json.loads(config.get_json("access_control")).get("enabled"):
@@ -73,8 +73,8 @@ def _by_certificate(tls: Tls, own: Identity) -> Peers:
         )
     if tls.robots is None:
         raise TransportError(
-            f"{tls.certificate.parent}: nobody is let in: give tls.robots, a file with the name of one robot a line; "
-            "`ibrobot certs` writes it as robots.txt beside a server's certificate"
+            f"{tls.certificate.parent}: no robot is admitted: set tls.robots to a file with one robot name per line; "
+            "`ibrobot certs` writes it as robots.txt in the folder of a server's certificate"
         )
     lines = enumerate(read_lines(tls.robots), 1)
     listed = [(number, name) for number, line in lines if (name := line.partition("#")[0].strip())]
@@ -82,7 +82,7 @@ def _by_certificate(tls: Tls, own: Identity) -> Peers:
 
 
 def _users(path: Path) -> tuple[str, ...]:
-    """The names in a file of users; there must be some, since Zenoh takes an empty file to let everybody in."""
+    """The names in a users file, which must not be empty, because Zenoh then admits everyone."""
     listed = []
     for number, line in enumerate(read_lines(path), 1):
         name, _, password = line.partition(":")
@@ -90,7 +90,7 @@ def _users(path: Path) -> tuple[str, ...]:
             raise TransportError(f"{path}:{number}: is not NAME:PASSWORD")
         listed.append((number, name))
     if not listed:
-        raise TransportError(f"{path}: is empty, must have a line NAME:PASSWORD for each who may connect")
+        raise TransportError(f"{path}: is empty, must have a line NAME:PASSWORD for each robot")
     return _names(path, listed)
 
 
@@ -102,16 +102,16 @@ def _names(path: Path, listed: Iterable[tuple[int, str]]) -> tuple[str, ...]:
         except ValueError as error:
             raise TransportError(f"{path}:{number}: {error}") from None
         if name in names:
-            raise TransportError(f"{path}:{number}: {name!r} is listed already")
+            raise TransportError(f"{path}:{number}: {name!r} is listed twice")
         names.append(name)
     return tuple(names)
 
 
 def read_lines(path: Path) -> list[str]:
-    """A text file's lines.
+    """The lines of a text file.
 
     Raises:
-        TransportError: when it cannot be read.
+        TransportError: if it cannot be read.
     """
     try:
         return path.read_text(encoding="utf-8").splitlines()
@@ -149,8 +149,8 @@ def _allow(flows: Sequence[str], messages: Iterable[str], keys: Sequence[str]) -
 
 
 def _hear(domain: int) -> list[dict[str, Any]]:
-    """What every robot may hear: who serves, and the topics that others chose to share."""
-    # A chunk that begins with @ is matched by none but itself: latched topics are kept below @adv.
+    """Rules for receiving: every robot sees the servers, and the topics that others share."""
+    # Wildcards do not match parts that begin with @, such as @adv of latched topics.
     shared = [f"{domain}/**", f"{domain}/**/@adv/**", f"{ADMIN}/{domain}/**"]
     return [
         _allow(
@@ -169,7 +169,7 @@ def _hear(domain: int) -> list[dict[str, Any]]:
 
 
 def _own(name: str, domain: int) -> list[dict[str, Any]]:
-    """What one robot may say and be asked, under its own name."""
+    """Rules for the keys below a robot's own name."""
     topics, kept = f"{domain}/{name}/**", f"{domain}/{name}/**/@adv/**"
     return [
         _allow(("ingress",), ["query"], [f"{SERVICES}/{name}/**"]),

@@ -26,21 +26,21 @@ from ibrobot_zenoh.identity import Identity, Role, identity_in, subject
 CA, CA_KEY = "ca.pem", "ca.key"
 CERTIFICATE, KEY = "certificate.pem", "key.pem"
 ROBOTS = "robots.txt"
-"""The robots that a server lets in: the authority's own list, and a copy in each server's folder."""
+"""The list of admitted robots: the authority's own, and a copy in each server's folder."""
 
 _EARLY = timedelta(days=2)
-"""Certificates are valid from before they are made, for machines whose clock is behind."""
+"""Certificates are valid from a time before their creation, for machines whose clock is behind."""
 
 
 class Authority:
-    """Who signs: the certificate and key in a folder, made there where there are none.
+    """A certificate authority: its certificate and key in a folder, which are created if they do not exist.
 
     Args:
-        folder: where `ca.pem` and `ca.key` are.
-        days: how long what is made here is valid.
+        folder: the folder with `ca.pem` and `ca.key`.
+        days: validity of new certificates [days].
 
     Raises:
-        TransportError: when only one of the two is there, they cannot be read, or the authority has expired.
+        TransportError: if only one of the two exists, they cannot be read, or the authority has expired.
     """
 
     def __init__(self, folder: Path, days: int) -> None:
@@ -61,32 +61,32 @@ class Authority:
         except (OSError, ValueError) as error:
             raise TransportError(f"{folder}: its {CA} and {CA_KEY} cannot be read: {error}") from error
         if not isinstance(loaded, ec.EllipticCurvePrivateKey) or loaded.public_key() != self._certificate.public_key():
-            raise TransportError(f"{key}: not the key of {certificate}")
+            raise TransportError(f"{key}: is not the key of {certificate}")
         self._key = loaded
         end = self._certificate.not_valid_after_utc
         if end < datetime.now(UTC):
-            raise TransportError(f"{certificate}: has expired on {end:%Y-%m-%d}; make all again in another folder")
+            raise TransportError(f"{certificate}: expired on {end:%Y-%m-%d}; make new certificates in another folder")
 
     @property
     def ends(self) -> datetime:
-        """When what is made now is not valid any more: no later than the authority itself."""
+        """The expiry of new certificates, not later than the authority's."""
         return min(self._certificate.not_valid_after_utc, datetime.now(UTC) + timedelta(days=self._days))
 
     def issue(self, name: str, hosts: Sequence[str] = ()) -> Path:
         """Make a folder `name` with `ca.pem`, `certificate.pem` and `key.pem`.
 
         Args:
-            name: the certificate's common name, by which access control knows the machine.
-            hosts: names and addresses under which a server is connected to; none for a robot, which only connects.
+            name: the certificate's common name, which identifies the machine in access lists.
+            hosts: names and addresses of a server; none for a robot, which only connects.
 
         Raises:
-            TransportError: when the folder is there already.
+            TransportError: if the folder exists.
         """
         folder = self._folder / name
         try:
             folder.mkdir(parents=True)
         except FileExistsError:
-            raise TransportError(f"{folder} is there already; nothing is overwritten") from None
+            raise TransportError(f"{folder} exists already; nothing is overwritten") from None
         key = ec.generate_private_key(ec.SECP256R1())
         names = x509.SubjectAlternativeName([_general_name(host) for host in hosts or (name,)])
         usages = [ExtendedKeyUsageOID.CLIENT_AUTH, *([ExtendedKeyUsageOID.SERVER_AUTH] if hosts else [])]
@@ -106,7 +106,7 @@ class Authority:
         """Add names to the list of robots, and copy it to all servers' folders; returns those copies.
 
         Raises:
-            TransportError: when the list cannot be read.
+            TransportError: if the list cannot be read.
         """
         own = self._folder / ROBOTS
         names = [*(read_lines(own) if own.exists() else ()), *robots]
@@ -164,6 +164,6 @@ def _write(path: Path, certificate: x509.Certificate) -> None:
 
 
 def _write_key(path: Path, key: ec.EllipticCurvePrivateKey) -> None:
-    """Only the owner may read it, from the first moment on."""
+    """Write a key, readable only by its owner from the beginning."""
     with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
         file.write(key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()))

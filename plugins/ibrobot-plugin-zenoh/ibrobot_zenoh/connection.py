@@ -1,4 +1,4 @@
-"""A Zenoh session that is there as soon as a peer answers, and what was declared on it before and after."""
+"""A Zenoh session that connects when a peer answers, and restores its declarations."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ from ibrobot_zenoh.options import ZenohOptions
 from ibrobot_zenoh.reasons import tls_context, why_not
 
 _RETRY_MS = (50, 200)
-"""First and longest time between attempts to connect."""
+"""First and longest time between attempts to connect [s]."""
 _BATCHES, _RECEIVED_AT_ONCE = 16, 256 << 10
-"""How many pieces of 64 kB a large message may be ahead of the socket, and what is read from that at once [bytes].
+"""Number of 64 kB buffers of a large message in front of the socket, and the size of a read [bytes].
 
-By Zenoh's defaults, two and 64 kB, its threads wake one another for every piece of a camera picture: that costs a
+With Zenoh's defaults, two and 64 kB, its threads wake one another for every piece of a camera image, which takes a
 quarter of a request's time.
 """
 _CLOSE_WAIT_S = 1.0
-"""How long closing waits for an attempt to connect, which nothing can interrupt."""
+"""How long `close` waits for an attempt to connect, which cannot be interrupted [s]."""
 _ASK_WHY_S = 2.0
-"""How often it is looked for what stands between us and the other side."""
+"""How often to diagnose why there is no connection [s]."""
 _FIRST_WAIT_S = 0.3
-"""How long making a client waits for a peer to answer, so that what is there can be used at once."""
+"""How long the constructor of a client waits for a peer to answer, so that it is usable at once [s]."""
 
 _LARGEST_KEPT, _KEPT_BYTES = 32 << 20, 256 << 20
-"""Freed memory that glibc keeps: mapping it again for each large message costs more than its copies do [bytes]."""
+"""Freed memory for glibc to keep [bytes], because mapping it for each large message costs more than the copies."""
 
 
 class Declared(Protocol):
@@ -46,10 +46,10 @@ class Declared(Protocol):
 
 
 def zenoh_config(options: ZenohOptions) -> zenoh.Config:
-    """Zenoh's settings: the user's own file, and over it what the options say. No scouting of any kind.
+    """Zenoh's settings: the user's own file, overridden by the options, without any scouting.
 
     Raises:
-        TransportError: for a file that cannot be read, or certificates that do not belong together.
+        TransportError: if a file cannot be read, or certificates do not belong together.
     """
     try:
         config = zenoh.Config() if options.settings is None else zenoh.Config.from_file(options.settings)
@@ -96,7 +96,7 @@ def zenoh_config(options: ZenohOptions) -> zenoh.Config:
 
 
 def first_line(error: BaseException) -> str:
-    """What Zenoh says, without where in its source."""
+    """Zenoh's error message, without the location in its source."""
     return str(error).partition(" at /")[0].strip()
 
 
@@ -105,9 +105,9 @@ _open: WeakSet[Connection] = WeakSet()
 
 @cache
 def _close_at_the_end() -> None:
-    """Ensure, once, that a process that failed before it closed its sessions ends.
+    """Register a handler, once, that closes open sessions at exit, so that the process ends.
 
-    The interpreter waits for the threads in which Zenoh calls back, and those for the end of their session.
+    The interpreter waits for Zenoh's callback threads, which wait for the end of their session.
     """
 
     def close_all() -> None:
@@ -119,12 +119,12 @@ def _close_at_the_end() -> None:
 
 
 class Connection:
-    """A Zenoh session. A peer or router has it at once; a client once the other side answers, and it keeps trying.
+    """A Zenoh session. A peer or router has it at once; a client keeps trying until the other side answers.
 
-    After that Zenoh connects again by itself, and declares again what was declared.
+    After that, Zenoh itself reconnects and restores declarations.
 
     Raises:
-        TransportError: e.g. for an address to listen on that is taken, or a certificate that cannot be read.
+        TransportError: e.g. if the address to listen on is in use, or a certificate cannot be read.
     """
 
     def __init__(self, options: ZenohOptions, log: logging.Logger) -> None:
@@ -133,7 +133,7 @@ class Connection:
         self._endpoints = ", ".join(options.connect or options.listen)
         self._config = zenoh_config(options)
         self.knows_who_asks = restrict(self._config, options)
-        """Whether the name in a request's key is proved."""
+        """Whether the name in a request's key is verified."""
         self._lock = threading.Lock()
         self._session: zenoh.Session | None = None
         self._pending: dict[object, Callable[[zenoh.Session], Declared]] = {}
@@ -144,9 +144,9 @@ class Connection:
         _close_at_the_end()
         self._options = options
         self.why_not = f"nobody answers at {self._endpoints}"
-        """What stands between us and the other side, before it answered."""
+        """Why there is no connection yet."""
         self.answered = threading.Event()
-        """Set when there is a session."""
+        """Set when the session is open."""
         if options.mode != "client":
             self.answered.set()
             try:
@@ -162,7 +162,7 @@ class Connection:
         """The session.
 
         Raises:
-            TransportError: when closed, or not connected yet.
+            TransportError: if closed, or not connected yet.
         """
         if (session := self.open_session) is None:
             raise TransportError(f"not connected: {self.why_not}")
@@ -170,28 +170,28 @@ class Connection:
 
     @property
     def open_session(self) -> zenoh.Session | None:
-        """The session, or None before the other side answered.
+        """The session, or None before the other side has answered.
 
         Raises:
-            TransportError: when closed.
+            TransportError: if closed.
         """
         self.check_open()
         return self._session
 
     def check_open(self) -> None:
-        """Nothing.
+        """Check that the session is not closed.
 
         Raises:
-            TransportError: when closed.
+            TransportError: if closed.
         """
         if self._closed.is_set():
             raise TransportError("the transport is closed")
 
     def declare(self, make: Callable[[zenoh.Session], Declared]) -> Callable[[], None]:
-        """Have `make` declare something on the session, now or when there is one; returns a function that ends it.
+        """Call `make` to declare something on the session, now or when it is open; returns a function that ends it.
 
         Raises:
-            TransportError: when closed.
+            TransportError: if closed.
         """
         key = object()
         with self._lock:
@@ -210,7 +210,7 @@ class Connection:
         return end
 
     def close(self) -> None:
-        """End the session, and all that was declared."""
+        """Close the session and all declarations."""
         with self._lock:
             if self._closed.is_set():
                 return
@@ -224,8 +224,8 @@ class Connection:
             session.close()  # type: ignore[no-untyped-call]  # its stub has no types
 
     def _connect(self) -> None:
-        """Try until a peer answers; log every new reason why none does once."""
-        told, asked_s = "", -math.inf
+        """Try until a peer answers; log each new reason of failure once."""
+        logged, asked_s = "", -math.inf
         pause_ms, longest_ms = _RETRY_MS
         while not self._closed.is_set():
             try:
@@ -235,8 +235,8 @@ class Connection:
                     tried = {each: why_not(each, self._options.tls) for each in self._options.connect}
                     self.why_not = "; ".join(f"{endpoint}: {reason}" for endpoint, reason in tried.items())
                     asked_s = time.monotonic()
-                if self.why_not != told:
-                    self._log.warning("not connected yet: %s", told := self.why_not)
+                if self.why_not != logged:
+                    self._log.warning("not connected yet: %s", logged := self.why_not)
                 self._closed.wait(pause_ms / 1000)
                 pause_ms = min(2 * pause_ms, longest_ms)
                 continue
@@ -246,7 +246,7 @@ class Connection:
                     self._declared |= {key: make(session) for key, make in self._pending.items()}
                     self._pending.clear()
                     self.answered.set()
-                    if told:
+                    if logged:
                         self._log.info("connected to %s", self._endpoints)
                     return
             session.close()  # type: ignore[no-untyped-call]  # its stub has no types

@@ -1,4 +1,4 @@
-"""Who a machine is: the name and role in its certificate."""
+"""Identity of a machine: the name and role in its certificate."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from ibrobot_zenoh.reasons import tls_context
 
 
 class Role(Enum):
-    """What a certificate allows its machine to be."""
+    """Role of a machine in its certificate."""
 
     SERVER = "server"
     """Others may connect to it; it answers requests."""
     ROBOT = "robot"
-    """It only connects: it asks servers, and publishes under its own name."""
+    """It only connects: it asks servers, and publishes in its own name."""
 
 
 @attrs.frozen
@@ -31,14 +31,14 @@ class Identity:
     role: Role
 
     def check_may_publish(self, topic: str) -> None:
-        """Nothing: a server would drop in silence what a robot publishes under another name than its own.
+        """Check that a robot publishes only in its own name, because a server silently drops other topics.
 
         Raises:
-            TransportError: for such a topic, e.g. `/robot2/joint_states` of robot1.
+            TransportError: if it does not, e.g. for `/robot2/joint_states` of robot1.
         """
         if self.role is Role.ROBOT and not topic.strip("/").startswith(f"{self.name}/"):
             raise TransportError(
-                f"{topic}: {self.name} may publish below /{self.name} only; remove transport.namespace, or begin it "
+                f"{topic}: {self.name} may publish only below /{self.name}; remove transport.namespace, or begin it "
                 f"with {self.name}"
             )
 
@@ -57,34 +57,34 @@ def read_identity(tls: Tls) -> Identity:
     """The name and role in a machine's certificate.
 
     Raises:
-        TransportError: for a certificate without a role, and see `tls_context`.
+        TransportError: if the certificate has no role, or as `tls_context`.
     """
     tls_context(tls)
     return identity_in(tls.certificate)
 
 
 def identity_in(certificate: Path) -> Identity:
-    """The name and role in a certificate's file, which must hold a certificate.
+    """The name and role in a certificate file.
 
     Raises:
-        TransportError: for a certificate without a role.
+        TransportError: if the certificate has no role.
     """
     found = x509.load_pem_x509_certificate(certificate.read_bytes()).subject
     names = found.get_attributes_for_oid(NameOID.COMMON_NAME)
     roles = found.get_attributes_for_oid(NameOID.ORGANIZATIONAL_UNIT_NAME)
     if len(names) != 1 or len(roles) != 1 or roles[0].value not in {role.value for role in Role}:
         raise TransportError(
-            f"{certificate}: has no role (server or robot), so nobody can tell what its machine may do; replace the "
+            f"{certificate}: has no role (server or robot), so the permissions of its machine are unknown; replace the "
             "certificates of all machines by new ones: ibrobot certs NEW_FOLDER --server HOST --robot NAME"
         )
     return Identity(str(names[0].value), Role(roles[0].value))
 
 
 def own_identity(options: ZenohOptions) -> Identity | None:
-    """What others know this machine by: its certificate, else its user name; None where it proves nothing.
+    """The identity of this machine: from its certificate, or else its user name; None without either.
 
     Raises:
-        TransportError: see `read_identity`.
+        TransportError: as `read_identity`.
     """
     if options.tls is not None:
         return read_identity(options.tls)

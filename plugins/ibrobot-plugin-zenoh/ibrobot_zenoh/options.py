@@ -1,4 +1,4 @@
-"""Options of the transport `zenoh`: whom to connect to, where to listen, and how both prove who they are."""
+"""Options of the transport `zenoh`: endpoints to connect to and listen on, and authentication."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ibrobot_core.api import documented, option
 
 MIB = 1024 * 1024
 DEFAULT_LISTEN = "tcp/127.0.0.1:7447"
-"""Where a server listens that is given no endpoint."""
+"""Default endpoint of a server."""
 
 _ENDPOINT = re.compile(r"(?P<protocol>tcp|tls|quic|unixsock-stream)/(?P<address>.+)")
 _ENCRYPTED = ("tls", "quic")
@@ -24,10 +24,10 @@ _ROBOT = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 
 def check_robot_name(name: str) -> None:
-    """Nothing.
+    """Check that a name can be the namespace of a robot's topics.
 
     Raises:
-        ValueError: for a name that cannot be the namespace of a robot's topics.
+        ValueError: if it cannot.
     """
     if not _ROBOT.fullmatch(name):
         raise ValueError(
@@ -49,7 +49,7 @@ def is_local(endpoint: str) -> bool:
 
 
 def server_options(endpoints: Sequence[str]) -> dict[str, Any]:
-    """Options of a server that listens at `endpoints`, or where none is given on this machine alone."""
+    """Options of a server that listens at `endpoints`; without any, only on this machine."""
     return {"connect": [], "mode": "router", "listen": list(endpoints) or [DEFAULT_LISTEN]}
 
 
@@ -57,21 +57,21 @@ def _check_endpoints(instance: object, attribute: attrs.Attribute[tuple[str, ...
     for endpoint in value:
         found = _ENDPOINT.fullmatch(endpoint)
         if found is None:
-            raise ValueError(f"{endpoint!r} is not an endpoint, give PROTOCOL/HOST:PORT, e.g. tcp/127.0.0.1:7447")
+            raise ValueError(f"{endpoint!r} is not an endpoint; use PROTOCOL/HOST:PORT, e.g. tcp/127.0.0.1:7447")
         port = found["address"].rpartition(":")[2].partition("#")[0]
         if found["protocol"] != "unixsock-stream" and not port.isdecimal():
-            raise ValueError(f"{endpoint!r} has no port, give PROTOCOL/HOST:PORT, e.g. {endpoint}:7447")
+            raise ValueError(f"{endpoint!r} has no port; use PROTOCOL/HOST:PORT, e.g. {endpoint}:7447")
 
 
 @documented
 @attrs.frozen
 class Tls:
-    """Certificates, as `ibrobot certs` makes them; both sides must have one that `ca` signed."""
+    """Certificates, made by `ibrobot certs`; both sides must have one signed by `ca`."""
 
-    ca: Path = option(help="certificate of the authority that signed everybody's")
+    ca: Path = option(help="certificate of the authority that signed all certificates")
     certificate: Path = option(help="this machine's certificate")
-    key: Path = option(help="its private key")
-    robots: Path | None = option(None, help="where to listen: the robots that are let in, a file with one name a line")
+    key: Path = option(help="private key of this machine")
+    robots: Path | None = option(None, help="to listen: a file of admitted robots, one name per line")
 
 
 def _check_topics(instance: Any, attribute: attrs.Attribute[tuple[str, ...]], value: tuple[str, ...]) -> None:
@@ -79,7 +79,7 @@ def _check_topics(instance: Any, attribute: attrs.Attribute[tuple[str, ...]], va
         if not topic.startswith("/"):
             raise ValueError(f"{topic!r} is not a full topic name, did you mean '/{topic}'?")
         if value.count(topic) > 1:
-            raise ValueError(f"{topic} is given twice")
+            raise ValueError(f"{topic} is listed twice")
 
 
 @documented
@@ -102,44 +102,50 @@ class Share:
 @documented
 @attrs.frozen
 class ZenohOptions:
-    """What the YAML may say."""
+    """Options of `type: zenoh`."""
 
     share: Share = option(factory=Share, help="topics shared with other machines")
     connect: tuple[str, ...] = option(
-        (), validator=_check_endpoints, help="whom to connect to, e.g. tls/gpu.lab:7447; tried in this order"
+        (), validator=_check_endpoints, help="endpoints to connect to, in order of preference, e.g. tls/gpu.lab:7447"
     )
     listen: tuple[str, ...] = option(
-        (), validator=_check_endpoints, help="where others may connect to, e.g. tcp/127.0.0.1:7447; nowhere by default"
+        (), validator=_check_endpoints, help="endpoints to listen on, e.g. tcp/127.0.0.1:7447; none by default"
     )
     mode: str = option(
         "client",
         choices=("client", "peer", "router"),
-        help="client: connects; peer: may listen as well; router: also passes on what its clients tell one another",
+        help="client: only connects; peer: may listen; router: also forwards messages between its clients",
     )
     tls: Tls | None = option(None, help="certificates, for tls and quic endpoints")
-    user: str | None = option(None, help="name to connect with, where the other side asks for one")
+    user: str | None = option(None, help="name to connect with, if the other side requires one")
     password: str | None = option(None, secret=True, help="password to connect with, e.g. ${IBROBOT_PASSWORD}")
-    users: Path | None = option(None, help="who may connect to us: a file of lines NAME:PASSWORD")
+    users: Path | None = option(None, help="file of robots that may connect, as lines NAME:PASSWORD")
     trusted_network: bool = option(
-        False, help="allows to listen beyond this machine without tls or users: everybody there may do everything"
+        False, help="allow listening beyond this machine without tls or users: everyone there has all permissions"
     )
-    settings: Path | None = option(None, help="a JSON5 file of Zenoh's own settings; its access_control replaces ours")
-    max_message_size: int = option(64 * MIB, unit="bytes", ge=1024, help="larger messages are neither sent nor taken")
+    settings: Path | None = option(
+        None, help="JSON5 file of Zenoh's own settings; its access_control replaces the built-in one"
+    )
+    max_message_size: int = option(
+        64 * MIB, unit="bytes", ge=1024, help="larger messages are neither sent nor accepted"
+    )
     lease: float = option(2.0, unit="s", ge=0.2, le=60, help="silence after which a connection counts as lost")
-    shared_memory: bool = option(True, help="large messages to processes of this machine go through shared memory")
+    shared_memory: bool = option(True, help="use shared memory for large messages to processes on this machine")
     domain: int = option(0, ge=0, le=232, help="ROS 2 domain of shared topics")
     namespace: str | None = option(
         None,
-        help="put before the names of shared topics, e.g. robot1 makes /robot1/joint_states; by default a robot's name "
+        help="prefix of shared topics, e.g. robot1 for /robot1/joint_states; by default a robot's name "
         "in its certificate, or its user name",
     )
-    type_hashes: bool = option(True, help="false: as ROS 2 Humble names topics, without the hash of their type")
+    type_hashes: bool = option(True, help="false: without type hashes, as in ROS 2 Humble")
 
     def __attrs_post_init__(self) -> None:
         if self.mode == "client" and self.listen:
-            raise ValueError("a client does not listen; give mode: router (or peer) beside listen")
+            raise ValueError("a client does not listen; set mode: router (or peer) to listen")
         if self.mode == "client" and not self.connect:
-            raise ValueError("needs whom to connect to, e.g. connect: [tcp/127.0.0.1:7447]; or mode: router and listen")
+            raise ValueError(
+                "needs endpoints to connect to, e.g. connect: [tcp/127.0.0.1:7447]; or mode: router and listen"
+            )
         for endpoint in (*self.connect, *self.listen):
             encrypted = endpoint.partition("/")[0] in _ENCRYPTED
             if encrypted and self.tls is None:
@@ -147,15 +153,15 @@ class ZenohOptions:
             if not encrypted and self.tls is not None and not is_local(endpoint):
                 raise ValueError(f"{endpoint} would not use tls; write tls/{endpoint.partition('/')[2]}")
         if (self.user is None) != (self.password is None):
-            raise ValueError("user and password belong together, one of them is missing")
+            raise ValueError("set both user and password, or neither")
         if self.user is not None:
             check_robot_name(self.user)
         if not (self.trusted_network or self.tls or self.users):
             for endpoint in self.listen:
                 if not is_local(endpoint):
                     raise ValueError(
-                        f"listen: {endpoint} can be reached by other machines: give tls or users, or "
-                        "trusted_network: true where everybody may do everything"
+                        f"listen: {endpoint} can be reached by other machines: set tls or users, or "
+                        "trusted_network: true if everyone may have all permissions"
                     )
         if not re.fullmatch(r"(/?[A-Za-z_][A-Za-z0-9_]*)*", self.namespace or ""):
             raise ValueError(f"namespace {self.namespace!r} is not a ROS 2 name, e.g. robot1 or lab/robot1")

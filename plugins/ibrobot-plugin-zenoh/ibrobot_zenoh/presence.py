@@ -1,4 +1,4 @@
-"""Who serves what: every server declares a token, which Zenoh takes back when the server dies."""
+"""Presence of servers: every server declares a token, which Zenoh removes when the server dies."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PREFIX = f"{SERVED}/"
 
 
 class Presence:
-    """Knows all present tokens, by one subscription for all names from the first moment on."""
+    """Tracks all present tokens with one subscription for all names."""
 
     def __init__(self, connection: Connection) -> None:
         self._lock = threading.Lock()
@@ -27,8 +27,8 @@ class Presence:
         )
 
     def watch(self, name: str, changed: Callable[[bool], object]) -> tuple[Callable[[], None], Workers[bool]]:
-        """What ends the watch, and the thread that calls `changed`; see `Transport.watch`."""
-        turn = threading.Lock()  # held until the present state was delivered, which comes first
+        """Returns a function that ends the watch, and the thread that calls `changed`; see `Transport.watch`."""
+        turn = threading.Lock()  # held until the present state is delivered, which must come first
 
         def tell(served: bool) -> None:
             with turn:

@@ -1,4 +1,4 @@
-"""Why nobody takes our connection: Zenoh says only that it failed, so it is tried by hand."""
+"""Diagnoses failed connections: Zenoh reports no reason, so each step is tried separately."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from ibrobot_core.api import TransportError
 from ibrobot_zenoh.options import Tls
 
 _TIMEOUT_S = 0.5
-"""How long each step of a trial waits for the other side."""
+"""How long each step waits for the other side [s]."""
 _OTHER_AUTHORITY = (7, 18, 19, 20, 21)
-"""OpenSSL's numbers for what is wrong with a certificate; 7: an authority of the same name, but of another key."""
+"""OpenSSL's error numbers of certificates; 7: an authority with the same name but another key."""
 _NAMES = "; `ibrobot certs --server` takes every name and address under which it is reached"
 _HINTS = {
     9: "; is the clock here right?",
@@ -23,10 +23,10 @@ _HINTS = {
 
 
 def tls_context(tls: Tls) -> ssl.SSLContext:
-    """What a client needs to show its certificate, and to check the server's.
+    """The TLS context with which a client presents its certificate and checks the server's.
 
     Raises:
-        TransportError: for an unreadable file, one without a certificate or key, or a key of another certificate.
+        TransportError: if a file cannot be read or lacks a certificate or key, or the key is of another certificate.
     """
     for path in (tls.ca, tls.certificate, tls.key):
         try:
@@ -43,30 +43,30 @@ def tls_context(tls: Tls) -> ssl.SSLContext:
     except ssl.SSLError as error:
         if error.reason == "KEY_VALUES_MISMATCH":
             raise TransportError(f"{tls.key}: is not the key of {tls.certificate}") from error
-        raise TransportError(f"{tls.certificate} and {tls.key}: are no certificate and key in PEM format") from error
+        raise TransportError(f"{tls.certificate} and {tls.key}: are not a certificate and key in PEM format") from error
     return context
 
 
 def why_not(endpoint: str, tls: Tls | None) -> str:
-    """What stands between us and who listens at an endpoint, such as `tls/gpu.lab:7447`.
+    """Why there is no connection to an endpoint, such as `tls/gpu.lab:7447`.
 
-    Takes 2 s at most, and longer only to look up a name.
+    Takes at most 2 s, or longer to look up a name.
     """
     protocol, _, address = endpoint.partition("/")
     if protocol not in ("tcp", "tls"):
-        return "nobody answers there"
+        return "there is no answer"
     host, _, port = address.partition("#")[0].rpartition(":")
     host = host.strip("[]")
     try:
         with socket.create_connection((host, int(port)), _TIMEOUT_S) as stream:
             return _over_tls(stream, host, tls) if protocol == "tls" and tls is not None else _over_tcp(stream)
     except OSError as error:
-        told = {
+        causes = {
             ConnectionRefusedError: "nobody listens there: is the robot, server or router up?",
             socket.gaierror: f"no machine of the name {host!r} is known here ({error.strerror})",
             TimeoutError: f"no answer within {_TIMEOUT_S:g} s: is the machine on, and is there no firewall between?",
         }
-        return told.get(type(error), error.strerror or str(error))
+        return causes.get(type(error), error.strerror or str(error))
 
 
 def _over_tls(stream: socket.socket, host: str, tls: Tls) -> str:
@@ -74,7 +74,7 @@ def _over_tls(stream: socket.socket, host: str, tls: Tls) -> str:
     try:
         with tls_context(tls).wrap_socket(stream, server_hostname=host) as secured:
             greeted = True
-            secured.recv(1)  # by TLS 1.3 the server looks at our certificate after we are done
+            secured.recv(1)  # with TLS 1.3 the server checks our certificate after the handshake
     except ssl.SSLCertVerificationError as error:
         if error.verify_code in _OTHER_AUTHORITY:
             return f"its certificate is not signed by {tls.ca}"
@@ -96,7 +96,7 @@ _NOT_TAKEN = (
 
 
 def _over_tcp(stream: socket.socket) -> str:
-    """Who answers a greeting of TLS wants TLS."""
+    """Detect a server that answers a TLS greeting and therefore needs TLS."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
     try:

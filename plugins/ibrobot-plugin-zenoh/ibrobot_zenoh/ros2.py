@@ -1,4 +1,4 @@
-"""How ROS 2 nodes with rmw_zenoh name topics on Zenoh, what they attach to messages, and how they tell who is there."""
+"""Conventions of rmw_zenoh: names of topics on Zenoh, attachments of messages, and liveliness tokens."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ibrobot_core.api import TransportError
 
 ADMIN = "@ros2_lv"
 NO_HASH = "TypeHashNotSupported"
-"""What ROS 2 Humble says for the hash of a type."""
+"""ROS 2 Humble's placeholder for the hash of a type."""
 
 _NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 _ATTACHMENT = struct.Struct("<qqB16s")
@@ -26,7 +26,7 @@ _QOS = ":{durability}:,{depth}:,:,:,,"
 
 @attrs.frozen
 class SharedTopic:
-    """A shared topic: its name and message type, and how many publish it and listen."""
+    """A shared topic: name, message type, and the numbers of publishers and subscribers."""
 
     name: str
     type: str
@@ -38,7 +38,7 @@ def absolute(topic: str, namespace: str = "") -> str:
     """A topic's full name, e.g. `/robot1/joint_states`.
 
     Raises:
-        TransportError: for what is not a ROS 2 name.
+        TransportError: if it is not a ROS 2 name.
     """
     name = "/" + "/".join(part.strip("/") for part in (namespace, topic) if part.strip("/"))
     if not _NAME.fullmatch(name):
@@ -56,7 +56,7 @@ def ros_type(dds: str) -> str:
     """`sensor_msgs::msg::dds_::Image_` -> `sensor_msgs/msg/Image`.
 
     Raises:
-        TransportError: for what is not such a name.
+        TransportError: if it is not such a name.
     """
     *packages, mark, name = dds.split("::")
     if mark != "dds_" or not packages or not name.endswith("_"):
@@ -65,7 +65,7 @@ def ros_type(dds: str) -> str:
 
 
 def typed(type_name: str, *, hashed: bool) -> str:
-    """How keys name a type: in DDS' words, and with its hash."""
+    """A type as it appears in keys: its DDS name, and its hash."""
     return f"{dds_type(type_name)}/{type_hash(type_name) if hashed else NO_HASH}"
 
 
@@ -78,19 +78,19 @@ def type_of_key(key: str) -> str:
     """The message type in a topic's key.
 
     Raises:
-        TransportError: where there is none.
+        TransportError: if there is none.
     """
     return ros_type(key.rsplit("/", 2)[-2] if key.count("/") > 1 else "")
 
 
 def attachment(sequence: int, stamp_ns: int, gid: bytes) -> bytes:
-    """What goes with a message: its number from 1, when it was sent [ns], and the publisher's id of 16 bytes."""
+    """The attachment of a message: its number from 1, time of sending [ns], and the publisher's id, 16 bytes."""
     return _ATTACHMENT.pack(sequence, stamp_ns, len(gid), gid)
 
 
 @attrs.frozen
 class Node:
-    """Under whose name topics are published.
+    """The ROS 2 node that publishes topics.
 
     Attributes:
         domain: the ROS 2 domain.
@@ -103,20 +103,20 @@ class Node:
     name: str
 
     def node_token(self) -> str:
-        """Tells that the node is there."""
+        """The liveliness token of the node."""
         return f"{ADMIN}/{self.domain}/{self.session}/0/0/NN/%/%/{self.name}"
 
     def publisher_token(self, number: int, topic: str, type_name: str, *, hashed: bool, latched: bool) -> str:
-        """Tells that publisher `number` (from 1) of the node is there."""
+        """The liveliness token of publisher `number` (from 1) of the node."""
         qos = _QOS.format(durability="1" if latched else "", depth=1 if latched else 10)
         mangled, kind = topic.replace("/", "%"), typed(type_name, hashed=hashed)
         return f"{ADMIN}/{self.domain}/{self.session}/0/{number}/MP/%/%/{self.name}/{mangled}/{kind}/{qos}"
 
 
 def topics_of_tokens(tokens: Iterable[str]) -> list[SharedTopic]:
-    """The topics that tokens tell of, by name; tokens of nodes and services, and ill-formed ones, are passed over."""
+    """The topics in liveliness tokens, by name; tokens of nodes and services, and malformed ones, are ignored."""
     counts: Counter[tuple[str, str, str]] = Counter()
-    for token in set(tokens):  # one's own may come twice
+    for token in set(tokens):  # own tokens may appear twice
         parts = token.split("/")
         if len(parts) == _TOKEN_PARTS and parts[5] in _ENDPOINTS:
             try:

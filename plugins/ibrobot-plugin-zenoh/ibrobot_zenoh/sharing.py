@@ -1,4 +1,4 @@
-"""Sharing: topics between a run and other machines, over the transport. The bus never waits for it."""
+"""Shares topics between a run and other machines, over the transport. The bus never waits for it."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from ibrobot_zenoh.options import Share
 from ibrobot_zenoh.ros2 import SharedTopic
 
 _DEPTH = 10
-"""Messages of a topic that may wait for the network; beyond, the oldest is dropped and counted by the bus."""
+"""Queue size of a topic for the network; when it is full, the bus drops and counts the oldest message."""
 
 _SILENT_NS = 5 * NS_PER_S
-"""A topic without any message for so long after the start is reported, once [ns]."""
+"""A topic without a message for this long after the start is reported once [ns]."""
 
 
 class TopicTransport(Transport):
@@ -34,43 +34,43 @@ class TopicTransport(Transport):
 
     @abstractmethod
     def publish_message(self, topic: str, message: Message, *, latched: bool = False) -> None:
-        """Send a message to all who listen to `topic`; of a latched topic also the newest to who comes later.
+        """Send a message to all subscribers of `topic`; later subscribers get the newest message of a latched topic.
 
-        It may wait for the network: call it from a thread that has nothing else to do.
+        It may wait for the network, so call it from a dedicated thread.
 
         Raises:
-            TransportError: when closed, or the topic carries another type.
-            IbrobotError: when the message cannot be sent.
+            TransportError: if closed, or the topic has another type.
+            IbrobotError: if the message cannot be sent.
         """
 
     @abstractmethod
     def subscribe_messages(self, topic: str, callback: Callable[[Message], object]) -> Callable[[], None]:
-        """Call `callback` with every message on `topic`, of whatever type; returns a function that ends it.
+        """Call `callback` with every message on `topic`, of any type; returns a function that unsubscribes.
 
-        What nobody can read is passed over, with a warning.
+        Unreadable messages are skipped, with a warning.
 
         Raises:
-            TransportError: when closed.
+            TransportError: if closed.
         """
 
     @abstractmethod
     def shared_topics(self, timeout_s: float) -> list[SharedTopic]:
-        """All topics that are shared now, by name, waiting up to `timeout_s` [s] for the answer.
+        """All shared topics, by name; waits up to `timeout_s` [s] for the answer.
 
         Raises:
-            TransportError: when closed, or not connected.
+            TransportError: if closed or not connected.
         """
 
 
 def components(share: Share, session: Session, link: TransportLink) -> list[Component]:
-    """What shares the topics that a YAML lists.
+    """The components that share the topics in a YAML.
 
     Raises:
-        NotSupported: for topics of other machines in lockstep.
-        MissingDependency: for topics of a sensor that this machine cannot run.
+        NotSupported: if it subscribes to topics of other machines in lockstep.
+        MissingDependency: if it publishes topics of a sensor that cannot run on this machine.
     """
     if session.request.lockstep and share.subscribe:
-        raise NotSupported("transport.share.subscribe: in lockstep nothing may come from other machines, at any time")
+        raise NotSupported("transport.share.subscribe: a lockstep run cannot receive topics of other machines")
     session.refuse_absent("transport.share.publish", share.publish.__contains__)
     subscribed: list[Component] = [SubscribedTopics(session, link, share.subscribe)] if share.subscribe else []
     return [*(PublishedTopic(session, link, topic) for topic in share.publish), *subscribed]
@@ -83,7 +83,7 @@ def _topics(link: TransportLink) -> TopicTransport:
 
 
 class PublishedTopic(SessionWorker):
-    """Sends one topic of the bus to other machines. A message that cannot be sent is reported once and left out."""
+    """Sends a topic of the bus to other machines. Messages that cannot be sent are skipped and reported once."""
 
     def __init__(self, session: Session, link: TransportLink, topic: str) -> None:
         super().__init__(session, f"share:{topic}", "to other machines", (link.name,))
@@ -108,7 +108,7 @@ class PublishedTopic(SessionWorker):
         elif self._silent_from_ns is not None and self.session.clock.now_ns() - self._silent_from_ns > _SILENT_NS:
             self._silent_from_ns = None
             known = did_you_mean(self._topic, list(self.session.bus.topics()), "topics here")
-            self.session.log.warning("%s is not shared: nothing publishes it so far%s", self._topic, known)
+            self.session.log.warning("%s is not shared: it has no publisher so far%s", self._topic, known)
         while received is not None:
             self._send(received.message)
             received = self._waiting.get()
@@ -128,7 +128,7 @@ class PublishedTopic(SessionWorker):
 
 
 class SubscribedTopics(Component):
-    """What other machines publish on some topics, to the bus."""
+    """Forwards topics of other machines to the bus."""
 
     def __init__(self, session: Session, link: TransportLink, topics: tuple[str, ...]) -> None:
         super().__init__("share", f"{', '.join(topics)} from other machines", (link.name,))

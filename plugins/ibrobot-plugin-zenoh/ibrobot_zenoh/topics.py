@@ -22,14 +22,14 @@ from ibrobot_zenoh.ros2 import ADMIN, Node, SharedTopic, absolute, attachment, t
 from ibrobot_zenoh.workers import Workers
 
 DEPTH = 100
-"""How many messages may wait for a subscriber; beyond, the oldest gives way."""
+"""Queue size of a subscriber; when it is full, the oldest message is dropped."""
 _AGAIN_S = 0.02
 _LARGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/PointCloud2")
-"""Types that others of less size overtake."""
+"""Types of large messages, which smaller ones may overtake."""
 
 
 class _Group:
-    """Several things that were declared together."""
+    """A group of declarations."""
 
     def __init__(self, *declared: Declared) -> None:
         self._declared = declared
@@ -40,7 +40,7 @@ class _Group:
 
 
 class _Publisher:
-    """One topic. The newest message of a latched one is also sent to who comes later, and after connecting."""
+    """A published topic. If latched, its newest message is also sent to later subscribers, and after connecting."""
 
     def __init__(self, topics: Topics, topic: str, type_name: str, *, latched: bool) -> None:
         self.type_name = type_name
@@ -63,7 +63,7 @@ class _Publisher:
 
     @property
     def is_heard(self) -> bool:
-        """Whether there is a subscriber; False before there is a connection."""
+        """Whether there is a subscriber; False without a connection."""
         if not isinstance(self._publisher, zenoh.Publisher):
             return False
         status: Any = self._publisher.matching_status  # its stub says bool
@@ -102,13 +102,13 @@ class _Publisher:
 
 
 class Topics:
-    """Publishes and receives messages; knows which topics there are.
+    """Publishes and receives messages, and lists topics.
 
     Args:
         connection: the session.
         options: domain, namespace, and whether types have hashes.
-        own: who this machine is to others.
-        ctx: whose robot's name the node has.
+        own: identity of this machine.
+        ctx: its robot's name becomes the node's name.
     """
 
     def __init__(self, connection: Connection, options: ZenohOptions, own: Identity | None, ctx: Context) -> None:
@@ -158,15 +158,15 @@ class Topics:
             return publisher
 
     def subscribe(self, topic: str, callback: Callable[[Message], object]) -> tuple[Callable[[], None], Workers[Any]]:
-        """What ends it, and the thread that calls `callback`; see `TopicTransport.subscribe_messages`."""
+        """Returns a function that unsubscribes, and the thread that calls `callback`; see `TopicTransport`."""
         name = absolute(topic, self._namespace)
-        told = _Once(self._log)
+        warn_once = _Once(self._log)
 
         def deliver(sample: zenoh.Sample) -> None:
             try:
                 message = decode(type_of_key(str(sample.key_expr)), sample.payload.to_bytes())
             except IbrobotError as error:
-                told.warning("a message on %s was passed over: %s", name, error)
+                warn_once.warning("a message on %s was skipped: %s", name, error)
                 return
             callback(message)
 
@@ -174,7 +174,7 @@ class Topics:
 
         def take(sample: zenoh.Sample) -> None:
             if subscriber.put(sample) is not None:
-                told.warning("a subscriber of %s is too slow: messages are dropped", name)
+                warn_once.warning("a subscriber of %s is too slow: messages are dropped", name)
 
         key = f"{self.options.domain}{name}/*/*"
         history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
@@ -187,7 +187,7 @@ class Topics:
         """See `TopicTransport.shared_topics`."""
         deadline = time.monotonic() + timeout_s
         found, before = self._tokens(timeout_s), None
-        # The first answer after connecting may come before the other side has sent all that it knows.
+        # The first answer after connecting may arrive before the other side has sent all its tokens.
         while found != before and time.monotonic() + _AGAIN_S < deadline:
             time.sleep(_AGAIN_S)
             found, before = self._tokens(timeout_s), found
@@ -198,7 +198,7 @@ class Topics:
         return {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
 
     def node(self, session: zenoh.Session) -> Node:
-        """Whose publishers there are on `session`."""
+        """The node of the publishers on `session`."""
         return Node(self.options.domain, str(session.info.zid()), self._name)
 
     def next_number(self) -> int:
@@ -208,13 +208,13 @@ class Topics:
 
 
 class _Once:
-    """Warns once of each kind of thing."""
+    """Logs each kind of warning once."""
 
     def __init__(self, log: logging.Logger) -> None:
         self._log = log
-        self._told: set[str] = set()
+        self._once: set[str] = set()
 
     def warning(self, text: str, *arguments: object) -> None:
-        if text not in self._told:
-            self._told.add(text)
+        if text not in self._once:
+            self._once.add(text)
             self._log.warning(text, *arguments)

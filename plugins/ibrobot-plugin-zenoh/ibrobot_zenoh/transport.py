@@ -1,4 +1,4 @@
-"""The transport: publish and subscribe, requests answered by several threads, and who is alive."""
+"""The transport: publish and subscribe, requests answered by several threads, and liveliness."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ from ibrobot_zenoh.topics import Topics
 from ibrobot_zenoh.workers import Workers
 
 SUBSCRIBER_DEPTH = 1000
-"""How many payloads may wait for a subscriber; beyond, the oldest gives way."""
+"""Queue size of a subscriber; when it is full, the oldest payload is dropped."""
 REQUESTS_WAITING = 64
-"""How many requests may wait for a server's workers; beyond, the oldest is answered that the server is overloaded."""
+"""Queue size of a server; when it is full, the oldest request fails because the server is overloaded."""
 _FAILED = zenoh.Encoding.TEXT_PLAIN
-"""Marks a server's own words, which Zenoh's about a timeout are not."""
+"""Marks error replies of a server, as opposed to Zenoh's own for a timeout."""
 
 
 @lru_cache
@@ -48,7 +48,7 @@ def _key(prefix: str, name: str) -> zenoh.KeyExpr:
 
 
 def _sendable(payload: Payload) -> bytes | bytearray:
-    """What Zenoh takes, which are no views."""
+    """A payload in a type that Zenoh accepts, which excludes views."""
     if not isinstance(payload, memoryview):
         return payload
     whole = payload.obj
@@ -61,7 +61,7 @@ class ZenohTransport(TopicTransport):
     """Payloads over Zenoh, under the keys of `ibrobot_zenoh.access`; messages as ROS 2 nodes send them.
 
     Raises:
-        TransportError: see `Connection`.
+        TransportError: as `Connection`.
     """
 
     def __init__(self, options: ZenohOptions, ctx: Context) -> None:
@@ -84,8 +84,8 @@ class ZenohTransport(TopicTransport):
             self._own.check_may_publish(topic)
         key = _key(TOPICS, topic)
         session = self._connection.open_session
-        if session is not None:  # else there is nobody who could have subscribed
-            # What waits here is the link, never a subscriber: those have queues of their own.
+        if session is not None:  # without a session there are no subscribers
+            # This may wait for the link but never for a subscriber, because subscribers have queues.
             try:
                 session.put(key, _sendable(payload), congestion_control=zenoh.CongestionControl.BLOCK)
             except zenoh.ZError as error:
@@ -110,7 +110,7 @@ class ZenohTransport(TopicTransport):
         key, token = _key(f"{SERVICES}/*", name), _key(SERVED, name).join(uuid.uuid4().hex)
 
         def answer(query: zenoh.Query) -> None:
-            with query:  # dropping it is what tells the requester that nothing more comes
+            with query:  # dropping it signals the end of replies to the requester
                 try:
                     request = query.payload
                     reply = handler(request.to_bytes() if request is not None else b"", self._sender(query))
@@ -130,7 +130,7 @@ class ZenohTransport(TopicTransport):
 
         with self._lock:
             if name in self._served:
-                raise TransportError(f"{name} is served already")
+                raise TransportError(f"{name} already has a server in this process")
             end_queries = self._connection.declare(lambda session: session.declare_queryable(key, take, complete=True))
             self._served.add(name)
         end_token = self._connection.declare(lambda session: session.liveliness().declare_token(token))
@@ -149,7 +149,7 @@ class ZenohTransport(TopicTransport):
         self._check_size(len(payload), name)
         session = self._connection.session()
         try:
-            # Replies go to a channel of this call's own: once it is gone, a late one has nowhere to go.
+            # Replies go to a channel of this call, so a late reply is discarded.
             replies = session.get(
                 key, payload=_sendable(payload), timeout=timeout_s, consolidation=zenoh.ConsolidationMode.NONE,
                 congestion_control=zenoh.CongestionControl.BLOCK, priority=zenoh.Priority.INTERACTIVE_HIGH,
@@ -169,7 +169,7 @@ class ZenohTransport(TopicTransport):
 
     @override
     def watch(self, name: str, changed: Callable[[bool], object]) -> Callable[[], None]:
-        _key(SERVED, name)  # refuses what cannot be a name
+        _key(SERVED, name)  # check the name
         self._connection.check_open()
         return self._keep(*self._presence.watch(name.removeprefix("/"), changed))
 
@@ -182,16 +182,16 @@ class ZenohTransport(TopicTransport):
         return self._keep(*self._topics.subscribe(topic, callback))
 
     def await_connection(self, timeout_s: float) -> bool:
-        """Wait up to `timeout_s` [s] for the other side; whether it has answered."""
+        """Wait up to `timeout_s` [s] for the other side; returns whether it has answered."""
         return self._connection.answered.wait(timeout_s)
 
     @property
     def why_not_connected(self) -> str:
-        """What stands between us and the other side, before it answered."""
+        """Why there is no connection yet."""
         return self._connection.why_not
 
     def is_heard(self, topic: str, type_name: str, timeout_s: float) -> bool:
-        """Whether anybody listens to messages of a type on a topic, waiting for it up to `timeout_s` [s]."""
+        """Whether a topic and type has a subscriber; waits for one up to `timeout_s` [s]."""
         return self._topics.is_heard(topic, type_name, timeout_s)
 
     @override
@@ -220,7 +220,7 @@ class ZenohTransport(TopicTransport):
         return end
 
     def _sender(self, query: zenoh.Query) -> str | None:
-        """Who asks: the access list lets nobody ask under a key of another name."""
+        """The sender of a request, which the access list allows to use only keys of its own name."""
         return (
             str(query.key_expr).removeprefix(f"{SERVICES}/").partition("/")[0]
             if self._connection.knows_who_asks

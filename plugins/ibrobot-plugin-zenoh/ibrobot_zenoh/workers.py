@@ -1,4 +1,4 @@
-"""Worker threads: items worked on in the order of arrival by a bounded number of threads."""
+"""Worker threads: process items in the order of arrival with a bounded number of threads."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ _END_S = 1.0
 
 
 class Workers[T]:
-    """Calls `work` with each item, in at most `count` threads, which start when they are needed.
+    """Calls `work` with each item, in at most `count` threads, which start when needed.
 
-    An exception of `work` is logged, and reaches no other item.
+    An exception in `work` is logged and does not affect other items.
 
     Args:
-        work: what to do with an item.
-        name: what the log and the threads are called, e.g. `a subscriber of topic`.
-        count: how many items are worked on at the same time; one keeps them in order.
-        depth: how many items may wait; None for any number.
+        work: function to call with each item.
+        name: name for the log and the threads, e.g. `a subscriber of topic`.
+        count: maximum number of threads; one preserves the order of completion.
+        depth: maximum number of waiting items; None: unlimited.
     """
 
     def __init__(self, work: Callable[[T], object], name: str, count: int = 1, depth: int | None = None) -> None:
@@ -37,11 +37,11 @@ class Workers[T]:
         self._ended = False
 
     def put(self, item: T) -> T | None:
-        """Have `item` worked on.
+        """Queue `item`.
 
         Returns:
-            What will not be worked on: the oldest item waiting, where it had to give way, or `item` itself after `end`;
-            None otherwise.
+            The item that will not be processed: the oldest one if the queue is full, or `item` itself after `end`;
+            otherwise None.
         """
         with self._arrived:
             if self._ended:
@@ -57,7 +57,7 @@ class Workers[T]:
         return gave_way
 
     def end(self) -> None:
-        """Begin nothing more. Waits a little for what is being worked on, unless called from there."""
+        """Stop processing. Waits briefly for running items, unless called from one of them."""
         with self._arrived:
             self._ended = True
             self._waiting.clear()

@@ -20,14 +20,14 @@ TLS = Tls(Path("ca.pem"), Path("certificate.pem"), Path("key.pem"))
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({}, "needs whom to connect to"),
-        ({"connect": ("gpu.lab:7447",)}, "is not an endpoint, give PROTOCOL/HOST:PORT"),
-        ({"connect": ("tcp/gpu.lab",)}, "has no port, give PROTOCOL/HOST:PORT, e.g. tcp/gpu.lab:7447"),
+        ({}, "needs endpoints to connect to"),
+        ({"connect": ("gpu.lab:7447",)}, "is not an endpoint; use PROTOCOL/HOST:PORT"),
+        ({"connect": ("tcp/gpu.lab",)}, "has no port; use PROTOCOL/HOST:PORT, e.g. tcp/gpu.lab:7447"),
         ({"connect": ("tcp/a:1",), "listen": ("tcp/127.0.0.1:1",)}, "a client does not listen"),
         ({"connect": ("tls/a:1",)}, "tls/a:1 needs tls"),
         ({"connect": ("tcp/a:1",), "tls": TLS}, "tcp/a:1 would not use tls; write tls/a:1"),
-        ({"connect": ("tcp/a:1",), "user": "me"}, "user and password belong together"),
-        ({"mode": "router", "listen": ("tcp/0.0.0.0:1",)}, "can be reached by other machines: give tls or users, or"),
+        ({"connect": ("tcp/a:1",), "user": "me"}, "set both user and password"),
+        ({"mode": "router", "listen": ("tcp/0.0.0.0:1",)}, "can be reached by other machines: set tls or users, or"),
         ({"mode": "router", "listen": ("tcp/[::]:1",)}, "can be reached by other machines"),
         ({"mode": "peer", "listen": ("tcp/gpu.lab:1",)}, "can be reached by other machines"),
         ({"connect": ("tcp/a:1",), "namespace": "a b"}, "is not a ROS 2 name"),
@@ -75,7 +75,7 @@ def test_files_that_are_not_there(options: dict[str, Any]):
         ("robot1:a\nrobot2\n", "users.txt:2: is not NAME:PASSWORD"),
         (":a\n", "users.txt:1: is not NAME:PASSWORD"),
         ("robot1:\n", "users.txt:1: is not NAME:PASSWORD"),
-        ("robot1:a\nrobot1:b\n", "users.txt:2: 'robot1' is listed already"),
+        ("robot1:a\nrobot1:b\n", "users.txt:2: 'robot1' is listed twice"),
         ("robot-1:a\n", "users.txt:1: 'robot-1' cannot be a robot's name"),
     ],
 )
@@ -124,7 +124,7 @@ def test_users_are_distinguished_by_their_passwords(tmp_path: Path):
     settle(server, robots["robot2"], "robot2")
     assert [robots["robot1"].request("who", b"", WAIT_S) for _ in range(5)] == [b"robot1"] * 5
     for name, robot in robots.items():
-        with pytest.raises(TransportError, match="may publish below"):
+        with pytest.raises(TransportError, match="may publish only below"):
             robot.publish("state", b"")
         robot.publish(f"{name}/state", name.encode())
         assert arrived.get(timeout=WAIT_S) == name.encode()

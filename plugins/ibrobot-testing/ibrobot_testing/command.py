@@ -1,4 +1,4 @@
-"""The command `ibrobot` for tests that run it in a process of its own."""
+"""The command `ibrobot`, for tests that run it in a separate process."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import sys
 
 
 def ibrobot_command(before: str = "") -> tuple[str, ...]:
-    """The beginning of a command line that runs `ibrobot` with this interpreter; its arguments follow.
+    """The beginning of a command line that runs `ibrobot` with this interpreter; append its arguments.
 
     Args:
         before: Python source that the process runs first.

@@ -8,14 +8,14 @@ from typing import Any
 from ibrobot_core.api import NS_PER_S, Bus, Clock, Context, Description, Joint, Robot, SteppedClock
 
 START_NS = 1_700_000_000 * NS_PER_S
-"""Where the stepped clock of a test begins [ns]: a plausible date, so that stamps near zero stand out."""
+"""Initial time of a test's stepped clock [ns]: a plausible date, so that stamps near zero are conspicuous."""
 
 ARM = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
 GRIPPER = ("gripper",)
 
 
 def make_robot() -> Robot:
-    """A robot of six joints in the groups `arm` and `gripper`; limits differ from joint to joint and side to side."""
+    """A robot with six joints in the groups `arm` and `gripper`; all limits are different and asymmetric."""
     limits = ((-1.9, 1.8), (-1.7, 1.6), (-1.6, 1.7), (-1.5, 1.65), (-2.7, 2.8), (-0.2, 1.7))
     joints = tuple(
         Joint(name, lower, upper, max_velocity=2.0 + 0.25 * i, max_acceleration=10.0 + i)

@@ -17,17 +17,17 @@ Values = Mapping[str, NDArray[np.generic]]
 
 
 class DatasetSuite(Suite[DatasetWriter]):
-    """What every `DatasetWriter` must do. The subclass reads back what was written: `read_back`."""
+    """Checks of every `DatasetWriter`. The subclass defines `read_back`."""
 
     fps: ClassVar[float] = 30.0
     features: ClassVar[Mapping[str, Feature]] = {
         "observation.state": Feature("float32", (3,), ("a", "b", "c")),
         "action": Feature("float32", (2,), ("a", "b")),
     }
-    """Features whose values come back to the bit."""
+    """Features whose values must be reproduced bit by bit."""
 
     def read_back(self, root: Path) -> Sequence[Values]:
-        """The saved episodes in order: key -> all its frames, stacked along the first axis; also before `finalize`."""
+        """The saved episodes in order, as key -> frames stacked along the first axis; also before `finalize`."""
         raise NotImplementedError(f"{type(self).__name__} must define read_back(self, root)")
 
     def created(self, root: Path) -> DatasetWriter:
@@ -50,7 +50,7 @@ class DatasetSuite(Suite[DatasetWriter]):
                 np.testing.assert_array_equal(values[key], wanted, err_msg=key)
 
     def test_gives_back_what_was_written(self, tmp_path: Path) -> None:
-        """Episodes are numbered from 0 and every value comes back to the bit."""
+        """Episodes are numbered from 0, and every value is reproduced bit by bit."""
         writer = self.created(tmp_path / "set")
         for episode, numbers in enumerate(((0, 1, 2), (3, 4))):
             for i in numbers:
@@ -60,7 +60,7 @@ class DatasetSuite(Suite[DatasetWriter]):
         self._check(tmp_path / "set", [(0, 1, 2), (3, 4)])
 
     def test_never_writes_over_anything(self, tmp_path: Path) -> None:
-        """A root with something in it is refused and left as it is; an empty one is not."""
+        """A non-empty root is refused and not changed; an empty one is accepted."""
         (tmp_path / "empty").mkdir()
         writer = self.created(tmp_path / "empty")
         writer.finalize()
@@ -71,7 +71,7 @@ class DatasetSuite(Suite[DatasetWriter]):
         assert [p.name for p in (tmp_path / "full").iterdir()] == ["old.txt"]
 
     def test_refuses_frames_that_do_not_fit(self, tmp_path: Path) -> None:
-        """A missing, unknown or misshapen value is a DatasetError that names it; the episode stays as it was."""
+        """A missing, unknown or misshapen value is a DatasetError that names it; the episode is unchanged."""
         writer = self.created(tmp_path / "set")
         writer.add_frame(self.frame(0), "pick")
         key = next(iter(self.features))
@@ -98,7 +98,7 @@ class DatasetSuite(Suite[DatasetWriter]):
         self._check(tmp_path / "set", [(0,)])
 
     def test_a_saved_episode_survives(self, tmp_path: Path) -> None:
-        """What was saved can be read before, and without, `finalize`."""
+        """Saved episodes can be read before, and without, `finalize`."""
         writer = self.created(tmp_path / "set")
         try:
             writer.add_frame(self.frame(0), "pick")

@@ -1,4 +1,4 @@
-"""What every descriptor must say, for tests of plugins."""
+"""Checks of descriptors, for tests of plugins."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from ibrobot_core.api import Descriptor, ExecutorDescriptor, HardwareDescriptor,
 
 
 def check_descriptor(descriptor: Descriptor[Any], options: Any) -> None:
-    """Check what a descriptor says for some options: what core asks of it before anything is made.
+    """Check the functions of a descriptor that core calls before it creates an object.
 
     Args:
-        descriptor: as the plugin's hook gives it.
-        options: of its class, e.g. with a calibration, or with the size of pictures.
+        descriptor: a descriptor from the plugin's hook.
+        options: options of its class, e.g. with a calibration or an image size.
 
     Raises:
-        AssertionError: for the first member that is wrong.
+        AssertionError: if a function returns a wrong value.
     """
     name = descriptor.type
     assert name, "type is empty"

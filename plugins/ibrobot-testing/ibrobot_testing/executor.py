@@ -15,19 +15,19 @@ from ibrobot_testing.suite import Suite
 
 
 class ExecutorSuite(Suite[Executor]):
-    """What every `Executor` must do. Where it takes goals, the subclass says which: `goal` and `wrong_goals`."""
+    """Checks of every `Executor`. If it accepts goals, the subclass defines `goal` and `wrong_goals`."""
 
     tolerance_rad: ClassVar[float] = 1e-6
-    """How far a held setpoint may be from the position to hold [rad]."""
+    """Allowed distance of a held setpoint from the position to hold [rad]."""
     goal_ticks: ClassVar[int] = 2000
-    """Ticks within which a goal must end."""
+    """Maximum number of ticks for a goal."""
 
     @override
     def context(self) -> Context:
         return control_context(joints=ARM)
 
     def goal(self, ctx: Context, position: Vector) -> Mapping[str, Any] | None:
-        """A goal that ends at `position` [rad], shape (J,); None for executors that take no goals."""
+        """A goal that ends at `position` [rad], shape (J,); None for executors that do not accept goals."""
         return None
 
     def wrong_goals(self, ctx: Context) -> list[Mapping[str, Any]]:
@@ -35,13 +35,13 @@ class ExecutorSuite(Suite[Executor]):
         return [{}, {"nonsense": 1}]
 
     def poses(self, ctx: Context) -> list[Vector]:
-        """Positions [rad], each shape (J,): none at zero, all within limits."""
+        """Positions [rad], each shape (J,): nonzero and within limits."""
         order = ctx.robot.indices(ctx.joints)
         lower, upper = ctx.robot.lower[order], ctx.robot.upper[order]
         return [lower + share * (upper - lower) for share in (0.3, 0.35, 0.65)]
 
     def active(self) -> tuple[Executor, Context, Vector]:
-        """An executor that took over at the first of `poses`, with its context and that position."""
+        """An executor activated at the first of `poses`, with its context and that position."""
         ctx = self.context()
         executor = self.make(ctx)
         start = self.poses(ctx)[0]
@@ -55,7 +55,7 @@ class ExecutorSuite(Suite[Executor]):
         return goal
 
     def _follow(self, executor: Executor, ctx: Context, position: Vector, ticks: int) -> list[Vector]:
-        """Setpoints of `ticks` ticks with joints that follow them at once, from `position`."""
+        """Setpoints of `ticks` ticks, from `position`, with joints that follow immediately."""
         setpoints = []
         for _ in range(ticks):
             position = executor.update(tick(ctx, position)).copy()
@@ -68,7 +68,7 @@ class ExecutorSuite(Suite[Executor]):
         assert self.make(ctx).joints == ctx.joints
 
     def test_activation_holds_the_measured_position(self) -> None:
-        """From the first tick the setpoint is where the joints were, and it does not follow them when they sag."""
+        """From the first tick, the setpoint is the initial position and does not follow the joints when they sag."""
         ctx = self.context()
         executor = self.make(ctx)
         for pose in self.poses(ctx):
@@ -79,7 +79,7 @@ class ExecutorSuite(Suite[Executor]):
             executor.deactivate()
 
     def test_activation_wants_torque(self) -> None:
-        """`wants_relax` is False once activated, also after a life in which it was True."""
+        """`wants_relax` is False after activation, even if it was True before."""
         executor, ctx, start = self.active()
         assert executor.wants_relax is False
         if executor.accepts_plans:
@@ -91,7 +91,7 @@ class ExecutorSuite(Suite[Executor]):
         assert executor.wants_relax is False
 
     def test_setpoints_are_complete(self) -> None:
-        """Every tick gives a finite number for each joint."""
+        """Every setpoint has a finite value for each joint."""
         executor, ctx, start = self.active()
         for noise in np.random.default_rng(0).normal(0, 0.02, (20, len(start))):
             setpoint = executor.update(tick(ctx, start + noise))
@@ -100,7 +100,7 @@ class ExecutorSuite(Suite[Executor]):
             assert np.isfinite(setpoint).all()
 
     def test_keeps_no_hold_of_the_callers_arrays(self) -> None:
-        """Buffers that the caller uses again do not change what is held, and nothing given is changed."""
+        """The executor keeps no reference to the caller's arrays, and does not change them."""
         executor, ctx, start = self.active()
         reading = measure(ctx, start)
         executor.activate(reading)
@@ -112,7 +112,7 @@ class ExecutorSuite(Suite[Executor]):
         np.testing.assert_allclose(executor.update(tick(ctx, start)), start, atol=self.tolerance_rad)
 
     def test_deactivation_forgets(self) -> None:
-        """After `deactivate` neither plan nor goal lives on: the next activation holds."""
+        """`deactivate` discards plan and goal: the next activation holds."""
         executor, ctx, start = self.active()
         target, elsewhere = self.poses(ctx)[1:]
         if executor.accepts_plans:
@@ -142,7 +142,7 @@ class ExecutorSuite(Suite[Executor]):
             np.testing.assert_allclose(position, point, atol=self.tolerance_rad, err_msg=f"point {i}")
 
     def test_refuses_an_impossible_plan(self) -> None:
-        """A plan with NaN or of another width is counted, and the old setpoint stays."""
+        """A plan with NaN or a wrong width is counted, and the old setpoint remains."""
         executor, ctx, start = self.active()
         if not executor.accepts_plans:
             pytest.skip("accepts no plans")
@@ -172,7 +172,7 @@ class ExecutorSuite(Suite[Executor]):
         np.testing.assert_allclose(position, target, atol=0.05)
 
     def test_a_rejected_goal_leaves_the_old_one(self) -> None:
-        """A wrong goal raises GoalRejected, and what was under way goes on to the bit."""
+        """A wrong goal raises GoalRejected, and the present goal continues unchanged, bit by bit."""
         executor, ctx, start = self.active()
         twin = self.make(ctx)
         twin.activate(measure(ctx, start))
@@ -232,7 +232,7 @@ def tick(ctx: Context, position: Vector) -> JointReading:
 
 
 def plan_towards(ctx: Context, start: Vector, target: Vector) -> Plan:
-    """A plan of ten slow points from `start` some way to `target`, beginning two ticks from now."""
+    """A plan of ten slow points from `start` towards `target`, which begins in two ticks."""
     shares = np.linspace(0.0, 0.2, 10)[:, None]
     positions = start + shares * (target - start)
     return Plan(ctx.clock.now_ns() + 2 * ctx.period_ns, 3 * ctx.period_ns, positions)

@@ -27,21 +27,21 @@ from ibrobot_testing.suite import Suite
 
 
 class HardwareSuite(Suite[Hardware]):
-    """What every `Hardware` must do. A driver runs it against a fake of its bus."""
+    """Checks of every `Hardware`. A driver uses a fake of its bus."""
 
     settle_s = 1.0
-    """Time in which every joint comes at least half-way to a command near by [s]."""
+    """Time within which every joint moves at least half-way to a nearby command [s]."""
     move_rad = 0.2
-    """How far the checks move a joint [rad]."""
+    """Distance by which the checks move a joint [rad]."""
     tolerance_rad = 0.03
-    """How far a joint that holds may be from where it was [rad]."""
+    """Allowed motion of a holding joint [rad]."""
 
     @override
     def context(self) -> Context:
         return control_context()
 
     def elapse(self, hardware: Hardware, ctx: Context, duration_s: float) -> None:
-        """Let `duration_s` [s] pass; override where a fake bus needs the time."""
+        """Let `duration_s` [s] pass; override it if a fake bus must be advanced."""
         for _ in range(max(1, round(ns(duration_s) / ctx.period_ns))):
             ctx.clock.sleep_until(ctx.clock.now_ns() + ctx.period_ns)
             if isinstance(hardware, SimulatedHardware):
@@ -61,7 +61,7 @@ class HardwareSuite(Suite[Hardware]):
     def moved(self, hardware: Hardware, ctx: Context) -> Vector:
         """Move every joint towards the middle of its range and return the measured position [rad], shape (J,).
 
-        Without this a check for holding would pass hardware that always goes to zero.
+        Without this, hardware that always moves to zero would pass the checks of holding.
         """
         start = hardware.read().position.copy()
         goal = self._target(hardware, ctx)
@@ -83,7 +83,7 @@ class HardwareSuite(Suite[Hardware]):
         assert self.make(ctx).joints == ctx.joints
 
     def test_reading_is_complete(self) -> None:
-        """Every vector has one number a joint; positions and velocities are finite."""
+        """Every vector has one value per joint; positions and velocities are finite."""
         with self.connected() as (hardware, ctx):
             self.elapse(hardware, ctx, 0.0)
             reading = hardware.read()
@@ -107,14 +107,14 @@ class HardwareSuite(Suite[Hardware]):
                 previous = stamp_ns
 
     def test_holds_where_it_is(self) -> None:
-        """Joints stay where the last command brought them, with nobody writing."""
+        """Without further commands, joints stay where the last one moved them."""
         with self.connected() as (hardware, ctx):
             before = self.moved(hardware, ctx)
             self.elapse(hardware, ctx, self.settle_s)
             np.testing.assert_allclose(hardware.read().position, before, atol=self.tolerance_rad)
 
     def test_connecting_moves_nothing(self) -> None:
-        """After `connect` the joints hold where they are, also when they are not at zero."""
+        """After `connect` the joints hold their positions, even if these are not zero."""
         with self.connected() as (hardware, ctx):
             self.moved(hardware, ctx)
             hardware.disconnect()
@@ -148,7 +148,7 @@ class HardwareSuite(Suite[Hardware]):
             np.testing.assert_allclose(hardware.read().position, before, atol=self.tolerance_rad)
 
     def test_keeps_no_hold_of_the_callers_arrays(self) -> None:
-        """A command is taken as it was at `write`, and a reading stays as it was at `read`."""
+        """Later changes of the caller's array do not affect a command, and a reading does not change after `read`."""
         with self.connected() as (hardware, ctx):
             start = hardware.read()
             copy = start.position.copy()
@@ -163,7 +163,7 @@ class HardwareSuite(Suite[Hardware]):
             np.testing.assert_array_equal(start.position, copy, err_msg="an earlier reading changed")
 
     def test_disconnect_is_safe_at_any_time(self) -> None:
-        """`disconnect` may come before `connect` and twice; `connect` works again afterwards."""
+        """`disconnect` may be called before `connect` and twice; `connect` works again afterwards."""
         hardware = self.make(self.context())
         hardware.disconnect()
         hardware.connect()
@@ -176,7 +176,7 @@ class HardwareSuite(Suite[Hardware]):
             hardware.disconnect()
 
     def test_refuses_use_while_disconnected(self) -> None:
-        """`read` and `write` raise HardwareError once disconnected, rather than repeat what was."""
+        """`read` and `write` raise HardwareError after `disconnect`, instead of repeating old values."""
         with self.connected() as (hardware, _):
             position = hardware.read().position
         with pytest.raises(HardwareError):
@@ -185,7 +185,7 @@ class HardwareSuite(Suite[Hardware]):
             hardware.write(position)
 
     def test_relax_reports_torque_and_what_holds_it(self) -> None:
-        """`relax` is not supported, or says what became of torque; `holding` agrees, with a place and a command."""
+        """`relax` is not supported, or returns the torque state; `holding` agrees, with a place and a command."""
         with self.connected() as (hardware, ctx):
             before = hardware.holding()
             try:
@@ -204,7 +204,7 @@ class HardwareSuite(Suite[Hardware]):
             assert (hardware.holding() is None) == (before is None), "after a write it holds as it did before relax"
 
     def test_holding_is_known_while_disconnected(self) -> None:
-        """`holding` answers before `connect`, when nothing holds, and as before after `disconnect`."""
+        """`holding` works before `connect`, when nothing holds; `disconnect` does not change it."""
         assert self.make(self.context()).holding() is None
         with self.connected() as (hardware, _):
             held = hardware.holding()
@@ -220,7 +220,7 @@ class HardwareSuite(Suite[Hardware]):
             assert np.isfinite(hardware.read().position).all()
 
     def test_conditions_are_of_its_joints(self) -> None:
-        """Every condition of `health` is of a joint of this hardware, finite, with a message; none comes twice."""
+        """Every condition of `health` is about a joint of this hardware, finite, unique, and has a message."""
         with self.connected() as (hardware, ctx):
             for _ in range(3):
                 self.elapse(hardware, ctx, 0.5)
@@ -235,7 +235,7 @@ class HardwareSuite(Suite[Hardware]):
                 assert len(set(keys)) == len(keys), f"two conditions of one quantity: {keys}"
 
     def test_relax_ends_with_the_next_write(self) -> None:
-        """`relax` is not supported, or the next `write` puts torque back on."""
+        """`relax` is not supported, or the next `write` switches the torque on again."""
         with self.connected() as (hardware, ctx):
             try:
                 hardware.relax()
@@ -257,7 +257,7 @@ class HardwareSuite(Suite[Hardware]):
             np.testing.assert_allclose(hardware.read().position, before, atol=self.tolerance_rad)
 
     def test_signals_fill_their_vectors(self) -> None:
-        """Every declared signal has a topic of its own and writes as many numbers as it declares."""
+        """Every declared signal has a unique topic and writes as many values as it declares."""
         with self.connected() as (hardware, ctx):
             self.elapse(hardware, ctx, 0.0)
             topics = [signal.topic for signal in hardware.signals]
@@ -272,7 +272,7 @@ class HardwareSuite(Suite[Hardware]):
 
 
 class SimulatedHardwareSuite(HardwareSuite):
-    """What every `SimulatedHardware` must do, beyond `HardwareSuite`."""
+    """Checks of every `SimulatedHardware`, in addition to `HardwareSuite`."""
 
     def _run(self, hardware: SimulatedHardware, ctx: Context, seed: int) -> list[JointReading]:
         hardware.reset(EpisodeSetup(seed))
@@ -291,7 +291,7 @@ class SimulatedHardwareSuite(HardwareSuite):
             yield hardware, ctx
 
     def test_time_passes_only_by_advance(self) -> None:
-        """Two readings without `advance` between them are equal, whatever the clock does."""
+        """Two readings without `advance` in between are equal, independent of the clock."""
         with self.simulated() as (hardware, ctx):
             hardware.write(self._target(hardware, ctx))
             self.elapse(hardware, ctx, 0.0)
@@ -303,7 +303,7 @@ class SimulatedHardwareSuite(HardwareSuite):
             np.testing.assert_array_equal(first.velocity, second.velocity)
 
     def test_equal_seeds_run_alike(self) -> None:
-        """After `reset` with the same seed the same commands give the same bits, whatever happened before."""
+        """After `reset` with the same seed, the same commands give identical results, whatever happened before."""
         with self.simulated() as (hardware, ctx):
             first = self._run(hardware, ctx, 7)
             signals = self._signals(hardware)
@@ -316,13 +316,13 @@ class SimulatedHardwareSuite(HardwareSuite):
                 np.testing.assert_array_equal(x, y)
 
     def test_equal_seeds_run_alike_in_another_object(self) -> None:
-        """A second simulation with the same seed gives the same bits as the first."""
+        """A second simulation with the same seed gives identical results."""
         with self.simulated() as (hardware, ctx), self.simulated() as (twin, twin_ctx):
             for a, b in zip(self._run(hardware, ctx, 7), self._run(twin, twin_ctx, 7), strict=True):
                 np.testing.assert_array_equal(a.position, b.position)
 
     def test_reset_holds(self) -> None:
-        """After `reset` nothing moves: an old command is forgotten."""
+        """After `reset` nothing moves: old commands are discarded."""
         with self.simulated() as (hardware, ctx):
             self.moved(hardware, ctx)
             hardware.reset(EpisodeSetup(1))

@@ -1,6 +1,6 @@
-"""What a test leaves behind: threads, child processes, open files and ports.
+"""Resource leaks of tests: threads, child processes, open files and ports.
 
-Every suite checks it. For all other tests of a project, its pytest configuration says `usefixtures = ["no_leaks"]`.
+Every suite checks them. For other tests of a project, set `usefixtures = ["no_leaks"]` in its pytest configuration.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ import attrs
 import pytest
 
 type Kind = Literal["thread", "process", "file", "port"]
-"""Kinds of leaks; a port is that of an open socket of the internet protocols."""
+"""Kinds of leaks; a port is an open TCP or UDP socket."""
 
 _SHARED = ("/dev/dri", "/dev/nvidia", "/dev/urandom", "/dev/null", "anon_inode:[eventpoll]", get_path("platlib"))
-"""Files that libraries open once and keep, such as a GPU's device, or Matplotlib's fonts among its own files."""
+"""Files that libraries open once and keep open, such as a GPU's device or Matplotlib's fonts."""
 
 
 _POLL_S = 0.05
@@ -42,13 +42,13 @@ def _check_reasons(_: object, __: object, allow: Mapping[Kind, str]) -> None:
 
 @attrs.frozen
 class LeakCheck:
-    """What a test may leave behind: nothing, unless `allow` says why.
+    """A check for leaks of a test, with exceptions that need a reason.
 
-    Files, ports and child processes are found on Linux only.
+    Files, ports and child processes are detected on Linux only.
 
     Attributes:
-        allow: kind of leak -> the reason why it is not a fault.
-        grace_s: how long threads, processes and connections may take to end [s].
+        allow: kind of leak -> reason why it is allowed.
+        grace_s: time for threads, processes and connections to end [s].
     """
 
     allow: Mapping[Kind, str] = attrs.field(factory=dict[Kind, str], validator=_check_reasons)
@@ -56,20 +56,20 @@ class LeakCheck:
 
     @contextmanager
     def watch(self) -> Iterator[None]:
-        """Fail the test if the block leaves something behind.
+        """Fail the test if the block leaks a resource.
 
         Raises:
-            pytest.fail.Exception: names each thread, process, file and port that the block has left behind.
+            pytest.fail.Exception: if there is a leak; names each thread, process, file and port.
         """
         if os.name == "posix":
-            resource_tracker.ensure_running()  # it lives as long as the interpreter, so it counts as there before
+            resource_tracker.ensure_running()  # it lives as long as the interpreter and is not a leak
         before = _Found.now()
         yield
         deadline = time.monotonic() + self.grace_s
         self._join_threads(before, deadline)
         left = self._left_since(before)
         if left:
-            gc.collect()  # a file without references is closed only now: untidy, but no leak
+            gc.collect()  # closes files without references, which are not leaks
             left = self._left_since(before)
         while left and time.monotonic() < deadline:  # e.g. a server's end of a connection, which its thread closes
             time.sleep(_POLL_S)
@@ -78,13 +78,13 @@ class LeakCheck:
             pytest.fail("the test left behind: " + "; ".join(left), pytrace=False)
 
     def _join_threads(self, before: _Found, deadline: float) -> None:
-        """Wait for the threads that are ending."""
+        """Wait for ending threads."""
         if "thread" not in self.allow:
             for thread in _Found.now().threads - before.threads:
                 thread.join(max(0.0, deadline - time.monotonic()))
 
     def _left_since(self, before: _Found) -> list[str]:
-        """What there is now beyond `before` and is not allowed, in words."""
+        """Descriptions of the leaks since `before` that are not allowed."""
         now = _Found.now()
         left: list[tuple[Kind, str]] = [("thread", f"thread {t.name!r}") for t in now.threads - before.threads]
         left += [("process", f"process {i}: {text}") for i, text in now.children.items() if i not in before.children]
@@ -94,7 +94,7 @@ class LeakCheck:
 
 @attrs.frozen
 class _Found:
-    """What this process has at some moment."""
+    """The resources of this process at one moment."""
 
     threads: set[threading.Thread]
     children: dict[int, str]
@@ -102,13 +102,13 @@ class _Found:
 
     @classmethod
     def now(cls) -> Self:
-        # Dummy threads are libraries' own: Python cannot join them, and may take them for alive long after their end.
+        # Dummy threads belong to libraries: Python cannot join them, and may report them as alive long after their end.
         threads = {thread for thread in threading.enumerate() if not isinstance(thread, threading._DummyThread)}
         return cls(threads, _child_processes(), _open_files())
 
 
 def _open_files() -> dict[int, str]:
-    """Descriptor -> what it is open on; empty where the system does not tell."""
+    """Descriptor -> its target; empty if the system does not provide it."""
     found: dict[int, str] = {}
     directory = Path("/proc/self/fd")
     for name in os.listdir(directory) if directory.exists() else ():
@@ -122,7 +122,7 @@ def _open_files() -> dict[int, str]:
 
 
 def _child_processes() -> dict[int, str]:
-    """Process id -> command line of every child, ended ones that nobody waited for included."""
+    """Process id -> command line of every child, including zombies."""
     found: dict[int, str] = {}
     for children in Path("/proc/self/task").glob("*/children"):
         pids: list[str] = []
@@ -146,6 +146,6 @@ def _describe(fd: int, target: str) -> tuple[Kind, str]:
 
 @pytest.fixture
 def no_leaks() -> Iterator[None]:
-    """Fail a test that leaves something behind."""
+    """Fail a test that leaks a resource."""
     with LeakCheck().watch():
         yield

@@ -15,10 +15,10 @@ from ibrobot_testing.suite import Suite
 
 
 class PlannerSuite(Suite[Planner]):
-    """What every `Planner` must do with joint goals."""
+    """Checks of every `Planner` with joint goals."""
 
     tolerance_rad: ClassVar[float] = 1e-6
-    """How far the ends of a trajectory may be from what was asked [rad]."""
+    """Allowed distance of a trajectory's ends from start and goal [rad]."""
     samples: ClassVar[int] = 20
     """Samples between two points, at which limits are checked."""
 
@@ -34,7 +34,7 @@ class PlannerSuite(Suite[Planner]):
             planner.close()
 
     def request(self, ctx: Context, seed: int, joints: tuple[str, ...] | None = None) -> PlanRequest:
-        """A request between random positions within limits; override where these would collide."""
+        """A request between random positions within limits; override it if these could collide."""
         joints = ctx.robot.joint_names if joints is None else joints
         order = ctx.robot.indices(joints)
         lower, upper = ctx.robot.lower[order], ctx.robot.upper[order]
@@ -54,7 +54,7 @@ class PlannerSuite(Suite[Planner]):
                 assert (np.diff([p.time_from_start_ns for p in points]) > 0).all(), "times must increase"
 
     def test_names_the_joints_asked_for(self) -> None:
-        """The trajectory has exactly the request's joints, in its order, and a number for each in every point."""
+        """The trajectory has exactly the request's joints, in its order, and a value for each in every point."""
         with self.loaded() as (planner, ctx):
             for joints in (ctx.robot.joint_names, ctx.robot.joint_names[::-1], ctx.robot.joint_names[1:3]):
                 request = self.request(ctx, 1, joints)
@@ -74,14 +74,14 @@ class PlannerSuite(Suite[Planner]):
                     np.testing.assert_allclose(point.velocities, 0.0, atol=1e-6)
 
     def test_keeps_the_limits(self) -> None:
-        """Sampled between its points, no trajectory leaves the limits on position, velocity and acceleration."""
+        """A trajectory, sampled between its points, stays within the limits of position, velocity and acceleration."""
         with self.loaded() as (planner, ctx):
             for seed in range(5):
                 request = self.request(ctx, seed)
                 check_limits(planner.plan(request).trajectory, request, ctx, self.samples)
 
     def test_scaling_slows_down(self) -> None:
-        """Scaled limits are kept as the whole ones are."""
+        """Scaled limits are observed in the same way."""
         with self.loaded() as (planner, ctx):
             whole = self.request(ctx, 3)
             for velocity, acceleration in ((0.3, 1.0), (1.0, 0.3), (0.1, 0.1)):
@@ -99,7 +99,7 @@ class PlannerSuite(Suite[Planner]):
                 np.testing.assert_allclose(others, 0.0, atol=self.tolerance_rad)
 
     def test_no_way_to_go_is_a_trajectory_too(self) -> None:
-        """A goal where the joints are gives a trajectory that stays there."""
+        """A goal at the present positions gives a trajectory that stays there."""
         with self.loaded() as (planner, ctx):
             request = self.request(ctx, 5)
             stay = attrs.evolve(request, goal=JointGoal(request.joints, request.start))

@@ -18,13 +18,13 @@ _STEP_NS = 33_333_333
 
 
 class PolicySuite(Suite[Policy]):
-    """What every `Policy` must do."""
+    """Checks of every `Policy`."""
 
     any_size: ClassVar[int] = 16
-    """What stands for -1 in the shapes of the frames that `frame` makes."""
+    """Replacement of -1 in the shapes of `frame`."""
 
     def frame(self, policy: Policy, ctx: Context, seed: int) -> Frame:
-        """A frame with all that the policy's spec asks for; override where random numbers will not do."""
+        """A frame with all inputs of the policy's spec; override it if random numbers are not suitable."""
         rng = np.random.default_rng(seed)
         now_ns = ctx.clock.now_ns()
         past = tuple(Frame(now_ns - i * _STEP_NS, self._values(policy, rng)) for i in range(policy.spec.history, 0, -1))
@@ -78,7 +78,7 @@ class PolicySuite(Suite[Policy]):
                 _check_chunk(chunk, policy.spec)
 
     def test_a_prefix_of_any_length_is_taken(self) -> None:
-        """A policy that says `prefix` gives chunks as specified for one action, some, and a whole chunk."""
+        """A policy with `prefix` returns valid chunks for prefixes of one action, several, and a whole chunk."""
         with self.loaded() as (policy, ctx):
             if not policy.spec.prefix:
                 pytest.skip("takes no prefix")
@@ -89,7 +89,7 @@ class PolicySuite(Suite[Policy]):
                     _check_chunk(policy.postprocess(policy.infer(policy.preprocess(frame))), policy.spec)
 
     def test_a_missing_key_is_refused(self) -> None:
-        """A frame without one of the keys that the spec names is a PolicyError that says which."""
+        """A frame that lacks a key of the spec is a PolicyError that names the key."""
         with self.loaded() as (policy, ctx):
             whole = self.frame(policy, ctx, 1)
             for key in policy.spec.observations:
@@ -98,7 +98,7 @@ class PolicySuite(Suite[Policy]):
                     policy.preprocess(attrs.evolve(whole, values=values, missing=frozenset({key})))
 
     def test_a_history_of_any_length_is_taken(self) -> None:
-        """A policy that says `history` gives chunks as specified at an episode's first tick, and soon after."""
+        """A policy with `history` returns valid chunks at an episode's first tick and soon after."""
         with self.loaded() as (policy, ctx):
             if not policy.spec.history:
                 pytest.skip("sees no history")
@@ -108,7 +108,7 @@ class PolicySuite(Suite[Policy]):
                 _check_chunk(policy.postprocess(policy.infer(policy.preprocess(short))), policy.spec)
 
     def test_equal_seeds_act_alike(self) -> None:
-        """After `reset` with the same seed the same frames give the same bits, whatever happened before."""
+        """After `reset` with the same seed, the same frames give identical results, whatever happened before."""
         with self.loaded() as (policy, ctx):
             first = self._run(policy, ctx, 3)
             self._run(policy, ctx, 4)
@@ -116,7 +116,7 @@ class PolicySuite(Suite[Policy]):
                 np.testing.assert_array_equal(a, b)
 
     def test_inputs_stay_as_they_were(self) -> None:
-        """No step changes what it is given."""
+        """No step changes its input."""
         with self.loaded() as (policy, ctx):
             frame = self.frame(policy, ctx, 1)
             before = copied_tensors(frame.values)
@@ -130,7 +130,7 @@ class PolicySuite(Suite[Policy]):
             assert _equal(outputs, before), "postprocess changed its input"
 
     def test_outputs_stay_as_they_were(self) -> None:
-        """A chunk does not change when the next one is made."""
+        """A chunk does not change when the next one is computed."""
         with self.loaded() as (policy, ctx):
             chunk = policy.postprocess(policy.infer(policy.preprocess(self.frame(policy, ctx, 1))))
             before = chunk.copy()
@@ -138,7 +138,7 @@ class PolicySuite(Suite[Policy]):
             np.testing.assert_array_equal(chunk, before)
 
     def test_pre_and_postprocess_are_pure(self) -> None:
-        """Twice the same input gives twice the same output."""
+        """The same input gives the same output."""
         with self.loaded() as (policy, ctx):
             frame = self.frame(policy, ctx, 1)
             inputs = policy.preprocess(frame)
@@ -157,7 +157,7 @@ class PolicySuite(Suite[Policy]):
             np.testing.assert_array_equal(here, there)
 
     def test_a_batch_is_as_good_as_one_by_one(self) -> None:
-        """`infer_batch` gives as many outputs as inputs, in their order, as `infer` would, none in another's memory."""
+        """`infer_batch` returns the outputs of `infer` in the order of the inputs, without shared memory."""
         with self.loaded() as (policy, ctx):
             if policy.spec.stateful:
                 pytest.skip("each request changes what it remembers")
@@ -169,7 +169,7 @@ class PolicySuite(Suite[Policy]):
                 np.testing.assert_allclose(policy.postprocess(outputs), alone, rtol=1e-4, atol=1e-5)
 
     def test_the_edge_needs_no_weights(self) -> None:
-        """One that was never loaded pre- and postprocesses for another's `infer`, and both agree on the fingerprint."""
+        """An unloaded policy can pre- and postprocess for another's `infer`, with the same fingerprint."""
         with self.loaded() as (policy, ctx):
             edge = self.make(ctx)
             try:
@@ -186,13 +186,13 @@ class PolicySuite(Suite[Policy]):
                 edge.close()
 
     def test_weights_have_one_hash(self) -> None:
-        """`weights` is empty or a short text that is the same whenever the same weights are loaded."""
+        """`weights` is empty or a short text, and equal for equal weights."""
         with self.loaded() as (one, _), self.loaded() as (other, _):
             assert one.weights() == other.weights()
             assert len(one.weights().encode()) <= 128
 
     def test_infer_remembers_nothing(self) -> None:
-        """The same input gives the same output, whatever came between, unless the spec says that it is stateful."""
+        """The same input gives the same output, whatever happens in between, unless the spec is stateful."""
         with self.loaded() as (policy, ctx):
             if policy.spec.stateful:
                 pytest.skip("says that it remembers")

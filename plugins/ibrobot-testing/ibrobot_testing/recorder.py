@@ -31,19 +31,19 @@ Record = tuple[int, Message]
 
 
 class RecorderSuite(Suite[Recorder]):
-    """What every `Recorder` must do. The subclass reads back what was written: `read_back` and `read_metadata`."""
+    """Checks of every `Recorder`. The subclass defines `read_back` and `read_metadata`."""
 
     topic: ClassVar[str] = "/joint_states"
-    """A topic of JointState that the recorder keeps."""
+    """A topic of JointState that the recorder stores."""
     max_loss_s: ClassVar[float] = 1.0
-    """The most that a crash may cost [s]."""
+    """Maximum loss after a crash [s]."""
 
     def read_back(self, path: Path) -> Mapping[str, Sequence[Record]]:
         """Topic -> records, in the order written; `path` may also be a copy of an unfinished episode."""
         raise NotImplementedError(f"{type(self).__name__} must define read_back(self, path)")
 
     def read_metadata(self, path: Path) -> Mapping[str, str]:
-        """What `EpisodeStart.metadata` became, and `outcome`."""
+        """The stored `EpisodeStart.metadata`, and `outcome`."""
         raise NotImplementedError(f"{type(self).__name__} must define read_metadata(self, path)")
 
     def records(self, ctx: Context, count: int = 50) -> list[Record]:
@@ -77,7 +77,7 @@ class RecorderSuite(Suite[Recorder]):
             recorder.write(self.topic, message, received_ns)
 
     def test_gives_back_what_was_written(self, tmp_path: Path) -> None:
-        """Every message comes back, to the bit, in order, with its receive stamp."""
+        """Every message is reproduced bit by bit, in order, with its time of receipt."""
         with self.recording(tmp_path / "episode") as (recorder, ctx):
             self._write(recorder, self.records(ctx))
             path = recorder.end(self._end(ctx, "success"))
@@ -87,7 +87,7 @@ class RecorderSuite(Suite[Recorder]):
             assert list(self.read_back(path)[self.topic]) == self.records(ctx)
 
     def test_keeps_metadata_and_outcome(self, tmp_path: Path) -> None:
-        """What was known at the beginning, and how it ended, are in the recording."""
+        """The recording contains the initial metadata and the outcome."""
         with self.recording(tmp_path / "episode") as (recorder, ctx):
             self._write(recorder, self.records(ctx))
             path = recorder.end(self._end(ctx, "failure"))
@@ -97,7 +97,7 @@ class RecorderSuite(Suite[Recorder]):
             assert metadata["outcome"] == "failure"
 
     def test_never_writes_over_anything(self, tmp_path: Path) -> None:
-        """A directory that exists is refused and left as it is."""
+        """An existing directory is refused and not changed."""
         old = tmp_path / "episode" / "old.txt"
         old.parent.mkdir()
         old.write_text("old")
@@ -129,7 +129,7 @@ class RecorderSuite(Suite[Recorder]):
             assert {topic for topic, kept in self.read_back(path).items() if kept} == {self.topic}
 
     def test_episodes_follow_one_another(self, tmp_path: Path) -> None:
-        """A second episode is a recording of its own."""
+        """A second episode is a separate recording."""
         with self.recording(tmp_path / "first") as (recorder, ctx):
             records = self.records(ctx)
             self._write(recorder, records[:20])
@@ -143,7 +143,7 @@ class RecorderSuite(Suite[Recorder]):
             assert list(self.read_back(second)[self.topic]) == records[20:]
 
     def test_refuses_calls_out_of_turn(self, tmp_path: Path) -> None:
-        """No `write` or `end` without an episode, and no second one before the first has ended."""
+        """`write` and `end` need an episode, and a second episode cannot begin before the first has ended."""
         ctx = self.context()
         recorder = self.make(ctx)
         received_ns, message = self.records(ctx, 1)[0]
@@ -160,7 +160,7 @@ class RecorderSuite(Suite[Recorder]):
             recorder.close()
 
     def test_close_ends_an_open_episode(self, tmp_path: Path) -> None:
-        """`close` keeps what was written, with outcome `unknown`; it is safe twice."""
+        """`close` saves the open episode with outcome `unknown`; it is safe twice."""
         with self.recording(tmp_path / "episode") as (recorder, ctx):
             self._write(recorder, self.records(ctx))
             recorder.close()
@@ -169,7 +169,7 @@ class RecorderSuite(Suite[Recorder]):
             assert self.read_metadata(tmp_path / "episode")["outcome"] == "unknown"
 
     def test_a_crash_costs_little(self, tmp_path: Path) -> None:
-        """What is on disk at any time is readable and lacks no more than the last `max_loss_s`."""
+        """The files are readable at any time and lack at most the last `max_loss_s`."""
         with self.recording(tmp_path / "episode") as (recorder, ctx):
             records = self.records(ctx)
             self._write(recorder, records)

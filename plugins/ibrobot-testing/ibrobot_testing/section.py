@@ -16,7 +16,7 @@ from ibrobot_testing.suite import Suite
 
 @attrs.define
 class FakeControl:
-    """The host's side of control, of a run without hardware."""
+    """The host's side of control in a run without hardware."""
 
     report: Mapping[str, Any] = attrs.field(factory=lambda: {"loop": {}, "counters": {}})
 
@@ -34,7 +34,7 @@ def make_session(**changes: Any) -> Session:
 
 
 class SectionSuite(Suite[Component]):
-    """What every component of a section must do. The subclass writes `component`, in place of `make`."""
+    """Checks of every component of a section. The subclass defines `component` instead of `make`."""
 
     def session(self) -> Session:
         """The run; override for another robot."""
@@ -70,7 +70,7 @@ class SectionSuite(Suite[Component]):
                 session.bus.publish("/joint_states", JointState(Header(1), joints, np.zeros(len(joints))))
 
     def test_start_and_stop_are_safe_at_any_time(self) -> None:
-        """`stop` may come before `start` and twice; `start` works again afterwards, and serves what it served."""
+        """`stop` may be called before `start` and twice; `start` works again afterwards, with the same services."""
         session = self.session()
         component = self.component(session)
         component.stop()
@@ -80,7 +80,7 @@ class SectionSuite(Suite[Component]):
             component.stop()
 
     def test_leaves_the_bus_when_stopped(self) -> None:
-        """After `stop` nothing queues up for it any more."""
+        """After `stop` no message queues up for it."""
         with self.started() as (component, session):
             component.stop()
             joints = session.config.robot.joint_names

@@ -26,17 +26,17 @@ _BYTES_PER_PIXEL = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1, "m
 
 
 class SensorSuite(Suite[Sensor]):
-    """What every `Sensor` must do. A driver runs it against a fake of its device."""
+    """Checks of every `Sensor`. A driver uses a fake of its device."""
 
     timeout_s: ClassVar[float] = 30.0
-    """How long a check waits for a message that must come [s]."""
+    """How long a check waits for an expected message [s]."""
 
     def trigger(self, sensor: Sensor, ctx: Context) -> None:
-        """Make the device capture once more, at a later time; as it stands, one control period passes."""
+        """Make the device capture again, at a later time; by default one control period passes."""
         ctx.clock.sleep_until(ctx.clock.now_ns() + ctx.period_ns)
 
     def silence(self, sensor: Sensor) -> None:
-        """Make the device fall silent; override for a device that captures without `trigger`."""
+        """Make the device stop capturing; override it for a device that captures without `trigger`."""
 
     @contextmanager
     def opened(self) -> Iterator[tuple[Sensor, Context]]:
@@ -68,7 +68,7 @@ class SensorSuite(Suite[Sensor]):
                 assert type(self._next(sensor, ctx)) is sensor.message_type
 
     def test_stamps_strictly_increase(self) -> None:
-        """The stamp of capture is later for each message, and not in the future."""
+        """Stamps increase with each message and are not in the future."""
         with self.opened() as (sensor, ctx):
             previous = -1
             for _ in range(5):
@@ -78,12 +78,12 @@ class SensorSuite(Suite[Sensor]):
                 previous = stamp_ns
 
     def test_silence_gives_none(self) -> None:
-        """A device that captures nothing more gives None, never its last message under a new stamp."""
+        """A device that has stopped capturing returns None, never its last message with a new stamp."""
         with self.opened() as (sensor, ctx):
             self._next(sensor, ctx)
             self.silence(sensor)
             silent = 0
-            for _ in range(100):  # what was captured before may take its time
+            for _ in range(100):  # earlier messages may still arrive
                 silent = silent + 1 if sensor.read(0.01) is None else 0
                 if silent == 3:
                     return
@@ -111,7 +111,7 @@ class SensorSuite(Suite[Sensor]):
             assert image.data.shape == (image.height * image.step,)
 
     def test_latched_messages_fit(self) -> None:
-        """Latched messages are messages on topics of their own; a CameraInfo has the size of the images."""
+        """Latched messages have their own topics; a CameraInfo has the size of the images."""
         with self.opened() as (sensor, ctx):
             message = _decoded(self._next(sensor, ctx))
             for topic, latched in sensor.latched():
@@ -122,7 +122,7 @@ class SensorSuite(Suite[Sensor]):
                     assert (latched.height, latched.width) == (message.height, message.width)
 
     def test_close_is_safe_at_any_time(self) -> None:
-        """`close` may come before `open` and twice; `open` works again afterwards."""
+        """`close` may be called before `open` and twice; `open` works again afterwards."""
         ctx = self.context()
         sensor = self.make(ctx)
         sensor.close()
@@ -136,7 +136,7 @@ class SensorSuite(Suite[Sensor]):
             sensor.close()
 
     def test_refuses_reading_while_closed(self) -> None:
-        """`read` raises SensorError once closed."""
+        """`read` raises SensorError after `close`."""
         with self.opened() as (sensor, _):
             pass
         with pytest.raises(SensorError):

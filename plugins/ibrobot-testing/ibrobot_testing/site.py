@@ -1,4 +1,4 @@
-"""Made-up plugins for tests of what runs whole robots: installed for this process and for those that it starts."""
+"""Test plugins for tests of complete runs, installed for this process and its children."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from ibrobot_core.api import installed_plugins
 
 @attrs.define
 class Site:
-    """A folder on the import path, with made-up distributions that are plugins.
+    """A folder on the import path with distributions of test plugins.
 
     Args:
-        folder: of the distributions.
+        folder: folder of the distributions.
         sources: where `add` finds its sources.
     """
 
@@ -34,7 +34,7 @@ class Site:
         """Install version 1.0 of `distribution`: a copy of one module, named in its entry point.
 
         Args:
-            distribution: its name, which the module gets too.
+            distribution: its name, also of the module.
             source: a file in `sources`, or an absolute path.
         """
         module = distribution.replace("-", "_")
@@ -44,17 +44,17 @@ class Site:
         (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {distribution}\nVersion: 1.0\n")
         (metadata / "entry_points.txt").write_text(f"[ibrobot]\n{module} = {module}\n")
         self.modules.append(module)
-        # Python lists a folder again when its time stamp has changed, which it has not within some milliseconds.
+        # Python rereads a folder only if its time stamp has changed, which does not happen within a few milliseconds.
         invalidate_caches()
 
     def entry_points(self) -> list[EntryPoint]:
-        """The entry points of what was added, and of nothing else."""
+        """The entry points of the added distributions only."""
         return [entry for found in distributions(path=[str(self.folder)]) for entry in found.entry_points]
 
 
 @contextmanager
 def made_up_site(folder: Path, sources: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
-    """An empty `Site`; `installed_plugins()` discovers what is added to it, and forgets it at the end.
+    """An empty `Site`, whose plugins `installed_plugins()` discovers, and forgets at the end.
 
     Args:
         folder: where to make it.

@@ -1,4 +1,4 @@
-"""What all conformance suites share: a context, `make`, and a way to run the checks without pytest."""
+"""Base of the conformance suites: a context, `make`, and a way to run the checks without pytest."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from ibrobot_testing.leaks import LeakCheck
 
 
 class Suite[T]:
-    """Base of the suites. A plugin's test subclasses one, under a name that begins with `Test`, and writes `make`.
+    """Base of the suites. A plugin's test subclasses one, with a name that begins with `Test`, and defines `make`.
 
     Attributes:
-        leak_check: what a check may leave behind. By default nothing; an exception needs a reason:
+        leak_check: check for leaked resources. An exception needs a reason:
             `leak_check = LeakCheck(allow={"thread": "libfoo keeps its thread until the process ends"})`.
     """
 
@@ -26,7 +26,7 @@ class Suite[T]:
 
     @pytest.fixture(autouse=True)
     def no_leaks(self) -> Iterator[None]:
-        """Fail a check that leaves a thread, a process, an open file or a port behind."""
+        """Fail a check that leaks a thread, a process, an open file or a port."""
         with self.leak_check.watch():
             yield
 
@@ -40,14 +40,14 @@ class Suite[T]:
 
 
 def run_checks[T](suite: type[Suite[T]], directory: Path) -> dict[str, BaseException | None]:
-    """Run every check of `suite`, for tests of the suites themselves and for trying out wrong implementations.
+    """Run every check of `suite`, to test the suites themselves or wrong implementations.
 
     Args:
         suite: the suite, with its `make`.
-        directory: where checks that write files get a directory each.
+        directory: folder for the files of checks.
 
     Returns:
-        Name of the check -> what it raised, or None where it passed; checks that were skipped are left out.
+        Name of the check -> its exception, or None if it passed; without skipped checks.
     """
     results: dict[str, BaseException | None] = {}
     for name, check in inspect.getmembers(suite, inspect.isfunction):

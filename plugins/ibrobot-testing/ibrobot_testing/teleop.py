@@ -14,24 +14,24 @@ from ibrobot_testing.suite import Suite
 
 
 class TeleopSuite(Suite[Teleop]):
-    """What every `Teleop` must do. The subclass plays the operator: `engage`, `release` and `operate`."""
+    """Checks of every `Teleop`. The subclass plays the operator with `engage`, `release` and `operate`."""
 
     has_deadman: ClassVar[bool] = True
-    """Whether the device has a deadman that `release` lets go."""
+    """Whether the device has a deadman, which `release` releases."""
     has_operator: ClassVar[bool] = True
-    """Whether a person starts every motion. False for a device that moves the robot by itself, e.g. a demonstration."""
+    """Whether an operator starts every motion. False for a device that moves the robot by itself, e.g. a demo."""
     tolerance_rad: ClassVar[float] = 1e-6
-    """How far the first positions may be from the measured ones [rad]."""
+    """Allowed distance of the first positions from the measured ones [rad]."""
 
     def engage(self, teleop: Teleop) -> None:
-        """The operator presses the deadman, or does what starts motion; nothing for a device that moves by itself."""
+        """The operator presses the deadman or starts motion; does nothing for a device that moves by itself."""
 
     def release(self, teleop: Teleop) -> None:
-        """The operator lets the deadman go."""
+        """The operator releases the deadman."""
         raise NotImplementedError(f"{type(self).__name__} must define release, or set has_deadman = False")
 
     def operate(self, teleop: Teleop) -> None:
-        """The operator, with the deadman pressed, asks for motion."""
+        """The operator, with the deadman pressed, commands motion."""
         raise NotImplementedError(f"{type(self).__name__} must define operate(self, teleop)")
 
     @contextmanager
@@ -46,7 +46,7 @@ class TeleopSuite(Suite[Teleop]):
             teleop.disconnect()
 
     def poses(self, ctx: Context) -> list[Vector]:
-        """Measured positions [rad], each shape (J,), that the checks begin from: none at zero, all within limits."""
+        """Initial measured positions of the checks [rad], each shape (J,): nonzero and within limits."""
         lower, upper = ctx.robot.lower, ctx.robot.upper
         return [lower + share * (upper - lower) for share in (0.3, 0.6)]
 
@@ -72,7 +72,7 @@ class TeleopSuite(Suite[Teleop]):
                     )
 
     def test_positions_are_of_known_joints(self) -> None:
-        """Every position is a finite number of a joint of the robot."""
+        """Every position is finite and belongs to a joint of the robot."""
         with self.connected() as (teleop, ctx):
             pose = self.poses(ctx)[0]
             commands = [self._begin(teleop, ctx, pose)]
@@ -84,7 +84,7 @@ class TeleopSuite(Suite[Teleop]):
                     assert np.isfinite(position)
 
     def test_operating_moves(self) -> None:
-        """Once the operator asks for motion, positions leave the first ones within a second."""
+        """After the operator commands motion, positions change within a second."""
         with self.connected() as (teleop, ctx):
             pose = self.poses(ctx)[0]
             first = self._begin(teleop, ctx, pose).positions or {}
@@ -96,7 +96,7 @@ class TeleopSuite(Suite[Teleop]):
             pytest.fail("the operator asked for motion and none came")
 
     def test_released_deadman_gives_none(self) -> None:
-        """While the deadman is released, positions are None, before it was ever pressed and after."""
+        """While the deadman is released, positions are None, both before and after it was pressed."""
         if not self.has_deadman:
             pytest.skip("has no deadman")
         with self.connected() as (teleop, ctx):
@@ -110,7 +110,7 @@ class TeleopSuite(Suite[Teleop]):
             assert commands[-1].positions is None
 
     def test_waits_for_the_operator(self) -> None:
-        """After each `activate` (a launch, a mode switch, a reset) nothing moves before the operator acts again."""
+        """After each `activate` (launch, mode switch, reset), nothing moves before the operator acts again."""
         if not self.has_operator:
             pytest.skip("moves by itself")
         with self.connected() as (teleop, ctx):
@@ -126,7 +126,7 @@ class TeleopSuite(Suite[Teleop]):
                 assert teleop.read(self._measure(ctx, pose)).positions, "no positions once the operator acted"
 
     def test_leaves_the_measurement_alone(self) -> None:
-        """`activate` and `read` change nothing in `measured`, nor does a later change of it reach the device."""
+        """`activate` and `read` do not change `measured`, and later changes of it do not affect the device."""
         with self.connected() as (teleop, ctx):
             pose = self.poses(ctx)[0]
             begin, now = self._measure(ctx, pose), self._measure(ctx, pose)
@@ -140,7 +140,7 @@ class TeleopSuite(Suite[Teleop]):
                 assert abs(position - pose[ctx.robot.joint_names.index(joint)]) <= self.tolerance_rad
 
     def test_disconnect_is_safe_at_any_time(self) -> None:
-        """`disconnect` may come before `connect` and twice; `connect` works again afterwards."""
+        """`disconnect` may be called before `connect` and twice; `connect` works again afterwards."""
         ctx = self.context()
         teleop = self.make(ctx)
         teleop.disconnect()
@@ -154,7 +154,7 @@ class TeleopSuite(Suite[Teleop]):
             teleop.disconnect()
 
     def test_refuses_reading_while_disconnected(self) -> None:
-        """`read` raises TeleopError once disconnected."""
+        """`read` raises TeleopError after `disconnect`."""
         with self.connected() as (teleop, ctx):
             pass
         with pytest.raises(TeleopError):

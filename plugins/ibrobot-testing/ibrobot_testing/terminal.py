@@ -1,4 +1,4 @@
-"""A command line run in a pseudo-terminal, for tests of dialogues: what is on the screen, and a person who types."""
+"""Runs a command line in a pseudo-terminal, for tests of dialogues: reads the screen and types keys."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ _TIMEOUT_S = 120.0
 
 
 class Terminal:
-    """`ibrobot ARGUMENTS` in a pseudo-terminal of its own, which is its controlling one; a context manager.
+    """`ibrobot ARGUMENTS` in a pseudo-terminal, which is its controlling terminal; a context manager.
 
     Args:
-        arguments: of the command.
+        arguments: arguments of the command.
         before: Python source that the process runs first.
-        environment: variables on top of this process's.
+        environment: additional environment variables.
         columns: width of the terminal.
     """
 
@@ -43,11 +43,11 @@ class Terminal:
         finally:
             os.close(slave)
         self.screen = ""
-        """Everything that it printed so far."""
+        """The output so far."""
         self._seen = 0
         self._ended = False
         self._changed = threading.Condition()
-        # Read at all times: a terminal that nobody reads stops whoever prints.
+        # Read continuously, because a program blocks if its terminal is not read.
         self._thread = threading.Thread(target=self._read, name="terminal", daemon=True)
         self._thread.start()
 
@@ -64,10 +64,10 @@ class Terminal:
         os.close(self._master)
 
     def wait_for(self, text: str) -> None:
-        """Wait until the text is printed, after what was waited for before.
+        """Wait until the text is printed, after the text of the previous wait.
 
         Raises:
-            AssertionError: when it does not come.
+            AssertionError: if it is not printed.
         """
         with self._changed:
             come = self._changed.wait_for(lambda: self._ended or text in self.screen[self._seen :], _TIMEOUT_S)
@@ -80,10 +80,10 @@ class Terminal:
         os.write(self._master, text.encode())
 
     def interrupt(self) -> None:
-        """Press Ctrl-C, and Enter where nothing comes of it, and wait for the command to end.
+        """Press Ctrl-C, then Enter if it has no effect, and wait for the command to end.
 
-        A signal between Python's last look at it and the system call that reads a line is not seen before that line. A
-        second Ctrl-C would not do: it may come while the first is obeyed.
+        Python does not see a signal that arrives between its last check and the system call that reads a line, until
+        the line is read. A second Ctrl-C is no solution, because it may arrive while the first one is handled.
         """
         with self._changed:
             self.type("\x03")
@@ -92,10 +92,10 @@ class Terminal:
                 self._changed.wait_for(lambda: self._ended, _TIMEOUT_S)
 
     def end(self) -> int:
-        """Wait for the end and take the exit code.
+        """Wait for the end; returns the exit code.
 
         Raises:
-            AssertionError: when it does not end.
+            AssertionError: if it does not end.
         """
         try:
             code = self._process.wait(_TIMEOUT_S)
@@ -105,11 +105,11 @@ class Terminal:
         return code
 
     def _read(self) -> None:
-        decoder = codecs.getincrementaldecoder("utf-8")("replace")  # a character may come in two pieces
+        decoder = codecs.getincrementaldecoder("utf-8")("replace")  # a character may arrive in two pieces
         while True:
             try:
                 received = os.read(self._master, 65536)
-            except OSError:  # nobody has the other end open any more
+            except OSError:  # the other end is closed
                 received = b""
             with self._changed:
                 self.screen += decoder.decode(received)

@@ -14,16 +14,16 @@ from ibrobot_core.api import Context, Payload, Transport, TransportError
 from ibrobot_testing.suite import Suite
 
 _HELD_S = 120.0
-"""The longest that a callback is held back [s]: longer than anything here waits, so that none goes on by itself."""
+"""Maximum time for which a callback is blocked [s]; longer than all waits, so that no callback continues by itself."""
 
 
 class TransportSuite(Suite[Transport]):
-    """What every `Transport` must do, between two ends."""
+    """Checks of every `Transport`, between two ends."""
 
     wait_s: ClassVar[float] = 30.0
-    """How long a check waits for what must come [s]."""
+    """How long a check waits for expected events [s]."""
     short_s: ClassVar[float] = 0.05
-    """How long a check waits for what must not come [s]."""
+    """How long a check waits for unexpected events [s]."""
 
     def make_pair(self, ctx: Context) -> tuple[Transport, Transport]:
         """Two connected ends; one object twice for a transport within a process."""
@@ -31,7 +31,7 @@ class TransportSuite(Suite[Transport]):
         return transport, transport
 
     def settle(self, near: Transport, far: Transport) -> None:
-        """Wait until subscriptions and services of one end are known to the other."""
+        """Wait until each end knows the subscriptions and services of the other."""
 
     @contextmanager
     def ends(self) -> Iterator[tuple[Transport, Transport]]:
@@ -45,7 +45,7 @@ class TransportSuite(Suite[Transport]):
 
     @contextmanager
     def held(self) -> Iterator[threading.Event]:
-        """What callbacks wait for; they go on when the block is left, however that is."""
+        """An event that blocks callbacks until the end of the block."""
         go_on = threading.Event()
         try:
             yield go_on
@@ -53,7 +53,7 @@ class TransportSuite(Suite[Transport]):
             go_on.set()
 
     def test_delivers_in_order(self) -> None:
-        """Every payload arrives once, whole, in the order sent; empty and large ones too."""
+        """Every payload, even if empty or large, arrives once, complete, and in order."""
         payloads = [b"", b"\x00\xff" * 500_000, *(str(i).encode() for i in range(200))]
         with self.ends() as (near, far):
             arrived: queue.SimpleQueue[Payload] = queue.SimpleQueue()
@@ -64,7 +64,7 @@ class TransportSuite(Suite[Transport]):
             assert [arrived.get(timeout=self.wait_s) for _ in payloads] == payloads
 
     def test_every_subscriber_gets_its_topic_only(self) -> None:
-        """Each subscriber of a topic gets every payload on it, and none of another."""
+        """Each subscriber of a topic gets every payload on it, and no others."""
         with self.ends() as (near, far):
             first: queue.SimpleQueue[Payload] = queue.SimpleQueue()
             second: queue.SimpleQueue[Payload] = queue.SimpleQueue()
@@ -76,7 +76,7 @@ class TransportSuite(Suite[Transport]):
             assert first.get(timeout=self.wait_s) == second.get(timeout=self.wait_s) == b"own"
 
     def test_an_ended_subscription_is_silent(self) -> None:
-        """After its end a subscriber gets nothing; others do."""
+        """After its end a subscription delivers nothing; others do."""
         with self.ends() as (near, far):
             ended: queue.SimpleQueue[Payload] = queue.SimpleQueue()
             going: queue.SimpleQueue[Payload] = queue.SimpleQueue()
@@ -91,7 +91,7 @@ class TransportSuite(Suite[Transport]):
                 ended.get(timeout=self.short_s)
 
     def test_a_slow_subscriber_blocks_nobody(self) -> None:
-        """`publish` returns and others are served while one callback does not return."""
+        """`publish` returns and others are served while one callback blocks."""
         with self.ends() as (near, far), self.held() as release:
             arrived: queue.SimpleQueue[Payload] = queue.SimpleQueue()
 
@@ -113,7 +113,7 @@ class TransportSuite(Suite[Transport]):
                 publisher.join()
 
     def test_a_failing_subscriber_harms_nobody(self) -> None:
-        """A callback that raises reaches neither the publisher nor other subscribers, and is called again."""
+        """An exception in a callback does not affect the publisher or other subscribers; it is called again."""
         with self.ends() as (near, far):
             calls: queue.SimpleQueue[Payload] = queue.SimpleQueue()
             arrived: queue.SimpleQueue[Payload] = queue.SimpleQueue()
@@ -131,7 +131,7 @@ class TransportSuite(Suite[Transport]):
                 assert calls.get(timeout=self.wait_s) == payload
 
     def test_each_request_gets_its_own_answer(self) -> None:
-        """Requests made at the same time are each answered with their own."""
+        """Concurrent requests each get their own answer."""
         with self.ends() as (near, far):
             far.serve("echo", lambda payload, _: bytes(payload) + b"!")
             self.settle(near, far)
@@ -148,7 +148,7 @@ class TransportSuite(Suite[Transport]):
             assert answers == {i: f"{i}!".encode() for i in range(20)}
 
     def test_sent_buffers_are_free_again(self) -> None:
-        """A bytearray or a view of one can be sent, and written to again once the call has returned."""
+        """A bytearray or a view of one can be sent, and modified after the call has returned."""
         with self.ends() as (near, far), self.held() as going_on:
             arrived: queue.SimpleQueue[Payload] = queue.SimpleQueue()
             served, sender = threading.Event(), threading.get_ident()
@@ -180,7 +180,7 @@ class TransportSuite(Suite[Transport]):
             assert {bytes(arrived.get(timeout=self.wait_s)) for _ in range(2)} == {b"sent", b"late"}
 
     def test_a_slow_answer_delays_no_other(self) -> None:
-        """While one request is being answered, others are; no more at a time than there are workers."""
+        """Requests are answered concurrently, with at most one per worker."""
         with self.ends() as (near, far), self.held() as release:
             begun: queue.SimpleQueue[Payload] = queue.SimpleQueue()
 
@@ -211,7 +211,7 @@ class TransportSuite(Suite[Transport]):
                         thread.join()
 
     def test_a_late_answer_is_dropped(self) -> None:
-        """A request that is answered too late fails, and its answer is not given to the next one."""
+        """A request with a late answer fails, and its answer is not delivered to the next one."""
         with self.ends() as (near, far), self.held() as release:
             done = threading.Event()
 
@@ -231,7 +231,7 @@ class TransportSuite(Suite[Transport]):
                 assert near.request("echo", str(i).encode(), self.wait_s) == str(i).encode()
 
     def test_a_servers_error_reaches_the_requester(self) -> None:
-        """An exception of the server is a TransportError with its text at the requester; the service goes on."""
+        """An exception in the server is a TransportError with its text for the requester; the service continues."""
         with self.ends() as (near, far):
 
             def answer(payload: Payload, _: str | None) -> Payload:
@@ -246,7 +246,7 @@ class TransportSuite(Suite[Transport]):
             assert near.request("echo", b"good", self.wait_s) == b"good"
 
     def test_nobody_serves(self) -> None:
-        """A request for a name that nobody serves, or serves no more, is a TransportError."""
+        """A request for a name without a server is a TransportError, also after its server has ended."""
         with self.ends() as (near, far):
             with pytest.raises(TransportError):
                 near.request("nobody", b"", self.short_s)
@@ -271,7 +271,7 @@ class TransportSuite(Suite[Transport]):
             assert near.request("echo", b"", self.wait_s) == b"third"
 
     def test_a_watch_tells_who_serves(self) -> None:
-        """The present state at once, then every change, until the watch ends."""
+        """A watch reports the present state at once, then every change, until it ends."""
         with self.ends() as (near, far):
             early: queue.SimpleQueue[bool] = queue.SimpleQueue()
             late: queue.SimpleQueue[bool] = queue.SimpleQueue()
@@ -298,7 +298,7 @@ class TransportSuite(Suite[Transport]):
             last()
 
     def test_a_server_may_use_the_transport(self) -> None:
-        """Callbacks and servers may publish and request themselves."""
+        """Callbacks and servers may publish and send requests."""
         with self.ends() as (near, far):
             arrived: queue.SimpleQueue[Payload] = queue.SimpleQueue()
 

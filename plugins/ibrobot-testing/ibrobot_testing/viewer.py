@@ -13,7 +13,7 @@ from ibrobot_testing.suite import Suite
 
 
 class ViewerSuite(Suite[Viewer]):
-    """What every `Viewer` must do. The subclass plays the person: `shut`; and looks: `shown`."""
+    """Checks of every `Viewer`. The subclass plays the user with `shut` and `shown`."""
 
     topic: ClassVar[str] = "/joint_states"
     """A topic that the viewer shows."""
@@ -23,7 +23,7 @@ class ViewerSuite(Suite[Viewer]):
         return JointState(Header(ctx.clock.now_ns()), ctx.robot.joint_names, np.full(6, 0.01 * i))
 
     def shut(self, viewer: Viewer) -> None:
-        """The person closes the viewer."""
+        """The user closes the viewer."""
         raise NotImplementedError(f"{type(self).__name__} must define shut(self, viewer)")
 
     def shown(self, viewer: Viewer) -> Message:
@@ -61,7 +61,7 @@ class ViewerSuite(Suite[Viewer]):
             assert self.shown(viewer) == self.message(ctx, 999)
 
     def test_passes_over_unknown_topics(self) -> None:
-        """Topics that it does not know do it no harm."""
+        """Unknown topics are ignored."""
         with self.opened() as (viewer, _, bus):
             bus.publish("/unheard_of", String("hello"))
             assert viewer.update() is True
@@ -73,7 +73,7 @@ class ViewerSuite(Suite[Viewer]):
             assert isinstance(self.make(ctx).where(), str)
 
     def test_leaves_the_bus_when_closed(self) -> None:
-        """After `close` nothing queues up for it any more."""
+        """After `close` no message queues up for it."""
         with self.opened() as (viewer, ctx, bus):
             viewer.update()
             viewer.close()

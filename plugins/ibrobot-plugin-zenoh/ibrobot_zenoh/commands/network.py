@@ -1,4 +1,4 @@
-"""Which network a command works on: a robot YAML's, or one named by its endpoint."""
+"""Selects the network of a command: that of a robot YAML, or of an endpoint."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from ibrobot_zenoh.options import ZenohOptions
 from ibrobot_zenoh.transport import ZenohTransport
 
 _CONNECT_S = 3.0
-"""How long a command waits for the other side."""
+"""How long a command waits for the other side [s]."""
 _EVERYWHERE = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}
-"""Where to find, from this machine, what listens on all its addresses."""
+"""Addresses to reach, from this machine, a server that listens on all addresses."""
 
 
 def network_options(command: Callable[..., None]) -> Callable[..., None]:
-    """The options that say which network."""
+    """Add the options that select the network."""
     for decorate in (
         click.option("--domain", type=click.IntRange(0, 232), help="ROS 2 domain.  [default: the YAML's, or 0]"),
         click.option("--endpoint", "endpoints", multiple=True, metavar="URL", help="E.g. tcp/127.0.0.1:7447."),
@@ -32,21 +32,21 @@ def network_options(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def options_from(config: str | None, endpoints: tuple[str, ...], domain: int | None) -> ZenohOptions:
-    """Those of a client on the network.
+    """Transport options of a client on the network.
 
     Raises:
-        UsageError: when nothing, or an impossible endpoint, says which network.
-        NotSupported: when the YAML's transport is none of this plugin's.
+        UsageError: if no network is given, or the endpoint is invalid.
+        NotSupported: if the YAML uses another transport.
     """
     if config is None and not endpoints:
-        raise click.UsageError("which network? Give --config CONFIG, or --endpoint, e.g. --endpoint tcp/127.0.0.1:7447")
+        raise click.UsageError("no network: give --config CONFIG, or --endpoint, e.g. --endpoint tcp/127.0.0.1:7447")
     changes: dict[str, Any] = {} if domain is None else {"domain": domain}
     if config is None:
         try:
             return ZenohOptions(connect=endpoints, **changes)
         except ValueError as error:
-            told = "certificates are given by --config" if "needs tls" in str(error) else error
-            raise click.UsageError(f"--endpoint: {told}") from None
+            reason = "certificates are given by --config" if "needs tls" in str(error) else error
+            raise click.UsageError(f"--endpoint: {reason}") from None
     from ibrobot_core.api import find_config, installed_plugins, load_config
 
     found = load_config(find_config(config, installed_plugins()), communicates=True)
@@ -66,14 +66,14 @@ def _here(endpoint: str) -> str:
 
 @contextmanager
 def connected(config: str | None, endpoints: tuple[str, ...], domain: int | None) -> Iterator[ZenohTransport]:
-    """A transport that is connected, as long as it is used.
+    """A context with a connected transport.
 
     Raises:
-        TransportError: when nobody answers.
+        TransportError: if there is no answer.
     """
     options = options_from(config, endpoints, domain)
     log = logging.getLogger("ibrobot.topic")
-    log.setLevel(logging.ERROR)  # why nobody answers is said by the error
+    log.setLevel(logging.ERROR)  # the error has the reason
     transport = ZenohTransport(options, Context("topic", RealClock(), log, Robot("command_line", ())))
     try:
         if not transport.await_connection(_CONNECT_S):

@@ -1,4 +1,4 @@
-"""Messages as YAML text, and back."""
+"""Converts messages to YAML text, and back."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import numpy as np
 from ibrobot_core.api import MESSAGE_TYPES, Message, NotSupported, dump_yaml, single_options
 
 _SHOWN = 16
-"""Elements of an array that are shown."""
+"""Number of array elements to show."""
 
 
 def shown(message: Message, *, full: bool) -> str:
-    """A message as YAML; of long arrays the first elements, unless `full`."""
+    """A message as YAML; long arrays are truncated unless `full`."""
     return dump_yaml(_plain(message, full))
 
 
@@ -32,11 +32,11 @@ def _plain(value: Any, full: bool) -> Any:
 
 
 def message_from(type_name: str, text: str) -> Message:
-    """The message that a YAML text says, e.g. `{data: true}`.
+    """Parse a message from YAML, e.g. `{data: true}`.
 
     Raises:
-        NotSupported: for a type that cannot be written so.
-        ConfigError: with everything that is wrong in the text.
+        NotSupported: if the type cannot be written in this way.
+        ConfigError: with all errors in the text.
     """
     kind = MESSAGE_TYPES.get(type_name)
     if kind is None:

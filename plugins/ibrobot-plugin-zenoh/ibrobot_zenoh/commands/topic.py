@@ -19,7 +19,7 @@ from ibrobot_zenoh.transport import ZenohTransport
 
 _LIST_S = 2.0
 _HEARD_S = 1.0
-"""How long `pub` waits for a subscriber."""
+"""How long `pub` waits for a subscriber [s]."""
 
 
 @click.group()
@@ -29,13 +29,13 @@ def topic() -> None:
 
 @contextmanager
 def _until_interrupted() -> Iterator[None]:
-    """Ctrl-C is how these commands end."""
+    """A context that Ctrl-C ends without an error."""
     with suppress(KeyboardInterrupt):
         yield
 
 
 def _command(function: Callable[..., None]) -> click.Command:
-    """A command of `topic` that is given a connected transport."""
+    """Make a command of `topic` whose function receives a connected transport."""
 
     @functools.wraps(function)
     def run(config: str | None, endpoints: tuple[str, ...], domain: int | None, **arguments: Any) -> None:
@@ -46,12 +46,12 @@ def _command(function: Callable[..., None]) -> click.Command:
 
 
 @_command
-@click.option("--types", is_flag=True, help="With message types, and how many publish and listen.")
+@click.option("--types", is_flag=True, help="Show message types and the numbers of publishers and subscribers.")
 def list_(transport: ZenohTransport, types: bool) -> None:
-    """List the topics that are shared now."""
+    """List the shared topics."""
     shared = transport.shared_topics(_LIST_S)
     if not shared:
-        echo("no topics are shared there now", err=True)
+        echo("no topics are shared", err=True)
     for found in shared:
         counts = f"  {found.type}  published by {found.publishers}, heard by {found.subscribers} ROS 2 nodes"
         echo(f"{found.name}{counts if types else ''}")
@@ -59,26 +59,28 @@ def list_(transport: ZenohTransport, types: bool) -> None:
 
 @_command
 @click.argument("name", metavar="TOPIC")
-@click.option("--count", "-n", type=click.IntRange(1), help="End after so many messages.")
-@click.option("--full", is_flag=True, help="All elements of arrays.")
+@click.option("--count", "-n", type=click.IntRange(1), help="Stop after this many messages.")
+@click.option("--full", is_flag=True, help="Show all elements of arrays.")
 def echo_(transport: ZenohTransport, name: str, count: int | None, full: bool) -> None:
     """Show the messages on TOPIC, until Ctrl-C."""
     arrived: queue.SimpleQueue[Message] = queue.SimpleQueue()
     transport.subscribe_messages(name, arrived.put)
-    _tell_whether_published(transport, name)
+    _warn_if_unpublished(transport, name)
     for _ in _counted(count):
         echo(f"{shown(arrived.get(), full=full)}---")
 
 
 @_command
 @click.argument("name", metavar="TOPIC")
-@click.option("--count", "-n", type=click.IntRange(1), help="End after so many measurements.")
-@click.option("--period", default=1.0, show_default=True, type=click.FloatRange(0.01), help="Seconds of each.")
+@click.option("--count", "-n", type=click.IntRange(1), help="Stop after this many measurements.")
+@click.option(
+    "--period", default=1.0, show_default=True, type=click.FloatRange(0.01), help="Duration of a measurement [s]."
+)
 def hz(transport: ZenohTransport, name: str, count: int | None, period: float) -> None:
-    """Measure how often messages come on TOPIC, until Ctrl-C."""
+    """Measure the rate of messages on TOPIC, until Ctrl-C."""
     arrived: queue.SimpleQueue[float] = queue.SimpleQueue()
     transport.subscribe_messages(name, lambda message: arrived.put(time.monotonic()))
-    _tell_whether_published(transport, name)
+    _warn_if_unpublished(transport, name)
     last: float | None = None
     for _ in _counted(count):
         times = [last] if last is not None else []
@@ -89,7 +91,7 @@ def hz(transport: ZenohTransport, name: str, count: int | None, period: float) -
         gaps = [after - before for before, after in pairwise(times)]
         last = times[-1] if times else None
         if not gaps:
-            echo(f"less than two messages on {name} in {period:g} s")
+            echo(f"fewer than two messages on {name} in {period:g} s")
             continue
         rate = len(gaps) / sum(gaps)
         echo(f"{rate:.2f} Hz, gaps {min(gaps) * 1e3:.1f} to {max(gaps) * 1e3:.1f} ms, {len(gaps)} messages")
@@ -99,10 +101,10 @@ def hz(transport: ZenohTransport, name: str, count: int | None, period: float) -
 @click.argument("name", metavar="TOPIC")
 @click.argument("type_name", metavar="TYPE")
 @click.argument("text", metavar="MESSAGE")
-@click.option("--rate", type=click.FloatRange(0.01, 1000), help="Publish so often a second [Hz], until Ctrl-C.")
-@click.option("--count", "-n", type=click.IntRange(1), help="With --rate: end after so many.")
+@click.option("--rate", type=click.FloatRange(0.01, 1000), help="Publish at this rate [Hz], until Ctrl-C.")
+@click.option("--count", "-n", type=click.IntRange(1), help="With --rate: stop after this many messages.")
 def pub(transport: ZenohTransport, name: str, type_name: str, text: str, rate: float | None, count: int | None) -> None:
-    """Publish MESSAGE, as YAML, on TOPIC: once, or again and again.
+    """Publish MESSAGE, as YAML, on TOPIC: once, or repeatedly.
 
     E.g. `ibrobot topic pub /lamp std_msgs/msg/Bool '{data: true}'`.
     """
@@ -111,7 +113,7 @@ def pub(transport: ZenohTransport, name: str, type_name: str, text: str, rate: f
     if known - {message.ros_type}:
         raise TransportError(f"topic {name} carries {', '.join(sorted(known))}, not {message.ros_type}")
     if not transport.is_heard(name, message.ros_type, _HEARD_S):
-        echo(f"nobody listens to {name} yet", err=True)
+        echo(f"{name} has no subscriber yet", err=True)
     due = time.monotonic()
     for _ in _counted(1 if rate is None else count):
         transport.publish_message(name, message)
@@ -120,15 +122,15 @@ def pub(transport: ZenohTransport, name: str, type_name: str, text: str, rate: f
             time.sleep(max(0.0, due - time.monotonic()))
 
 
-def _tell_whether_published(transport: ZenohTransport, name: str) -> None:
-    """Warn when nobody publishes."""
+def _warn_if_unpublished(transport: ZenohTransport, name: str) -> None:
+    """Warn if a topic has no publisher."""
     published = [found.name for found in transport.shared_topics(_LIST_S) if found.publishers]
     if name not in published:
-        echo(f"nobody publishes {name} yet; published now: {', '.join(published) or 'nothing'}", err=True)
+        echo(f"{name} has no publisher yet; available: {', '.join(published) or 'none'}", err=True)
 
 
 def _counted(count: int | None) -> Iterator[int]:
-    """As many as asked for, or without end."""
+    """Count to `count`, or without end."""
     done = 0
     while count is None or done < count:
         yield done

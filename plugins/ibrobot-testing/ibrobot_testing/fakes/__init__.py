@@ -1,4 +1,4 @@
-"""The least that is a correct implementation of each kind: for tests, and as examples to read."""
+"""Minimal correct implementations of each kind, for tests and as examples."""
 
 from ibrobot_testing.fakes.control import FakeExecutor, FakeHardware, FakeRealHardware, FakeTrajectoryExecutor
 from ibrobot_testing.fakes.host import FakeEngine, FakePlanner, FakePolicy, FakeSensor, FakeTeleop, FakeViewer

@@ -1,4 +1,4 @@
-"""Fakes of what runs in the control process: hardware and executors."""
+"""Fakes of components in the control process: hardware and executors."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ from ibrobot_core.api import (
 
 
 class FakeHardware(SimulatedHardware):
-    """Joints that follow their command with a first-order lag; a reset puts them at a random place near the middle.
+    """Joints that follow their command with a first-order lag; a reset sets random positions near the middle.
 
     Args:
-        ctx: its joints are the hardware's.
+        ctx: provides the joints.
         lag_s: time constant [s].
     """
 
@@ -101,7 +101,7 @@ class FakeHardware(SimulatedHardware):
 
 
 class FakeRealHardware(Hardware):
-    """`FakeHardware` whose time is the clock's: as a real robot, it moves by itself."""
+    """`FakeHardware` that moves with the clock, like a real robot."""
 
     def __init__(self, ctx: Context, lag_s: float = 0.1) -> None:
         self._joints = FakeHardware(ctx, lag_s)
@@ -136,7 +136,7 @@ class FakeRealHardware(Hardware):
 
 
 class FakeExecutor(Executor):
-    """Takes both kinds of work: plans, read at their nearest point, and goals `{"position": …}`, approached evenly."""
+    """Accepts plans, read at their nearest point, and goals `{"position": …}`, approached at constant speed."""
 
     accepts_plans = True
 
@@ -205,7 +205,7 @@ class FakeExecutor(Executor):
 
 
 class FakeTrajectoryExecutor(Executor):
-    """Takes goals as `trajectory_goal` gives them, and follows their positions along straight lines, by time.
+    """Accepts goals made by `trajectory_goal`, and interpolates their positions linearly.
 
     A goal succeeds once the joints are within 0.02 rad of its end.
     """

@@ -1,4 +1,4 @@
-"""Fakes of what runs in the host: sensor, teleoperation device, policy, engine, planner and viewer."""
+"""Fakes of components in the host: sensor, teleoperation device, policy, engine, planner and viewer."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ from ibrobot_core.api import (
 
 
 class FakeSensor(Sensor):
-    """A camera that captures an image whenever the clock has moved since the last."""
+    """A camera that captures an image whenever the clock has advanced."""
 
     message_type: type[Message] = Image
 
@@ -84,9 +84,9 @@ class FakeTeleop(Teleop):
         self._last_ns = 0
         self.deadman = False
         self.velocity = 0.0
-        """Of all joints [rad/s]."""
+        """Velocity of all joints [rad/s]."""
         self.events: tuple[OperatorEvent, ...] = ()
-        """For the next command."""
+        """Buttons of the next command."""
 
     @override
     def connect(self) -> None:
@@ -114,7 +114,7 @@ class FakeTeleop(Teleop):
 
 
 class FakePolicy(Policy):
-    """Steers every joint towards a place that is drawn again for each episode, in chunks of ten."""
+    """Moves every joint towards a position drawn for each episode, in chunks of ten."""
 
     def __init__(self, ctx: Context) -> None:
         names = ctx.robot.joint_names
@@ -189,7 +189,7 @@ class FakePlanner(Planner):
         way = np.abs(end - request.start)
         velocity = self._robot.max_velocity[order] * request.velocity_scaling
         acceleration = self._robot.max_acceleration[order] * request.acceleration_scaling
-        # The peaks of a cubic over time T: velocity 1.5 way / T, acceleration 6 way / T^2.
+        # Peaks of a cubic over time T: velocity 1.5 distance / T, acceleration 6 distance / T^2.
         duration = max((1.5 * way / velocity).max(), np.sqrt(6 * way / acceleration).max(), 0.01)
         points = tuple(_cubic_point(request.start, end, duration, share) for share in np.linspace(0.0, 1.0, 50))
         return PlanResult(JointTrajectory(Header(), request.joints, points))

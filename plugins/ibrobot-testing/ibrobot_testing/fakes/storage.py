@@ -1,4 +1,4 @@
-"""Fakes of what writes to disk: a recorder and a dataset writer, in files that numpy and JSON read."""
+"""Fakes of a recorder and a dataset writer, with NumPy and JSON files."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from ibrobot_core.api import (
 
 
 class FakeRecorder(Recorder):
-    """Writes JointStates to `records.jsonl`, a line each, flushed; metadata to `metadata.json`."""
+    """Writes JointStates to `records.jsonl`, one flushed line each; metadata to `metadata.json`."""
 
     def __init__(self, ctx: Context) -> None:
         self._episode: EpisodeStart | None = None
@@ -74,7 +74,7 @@ class FakeRecorder(Recorder):
 
 
 class FakeDataset(DatasetWriter):
-    """Writes each episode to `episode_N.npz`: a column a feature, and the tasks."""
+    """Writes each episode to `episode_N.npz`: one array per feature, and the tasks."""
 
     def __init__(self, ctx: Context) -> None:
         self._root: Path | None = None

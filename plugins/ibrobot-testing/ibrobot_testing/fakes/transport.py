@@ -1,4 +1,4 @@
-"""The fake transport: within this process."""
+"""A fake transport within the process."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class _Threads[T]:
             self._pool.submit(self._call, item)
 
     def end(self) -> None:
-        """Begin nothing more."""
+        """Stop processing."""
         self._pool.shutdown(wait=False, cancel_futures=True)
 
     def _call(self, item: T) -> None:
@@ -45,9 +45,9 @@ class _Threads[T]:
 
 
 class FakeTransport(Transport):
-    """Each subscriber is called in a thread of its own, and each server in several.
+    """A transport within the process: each subscriber has its own thread, and each server several.
 
-    What a slow one has not taken yet waits for it in memory.
+    Queues are unbounded.
     """
 
     def __init__(self) -> None:
@@ -117,7 +117,7 @@ class FakeTransport(Transport):
 
     @override
     def watch(self, name: str, changed: Callable[[bool], object]) -> Callable[[], None]:
-        turn = threading.Lock()  # held until the present state was delivered, which comes first
+        turn = threading.Lock()  # held until the present state is delivered, which must come first
 
         def tell(served: bool) -> None:
             with turn:
