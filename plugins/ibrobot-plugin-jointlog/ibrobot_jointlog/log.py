@@ -57,7 +57,7 @@ def read_log(path: Path) -> JointLog:
         where, cells = f"{path}:{number}", line.split(",")
         values = _numbers(where, names, cells)
         if times and values[0] <= times[-1]:
-            raise RecorderError(f"{where}: time_s is {values[0]}, must be greater than {times[-1]} of the previous row")
+            raise RecorderError(f"{where}: time_s is {values[0]}, must be greater than {times[-1]}")
         times.append(values[0])
         samples.append(values[1:])
     if not times:
