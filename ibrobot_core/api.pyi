@@ -218,11 +218,12 @@ from ibrobot_core.config import (
     from_document as from_document,
     load_config as load_config,
 )
-from ibrobot_core.config.load import load_contract as load_contract
+from ibrobot_core.config.load import contract_alone as contract_alone, read_document as read_document
 from ibrobot_core.config.schema import (
     TASK_KEY as TASK_KEY,
     Align as Align,
     ControlMode as ControlMode,
+    ExecutorConfig as ExecutorConfig,
     ImageSpec as ImageSpec,
     Mount as Mount,
     TransportConfig as TransportConfig,

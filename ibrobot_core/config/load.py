@@ -15,7 +15,7 @@ from ibrobot_core.config.contract_checks import ContractChecks
 from ibrobot_core.config.convert import shown
 from ibrobot_core.config.missing import split
 from ibrobot_core.config.overrides import apply_overrides, put
-from ibrobot_core.config.schema import ComponentConfig, ExecutorConfig, PeripheralConfig, RobotConfig
+from ibrobot_core.config.schema import ComponentConfig, ContractConfig, PeripheralConfig, RobotConfig
 from ibrobot_core.config.secrets import check_known, expanded_again, public, warn_of_literals
 from ibrobot_core.config.structure import ParsedComponent, ParsedSections, SectionParser
 from ibrobot_core.config.yaml_nodes import MAX_BYTES, Document, Place, parse_yaml
@@ -49,50 +49,38 @@ def load_config(
     Raises:
         ConfigError: with everything that is wrong, in file order.
     """
-    document = _parse(path)
+    document = read_document(path)
     _override(document, overrides, mode)
     config = _build(document, Path(path), sim, registry or installed_plugins(), communicates)
     warn_of_literals(document)
     return config
 
 
-def load_contract(path: str | Path, registry: Registry | None = None) -> RobotConfig:
-    """Read and check a robot YAML for its contract, or a file that has a `contract` section alone.
+def contract_alone(document: Document, base: Path, registry: Registry | None = None) -> ContractConfig:
+    """The contract of a document that has no other section, for converting foreign bags.
 
-    Such a file is for converting foreign bags: its actions have `joints` in place of an executor. Its config is of a
-    robot without a name or joints.
+    Its actions have `joints`: no executor says what their numbers are.
+
+    Args:
+        document: as `read_document` gives it.
+        base: where relative paths start.
+        registry: the plugins; the installed ones when None.
 
     Raises:
         ConfigError: with everything that is wrong, in file order.
     """
-    document = _parse(path)
-    registry = registry or installed_plugins()
-    if set(document.root) != {"contract"}:
-        return load_config(path, registry=registry)
-    section = document.root["contract"]
-    actions = section.get("actions") if isinstance(section, Mapping) else None
-    for action in actions if isinstance(actions, list) else ():
-        if isinstance(action, dict):
-            for key, value in (("executor", str(action.get("topic", ""))), ("foreign", True)):
-                if action.setdefault(key, value) != value:
-                    document.add(("contract", "actions"), f"{key} has no meaning in a contract alone; leave it out")
-    sections = SectionParser(document, registry, Path(path).absolute().parent, sim=False).contract()
+    sections = SectionParser(document, registry or installed_plugins(), base, sim=False).contract()
     contract = ContractChecks(document, sections, alone=True).run()
     document.raise_problems()
-    parts_of = {spec.executor: spec.joints for spec in contract.actions}
-    executors = {name: ExecutorConfig("", None, name, "", joints) for name, joints in parts_of.items()}
-    return RobotConfig(
-        robot=Robot("", ()),
-        executors=executors,
-        control_modes={},
-        default_control_mode="",
-        contract=contract,
-        source=Path(path),
-        document=document.root,
-    )
+    return contract
 
 
-def _parse(path: str | Path) -> Document:
+def read_document(path: str | Path) -> Document:
+    """Read a YAML file that is a mapping of sections; what is in them is not checked yet.
+
+    Raises:
+        ConfigError: when it cannot be read, or is none.
+    """
     try:
         with Path(path).open(encoding="utf-8") as file:
             text = file.read(MAX_BYTES + 1)

@@ -15,7 +15,6 @@ import pytest
 
 from ibrobot_core.cli.main import cli
 from ibrobot_core.config import from_document
-from ibrobot_core.config.load import load_contract
 from ibrobot_core.config.yaml_nodes import parse_yaml
 from ibrobot_core.errors import ConfigError
 from ibrobot_core.plugins import installed_plugins
@@ -210,6 +209,8 @@ def _check_excerpt(values: Any, folder: Path, *, sim: bool) -> None:
 
 
 def test_every_robot_yaml_passes_the_check(tmp_path: Path) -> None:
+    from ibrobot_data.given import load_contract
+
     wrong = []
     robot = last = _robot()
     for excerpt in _excerpts():

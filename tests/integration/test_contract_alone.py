@@ -11,12 +11,12 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from command_line import run_here
+from ibrobot_data.given import load_contract
 from ibrobot_ros2 import encode
 from recordings import JOINTS, SIZE, START_NS, numbered
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from ibrobot_core.config.load import load_contract
 from ibrobot_core.errors import ConfigError
 from ibrobot_core.messages import (
     Bool,

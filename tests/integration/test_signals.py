@@ -11,6 +11,7 @@ from typing import Any
 import pyarrow.parquet as pq
 import pytest
 from ibrobot_data.episode import DATASET, Job, convert_episode
+from ibrobot_data.given import load_contract
 from ibrobot_data.request import ConversionRequest, EpisodeReport
 from ibrobot_lerobot.options import LeRobotOptions
 from ibrobot_ros2 import encode
@@ -18,7 +19,6 @@ from recordings import JOINTS, START_NS
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from ibrobot_core.config.load import load_contract
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import ConfigError
 from ibrobot_core.messages import Bool, Float64MultiArray, Header, JointState, String

@@ -187,7 +187,8 @@ def _options(kind: str, type_: str, overrides: Sequence[str]) -> Any:
 
 
 def _robot(config: str) -> RobotConfig:
-    from ibrobot_core.api import find_config, load_contract
+    from ibrobot_core.api import find_config
+    from ibrobot_data.given import load_contract
 
     return load_contract(find_config(config, installed_plugins()))
 

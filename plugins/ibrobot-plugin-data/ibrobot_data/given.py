@@ -1,12 +1,55 @@
-"""What a robot YAML says of a dataset that keeps nothing itself."""
+"""What a robot YAML says of episodes and datasets that keep nothing themselves."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
-from ibrobot_core.api import Contract, RobotConfig, robot_metadata, with_closed_ends
+from ibrobot_core.api import (
+    Contract,
+    ExecutorConfig,
+    Robot,
+    RobotConfig,
+    contract_alone,
+    load_config,
+    read_document,
+    robot_metadata,
+    with_closed_ends,
+)
+
+
+def load_contract(path: str | Path) -> RobotConfig:
+    """Read and check a robot YAML for its contract, or a file that has a `contract` section alone.
+
+    Such a file is for converting foreign bags: its actions have `joints` in place of an executor. Its config is of a
+    robot without a name or joints.
+
+    Raises:
+        ConfigError: with everything that is wrong, in file order.
+    """
+    document = read_document(path)
+    if set(document.root) != {"contract"}:
+        return load_config(path)
+    section = document.root["contract"]
+    actions = section.get("actions") if isinstance(section, Mapping) else None
+    for action in actions if isinstance(actions, list) else ():
+        if isinstance(action, dict):
+            for key, value in (("executor", str(action.get("topic", ""))), ("foreign", True)):
+                if action.setdefault(key, value) != value:
+                    document.add(("contract", "actions"), f"{key} has no meaning in a contract alone; leave it out")
+    contract = contract_alone(document, Path(path).absolute().parent)
+    parts_of = {spec.executor: spec.joints for spec in contract.actions}
+    return RobotConfig(
+        robot=Robot("", ()),
+        executors={name: ExecutorConfig("", None, name, "", joints) for name, joints in parts_of.items()},
+        control_modes={},
+        default_control_mode="",
+        contract=contract,
+        source=Path(path),
+        document=document.root,
+    )
 
 
 def metadata_from_config(
