@@ -25,6 +25,8 @@ myst_heading_anchors = 3
 exclude_patterns = ["_build"]
 html_theme = "furo"
 html_title = "ibrobot"
+html_static_path = ["_static"]
+html_css_files = ["wide.css"]
 
 autodoc_member_order = "bysource"
 autodoc_default_options = {"members": True, "show-inheritance": True}
@@ -34,9 +36,9 @@ nitpick_ignore_regex = [("py:.*", r"(?!ibrobot_core\.interfaces\.\w+\.[A-Z]).*")
 
 
 def _keep_colons(app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
-    """Napoleon reads "word: words" at the beginning of an attribute's docstring as its type, unless a line precedes."""
-    if what == "attribute":
-        lines.insert(0, "")
+    """Begin docstrings of attributes with an empty comment, since Napoleon takes text before a colon for a type."""
+    if what in ("attribute", "data", "property"):
+        lines[:0] = ["..", ""]
 
 
 def setup(app: Sphinx) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable, Iterator
 from typing import Any, get_args
 
@@ -27,7 +28,7 @@ def config_page() -> Iterator[str]:
     for name, field in SECTIONS.items():
         required = "required" if field.default is attrs.NOTHING else ""
         target = next((f"[`{name}`](#{_anchor(kind)})" for _, kind in _classes(name, field.type)), f"`{name}`")
-        yield f"| {target} | {required} | {field.metadata['help']} |"
+        yield f"| {target} | {required} | {_text(field.metadata['help'])} |"
     registry = installed_plugins()
     for name in registry.types("section"):
         yield f"| [`{name}`](#{_options_anchor('section', name)}) | | {registry.find('section', name).summary} |"
@@ -95,9 +96,21 @@ def _table(kind: type[Any], *, links: bool = True) -> Iterator[str]:
     for each in described(kind):
         inner = [(path, found) for path, found in _classes(each.name, fields(kind)[each.name].type) if links]
         keys = "".join(f"; keys of [`{path}`](#{_anchor(found)})" for path, found in inner)
-        cells = (f"`{each.name}`", f"`{each.type}`", each.unit, _default(each.default), each.allowed, each.help + keys)
+        cells = (
+            f"`{each.name}`",
+            f"`{each.type}`",
+            each.unit,
+            _default(each.default),
+            each.allowed,
+            _text(each.help) + keys,
+        )
         yield _row(cells)
     yield ""
+
+
+def _text(help_text: str) -> str:
+    """A help text with its flags, e.g. --sim, as code; otherwise they get a dash for their two hyphens."""
+    return re.sub(r"(?<!\S)--\w[\w-]*", lambda flag: f"`{flag[0]}`", help_text)
 
 
 def _row(cells: Iterable[str]) -> str:
