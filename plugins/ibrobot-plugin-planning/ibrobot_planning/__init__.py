@@ -5,12 +5,20 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.api import ExecutorDescriptor, MissingDependency, PlannerDescriptor, hookimpl
+from ibrobot_core.api import (
+    ExecutorDescriptor,
+    MissingDependency,
+    OptionFault,
+    PlannerDescriptor,
+    SectionDescriptor,
+    hookimpl,
+)
 from ibrobot_planning.executors.options import GripperOptions, TrajectoryOptions
 from ibrobot_planning.options import JointPlannerOptions, RrtConnectOptions
+from ibrobot_planning.world_options import WorldOptions
 
 if TYPE_CHECKING:
-    from ibrobot_core.api import Context, Executor, Planner
+    from ibrobot_core.api import Component, Context, Executor, Planner, Robot, Session
 
 
 def _joint(options: Any, ctx: Context) -> Planner:
@@ -71,4 +79,28 @@ def ibrobot_executors() -> Iterable[ExecutorDescriptor]:
     yield ExecutorDescriptor(
         type="gripper", options=GripperOptions, make=_gripper, goals="position",
         summary="opens or closes a gripper; a stall counts as grasped",
+    )  # fmt: skip
+
+
+def _world(options: WorldOptions, session: Session) -> Component:
+    from ibrobot_planning.world_keeper import WorldKeeper
+
+    return WorldKeeper(options, session)
+
+
+def _check_world(options: WorldOptions, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
+    """Check that the objects have sensible sizes and that meshes can be read."""
+    for name, thing in options.objects.items():
+        try:
+            thing.made()
+        except ValueError as error:
+            yield OptionFault(("objects", name), str(error))
+
+
+@hookimpl
+def ibrobot_sections() -> Iterable[SectionDescriptor]:
+    """What is around the robot."""
+    yield SectionDescriptor(
+        type="world", options=WorldOptions, make=_world, check=_find_engines, check_options=_check_world,
+        summary="objects that planners avoid: boxes, spheres, cylinders, meshes, planes; services change them",
     )  # fmt: skip

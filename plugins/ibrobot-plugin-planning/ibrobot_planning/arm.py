@@ -19,8 +19,8 @@ from ibrobot_planning.shapes import convex, geometry
 from ibrobot_planning.transforms import rotation
 from ibrobot_planning.world import Box, Capsule, Cylinder, Plane, Shape, Sphere
 
-ADJACENT, ALWAYS, NEVER = "Adjacent", "Always", "Never"
-"""Why a pair of links is not checked, as an SRDF says it."""
+ADJACENT, ALWAYS, NEVER, SRDF = "Adjacent", "Always", "Never", "SRDF"
+"""Why a pair of links is not checked; the first three as MoveIt's setup assistant writes them."""
 _PLANE, _SPHERE, _CAPSULE, _CYLINDER, _BOX, _MESH = 0, 2, 3, 5, 6, 7
 """Values of mujoco.mjtGeom."""
 _HINGE, _SLIDE = 3, 2

@@ -9,7 +9,9 @@ from typing import override
 
 import attrs
 import numpy as np
-from ibrobot_kinematics import KinematicModel, robot_model
+from ibrobot_kinematics import KinematicModel, KinematicsError, robot_model
+from ibrobot_kinematics.srdf import Srdf, read_srdf
+from ibrobot_kinematics.urdf import read_urdf
 
 from ibrobot_core.api import (
     AnyGoal,
@@ -30,7 +32,7 @@ from ibrobot_core.api import (
     Vector,
     ns,
 )
-from ibrobot_planning.arm import Arm, Pair, robot_arm
+from ibrobot_planning.arm import SRDF, Arm, Pair, robot_arm
 from ibrobot_planning.collision import Collisions, Contact, unchecked_pairs
 from ibrobot_planning.goals import Candidate, Tool, joint_target
 from ibrobot_planning.linear import linear_path
@@ -38,9 +40,7 @@ from ibrobot_planning.options import RrtConnectOptions
 from ibrobot_planning.search import Space, connect, shortened
 from ibrobot_planning.timing import Motion, timed
 from ibrobot_planning.world import World
-
-SNAPSHOT = "/world/snapshot"
-"""Service that answers with the `World` of the run; where nobody serves it, `RrtConnectPlanner.world` counts."""
+from ibrobot_planning.world_keeper import SNAPSHOT
 
 _RESOLUTIONS_M = (0.02, 0.006)
 """How far the arm moves at most between checks of the search; finer ones follow where the timed motion touches."""
@@ -66,7 +66,7 @@ class RrtConnectPlanner(Planner):
     """Plans around the objects of a world, with padding.
 
     Attributes:
-        world: what is around the arm where no component of the run serves it; replace it at any time.
+        world: what is around the arm where the run has no section `world`; replace it at any time.
     """
 
     def __init__(self, options: RrtConnectOptions, ctx: Context) -> None:
@@ -76,6 +76,7 @@ class RrtConnectPlanner(Planner):
         self._arm: Arm | None = None
         self._tool: Tool | None = None
         self._unchecked: dict[Pair, str] = {}
+        self._srdf: Srdf | None = None
 
     @override
     def load(self) -> None:
@@ -83,6 +84,23 @@ class RrtConnectPlanner(Planner):
         self._arm = robot_arm(robot)
         self._tool = Tool(robot_model(robot))
         self._unchecked = unchecked_pairs(self._arm)
+        if robot.description.srdf is not None and robot.description.urdf is not None:
+            self._srdf = read_srdf(robot.description.srdf, read_urdf(robot.description.urdf))
+            self._leave_out(self._srdf)
+
+    def _leave_out(self, srdf: Srdf) -> None:
+        """Do not check pairs of the SRDF, which names links of the URDF: the MJCF may call them otherwise."""
+        for pair in srdf.may_touch:
+            unknown = [link for link in pair if link not in self.arm.frames]
+            if unknown:
+                self._ctx.log.warning(
+                    "%s: pair %s is checked nevertheless: the MJCF has no link %r",
+                    srdf.path,
+                    " and ".join(pair),
+                    unknown[0],
+                )
+            else:
+                self._unchecked[pair] = SRDF
 
     @property
     def arm(self) -> Arm:
@@ -100,7 +118,7 @@ class RrtConnectPlanner(Planner):
             arm, self._snapshot(), request.joints, request.others,
             padding=options.padding, self_padding=options.self_padding, unchecked=self._unchecked,
         )  # fmt: skip
-        plan = _Plan(self._ctx, options, request, start, checks, begun + options.planning_time)
+        plan = _Plan(self._ctx, options, request, start, checks, self._srdf, begun + options.planning_time)
         assert self._tool is not None
         return plan.solve(self._tool)
 
@@ -160,6 +178,7 @@ class _Plan:
     request: PlanRequest
     start: Vector
     checks: Collisions
+    srdf: Srdf | None
     deadline: float
 
     def solve(self, tool: Tool) -> PlanResult:
@@ -230,6 +249,8 @@ class _Plan:
 
     def _candidates(self, tool: Tool, goal: object) -> list[Candidate]:
         robot = self.ctx.robot
+        if isinstance(goal, NamedGoal) and goal.name not in robot.description.poses and self.srdf is not None:
+            goal = self._state(goal.name, self.srdf)
         if isinstance(goal, JointGoal | NamedGoal):
             whole = self._whole()
             whole[self._order] = joint_target(goal, robot, self.request.joints, self.start)
@@ -242,6 +263,15 @@ class _Plan:
             " PoseGoal, AnyGoal and LinearGoal",
             PlanCode.UNRECOGNIZED_GOAL_TYPE,
         )
+
+    def _state(self, name: str, srdf: Srdf) -> JointGoal:
+        """A pose of the SRDF, of the planned joints."""
+        try:
+            state = srdf.state(name).positions
+        except KinematicsError as error:
+            raise PlanningError(str(error), PlanCode.INVALID_GOAL_CONSTRAINTS) from error
+        joints = tuple(joint for joint in self.request.joints if joint in state)
+        return JointGoal(joints, np.array([state[joint] for joint in joints]))
 
     def _check_chain(self, model: KinematicModel) -> None:
         missing = [model.joint_names[i] for i in model.moving if model.joint_names[i] not in self.request.joints]

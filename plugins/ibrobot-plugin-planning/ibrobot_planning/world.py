@@ -195,12 +195,12 @@ class World:
         Raises:
             PlanningError: for a name that no object has; so do the methods below.
         """
-        self._named(name)
+        self.named(name)
         return World({key: value for key, value in self.objects.items() if key != name})
 
     def move(self, name: str, pose: Pose) -> World:
         """With an object elsewhere, in the frame in which it stands."""
-        return World({**self.objects, name: attrs.evolve(self._named(name), pose=pose)})
+        return World({**self.objects, name: attrs.evolve(self.named(name), pose=pose)})
 
     def attach(self, name: str, link: str, pose: Pose, may_touch: frozenset[str] = frozenset()) -> World:
         """With an object carried by `link`, at `pose` in the link's frame, touching the link and `may_touch`.
@@ -208,7 +208,7 @@ class World:
         Raises:
             PlanningError: for a name that no object has, or an object that is attached already.
         """
-        thing = self._named(name)
+        thing = self.named(name)
         if thing.link is not None:
             raise PlanningError(f"object {name!r} is attached to {thing.link!r} already", PlanCode.INVALID_OBJECT_NAME)
         touching = thing.may_touch | may_touch | {link}
@@ -220,12 +220,17 @@ class World:
         Raises:
             PlanningError: for a name that no object has, or an object that is not attached.
         """
-        thing = self._named(name)
+        thing = self.named(name)
         if thing.link is None:
             raise PlanningError(f"object {name!r} is not attached", PlanCode.INVALID_OBJECT_NAME)
         return World({**self.objects, name: attrs.evolve(thing, link=None, pose=pose, may_touch=may_touch)})
 
-    def _named(self, name: str) -> WorldObject:
+    def named(self, name: str) -> WorldObject:
+        """An object.
+
+        Raises:
+            PlanningError: for a name that no object has.
+        """
         if name not in self.objects:
             raise PlanningError(
                 f"no object {name!r}; the objects are: {', '.join(self.objects) or 'none'}",

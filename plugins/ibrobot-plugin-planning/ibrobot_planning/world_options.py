@@ -1,0 +1,128 @@
+"""What the YAML may say under `world:`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import attrs
+
+from ibrobot_core.api import Pose, Vector3, documented, option
+from ibrobot_planning.transforms import from_rpy
+
+if TYPE_CHECKING:
+    from ibrobot_planning.world import WorldObject
+
+_KEYS = {
+    "box": ("size",), "sphere": ("radius",), "cylinder": ("radius", "height"), "capsule": ("radius", "height"),
+    "plane": (), "mesh": ("file",),
+}  # fmt: skip
+"""Shape -> the keys that it needs."""
+
+
+@documented
+@attrs.frozen
+class ObjectOptions:
+    """One object of the world."""
+
+    shape: Literal["box", "sphere", "cylinder", "capsule", "plane", "mesh"] = option(
+        help="box about its centre, sphere, cylinder or capsule along z, everything below z = 0, or triangles of a file"
+    )
+    size: tuple[float, float, float] | None = option(None, unit="m", help="lengths of a box along x, y and z")
+    radius: float | None = option(None, unit="m", gt=0, help="of a sphere, cylinder or capsule")
+    height: float | None = option(None, unit="m", gt=0, help="of a cylinder, or of the cylinder of a capsule")
+    file: Path | None = option(None, help="mesh: STL, OBJ or PLY")
+    scale: float = option(1.0, gt=0, help="what the numbers of the mesh are multiplied by, e.g. 0.001 for millimetres")
+    convex: bool = option(False, help="whether to take the mesh's convex hull: solid, and faster to check")
+    position: tuple[float, float, float] = option((0.0, 0.0, 0.0), unit="m", help="in the base frame")
+    rpy: tuple[float, float, float] = option((0.0, 0.0, 0.0), unit="rad", help="turns about the base's x, y and z axis")
+    link: str | None = option(None, help="link of the MJCF that carries it; its position and turns are in that frame")
+    may_touch: tuple[str, ...] = option((), help="links and objects that it may touch")
+
+    def __attrs_post_init__(self) -> None:
+        needed = _KEYS.get(self.shape, ())
+        given = {"size": self.size, "radius": self.radius, "height": self.height, "file": self.file}
+        for key, value in given.items():
+            if key in needed and value is None:
+                raise ValueError(f"a {self.shape} needs {' and '.join(needed)}; {key} is missing")
+            if key not in needed and value is not None:
+                takes = f"it takes {' and '.join(needed)}" if needed else "it takes no size"
+                raise ValueError(f"a {self.shape} has no {key}; {takes}")
+        if self.size is not None and min(self.size) <= 0:
+            raise ValueError(f"size is {list(self.size)}, must be three lengths above 0")
+
+    def made(self) -> WorldObject:
+        """The object.
+
+        Raises:
+            ValueError: for a size that cannot be meant, or a mesh that cannot be read.
+        """
+        from ibrobot_planning.world import Box, Capsule, Cylinder, Plane, Shape, Sphere, WorldObject, read_mesh
+
+        shape: Shape
+        if self.size is not None:
+            shape = Box(self.size)
+        elif self.file is not None:
+            shape = read_mesh(self.file, self.scale, convex=self.convex)
+        elif self.radius is not None and self.height is not None:
+            shape = (Cylinder if self.shape == "cylinder" else Capsule)(self.radius, self.height)
+        elif self.radius is not None:
+            shape = Sphere(self.radius)
+        else:
+            shape = Plane()
+        return WorldObject(shape, Pose(Vector3(*self.position), from_rpy(*self.rpy)), self.link, self.may_touch)
+
+
+@documented
+@attrs.frozen
+class WorldOptions:
+    """The section `world`: what stands around the robot, for planners."""
+
+    objects: Mapping[str, ObjectOptions] = option(factory=dict, help="objects by name")
+
+
+@documented
+@attrs.frozen
+class Added:
+    """A request to `/world/add`."""
+
+    name: str = option(help="a name that no object has")
+    object: ObjectOptions = option(help="the object, as in the YAML")
+
+
+@documented
+@attrs.frozen
+class Named:
+    """A request to `/world/remove`."""
+
+    name: str = option(help="the object's name")
+
+
+@documented
+@attrs.frozen
+class Moved:
+    """A request to `/world/move`."""
+
+    name: str = option(help="the object's name")
+    position: tuple[float, float, float] = option(unit="m", help="in the frame in which the object stands")
+    rpy: tuple[float, float, float] = option((0.0, 0.0, 0.0), unit="rad", help="turns about its x, y and z axis")
+
+
+@documented
+@attrs.frozen
+class Attached:
+    """A request to `/world/attach`: the object stays where it is as seen from the link."""
+
+    name: str = option(help="the object's name")
+    link: str = option(help="the link of the MJCF that carries it from now on")
+    may_touch: tuple[str, ...] = option((), help="further links that it may touch, e.g. the other finger")
+
+
+@documented
+@attrs.frozen
+class Detached:
+    """A request to `/world/detach`: the object stays where it is."""
+
+    name: str = option(help="the object's name")
+    may_touch: tuple[str, ...] = option((), help="what it may touch from now on, e.g. the table")

@@ -1,0 +1,152 @@
+"""The section `world`: objects from the YAML, and services that change them."""
+
+from __future__ import annotations
+
+import logging
+from typing import override
+
+import numpy as np
+import pytest
+from ibrobot_planning import ibrobot_sections
+from ibrobot_planning.options import RrtConnectOptions
+from ibrobot_planning.rrt import RrtConnectPlanner
+from ibrobot_planning.transforms import matrix
+from ibrobot_planning.world import Box, Capsule, Cylinder, Mesh, Plane, Sphere
+from ibrobot_planning.world_keeper import SNAPSHOT, WorldKeeper
+from ibrobot_planning.world_options import WorldOptions
+from ibrobot_testing import SectionSuite, make_session
+
+from ibrobot_core.api import ConfigError, Context, JointGoal, PlanningError, PlanRequest, SteppedClock, single_options
+
+from .table_arm import ARM, make_robot
+from .test_world import STL
+
+YAML = """
+objects:
+  table: {shape: box, size: [0.6, 0.8, 0.02], position: [0.3, 0, -0.02]}
+  can: {shape: cylinder, radius: 0.03, height: 0.1, position: [0.3, 0.1, 0.05], may_touch: [table]}
+  ball: {shape: sphere, radius: 0.02, position: [0.1, 0, 0.6]}
+  pen: {shape: capsule, radius: 0.005, height: 0.1, rpy: [0, 1.5708, 0], position: [0.3, -0.2, 0.3]}
+  wall: {shape: plane, rpy: [0, 1.5708, 0], position: [-0.5, 0, 0]}
+"""
+
+
+def options(text: str = YAML) -> WorldOptions:
+    return single_options(WorldOptions, (), "world", text=text)
+
+
+class TestWorldKeeper(SectionSuite):
+    @override
+    def component(self, session):
+        return WorldKeeper(options(), session)
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch):
+    """A session with the world, of the arm at zero."""
+    session = make_session(robot=make_robot(tmp_path))
+    reading = type("Reading", (), {"position": np.zeros(6)})()
+    monkeypatch.setattr(session, "measured", lambda: reading)
+    keeper = WorldKeeper(options(), session)
+    keeper.start()
+    yield session.bus
+    keeper.stop()
+
+
+def test_objects_come_from_the_yaml(run):
+    objects = run.call(SNAPSHOT, None).objects
+    assert {name: type(thing.shape) for name, thing in objects.items()} == {
+        "table": Box, "can": Cylinder, "ball": Sphere, "pen": Capsule, "wall": Plane,
+    }  # fmt: skip
+    assert objects["can"].may_touch == {"table"}
+    np.testing.assert_allclose(matrix(objects["pen"].pose)[:3, 2], [1, 0, 0], atol=1e-5)
+
+
+def test_services_change_the_world_and_leave_snapshots_alone(run):
+    before = run.call(SNAPSHOT, None)
+    names = run.call("/world/add", "{name: post, object: {shape: box, size: [0.1, 0.1, 0.4]}}")
+    assert names == ["table", "can", "ball", "pen", "wall", "post"]
+    assert "post" not in before.objects
+    run.call("/world/move", "{name: post, position: [0.2, 0.3, 0.2]}")
+    assert run.call(SNAPSHOT, None).objects["post"].pose.position.y == 0.3
+    assert "post" not in run.call("/world/remove", "{name: post}")
+
+
+def test_attached_objects_stay_where_they_are(run):
+    before = matrix(run.call(SNAPSHOT, None).objects["ball"].pose)
+    run.call("/world/attach", "{name: ball, link: hand, may_touch: [finger]}")
+    held = run.call(SNAPSHOT, None).objects["ball"]
+    assert (held.link, held.may_touch) == ("hand", {"hand", "finger"})
+    # The hand is 0.41 m above the base.
+    np.testing.assert_allclose(matrix(held.pose)[:3, 3], [0.1, 0, 0.19], atol=1e-9)
+    run.call("/world/detach", "{name: ball}")
+    put = run.call(SNAPSHOT, None).objects["ball"]
+    assert put.link is None
+    np.testing.assert_allclose(matrix(put.pose), before, atol=1e-9)
+
+
+def test_planners_use_the_world_of_the_run(run, tmp_path):
+    context = Context("planner", SteppedClock(0), logging.getLogger("test"), make_robot(tmp_path), bus=run)
+    planner = RrtConnectPlanner(RrtConnectOptions(), context)
+    planner.load()
+    goal = JointGoal(ARM, np.array([0.3, 1.45, 0.0, 0.0, 0.0]))
+    planner.plan(PlanRequest(ARM, np.zeros(5), goal))
+    run.call("/world/add", "{name: block, object: {shape: box, size: [0.4, 0.4, 0.1], position: [0.3, 0.1, 0.1]}}")
+    with pytest.raises(PlanningError, match=r"the goal is in collision: \w+ overlaps block"):
+        planner.plan(PlanRequest(ARM, np.zeros(5), goal))
+
+
+MALFORMED = {
+    "no size": ("{a: {shape: box}}", "a box needs size; size is missing"),
+    "no radius": ("{a: {shape: sphere}}", "a sphere needs radius; radius is missing"),
+    "no height": ("{a: {shape: cylinder, radius: 0.1}}", "a cylinder needs radius and height; height is missing"),
+    "no file": ("{a: {shape: mesh}}", "a mesh needs file; file is missing"),
+    "no shape": ("{a: {size: [1, 1, 1]}}", "required key is missing"),
+    "another shape": ("{a: {shape: cone}}", "'cone' is not one of: box, sphere, cylinder, capsule, plane, mesh"),
+    "size of a sphere": ("{a: {shape: sphere, radius: 0.1, size: [1, 1, 1]}}", "a sphere has no size; it takes radius"),
+    "radius of a plane": ("{a: {shape: plane, radius: 0.1}}", "a plane has no radius; it takes no size"),
+    "two lengths": ("{a: {shape: box, size: [1, 1]}}", "expected a list of 3 values, got 2"),
+    "flat box": ("{a: {shape: box, size: [1, 1, 0]}}", r"size is \[1.0, 1.0, 0.0\], must be three lengths above 0"),
+    "negative radius": ("{a: {shape: sphere, radius: -1}}", "-1.0 is too small, must be above 0 m"),
+    "text for a number": ("{a: {shape: sphere, radius: small}}", "expected a number, got 'small'"),
+    "unknown key": ("{a: {shape: plane, colour: red}}", "unknown key"),
+    "no mapping": ("[a, b]", "expected a mapping, got a list"),
+}
+
+
+@pytest.mark.parametrize(("text", "message"), MALFORMED.values(), ids=MALFORMED)
+def test_malformed_worlds_are_refused(text, message):
+    with pytest.raises(ConfigError, match=message):
+        options(f"objects: {text}")
+
+
+def test_meshes_and_sizes_are_checked_before_a_run(tmp_path):
+    (descriptor,) = ibrobot_sections()
+    path = tmp_path / "part.stl"
+    path.write_text(STL)
+    good = options(f"objects: {{part: {{shape: mesh, file: {path}, scale: 0.001}}}}")
+    assert list(descriptor.check_options(good, make_robot(tmp_path), ())) == []
+    assert isinstance(good.objects["part"].made().shape, Mesh)
+    for text, message in (
+        ("{part: {shape: mesh, file: none.stl}}", "no file .*none.stl"),
+        ("{part: {shape: box, size: [600, 800, 20]}}", "at most 100 m"),
+        (f"{{part: {{shape: mesh, file: {path}, convex: true}}}}", "a flat mesh has no convex hull"),
+    ):
+        (fault,) = descriptor.check_options(options(f"objects: {text}"), make_robot(tmp_path), ())
+        assert fault.option == ("objects", "part")
+        with pytest.raises(ValueError, match=message):
+            raise ValueError(fault.message)
+
+
+def test_impossible_requests_are_refused(run):
+    for service, text, error, message in (
+        ("/world/add", "{name: can, object: {shape: plane}}", PlanningError, "there is an object 'can' already"),
+        ("/world/add", "{name: cup, object: {shape: box, size: [600, 1, 1]}}", PlanningError, "at most 100 m"),
+        ("/world/add", "{name: cup}", ConfigError, "required key is missing"),
+        ("/world/remove", "{name: cup}", PlanningError, "no object 'cup'; the objects are: table, can"),
+        ("/world/attach", "{name: can, link: foot}", PlanningError, "no link 'foot'; the links are: world, base"),
+        ("/world/detach", "{name: can}", PlanningError, "object 'can' is not attached"),
+    ):
+        with pytest.raises(error, match=message):
+            run.call(service, text)
+    assert len(run.call(SNAPSHOT, None).objects) == 5
