@@ -1,4 +1,4 @@
-"""The model process: loads one policy and runs its `infer` for one robot, until the host ends it or is gone.
+"""The model process: loads one policy and runs its `infer` for one robot, until the host ends it or dies.
 
 Started by `ibrobot_serve.process` as a `Child` with the descriptors REQUEST and ANSWER: memory for the frames
 of the wire format, one each way.
@@ -28,9 +28,9 @@ from ibrobot_core.api import (
 from ibrobot_serve.wire import WIRE_LIMITS, WireDecoder, WireEncoder, WireKind, WireMessage
 
 _GLANCE_S = 0.5
-"""How often to look whether the host is still there."""
+"""How often to check whether the host is alive [s]."""
 _NICE = 5
-"""Behind the host, which has cameras to read and a plan to send while the model computes."""
+"""Below the priority of the host, which reads cameras and sends plans while the model computes."""
 
 
 @attrs.define
@@ -94,7 +94,7 @@ def main(parent: int, request: int, answer: int) -> int:
         channel.send({"event": "ready", "fingerprint": policy.fingerprint(), "weights": policy.weights()})
         frames = [memoryview(mmap.mmap(descriptor, WIRE_LIMITS.size)) for descriptor in (request, answer)]
         ModelLoop(policy, channel, frames[0], frames[1]).run()
-    except Exception as error:  # noqa: BLE001 - the host tells it
+    except Exception as error:  # noqa: BLE001 - the host reports it
         channel.send({"event": "failed", "error": error_text(error)})
         return 1
     finally:

@@ -29,14 +29,14 @@ _START_TIMEOUT_S = 600.0
 _END_TIMEOUT_S = 2.0
 _LONGEST_PAUSE_S = 30.0
 _GLANCE_S = 0.1
-"""How often a wait looks whether it was given up."""
+"""How often a wait checks whether the run has ended [s]."""
 
 
 class ProcessEngine(Engine):
     """The model in a process of its own, which loads the weights; tensors go through shared memory.
 
-    One that dies is started again: at once the first time, then after pauses that double until it answers. Requests
-    meanwhile fail, and the arm holds. One that hangs is killed, and so dies.
+    A process that dies is restarted: at once the first time, then after pauses that double until it answers. Meanwhile
+    requests fail, and the arm holds. A process that hangs is killed and restarted too.
 
     Args:
         config: the robot YAML.
@@ -44,7 +44,7 @@ class ProcessEngine(Engine):
         fingerprint: of the policy on this side.
         seed: the run's.
         given_up: set when the run ends, e.g. while the model loads.
-        hang_timeout_s: how long it may be at work on one request before it is taken to hang [s].
+        hang_timeout_s: a process that works on one request for longer hangs [s].
         accept_new_weights: go on, with a warning, when the process starts again with other weights.
     """
 
@@ -70,7 +70,7 @@ class ProcessEngine(Engine):
         self._sent = 0
         """The id of the newest request."""
         self._at_work_s: float | None = None
-        """Since when the process is at work on one request [s]; None while it has none."""
+        """When the process began its current request [s]; None between requests."""
         self._deaths = 0
         self._start_again_s = 0.0
 
@@ -123,7 +123,7 @@ class ProcessEngine(Engine):
     @override
     def close(self) -> None:
         self._closed.set()
-        child = self._child  # a request that goes on may bury it meanwhile
+        child = self._child  # a request in another thread may reap it meanwhile
         if child is not None:
             child.kill()
         with self._lock:
@@ -136,7 +136,7 @@ class ProcessEngine(Engine):
         memories = [create_memory() for _ in range(2)]
         try:
             for memory in memories:
-                os.ftruncate(memory, WIRE_LIMITS.size)  # pages are there from their first use on
+                os.ftruncate(memory, WIRE_LIMITS.size)  # pages are allocated at their first use
             self._request, self._answer = (memoryview(mmap.mmap(memory, WIRE_LIMITS.size)) for memory in memories)
             self._child = Child("ibrobot_serve.model_process", self._order, *memories)
         finally:
@@ -169,7 +169,7 @@ class ProcessEngine(Engine):
                 raise PolicyError(f"the model's process {child.pid} {state} in time")
 
     def _check(self, fingerprint: str, weights: str) -> None:
-        """Take a process that is ready, unless its model is another: the files may have changed since the start."""
+        """Accept a process that is ready, unless its model differs: files may have changed since the start."""
         try:
             if fingerprint != self._fingerprint:
                 raise PolicyError(
@@ -185,7 +185,7 @@ class ProcessEngine(Engine):
         self.stats.alive = True
 
     def _revived(self, deadline_s: float) -> Child:
-        """The process, started again where it died, once it has loaded."""
+        """The process, restarted if it died, once it has loaded the model."""
         child = self._child
         if child is None:
             if (left := self._start_again_s - time.monotonic()) > 0:
@@ -197,7 +197,7 @@ class ProcessEngine(Engine):
         return child
 
     def _died(self, child: Child, why: str = "") -> PolicyError:
-        """What is known of the death of the process, which is set to start again."""
+        """An error with the cause of the process's death; schedules the restart."""
         how = why or child.cause(self._patience_s)
         self._reap()
         pause_s = min(_LONGEST_PAUSE_S, 2.0 ** (self._deaths - 1)) if self._deaths else 0.0
@@ -213,7 +213,7 @@ class ProcessEngine(Engine):
         self._at_work_s = None
         if self._child is not None:
             child, self._child = self._child, None
-            child.channel.close()  # for one that is well, the end
+            child.channel.close()  # a healthy process then ends
             child.end(self._patience_s)
             self._request = self._answer = memoryview(b"")
 

@@ -44,22 +44,22 @@ _HEALTH_TIMEOUT_S = 2.0
 _HEALTH_SIZE = 1 << 20
 _RETRY_S = 0.2
 _PARALLEL = 8
-"""Requests on their way to the server at a time, where its model does not remember them."""
+"""Concurrent requests to a server whose model does not remember them."""
 
 
 class RemoteEngine(Engine):
     """The model on a server; the robot's side has no weights.
 
-    A server that goes away fails requests, and the arm holds; once it is back, requests are answered again, since each
-    says all that a server must know. The transport connects again by itself.
+    While the server is away, requests fail and the arm holds. Once it is back it answers again, because each request
+    contains all that a server needs. The transport reconnects by itself.
 
     Args:
         policy: the robot's side, which must have the fingerprint of the server's.
-        transport: the way to the server; whoever made it closes it.
+        transport: the way to the server; its owner closes it.
         model: what the server calls the model.
         robot: this robot's name; made unique among the server's robots.
         start_timeout_s: how long `start` waits for a server [s].
-        codec: makes JPEG of camera pictures on thin links.
+        codec: encodes camera pictures as JPEG, for slow links.
         limits: the server's.
         accept_new_weights: go on, with a warning, with a server that comes back with other weights.
     """
@@ -74,7 +74,7 @@ class RemoteEngine(Engine):
         """With the server's weights, once it is known."""
         self._accept_new_weights = accept_new_weights
         self._changed = threading.Event()
-        """Set when an answer was another policy's."""
+        """Set when an answer came from another policy."""
         self._looking = threading.Lock()
         self._transport = transport
         self._model = model
@@ -83,9 +83,9 @@ class RemoteEngine(Engine):
         self.parallel = 1 if policy.spec.stateful else _PARALLEL
         self._encoder, self._decoder = WireEncoder(limits, codec), WireDecoder(limits)
         self._buffers = [Buffer() for _ in range(self.parallel)]
-        """Those that are free."""
+        """Free buffers."""
         self._episode = time.time_ns()
-        """An episode's number does not come again after a restart under the same certificate."""
+        """From the time, so that no restart with the same certificate repeats an episode's number."""
         self._end_watch: Callable[[], None] | None = None
 
     @classmethod
@@ -168,7 +168,7 @@ class RemoteEngine(Engine):
             end()
 
     def _look_again(self) -> None:
-        """See which policy the server has now.
+        """Ask which policy the server has now.
 
         Raises:
             PolicyError: when it is another, or has other weights that are not accepted.
@@ -183,7 +183,7 @@ class RemoteEngine(Engine):
             self._changed.clear()
 
     def _adopt(self, health: Mapping[str, Any]) -> None:
-        """Take the server's weights for those that act, where its policy is the robot's."""
+        """Use the server's weights, if its policy is the robot's."""
         weights = str(health.get("weights", ""))[:128]
         fingerprint = whole_fingerprint(self._policy.fingerprint(), weights)
         if health.get("fingerprint") != fingerprint:

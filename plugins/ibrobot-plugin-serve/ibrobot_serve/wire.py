@@ -40,7 +40,7 @@ _CODES = {dtype: code for code, dtype in enumerate(_DTYPES, 1)}
 _JPEG = 128
 _BYTE = np.dtype(np.uint8)
 _LAYOUTS_KEPT = 512
-"""One for each robot, as a rule: more than a server has. They take about 2 kB each."""
+"""Usually one per robot, and more than a server has robots. Each takes about 2 kB."""
 
 
 def service_name(model: str) -> str:
@@ -79,7 +79,7 @@ _KINDS = {kind.value: kind for kind in WireKind}
 
 @attrs.frozen
 class WireLimits:
-    """What a frame may at most be; all are checked before anything is allocated."""
+    """Upper limits of a frame, checked before anything is allocated."""
 
     size: int = 64 * 1024 * 1024
     """Bytes of a frame, and of its pictures once decoded."""
@@ -110,8 +110,7 @@ class WireMessage:
     stamp_ns: int = 0
     """When the robot sent the request, by its own clock; the answer repeats it."""
     deadline_ns: int = 0
-    """In a request: for how long from its arrival on anybody waits for the answer [ns]; no clock needs to agree with
-    another."""
+    """In a request: how long after its arrival the answer is of use [ns]. The clocks of both sides need not agree."""
     episode: int = 0
     """In a request: counts the robot's episodes; a policy that remembers is reset with `seed` where it changes."""
     seed: int = 0
@@ -149,7 +148,7 @@ class _Place:
 
 @attrs.frozen(eq=False)
 class _MessageLayout:
-    """All of a frame but its numbers and its tensors' values: as a rule the same from one request to the next."""
+    """Everything in a frame except its numbers and its tensors' values; usually equal for all requests of a robot."""
 
     robot: str
     fingerprint: str
@@ -261,13 +260,13 @@ def _fresh(size: int) -> memoryview:
 
 
 class Buffer:
-    """Memory for one frame after another: fresh memory for a large one costs more than to fill it."""
+    """Memory reused for one frame after another: to allocate memory for a large frame costs more than to fill it."""
 
     def __init__(self) -> None:
         self._memory = bytearray()
 
     def allocate(self, size: int) -> memoryview:
-        """So many bytes, as a rule those given before: a frame is good until the next is made."""
+        """`size` bytes, usually of the same memory as before: a frame is valid until the next one is made."""
         try:
             if size < len(self._memory):
                 del self._memory[size:]
@@ -279,11 +278,11 @@ class Buffer:
 
 
 class WireEncoder:
-    """Encodes messages, the sooner those that differ from earlier ones in numbers and values alone.
+    """Encodes messages. Messages that differ from earlier ones only in numbers and values are encoded faster.
 
     Args:
         limits: those of the receiver.
-        codec: makes JPEG of camera pictures: their pixels change.
+        codec: encodes camera pictures as JPEG, which changes their pixels.
     """
 
     def __init__(self, limits: WireLimits = WIRE_LIMITS, codec: PictureCodec | None = None) -> None:
@@ -296,7 +295,7 @@ class WireEncoder:
 
         Args:
             message: what to say.
-            allocate: gives writable memory of so many bytes, or more.
+            allocate: returns writable memory of at least so many bytes.
 
         Raises:
             WireError: for what has no place in a frame, e.g. a tensor of objects, or more than the limits allow.
@@ -315,21 +314,21 @@ class WireEncoder:
 
 
 def encode(message: WireMessage, *, limits: WireLimits = WIRE_LIMITS, codec: PictureCodec | None = None) -> memoryview:
-    """As `Encoder.encode`, for once."""
+    """As `WireEncoder.encode`, for a single message."""
     return WireEncoder(limits, codec).encode(message)
 
 
 def decode(payload: Payload, *, limits: WireLimits = WIRE_LIMITS, codec: PictureCodec | None = None) -> WireMessage:
-    """As `Decoder.decode`, for once."""
+    """As `WireDecoder.decode`, for a single frame."""
     return WireDecoder(limits, codec).decode(payload)
 
 
 class WireDecoder:
-    """Decodes frames, the sooner those that differ from earlier ones in numbers and values alone.
+    """Decodes frames. Frames that differ from earlier ones only in numbers and values are decoded faster.
 
     Args:
         limits: a frame beyond them is refused.
-        codec: for pictures that come as JPEG; none are taken without.
+        codec: decodes JPEG pictures; without it they are refused.
     """
 
     def __init__(self, limits: WireLimits = WIRE_LIMITS, codec: PictureCodec | None = None) -> None:
@@ -339,7 +338,7 @@ class WireDecoder:
         """By their heads."""
 
     def decode(self, payload: Payload) -> WireMessage:
-        """A message whose tensors are read-only views of `payload`: nothing is copied, but for JPEG.
+        """A message whose tensors are read-only views of `payload`; only JPEG pictures have memory of their own.
 
         May be called by several threads at a time.
 
@@ -386,7 +385,7 @@ class WireDecoder:
             )
         end = table = _HEAD_SIZE + robot_size + fingerprint_size + text_size
         if count and table + _OFFSET.size <= size:
-            # The table ends where the first tensor begins; whether it does is seen when it is read.
+            # The table ends where the first tensor begins; reading it checks that.
             longest = count * (_ENTRY.size + 4 * limits.ndim + limits.name) + ALIGNMENT
             end = min(_OFFSET.unpack_from(frame, table)[0], table + longest)
         head = bytes(frame[_NUMBERS.size : end])
@@ -396,7 +395,7 @@ class WireDecoder:
             robot, fingerprint, text = (reader.text(n) for n in (robot_size, fingerprint_size, text_size))
             places = _places(reader, count, limits)
             layout = _MessageLayout(robot, fingerprint, text, places, head, size)
-            if not (text or any(place.jpeg for place in places)):  # those do not come again
+            if not (text or any(place.jpeg for place in places)):  # they rarely repeat
                 self._layouts.keep(head, layout)
         return layout
 
@@ -406,7 +405,7 @@ class WireDecoder:
             picture = self._codec.decode(frame[place.offset : place.offset + place.nbytes], (height, width, channels))
         except WireError as error:
             raise WireError(f"picture {place.name!r}: {error}") from None
-        except Exception as error:  # contained: a decoder may fail in any way over what a stranger sent
+        except Exception as error:  # contained: a decoder may raise anything for bytes from the network
             raise WireError(f"picture {place.name!r}: {type(error).__name__}: {error}") from error
         if picture.shape != place.shape or picture.dtype != _BYTE:
             raise WireError(
