@@ -29,6 +29,7 @@ from ibrobot_core.api import (
     run_robot,
     wrong_input,
 )
+from ibrobot_data.episode import recorded_contract
 from ibrobot_data.given import metadata_from_config
 from ibrobot_data.playback import read_playback
 from ibrobot_data.replay_source import Replay, ReplaySource
@@ -120,14 +121,11 @@ def _mode(robot: RobotConfig) -> str:
 
 def _check(contract: Contract, summary: EpisodeSummary, name: str, *, force: bool) -> None:
     """Check that the episode was recorded with this contract; one without its own goes by CONFIG's."""
-    text = summary.metadata.get("contract")
-    if text is None:
-        return
     try:
-        recorded = Contract.from_canonical(json.loads(text))
-    except ValueError as error:
-        raise ContractError(f"{summary.path}: the recorded contract cannot be read: {error}") from None
-    if recorded.fingerprint() == contract.fingerprint():
+        recorded = recorded_contract(summary.metadata)
+    except ContractError as error:
+        raise ContractError(f"{summary.path}: {error}") from None
+    if recorded is None or recorded.fingerprint() == contract.fingerprint():
         return
     actions = [[(part.topic, part.type, part.joints) for part in each.action_parts] for each in (recorded, contract)]
     if force and actions[0] == actions[1]:
