@@ -159,6 +159,7 @@ class VelocityJog:
         self._setpoint = measured.copy()
         self._direction[:] = 0.0
         self._twist[:] = 0.0
+        self._arm.stop_tool()
 
     def move(self, measured: Vector, motion: JogMotion, dt: float) -> Vector:
         """The setpoints after a motion of `dt` [s], shape (J,).
@@ -180,7 +181,8 @@ class VelocityJog:
         if turns_tool:
             fresh[arm] |= bool(twist @ self._twist < 0)
             moving[arm] = True
-            self._twist = twist
+            if twist.any():
+                self._twist = twist
         if motion.pose is not None:
             moving[:] = True
         rest = np.clip(self._setpoint, measured - self._follow, measured + self._follow)

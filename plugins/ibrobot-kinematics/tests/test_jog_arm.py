@@ -113,3 +113,22 @@ def test_a_restart_forgets_the_lead():
         jog.move(STILL, one(0, 1.0), DT)
     jog.restart(STILL)
     np.testing.assert_array_equal(jog.move(STILL, JogMotion(STILL), DT), STILL)
+
+
+def test_a_restart_stops_the_tool(tmp_path):
+    jog, at = VelocityJog(arm_of(tmp_path), 0.1), np.array([BENT[name] for name in FIVE])
+    for _ in range(20):
+        at = jog.move(at, JogMotion(STILL, np.array([0.1, 0.0, 0.0])), DT)
+    jog.restart(at)
+    np.testing.assert_array_equal(jog.move(at, JogMotion(STILL), DT), at)
+
+
+def test_tool_reverses_at_once_also_after_a_rest(tmp_path):
+    jog, at = VelocityJog(arm_of(tmp_path), 0.1), np.array([BENT[name] for name in FIVE])
+    forward = JogMotion(STILL, np.array([0.1, 0.0, 0.0]))
+    for _ in range(400):
+        jog.move(at, forward, DT)
+    for _ in range(50):
+        jog.move(at, JogMotion(STILL), DT)
+    back = jog.move(at, attrs.evolve(forward, linear=-forward.linear), DT)
+    assert np.max(np.abs(back - at)) < 0.02
