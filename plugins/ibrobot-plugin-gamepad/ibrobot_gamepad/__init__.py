@@ -1,0 +1,59 @@
+"""The plugin's hooks: teleops `gamepad` and `spacemouse`, `ibrobot gamepad …`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+from ibrobot_core.api import Check, Command, TeleopDescriptor, hookimpl
+from ibrobot_gamepad.options import GamepadOptions, SpaceMouseOptions
+
+if TYPE_CHECKING:
+    import click
+
+    from ibrobot_core.api import Context, OptionFault, Robot, Teleop
+
+
+def _jog(options: Any, ctx: Context) -> Teleop:
+    from ibrobot_gamepad.teleop import JogTeleop
+
+    return JogTeleop(options, ctx)
+
+
+def _check(options: Any, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
+    from ibrobot_gamepad.mapping import check_mapping
+
+    return check_mapping(options, robot)
+
+
+@hookimpl
+def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
+    """Jog with the hands on a device."""
+    yield TeleopDescriptor(
+        type="gamepad", options=GamepadOptions, make=_jog, check_options=_check,
+        summary="joint and tool jog with an Xbox, PlayStation, Switch, 8BitDo or other pad",
+    )  # fmt: skip
+    yield TeleopDescriptor(
+        type="spacemouse", options=SpaceMouseOptions, make=_jog, check_options=_check,
+        summary="joint and tool jog with a SpaceMouse",
+    )  # fmt: skip
+
+
+def _commands() -> click.Command:
+    from ibrobot_gamepad.commands import gamepad
+
+    return gamepad
+
+
+@hookimpl
+def ibrobot_commands() -> Iterable[Command]:
+    """`ibrobot gamepad …`."""
+    yield Command("gamepad", "List, test and map gamepads and SpaceMice.", _commands)
+
+
+@hookimpl
+def ibrobot_doctor() -> Iterable[Check]:
+    """Check which devices the user may open."""
+    from ibrobot_gamepad.permissions import checks
+
+    return checks()

@@ -1,0 +1,126 @@
+"""`ibrobot gamepad map`: learns which control does what, and prints it for the robot YAML."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import click
+
+from ibrobot_core.api import dump_yaml, echo, find_config, installed_plugins, load_config
+from ibrobot_gamepad.commands.chosen import device_option, opened, watch
+from ibrobot_gamepad.controls import Controls
+from ibrobot_gamepad.devices import Device, Found
+from ibrobot_gamepad.options import FUNCTIONS, TOOL_AXES
+
+_MOVED = 0.6
+"""How far an axis goes from its rest before it is the one that is meant."""
+_WAYS = {
+    "x": "forward", "y": "to the left", "z": "up", "roll": "turned about where it points", "pitch": "down",
+    "yaw": "sideways",
+}  # fmt: skip
+_PRESSES = {
+    "deadman": "that must be held for anything to move", "toggle": "that changes between joints and tool",
+    "gripper_open": "or trigger that opens the gripper", "gripper_close": "or trigger that closes it",
+    "gripper": "that opens and closes it in turns", "estop": "of the emergency stop", "start": "that begins an episode",
+    "success": "that ends one as a success", "failure": "that ends one as a failure",
+    "discard": "that ends one and keeps nothing",
+    "intervention": "that takes the robot from the policy",
+}  # fmt: skip
+
+
+_Find = Callable[[Controls, Controls], str | None]
+"""State and state at rest -> the control that is meant."""
+
+
+@click.command("map")
+@click.argument("config", required=False)
+@device_option
+@click.option("--wait", type=click.FloatRange(min=0), default=5.0, show_default=True, help="Time for each control [s].")
+def map_controls(config: str | None, device: str, wait: float) -> None:
+    """Learn the controls of a device, and print them as YAML for the section `teleoperation`.
+
+    CONFIG is a robot YAML, as for `ibrobot launch`: its joints are asked for. Asks for one control after another: press
+    or move it to its end, then let go. What is not touched in time keeps its default.
+    """
+    registry = installed_plugins()
+    robot = load_config(find_config(config, registry), registry=registry).robot
+    with opened(device) as (kind, found, open_device):
+        echo(f"{found.name} ({found.id}): let go of all controls")
+        learner = _Learner(open_device, wait)
+        joints = {
+            name: f"Move what moves {name} towards its upper limit" for name in robot.joint_names
+            if name not in robot.groups.get("gripper", ())
+        }  # fmt: skip
+        learned = {
+            "joints": learner.axes(joints),
+            "tool": learner.axes({axis: f"Move what moves the tool {_WAYS[axis]} ({axis})" for axis in TOOL_AXES}),
+            "buttons": learner.buttons({name: f"Press the button {_PRESSES[name]} ({name})" for name in FUNCTIONS}),
+        }
+    echo("")
+    echo(dump_yaml({"teleoperation": {kind: _section(kind, found, learned)}}).rstrip())
+
+
+def _section(kind: str, found: Found, learned: Mapping[str, Mapping[str, str]]) -> dict[str, object]:
+    device = f"{found.vendor:04x}:{found.product:04x}"
+    return {"type": kind, "device": device, **{name: dict(pairs) for name, pairs in learned.items() if pairs}}
+
+
+class _Learner:
+    """Asks for controls, one after another."""
+
+    def __init__(self, device: Device, wait_s: float) -> None:
+        self._device = device
+        self._wait_s = wait_s
+        self._rest: Controls | None = None
+        watch(device, wait_s, self._settle)
+
+    def _settle(self, controls: Controls) -> bool:
+        self._rest = controls
+        return True
+
+    def axes(self, questions: Mapping[str, str]) -> dict[str, str]:
+        """Name -> the axis that the operator moved, with a `-` where it went down."""
+        return self._ask(questions, self._moved)
+
+    def buttons(self, questions: Mapping[str, str]) -> dict[str, str]:
+        """Name -> the button that the operator pressed, or the axis."""
+        return self._ask(questions, self._pressed)
+
+    def _ask(self, questions: Mapping[str, str], find: _Find) -> dict[str, str]:
+        learned: dict[str, str] = {}
+        for name, question in questions.items():
+            answer: list[str] = []
+
+            def see(controls: Controls, answer: list[str] = answer) -> bool:
+                if self._rest is None:
+                    return not self._settle(controls)
+                control = find(controls, self._rest)
+                answer += [control] if control is not None else []
+                return control is not None
+
+            echo(f"{question}:", nl=False)
+            watch(self._device, self._wait_s, see)
+            echo(f" {answer[0]}" if answer else " default")
+            if answer:
+                learned[name] = answer[0]
+                watch(self._device, self._wait_s, lambda controls: self._find_any(controls) is None)  # let go
+        return learned
+
+    def _find_any(self, controls: Controls) -> str | None:
+        assert self._rest is not None
+        return self._pressed(controls, self._rest) or self._moved(controls, self._rest)
+
+    @staticmethod
+    def _moved(controls: Controls, rest: Controls) -> str | None:
+        ways = {name: value - rest.axes.get(name, 0.0) for name, value in controls.axes.items()}
+        name = max(ways, key=lambda each: abs(ways[each]), default=None)
+        if name is None or abs(ways[name]) < _MOVED:
+            return None
+        return name if ways[name] > 0 else f"-{name}"
+
+    @staticmethod
+    def _pressed(controls: Controls, rest: Controls) -> str | None:
+        pressed = sorted(controls.buttons - rest.buttons)
+        moved = _Learner._moved(controls, rest)
+        pulled = moved if moved is not None and not moved.startswith("-") else None
+        return pressed[0] if pressed else pulled

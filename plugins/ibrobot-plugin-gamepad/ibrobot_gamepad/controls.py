@@ -1,0 +1,72 @@
+"""What an operator holds at one instant: axes and buttons by name, the same names for every make."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+
+import attrs
+
+STICKS = ("left_x", "left_y", "right_x", "right_y")
+"""-1 to 1: right and up are positive."""
+TRIGGERS = ("left_trigger", "right_trigger")
+"""0 released, 1 pulled."""
+DPAD = ("dpad_x", "dpad_y")
+"""-1, 0 or 1: right and up are positive."""
+PAD_AXES = (*STICKS, *TRIGGERS, *DPAD)
+PAD_BUTTONS = (
+    "south", "east", "west", "north", "left_shoulder", "right_shoulder", "left_stick", "right_stick",
+    "back", "start", "guide", "touchpad", "misc",
+)  # fmt: skip
+"""The four on the right by their place; `south` is A of Xbox, B of Nintendo, the cross of PlayStation."""
+MOUSE_AXES = ("x", "y", "z", "roll", "pitch", "yaw")
+"""-1 to 1: forward, left, up, and turns about these (right-hand rule)."""
+MOUSE_BUTTONS = ("left", "right", *(f"button{n}" for n in range(3, 49)))
+
+_RAW_AXIS = re.compile(r"axis\d{1,2}|hat\d_[xy]")
+_RAW_BUTTON = re.compile(r"button\d{1,2}")
+_PULLED = 0.5
+"""Where an axis counts as a pressed button."""
+
+
+def is_raw_axis(name: str) -> bool:
+    """Whether a pad that SDL has no mapping for may have this axis."""
+    return _RAW_AXIS.fullmatch(name) is not None
+
+
+def is_raw_button(name: str) -> bool:
+    """Whether a pad that SDL has no mapping for may have this button."""
+    return _RAW_BUTTON.fullmatch(name) is not None
+
+
+@attrs.frozen
+class Controls:
+    """The state of all axes and buttons."""
+
+    axes: Mapping[str, float]
+    """Name -> deflection, -1 to 1, triggers 0 to 1."""
+    buttons: frozenset[str]
+    """Those that are pressed."""
+
+    def value(self, control: str) -> float:
+        """Deflection of an axis; 1 for a pressed button; 0 for what the device lacks."""
+        return self.axes.get(control, 1.0 if control in self.buttons else 0.0)
+
+    def pressed(self, control: str) -> bool:
+        """Whether a button is pressed, or an axis more than half way."""
+        return control in self.buttons or self.axes.get(control, 0.0) > _PULLED
+
+
+def pad(
+    sticks: Iterable[float], triggers: Iterable[float], hat: tuple[int, int], buttons: Iterable[tuple[str, int]]
+) -> Controls:
+    """The state of a standard pad.
+
+    Args:
+        sticks: left x, left y, right x, right y; beyond -1 and 1 they are cut off.
+        triggers: left, right.
+        hat: the directional pad, right and up.
+        buttons: name and whether it is pressed.
+    """
+    values = (*(min(1.0, max(-1.0, each)) for each in sticks), *triggers, *(float(each) for each in hat))
+    return Controls(dict(zip(PAD_AXES, values, strict=True)), frozenset(name for name, on in buttons if on))

@@ -1,0 +1,159 @@
+"""Which control does what on a robot: the defaults, and what the YAML changes of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import attrs
+
+from ibrobot_core.api import OptionFault, Robot, TeleopError, did_you_mean
+from ibrobot_gamepad.controls import Controls
+from ibrobot_gamepad.options import NONE, GamepadOptions, SpaceMouseOptions
+
+_PAD_JOINTS = ("left_x", "left_y", "right_y", "dpad_y", "right_x", "dpad_x")
+_PAD_TOOL = {"x": "left_y", "y": "-left_x", "z": "right_y", "roll": "right_x", "pitch": "-dpad_y", "yaw": "dpad_x"}
+_PAD_BUTTONS = {
+    "deadman": "left_shoulder", "toggle": "right_shoulder", "gripper_open": "left_trigger",
+    "gripper_close": "right_trigger", "estop": "east", "start": "start", "success": "south", "failure": "right_stick",
+    "discard": "back", "intervention": "left_stick",
+}  # fmt: skip
+_PAD_POSES = {"home": "west", "rest": "north"}
+_MOUSE_JOINTS = ("yaw", "x", "z", "pitch", "roll", "y")
+_MOUSE_TOOL = {"x": "x", "y": "y", "z": "z", "roll": "roll", "pitch": "pitch", "yaw": "-yaw"}
+_MOUSE_BUTTONS = {"deadman": "left", "gripper": "right"}
+
+
+@attrs.frozen
+class Axis:
+    """An axis of the device, or its reverse."""
+
+    control: str
+    sign: int
+
+    @classmethod
+    def named(cls, name: str) -> Axis:
+        """The axis of a YAML, e.g. `-left_y`."""
+        return cls(name.removeprefix("-"), -1 if name.startswith("-") else 1)
+
+    def value(self, controls: Controls, dead_zone: float) -> float:
+        """The deflection beyond the dead zone, -1 to 1."""
+        value = controls.value(self.control)
+        beyond = max(0.0, abs(value) - dead_zone) / (1.0 - dead_zone)
+        return self.sign * (beyond if value > 0 else -beyond)
+
+    def __str__(self) -> str:
+        return ("-" if self.sign < 0 else "") + self.control
+
+
+@attrs.frozen
+class ControlMap:
+    """Which control does what on a robot; functions without a control are left out."""
+
+    joints: Mapping[str, Axis]
+    tool: Mapping[str, Axis]
+    """Empty where the tool cannot be jogged."""
+    buttons: Mapping[str, str]
+    """Function -> button."""
+    poses: Mapping[str, str]
+    """Pose -> button."""
+
+    def help(self) -> str:
+        """A compact table."""
+        rows = {"joints": self.joints, "tool": self.tool, "buttons": self.buttons, "poses": self.poses}
+        return "\n".join(
+            f"{heading:8} " + "  ".join(f"{control} {name}" for name, control in pairs.items())
+            for heading, pairs in rows.items()
+            if pairs
+        )
+
+
+def control_map(options: GamepadOptions | SpaceMouseOptions, robot: Robot) -> ControlMap:
+    """The controls that options give a robot.
+
+    Raises:
+        TeleopError: where they do not fit the robot.
+    """
+    for fault in check_mapping(options, robot):
+        raise TeleopError(f"{'.'.join(str(part) for part in fault.option)}: {fault.message}")
+    gripper, arm = _parts(options, robot)
+    is_pad = isinstance(options, GamepadOptions)
+    joints = _chosen(dict(zip(arm, _PAD_JOINTS if is_pad else _MOUSE_JOINTS, strict=False)), options.joints)
+    tool = _chosen(_PAD_TOOL if is_pad else _MOUSE_TOOL, options.tool) if options.cartesian else {}
+    buttons = _chosen(_PAD_BUTTONS if is_pad else _MOUSE_BUTTONS, options.buttons)
+    if not gripper:
+        buttons = {name: control for name, control in buttons.items() if name not in _GRIPPER}
+    if not options.cartesian:
+        buttons.pop("toggle", None)
+    poses = {name: control for name, control in _PAD_POSES.items() if name in robot.description.poses}
+    return ControlMap(
+        {name: Axis.named(control) for name, control in joints.items()},
+        {name: Axis.named(control) for name, control in tool.items()},
+        buttons,
+        _chosen(poses if is_pad else {}, options.poses),
+    )
+
+
+def check_mapping(options: GamepadOptions | SpaceMouseOptions, robot: Robot) -> Iterator[OptionFault]:
+    """Each joint has an axis, each control one meaning in each mode, and the tool a model."""
+    gripper, arm = _parts(options, robot)
+    if options.cartesian and robot.description.mjcf is None:
+        yield OptionFault(("cartesian",), "tool jog needs robot.description.mjcf: set it, or cartesian: false")
+    if options.start == "tool" and not options.cartesian:
+        yield OptionFault(("start",), "the tool cannot be jogged with cartesian: false: must be joints")
+    poses = tuple(robot.description.poses)
+    unknown = [
+        OptionFault((option, name), f"unknown {what}{did_you_mean(name, known, has)}")
+        for option, names, known, what, has in (
+            ("joints", options.joints, arm, "joint", "the arm has"),
+            ("poses", options.poses, poses, "pose", "the robot has"),
+        )
+        for name in names
+        if name not in known
+    ]
+    yield from unknown
+    for function in options.buttons:
+        if function in _GRIPPER and not gripper:
+            yield OptionFault(("buttons", function), f"the robot has no group {options.gripper!r}")
+    default = _PAD_JOINTS if isinstance(options, GamepadOptions) else _MOUSE_JOINTS
+    for joint in arm[len(default) :]:
+        if joint not in options.joints:
+            yield OptionFault(("joints",), f"no axis is left for {joint}: give it one, or `{joint}: {NONE}`")
+    if not unknown:
+        yield from _doubles(options, robot)
+
+
+_GRIPPER = ("gripper_open", "gripper_close", "gripper")
+
+
+def _parts(options: GamepadOptions | SpaceMouseOptions, robot: Robot) -> tuple[Sequence[str], Sequence[str]]:
+    """Names of the joints of the gripper, and of the arm."""
+    gripper = robot.groups.get(options.gripper, ())
+    return gripper, [name for name in robot.joint_names if name not in gripper]
+
+
+def _chosen(defaults: Mapping[str, str], own: Mapping[str, str]) -> dict[str, str]:
+    return {name: control for name, control in {**defaults, **own}.items() if control.removeprefix("-") != NONE}
+
+
+def _doubles(options: GamepadOptions | SpaceMouseOptions, robot: Robot) -> Iterator[OptionFault]:
+    """A fault for each control that the file gives a second meaning."""
+    is_pad = isinstance(options, GamepadOptions)
+    _, arm = _parts(options, robot)
+    known_poses = {name: at for name, at in (_PAD_POSES if is_pad else {}).items() if name in robot.description.poses}
+    buttons = _chosen(_PAD_BUTTONS if is_pad else _MOUSE_BUTTONS, options.buttons)
+    poses = _chosen(known_poses, options.poses)
+    joints = _chosen(dict(zip(arm, _PAD_JOINTS if is_pad else _MOUSE_JOINTS, strict=False)), options.joints)
+    tool = _chosen(_PAD_TOOL if is_pad else _MOUSE_TOOL, options.tool) if options.cartesian else {}
+    always = [("buttons", name, control) for name, control in buttons.items()]
+    always += [("poses", name, control) for name, control in poses.items()]
+    own = {"buttons": options.buttons, "poses": options.poses, "joints": options.joints, "tool": options.tool}
+    faults: dict[OptionFault, None] = {}
+    for section, axes in (("joints", joints), ("tool", tool)):
+        taken: dict[str, tuple[str, str]] = {}
+        for option, name, control in (*always, *((section, name, control) for name, control in axes.items())):
+            plain = control.removeprefix("-")
+            first, other = taken.setdefault(plain, (option, name))
+            if (first, other) != (option, name):
+                message = f"{plain!r} is both {other} and {name}, must be one of them"
+                faults[OptionFault((option if name in own[option] else first,), message)] = None
+    yield from faults

@@ -1,0 +1,162 @@
+"""What the YAML may say under `type: gamepad` and `type: spacemouse` of teleoperation."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+import attrs
+
+from ibrobot_core.api import did_you_mean, documented, option
+from ibrobot_gamepad.controls import (
+    MOUSE_AXES,
+    MOUSE_BUTTONS,
+    PAD_AXES,
+    PAD_BUTTONS,
+    is_raw_axis,
+    is_raw_button,
+)
+
+NONE = "none"
+"""In a mapping: this function has no control."""
+TOOL_AXES = ("x", "y", "z", "roll", "pitch", "yaw")
+FUNCTIONS = (
+    "deadman", "toggle", "gripper_open", "gripper_close", "gripper", "estop",
+    "start", "success", "failure", "discard", "intervention",
+)  # fmt: skip
+"""What `buttons` maps; `gripper` opens and closes in turns."""
+_DEVICE = re.compile(r"[0-9a-fA-F]{4}:[0-9a-fA-F]{4}(:.+)?")
+
+
+def _check_device(instance: Any, attribute: attrs.Attribute[Any], value: str) -> None:
+    if value and not _DEVICE.fullmatch(value):
+        raise ValueError(
+            f"{value!r} is not VENDOR:PRODUCT or VENDOR:PRODUCT:SERIAL in hexadecimal, e.g. 054c:0ce6; "
+            "`ibrobot gamepad list` prints them"
+        )
+
+
+@attrs.frozen
+class Layout:
+    """The controls of a device."""
+
+    axes: tuple[str, ...]
+    buttons: tuple[str, ...]
+    raw: bool
+    """Whether there are devices whose controls have numbers alone."""
+
+    def check_axis(self, name: str) -> str | None:
+        """What is wrong with the name of an axis; it may begin with `-`."""
+        plain = name.removeprefix("-")
+        if plain in (NONE, *self.axes) or (self.raw and is_raw_axis(plain)):
+            return None
+        return f"unknown axis {name!r}{did_you_mean(plain, self.axes, 'the axes are')}"
+
+    def check_button(self, name: str) -> str | None:
+        """What is wrong with the name of a button; an axis is one, too, where it is more than half way."""
+        if name in (NONE, *self.axes, *self.buttons) or (self.raw and (is_raw_button(name) or is_raw_axis(name))):
+            return None
+        known = (*self.buttons, *self.axes)
+        return f"unknown button {name!r}{did_you_mean(name, known, 'the buttons are')}"
+
+
+PAD = Layout(PAD_AXES, PAD_BUTTONS, raw=True)
+MOUSE = Layout(MOUSE_AXES, MOUSE_BUTTONS, raw=False)
+
+
+def _joints(layout: Layout) -> Any:
+    def check(instance: Any, attribute: attrs.Attribute[Any], value: Mapping[str, str]) -> None:
+        for joint, control in value.items():
+            _refuse(joint, layout.check_axis(control))
+
+    return option(factory=dict, help="joint -> axis (`-` reverses it, `none`), where not the default", validator=check)
+
+
+def _tool(layout: Layout) -> Any:
+    def check(instance: Any, attribute: attrs.Attribute[Any], value: Mapping[str, str]) -> None:
+        for axis, control in value.items():
+            if axis not in TOOL_AXES:
+                raise ValueError(f"unknown axis of the tool {axis!r}{did_you_mean(axis, TOOL_AXES, 'they are')}")
+            _refuse(axis, layout.check_axis(control))
+
+    return option(
+        factory=dict, help=f"{', '.join(TOOL_AXES)} -> axis (`-` reverses it, `none`), where not the default",
+        validator=check,
+    )  # fmt: skip
+
+
+def _buttons(layout: Layout) -> Any:
+    def check(instance: Any, attribute: attrs.Attribute[Any], value: Mapping[str, str]) -> None:
+        for function, control in value.items():
+            if function not in FUNCTIONS:
+                known = did_you_mean(function, FUNCTIONS, "the functions are")
+                raise ValueError(f"unknown function {function!r}{known}")
+            _refuse(function, layout.check_button(control))
+        if value.get("deadman") == NONE:
+            raise ValueError("deadman: must have a button: nothing may move that nobody asks for")
+
+    return option(
+        factory=dict, help=f"function -> button or `none`, where not the default; functions: {', '.join(FUNCTIONS)}",
+        validator=check,
+    )  # fmt: skip
+
+
+def _poses(layout: Layout) -> Any:
+    def check(instance: Any, attribute: attrs.Attribute[Any], value: Mapping[str, str]) -> None:
+        for pose, control in value.items():
+            _refuse(pose, layout.check_button(control))
+
+    return option(factory=dict, help="pose -> button that drives there while held, or `none`", validator=check)
+
+
+def _refuse(key: str, fault: str | None) -> None:
+    if fault is not None:
+        raise ValueError(f"{key}: {fault}")
+
+
+@documented
+@attrs.frozen
+class JogOptions:
+    """What gamepads and SpaceMice have in common."""
+
+    device: str = option("", help="VENDOR:PRODUCT or VENDOR:PRODUCT:SERIAL; empty: the first", validator=_check_device)
+    joint_speed: float = option(0.8, unit="rad/s", gt=0, help="speed of a joint at full deflection, and to poses")
+    tool_speed: float = option(0.1, unit="m/s", gt=0, help="speed of the tool at full deflection")
+    turn_speed: float = option(0.8, unit="rad/s", gt=0, help="speed of turning the tool at full deflection")
+    gripper_speed: float = option(1.5, unit="rad/s", gt=0, help="speed of the gripper with its trigger pulled")
+    dead_zone: float = option(0.1, ge=0, lt=0.9, help="share of an axis' way that counts as rest")
+    follow: float = option(
+        0.1, unit="rad", ge=0, help="how far a joint at rest may be from its setpoint before the setpoint follows"
+    )
+    long_press: float = option(0.5, unit="s", gt=0, le=5, help="how long the toggle button is held")
+    cartesian: bool = option(True, help="whether the tool can be jogged; it needs robot.description.mjcf")
+    gripper: str = option("gripper", help="group of joints that the gripper controls move")
+
+
+@documented
+@attrs.frozen
+class GamepadOptions(JogOptions):
+    """Options of `type: gamepad`; the joints' own limits bound every speed."""
+
+    start: str = option("joints", choices=("joints", "tool"), help="what the sticks move at first")
+    via: str = option(
+        "auto", choices=("auto", "hid", "sdl"),
+        help="how the pad is read: its own reports (hid), SDL's mapping database (sdl), or whichever knows it",
+    )  # fmt: skip
+    joints: Mapping[str, str] = _joints(PAD)
+    tool: Mapping[str, str] = _tool(PAD)
+    buttons: Mapping[str, str] = _buttons(PAD)
+    poses: Mapping[str, str] = _poses(PAD)
+
+
+@documented
+@attrs.frozen
+class SpaceMouseOptions(JogOptions):
+    """Options of `type: spacemouse`; the joints' own limits bound every speed."""
+
+    start: str = option("tool", choices=("joints", "tool"), help="what the cap moves at first")
+    joints: Mapping[str, str] = _joints(MOUSE)
+    tool: Mapping[str, str] = _tool(MOUSE)
+    buttons: Mapping[str, str] = _buttons(MOUSE)
+    poses: Mapping[str, str] = _poses(MOUSE)

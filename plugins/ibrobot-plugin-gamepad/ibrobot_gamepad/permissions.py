@@ -1,0 +1,41 @@
+"""Which devices the user may open, and the udev rule that permits it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from ibrobot_core.api import Check
+from ibrobot_gamepad.hid import find_hid
+from ibrobot_gamepad.reports import KINDS, MODELS, THREEDCONNEXION
+
+RULES = "/etc/udev/rules.d/60-ibrobot-gamepad.rules"
+"""Before 73-seat-late.rules, which gives what is tagged `uaccess` to whoever sits at the machine."""
+WRITE_RULES = f"ibrobot gamepad udev | sudo tee {RULES} && sudo udevadm control --reload, then plug it in again"
+_LOGITECH = "*:046D:C6*"
+"""SpaceMice of Logitech's time."""
+_JOYSTICKS = "by-*/*-event-joystick"
+
+
+def udev_rules() -> str:
+    """The rule that lets users open the devices whose reports are known, over USB and Bluetooth."""
+    vendors = sorted({vendor for model in MODELS for vendor, _ in model.ids} | {THREEDCONNEXION})
+    parents = [f"*:{vendor:04X}:*" for vendor in vendors] + [_LOGITECH]
+    lines = [f'KERNEL=="hidraw*", KERNELS=="{parent}", MODE="0660", TAG+="uaccess"' for parent in parents]
+    return "\n".join(["# Gamepads and SpaceMice, for ibrobot", *lines])
+
+
+def checks(joysticks: Path = Path("/dev/input")) -> Iterator[Check]:
+    """A line for each device: hidraw, which pads with known reports need, and evdev, which all others need."""
+    for kind in KINDS:
+        for found in find_hid(kind):
+            # Elsewhere than on Linux a path is not a file's.
+            allowed = not found.path.startswith("/dev/") or os.access(found.path, os.R_OK | os.W_OK)
+            text = f"{found.name} ({found.id}) at {found.path}"
+            yield Check(kind, allowed, text if allowed else f"{text}: no permission", WRITE_RULES)
+    for path in sorted(joysticks.glob(_JOYSTICKS)):
+        allowed = os.access(path, os.R_OK)
+        text = f"{path.name} at {path.resolve()}"
+        remedy = "sudo usermod -aG input $USER, log in again"
+        yield Check("joystick", allowed, text if allowed else f"{text}: no permission", remedy)

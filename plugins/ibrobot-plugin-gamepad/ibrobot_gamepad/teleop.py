@@ -1,0 +1,243 @@
+"""Teleops `gamepad` and `spacemouse`: jog joints or the tool while a deadman is held."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import get_args, override
+
+import numpy as np
+from ibrobot_kinematics import JogArm, JogMotion, VelocityJog
+
+from ibrobot_core.api import (
+    Context,
+    JointReading,
+    OperatorEvent,
+    Teleop,
+    TeleopCommand,
+    TeleopError,
+    ns,
+    seconds,
+)
+from ibrobot_gamepad.controls import Controls
+from ibrobot_gamepad.devices import Device, DeviceGone, Finder, open_first
+from ibrobot_gamepad.mapping import control_map
+from ibrobot_gamepad.options import GamepadOptions, SpaceMouseOptions
+from ibrobot_gamepad.reports import Kind
+
+_LOOK_NS = ns(0.5)
+"""How often a device is looked for while none is there."""
+_LONGEST_STEP_S = 0.1
+"""What one command moves at most: a host that stood still does not make up for it in one leap."""
+_EVENTS: tuple[OperatorEvent, ...] = get_args(OperatorEvent)
+_GRIPPER = ("gripper_open", "gripper_close", "gripper")
+_POSE = "pose "
+"""What begins the function of a button that drives to a pose."""
+
+
+class JogTeleop(Teleop):
+    """Jogs with the first device of its kind that is plugged in, now or later. Time is that of the measurements.
+
+    While no device is there, the robot holds. What is pressed when a device comes, or when the mode begins, counts as
+    released: the deadman is pressed again before anything moves.
+    """
+
+    def __init__(self, options: GamepadOptions | SpaceMouseOptions, ctx: Context) -> None:
+        robot = ctx.robot
+        self._options = options
+        self._ctx = ctx
+        self._kind: Kind = "gamepad" if isinstance(options, GamepadOptions) else "spacemouse"
+        self._via = options.via if isinstance(options, GamepadOptions) else "hid"
+        self._map = control_map(options, robot)
+        self._buttons = {**self._map.buttons, **{_POSE + name: button for name, button in self._map.poses.items()}}
+        """Function -> button."""
+        self._arm = JogArm(robot, options.gripper)
+        self._jog = VelocityJog(self._arm, options.follow)
+        self._mode = options.start
+        self._finder: Finder | None = None
+        """From `connect` to `disconnect`."""
+        self._device: Device | None = None
+        self._name = ""
+        self._looked_ns: int | None = None
+        self._complaint = ""
+        self._estop = False
+        """Whether the emergency stop was pressed and not passed on yet."""
+        self._opens = False
+        """Whether the button that opens and closes the gripper in turns opens it."""
+        self._forget()
+
+    def _forget(self) -> None:
+        """Begin with a device of which nothing is known yet."""
+        self._controls: Controls | None = None
+        self._pressed: frozenset[str] = frozenset(self._buttons)
+        """Functions whose buttons are pressed; all of them until the device says otherwise."""
+        self._rest: dict[str, float] = {}
+        """Gripper control -> its first value, for those that have not moved yet."""
+        self._release()
+
+    def _release(self) -> None:
+        self._engaged = False
+        self._toggle_ns: int | None = None
+        """When the toggle button was pressed [ns]; None once it counted, or while it is up."""
+        self._moved_ns: int | None = None
+        """When the last setpoint was computed [ns]; None while nothing moves."""
+
+    @override
+    def connect(self) -> None:
+        if self._options.cartesian:
+            self._arm.load_model("cartesian: false")
+        self._finder = Finder(self._kind, self._via)
+        self._look(self._finder)
+        if self._device is None:
+            self._ctx.log.warning(
+                "%s: no %s is plugged in; the robot holds until one is", self._ctx.name, self._kind
+            )  # fmt: skip
+
+    @override
+    def activate(self, measured: JointReading) -> None:
+        self._take(self._poll(measured.stamp_ns), measured.stamp_ns)  # pressed for something else
+        self._release()
+        self._jog.restart(measured.position)
+
+    @override
+    def read(self, measured: JointReading) -> TeleopCommand:
+        if self._finder is None:
+            raise TeleopError(f"{self._ctx.name}: the {self._kind} is not connected: connect comes before read")
+        now_ns = measured.stamp_ns
+        events = self._take(self._poll(now_ns), now_ns)
+        if self._estop:
+            self._estop = False
+            self._release()
+            return TeleopCommand(None, estop=True, events=events)
+        self._toggle_after_long_press(measured)
+        if not self._engaged or self._controls is None:
+            self._moved_ns = None
+            return TeleopCommand(None, events=events)
+        if self._moved_ns is None:
+            self._jog.restart(measured.position)
+        dt = min(seconds(now_ns - self._moved_ns), _LONGEST_STEP_S) if self._moved_ns is not None else 0.0
+        self._moved_ns = now_ns
+        setpoint = self._jog.move(measured.position, self._motion(self._controls), dt)
+        return TeleopCommand(dict(zip(self._ctx.robot.joint_names, setpoint.tolist(), strict=True)), events=events)
+
+    @override
+    def disconnect(self) -> None:
+        self._lose()
+        if self._finder is not None:
+            self._finder.close()
+        self._finder = None
+        self._looked_ns = None
+
+    @override
+    def help(self) -> str:
+        moves = "the tool" if self._mode == "tool" else "joints"
+        return f"{self._name or f'no {self._kind} yet'}: moves {moves}\n{self._map.help()}"
+
+    def _poll(self, now_ns: int) -> Sequence[Controls]:
+        """What the device sent, if one is there."""
+        if self._finder is not None and self._device is None and self._is_due(now_ns):
+            self._looked_ns = now_ns
+            try:
+                self._look(self._finder)
+            except TeleopError as error:  # e.g. the permissions of a device that has just come are not set yet
+                if str(error) != self._complaint:
+                    self._complaint = str(error)
+                    self._ctx.log.warning("%s: %s", self._ctx.name, error)
+        if self._device is None:
+            return ()
+        try:
+            return self._device.poll(now_ns)
+        except DeviceGone as error:
+            self._ctx.log.warning("%s: lost %s (%s); the robot holds", self._ctx.name, self._name, error)
+            self._lose()
+            return ()
+
+    def _is_due(self, now_ns: int) -> bool:
+        return self._looked_ns is None or now_ns - self._looked_ns >= _LOOK_NS
+
+    def _look(self, finder: Finder) -> None:
+        opened = open_first(finder.find(), self._options.device)
+        if opened is not None:
+            found, self._device = opened
+            self._name = f"{found.name} ({found.id}, {found.model})"
+            self._complaint = ""
+
+    def _lose(self) -> None:
+        if self._device is not None:
+            self._device.close()
+        self._device = None
+        self._name = ""
+        self._forget()
+
+    def _take(self, states: Sequence[Controls], now_ns: int) -> tuple[OperatorEvent, ...]:
+        """Take over what the device sent; returns what the operator asked for."""
+        events: list[OperatorEvent] = []
+        if states and self._controls is None:
+            self._ctx.log.info("%s: %s", self._ctx.name, self._name)
+        for controls in states:
+            self._controls = controls
+            before, self._pressed = self._pressed, self._functions(controls)
+            for function in sorted(self._pressed - before):
+                if function == "deadman":
+                    self._engaged = True
+                elif function == "toggle":
+                    self._toggle_ns = now_ns
+                elif function == "gripper":
+                    self._opens = not self._opens
+                elif function == "estop":
+                    self._estop = True
+                elif function in _EVENTS:
+                    events.append(function)
+            if "deadman" not in self._pressed:
+                self._engaged = False
+            if "toggle" not in self._pressed:
+                self._toggle_ns = None
+        return tuple(events)
+
+    def _functions(self, controls: Controls) -> frozenset[str]:
+        """The functions whose buttons are pressed; those of the gripper only once their controls have moved."""
+        for function in _GRIPPER:
+            if (control := self._buttons.get(function)) is not None:
+                value = controls.value(control)
+                if abs(value - self._rest.setdefault(control, value)) > self._options.dead_zone:
+                    self._rest[control] = np.inf
+        return frozenset(name for name, button in self._buttons.items() if controls.pressed(button))
+
+    def _toggle_after_long_press(self, measured: JointReading) -> None:
+        if self._toggle_ns is None or measured.stamp_ns - self._toggle_ns < ns(self._options.long_press):
+            return
+        self._toggle_ns = None
+        self._mode = "joints" if self._mode == "tool" else "tool"
+        self._jog.restart(measured.position)
+        self._ctx.log.info("%s: moves %s", self._ctx.name, "the tool" if self._mode == "tool" else "joints")
+
+    def _motion(self, controls: Controls) -> JogMotion:
+        options, robot = self._options, self._ctx.robot
+        velocity = np.zeros(len(robot.joints))
+        velocity[robot.indices(self._arm.gripper)] = self._gripper(controls) * options.gripper_speed
+        for function in self._pressed:
+            if function.startswith(_POSE):
+                pose = robot.pose(function.removeprefix(_POSE)).copy()
+                return JogMotion(np.zeros(len(robot.joints)), pose=pose, pose_speed=options.joint_speed)
+        if self._mode == "joints":
+            for joint, axis in self._map.joints.items():
+                velocity[robot.indices((joint,))] = axis.value(controls, options.dead_zone) * options.joint_speed
+            return JogMotion(velocity)
+        x, y, z, roll, pitch, yaw = (self._tool(controls, axis) for axis in ("x", "y", "z", "roll", "pitch", "yaw"))
+        linear, turn = np.array([x, y, z]), np.array([yaw, pitch, roll])
+        return JogMotion(velocity, linear * options.tool_speed, turn * options.turn_speed)
+
+    def _tool(self, controls: Controls, name: str) -> float:
+        axis = self._map.tool.get(name)
+        return axis.value(controls, self._options.dead_zone) if axis is not None else 0.0
+
+    def _gripper(self, controls: Controls) -> float:
+        """How fast the gripper opens, as a share of its speed; negative where it closes."""
+        opens, closes, turns = (self._moved(controls, function) for function in _GRIPPER)
+        return opens - closes + (turns if self._opens else -turns)
+
+    def _moved(self, controls: Controls, function: str) -> float:
+        """The deflection of a gripper control, 0 to 1; 0 until it has moved since the device came."""
+        control = self._buttons.get(function)
+        if control is None or np.isfinite(self._rest.get(control, 0.0)):
+            return 0.0
+        return max(0.0, controls.value(control) - self._options.dead_zone) / (1.0 - self._options.dead_zone)
