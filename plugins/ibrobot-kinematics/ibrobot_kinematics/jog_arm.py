@@ -99,7 +99,7 @@ class JogArm:
         """
         servo = self._servo
         if servo is None:
-            raise TeleopError("the model of the arm is not loaded: load_model comes before move_tool")
+            raise TeleopError("the model of the arm is not loaded: call load_model before move_tool")
         arm = self.robot.indices(self.arm)
         if not np.array_equal(before[arm], servo.position):
             servo.reset(before[arm])
