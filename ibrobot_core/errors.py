@@ -57,7 +57,7 @@ class PluginError(IbrobotError):
 
 
 def plugin_type(kind: str, type: str) -> str:
-    """What messages call a type of a kind, e.g. `teleop type 'gamepad'`."""
+    """What messages call a type of a kind, e.g. `teleop type 'joystick'`."""
     named = {"command": f"ibrobot {type}", "section": f"section {type!r}"}
     return named.get(kind, f"{kind} type {type!r}")
 

@@ -101,7 +101,7 @@ class JogTeleop(Teleop):
     @override
     def read(self, measured: JointReading) -> TeleopCommand:
         if self._finder is None:
-            raise TeleopError(f"{self._ctx.name}: the {self._kind} is not connected: connect comes before read")
+            raise TeleopError(f"{self._ctx.name}: the {self._kind} is not connected: call connect before read")
         now_ns = measured.stamp_ns
         events = self._take(self._poll(now_ns), now_ns)
         if self._estop:
