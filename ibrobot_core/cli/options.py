@@ -6,37 +6,32 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import click
+from click import argument, option
 
 from ibrobot_core.plugins import installed_plugins
 
 _OPTIONS: dict[str, Callable[..., Any]] = {
-    "config": click.argument("config", required=False),
-    "sim": click.option("--sim", is_flag=True, help="Use the simulation section in place of hardware."),
-    "lockstep": click.option(
+    "config": argument("config", required=False),
+    "sim": option("--sim", is_flag=True, help="Use the simulation section in place of hardware."),
+    "lockstep": option(
         "--lockstep", is_flag=True, help="Simulated time, as fast as the machine goes; equal seeds, equal runs."
     ),
-    "seed": click.option(
-        "--seed", type=int, default=0, show_default=True, help="Of the first episode; later ones count up."
-    ),
-    "mode": click.option("--mode", metavar="MODE", help="Start in this control mode, not in default_control_mode."),
-    "overrides": click.option(
+    "seed": option("--seed", type=int, default=0, show_default=True, help="Of the first episode; later ones count up."),
+    "mode": option("--mode", metavar="MODE", help="Start in this control mode, not in default_control_mode."),
+    "overrides": option(
         "--set", "overrides", multiple=True, metavar="PATH=VALUE", help="Override a key, e.g. control.rate_hz=50."
     ),
-    "duration": click.option(
-        "--duration", type=click.FloatRange(min=0), metavar="S", help="Stop after so many seconds."
-    ),
-    "episodes": click.option(
-        "--episodes", type=click.IntRange(min=1), metavar="N", help="Stop after so many episodes."
-    ),
-    "goals": click.option(
+    "duration": option("--duration", type=click.FloatRange(min=0), metavar="S", help="Stop after so many seconds."),
+    "episodes": option("--episodes", type=click.IntRange(min=1), metavar="N", help="Stop after so many episodes."),
+    "goals": option(
         "--goal", "goals", multiple=True, metavar="GOAL", help="For planning modes: a pose, or joint=rad,…"
     ),
-    "window": click.option("--window", is_flag=True, help="Show the simulation in a desktop window."),
-    "headless": click.option("--headless", is_flag=True, help="No window, no viewer, no panel: plain lines."),
-    "dry_run": click.option(
+    "window": option("--window", is_flag=True, help="Show the simulation in a desktop window."),
+    "headless": option("--headless", is_flag=True, help="No window, no viewer, no panel: plain lines."),
+    "dry_run": option(
         "--dry-run", is_flag=True, help="Print the plan, compare the model with the contract, and start nothing."
     ),
-    "as_json": click.option(
+    "as_json": option(
         "--json", "as_json", is_flag=True, help="Print JSON alone on standard output: the summary, or the plan."
     ),
 }

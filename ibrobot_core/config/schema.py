@@ -44,6 +44,10 @@ class ComponentConfig:
     """An instance of the plugin's options class."""
 
     @classmethod
+    def __attrs_init_subclass__(cls) -> None:
+        documented(cls)
+
+    @classmethod
     def type_key(cls) -> str:
         """The key that names the plugin."""
         return str(attrs.fields(cls).type.alias)
@@ -72,7 +76,6 @@ def component_of(kind: Any) -> type[ComponentConfig] | None:
     return next((each for each in members if isinstance(each, type) and issubclass(each, ComponentConfig)), None)
 
 
-@documented
 @attrs.frozen
 class HardwareConfig(NamedComponentConfig):
     """Hardware, and the joints that it owns."""
@@ -100,7 +103,6 @@ class HardwareConfig(NamedComponentConfig):
         return {"calibration": descriptor.calibration(options), "anchored": descriptor.anchored(options)}
 
 
-@documented
 @attrs.frozen
 class SimulationConfig(ComponentConfig):
     """What stands for the hardware with `--sim`, or where there is none."""
@@ -137,7 +139,6 @@ class Mount:
             raise ValueError(f"quaternion has length {math.hypot(*self.quaternion):.4g}, must have 1")
 
 
-@documented
 @attrs.frozen
 class PeripheralConfig(ComponentConfig):
     """A sensor. Under `--sim` the simulation's own sensor of the same kind stands for it."""
@@ -158,7 +159,6 @@ class PeripheralConfig(ComponentConfig):
         return {"picture": descriptor.picture(options)}
 
 
-@documented
 @attrs.frozen
 class ExecutorConfig(NamedComponentConfig):
     """An executor, which moves the joints of a group."""
@@ -178,7 +178,6 @@ class ExecutorConfig(NamedComponentConfig):
         return {"goals": descriptor.goals}
 
 
-@documented
 @attrs.frozen
 class TeleopConfig(NamedComponentConfig):
     """A teleoperation device."""
@@ -186,7 +185,6 @@ class TeleopConfig(NamedComponentConfig):
     plugin_kind = "teleop"
 
 
-@documented
 @attrs.frozen
 class PlannerConfig(ComponentConfig):
     """The planner of a mode."""
@@ -194,7 +192,6 @@ class PlannerConfig(ComponentConfig):
     plugin_kind = "planner"
 
 
-@documented
 @attrs.frozen
 class ViewerConfig(ComponentConfig):
     """What shows the robot to a person."""
@@ -308,7 +305,6 @@ class ContractConfig:
     signals: tuple[SignalSpec, ...] = option((), help="topics -> task, reward and end of a dataset's rows")
 
 
-@documented
 @attrs.frozen
 class ModelConfig(NamedComponentConfig):
     """A policy, the unit of its vectors, and what it sees beyond the contract."""
@@ -364,7 +360,6 @@ class DispatchConfig:
         return self.strategy or ("ensemble" if self.smoothing.enabled else "replace")
 
 
-@documented
 @attrs.frozen
 class InferenceConfig(ComponentConfig):
     """Which model a mode runs, and where."""
@@ -406,7 +401,6 @@ def _check_dataset(_: object, __: object, value: str) -> None:
         raise ValueError(f"{str(folder)!r} does not lie below recording.root; give a folder's name, e.g. pick_cube")
 
 
-@documented
 @attrs.frozen
 class RecordingConfig(ComponentConfig):
     """How episodes are recorded."""
@@ -423,7 +417,6 @@ class RecordingConfig(ComponentConfig):
         return Path(self.root) / self.dataset
 
 
-@documented
 @attrs.frozen
 class TransportConfig(ComponentConfig):
     """How processes and machines talk."""
