@@ -5,6 +5,7 @@ Loading, `config show`, the JSON Schema and the reference pages derive from thes
 
 from __future__ import annotations
 
+import logging
 import math
 import types
 from collections.abc import Mapping
@@ -13,6 +14,7 @@ from typing import Any, ClassVar, Literal, get_args, get_origin
 
 import attrs
 
+from ibrobot_core.clock import Clock
 from ibrobot_core.descriptors import (
     Descriptor,
     EngineDescriptor,
@@ -21,9 +23,10 @@ from ibrobot_core.descriptors import (
     SensorDescriptor,
 )
 from ibrobot_core.errors import PluginNotInstalled
+from ibrobot_core.interfaces import Context
 from ibrobot_core.options import documented, fields, not_a_key, option
 from ibrobot_core.robot import Robot
-from ibrobot_core.units import NORM_MODES
+from ibrobot_core.units import NORM_MODES, ns
 
 _UNIT = 1e-3
 """How far the length of a quaternion may be from 1: people round."""
@@ -498,6 +501,20 @@ class RobotConfig:
     """`document` with its secrets, for other processes of the run only: never to be written or shown."""
     secrets: Mapping[str, str] = not_a_key(factory=dict, repr=False, eq=False)
     """Secret -> what is shown in its place."""
+
+    def context(self, name: str, clock: Clock, seed: int = 0, **more: Any) -> Context:
+        """What the `make` of a component's plugin is given.
+
+        Args:
+            name: of the component.
+            clock: the run's.
+            seed: the run's.
+            more: other fields of the context; `joints` are all of the robot's where left out.
+        """
+        simulation = self.simulation.options if self.simulation is not None else None
+        given = {"joints": self.robot.joint_names, "simulation": simulation, **more}
+        log, period_ns = logging.getLogger(f"ibrobot.{name}"), ns(1.0 / self.control.rate_hz)
+        return Context(name=name, clock=clock, log=log, robot=self.robot, period_ns=period_ns, seed=seed, **given)
 
 
 def _as_written(field: attrs.Attribute[Any]) -> attrs.Attribute[Any]:

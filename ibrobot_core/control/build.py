@@ -6,7 +6,6 @@ from typing import Any
 
 from ibrobot_core.clock import Clock
 from ibrobot_core.config import RobotConfig
-from ibrobot_core.config.context import component_context
 from ibrobot_core.config.schema import ComponentConfig
 from ibrobot_core.control.core import ControlCore
 from ibrobot_core.control.hardware_group import HardwareGroup
@@ -25,7 +24,7 @@ def build_core(config: RobotConfig, registry: Registry, clock: Clock, seed: int)
 
     def make(kind: str, component: ComponentConfig, name: str, joints: tuple[str, ...]) -> Any:
         options = simulation.options if simulation is not None else None
-        context = component_context(config, name, clock, seed, joints=joints, simulation=options)
+        context = config.context(name, clock, seed, joints=joints, simulation=options)
         return registry.find(kind, component.type).make(component.options, context)
 
     executors = {name: make("executor", each, name, each.joints) for name, each in config.executors.items()}

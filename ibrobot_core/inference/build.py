@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from ibrobot_core.clock import RealClock
 from ibrobot_core.config import RobotConfig
-from ibrobot_core.config.context import component_context
 from ibrobot_core.interfaces import Policy
 from ibrobot_core.plugins import Registry
 
@@ -17,6 +16,5 @@ def build_policy(config: RobotConfig, registry: Registry, name: str, seed: int =
         PolicyError: e.g. for a checkpoint without its statistics.
     """
     model = config.models[name]
-    context = component_context(config, name, RealClock(), seed)
-    policy: Policy = registry.find("policy", model.type).make(model.options, context)
+    policy: Policy = registry.find("policy", model.type).make(model.options, config.context(name, RealClock(), seed))
     return policy

@@ -16,7 +16,6 @@ from ibrobot_core.bus import Bus
 from ibrobot_core.clock import Clock, RealClock, SteppedClock
 from ibrobot_core.component import Worker, error_line
 from ibrobot_core.config import RobotConfig
-from ibrobot_core.config.context import component_context
 from ibrobot_core.config.schema import ComponentConfig, ControlMode
 from ibrobot_core.control.link import ControlState, PlanRecord
 from ibrobot_core.errors import ComponentFailed
@@ -224,7 +223,7 @@ class Session:
     def context(self, name: str, **more: Any) -> Context:
         """The context for a plugin's `make` in the host; `more` are further fields of it."""
         request = self.request
-        return component_context(self.config, name, self.clock, request.seed, bus=self.bus, keys=request.keys, **more)
+        return self.config.context(name, self.clock, request.seed, bus=self.bus, keys=request.keys, **more)
 
     def make(self, kind: str, component: ComponentConfig, name: str, **more: Any) -> Any:
         """What the plugin of a component of the YAML makes; `name` and `more` are those of its context."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import queue
 import threading
+from typing import Any
 
 import pytest
 from ibrobot_zenoh.workers import Workers
@@ -12,7 +13,7 @@ PATIENCE_S = 30.0
 
 
 def test_one_worker_keeps_the_order():
-    done = queue.SimpleQueue()
+    done: queue.SimpleQueue[int] = queue.SimpleQueue()
     workers = Workers(done.put, "numbers")
     for i in range(100):
         assert workers.put(i) is None
@@ -21,7 +22,8 @@ def test_one_worker_keeps_the_order():
 
 
 def test_threads_start_when_needed_and_no_more_than_allowed():
-    begun, release = queue.SimpleQueue(), threading.Event()
+    begun: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    release = threading.Event()
 
     def work(item):
         begun.put(threading.current_thread())
@@ -39,7 +41,8 @@ def test_threads_start_when_needed_and_no_more_than_allowed():
 
 
 def test_the_oldest_gives_way():
-    begun, release = queue.SimpleQueue(), threading.Event()
+    begun: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    release = threading.Event()
 
     def work(item):
         begun.put(item)
@@ -55,7 +58,7 @@ def test_the_oldest_gives_way():
 
 
 def test_an_exception_is_logged_and_the_next_item_worked_on(caplog: pytest.LogCaptureFixture):
-    done = queue.SimpleQueue()
+    done: queue.SimpleQueue[int] = queue.SimpleQueue()
 
     def work(item):
         if item == 1:
@@ -72,7 +75,7 @@ def test_an_exception_is_logged_and_the_next_item_worked_on(caplog: pytest.LogCa
 
 
 def test_after_the_end_nothing_is_begun():
-    done = queue.SimpleQueue()
+    done: queue.SimpleQueue[int] = queue.SimpleQueue()
     workers = Workers(done.put, "ended")
     workers.end()
     workers.end()

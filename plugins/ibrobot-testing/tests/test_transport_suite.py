@@ -11,7 +11,7 @@ from ibrobot_testing import TransportSuite, checks, failed_checks
 from ibrobot_testing.fakes import FakeTransport
 from ibrobot_testing.fakes.transport import _Request
 
-from ibrobot_core.api import TransportError
+from ibrobot_core.api import Payload, TransportError
 
 
 class TestTransport(TransportSuite):
@@ -224,9 +224,9 @@ def test_every_check_catches_something():
 
 def test_a_failing_subscriber_is_logged(caplog: pytest.LogCaptureFixture) -> None:
     transport = FakeTransport()
-    taken: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    taken: queue.SimpleQueue[Payload] = queue.SimpleQueue()
 
-    def failing(payload: bytes) -> None:
+    def failing(payload: Payload) -> None:
         if payload == b"bad":
             raise ValueError("cannot read this")
         taken.put(payload)
@@ -242,10 +242,10 @@ def test_a_failing_subscriber_is_logged(caplog: pytest.LogCaptureFixture) -> Non
 
 def test_a_subscriber_may_end_itself() -> None:
     transport = FakeTransport()
-    arrived: list[bytes] = []
+    arrived: list[Payload] = []
     done = threading.Event()
 
-    def once(payload: bytes) -> None:
+    def once(payload: Payload) -> None:
         arrived.append(payload)
         end()
         done.set()
