@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import types
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin
@@ -193,23 +193,23 @@ class Converter:
         any_length = build is list or len(args) == 1 or args[1] is Ellipsis
         if not any_length and len(value) != len(args):
             raise ValueError(f"expected a list of {len(args)} values, got {len(value)}")
-        faults, items = Faults(), []
-        for i, item in enumerate(value):
-            with faults.at(i):
-                items.append(self.structure(item, args[0] if any_length else args[i]))
-        faults.raise_any()
-        return build(items)
+        return build(self._items((i, item, args[0] if any_length else args[i]) for i, item in enumerate(value)))
 
     def _mapping(self, value: Any, kind: Any) -> dict[str, Any]:
         if not isinstance(value, Mapping):
             raise _wrong("a mapping", value)
         _, item_kind = get_args(kind) or (str, Any)
-        faults, items = Faults(), {}
-        for name, item in value.items():
-            with faults.at(name):
-                items[name] = self.structure(item, item_kind)
+        items = self._items((name, item, item_kind) for name, item in value.items())
+        return dict(zip(value, items, strict=True))
+
+    def _items(self, items: Iterable[tuple[str | int, Any, Any]]) -> list[Any]:
+        """Key, value and kind of each -> what is made of it."""
+        faults, found = Faults(), []
+        for key, item, kind in items:
+            with faults.at(key):
+                found.append(self.structure(item, kind))
         faults.raise_any()
-        return items
+        return found
 
     def _union(self, value: Any, kind: Any) -> Any:
         members = [member for member in get_args(kind) if member is not type(None)]

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from functools import singledispatch
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,22 +14,40 @@ from ibrobot_core.config.yaml_nodes import is_text
 from ibrobot_core.options import HIDDEN, fields
 from ibrobot_core.outside import without_credentials
 
+_RESOLVED: Mapping[type, str] = {schema.PeripheralConfig: "sim", schema.SimulationConfig: "default_control_mode"}
+"""Component -> a key that loading has resolved: a simulated sensor's options, the mode that a simulation begins in."""
 
-@singledispatch
+
 def plain(value: Any) -> Any:
     """A config value as what YAML and JSON know: attrs classes as mappings, tuples as lists, paths as text."""
-    return _fields(value) if attrs.has(type(value)) else value
+    match value:
+        case schema.ComponentConfig():
+            return _fields(value, but=(_RESOLVED.get(type(value)),)) | plain(value.options)
+        case schema.ControlMode():
+            left_out = ("dispatch",) if value.inference is None else ()
+            return {name: item for name, item in _fields(value, but=left_out).items() if item is not None}
+        case Mapping():
+            return {name: plain(item) for name, item in value.items()}
+        case list() | tuple():
+            return [plain(item) for item in value]
+        case _ if attrs.has(type(value)):
+            # Topic and type of a peripheral were filled in; a file says either these or the peripheral.
+            filled = isinstance(value, schema.ObservationSpec) and value.peripheral is not None
+            return _fields(value, but=("topic", "type") if filled else ())
+        case _:
+            return str(value) if isinstance(value, Path) else value
 
 
 class _Secret(str):
     """The value of a secret option, until it is replaced by what is shown of it."""
 
 
-def _fields(value: Any) -> dict[str, Any]:
+def _fields(value: Any, but: Collection[str | None] = ()) -> dict[str, Any]:
     return {
         name: _Secret(item) if field.metadata.get("secret") and isinstance(item, str) else plain(item)
         for name, field in fields(type(value)).items()
         for item in (getattr(value, field.name),)
+        if name not in but
     }
 
 
@@ -41,45 +58,6 @@ def _without_secrets(value: Any, shown: Mapping[str, str]) -> Any:
     if isinstance(value, Mapping):
         return {name: _without_secrets(item, shown) for name, item in value.items()}
     return [_without_secrets(item, shown) for item in value] if isinstance(value, list) else value
-
-
-@plain.register
-def _(value: schema.ObservationSpec) -> dict[str, Any]:
-    # The topic and type of a peripheral were filled in; a file says either these or the peripheral.
-    left_out = ("topic", "type") if value.peripheral is not None else ()
-    return {name: item for name, item in _fields(value).items() if name not in left_out}
-
-
-_RESOLVED: Mapping[type, str] = {schema.PeripheralConfig: "sim", schema.SimulationConfig: "default_control_mode"}
-"""Component -> a key that loading has resolved: a simulated sensor's options, the mode that a simulation begins in."""
-
-
-@plain.register
-def _(value: schema.ComponentConfig) -> dict[str, Any]:
-    own = {name: item for name, item in _fields(value).items() if name != _RESOLVED.get(type(value))}
-    return {**own, **plain(value.options)}
-
-
-@plain.register
-def _(value: schema.ControlMode) -> dict[str, Any]:
-    left_out = ("dispatch",) if value.inference is None else ()
-    return {name: item for name, item in _fields(value).items() if item is not None and name not in left_out}
-
-
-@plain.register
-def _(value: Mapping) -> dict[str, Any]:  # type: ignore[type-arg]
-    return {name: plain(item) for name, item in value.items()}
-
-
-@plain.register(list)
-@plain.register(tuple)
-def _(value: Any) -> list[Any]:
-    return [plain(item) for item in value]
-
-
-@plain.register
-def _(value: Path) -> str:
-    return str(value)
 
 
 def document(config: schema.RobotConfig) -> dict[str, Any]:

@@ -36,6 +36,7 @@ class HardwareGroup:
 
     def __init__(self, robot: Robot, parts: dict[str, Hardware]) -> None:
         self._parts = parts
+        self._simulated = [part for part in parts.values() if isinstance(part, SimulatedHardware)]
         self._indices = {name: robot.indices(part.joints) for name, part in parts.items()}
         self._size = len(robot.joints)
         self._off: set[str] = set()
@@ -158,9 +159,8 @@ class HardwareGroup:
 
     def advance(self, step_ns: int) -> None:
         """Advance those that are simulated."""
-        for part in self._parts.values():
-            if isinstance(part, SimulatedHardware):
-                part.advance(step_ns)
+        for part in self._simulated:
+            part.advance(step_ns)
 
     def reset_episode(self, episode: EpisodeSetup) -> None:
         """Set up simulated scenes again.
@@ -168,18 +168,14 @@ class HardwareGroup:
         Raises:
             NotSupported: where no part is simulated.
         """
-        simulated = [part for part in self._parts.values() if isinstance(part, SimulatedHardware)]
-        if not simulated:
+        if not self._simulated:
             raise NotSupported("only a simulation can be set up again")
-        for part in simulated:
+        for part in self._simulated:
             part.reset(episode)
 
     def success(self) -> bool | None:
         """Whether the scene's task is done; None where there is none."""
-        for part in self._parts.values():
-            if isinstance(part, SimulatedHardware):
-                return part.success()
-        return None
+        return self._simulated[0].success() if self._simulated else None
 
     def _each(self, act: Callable[[Hardware], Any], but: Collection[str] = ()) -> Sequence[Any]:
         parts = [(name, part) for name, part in self._parts.items() if name not in but]

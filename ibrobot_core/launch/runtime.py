@@ -253,19 +253,18 @@ class Runtime:
         Simulated episodes belong to the mode in which the run began: they end with it.
         """
         session = self.session
-        worker = self.plan.episodes_worker
-        judged = worker is not None and worker in self._started
-        if worker is not None and judged:
+        worker = self.plan.episodes_worker if self.plan.episodes_worker in self._started else None
+        if worker is not None:
             worker.stop()
         session.pause_feed()
         try:
             session.command("switch_mode", mode=mode)
         except BaseException:
             session.begin_source()
-            if worker is not None and judged:
+            if worker is not None:
                 worker.start()
             raise
-        if worker is not None and judged:
+        if worker is not None:
             self._started.remove(worker)
 
     def _await_state(self) -> None:
