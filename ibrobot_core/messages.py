@@ -60,6 +60,13 @@ class Bool(Message, ros_type="std_msgs/msg/Bool"):
 
 
 @attrs.frozen
+class Int8(Message, ros_type="std_msgs/msg/Int8"):
+    """std_msgs/msg/Int8: -128 to 127."""
+
+    data: int
+
+
+@attrs.frozen
 class Int32(Message, ros_type="std_msgs/msg/Int32"):
     """std_msgs/msg/Int32."""
 
@@ -249,6 +256,14 @@ class Twist(Message, ros_type="geometry_msgs/msg/Twist"):
 
     linear: Vector3 = Vector3()
     angular: Vector3 = Vector3()
+
+
+@attrs.frozen
+class TwistStamped(Message, ros_type="geometry_msgs/msg/TwistStamped"):
+    """geometry_msgs/msg/TwistStamped: along the axes of `header.frame_id`."""
+
+    header: Header
+    twist: Twist
 
 
 @attrs.frozen

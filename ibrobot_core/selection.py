@@ -23,8 +23,9 @@ _WHOLE: dict[str, tuple[str, ...]] = {
     "geometry_msgs/msg/Pose": ("position", "orientation"),
     "geometry_msgs/msg/PoseStamped": ("pose",),
     "geometry_msgs/msg/Twist": ("linear", "angular"),
+    "geometry_msgs/msg/TwistStamped": ("twist",),
     "geometry_msgs/msg/TransformStamped": ("translation", "rotation"),
-    **{f"std_msgs/msg/{name}": ("data",) for name in ("Bool", "Int32")},
+    **{f"std_msgs/msg/{name}": ("data",) for name in ("Bool", "Int8", "Int32")},
     **{f"std_msgs/msg/{name}MultiArray": ("data",) for name in ("Float32", "Float64", "Int32")},
 }
 _LEROBOT_SUFFIX = {"position": "pos", "velocity": "vel", "effort": "eff"}

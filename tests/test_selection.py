@@ -17,6 +17,7 @@ from ibrobot_core.messages import (
     Float64MultiArray,
     Header,
     Imu,
+    Int8,
     Int32,
     Int32MultiArray,
     JointState,
@@ -29,6 +30,7 @@ from ibrobot_core.messages import (
     Quaternion,
     TransformStamped,
     Twist,
+    TwistStamped,
     Vector3,
 )
 from ibrobot_core.selection import Selection
@@ -74,12 +76,14 @@ POSE = Pose(Vector3(1, 2, 3), QUATERNION)
         (PoseStamped(Header(), POSE), [], [1, 2, 3, 0.1, 0.2, 0.3, 0.9]),
         (PoseStamped(Header(), POSE), ["pose.position", "pose.orientation.w"], [1, 2, 3, 0.9]),
         (Twist(Vector3(1, 2, 3), Vector3(4, 5, 6)), [], [1, 2, 3, 4, 5, 6]),
+        (TwistStamped(Header(), Twist(Vector3(1, 2, 3), Vector3(4, 5, 6))), ["twist.linear.z"], [3]),
         (TransformStamped(Header(), "tip", Vector3(1, 2, 3), QUATERNION), [], [1, 2, 3, 0.1, 0.2, 0.3, 0.9]),
         (Float64MultiArray([1.5, 2.5, 3.5]), [], [1.5, 2.5, 3.5]),
         (Float64MultiArray([1.5, 2.5, 3.5]), ["data.2", "data.0"], [3.5, 1.5]),
         (Int32MultiArray([7, 8]), ["data", "data.1"], [7, 8, 8]),
         (Bool(True), [], [1]),
         (Int32(-3), ["data"], [-3]),
+        (Int8(-1), [], [-1]),
     ],
 )
 def test_paths_of_other_messages(message: Message, select: list[str], expected: list[float]) -> None:

@@ -20,9 +20,9 @@ import numpy as np
 from rclpy.serialization import serialize_message
 
 TYPES = {
-    "std_msgs": ("Bool", "Int32", "String", "Float32MultiArray", "Float64MultiArray", "Int32MultiArray"),
+    "std_msgs": ("Bool", "Int8", "Int32", "String", "Float32MultiArray", "Float64MultiArray", "Int32MultiArray"),
     "sensor_msgs": ("JointState", "Image", "CompressedImage", "CameraInfo", "Imu", "Joy", "PointCloud2"),
-    "geometry_msgs": ("Pose", "PoseStamped", "Twist", "TransformStamped"),
+    "geometry_msgs": ("Pose", "PoseStamped", "Twist", "TwistStamped", "TransformStamped"),
     "trajectory_msgs": ("JointTrajectory",),
     "diagnostic_msgs": ("DiagnosticArray",),
 }

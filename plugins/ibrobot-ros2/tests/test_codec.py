@@ -23,6 +23,7 @@ STAMP = st.integers(-(2**31) * 10**9, (2**31 - 1) * 10**9 + 999_999_999)
 FIXED = {"k": 9, "r": 9, "p": 12, "orientation_covariance": 9, "angular_velocity_covariance": 9,
          "linear_acceleration_covariance": 9}  # fmt: skip
 RANGES = {
+    "std_msgs/msg/Int8": (-(2**7), 2**7 - 1),
     "std_msgs/msg/Int32": (-(2**31), 2**31 - 1),
     "level": (0, 127),
     "is_bigendian": (0, 255),
