@@ -103,7 +103,15 @@ def test_dry_run_prints_the_plan_and_starts_nothing(launch: Callable[..., Ran], 
     assert (ran.code, ran.err) == (0, "")
     components = json.loads(ran.out)["components"]
     names = [component["name"] for component in components]
-    assert names == ["control", "sensor:top", "sensor:wrist", "mode:moveit_planning", "status", "description"]
+    assert names == [
+        "control",
+        "sensor:top",
+        "sensor:wrist",
+        "mode:moveit_planning",
+        "status",
+        "description",
+        "tool_pose",
+    ]
     assert "planner joint" in components[3]["summary"]
 
 

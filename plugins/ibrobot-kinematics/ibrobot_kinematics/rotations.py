@@ -30,6 +30,13 @@ def exp(v: Vector) -> Vector:
     return np.asarray(np.eye(3) + first * k + second * k @ k)
 
 
+def quaternion(rotation: Vector) -> Vector:
+    """Unit quaternion (x, y, z, w), shape (4,), of a matrix, shape (3, 3); w is not negative."""
+    turn = log(rotation)
+    half = float(np.linalg.norm(turn)) / 2
+    return np.append(np.sinc(half / np.pi) / 2 * turn, np.cos(half))
+
+
 def log(rotation: Vector) -> Vector:
     """Rotation vectors, shape (…, 3), of matrices, shape (…, 3, 3); their length is at most pi."""
     r = rotation

@@ -5,6 +5,7 @@ What any device that jogs a tool uses: keyboards, gamepads, 3D mice, phones, and
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from enum import IntEnum
@@ -102,7 +103,6 @@ class Servo:
     Attributes:
         position: joint positions [rad or m], shape (J,).
         velocity: joint velocities [rad/s or m/s], shape (J,).
-        status: what holds the tool back.
         refused: reason -> how many twists were refused for it.
     """
 
@@ -146,9 +146,15 @@ class Servo:
             )
         self.position = np.array(position, dtype=float)
         self.velocity = np.zeros_like(self.position)
-        self.status = ServoStatus.NO_WARNING
+        self._state = ServoStatus.NO_WARNING
+        self._is_invalid = False
         self._twist: _Twist | None = None
         self._last_ns: int | None = None
+
+    @property
+    def status(self) -> ServoStatus:
+        """What holds the tool back."""
+        return ServoStatus.INVALID if self._is_invalid else self._state
 
     @property
     def at_rest(self) -> bool:
@@ -177,14 +183,18 @@ class Servo:
             return reason
         until = now_ns + ns(self._options.timeout)
         self._twist = _Twist(np.array(linear, dtype=float), np.array(angular, dtype=float), in_tool, until)
-        if self.status is ServoStatus.INVALID:
-            self.status = ServoStatus.NO_WARNING
+        self._is_invalid = False
         return None
 
     def refuse(self, reason: str) -> None:
         """Count a twist that was refused."""
         self.refused[reason] += 1
-        self.status = ServoStatus.INVALID
+        self._is_invalid = True
+
+    def hold_at(self, position: Vector) -> None:
+        """Stand at a position [rad or m], shape (J,), e.g. where a joint does not follow; the twist stays."""
+        self.position = np.array(position, dtype=float)
+        self.velocity = np.zeros_like(self.position)
 
     def halt(self) -> None:
         """Forget the twist: the arm slows down to a stop."""
@@ -210,8 +220,8 @@ class Servo:
         wanted = np.zeros(len(moving))
         if self._twist is not None:
             wanted = self._wanted(self._twist, np.minimum(lowest, 0), np.maximum(highest, 0))
-        elif self.status is not ServoStatus.INVALID:
-            self.status = ServoStatus.NO_WARNING
+        else:
+            self._state = ServoStatus.NO_WARNING
         # All joints change their speeds in step, so that the tool goes straight from one twist to the next.
         before = self.velocity[moving]
         change, most = wanted - before, self._max_acceleration * dt
@@ -227,9 +237,9 @@ class Servo:
             return "not three numbers each"
         if not (np.isfinite(linear).all() and np.isfinite(angular).all()):
             return "not finite"
-        if np.linalg.norm(linear) > self._options.max_linear:
+        if math.hypot(*linear) > self._options.max_linear:
             return f"faster than {self._options.max_linear:g} m/s"
-        if np.linalg.norm(angular) > self._options.max_angular:
+        if math.hypot(*angular) > self._options.max_angular:
             return f"turns faster than {self._options.max_angular:g} rad/s"
         return None
 
@@ -257,7 +267,7 @@ class Servo:
         # Turns are in the frame of the tip, where their weights are.
         rates = self._weights[:, None] * np.vstack([jacobian[:3, moving], to_tip @ jacobian[3:, moving]])
         asked = self._weights * np.concatenate([linear, angular])
-        self.status = ServoStatus.NO_WARNING
+        self._state = ServoStatus.NO_WARNING
         size = float(np.linalg.norm(asked))
         if size == 0:
             return np.zeros(len(moving))
@@ -271,7 +281,7 @@ class Servo:
         near_limit = (wanted <= lowest) & (lowest > -self._max_velocity)
         near_limit |= (wanted >= highest) & (highest < self._max_velocity)
         if scale < 1 or near_limit.any():
-            self.status = ServoStatus.JOINT_BOUND
+            self._state = ServoStatus.JOINT_BOUND
         ahead = self.position.copy()
         ahead[moving] += wanted * _LOOK_AHEAD_S
         scale *= self._scale_for_singularity(jacobian, ahead)
@@ -287,10 +297,10 @@ class Servo:
         way = options.hard_stop_singularity_threshold - options.lower_singularity_threshold
         scale = float(np.clip((options.hard_stop_singularity_threshold - condition) / way, 0, 1))
         if self._condition(self._model.jacobian(ahead)) < condition:
-            self.status = ServoStatus.DECELERATE_FOR_LEAVING_SINGULARITY
+            self._state = ServoStatus.DECELERATE_FOR_LEAVING_SINGULARITY
             return max(scale, _LEAVING)
         halts = scale == 0
-        self.status = ServoStatus.HALT_FOR_SINGULARITY if halts else ServoStatus.DECELERATE_FOR_APPROACHING_SINGULARITY
+        self._state = ServoStatus.HALT_FOR_SINGULARITY if halts else ServoStatus.DECELERATE_FOR_APPROACHING_SINGULARITY
         return scale
 
     def _condition(self, jacobian: Vector) -> float:
@@ -305,5 +315,5 @@ class Servo:
             return 1.0
         way = options.slow_distance - options.stop_distance
         scale = float(np.clip((distance - options.stop_distance) / way, 0, 1))
-        self.status = ServoStatus.HALT_FOR_COLLISION if scale == 0 else ServoStatus.DECELERATE_FOR_COLLISION
+        self._state = ServoStatus.HALT_FOR_COLLISION if scale == 0 else ServoStatus.DECELERATE_FOR_COLLISION
         return scale

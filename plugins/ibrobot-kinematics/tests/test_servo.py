@@ -49,8 +49,8 @@ class Rig:
     positions: list[Vector] = attrs.field(factory=list)
 
     def __attrs_post_init__(self) -> None:
-        limits = (np.full(len(self.model.lower), value) for value in (SPEED, ACCELERATION))
-        self.servo = Servo(self.model, *limits, self.options, **self.changes)
+        ones = np.ones(len(self.model.lower))
+        self.servo = Servo(self.model, SPEED * ones, ACCELERATION * ones, self.options, **self.changes)
         self.servo.reset(bent(self.model) if self.start is None else self.start)
         self.tick()
 

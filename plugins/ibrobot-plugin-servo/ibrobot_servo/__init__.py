@@ -1,0 +1,58 @@
+"""The plugin's hooks: teleop `twist`, and section `tool_pose`, which robots with a model need not write."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+from ibrobot_core.api import OptionFault, SectionDescriptor, TeleopDescriptor, hookimpl
+from ibrobot_servo.options import ToolPoseOptions, TwistOptions
+
+if TYPE_CHECKING:
+    from ibrobot_core.api import Component, Context, Robot, RobotConfig, Session, Teleop
+
+
+def _twist(options: TwistOptions, ctx: Context) -> Teleop:
+    from ibrobot_servo.teleop import TwistTeleop
+
+    return TwistTeleop(options, ctx)
+
+
+def _pose(options: ToolPoseOptions | None, session: Session) -> Component:
+    from ibrobot_servo.tool_pose import ToolPose
+
+    return ToolPose(options or ToolPoseOptions(), session)
+
+
+def _check_twist(options: TwistOptions, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
+    if robot.description.mjcf is None:
+        yield OptionFault(("topic",), "twists move a tool, which needs robot.description.mjcf: set it")
+    if options.frame == robot.description.tip:
+        yield OptionFault(("frame",), f"{options.frame!r} is robot.description.tip, must be another frame, the base's")
+
+
+def _check_pose(options: ToolPoseOptions, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
+    if robot.description.mjcf is None:
+        yield OptionFault((), "the pose of the tool needs robot.description.mjcf: set it")
+
+
+def _has_model(config: RobotConfig) -> bool:
+    return config.robot.description.mjcf is not None
+
+
+@hookimpl
+def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
+    """What MoveIt Servo does in ROS."""
+    yield TeleopDescriptor(
+        type="twist", options=TwistOptions, make=_twist, check_options=_check_twist,
+        summary="moves the tool along a topic of twists, as MoveIt Servo does",
+    )  # fmt: skip
+
+
+@hookimpl
+def ibrobot_sections() -> Iterable[SectionDescriptor]:
+    """Where the tool is."""
+    yield SectionDescriptor(
+        type="tool_pose", options=ToolPoseOptions, make=_pose, check_options=_check_pose, without_section=_has_model,
+        summary="the tool's pose in the base frame, on /robot_status/ee_pose",
+    )  # fmt: skip

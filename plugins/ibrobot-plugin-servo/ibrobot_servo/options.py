@@ -1,0 +1,38 @@
+"""What the YAML may say under a `type: twist` of teleoperation, and in the section `tool_pose`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import attrs
+from ibrobot_kinematics import ServoOptions
+
+from ibrobot_core.api import documented, option
+
+
+def _check_topic(instance: Any, attribute: attrs.Attribute[Any], topic: str) -> None:
+    if not topic.startswith("/") or topic.endswith("/") or " " in topic:
+        raise ValueError(f"{topic!r} is no topic: a topic begins with /, e.g. {attribute.default}")
+
+
+@documented
+@attrs.frozen
+class TwistOptions(ServoOptions):
+    """Options of `type: twist`; the joints' own limits bound every speed."""
+
+    topic: str = option("/servo_node/delta_twist_cmds", validator=_check_topic, help="where twists come from")
+    status_topic: str = option(
+        "/servo_node/status", validator=_check_topic, help="where the status goes, by MoveIt Servo's codes"
+    )
+    frame: str = option("base_link", help="name of the base frame in twists; the tool's is robot.description.tip")
+    gripper: str = option("gripper", help="group of joints that do not belong to the arm")
+
+
+@documented
+@attrs.frozen
+class ToolPoseOptions:
+    """Keys of the section `tool_pose`."""
+
+    topic: str = option("/robot_status/ee_pose", validator=_check_topic, help="where the pose of the tool goes")
+    frame: str = option("base_link", help="name of the base frame, in which the pose is")
+    rate_hz: float = option(20.0, unit="Hz", gt=0, le=1000, help="poses a second, at most one per joint state")

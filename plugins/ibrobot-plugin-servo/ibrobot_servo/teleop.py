@@ -1,0 +1,163 @@
+"""Teleop `twist`: moves the tool along a topic of twists."""
+
+from __future__ import annotations
+
+from typing import override
+
+import numpy as np
+from ibrobot_kinematics import KinematicsError, Servo, ServoStatus, robot_model
+
+from ibrobot_core.api import (
+    Context,
+    DiagnosticArray,
+    DiagnosticStatus,
+    Header,
+    Int8,
+    JointReading,
+    KeyValue,
+    Message,
+    Received,
+    Subscription,
+    Teleop,
+    TeleopCommand,
+    TeleopError,
+    TwistStamped,
+    Vector,
+    Vector3,
+    ns,
+)
+from ibrobot_servo.options import TwistOptions
+
+_STATUS_S = 0.1
+"""The status is published when it changes, and at least that often [s]."""
+_FOLLOW_RAD = 0.1
+"""An arm at rest that is further from its setpoint was moved by other means: it begins where it is."""
+_DIAGNOSTICS = "/diagnostics"
+
+
+class TwistTeleop(Teleop):
+    """The newest twist moves the tool until its timeout; then it slows down to a stop, and the robot holds.
+
+    Time is that of the measurements; the age of a twist is counted from its arrival.
+    """
+
+    def __init__(self, options: TwistOptions, ctx: Context) -> None:
+        self._options = options
+        self._ctx = ctx
+        gripper = ctx.robot.groups.get(options.gripper, ())
+        self._arm = tuple(name for name in ctx.robot.joint_names if name not in gripper)
+        self._indices = ctx.robot.indices(self._arm)
+        self._servo: Servo | None = None
+        self._chain: tuple[int, ...] = ()
+        """Of the arm's joints, those that move the tool."""
+        self._twists: Subscription | None = None
+        self._fresh = True
+        """Whether the setpoint is yet to be taken from the measurement."""
+        self._published: tuple[ServoStatus, int] | None = None
+        """The status as it was last published, and when [ns]."""
+
+    @override
+    def connect(self) -> None:
+        ctx, robot = self._ctx, self._ctx.robot
+        if ctx.bus is None:
+            raise TeleopError(f"{ctx.name}: twists come over the bus, which this process does not have")
+        if robot.description.mjcf is None:
+            raise TeleopError(f"{ctx.name}: twists move a tool, which needs robot.description.mjcf: set it")
+        try:
+            model = robot_model(robot, self._arm)
+        except KinematicsError as error:
+            raise TeleopError(f"{ctx.name}: {error}") from error
+        self._chain = tuple(model.moving.tolist())
+        limits = robot.max_velocity[self._indices], robot.max_acceleration[self._indices]
+        self._servo = Servo(model, *limits, self._options)
+        self._twists = ctx.bus.subscribe(self._options.topic)
+        self._fresh = True
+
+    @override
+    def activate(self, measured: JointReading) -> None:
+        if self._servo is not None and self._twists is not None:
+            self._servo.reset(measured.position[self._indices])
+            self._twists.drain()  # sent for something else
+        self._fresh = True
+
+    @override
+    def read(self, measured: JointReading) -> TeleopCommand:
+        servo, twists = self._servo, self._twists
+        if servo is None or twists is None:
+            raise TeleopError(f"{self._ctx.name}: twists are not connected: connect comes before read")
+        here = measured.position[self._indices]
+        for received in twists.drain():
+            self._take(servo, received, measured.stamp_ns, here)
+        position = servo.step(measured.stamp_ns)
+        moves = not servo.at_rest
+        lead = self._ctx.robot.max_lead[self._indices]
+        if moves and (np.abs(position - here) > lead).any():
+            # A joint does not follow: the tool waits for it.
+            position = np.clip(position, here - lead, here + lead)
+            servo.hold_at(position)
+        self._publish_status(servo, measured.stamp_ns)
+        if not moves:
+            return TeleopCommand(None)
+        return TeleopCommand({self._arm[i]: float(position[i]) for i in self._chain})
+
+    @override
+    def disconnect(self) -> None:
+        if self._twists is not None:
+            self._twists.close()
+        self._twists = self._servo = None
+
+    @override
+    def help(self) -> str:
+        options = self._options
+        frames = f"{options.frame} or {self._ctx.robot.description.tip}"
+        return f"publish geometry_msgs/msg/TwistStamped on {options.topic}, its frame_id {frames}"
+
+    def _take(self, servo: Servo, received: Received, now_ns: int, here: Vector) -> None:
+        """Follow a twist, or refuse it."""
+        fault = self._fault(received.message, received.received_ns)
+        if fault is None:
+            assert isinstance(received.message, TwistStamped)
+            if servo.at_rest and (self._fresh or np.abs(servo.position - here).max() > _FOLLOW_RAD):
+                servo.reset(here)
+            twist = received.message.twist
+            in_tool = received.message.header.frame_id == self._ctx.robot.description.tip
+            fault = servo.command(_array(twist.linear), _array(twist.angular), now_ns, in_tool=in_tool)
+            self._fresh &= fault is not None
+        else:
+            servo.refuse(fault)
+        if fault is not None:
+            self._report(servo, fault, now_ns)
+
+    def _fault(self, message: Message, received_ns: int) -> str | None:
+        if not isinstance(message, TwistStamped):
+            return f"not a {TwistStamped.ros_type}"
+        frames = (self._options.frame, self._ctx.robot.description.tip)
+        if message.header.frame_id not in ("", *frames):
+            return f"its frame is neither {frames[0]} nor {frames[1]}"
+        if self._ctx.clock.now_ns() - received_ns > ns(self._options.timeout):
+            return "read too late"
+        return None
+
+    def _report(self, servo: Servo, fault: str, now_ns: int) -> None:
+        """Log the first twist that is refused for a reason, and publish how many were."""
+        if servo.refused[fault] == 1:
+            self._ctx.log.warning("%s: refused a twist: %s", self._ctx.name, fault)
+        counts = tuple(KeyValue(reason, str(count)) for reason, count in servo.refused.items())
+        status = DiagnosticStatus(
+            DiagnosticStatus.WARN, f"{self._ctx.name}: refused twists", f"refused a twist: {fault}", values=counts
+        )
+        if self._ctx.bus is not None:
+            self._ctx.bus.publish(_DIAGNOSTICS, DiagnosticArray(Header(now_ns), (status,)))
+
+    def _publish_status(self, servo: Servo, now_ns: int) -> None:
+        if self._published is not None:
+            status, then_ns = self._published
+            if status == servo.status and 0 <= now_ns - then_ns < ns(_STATUS_S):
+                return
+        self._published = servo.status, now_ns
+        if self._ctx.bus is not None:
+            self._ctx.bus.publish(self._options.status_topic, Int8(int(servo.status)))
+
+
+def _array(vector: Vector3) -> Vector:
+    return np.array([vector.x, vector.y, vector.z], dtype=float)

@@ -1,0 +1,309 @@
+"""Teleop `twist` as a program finds it: twists in, joint positions, status and counts out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import ClassVar, override
+
+import attrs
+import numpy as np
+import pytest
+from ibrobot_kinematics import KinematicModel, robot_model
+from ibrobot_servo import ibrobot_sections, ibrobot_teleop
+from ibrobot_servo.options import TwistOptions
+from ibrobot_servo.teleop import TwistTeleop
+from ibrobot_testing import TeleopSuite, host_context, make_robot
+
+from ibrobot_core.api import (
+    Bool,
+    Context,
+    Description,
+    DiagnosticArray,
+    Header,
+    Int8,
+    Joint,
+    JointReading,
+    Message,
+    Robot,
+    Teleop,
+    TeleopError,
+    Twist,
+    TwistStamped,
+    Vector,
+    Vector3,
+    ns,
+)
+
+AXES = {"shoulder_pan": "0 0 1", "shoulder_lift": "0 1 0", "elbow_flex": "0 1 0", "wrist_flex": "0 1 0",
+        "wrist_roll": "1 0 0", "gripper": "0 0 1"}  # fmt: skip
+PLACES = ("0 0 0.05", "0 0 0.05", "0.15 0 0", "0.15 0 0", "0.05 0 0", "0.03 0.01 0")
+BENT = np.array([0.3, -0.6, 1.1, 0.2, 0.2, 0.4])
+TOPIC = TwistOptions().topic
+DT = 0.01
+
+
+@pytest.fixture(scope="session")
+def model(tmp_path_factory) -> Path:
+    """An arm with the joints of `make_robot`; its tool points along the arm."""
+    path: Path = tmp_path_factory.mktemp("arm") / "arm.xml"
+    bodies = ""
+    for (name, axis), place in zip(AXES.items(), PLACES, strict=True):
+        bodies += f'<body pos="{place}"><joint name="{name}" axis="{axis}"/><geom size="0.01"/>'
+        if name == "wrist_roll":
+            bodies += '<site name="tool" pos="0.08 0 0" xyaxes="0 0 -1 0 1 0"/>'
+    path.write_text(f"<mujoco><worldbody>{bodies}{'</body>' * len(AXES)}</worldbody></mujoco>")
+    return path
+
+
+def robot_of(model: Path) -> Robot:
+    joints = tuple(Joint(name, -1.6, 1.6, max_velocity=3.0, max_acceleration=20.0) for name in AXES)
+    groups = {"gripper": ("gripper",)}
+    return attrs.evolve(make_robot(), joints=joints, groups=groups, description=Description(mjcf=model, tip="tool"))
+
+
+def twist(linear: tuple[float, ...] = (0.0, 0.0, 0.1), angular: tuple[float, ...] = (0.0, 0.0, 0.0),
+          frame: str = "") -> TwistStamped:  # fmt: skip
+    return TwistStamped(Header(0, frame), Twist(Vector3(*linear), Vector3(*angular)))
+
+
+class TestTwist(TeleopSuite):
+    path: ClassVar[Path]
+
+    @pytest.fixture(autouse=True)
+    def arm(self, model: Path) -> None:
+        type(self).path = model
+
+    @override
+    def context(self) -> Context:
+        self.ctx = host_context(robot=robot_of(self.path))
+        return self.ctx
+
+    @override
+    def make(self, ctx: Context) -> Teleop:
+        return TwistTeleop(TwistOptions(), ctx)
+
+    @override
+    def engage(self, teleop: Teleop) -> None:
+        assert self.ctx.bus is not None
+        self.ctx.bus.publish(TOPIC, twist())
+
+    @override
+    def operate(self, teleop: Teleop) -> None:
+        self.engage(teleop)
+
+    @override
+    def release(self, teleop: Teleop) -> None:
+        self.ctx.clock.sleep_until(self.ctx.clock.now_ns() + ns(TwistOptions().timeout))
+
+
+class Rig:
+    """A program that sends twists, and a robot that goes where it is told."""
+
+    def __init__(self, path: Path, options: TwistOptions = TwistOptions()) -> None:  # noqa: B008 - it is frozen
+        self.robot = robot_of(path)
+        self.ctx = host_context("twist", robot=self.robot)
+        assert self.ctx.bus is not None
+        self.bus = self.ctx.bus
+        self.kinematics: KinematicModel = robot_model(self.robot)
+        self.status = self.bus.subscribe(options.status_topic, 1000)
+        self.diagnostics = self.bus.subscribe("/diagnostics", 1000)
+        self.position = BENT.copy()
+        self.positions: list[Vector] = []
+        self.commanded = False
+        self.follows = True
+        self.teleop = TwistTeleop(options, self.ctx)
+        self.teleop.connect()
+        self.teleop.activate(self.measured())
+
+    def measured(self) -> JointReading:
+        return JointReading(self.ctx.clock.now_ns(), self.position.copy(), np.zeros(6), np.zeros(6))
+
+    def tick(self, *messages: Message, topic: str = TOPIC) -> Vector:
+        self.ctx.clock.sleep_until(self.ctx.clock.now_ns() + ns(DT))
+        for message in messages:
+            self.bus.publish(topic, message)
+        positions = self.teleop.read(self.measured()).positions
+        self.commanded = positions is not None
+        for name, position in (positions or {}).items():
+            if self.follows:
+                self.position[self.robot.joint_names.index(name)] = position
+        self.positions.append(self.position.copy())
+        return self.position
+
+    def follow(self, message: TwistStamped, seconds: float) -> Vector:
+        begin = self.tool().copy()
+        for _ in range(round(seconds / DT)):
+            self.tick(message)
+        return np.asarray(self.tool() - begin)
+
+    def tool(self) -> Vector:
+        return self.kinematics.forward(self.position).position
+
+    def counts(self) -> dict[str, str]:
+        published = self.diagnostics.drain()
+        if not published:
+            return {}
+        message = published[-1].message
+        assert isinstance(message, DiagnosticArray)
+        return {each.key: each.value for each in message.status[0].values}
+
+
+def test_the_tool_follows_the_base_frame_and_its_own(model):
+    for frame in ("", "base_link"):
+        np.testing.assert_allclose(Rig(model).follow(twist((0, 0, 0.1), frame=frame), 0.5), [0, 0, 0.05], atol=3e-3)
+    rig = Rig(model)
+    pointing = rig.kinematics.forward(BENT).rotation[:, 2]
+    np.testing.assert_allclose(rig.follow(twist((0, 0, 0.05), frame="tool"), 0.4), 0.02 * pointing, atol=2e-3)
+
+
+def test_only_joints_that_move_the_tool_are_commanded(model):
+    rig = Rig(model)
+    rig.bus.publish(TOPIC, twist())
+    positions = rig.teleop.read(rig.measured()).positions
+    assert positions is not None
+    assert "gripper" not in positions
+    assert len(positions) == 5
+
+
+def test_without_twists_the_arm_stops_within_its_accelerations_and_is_let_go(model):
+    rig = Rig(model)
+    rig.follow(twist((0, 0, 0.2)), 0.3)
+    released = 0
+    while rig.commanded:
+        rig.tick()
+        released += 1
+    assert 10 <= released <= 25
+    velocities = np.diff(rig.positions, axis=0) / DT
+    assert np.abs(np.diff(velocities, axis=0, prepend=np.zeros((1, 6)))).max() <= 20.0 * DT + 1e-9
+    assert not velocities[-1].any()
+
+
+def test_a_joint_that_does_not_follow_makes_the_tool_wait(model):
+    rig = Rig(model)
+    rig.follows = False
+    most = 0.0
+    for _ in range(300):
+        rig.bus.publish(TOPIC, twist((0.1, 0, 0)))
+        rig.ctx.clock.sleep_until(rig.ctx.clock.now_ns() + ns(DT))
+        positions = rig.teleop.read(rig.measured()).positions or {}
+        lead = [
+            abs(at - BENT[rig.robot.joint_names.index(name)]) / rig.robot.max_lead[0] for name, at in positions.items()
+        ]
+        most = max(most, *lead)
+    assert 0.5 < most <= 1 + 1e-9
+
+
+def test_an_arm_that_was_moved_by_hand_begins_where_it_is(model):
+    rig = Rig(model)
+    rig.follow(twist(), 0.2)
+    while rig.commanded:
+        rig.tick()
+    rig.position[1] += 0.5
+    before = rig.position.copy()
+    np.testing.assert_allclose(rig.tick(twist()), before, atol=1e-9)
+
+
+def test_the_status_is_published_when_it_changes_and_at_ten_hertz(model):
+    rig = Rig(model)
+    rig.follow(twist(), 1.0)
+    assert 10 <= len(rig.status.drain()) <= 12
+    rig.tick(twist((np.nan, 0, 0)))
+    codes = [received.message for received in rig.status.drain()]
+    assert codes[-1] == Int8(-1)
+    rig.tick(twist())
+    assert rig.status.drain()[-1].message == Int8(0)
+    for _ in range(600):
+        rig.tick(twist((0.2, 0, 0)))
+    assert {received.message for received in rig.status.drain()} & {Int8(1), Int8(2), Int8(5)}
+
+
+REFUSED = {
+    "nan": (twist((0, float("nan"), 0)), "not finite"),
+    "infinite turn": (twist((0, 0, 0), (float("inf"), 0, 0)), "not finite"),
+    "huge": (twist((0, 0, 1e300)), "faster than 1 m/s"),
+    "too fast": (twist((0.8, 0.8, 0)), "faster than 1 m/s"),
+    "spin": (twist((0, 0, 0), (0, 0, 100)), "turns faster than 6 rad/s"),
+    "camera frame": (twist(frame="camera_link"), "its frame is neither base_link nor tool"),
+    "tool misspelt": (twist(frame="Tool"), "its frame is neither base_link nor tool"),
+}
+
+
+@pytest.mark.parametrize(("message", "reason"), REFUSED.values(), ids=REFUSED.keys())
+def test_a_refused_twist_is_counted_and_the_one_before_it_stays(model, message, reason, caplog):
+    rig = Rig(model)
+    rig.follow(twist(), 0.1)
+    before = rig.tool()
+    for _ in range(3):
+        rig.tick(message)
+    assert rig.tool()[2] > before[2] + 1e-3
+    for _ in range(30):
+        rig.tick(message)
+    assert not rig.commanded
+    assert rig.counts() == {reason: "33"}
+    assert [record.getMessage() for record in caplog.records] == [f"twist: refused a twist: {reason}"]
+    assert np.isfinite(rig.positions).all()
+
+
+def test_a_message_of_another_type_is_refused(model):
+    rig = Rig(model)
+    rig.tick(Bool(True))
+    assert rig.counts() == {"not a geometry_msgs/msg/TwistStamped": "1"}
+
+
+def test_twists_that_waited_longer_than_the_timeout_are_refused(model):
+    rig = Rig(model)
+    rig.tick()
+    rig.bus.publish(TOPIC, twist())
+    rig.ctx.clock.sleep_until(rig.ctx.clock.now_ns() + ns(0.5))
+    rig.tick()
+    assert not rig.commanded
+    assert rig.counts() == {"read too late": "1"}
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"topic": "twists"}, "'twists' is no topic: a topic begins with /, e.g. /servo_node/delta_twist_cmds"),
+        ({"topic": "/a b"}, "'/a b' is no topic"),
+        ({"status_topic": "/status/"}, "'/status/' is no topic"),
+        ({"timeout": 5.0}, "5.0 is too large, must be at most 1 s"),
+        ({"hard_stop_singularity_threshold": 10.0}, "lower_singularity_threshold is 30, must be below hard_stop"),
+    ],
+)
+def test_options_that_make_no_sense_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        TwistOptions(**options)
+
+
+def faults(robot: Robot, options: TwistOptions = TwistOptions()) -> list[str]:  # noqa: B008 - it is frozen
+    (descriptor,) = ibrobot_teleop()
+    return [fault.message for fault in descriptor.check_options(options, robot, ())]
+
+
+def test_options_are_checked_against_the_robot(model):
+    assert faults(robot_of(model)) == []
+    assert faults(make_robot()) == ["twists move a tool, which needs robot.description.mjcf: set it"]
+    same = "'tool' is robot.description.tip, must be another frame, the base's"
+    assert faults(robot_of(model), TwistOptions(frame="tool")) == [same]
+    (section,) = ibrobot_sections()
+    (fault,) = section.check_options(section.options(), make_robot(), ())
+    assert fault.message == "the pose of the tool needs robot.description.mjcf: set it"
+
+
+def test_a_device_that_cannot_work_says_why(model):
+    with pytest.raises(TeleopError, match=r"twist: twists move a tool, which needs robot.description.mjcf: set it"):
+        TwistTeleop(TwistOptions(), host_context("twist")).connect()
+    ctx = attrs.evolve(host_context("twist", robot=robot_of(model)), bus=None)
+    with pytest.raises(TeleopError, match="twist: twists come over the bus, which this process does not have"):
+        TwistTeleop(TwistOptions(), ctx).connect()
+    robot = robot_of(model)
+    nose = attrs.evolve(robot, description=attrs.evolve(robot.description, tip="nose"))
+    with pytest.raises(TeleopError, match="has no site 'nose'; it has: tool"):
+        TwistTeleop(TwistOptions(), host_context("twist", robot=nose)).connect()
+
+
+def test_help_names_topic_type_and_frames(model):
+    help_text = TwistTeleop(TwistOptions(), host_context(robot=robot_of(model))).help()
+    assert help_text == (
+        "publish geometry_msgs/msg/TwistStamped on /servo_node/delta_twist_cmds, its frame_id base_link or tool"
+    )
