@@ -58,8 +58,6 @@ UNTYPED = [
     "--no-warn-return-any", "--explicit-package-bases",
 ]  # fmt: skip
 """Tests need no annotations; what has them is checked, and so is what is in functions without."""
-NOT_TYPED = ("lerobot", "mcap", "ros2")
-"""Those whose tests mypy does not read yet; nor does it read `tests/` and `benchmarks/`, beyond the plugins there."""
 IS_FIRST = "NOX_NOT_TESTED" not in os.environ
 """Whether this process started the others: those that run one session each, side by side."""
 NOT_TESTED = Path(os.environ.setdefault("NOX_NOT_TESTED", str(Path(f".nox/not-tested-{os.getpid()}").absolute())))
@@ -177,11 +175,20 @@ def docs(session: nox.Session) -> None:
 
 @nox.session
 def types(session: nox.Session) -> None:
-    """Types of core and of every plugin, strictly, and of the plugins that tests use."""
-    install(session, *PLUGINS, groups=("lint", "test"))
+    """Types of core and of every plugin, strictly, and of all tests, benchmarks and scripts of the documentation."""
+    install(session, *PLUGINS, groups=("docs", "lint", "test"))
     session.run("mypy", "--strict", "ibrobot_core", *(str(FOLDERS[name] / f"ibrobot_{name}") for name in PLUGINS))
-    session.run("mypy", *UNTYPED, "tests/shared/plugins", env={"MYPYPATH": "tests/shared"})
-    for name in (name for name in PLUGINS if name not in NOT_TYPED):
+    modules = (
+        "tests/shared",
+        "tests/house",
+        "tests/lerobot",
+        "benchmarks",
+        "docs",
+        "plugins/ibrobot-plugin-lerobot/tests",
+    )
+    read = ("tests", "benchmarks", *map(str, Path("docs").glob("*.py")))
+    session.run("mypy", *UNTYPED, *read, env={"MYPYPATH": ":".join(modules)})
+    for name in PLUGINS:
         # Each by itself: all of them have a package `tests`.
         bases = {"MYPYPATH": f"tests/shared:benchmarks:{FOLDERS[name]}"}
         session.run("mypy", *UNTYPED, str(FOLDERS[name] / "tests"), env=bases)

@@ -155,7 +155,7 @@ def lerobot(port: str, stack: ExitStack) -> Client:
 
 
 def available() -> dict[str, Callable[[str, ExitStack], Client]]:
-    found = {"bare": bare, "ours": ours}
+    found: dict[str, Callable[[str, ExitStack], Client]] = {"bare": bare, "ours": ours}
     if importlib.util.find_spec("scservo_sdk"):
         found["sdk"] = sdk
     if importlib.util.find_spec("lerobot"):

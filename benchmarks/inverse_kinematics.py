@@ -210,7 +210,8 @@ def just_out_of_reach(arm: KinematicModel, number: int) -> tuple[list[Target], l
     That point is the nearest of all positions on the way.
     """
     rng = np.random.default_rng(4)
-    targets, known = [], []
+    targets: list[Target] = []
+    known = []
     while len(targets) < number:
         away = far(rng)
         try:

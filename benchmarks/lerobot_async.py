@@ -83,7 +83,7 @@ def serve(port: int, payload: str) -> None:
 
     shape, dtype = PAYLOADS[payload]
 
-    class Server(PolicyServer):
+    class Server(PolicyServer):  # type: ignore[misc]  # LeRobot brings no types
         """Its policy is there from the beginning."""
 
         def SendPolicyInstructions(self, request: Any, context: Any) -> Any:

@@ -6,7 +6,7 @@ world, a start and a goal, both free, with a straight line between them that is 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from itertools import pairwise
 from pathlib import Path
 
@@ -67,7 +67,7 @@ def _table() -> dict[str, WorldObject]:
     return {"table": _box(0.15, 0, -0.016, 0.9, 0.9, 0.02)}
 
 
-def _placed(parts: dict[str, tuple[float, ...]], x: float, y: float, z: float, yaw: float) -> dict[str, WorldObject]:
+def _placed(parts: Mapping[str, tuple[float, ...]], x: float, y: float, z: float, yaw: float) -> dict[str, WorldObject]:
     """Boxes given in a frame of their own, as x, y, z and sizes."""
     c, s = np.cos(yaw), np.sin(yaw)
     return {

@@ -29,6 +29,7 @@ from made_up import plugin
 from ibrobot_core.config import load_config
 from ibrobot_core.launch.runtime import Runtime
 from ibrobot_core.launch.session import LaunchRequest, Session
+from ibrobot_core.messages import Float64MultiArray
 from ibrobot_core.plugins import discover
 from ibrobot_core.units import seconds
 
@@ -140,6 +141,7 @@ class Motion:
     def moved_ns(self) -> np.ndarray:
         """Times at which a setpoint differed from the one before [ns]."""
         while (received := self._commands.get(0.0)) is not None:
+            assert isinstance(received.message, Float64MultiArray)
             command = np.array(received.message.data)
             if self._last is not None and np.abs(command - self._last).max() > 1e-9:
                 self._moved_ns.append(received.received_ns)

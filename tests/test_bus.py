@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from bisect import bisect_right
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -114,7 +115,7 @@ def test_get_waits_for_a_message_and_gives_up_in_time(bus: Bus) -> None:
     subscription = bus.subscribe("/a")
     assert subscription.get() is None
     assert subscription.get(0.001) is None
-    got: list[object] = []
+    got: list[Any] = []
     waiting = threading.Thread(target=lambda: got.append(subscription.get(None)))
     waiting.start()
 
@@ -135,7 +136,7 @@ def test_what_was_received_by_the_snapshot_is_in_the_queues() -> None:
 
     publisher = threading.Thread(target=publish)
     publisher.start()
-    snapshots = []
+    snapshots: list[tuple[int, int]] = []
     while publisher.is_alive() or not snapshots:
         now_ns = bus.snapshot_ns()
         snapshots.append((now_ns, len(subscription._queue)))

@@ -17,7 +17,7 @@ from ibrobot_core.options import NoOptions
 from ibrobot_core.plugins import KINDS, Registry, discover
 
 if TYPE_CHECKING:
-    from conftest import Site
+    from ibrobot_testing.site import Site
 
 
 @pytest.fixture
@@ -41,7 +41,8 @@ def test_the_first_decoder_that_knows_a_picture_decodes_it(site: Site) -> None:
     def picture(size: int) -> CompressedImage:
         return CompressedImage(Header(), "odd", np.zeros(size, np.uint8))
 
-    assert [registry.decode(picture(size)) for size in (0, 1)] == ["nothing", "something"]
+    found: list[object] = [registry.decode(picture(size)) for size in (0, 1)]
+    assert found == ["nothing", "something"]
     with pytest.raises(ContractError, match=r"no installed plugin decodes a 'odd' picture; .* are: any, empty, short"):
         registry.decode(picture(9))
 

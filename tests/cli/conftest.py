@@ -13,7 +13,7 @@ import pytest
 from ibrobot_core.cli.main import main
 
 if TYPE_CHECKING:
-    from conftest import Site
+    from ibrobot_testing.site import Site
 
 ROBOT = """\
 robot:

@@ -13,7 +13,7 @@ import pytest
 from ibrobot_core.config.yaml_nodes import parse_yaml
 
 if TYPE_CHECKING:
-    from cli.conftest import Ran
+    from tests.cli.conftest import Ran
 
 Ibrobot = Callable[..., "Ran"]
 

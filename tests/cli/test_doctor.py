@@ -16,9 +16,9 @@ from ibrobot_core.cli import doctor
 from ibrobot_core.plugins import discover
 
 if TYPE_CHECKING:
-    from cli.conftest import Ran
+    from ibrobot_testing.site import Site
 
-    from conftest import Site
+    from tests.cli.conftest import Ran
 
 Ibrobot = Callable[..., "Ran"]
 

@@ -14,9 +14,9 @@ import pytest
 from ibrobot_core.bugs import DEBUG
 
 if TYPE_CHECKING:
-    from cli.conftest import Ran
+    from ibrobot_testing.site import Site
 
-    from conftest import Site
+    from tests.cli.conftest import Ran
 
 Ibrobot = Callable[..., "Ran"]
 

@@ -15,7 +15,7 @@ from ibrobot_core.cli.main import COMMANDS
 from ibrobot_core.plugins import Registry
 
 if TYPE_CHECKING:
-    from cli.conftest import Ran
+    from tests.cli.conftest import Ran
 
 Ibrobot = Callable[..., "Ran"]
 

@@ -18,7 +18,9 @@ from ibrobot_testing.fakes import FakePolicy
 from ibrobot_core.errors import PolicyError
 
 if TYPE_CHECKING:
-    from conftest import Ran, Site
+    from ibrobot_testing.site import Site
+
+    from tests.cli.conftest import Ran
 
 ROBOT = """\
 robot:

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from cli.conftest import Ran
+    from ibrobot_testing.site import Site
 
-    from conftest import Site
+    from tests.cli.conftest import Ran
 
 Ibrobot = Callable[..., "Ran"]
 

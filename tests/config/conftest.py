@@ -13,6 +13,7 @@ import pytest
 from ibrobot_core.config import RobotConfig, load_config
 from ibrobot_core.descriptors import (
     ConfigFile,
+    Descriptor,
     EngineDescriptor,
     ExecutorDescriptor,
     HardwareDescriptor,
@@ -107,7 +108,7 @@ class FarOptions:
     server: str = option("", help="where the model is")
 
 
-def _make(options: object, ctx: object) -> object:
+def _make(options: object, ctx: object) -> Any:
     raise AssertionError("checking a config makes nothing")
 
 
@@ -144,7 +145,7 @@ def faults_of_edit(load_text: Callable[..., RobotConfig], tmp_path: Path) -> Cal
 @pytest.fixture
 def registry(tmp_path: Path) -> Registry:
     registry = discover([])
-    offered = [
+    offered: list[tuple[str, Descriptor[Any]]] = [
         ("hardware", HardwareDescriptor("bus", _make, "a bus", BusOptions)),
         ("hardware", HardwareDescriptor("world", _make, "a world", simulated=True, sensors={"camera": "virtual"})),
         ("sensor", SensorDescriptor("webcam", _make, "a camera", WebcamOptions)),

@@ -11,6 +11,7 @@ import pytest
 
 from ibrobot_core.config import RobotConfig, find_config, from_document, load_config
 from ibrobot_core.config.show import to_yaml
+from ibrobot_core.descriptors import EngineDescriptor
 from ibrobot_core.errors import ConfigError
 from ibrobot_core.plugins import Registry
 
@@ -212,6 +213,7 @@ def test_what_show_prints_loads_to_the_same(load_text: Load, base: str, sim: boo
 
 def test_options_of_an_engine_stand_beside_its_execution_mode(load_text: Load, base: str, registry: Registry) -> None:
     entry = registry.entries["engine", "far"]
+    assert isinstance(entry.descriptor, EngineDescriptor)
     descriptor = attrs.evolve(entry.descriptor, uses_transport=False)  # for a YAML without a transport
     registry.entries["engine", "far"] = attrs.evolve(entry, descriptor=descriptor)
     config = load_text(base.replace("{model: net}", "{model: net, execution_mode: far, server: big}"))

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 
+from ibrobot_core.config import RobotConfig
 from ibrobot_core.config.models import DescriptionModel, ModelError, read_mjcf, read_urdf
 from ibrobot_core.errors import ConfigError
 
-if TYPE_CHECKING:
-    from conftest import Load
+Load = Callable[..., RobotConfig]
 
 URDF = """<?xml version="1.0"?>
 <robot name="arm">

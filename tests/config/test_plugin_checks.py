@@ -25,6 +25,10 @@ class StickOptions:
     inverted: tuple[str, ...] = option((), help="joints that turn the other way")
 
 
+def never_made(options: Any, ctx: Any) -> Any:
+    """The `make` of descriptors whose objects no test makes."""
+
+
 def _check(options: Any, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
     for i, name in enumerate(options.inverted):
         if name not in joints:
@@ -42,15 +46,10 @@ def _device(options: Any) -> Mapping[str, str]:
 @pytest.fixture(autouse=True)
 def checking(registry: Registry) -> None:
     """The made-up plugins of these tests say what they open, and check their options."""
-    for key, changes in {
-        ("hardware", "bus"): {"devices": _port},
-        ("sensor", "webcam"): {"devices": _device},
-    }.items():
+    for key, devices in ((("hardware", "bus"), _port), (("sensor", "webcam"), _device)):
         entry = registry.entries[key]
-        registry.entries[key] = attrs.evolve(entry, descriptor=attrs.evolve(entry.descriptor, **changes))
-    stick = TeleopDescriptor(
-        "stick", lambda options, ctx: None, "a stick", StickOptions, check_options=_check, devices=_port
-    )  # type: ignore[arg-type, return-value]
+        registry.entries[key] = attrs.evolve(entry, descriptor=attrs.evolve(entry.descriptor, devices=devices))
+    stick = TeleopDescriptor("stick", never_made, "a stick", StickOptions, check_options=_check, devices=_port)
     registry.entries["teleop", "stick"] = Entry("teleop", stick, "fake", "ibrobot-plugin-fake", "1.0")
 
 

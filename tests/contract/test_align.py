@@ -44,8 +44,10 @@ def oracle(samples: list[tuple[int, int, int]], align: Align, step_ns: int, t_ns
     if not due:
         return None, resets
     stamp, _, value = max(due)
-    if align.strategy == "asof" and not t_ns - stamp <= align.tol_ms * MS:
-        return None, resets
+    if align.strategy == "asof":
+        assert align.tol_ms is not None
+        if not t_ns - stamp <= align.tol_ms * MS:
+            return None, resets
     if align.strategy == "drop" and not stamp > t_ns - step_ns:
         return None, resets
     return value, resets

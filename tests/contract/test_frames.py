@@ -20,6 +20,7 @@ from ibrobot_core.config.schema import Align, ImageSpec, ObservationSpec
 from ibrobot_core.contract import frames as frames_module
 from ibrobot_core.contract import image as image_module
 from ibrobot_core.contract.frames import FrameAssembler, FrameSampler
+from ibrobot_core.contract.image import decode_image
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.descriptors import DecoderDescriptor
 from ibrobot_core.errors import ContractError
@@ -172,7 +173,7 @@ def test_samples_are_decoded_once_and_only_when_a_frame_asks(
     contract: Contract, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     decoded: list[int] = []
-    decode = frames_module.decode_image
+    decode = decode_image
 
     def counting(message: Any, spec: ImageSpec) -> Any:
         decoded.append(message.header.stamp_ns)
@@ -212,7 +213,7 @@ def test_compressed_pictures_are_decoded_once_and_only_when_a_frame_asks(
 
 
 def test_arrays_of_frames_are_read_only_and_messages_are_not_touched(contract: Contract) -> None:
-    message = image(0, 0.0)
+    message: Any = image(0, 0.0)
     bag = [("/camera/top/image_raw", message, 0), ("/joint_states", joint_state(0, 1.0), 0)]
     bag.append(("/imu", MAKERS["/imu"](0, 1.0), 0))
     frame = offline(contract, bag, 1)[0]
@@ -312,14 +313,19 @@ def test_history_is_the_ticks_just_before(contract: Contract) -> None:
         if value is not None:
             publish(value)
         t_ns = clock.advance(step - (clock.now_ns() - START_NS) % step)
-        return sampler.sample(t_ns) if ask else sampler.advance(t_ns)
+        if ask:
+            return sampler.sample(t_ns)
+        sampler.advance(t_ns)
+        return None
 
     def seen(frame: Frame | None) -> list[float]:
         assert frame is not None
         assert [each.stamp_ns for each in frame.history] == [t_ns - k * step for k in range(len(frame.history), 0, -1)]
         return [float(each.values["observation.state"][5]) for each in (*frame.history, frame)]
 
-    assert tick(None).missing  # nothing was measured yet
+    first = tick(None)
+    assert first is not None
+    assert first.missing  # nothing was measured yet
     assert seen(tick(1)) == [1]
     assert seen(tick(2)) == [1, 2]
     tick(3, ask=False)

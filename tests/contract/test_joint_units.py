@@ -54,16 +54,20 @@ class ForeignOptions:
     closes: tuple[str, ...] = option((), help="joints that are closed at their lower limit")
 
 
+def never_made(options: Any, ctx: Any) -> Any:
+    """The `make` of descriptors whose objects no test makes."""
+
+
 @pytest.fixture
 def foreign(tmp_path: Path) -> Callable[[str], RobotConfig]:
     """Loads the arm with some joints that are closed at their lower limit."""
     registry = discover([])
     described = (
         HardwareDescriptor(
-            "foreign_arm", lambda options, ctx: None, "an arm", ForeignOptions,
+            "foreign_arm", never_made, "an arm", ForeignOptions,
             calibration=lambda options: options.offsets, anchored=lambda options: options.closes,
         ),
-        HardwareDescriptor("stick", lambda options, ctx: None, "a stick"),
+        HardwareDescriptor("stick", never_made, "a stick"),
     )  # fmt: skip
     for kind, descriptor in zip(("hardware", "teleop"), described, strict=True):
         registry.entries[kind, descriptor.type] = Entry(kind, descriptor, "test", "test", "0")

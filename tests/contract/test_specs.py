@@ -147,7 +147,7 @@ def changed_image(**changes: Any) -> tuple[ObservationSpec, ...]:
     return (SELECTED, attrs.evolve(FINGERPRINT_BASE[1], **changes))
 
 
-SHAPING = {
+SHAPING: dict[str, dict[str, Any]] = {
     "joint order": {"observations": changed(select=SELECTED.select[::-1])},
     "fewer joints": {"observations": changed(select=SELECTED.select[:1])},
     "another field": {"observations": changed(select=("position.gripper", "velocity.elbow_flex"))},
@@ -239,6 +239,10 @@ contract:
 """
 
 
+def never_made(options: Any, ctx: Any) -> Any:
+    """The `make` of descriptors whose objects no test makes."""
+
+
 def reversed_keys(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: reversed_keys(value[key]) for key in reversed(value)}
@@ -248,7 +252,7 @@ def reversed_keys(value: Any) -> Any:
 def test_the_order_of_yaml_keys_keeps_the_fingerprint(tmp_path: Path) -> None:
     registry = discover([])
     for kind, type_ in (("hardware", "bus"), ("teleop", "stick")):
-        descriptor = HardwareDescriptor(type=type_, make=lambda options, ctx: None, summary="")
+        descriptor = HardwareDescriptor(type=type_, make=never_made, summary="")
         registry.entries[kind, type_] = Entry(kind, descriptor, "test", "test", "0")
     contracts = []
     for i, document in enumerate((yaml.safe_load(ROBOT), reversed_keys(yaml.safe_load(ROBOT)))):

@@ -207,7 +207,7 @@ class Rig:
 
     def events(self, kind: str) -> list[dict[str, Any]]:
         """Events of a kind so far, each once."""
-        found = [event for event in self.core.events if event["event"] == kind]
+        found = [dict(event) for event in self.core.events if event["event"] == kind]
         self.core.events.clear()
         return found
 

@@ -24,7 +24,7 @@ from ibrobot_core.errors import ComponentFailed, HardwareError
 from ibrobot_core.plugins import installed_plugins
 
 if TYPE_CHECKING:
-    from conftest import Site
+    from ibrobot_testing.site import Site
 
 PATIENCE_S = 30.0
 DOCUMENT = """
@@ -164,7 +164,12 @@ class TestProcess:
         host.write_plan(PlanRecord(first.generation, first.stamp_ns, 10_000_000, np.ones(2, dtype=bool), positions))
 
         ticks = [first.tick]
-        told.state(lambda state: ticks.append(state.tick) or np.allclose(state.command, end))
+
+        def arrived(state: ControlState) -> bool:
+            ticks.append(state.tick)
+            return np.allclose(state.command, end)
+
+        told.state(arrived)
         assert ticks == sorted(set(ticks))
         # A host that was stopped for seconds comes too late for some, and says so.
         assert ticks[-1] - first.tick + 1 - len(ticks) <= host.lost_states

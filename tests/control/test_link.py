@@ -32,10 +32,11 @@ VECTOR = arrays(np.float64, 3, elements=FLOATS)
 
 
 def state(tick: int, success: bool | None = None, vectors: np.ndarray | None = None, late_ns: int = 5) -> ControlState:
-    given_vectors = np.arange(12.0).reshape(4, 3) + tick if vectors is None else vectors
+    position, velocity, effort, command = np.arange(12.0).reshape(4, 3) + tick if vectors is None else vectors
     return ControlState(
-        tick, 1_000 * tick, late_ns, 2, tick % 2 == 0, tick % 3 == 0, success, *given_vectors, np.array([1.5, np.nan])
-    )
+        tick, 1_000 * tick, late_ns, 2, tick % 2 == 0, tick % 3 == 0, success,
+        position, velocity, effort, command, np.array([1.5, np.nan]),
+    )  # fmt: skip
 
 
 def plan(generation: int = 1, rows: int = 4) -> PlanRecord:

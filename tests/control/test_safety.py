@@ -357,7 +357,8 @@ def test_a_target_that_jumps_on_while_it_is_approached_is_not_overshot(ticks: in
 def test_a_gentle_way_to_a_target_keeps_its_speed_and_needs_no_intervention() -> None:
     watched = Watched(one_joint(), PERIOD_NS)
     watched.start(ZERO)
-    target, speeds = np.array([1.0]), []
+    target = np.array([1.0])
+    speeds: list[float] = []
     while not speeds or not watched.layer.at_rest:
         command = watched.tick(watched.layer.towards(target, 0.25))
         assert command[0] <= 1.0
@@ -497,7 +498,7 @@ def test_the_emergency_stop_latches_brakes_and_ignores_until_reset() -> None:
     for _ in range(30):
         watched.tick(np.array([1.9]))
     assert watched.layer.at_rest
-    assert watched.layer.counters() == before | {"estop": 30}
+    assert watched.layer.counters() == {**before, "estop": 30}
     watched.layer.activate(watched.layer.current)  # torque returned: still stopped
     assert watched.layer.estopped
     watched.start(np.array([0.3]), reset=True)

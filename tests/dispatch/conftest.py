@@ -81,7 +81,7 @@ class Rig:
     ) -> None:  # fmt: skip
         self.clock = SteppedClock(START_NS)
         self.bus = Bus(self.clock)
-        self.client = client or ScriptedClient()
+        self.client: Any = client or ScriptedClient()
         self.plans: list[tuple[int, int, np.ndarray]] = []
         self.sent: list[tuple[int, tuple[int, int, np.ndarray]]] = []
         """Plans with the tick at which each was sent."""

@@ -14,7 +14,7 @@ from ibrobot_testing.fakes import FakePolicy
 from ibrobot_core.inference.client import LockstepClient
 
 if TYPE_CHECKING:
-    from conftest import Rig
+    from tests.dispatch.conftest import Rig
 
 STEP = 100_000_000
 """The contract's tick at 10 Hz [ns]."""

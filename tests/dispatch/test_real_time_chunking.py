@@ -15,7 +15,7 @@ from ibrobot_core.errors import ContractError
 from ibrobot_core.inference.client import Chunk, DispatchInfer
 
 if TYPE_CHECKING:
-    from conftest import Rig
+    from tests.dispatch.conftest import Rig
 
 STEP = 100_000_000
 SIZE, LENGTH = 6, 16
@@ -107,7 +107,9 @@ def test_no_more_than_a_chunk_of_the_plan_is_sent(make_rig: type[Rig]) -> None:
     rig.tick()
     rig.answer(np.zeros((9, SIZE)))
     rig.tick()
-    assert rig.requests[1].frame.prefix.shape == (5, SIZE)
+    prefix = rig.requests[1].frame.prefix
+    assert prefix is not None
+    assert prefix.shape == (5, SIZE)
 
 
 def test_while_the_arm_is_held_the_prefix_is_where_and_for_how_long(make_rig: type[Rig]) -> None:

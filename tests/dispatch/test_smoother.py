@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -264,6 +266,6 @@ def test_plans_handed_out_and_chunks_taken_in_share_nothing() -> None:
         ({"step_ns": 1, "action_size": 3, "coeff": float("nan")}, "coeff must lie between -700 and 700, got nan"),
     ],
 )
-def test_impossible_settings_are_refused(kwargs: dict, message: str) -> None:
+def test_impossible_settings_are_refused(kwargs: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         TemporalSmoother(**kwargs)

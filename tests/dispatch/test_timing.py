@@ -13,7 +13,7 @@ from ibrobot_testing.contexts import START_NS
 from ibrobot_core.inference.client import Chunk
 
 if TYPE_CHECKING:
-    from conftest import Rig
+    from tests.dispatch.conftest import Rig
 
 STEP = 100_000_000
 SIZE = 6
@@ -223,7 +223,8 @@ def test_waiting_for_other_robots_does_not_raise_the_demand(make_rig: type[Rig])
 
 def test_one_that_had_to_wait_for_others_asks_later_by_as_much(make_rig: type[Rig]) -> None:
     rig = make_rig(watermark="auto", timeout_s=60.0, chunk_size=20)
-    asked, queued = [], (0, 2, 0)
+    asked: list[int] = []
+    queued = (0, 2, 0)
     for ticks in queued:
         while len(rig.requests) == len(asked):
             rig.tick()

@@ -12,7 +12,7 @@ from ibrobot_testing import host_context
 from ibrobot_core.plugins import discover
 
 if TYPE_CHECKING:
-    from conftest import Site
+    from ibrobot_testing.site import Site
 
 EXAMPLE = Path(__file__).parent / "ibrobot-plugin-wave"
 ROOT = Path(__file__).parents[2]

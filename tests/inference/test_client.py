@@ -78,11 +78,14 @@ class ReusesItsChunk(FakePolicy):
 
 def test_chunk_is_not_overwritten_by_the_next():
     client = LockstepClient(ReusesItsChunk())
-    chunks = []
+    actions: list[np.ndarray] = []
     for number in (1, 2):
         client.submit(request(number))
-        chunks.append(client.poll())
-    assert not np.array_equal(chunks[0].actions, chunks[1].actions)
+        chunk = client.poll()
+        assert chunk is not None
+        assert chunk.actions is not None
+        actions.append(chunk.actions)
+    assert not np.array_equal(actions[0], actions[1])
 
 
 def test_the_answer_carries_the_id_and_the_observations_time(policy: GatedPolicy, monolithic: EngineClient):

@@ -170,7 +170,8 @@ def damaged(content: bytes, chance: random.Random) -> bytes:
 
 def read(path: Path) -> tuple[str, Rows, str]:
     """Outcome and rows of an episode, and why there are no more of them."""
-    outcome, rows = "unknown", []
+    outcome = "unknown"
+    rows: Rows = []
     try:
         reader = Rosbag2Reader(path)
         try:

@@ -319,7 +319,7 @@ def test_joints_in_lerobots_units(bags: Path, tmp_path: Path) -> None:
         "robot": {"joints": [{"name": name, "lower": -0.1} for name in JOINTS]},
         "hardware": {"type": "feetech_so101"},
     }
-    metadata = {"config": json.dumps(document), "calibration": json.dumps({"arm": CALIBRATION})}
+    metadata: dict[str, Any] = {"config": json.dumps(document), "calibration": json.dumps({"arm": CALIBRATION})}
     record(tmp_path / "bag", 1, 0.5, **metadata)
     for mode in ("radians", "degrees", "range_m100_100"):
         result = run(tmp_path / "bag", "--out", tmp_path / mode, "--norm-mode", mode)
@@ -355,7 +355,7 @@ def test_foreign_bags_by_the_contract_alone(
     if compression is not None:
         writer.set_compression(compression, CompressionFormat.ZSTD)
     with writer:
-        types = {"/joint_states": JointState, "/top": Image, "/commands": Float64MultiArray}
+        types: dict[str, type[Message]] = {"/joint_states": JointState, "/top": Image, "/commands": Float64MultiArray}
         topics = {
             topic: writer.add_connection(topic, type_.ros_type, typestore=store) for topic, type_ in types.items()
         }

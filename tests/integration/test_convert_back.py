@@ -17,6 +17,7 @@ from ibrobot_lerobot.rows import EpisodeRows
 from recordings import CONTRACT, JOINTS, START_NS, record
 
 from ibrobot_core.contract.specs import Contract
+from ibrobot_core.messages import JointState
 from ibrobot_core.plugins import installed_plugins
 
 pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("first_conversion")]
@@ -25,7 +26,7 @@ CALIBRATION = {
     joint: {"id": i + 1, "drive_mode": i % 2, "homing_offset": 0, "range_min": 1000, "range_max": 3000}
     for i, joint in enumerate(JOINTS)
 }
-ROBOT = {
+ROBOT: dict[str, Any] = {
     "robot": {"name": "bench", "robot_type": "bench_follower",
               "joints": [{"name": joint, "lower": -1.5, "upper": 1.5} for joint in JOINTS]},
     "hardware": {"type": "bench"},
@@ -198,5 +199,6 @@ def test_a_foreign_dataset_is_described_by_a_robot_yaml(exact: Path, convert: Co
     items = [item for item in reader.messages({"/joint_states"})]
     metadata = reader.summary().metadata
     reader.close()
+    assert isinstance(items[3].message, JointState)
     np.testing.assert_array_equal(items[3].message.position, rows(exact, 0)[3]["observation.state"])
     assert (metadata["prompt"], metadata["robot"]) == ("sort 1", "bench")

@@ -44,7 +44,7 @@ def millimetres(number: int) -> NDArray[np.uint16]:
 
 def metres(number: int) -> NDArray[np.float32]:
     """Unknown, too near and too far in its first pixels, as REP 118 has it."""
-    values = millimetres(number).astype(np.float32) / 1000
+    values = (millimetres(number) / 1000).astype(np.float32)
     values[0, :3] = np.nan, -np.inf, np.inf
     return values
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 if TYPE_CHECKING:
-    from conftest import Log, Ran
+    from tests.integration.conftest import Log, Ran
 
 pytestmark = pytest.mark.integration
 

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import threading
 import time
+from collections import deque
 from pathlib import Path
 
 import pytest
@@ -35,7 +36,7 @@ def test_cube_lies_in_the_bin_and_only_the_emulator_says_so(ibrobot: tuple[str, 
     ) as emulator:  # fmt: skip
         assert emulator.stdout is not None
         said: queue.SimpleQueue[str] = queue.SimpleQueue()
-        reading = threading.Thread(target=lambda lines: [said.put(line) for line in lines], args=(emulator.stdout,))
+        reading = threading.Thread(target=lambda lines: deque(map(said.put, lines), maxlen=0), args=(emulator.stdout,))
         reading.start()
         try:
             before = [said.get(timeout=PATIENCE_S)]

@@ -19,7 +19,7 @@ import pytest
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from conftest import Site
+    from ibrobot_testing.site import Site
 
 pytestmark = pytest.mark.integration
 

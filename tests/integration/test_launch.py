@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 if TYPE_CHECKING:
-    from conftest import Log, Ran
+    from tests.integration.conftest import Log, Ran
 
 pytestmark = pytest.mark.integration
 

@@ -189,14 +189,14 @@ def check_rows(reader: Any, spec: Contract, seen: list[Frame], sent: list[tuple[
     for frame in seen:
         commands = [made for received, topic, made in sent if topic == COMMANDS and received <= frame.stamp_ns]
         if commands and not frame.missing:
-            wanted.append(frame.values | {"action": np.asarray(commands[-1].data, np.float32)})  # type: ignore[attr-defined]
+            wanted.append({**frame.values, "action": np.asarray(commands[-1].data, np.float32)})  # type: ignore[attr-defined]
     if not wanted:
         return 0
     rows = list(Ticks(reader, spec, "skip"))
     assert len(rows) == len(wanted)
-    for row, frame in zip(rows, wanted, strict=True):
-        assert row.keys() == frame.keys()
-        assert all(same(row[key], frame[key]) for key in frame)
+    for row, values in zip(rows, wanted, strict=True):
+        assert row.keys() == values.keys()
+        assert all(same(row[key], values[key]) for key in values)
     return len(rows)
 
 
@@ -213,7 +213,8 @@ def test_pictures_of_a_motion_jpeg_camera(tmp_path: Path) -> None:
     recorder = McapRecorder(McapOptions(), host_context(clock=clock))
     recorder.begin(EpisodeStart(tmp_path / "bag", clock.now_ns(), spec.topics, {}))
     arrived = bus.subscribe(image.topic, 100)
-    sent, seen = [], []
+    sent: list[Any] = []
+    seen: list[Any] = []
     with StreamServer() as server:
         camera = OpenCvCamera(OpenCvOptions(device=server.url), host_context("top", clock=clock))
         camera.open()

@@ -27,7 +27,9 @@ from ibrobot_core.interfaces import Transport
 from ibrobot_core.plugins import installed_plugins
 
 if TYPE_CHECKING:
-    from conftest import Log, Ran, Site
+    from ibrobot_testing.site import Site
+
+    from tests.integration.conftest import Log, Ran
 
 pytestmark = pytest.mark.integration
 
@@ -117,7 +119,7 @@ def test_a_model_process_ends_with_a_host_that_was_killed(ibrobot: tuple[str, ..
 
 
 def test_a_server_that_is_killed_in_the_middle_of_requests_harms_nothing():
-    command = [sys.executable, ROOT / "benchmarks/server_kill.py", "--kills", "2", "--slack", "5"]
+    command = [sys.executable, str(ROOT / "benchmarks/server_kill.py"), "--kills", "2", "--slack", "5"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     told: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
@@ -129,9 +131,9 @@ def test_a_server_whose_model_hangs_starts_again(
 ):
     site.add("hangs-once", "hangs_once.py")
     port = free_endpoint().split(":")[1]
-    command = [*ibrobot, "serve", tmp_path, "--type", "hangs_once", "--name", "net", "--listen", endpoint]
+    command = [*ibrobot, "serve", str(tmp_path), "--type", "hangs_once", "--name", "net", "--listen", endpoint]
     process = subprocess.Popen(
-        [*command, "--hang-timeout", "0.5", "--metrics-port", port],
+        [*command, "--hang-timeout", "0.5", "--metrics-port", str(port)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

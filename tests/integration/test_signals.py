@@ -124,7 +124,7 @@ def test_signals_shape_the_data_and_do_not_come_back_from_a_dataset(bag: Path, t
     assert Contract.from_canonical(labelled.canonical()).fingerprint() == labelled.fingerprint() != plain.fingerprint()
     assert labelled.without_signals().fingerprint() == plain.fingerprint()
     assert "next.reward" in labelled.difference(plain)
-    command = [sys.executable, "-c", PROGRAM, "convert", bag, "--config", "contract.yaml", "--out", "set"]
+    command = [sys.executable, "-c", PROGRAM, "convert", str(bag), "--config", "contract.yaml", "--out", "set"]
     subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)
     reader = installed_plugins().open_episode(tmp_path / "set:0")
     try:

@@ -19,7 +19,7 @@ from ibrobot_core.launch.session import LaunchRequest, Session
 from ibrobot_core.plugins import discover
 
 if TYPE_CHECKING:
-    from conftest import Site
+    from ibrobot_testing.site import Site
 
 NEEDS = {"test_distributed.py": "ibrobot_serve", "test_sharing.py": "ibrobot_zenoh"}
 collect_ignore = [name for name, package in NEEDS.items() if find_spec(package) is None]

@@ -9,10 +9,11 @@ import pytest
 
 from ibrobot_core.errors import HardwareError, TeleopError
 from ibrobot_core.launch.runtime import RESET, SET_MODE
+from ibrobot_core.messages import RobotStatus
 
 if TYPE_CHECKING:
-    from conftest import Runs
     from ibrobot_core.launch.runtime import Runtime
+    from tests.launch.conftest import Runs
 
 
 @pytest.fixture
@@ -159,8 +160,8 @@ def test_status_has_a_fault_until_its_reset_and_the_summary_to_the_end(run: Runt
         moves(run)
         received = status.get()
         assert received is not None
-        found: tuple[str, ...] = received.message.faults
-        return found
+        assert isinstance(received.message, RobotStatus)
+        return received.message.faults
 
     device = runs.parts.MADE["lever"]
     read = device.read

@@ -11,12 +11,16 @@ import numpy as np
 import pytest
 from ibrobot_serve.service import InferenceService
 from ibrobot_testing import host_context
+from ibrobot_testing.fakes import FakeTransport
 
 from ibrobot_core.errors import ComponentFailed
+from ibrobot_core.messages import DiagnosticArray
 
 if TYPE_CHECKING:
-    from conftest import Runs, Site
+    from ibrobot_testing.site import Site
+
     from ibrobot_core.launch.runtime import Runtime
+    from tests.launch.conftest import Runs
 
 pytestmark = pytest.mark.integration
 
@@ -39,7 +43,7 @@ def cloud(runs: Runs, site: Site) -> Iterator[InferenceService]:
     service.start()
     yield service
     service.close()
-    type(network).__mro__[1].close(network)
+    FakeTransport.close(network)
 
 
 def motion(runtime: Runtime) -> np.ndarray:
@@ -83,7 +87,7 @@ def test_the_plan_to_be_continued_travels_with_the_request(mode: str, runs: Runs
         np.testing.assert_array_equal(told(MODE.format(mode), transport, strategy="rtc"), here)
     finally:
         service.close()
-        type(network).__mro__[1].close(network)
+        FakeTransport.close(network)
 
 
 def test_diagnostics_tell_where_the_model_is_and_whether_it_answers(runs: Runs, cloud: InferenceService):
@@ -93,6 +97,7 @@ def test_diagnostics_tell_where_the_model_is_and_whether_it_answers(runs: Runs, 
     received = diagnostics.get()
     diagnostics.close()
     assert received is not None
+    assert isinstance(received.message, DiagnosticArray)
     (status,) = (status for status in received.message.status if status.name == "inference")
     values = {pair.key: pair.value for pair in status.values}
     assert (values["mode"], values["alive"], values["failures"]) == ("distributed", "True", "0")
@@ -113,10 +118,12 @@ def test_the_arm_holds_while_the_server_is_gone_and_goes_on_when_it_is_back(runs
         runtime.step()
     for _ in range(25):  # it comes to rest
         runtime.step()
+    assert session.state is not None
     held = session.state.command.copy()
     for _ in range(20):
         runtime.step()
         np.testing.assert_array_equal(session.state.command, held)
+    assert runtime.plan.link is not None
     transport = runtime.plan.link.transport
     again = InferenceService(runs.parts.Net(host_context(robot=session.config.robot)), transport, "net")
     again.start()

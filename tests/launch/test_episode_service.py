@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 import yaml
 
 from ibrobot_core.errors import DiskFull, NotSupported, RecorderError
 from ibrobot_core.recording.operator import Operator
-from ibrobot_core.recording.service import DISCARD, START, STATUS, STOP
+from ibrobot_core.recording.service import DISCARD, START, STATUS, STOP, EpisodeService
 
 if TYPE_CHECKING:
-    from conftest import Runs
     from ibrobot_core.launch.runtime import Runtime
+    from tests.launch.conftest import Runs
 
 RECORDING = "recording={type: lines, root: kept, dataset: pick}"
 
@@ -69,7 +69,7 @@ def test_services_begin_end_and_discard_episodes(run: Runtime, runs: Runs):
     assert ("ended", 1, "failure") in runs.parts.EVENTS
     assert ("ended", 2, "discarded") in runs.parts.EVENTS
     assert run.episode_service is not None
-    assert run.episode_service.saved == 1
+    assert service(run).saved == 1
     assert folders(runs) == ["episode_000001"]
 
 
@@ -159,8 +159,13 @@ def test_buttons_without_a_meaning_in_a_run_are_reported(runs: Runs, caplog: pyt
     assert "intervention: mode teleop has no policy to take the robot from" in caplog.text
 
 
+def service(run: Runtime) -> EpisodeService:
+    assert run.episode_service is not None
+    return run.episode_service
+
+
 class TestOperator:
-    def watch(self, run: Runtime, **asked: object) -> Operator:
+    def watch(self, run: Runtime, **asked: Any) -> Operator:
         assert run.episode_service is not None
         return Operator(
             run.session, run.episode_service,
@@ -178,15 +183,15 @@ class TestOperator:
         for key in ("tab", "h", "o", "p", "backspace", "space", "!"):
             assert operator.key(key)
         assert "ho !_" in operator.rows()[0][1]
-        assert not run.episode_service.running
+        assert not service(run).running
         operator.key("enter")
-        assert run.episode_service.running
+        assert service(run).running
         assert "recording “ho !”" in operator.line()
         operator.key("tab")
-        assert (run.episode_service.running, run.episode_service.saved) == (False, 1)
+        assert (service(run).running, service(run).saved) == (False, 1)
         operator.key("tab")
         operator.key("tab")
-        assert not run.episode_service.running, "a second Tab goes back"
+        assert not service(run).running, "a second Tab goes back"
         assert not operator.key("a"), "letters belong to the mode again"
 
     def test_failure_and_discard(self, run: Runtime, runs: Runs):
@@ -197,7 +202,7 @@ class TestOperator:
             operator.key(end)
             self.step(run, operator, 2)
         assert [event[2] for event in runs.parts.EVENTS if event[0] == "ended"] == ["failure", "discarded"]
-        assert run.episode_service.saved == 1
+        assert service(run).saved == 1
 
     def press(self, run: Runtime, runs: Runs, *events: str) -> None:
         runs.parts.MADE["stick"].events = events
@@ -207,9 +212,9 @@ class TestOperator:
         for events in (("start",), ("success",), ("start",), ("failure",), ("start",), ("discard",)):
             self.press(run, runs, *events)
             self.step(run, operator, 3)
-            assert run.episode_service.running == (events == ("start",))
+            assert service(run).running == (events == ("start",))
         assert [event[2] for event in runs.parts.EVENTS if event[0] == "ended"] == ["success", "failure", "discarded"]
-        assert run.episode_service.saved == 2
+        assert service(run).saved == 2
 
     def test_a_button_without_an_episode_to_end_says_so(self, run: Runtime, runs: Runs):
         operator = self.watch(run, prompt="pick")
@@ -224,13 +229,13 @@ class TestOperator:
         self.step(run, operator, 3)
         self.press(run, runs, "discard")
         self.step(run, operator, 3)
-        assert run.episode_service.running
+        assert service(run).running
         assert "discard: this run begins and ends its episodes by itself" in caplog.text
 
     def test_unattended_episodes_pause_and_end_with_the_count(self, run: Runtime, runs: Runs):
         operator = self.watch(run, auto=True, count=2, reset_time_s=0.5, prompt="pick")
         self.step(run, operator, 50 + 2)
-        assert run.episode_service.saved == 1
+        assert service(run).saved == 1
         assert "set up the scene again" in operator.line()
         self.step(run, operator, 200)
         assert run.session.finished.is_set()
@@ -259,17 +264,17 @@ class TestOperator:
         if not auto:
             operator.key("tab")
         self.step(run, operator, 3)
-        assert run.episode_service.running
+        assert service(run).running
         with monkeypatch.context() as patch:
             patch.setattr(runs.parts.MADE["recording"], "write", full)
             self.step(run, operator, 3)
-        assert (run.episode_service.running, run.episode_service.saved) == (False, 0)
+        assert (service(run).running, service(run).saved) == (False, 0)
         assert ("", "recording ended: its disk has 1 MiB left") in operator.rows()
         assert run.session.finished.is_set() == auto, "the robot goes on where an operator is there"
         if not auto:
             operator.key("tab")
             self.step(run, operator, 3)
-            assert run.episode_service.running, "there is room again"
+            assert service(run).running, "there is room again"
             assert "" not in dict(operator.rows())
 
     def test_unattended_the_run_ends_without_room_for_another_episode(
@@ -280,18 +285,18 @@ class TestOperator:
         monkeypatch.setattr(run.episode_service, "free_bytes", lambda: 1)
         self.step(run, operator, 40)
         assert run.session.finished.is_set()
-        assert (run.episode_service.saved, len(run.session.outcome.faults)) == (1, 1)
+        assert (service(run).saved, len(run.session.outcome.faults)) == (1, 1)
         assert "0 MiB left" in run.session.outcome.faults[0]
 
     def test_continuous_is_one_episode_to_the_end_of_the_run(self, run: Runtime, runs: Runs):
         operator = self.watch(run, continuous=True, keys=False, prompt="watch")
         self.step(run, operator, 120)
-        assert run.episode_service.elapsed_s() > 2 * run.session.config.contract.max_duration_s
+        assert service(run).elapsed_s() > 2 * run.session.config.contract.max_duration_s
         assert operator.line().startswith("recording “watch”, 2 s, saved")
         assert not operator.key("tab")
         run.stop()
         assert [event for event in runs.parts.EVENTS if event[0] == "ended"] == [("ended", 1, "unknown")]
-        assert (run.episode_service.saved, folders(runs)) == (1, ["episode_000001"])
+        assert (service(run).saved, folders(runs)) == (1, ["episode_000001"])
 
     def test_continuous_means_nothing_where_the_mode_has_episodes(self, runs: Runs, monkeypatch: pytest.MonkeyPatch):
         monkeypatch.chdir(runs.folder)

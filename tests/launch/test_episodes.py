@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -12,7 +12,9 @@ from ibrobot_core.errors import NotSupported
 from ibrobot_core.launch.runtime import ESTOP, RESET, Runtime
 
 if TYPE_CHECKING:
-    from conftest import Runs, Site
+    from ibrobot_testing.site import Site
+
+    from tests.launch.conftest import Runs
 
 RECORDING = "recording={type: lines, root: kept, dataset: picks}"
 
@@ -28,7 +30,7 @@ def seconds(runtime: Runtime, duration: float) -> None:
         runtime.step()
 
 
-def records(folder: Path) -> list[dict]:
+def records(folder: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (folder / "records.jsonl").read_text().splitlines()]
 
 

@@ -9,9 +9,12 @@ import attrs
 import pytest
 
 from ibrobot_core.errors import ComponentFailed, ConfigError
+from ibrobot_core.messages import DiagnosticArray, RobotStatus
 
 if TYPE_CHECKING:
-    from conftest import Runs, Site
+    from ibrobot_testing.site import Site
+
+    from tests.launch.conftest import Runs
 
 MODE = "control_modes.policy.inference.execution_mode={}"
 
@@ -45,7 +48,10 @@ def test_the_status_and_the_diagnostics_tell_how_the_plan_is_kept_filled(runs: R
     while not runtime.step():
         pass
     runtime.raise_failure()
-    status, diagnostics = (subscription.get().message for subscription in received)
+    messages = [subscription.get() for subscription in received]
+    status, diagnostics = (message and message.message for message in messages)
+    assert isinstance(status, RobotStatus)
+    assert isinstance(diagnostics, DiagnosticArray)
     for subscription in received:
         subscription.close()
     (dispatch,) = (each for each in diagnostics.status if each.name == "dispatch")

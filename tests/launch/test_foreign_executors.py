@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 if TYPE_CHECKING:
-    from launch.conftest import Runs
+    from ibrobot_testing.site import Site
 
-    from conftest import Site
+    from tests.launch.conftest import Runs
 
 
 @pytest.fixture(autouse=True)

@@ -8,13 +8,16 @@ from importlib.metadata import entry_points
 from typing import TYPE_CHECKING
 
 import pytest
+from ibrobot_metrics.component import MetricsPort
 from prometheus_client.parser import text_string_to_metric_families
 
 from ibrobot_core.errors import ComponentFailed, ConfigError, SensorError
 
 if TYPE_CHECKING:
-    from conftest import Runs, Site
+    from ibrobot_testing.site import Site
+
     from ibrobot_core.launch.runtime import Runtime
+    from tests.launch.conftest import Runs
 
 
 pytestmark = pytest.mark.integration
@@ -30,6 +33,7 @@ def installed(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def url(runtime: Runtime) -> str:
     (port,) = (component for component in runtime.plan.components if component.name == "metrics")
+    assert isinstance(port, MetricsPort)
     return port.url
 
 
@@ -54,6 +58,7 @@ def test_prometheus_learns_what_diagnostics_tell(runtime: Runtime):
     status, text = get(runtime, "/metrics")
     assert status == 200
     families = {family.name: family for family in text_string_to_metric_families(text)}
+    assert runtime.session.acting is not None
     stats = runtime.session.acting.dispatch
     assert stats is not None
     for name, kind, value in (
@@ -65,7 +70,8 @@ def test_prometheus_learns_what_diagnostics_tell(runtime: Runtime):
         ("ibrobot_estop", "gauge", 0),
     ):
         (sample,) = families[name].samples
-        assert (families[name].type, sample.value) == (kind, pytest.approx(value))
+        assert families[name].type == kind
+        assert sample.value == pytest.approx(value)
         assert sample.labels == {"robot": "mini"}
     assert families["ibrobot_mode"].samples[0].labels == {"robot": "mini", "mode": "policy"}
     assert {sample.labels["name"] for sample in families["ibrobot_sensor_rate_hertz"].samples} == {"top", "side"}
@@ -74,6 +80,7 @@ def test_prometheus_learns_what_diagnostics_tell(runtime: Runtime):
 
 def test_a_robot_is_ready_unless_it_is_stopped_or_its_model_is_gone(runtime: Runtime):
     assert get(runtime, "/readyz") == (200, "ok\n")
+    assert runtime.session.acting is not None
     stats = runtime.session.acting.engine
     assert stats is not None
     stats.alive = False

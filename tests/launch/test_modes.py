@@ -11,7 +11,7 @@ from ibrobot_core.launch.runtime import SET_MODE, Runtime
 from ibrobot_core.launch.sources.planner import GO_TO
 
 if TYPE_CHECKING:
-    from conftest import Runs
+    from tests.launch.conftest import Runs
 
 
 def seconds(runtime: Runtime, duration: float) -> None:

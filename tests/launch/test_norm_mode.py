@@ -15,20 +15,22 @@ from ibrobot_core.interfaces import Frame
 from ibrobot_core.units import radians_to_lerobot
 
 if TYPE_CHECKING:
-    from conftest import Runs
+    from tests.launch.conftest import Runs
 
-RANGE = {"range_min": 1000, "range_max": 3000}
+
+RANGE = (1000, 3000)
+"""Ticks."""
 
 
 @pytest.fixture
 def calibration(tmp_path: Path) -> str:
-    joints = {joint: JointCalibration(i, 0, 0, **RANGE) for i, joint in enumerate(("pan", "grip"), 1)}
+    joints = {joint: JointCalibration(i, 0, 0, *RANGE) for i, joint in enumerate(("pan", "grip"), 1)}
     return str(write_calibration(Calibration(joints), tmp_path / "arm.json"))
 
 
 def degrees(positions: Any) -> list[float]:
     """Radians -> LeRobot's degrees by the calibration."""
-    return [radians_to_lerobot(float(each), "degrees", **RANGE) for each in positions]
+    return [radians_to_lerobot(float(each), "degrees", range_min=RANGE[0], range_max=RANGE[1]) for each in positions]
 
 
 def test_the_model_lives_in_degrees_and_the_arm_in_radians(

@@ -11,7 +11,7 @@ import pytest
 from ibrobot_core.launch.perception import SensorWorker
 
 if TYPE_CHECKING:
-    from conftest import Runs
+    from tests.launch.conftest import Runs
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -15,8 +15,8 @@ from ibrobot_core.messages import String
 from ibrobot_core.recording import worker as recording
 
 if TYPE_CHECKING:
-    from conftest import Runs
     from ibrobot_core.launch.runtime import Runtime
+    from tests.launch.conftest import Runs
 
 
 class Notes:
@@ -53,7 +53,7 @@ def ticks(runtime: Runtime, count: int) -> None:
         assert not runtime.step()
 
 
-def note(runs: Runs, monkeypatch: pytest.MonkeyPatch, topics: str = "contract") -> tuple[Runtime, Notes]:
+def note(runs: Runs, monkeypatch: pytest.MonkeyPatch, topics: str = "contract") -> tuple[Any, Notes]:
     """A run whose next episode is noted."""
     runtime = runs.start(f"recording={{type: lines, topics: {topics}}}", mode="teleop")
     ticks(runtime, 2)

@@ -14,10 +14,10 @@ from ibrobot_core.errors import ComponentFailed, NotSupported, PlanningError, Te
 from ibrobot_core.interfaces import Condition, Severity
 from ibrobot_core.launch.runtime import ESTOP, RESET, Runtime
 from ibrobot_core.launch.session import Session
-from ibrobot_core.messages import DiagnosticStatus, KeyValue
+from ibrobot_core.messages import DiagnosticArray, DiagnosticStatus, KeyValue
 
 if TYPE_CHECKING:
-    from conftest import Runs
+    from tests.launch.conftest import Runs
 
 
 def steps(runtime: Runtime, count: int) -> None:
@@ -287,6 +287,7 @@ def test_diagnostics_have_each_sensors_rate_and_age_and_what_the_hardware_counts
     seconds(runtime, 3.0)
     received = diagnostics.get()
     assert received is not None
+    assert isinstance(received.message, DiagnosticArray)
     found = {status.name: {pair.key: pair.value for pair in status.values} for status in received.message.status}
     assert float(found["sensor top"]["rate_hz"]) > 1
     assert 0 <= float(found["sensor top"]["age_ms"]) < 1000
@@ -304,6 +305,7 @@ def test_diagnostics_have_the_conditions_of_joints_the_leads_and_the_following_e
     seconds(runtime, 3.0)
     received = diagnostics.get()
     assert received is not None
+    assert isinstance(received.message, DiagnosticArray)
     status = {each.name: each for each in received.message.status}
     assert (status["joint pan"].level, status["joint grip"].level) == (DiagnosticStatus.WARN, DiagnosticStatus.ERROR)
     assert status["joint pan"].message == hot.message

@@ -12,7 +12,9 @@ from ibrobot_core.messages import Bool, String
 from ibrobot_core.units import NS_PER_S
 
 if TYPE_CHECKING:
-    from conftest import Runs, Site
+    from ibrobot_testing.site import Site
+
+    from tests.launch.conftest import Runs
 
 
 @pytest.fixture

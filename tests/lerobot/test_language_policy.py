@@ -73,7 +73,7 @@ def test_a_prompt_gives_lerobots_chunk(path: Path, policy: LeRobotPolicy) -> Non
         chunks.append(policy.postprocess(policy.infer(tensors)))
         wanted = theirs.chunk(frame().values, int(tensors[SEED][0]), prompt)
         np.testing.assert_array_equal(chunks[-1], wanted.astype(np.float64))
-    assert not np.array_equal(*chunks)
+    assert not np.array_equal(chunks[0], chunks[1])
 
 
 def test_the_plan_is_continued_as_lerobot_does(path: Path, policy: LeRobotPolicy) -> None:

@@ -191,7 +191,7 @@ def test_noise_of_a_batch_is_that_of_each_request_alone(folders: dict[str, Path]
     policy = loaded(folders[name])
     one = dict(policy.preprocess(frames(policy, 1)[0]))
     other = {**one, SEED: one[SEED] + 1}
-    first, second, third = (each["action"] for each in policy.infer_batch([one, other, one]))
+    first, second, third = (np.asarray(each["action"], np.float64) for each in policy.infer_batch([one, other, one]))
     np.testing.assert_allclose(first, third, atol=TOLERANCE)
     assert np.abs(first - second).max() > 0.01
 

@@ -66,7 +66,7 @@ def episodes(root: Path) -> list[dict[str, Any]]:
     return [row for path in sorted(root.glob("meta/episodes/*/*.parquet")) for row in pq.read_table(path).to_pylist()]
 
 
-def shown(root: Path, key: str, episode: int) -> list[NDArray[np.uint8]]:
+def shown(root: Path, key: str, episode: int) -> list[NDArray[Any]]:
     """The pictures of an episode, found as LeRobot does: by file and time."""
     row = episodes(root)[episode]
     chunk, file = row[f"videos/{key}/chunk_index"], row[f"videos/{key}/file_index"]

@@ -40,7 +40,7 @@ def _config(**values: Any) -> Callable[[Path, Path], None]:
     return lambda path, canary: _edit(path / "config.json", lambda document: document.update(values))
 
 
-def _step(file: str, entry: Callable[[Path], dict[str, Any]]) -> Callable[[Path, Path], None]:
+def _step(file: str, entry: Callable[[Path], Any]) -> Callable[[Path, Path], None]:
     return lambda path, canary: _edit(path / file, lambda document: document["steps"].append(entry(canary)))
 
 

@@ -87,7 +87,7 @@ def make(path: Path, **options: Any) -> LeRobotPolicy:
 
 
 def frame(value: float = 0.0, pixel: int = 0, **changes: Any) -> Frame:
-    values = {STATE: np.full(6, value, np.float32), TOP: np.full((4, 5, 3), pixel, np.uint8)}
+    values: dict[str, Any] = {STATE: np.full(6, value, np.float32), TOP: np.full((4, 5, 3), pixel, np.uint8)}
     return attrs.evolve(Frame(START_NS, values), **changes)
 
 
@@ -105,7 +105,7 @@ def test_what_it_needs_and_gives(tmp_path: Path) -> None:
 
 def test_numbers_are_normalised_and_back(tmp_path: Path) -> None:
     policy = make(write(tmp_path / "act"))
-    tensors = policy.preprocess(frame(0.5, 51))
+    tensors: Any = policy.preprocess(frame(0.5, 51))
     np.testing.assert_allclose(tensors[STATE][0, :5], 0.5)
     assert tensors[STATE][0, 5] == pytest.approx(3e8), "a range of nothing is taken as 1e-8, as in LeRobot"
     assert (tensors[TOP].shape, tensors[TOP].dtype) == ((4, 5, 3), np.uint8), "pictures are the model's to normalise"
@@ -118,7 +118,7 @@ def test_clients_in_other_languages_learn_of_every_tensor(tmp_path: Path) -> Non
     page = (Path(__file__).parents[3] / "docs/reference/wire.md").read_text(encoding="utf-8")
     policy = make(write(tmp_path / "pi0", type="pi0"))
     plan = np.zeros((3, 6))
-    tensors = policy.preprocess(frame(prompt="pick", prefix=plan, delay_steps=1))
+    tensors: Any = policy.preprocess(frame(prompt="pick", prefix=plan, delay_steps=1))
     assert tensors.keys() == {STATE, TOP, "seed", "task", "prefix", "delay_steps"}
     for name in ("seed", "task", "prefix", "delay_steps"):
         dtype, shape = (cell.strip() for cell in page.partition(f"| `{name}` |")[2].split("|")[:2])
@@ -149,7 +149,7 @@ def test_a_prompt_and_the_plan_travel_with_the_observation(tmp_path: Path) -> No
     assert "prefix" not in plain
     assert "delay_steps" not in plain
     prefix = np.arange(18.0).reshape(3, 6)
-    tensors = policy.preprocess(frame(prompt="x", prefix=prefix, delay_steps=2))
+    tensors: Any = policy.preprocess(frame(prompt="x", prefix=prefix, delay_steps=2))
     np.testing.assert_allclose(tensors["prefix"], (prefix[None] - np.arange(6)) / 2)
     assert tensors["delay_steps"].tolist() == [2]
     assert "prefix" not in make(write(tmp_path / "act")).preprocess(frame(prefix=prefix))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -82,7 +84,7 @@ def test_parts_of_a_key_and_keys_of_a_topic_share_messages():
     values = {"state": np.array([1, 2, 7, 8, 9], np.float32), "speed": np.array([3], np.float32)}
     made = Composer(contract)(values, STAMP_NS)
     assert made.keys() == {"/joints", "/extra"}
-    joints = made["/joints"]
+    joints: Any = made["/joints"]
     assert joints.name == ("a", "b")
     np.testing.assert_array_equal(joints.velocity, [np.nan, 3])
     assert joints.effort.size == 0
@@ -119,7 +121,7 @@ def test_actions_go_to_their_executors_topics():
         ActionPart(name, f"/{name}", "std_msgs/msg/Float64MultiArray", "hold", joints)
         for name, joints in (("arm", ("a", "b")), ("gripper", ("c",)))
     )
-    made = Composer(Contract(30.0, (), actions))({"action": np.array([1, 2, 3], np.float32)}, STAMP_NS)
+    made: Any = Composer(Contract(30.0, (), actions))({"action": np.array([1, 2, 3], np.float32)}, STAMP_NS)
     assert {topic: message.data.tolist() for topic, message in made.items()} == {"/arm": [1, 2], "/gripper": [3]}
     with pytest.raises(ContractError, match=r"an action has 3 values \(a, b, c\), got the shape \(2,\)"):
         Composer(Contract(30.0, (), actions))({"action": np.zeros(2)}, STAMP_NS)
@@ -133,7 +135,7 @@ def test_only_topics_whose_keys_are_there_are_made():
 
 def test_numbers_that_nothing_selects_are_not_made_up():
     contract = Contract(30.0, (part("state", "/imu", "sensor_msgs/msg/Imu", ["angular_velocity"]),), ())
-    message = Composer(contract)({"state": np.ones(3)}, STAMP_NS)["/imu"]
+    message: Any = Composer(contract)({"state": np.ones(3)}, STAMP_NS)["/imu"]
     assert np.isnan([message.orientation.w, message.linear_acceleration.x]).all()
     buttons = Contract(30.0, (part("state", "/joy", "sensor_msgs/msg/Joy", ["buttons.1"]),), ())
     with pytest.raises(ContractError, match=r"buttons: elements that no path selects are unknown"):

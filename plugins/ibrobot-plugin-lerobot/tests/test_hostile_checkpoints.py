@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +11,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-sys.path.insert(0, str(Path(__file__).parent))
-from hostile import ATTACKS, POST, PRE, pickled_weights
-from test_checkpoint import frame, make, step, write
-
 from ibrobot_core.api import PolicyError
 
-TYPES = {
+from .hostile import ATTACKS, POST, PRE, pickled_weights
+from .test_checkpoint import frame, make, step, write
+
+TYPES: dict[str, dict[str, Any]] = {
     "act": {}, "diffusion": {"horizon": 16, "n_obs_steps": 2}, "vqbet": {"action_chunk_size": 5},
     "smolvla": {"vlm_model_name": "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"}, "pi0": {},
 }  # fmt: skip

@@ -76,7 +76,7 @@ def test_pictures_in_tables_are_exact(tmp_path: Path) -> None:
 
 def opened(content: bytes) -> NDArray[Any]:
     """A picture file's pixels, shape (H, W, C), by FFmpeg."""
-    with av.open(BytesIO(content)) as container:
+    with av.open(BytesIO(content), "r") as container:
         [frame] = container.decode(video=0)
         pixels = frame.to_ndarray()
     return pixels if pixels.ndim == 3 else pixels[..., None]

@@ -13,6 +13,7 @@ from ibrobot_mcap import rewrite
 from ibrobot_mcap.commands import episodes
 from ibrobot_mcap.commands.plot import Facts, actions_of
 from ibrobot_mcap.reader import Rosbag2Reader
+from ibrobot_mcap.storage import Storage
 from mcap.reader import make_reader
 from PIL import Image as Png
 from rosbags.rosbag2 import Reader as RosbagsReader
@@ -166,7 +167,7 @@ def test_messages_that_are_missing_from_within_keep_an_episode_from_being_read(t
 def test_a_repair_that_fails_leaves_the_original(tmp_path, monkeypatch):
     path = unfinish(made(tmp_path), 300)
     kept = {p.name: p.read_bytes() for p in path.iterdir()}
-    monkeypatch.setattr(rewrite.Storage, "finish", lambda *_: (_ for _ in ()).throw(RecorderError("the disk is full")))
+    monkeypatch.setattr(Storage, "finish", lambda *_: (_ for _ in ()).throw(RecorderError("the disk is full")))
     assert "the disk is full" in run("repair", path, code=1)
     assert {p.name: p.read_bytes() for p in path.iterdir()} == kept
     assert [p.name for p in path.parent.iterdir()] == [path.name]
@@ -195,6 +196,7 @@ def test_verify_says_what_is_wrong(tmp_path):
 
 def test_verify_counts_the_latched_messages_that_every_file_repeats(tmp_path):
     bench = Bench(tmp_path, split_duration=0.2)
+    assert bench.ctx.bus is not None
     bench.ctx.bus.publish("/robot_description", String("<urdf/>"), latched=True)
     bench.begin()
     bench.recorder.write("/robot_description", String("<urdf/>"), stamp(0))
@@ -261,8 +263,9 @@ def test_a_copy_is_compressed_as_the_original_is(tmp_path, compression):
     run("trim", bench.path, "-o", tmp_path / "cut")
     assert contents(tmp_path / "cut")[1] == contents(bench.path)[1]
     with (tmp_path / "cut" / "cut_0.mcap").open("rb") as file:
-        chunks = make_reader(file).get_summary().chunk_indexes
-    assert {chunk.compression for chunk in chunks} == {"" if compression == "none" else compression}
+        found = make_reader(file).get_summary()
+    assert found is not None
+    assert {chunk.compression for chunk in found.chunk_indexes} == {"" if compression == "none" else compression}
 
 
 def test_export_writes_numbers_by_joint(tmp_path):

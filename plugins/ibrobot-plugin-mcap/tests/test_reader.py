@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import struct
 from io import BytesIO
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,6 +32,7 @@ from ibrobot_core.api import (
     IbrobotError,
     Image,
     JointState,
+    Message,
     ObservationPart,
     RecorderError,
     installed_plugins,
@@ -48,6 +50,7 @@ def unfinished(request, tmp_path_factory):
     made = Bench(tmp_path_factory.mktemp("kept"), compression=request.param, chunk_size=2048)
     made.begin(prompt="pick")
     made.write(400)
+    assert made.recorder._storage is not None
     made.recorder._storage.flush_due()
     copy = tmp_path_factory.mktemp("copy") / "file.mcap"
     shutil.copyfile(made.path / "episode_000001_0.mcap", copy)
@@ -106,7 +109,7 @@ def test_damage_in_the_midst_is_reported_after_what_came_before(bench):
     content = bytearray(file.read_bytes())
     content[block.offset + block.length - 5] ^= 0xFF
     file.write_bytes(content)
-    found = []
+    found: list[Message] = []
     with (
         reading(path) as reader,
         pytest.raises(RecorderError, match=rf"chunk at byte {block.offset} is damaged: its checksum"),
@@ -178,7 +181,7 @@ def test_messages_keep_no_chunk_in_memory(bench):
     first = read(made.end())[0].message.position
     while first.base is not None and not isinstance(first.base, bytes | memoryview):
         first = first.base
-    owner = first.base.obj if isinstance(first.base, memoryview) else first.base
+    owner: Any = first.base.obj if isinstance(first.base, memoryview) else first.base
     assert len(owner) < 500
 
 
@@ -316,8 +319,8 @@ def png(array):
     ("format_", "encoding", "header", "array"),
     [
         ("rgb8; png compressed bgr8", "rgb8", b"", np.arange(24, dtype=np.uint8).reshape(2, 4, 3)),
-        ("mono16; png compressed mono16", "16UC1", b"", np.arange(0, 64000, 8000, np.uint16).reshape(2, 4)),
-        ("16UC1; compressedDepth png", "16UC1", bytes(12), np.arange(0, 64000, 8000, np.uint16).reshape(2, 4)),
+        ("mono16; png compressed mono16", "16UC1", b"", np.arange(0, 64000, 8000, dtype=np.uint16).reshape(2, 4)),
+        ("16UC1; compressedDepth png", "16UC1", bytes(12), np.arange(0, 64000, 8000, dtype=np.uint16).reshape(2, 4)),
     ],
 )
 def test_foreign_png_pictures_come_as_images(tmp_path, format_, encoding, header, array):

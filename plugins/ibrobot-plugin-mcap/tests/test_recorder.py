@@ -8,6 +8,7 @@ import resource
 import threading
 from collections import Counter
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from ibrobot_ros2 import definition, encode, type_hash
 from ibrobot_testing.contexts import START_NS, host_context
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
+from rosbags.interfaces import ConnectionExtRosbag2
 
 from ibrobot_core.api import NS_PER_S, Image, JointState, RecorderError, String
 
@@ -49,7 +51,8 @@ def test_other_readers_open_it_and_count_the_same(bench, compression):
         assert {c.topic: c.msgcount for c in reader.connections} == counts
         found = Counter(connection.topic for connection, _, _ in reader.messages())
         assert found == counts
-        assert reader.deserialize(next(reader.messages())[2], JointState.ros_type).position.tolist() == [0.0, 0.0]
+        joint_state: Any = reader.deserialize(next(reader.messages())[2], JointState.ros_type)
+        assert joint_state.position.tolist() == [0.0, 0.0]
     assert {topic: kept.count for topic, kept in summary(path).topics.items()} == counts
 
 
@@ -65,6 +68,7 @@ def test_the_file_is_what_ros_tools_expect(bench):
         ((schema, channel, message), *_) = reader.iter_messages()
     assert [record["message_count"] for record in records] == [0, 3]
     assert records[0]["custom_data"] == {"prompt": "pick"}
+    assert schema is not None
     assert (schema.name, schema.encoding, channel.message_encoding) == (JointState.ros_type, "ros2msg", "cdr")
     assert schema.data.decode() == definition(JointState.ros_type)
     assert channel.metadata["topic_type_hash"] == type_hash(JointState.ros_type)
@@ -112,6 +116,7 @@ def test_splits_begin_with_what_is_latched(bench, option, value):
     for part in parts:
         with AnyReader([part]) as reader:
             (connection,) = [c for c in reader.connections if c.topic == "/robot_description"]
+            assert isinstance(connection.ext, ConnectionExtRosbag2)
             assert connection.ext.offered_qos_profiles[0].durability.name == "TRANSIENT_LOCAL"
             ((_, begin_ns, _),) = reader.messages([connection])
             assert begin_ns == reader.start_time
@@ -141,7 +146,7 @@ def test_pictures_may_be_jpeg(bench, encoding, channels):
     with AnyReader([path]) as reader:
         (connection,) = reader.connections
         assert connection.msgtype == "sensor_msgs/msg/CompressedImage"
-        first = reader.deserialize(next(reader.messages())[2], connection.msgtype)
+        first: Any = reader.deserialize(next(reader.messages())[2], connection.msgtype)
     assert first.format == f"{encoding}; jpeg compressed {'mono8' if channels == 1 else 'bgr8'}"
     assert first.data[:3].tobytes() == b"\xff\xd8\xff"
     assert len(first.data) < picture(0, encoding, channels).data.nbytes
@@ -202,7 +207,12 @@ def test_a_slow_disk_costs_messages_which_are_counted_and_no_time(bench, monkeyp
 def test_a_chunk_is_written_when_it_is_old_though_nothing_more_comes(bench, monkeypatch):
     flushed = threading.Event()
     flush = bagfile.BagFile.flush
-    monkeypatch.setattr(bagfile.BagFile, "flush", lambda self: (flush(self), flushed.set()))
+
+    def flush_and_tell(self):
+        flush(self)
+        flushed.set()
+
+    monkeypatch.setattr(bagfile.BagFile, "flush", flush_and_tell)
     made = bench(threaded=True, chunk_period_s=0.05)
     made.begin()
     made.write(1)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from ibrobot_mcap.options import McapOptions
 from ibrobot_mcap.reader import Rosbag2Reader
 from ibrobot_mcap.recorder import McapRecorder
@@ -20,7 +22,7 @@ class McapSuite(RecorderSuite):
     def read_back(self, path):
         reader = Rosbag2Reader(path)
         try:
-            found = {topic: [] for topic in reader.summary().topics}
+            found: dict[str, list[Any]] = {topic: [] for topic in reader.summary().topics}
             for item in reader.messages():
                 found[item.topic].append((item.received_ns, item.message))
         finally:
@@ -61,7 +63,7 @@ class StillClock(RealClock):
 
 class TestWithItsThread(McapSuite):
     # The thread writes by wall time: test_kill.py sees what a killed process leaves.
-    test_a_crash_costs_little = None
+    test_a_crash_costs_little = None  # type: ignore[assignment]  # pytest then does not collect it
 
     def context(self):
         return host_context(clock=StillClock())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -56,9 +57,10 @@ def test_its_bytes_are_read_and_written_again(name, length):
 
 def test_values_arrive():
     rng = np.random.default_rng(0)
-    message = decode("std_msgs/msg/Int32", bytes.fromhex(JAZZY["std_msgs/msg/Int32"]["cdr"][0]))
+    message: Any = decode("std_msgs/msg/Int32", bytes.fromhex(JAZZY["std_msgs/msg/Int32"]["cdr"][0]))
     assert message.data == rng.integers(1, 100)
-    names = [decode("sensor_msgs/msg/JointState", bytes.fromhex(text)).name for text in JAZZY[
-        "sensor_msgs/msg/JointState"]["cdr"]]  # fmt: skip
+    texts = JAZZY["sensor_msgs/msg/JointState"]["cdr"]
+    states: list[Any] = [decode("sensor_msgs/msg/JointState", bytes.fromhex(text)) for text in texts]
+    names = [state.name for state in states]
     assert [len(name) for name in names] == [0, 1, 2, 3]
     assert any("€" in text for name in names for text in name)
