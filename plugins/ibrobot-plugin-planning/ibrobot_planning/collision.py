@@ -52,6 +52,11 @@ class Collisions:
         self_padding: least distance [m] between links, and between links and what other links carry.
         unchecked: pairs of links that may touch; see `unchecked_pairs`.
 
+    Attributes:
+        data: pinocchio.Data.
+        geometry: pinocchio.GeometryModel with all shapes and pairs.
+        results: pinocchio.GeometryData, with the padding of each pair.
+
     Raises:
         PlanningError: for a joint or link that the arm does not have.
     """
@@ -72,23 +77,23 @@ class Collisions:
         self.reach = reach(arm, shapes)[self._indices]
         """How far any point moves at most with each joint [m/rad], shape (J,)."""
         self._names = [shape.link for shape in shapes]
-        self._geometry = pinocchio.GeometryModel()
+        self.geometry = pinocchio.GeometryModel()
         for number, shape in enumerate(shapes):
-            self._geometry.addGeometryObject(
+            self.geometry.addGeometryObject(
                 pinocchio.GeometryObject(f"{number}", shape.joint, pinocchio.SE3(shape.placement), shape.geometry)
             )
         margins = []
         for first, second, margin in _pairs(arm, world, shapes, padding, self_padding, set(unchecked)):
-            self._geometry.addCollisionPair(pinocchio.CollisionPair(first, second))
+            self.geometry.addCollisionPair(pinocchio.CollisionPair(first, second))
             margins.append(margin)
-        self._data = arm.model.createData()
-        self._results = self._geometry.createData()
-        for request, margin in zip(self._results.collisionRequests, margins, strict=True):
+        self.data = arm.model.createData()
+        self.results = self.geometry.createData()
+        for request, margin in zip(self.results.collisionRequests, margins, strict=True):
             request.security_margin = margin
         self._margins = margins
         # The naive manager compares all bounding boxes natively: for the few dozen shapes of an arm it is the fastest.
         # It widens them by the margins, which must therefore be set before.
-        self._manager = pinocchio.BroadPhaseManager_NaiveCollisionManager(arm.model, self._geometry, self._results)
+        self._manager = pinocchio.BroadPhaseManager_NaiveCollisionManager(arm.model, self.geometry, self.results)
 
     def free(self, q: Vector) -> bool:
         """Whether nothing touches at `q`, shape (J,)."""
@@ -96,8 +101,8 @@ class Collisions:
 
     def first_hit(self, configurations: Vector) -> int:
         """How many of the configurations, shape (N, J), are free before the first that is not."""
-        model, data, manager, check = self.arm.model, self._data, self._manager, pinocchio.computeCollisions
-        for number, q in enumerate(self._native(configurations)):
+        model, data, manager, check = self.arm.model, self.data, self._manager, pinocchio.computeCollisions
+        for number, q in enumerate(self.native(configurations)):
             if check(model, data, manager, q, True):
                 return number
         return len(configurations)
@@ -105,21 +110,22 @@ class Collisions:
     def contacts(self, q: Vector) -> list[Contact]:
         """What is closer than its padding at `q`, shape (J,): the closest of each pair of names, deepest first."""
         pinocchio.computeCollisions(
-            self.arm.model, self._data, self._geometry, self._results, self._native(q[None])[0], False
+            self.arm.model, self.data, self.geometry, self.results, self.native(q[None])[0], False
         )
         found: dict[Pair, Contact] = {}
-        for number, (pair, margin) in enumerate(zip(self._geometry.collisionPairs, self._margins, strict=True)):
-            if not self._results.collisionResults[number].isCollision():
+        for number, (pair, margin) in enumerate(zip(self.geometry.collisionPairs, self._margins, strict=True)):
+            if not self.results.collisionResults[number].isCollision():
                 continue
             first, second = self._names[pair.first], self._names[pair.second]
-            distance = pinocchio.computeDistance(self._geometry, self._results, number).min_distance
+            distance = pinocchio.computeDistance(self.geometry, self.results, number).min_distance
             contact = Contact(first, second, float(distance), margin)
             known = found.get((first, second))
             if known is None or contact.distance < known.distance:
                 found[first, second] = contact
         return sorted(found.values(), key=lambda contact: contact.distance)
 
-    def _native(self, configurations: Vector) -> Vector:
+    def native(self, configurations: Vector) -> Vector:
+        """Configurations of the planned joints, shape (N, J), as Pinocchio takes them, with all other joints."""
         whole = np.repeat(self._base[None], len(configurations), axis=0)
         whole[:, self._indices] = configurations
         return self.arm.native(whole)

@@ -42,7 +42,7 @@ from ibrobot_planning.timing import Motion, timed
 from ibrobot_planning.world import World
 from ibrobot_planning.world_keeper import SNAPSHOT
 
-_RESOLUTIONS_M = (0.02, 0.006)
+_RESOLUTIONS_M = (0.03, 0.01, 0.004)
 """How far the arm moves at most between checks of the search; finer ones follow where the timed motion touches."""
 _FINEST_M = 0.0015
 """The same for a whole path before it is timed."""
@@ -233,19 +233,15 @@ class _Plan:
         raise PlanningError(self._stuck(way_out[-1], goals[0]), PlanCode.TIMED_OUT)
 
     def _paths(self, start: Vector, goals: list[Vector], deadline: float) -> Iterator[list[Vector]]:
-        """Short paths, of which the next is wanted where the timed motion touches; ever more closely checked."""
+        """Short paths, ever more closely checked; the next is wanted where the timed motion of one touches."""
         rng = np.random.default_rng(self.ctx.seed)
-        finest = Space(self.checks, *self._limits, _FINEST_M)
         for resolution in _RESOLUTIONS_M:
             space = Space(self.checks, *self._limits, resolution)
             found = connect(space, start, goals, rng, lambda: time.monotonic() > deadline)
             if found is None:
                 return
             for closely in (resolution, *(finer for finer in _RESOLUTIONS_M if finer < resolution)):
-                path = shortened(Space(self.checks, *self._limits, closely), found, rng)
-                if all(finest.free(a, b) for a, b in pairwise(path)):
-                    yield path
-                    break
+                yield shortened(Space(self.checks, *self._limits, closely), found, rng)
 
     def _candidates(self, tool: Tool, goal: object) -> list[Candidate]:
         robot = self.ctx.robot
@@ -401,12 +397,12 @@ class _Plan:
         acceleration = np.minimum(limit, options.max_jerk * widest / 2)
         window = 2 * float(acceleration.max()) / options.max_jerk
         blends = self._blends(way)
-        for _ in range(_REPAIRS):
+        for number in range(_REPAIRS):
             motion = timed(way, velocity, acceleration, blends=blends, window=window, step=options.step)
             touching = self._touching(motion)
             if not len(touching):
                 return motion
-            if not blends.any():
+            if not blends.any() or (number == 0 and not self._free_closely(way)):
                 return None
             corners = np.linalg.norm(touching[:, None] - way[None, 1:-1], axis=2)
             nearest = np.unique(np.where(blends > 0, corners, np.inf).argmin(axis=1))
@@ -415,6 +411,12 @@ class _Plan:
         blends[:] = 0.0
         motion = timed(way, velocity, acceleration, blends=blends, window=window, step=options.step)
         return None if len(self._touching(motion)) else motion
+
+    def _free_closely(self, way: Vector) -> bool:
+        """Whether the path itself is free: where it is not, no blend helps."""
+        begin = 0 if self.checks.free(way[0]) else 1
+        finest = Space(self.checks, *self._limits, _FINEST_M)
+        return all(finest.free(a, b) for a, b in pairwise(way[begin:]))
 
     def _blends(self, way: Vector) -> Vector:
         """How far each corner may be cut, so that the cut touches nothing."""

@@ -18,7 +18,7 @@ from ibrobot_core.api import Vector
 _LONGEST = 0.8
 """Length of an extension of the trees [rad]."""
 _FIRST_NODES = 256
-_FRUITLESS = 25
+_FRUITLESS = 10
 """Attempts to shorten a path, one after the other, that end the shortening."""
 _ATTEMPTS = 200
 _SHORTER = 1e-3
