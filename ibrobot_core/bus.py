@@ -16,7 +16,7 @@ from ibrobot_core.messages import Message
 
 @attrs.frozen
 class Received:
-    """A message with the time at which the bus took it [ns]."""
+    """A message with its time of receipt by the bus [ns]."""
 
     topic: str
     message: Message
@@ -24,14 +24,14 @@ class Received:
 
 
 class Subscription:
-    """One subscriber's queue: `keep_last` of `depth`; when full the oldest is dropped and counted."""
+    """A subscriber's queue with `depth` messages; when it is full, the oldest is dropped and counted."""
 
     def __init__(self, bus: Bus, topic: str, depth: int) -> None:
         self.topic = topic
         self.depth = depth
         self.dropped = 0
         self.lost = Counter[str]()
-        """Topic -> messages dropped."""
+        """Topic -> number of dropped messages."""
         self._bus = bus
         self._queue: deque[Received] = deque()
         self._arrived = threading.Condition(bus._lock)
@@ -46,43 +46,43 @@ class Subscription:
         self._arrived.notify_all()
 
     def get(self, timeout_s: float | None = 0.0) -> Received | None:
-        """The oldest message waiting, or None when none comes within `timeout_s` (None waits for ever)."""
+        """The oldest queued message, or None if none arrives within `timeout_s` (None waits forever)."""
         with self._arrived:
             if not self._queue and timeout_s != 0.0:
                 self._arrived.wait_for(lambda: bool(self._queue), timeout_s)
             return self._queue.popleft() if self._queue else None
 
     def drain(self) -> list[Received]:
-        """All messages waiting, oldest first."""
+        """All queued messages, oldest first."""
         with self._arrived:
             items = list(self._queue)
             self._queue.clear()
             return items
 
     def close(self) -> None:
-        """Receive nothing more."""
+        """End the subscription."""
         self._bus._unsubscribe(self)
 
 
 class Bus:
     """Publish and subscribe within a process. Publishing never blocks on a subscriber.
 
-    Receive stamps are taken under the bus lock, so that a reader that holds `now_ns` from `snapshot_ns` has, in its
-    queues, every message received at or before it: this is what makes live sampling reproducible from a bag.
+    Times of receipt are taken under the bus lock. So for a time from `snapshot_ns`, the queues contain every message
+    received at or before it. This makes live sampling reproducible from a bag.
     """
 
     def __init__(self, clock: Clock) -> None:
         self.clock = clock
         self._lock = threading.RLock()
         self._subscriptions: defaultdict[str, list[Subscription]] = defaultdict(list)
-        """By topic; the empty one has those of every topic."""
+        """Subscriptions by topic; the empty key has those of all topics."""
         self._types: dict[str, str] = {}
         self._latched: dict[str, Received] = {}
         self._counts: dict[str, int] = {}
         self._services: dict[str, Callable[[Any], Any]] = {}
 
     def publish(self, topic: str, message: Message, *, latched: bool = False) -> None:
-        """Hand `message` to every subscriber of `topic`; a latched one is also given to later subscribers.
+        """Deliver `message` to every subscriber of `topic`; a latched one is also delivered to later subscribers.
 
         Raises:
             TransportError: if the topic carries another message type.
@@ -102,7 +102,7 @@ class Bus:
         """A new queue on `topic` (None: every topic), holding the newest `depth` messages.
 
         Raises:
-            ValueError: for a depth below one.
+            ValueError: if `depth` is below one.
         """
         if depth < 1:
             raise ValueError(f"depth must be at least 1, got {depth}")
@@ -120,22 +120,22 @@ class Bus:
                 self._subscriptions[subscription.topic].remove(subscription)
 
     def snapshot_ns(self) -> int:
-        """Now [ns], such that every message received at or before it is in its subscribers' queues."""
+        """The present time [ns], such that every message received until then is in its subscribers' queues."""
         with self._lock:
             return self.clock.now_ns()
 
     def topics(self) -> dict[str, tuple[str, int]]:
-        """Every topic seen: message type and number of messages published."""
+        """Every published topic -> message type and number of messages."""
         with self._lock:
             return {topic: (self._types[topic], count) for topic, count in sorted(self._counts.items())}
 
     def latched(self) -> dict[str, Received]:
-        """Topic -> its newest message, of every topic that keeps it for later subscribers."""
+        """Latched topic -> its newest message."""
         with self._lock:
             return dict(self._latched)
 
     def dropped(self) -> dict[str, int]:
-        """Messages dropped from full queues, per topic, over the present subscribers; topics without loss left out."""
+        """Topic -> number of messages dropped from full queues of present subscribers; only topics with losses."""
         with self._lock:
             lost = Counter[str]()
             for topic, subscriptions in self._subscriptions.items():
@@ -154,7 +154,7 @@ class Bus:
             self._services[name] = handler
 
     def unserve(self, name: str) -> None:
-        """Serve `name` no more; nothing happens where nobody did."""
+        """Stop serving `name`; does nothing if it is not served."""
         with self._lock:
             self._services.pop(name, None)
 
@@ -167,7 +167,7 @@ class Bus:
         """Call service `name`.
 
         Raises:
-            TransportError: if nobody serves it.
+            TransportError: if it has no server.
         """
         with self._lock:
             handler = self._services.get(name)

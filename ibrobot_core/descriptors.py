@@ -1,4 +1,4 @@
-"""Descriptors: what a plugin says about each thing it offers, without importing anything heavy."""
+"""Descriptors of what a plugin offers; they import nothing heavy."""
 
 from __future__ import annotations
 
@@ -25,50 +25,50 @@ if TYPE_CHECKING:
 
 @attrs.frozen
 class Descriptor[T]:
-    """One implementation of one kind.
+    """An implementation of one kind.
 
-    `make(options, ctx)` imports what it needs when it is called, and opens no device: that is for the object's own
-    `connect`, `open` or `load`.
+    `make(options, ctx)` imports what it needs when it is called, and opens no device; the object's `connect`, `open` or
+    `load` does.
     """
 
     type: str
-    """What the YAML gives as `type`."""
+    """The value of `type` in the YAML."""
     make: Callable[[Any, interfaces.Context], T]
     summary: str
     options: builtins.type[Any] = NoOptions
     """A frozen attrs class made with `ibrobot_core.options.option`."""
     check: Callable[[], None] = attrs.field(default=lambda: None, kw_only=True)
-    """Whether this machine has what the type needs beyond the plugin's own packages; imports nothing heavy.
+    """Checks dependencies other than Python packages; imports nothing heavy.
 
     Raises:
-        MissingDependency: e.g. for a system library. A run goes on without a sensor that nothing in it needs.
+        MissingDependency: e.g. if a system library is missing. A run continues without a sensor that it does not need.
     """
     check_options: Callable[[Any, Robot, tuple[str, ...]], Iterable[OptionFault]] = attrs.field(
         default=lambda options, robot, joints: (), kw_only=True
     )
-    """What is wrong with the options for a robot, e.g. a joint that it does not have; the third argument has the joints
-    that the component owns, or all where its kind owns none. Opens no device, and imports nothing heavy."""
+    """Yields faults of the options for a robot, e.g. an unknown joint. The third argument is the joints that the
+    component owns, or all joints if its kind owns none. Opens no device, and imports nothing heavy."""
     devices: Callable[[Any], Mapping[str, str]] = attrs.field(default=lambda options: {}, kw_only=True)
-    """Option -> the device that it names and that one component at a time can open, always written in the same way."""
+    """Maps options to devices that only one component can open at a time, in a canonical form."""
     default: bool = attrs.field(default=False, kw_only=True)
-    """Whether commands take this type where none of its kind is named; one type of a kind at most."""
+    """Whether commands use this type by default; at most one type of each kind."""
 
 
 @attrs.frozen
 class HardwareDescriptor(Descriptor["interfaces.Hardware"]):
-    """Hardware; `simulated` ones are `SimulatedHardware` and may stand in the `simulation:` section."""
+    """Hardware. If `simulated`, it is a `SimulatedHardware` and can be used in the `simulation:` section."""
 
     simulated: bool = False
     sensors: Mapping[str, str] = attrs.field(factory=dict)
-    """For simulated hardware, sensor kind, e.g. `camera` -> the sensor type that stands for it."""
+    """For simulated hardware: sensor kind, e.g. `camera` -> sensor type that replaces it."""
     torque_off: str = ""
-    """For joints that hold on when no process commands them any more: the command that takes their torque off."""
+    """For joints that hold even without a process that commands them: the command that switches their torque off."""
     calibration: Callable[[Any], str | None] = attrs.field(default=lambda options: None, kw_only=True)
-    """Name or path of the calibration that the options name, as `load_calibration` takes it; recordings keep it. None
-    where it works without one."""
+    """Name or path of the calibration in the options, for `load_calibration`; recordings contain it. None without a
+    calibration."""
     anchored: Callable[[Any], tuple[str, ...]] = attrs.field(default=lambda options: (), kw_only=True)
-    """The joints whose calibrated closed end is their lower limit, as a gripper's may be. In LeRobot's units these are
-    0 to 100."""
+    """The joints whose calibrated closed end is at their lower limit, such as a gripper. In LeRobot's units they range
+    from 0 to 100."""
 
 
 @attrs.frozen
@@ -77,7 +77,7 @@ class SensorDescriptor(Descriptor["interfaces.Sensor"]):
 
     kind: str = "camera"
     picture: Callable[[Any], tuple[int, int] | None] = attrs.field(default=lambda options: None, kw_only=True)
-    """Height and width of the pictures [px], as far as the options say them."""
+    """Height and width of the images [px], if the options define them."""
 
 
 @attrs.frozen
@@ -92,28 +92,28 @@ class PolicyDescriptor(Descriptor["interfaces.Policy"]):
 
 @attrs.frozen
 class EngineDescriptor(Descriptor["interfaces.Engine"]):
-    """A place where the model of a policy runs, and `Context.model` is that model.
+    """An engine, which runs the model of a policy, `Context.model`.
 
-    In the YAML `inference.execution_mode` names the type, and its options stand beside it.
+    In the YAML, `inference.execution_mode` selects the type, and its options are keys of `inference`.
     """
 
     uses_transport: bool = False
-    """Whether it reaches the model over the transport of the YAML, which must then lead to other machines."""
+    """Whether it reaches the model over the transport of the YAML, which must then connect to other machines."""
     weights_here: bool = True
-    """Whether this machine has the model's weights, so that `ibrobot config check --deep` looks at them."""
+    """Whether this machine has the model's weights, so that `ibrobot config check --deep` checks them."""
 
 
 @attrs.frozen
 class ExecutorDescriptor(Descriptor["interfaces.Executor"]):
-    """An executor; `streams` says that it follows setpoints (from policies and teleop) rather than goals.
+    """An executor. If `streams`, it follows setpoints (from policies and teleop) rather than goals.
 
-    The options of one that streams derive from `ibrobot_core.executor_options.StreamOptions`.
+    The options of a streaming executor derive from `ibrobot_core.executor_options.StreamOptions`.
     """
 
     streams: bool = False
     goals: Literal["trajectory", "position"] = "trajectory"
-    """What a planner sends to one that does not stream: a timed path, as `trajectory_goal` gives it, or
-    `{"position": q}`, where the first of its joints goes [rad]."""
+    """The goals of an executor that does not stream: `trajectory`, made by `trajectory_goal`, or `position`,
+    `{"position": q}`, with the position of its first joint [rad]."""
 
 
 @attrs.frozen
@@ -126,15 +126,15 @@ class TransportDescriptor(Descriptor["interfaces.Transport"]):
     """A transport."""
 
     listen: Callable[[Sequence[str]], Mapping[str, Any]] | None = None
-    """Endpoints -> the options with which a server listens there and connects to nobody; at an endpoint of this machine
-    alone where none is given. None where servers cannot use this transport."""
+    """Maps endpoints to the options of a server that listens there and does not connect; without endpoints, it listens
+    on this machine only. None if servers cannot use this transport."""
     used: Callable[[Any], bool] = attrs.field(default=lambda options: False, kw_only=True)
     """Whether a run with these options uses the transport even if no mode needs it."""
     components: Callable[[Any, Session, TransportLink], Sequence[Component]] = attrs.field(
         default=lambda options, session, link: (), kw_only=True
     )
-    """Options, run and its transport -> what the options add to a run that uses the transport, e.g. components that
-    send topics to other machines. Each needs `link.name`; from its start on, `link.transport` is open."""
+    """Returns components that the options add to a run with this transport, e.g. to send topics to other machines. Each
+    needs `link.name`; when it starts, `link.transport` is open."""
 
 
 @attrs.frozen
@@ -151,7 +151,7 @@ class Flag:
     option: str
     help: str
     value: str | None = None
-    """What the flag sets the option to; None where the value follows the flag."""
+    """The value that the flag sets; None if the value follows the flag."""
 
 
 @attrs.frozen
@@ -159,7 +159,7 @@ class DatasetDescriptor(Descriptor["interfaces.DatasetWriter"]):
     """A dataset writer."""
 
     flags: tuple[Flag, ...] = ()
-    """Short ways, in the command that converts, to set options of this type."""
+    """Flags of the convert command that set options of this type."""
 
 
 @attrs.frozen
@@ -169,29 +169,29 @@ class ViewerDescriptor(Descriptor["interfaces.Viewer"]):
 
 @attrs.frozen
 class SectionDescriptor(Descriptor["Component"]):
-    """A section that a plugin adds to the robot YAML, e.g. `counter: {topic: /count}`, and what serves it in a run.
+    """A section that a plugin adds to the robot YAML, e.g. `counter: {topic: /count}`, and its component.
 
-    `type` is the section's key at the top level of the file, one that core does not have. `options` are its keys.
+    `type` is the section's key at the top level of the file, which core must not have. `options` are its keys.
     """
 
     make: Callable[[Any, Session], Component] = attrs.field(kw_only=True)  # type: ignore[assignment]
-    """Options and run -> the component that starts and stops with the run. The options are None where the component
-    runs without its section. Imports what it needs when it is called, and opens nothing."""
+    """Makes the component, from options and session. The options are None if the component runs without its section.
+    Imports what it needs when it is called, and opens nothing."""
     without_section: Callable[[RobotConfig], bool] = attrs.field(default=lambda config: False, kw_only=True)
-    """Whether the component also runs with a robot whose file lacks the section."""
+    """Whether the component also runs if the YAML lacks the section."""
     check_config: Callable[[RobotConfig], Iterable[OptionFault]] = attrs.field(default=lambda config: (), kw_only=True)
-    """What is wrong with a robot that it runs with, in any section; opens no device. The `option` of a fault begins at
-    the top of the file: `("peripherals", 0, "transform")`."""
+    """Yields faults of a robot config in any section; opens no device. The `option` of a fault is a path from the top
+    of the file: `("peripherals", 0, "transform")`."""
 
 
 @attrs.frozen
 class ReaderDescriptor:
-    """A format of recorded episodes that can be read; the first installed one that knows a path reads it."""
+    """A readable format of recorded episodes; the first installed one that recognises a path reads it."""
 
     type: str
     summary: str
     reads: Callable[[Path], bool]
-    """Whether what lies at a path is of this format; looks at names and first bytes only."""
+    """Whether a path has this format; checks only names and first bytes."""
     make: Callable[[interfaces.EpisodeAddress], interfaces.EpisodeReader]
     """Opens an episode.
 
@@ -199,20 +199,20 @@ class ReaderDescriptor:
         RecorderError: when it cannot be read.
     """
     numbered: bool = False
-    """Whether many episodes lie at a path, which go by their numbers, from 0."""
+    """Whether a path contains many episodes, numbered from 0."""
 
 
 @attrs.frozen
 class DecoderDescriptor:
-    """A decoder of compressed pictures, registered by plugins that send them; the first that knows a format counts."""
+    """A decoder of compressed images; the first one that supports a format is used."""
 
     formats: tuple[str, ...]
-    """E.g. `jpeg`; for messages to the user."""
+    """Names of formats for messages, e.g. `jpeg`."""
     make: Callable[[], Callable[[CompressedImage], Image | None]]
-    """Imports the decoder, which gives the pixels, or None for a format that it does not know.
+    """Imports the decoder, which returns pixels, or None for an unknown format.
 
     Equal bytes give equal pixels, in a run and in a conversion. The decoder raises:
-        ContractError: for a damaged picture.
+        ContractError: if an image is damaged.
     """
 
 
@@ -227,7 +227,7 @@ class ConfigFile:
 
 @attrs.frozen
 class Command:
-    """A command that a plugin adds: `ibrobot NAME …`; `load` imports it when it is called."""
+    """A command of a plugin: `ibrobot NAME …`; `load` imports it when it is called."""
 
     name: str
     summary: str
@@ -242,6 +242,6 @@ class Check:
     ok: bool
     found: str
     remedy: str = ""
-    """What to do about it, where `ok` is False."""
+    """The remedy if `ok` is False."""
     matters: bool = True
-    """Whether `ibrobot doctor` fails where `ok` is False; otherwise it is a note."""
+    """Whether `ibrobot doctor` fails if `ok` is False; otherwise it is only a note."""

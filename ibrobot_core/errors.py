@@ -1,4 +1,4 @@
-"""The errors that a user may see; each prints as one line and carries the command's exit code."""
+"""The errors that a user may see; each is printed as one line and has the command's exit code."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from pathlib import Path
 import attrs
 
 _LISTED = 50
-"""How many problems a message lists; a screen holds no more."""
+"""Maximum number of problems in a message, to fit on a screen."""
 
 
 class IbrobotError(Exception):
-    """Base of every error that ibrobot raises on purpose.
+    """Base of all errors that ibrobot raises on purpose.
 
     The command line prints `str(error)` and exits with `exit_code`; anything else is a bug: see `ibrobot_core.bugs`.
     """
@@ -25,10 +25,10 @@ class IbrobotError(Exception):
 
 @attrs.frozen
 class Problem:
-    """One thing wrong with a config file."""
+    """A problem in a config file."""
 
     file: Path | str
-    """The file as it was given, or the override, e.g. `--set control.rate_hz=abc`."""
+    """The given path of the file, or the override, e.g. `--set control.rate_hz=abc`."""
     line: int
     path: str
     message: str
@@ -39,7 +39,7 @@ class Problem:
 
 
 class ConfigError(IbrobotError):
-    """A robot YAML that cannot be used, e.g. an unknown key; `problems` has every fault found, in file order."""
+    """A robot YAML is invalid, e.g. because of an unknown key; `problems` has all problems, in file order."""
 
     exit_code = 2
 
@@ -51,25 +51,25 @@ class ConfigError(IbrobotError):
 
 
 class PluginError(IbrobotError):
-    """A plugin that is asked for but is missing or broken, e.g. a `type` without its package."""
+    """A required plugin is missing or broken, e.g. the package of a `type`."""
 
     exit_code = 2
 
 
 def plugin_type(kind: str, type: str) -> str:
-    """What messages call a type of a kind, e.g. `teleop type 'joystick'`."""
+    """The name of a type in messages, e.g. `teleop type 'joystick'`."""
     named = {"command": f"ibrobot {type}", "section": f"section {type!r}"}
     return named.get(kind, f"{kind} type {type!r}")
 
 
 class PluginNotInstalled(PluginError):
-    """A type whose plugin is not installed, or is broken.
+    """The plugin of a type is not installed, or is broken.
 
     Args:
         kind: e.g. `teleop`, `section` or `command`.
-        type: as the YAML has it, or the command's name.
-        package: which offers it.
-        reason: why the plugin cannot be used, where it is installed.
+        type: the type in the YAML, or the command's name.
+        package: the package that offers it.
+        reason: why the plugin cannot be used, if it is installed.
     """
 
     def __init__(self, kind: str, type: str, package: str, reason: str = "") -> None:
@@ -83,12 +83,12 @@ class PluginNotInstalled(PluginError):
 
 
 class MissingDependency(IbrobotError):
-    """A library that a type needs and this machine lacks, e.g. no OpenGL for simulated cameras.
+    """This machine lacks a library that a type needs, e.g. OpenGL for simulated cameras.
 
     Args:
-        missing: what is missing, and what for.
-        apt: the Debian packages that bring it; `remedy` then is the command that installs them.
-        remedy: what to do about it, where that is not a matter of Debian packages.
+        missing: the missing library and its purpose.
+        apt: Debian packages that contain it; `remedy` is then the command that installs them.
+        remedy: the remedy, if it is not to install Debian packages.
     """
 
     exit_code = 2
@@ -101,35 +101,35 @@ class MissingDependency(IbrobotError):
 
 
 class ContractError(IbrobotError):
-    """Data that does not fit the contract, e.g. a policy trained on other joints than the robot's."""
+    """Data does not fit the contract, e.g. a policy was trained with other joints than the robot's."""
 
     exit_code = 2
 
 
 class HardwareError(IbrobotError):
-    """Hardware that cannot be opened, read or written, e.g. a servo that stopped answering."""
+    """Hardware cannot be opened, read or written, e.g. because a servo stopped answering."""
 
 
 class CalibrationError(IbrobotError):
-    """A calibration that is missing or cannot be true, e.g. a range that crosses the encoder's end."""
+    """A calibration is missing or impossible, e.g. because a range crosses the encoder's end."""
 
     exit_code = 2
 
 
 class SensorError(IbrobotError):
-    """A sensor that cannot be opened or read, e.g. a camera that another program holds."""
+    """A sensor cannot be opened or read, e.g. because another program uses the camera."""
 
 
 class TeleopError(IbrobotError):
-    """A teleoperation device that cannot be opened or read, e.g. no terminal for the keyboard."""
+    """A teleoperation device cannot be opened or read, e.g. because the keyboard has no terminal."""
 
 
 class PolicyError(IbrobotError):
-    """A policy that cannot be loaded or run, e.g. a checkpoint without its statistics."""
+    """A policy cannot be loaded or run, e.g. because a checkpoint lacks its statistics."""
 
 
 class PlanCode(IntEnum):
-    """Why a motion cannot be planned: names and values of moveit_msgs/msg/MoveItErrorCodes."""
+    """Reasons why a motion cannot be planned: names and values of moveit_msgs/msg/MoveItErrorCodes."""
 
     SUCCESS = 1
     FAILURE = 99999
@@ -156,11 +156,11 @@ class PlanCode(IntEnum):
 
 
 class PlanningError(IbrobotError):
-    """A motion that cannot be planned, e.g. a goal outside the joint limits.
+    """A motion cannot be planned, e.g. because the goal is outside the joint limits.
 
     Args:
-        message: what is in the way.
-        code: the reason, as MoveIt names it.
+        message: the reason.
+        code: MoveIt's code for the reason.
     """
 
     def __init__(self, message: str, code: PlanCode = PlanCode.PLANNING_FAILED) -> None:
@@ -169,41 +169,41 @@ class PlanningError(IbrobotError):
 
 
 class TransportError(IbrobotError):
-    """A message that cannot be sent, e.g. a request that nobody serves."""
+    """A message cannot be sent, e.g. because a request has no server."""
 
 
 class WireError(IbrobotError):
-    """Bytes that are no frame of the wire format, or a frame that has no bytes, e.g. one that was cut short."""
+    """Bytes are not a valid frame of the wire format, e.g. because they are truncated, or a frame cannot be encoded."""
 
 
 class RecorderError(IbrobotError):
-    """A recording that cannot be written or read, e.g. a full disk."""
+    """A recording cannot be written or read, e.g. because the disk is full."""
 
 
 class DiskFull(RecorderError):
-    """A disk with less space than an episode takes."""
+    """The disk has less free space than an episode needs."""
 
 
 class DatasetError(IbrobotError):
-    """A dataset that cannot be written or read, e.g. a frame of another shape than the first."""
+    """A dataset cannot be written or read, e.g. because the shapes of frames differ."""
 
 
 class GoalRejected(IbrobotError):
-    """A goal that an executor refuses, e.g. a trajectory whose times do not increase."""
+    """An executor refuses a goal, e.g. because the times of a trajectory do not increase."""
 
 
 class ComponentFailed(IbrobotError):
-    """A running component that died, e.g. a control process that was killed; the rest was stopped."""
+    """A running component died, e.g. the control process was killed; the others were stopped."""
 
 
 class NotSupported(IbrobotError):
-    """Something that this implementation cannot do, e.g. `control.stop: relax` on hardware without torque control."""
+    """An implementation does not support a feature, e.g. `control.stop: relax` without torque control."""
 
     exit_code = 2
 
 
 class Declined(IbrobotError):
-    """A question that the user answered with no; what was done before stays done."""
+    """The user answered a question with no; earlier steps are not undone."""
 
     def __init__(self) -> None:
         super().__init__("stopped: the answer was no")
@@ -216,9 +216,9 @@ _OF_THE_MACHINE = frozenset(
 
 @contextmanager
 def wrong_input() -> Iterator[None]:
-    """Let commands exit with 2 for errors raised within: the user named something that cannot be used.
+    """A context and decorator with which errors make a command exit with 2, because the user gave invalid input.
 
-    Errors of the machine, such as a full disk, and of components that died keep their code. Also a decorator.
+    Errors of the machine, such as a full disk, and of components that died keep their exit code.
     """
     try:
         yield

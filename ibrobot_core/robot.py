@@ -1,4 +1,4 @@
-"""The robot itself: joints in their order, limits, groups, poses and where its models are."""
+"""The robot: its joints in order, limits, groups, poses and models."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ _LEAD_AT_REST = 0.2
 class Joint:
     """One joint; SI units."""
 
-    name: str = option(help="as in the URDF and MJCF")
+    name: str = option(help="name in the URDF and MJCF")
     lower: float = option(unit="rad", help="lower position limit")
     upper: float = option(unit="rad", help="upper position limit")
-    max_velocity: float = option(unit="rad/s", gt=0, help="speed that no command exceeds")
-    max_acceleration: float = option(unit="rad/s^2", gt=0, help="acceleration that no command exceeds")
+    max_velocity: float = option(unit="rad/s", gt=0, help="maximum speed of commands")
+    max_acceleration: float = option(unit="rad/s^2", gt=0, help="maximum acceleration of commands")
     max_lead: float | None = option(
         None,
         unit="rad",
         gt=0,
-        help="how far a command may be from the measured position; None: 0.2 rad, and the ways that the joint goes "
-        "in 0.1 s at max_velocity and while it brakes from there",
+        help="maximum distance of a command from the measured position; None: 0.2 rad, plus the distance in 0.1 s at "
+        "max_velocity, plus the braking distance",
     )
     grips: bool | None = option(
         None,
-        help="whether it holds objects, so that it may stay away from its setpoint without a fault; None: whether it "
-        "is in a group named gripper",
+        help="whether it grips objects, so that a distance from its setpoint is not a fault; None: true in a group "
+        "named gripper",
     )
     beyond_model: bool = option(False, help="whether its limits may be wider than those of the URDF and MJCF")
 
@@ -52,7 +52,7 @@ class Joint:
 @documented
 @attrs.frozen
 class Description:
-    """Where the robot's models are, and its named poses."""
+    """The robot's models and named poses."""
 
     mjcf: Path | None = option(None, help="MuJoCo model: a path, or package://PYTHON_PACKAGE/path")
     urdf: Path | None = option(None, help="URDF model: a path, or package://PYTHON_PACKAGE/path")
@@ -66,9 +66,9 @@ class Description:
 class Robot:
     """The `robot:` section. The order of `joints` is the order in every vector."""
 
-    name: str = option(help="this robot's name")
+    name: str = option(help="name of the robot")
     joints: tuple[Joint, ...] = option(help="the joints, in the order of every vector")
-    robot_type: str = option("", help="as LeRobot names it, written into datasets")
+    robot_type: str = option("", help="LeRobot's name of the robot type, for datasets")
     groups: Mapping[str, tuple[str, ...]] = option(factory=dict, help="named groups of joints; executors own them")
     description: Description = option(factory=Description, help="models and named poses")
 
@@ -99,7 +99,7 @@ class Robot:
 
     @cached_property
     def max_lead(self) -> Vector:
-        """How far a command may be from the measured position [rad], shape (J,)."""
+        """Maximum distance of a command from the measured position [rad], shape (J,)."""
         velocity = self.max_velocity
         default = _LEAD_AT_REST + LAG_S * velocity + velocity**2 / (2 * self.max_acceleration)
         own = [np.nan if joint.max_lead is None else joint.max_lead for joint in self.joints]
@@ -107,15 +107,15 @@ class Robot:
 
     @cached_property
     def grips(self) -> NDArray[np.bool_]:
-        """Which joints hold objects, shape (J,)."""
+        """Whether each joint grips objects, shape (J,)."""
         gripper = self.groups.get("gripper", ())
         return np.array([joint.name in gripper if joint.grips is None else joint.grips for joint in self.joints])
 
     def indices(self, names: Sequence[str]) -> NDArray[np.intp]:
-        """Positions of `names` in joint order, shape (len(names),).
+        """Indices of `names` in joint order, shape (len(names),).
 
         Raises:
-            KeyError: for a name that is not a joint of this robot.
+            KeyError: if a name is not a joint of this robot.
         """
         order = {name: i for i, name in enumerate(self.joint_names)}
         missing = [n for n in names if n not in order]
@@ -127,7 +127,7 @@ class Robot:
         """A named pose [rad], shape (J,).
 
         Raises:
-            KeyError: for an unknown pose.
+            KeyError: if the pose is unknown.
         """
         poses = self.description.poses
         if name not in poses:

@@ -1,4 +1,4 @@
-"""One abstract class per plugin kind; the whole of what an implementation must know."""
+"""The interfaces of plugins: one abstract class per kind."""
 
 from ibrobot_core.interfaces.context import Context, ModelContext
 from ibrobot_core.interfaces.dataset import DatasetSummary, DatasetWriter, Feature

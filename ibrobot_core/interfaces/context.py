@@ -1,4 +1,4 @@
-"""What every implementation is given at construction: its name, the clock, a logger, the robot, the bus."""
+"""The context that every implementation receives at construction: name, clock, logger, robot, bus."""
 
 from __future__ import annotations
 
@@ -21,39 +21,39 @@ if TYPE_CHECKING:
 
 @attrs.frozen(eq=False)
 class ModelContext:
-    """What an engine needs to know of the model that it runs. New fields may come; none will go."""
+    """The model that an engine runs. Fields may be added, but not removed."""
 
     config: RobotConfig
     """The robot YAML. The model is `config.models[NAME]`, where NAME is the context's `name`."""
     policy: Policy
-    """The robot's side of the model: constructed, not loaded. The run closes it, after the engine."""
+    """The robot's side of the model: constructed, not loaded. The run closes it after the engine."""
     transport: Transport | None = None
-    """The way to other machines, for engines whose descriptor says `uses_transport`. The run closes it."""
+    """The transport to other machines, for engines with `uses_transport` in their descriptor. The run closes it."""
     timeout_s: float = 5.0
-    """After this time a request has failed [s]: `inference.request_timeout`."""
+    """Timeout of a request [s], from `inference.request_timeout`."""
     ending: threading.Event = attrs.field(factory=threading.Event)
-    """Set when the run ends: `start` need not wait any longer."""
+    """Set when the run ends, so that `start` can stop waiting."""
 
 
 @attrs.frozen
 class Context:
-    """Handed to `make(options, ctx)`. New fields may come; none will go."""
+    """The argument `ctx` of `make(options, ctx)`. Fields may be added, but not removed."""
 
     name: str
-    """What the YAML calls this component, e.g. `top` for a camera."""
+    """The component's name in the YAML, e.g. `top` for a camera."""
     clock: Clock
     log: logging.Logger
     robot: Robot
     joints: tuple[str, ...] = ()
-    """The joints that this component owns, in its vectors' order: hardware and executors."""
+    """The joints that hardware or an executor owns, in the order of its vectors."""
     period_ns: int = 10_000_000
     """The control period [ns]."""
     seed: int = 0
     bus: Bus | None = None
     """The host's bus; None in the control process."""
     simulation: Any = None
-    """The options of the simulation in use (an attrs instance of its plugin), which may run elsewhere; else None."""
+    """Options of the simulation in use, which may run in another process; None without simulation."""
     keys: Callable[[], Any] | None = None
-    """Returns a new queue of keys typed in the terminal (`queue.SimpleQueue[str]`); None where there is no terminal."""
+    """Returns a new queue of keys typed in the terminal (`queue.SimpleQueue[str]`); None without a terminal."""
     model: ModelContext | None = None
     """For engines: the model, whose name is that of the context."""

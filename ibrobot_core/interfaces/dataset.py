@@ -1,4 +1,4 @@
-"""Dataset writers: what turns frames into a training set on disk."""
+"""Dataset writers, which write frames as training sets."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ibrobot_core.errors import NotSupported
 
 @attrs.frozen
 class Feature:
-    """One column of a dataset, as LeRobot describes it."""
+    """A column of a dataset, with LeRobot's fields."""
 
     dtype: str
     """`float32`, `image`, …"""
@@ -26,18 +26,18 @@ class Feature:
 
 @attrs.frozen
 class DatasetSummary:
-    """What is known of a dataset on disk without reading its frames."""
+    """Summary of a dataset on disk, available without reading its frames."""
 
     fps: float
     features: Mapping[str, Feature]
     metadata: Mapping[str, Any]
-    """The metadata given to `create` or `merge`; empty for a dataset that was not written by this writer."""
+    """The metadata passed to `create` or `merge`; empty if another program wrote the dataset."""
     episodes: int
     frames: int
 
 
 class DatasetWriter(ABC):
-    """Appends episodes to a dataset. A dataset that was not finalised keeps every saved episode.
+    """Appends episodes to a dataset. Saved episodes persist even if the dataset is not finalised.
 
     Args of implementations: options, ctx; then `create`.
     """
@@ -47,51 +47,51 @@ class DatasetWriter(ABC):
         """Begin a dataset in `root`, which must not exist or be empty.
 
         Raises:
-            DatasetError: when there is something in `root`.
+            DatasetError: if `root` is not empty.
         """
 
     @abstractmethod
     def add_frame(self, values: Mapping[str, NDArray[np.generic]], task: str) -> None:
-        """Append a frame to the open episode: exactly the features, each of its shape.
+        """Append a frame to the open episode, with a value of the right shape for every feature.
 
         Raises:
-            DatasetError: for a missing, unknown or misshapen value; the episode stays as it was.
+            DatasetError: if a value is missing, unknown or misshapen; the episode is unchanged.
         """
 
     @abstractmethod
     def save_episode(self) -> int:
-        """Close the open episode and return its index; it survives a crash from here on.
+        """Close the open episode and return its index; from now on it survives a crash.
 
         Raises:
-            DatasetError: for an episode without frames.
+            DatasetError: if the episode has no frames.
         """
 
     @abstractmethod
     def finalize(self) -> None:
-        """Finish the dataset; frames of an episode not saved are dropped. Safe to call twice."""
+        """Finish the dataset; frames of an unsaved episode are dropped. Safe to call twice."""
 
     def summary(self, root: Path) -> DatasetSummary | None:
-        """What is in the finished dataset at `root`; None where there is none.
+        """Summary of the finished dataset at `root`; None if there is none.
 
         Raises:
-            DatasetError: when it cannot be read.
+            DatasetError: if it cannot be read.
             NotSupported: by default.
         """
         raise NotSupported(f"{type(self).__name__} does not read datasets back")
 
     def merge(self, root: Path, parts: Sequence[Path], metadata: Mapping[str, Any]) -> None:
-        """Append finished datasets of this writer to the one at `root`, or make it of them where there is none.
+        """Append finished datasets of this writer to the one at `root`, which is created if it does not exist.
 
-        Nothing is re-encoded, equal parts give equal bytes, and a crash leaves the old dataset or the new one: a
-        merge that was interrupted once it was certain is completed by the next call of `merge` or `summary`.
+        Nothing is re-encoded, and equal parts give equal bytes. A crash leaves either the old or the new dataset: the
+        next call of `merge` or `summary` completes a merge that was interrupted during its final step.
 
         Args:
-            root: where the dataset is or shall be.
-            parts: datasets of the same rate and features, in the order in which their episodes come.
-            metadata: of the whole, in place of what was there.
+            root: folder of the dataset.
+            parts: datasets with the same rate and features, in the order of their episodes.
+            metadata: new metadata of the whole dataset.
 
         Raises:
-            DatasetError: for a part that does not fit, or a full disk; what was there stays as it was.
+            DatasetError: if a part does not fit, or the disk is full; the existing dataset is unchanged.
             NotSupported: by default.
         """
         raise NotSupported(f"{type(self).__name__} does not merge datasets")

@@ -1,4 +1,4 @@
-"""Engines: where a policy's `infer` runs, e.g. in this process, in another, or on a server."""
+"""Engines, which run a policy's `infer`, e.g. in this process, in another one, or on a server."""
 
 from __future__ import annotations
 
@@ -13,38 +13,38 @@ from ibrobot_core.interfaces.policy import Tensors
 
 @attrs.define
 class EngineStats:
-    """What happened, for diagnostics."""
+    """Statistics for diagnostics."""
 
     mode: str
-    """The engine's type, as `execution_mode` gives it."""
+    """The engine's type, from `execution_mode`."""
     alive: bool = False
-    """Whether the model answers."""
+    """Whether the model is reachable."""
     weights: str = ""
-    """Hash of the weights that act, as `Policy.weights`."""
+    """Hash of the weights in use, as in `Policy.weights`."""
     requests: int = 0
     failures: int = 0
-    """Requests without outputs; those that were on their way when one failed count as one with it."""
+    """Number of failed requests; requests in flight at the time of a failure are counted with it as one."""
     restarts: int = 0
-    """Times that the model came back after it was away."""
+    """Number of times that the model returned after an outage."""
     infer_ms: float = 0.0
-    """From the tensors to the outputs, of the last request."""
+    """Duration of the last request, from tensors to outputs."""
     model_ms: float = 0.0
-    """The model's part of it, where it runs elsewhere."""
+    """The model's part of it, if it runs elsewhere."""
     queue_ms: float = 0.0
-    """The part of it for which the request waited for other robots' requests."""
+    """The part of it spent waiting for requests of other robots."""
     pace_ms: float = 0.0
-    """Time to leave from one request to the next, as the server asks; 0: any."""
+    """Time to leave between requests, set by the server; 0: any."""
 
 
 class Engine(ABC):
-    """Runs `infer` for one robot: up to `parallel` requests at a time, each from a thread of its own.
+    """Runs `infer` for one robot, with up to `parallel` concurrent requests, each in its own thread.
 
     The constructor opens nothing; `start` does. The run resets and closes the policy of `Context.model`. An engine that
     runs `infer` elsewhere never loads it.
 
     Args:
         mode: the engine's type.
-        seed: the run's, until the first `reset`.
+        seed: seed of the run, used until the first `reset`.
     """
 
     parallel = 1
@@ -52,28 +52,28 @@ class Engine(ABC):
     def __init__(self, mode: str, seed: int = 0) -> None:
         self.stats = EngineStats(mode)
         self._episode, self._seed = 0, seed
-        """For models elsewhere, which may have restarted since the last request: send both with each request."""
+        """For remote models, which may have restarted since the last request: send both with each request."""
         self._counting = threading.Lock()
         self._failed_ns = 0
 
     def start(self) -> None:
-        """Return when the model is ready.
+        """Start the model; returns when it is ready.
 
         Raises:
-            PolicyError: e.g. no such checkpoint, or no server has it.
-            ContractError: when the model is not the one that the robot expects, with both sides.
+            PolicyError: e.g. if the checkpoint does not exist, or no server has it.
+            ContractError: if the model is not the one that the robot expects; shows both sides.
         """
 
     def infer(self, tensors: Tensors, request_id: int, deadline_ns: int) -> Tensors:
-        """Inputs -> raw outputs.
+        """Compute raw outputs from inputs.
 
         Args:
-            tensors: what `preprocess` made.
-            request_id: unique in a run, so that no request gets the answer to another one.
-            deadline_ns: when the answer is of no use any more, by `time.monotonic_ns()`.
+            tensors: tensors from `preprocess`.
+            request_id: unique in a run, so that answers are never assigned to another request.
+            deadline_ns: time after which the answer is useless, by `time.monotonic_ns()`.
 
         Raises:
-            PolicyError: when there is no answer in time; a later request may well have one.
+            PolicyError: if there is no answer in time; later requests may succeed.
         """
         begun_ns = time.monotonic_ns()
         with self._counting:
@@ -82,7 +82,7 @@ class Engine(ABC):
             outputs = self.run(tensors, request_id, deadline_ns)
         except Exception:
             with self._counting:
-                if begun_ns >= self._failed_ns:  # else it was on its way when the outage was noticed
+                if begun_ns >= self._failed_ns:  # otherwise it was in flight when the outage was detected
                     self.stats.failures += 1
                     self._failed_ns = time.monotonic_ns()
             raise
@@ -91,12 +91,12 @@ class Engine(ABC):
 
     @abstractmethod
     def run(self, tensors: Tensors, request_id: int, deadline_ns: int) -> Tensors:
-        """As `infer`, which counts."""
+        """The implementation of `infer`, which adds statistics."""
 
     def reset(self, seed: int) -> None:
-        """A new episode begins: a policy that remembers forgets the last one before the next request."""
+        """Begin a new episode: a stateful policy is reset before the next request."""
         self._episode += 1
         self._seed = seed
 
     def close(self) -> None:
-        """Release all resources; a request that is under way fails soon. Safe to call twice."""
+        """Release all resources; a running request fails soon. Safe to call twice."""

@@ -1,4 +1,4 @@
-"""Executors: what turns plans and goals into one setpoint per tick; runs in the control process, ahead of safety."""
+"""Executors, which turn plans and goals into one setpoint per tick, in the control process, before the safety layer."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Plan:
 
 
 class GoalState(enum.StrEnum):
-    """How a goal stands; names as in action_msgs/msg/GoalStatus."""
+    """State of a goal; names as in action_msgs/msg/GoalStatus."""
 
     EXECUTING = "executing"
     SUCCEEDED = "succeeded"
@@ -36,7 +36,7 @@ class GoalState(enum.StrEnum):
 
 @attrs.frozen
 class GoalStatus:
-    """A goal's state, and what to know of it."""
+    """A goal's state, with an explanation."""
 
     goal_id: str
     state: GoalState
@@ -45,19 +45,19 @@ class GoalStatus:
 
 
 class Executor(ABC):
-    """Owns joints while active. Called once a tick, from one thread.
+    """Owns joints while active. Called once per tick, from one thread.
 
-    Everything an executor returns goes through the safety layer; it need not limit, only say what it wants.
+    The safety layer limits everything that an executor returns, so the executor does not need to.
     """
 
     accepts_plans: ClassVar[bool] = False
-    """True for executors of streamed setpoints (the dispatcher's and teleop's); they implement `set_plan`."""
+    """Whether it accepts streamed setpoints, from the dispatcher or teleop; it then implements `set_plan`."""
 
     joints: tuple[str, ...]
 
     @abstractmethod
     def activate(self, measured: JointReading) -> None:
-        """Take the joints over at `measured`, shape (J,) in `joints` order, and hold there."""
+        """Take over the joints at `measured`, shape (J,) in the order of `joints`, and hold there."""
 
     @abstractmethod
     def update(self, measured: JointReading) -> Vector:
@@ -65,52 +65,48 @@ class Executor(ABC):
 
     @property
     def wants_relax(self) -> bool:
-        """Whether, from its last `update` on, torque should be off instead of following its setpoint.
+        """Whether the torque should be off instead of following the setpoint of the last `update`.
 
-        False after `activate`. The loop puts torque back on when no active executor wants it off.
+        False after `activate`. The loop switches the torque on again when no active executor wants it off.
         """
         return False
 
     def deactivate(self) -> None:
-        """Give the joints up; forget plans and goals."""
+        """Release the joints; discard plans and goals."""
 
     def set_plan(self, plan: Plan) -> None:
-        """Replace the plan; only where `accepts_plans`. One that cannot be followed is counted, the old one stays."""
+        """Replace the plan; only if `accepts_plans`. An invalid plan is counted, and the old one is kept."""
         raise NotImplementedError(f"{type(self).__name__} accepts no plans")
 
     def set_goal(self, goal_id: str, goal: Mapping[str, Any], measured: JointReading) -> None:
-        """Begin a goal, replacing a present one without a step in the setpoint.
+        """Begin a goal; it replaces a present one without a step in the setpoint.
 
         Raises:
-            GoalRejected: when it is malformed or this executor takes no goals; the old goal goes on.
+            GoalRejected: if it is malformed or this executor accepts no goals; the old goal continues.
         """
         raise GoalRejected(f"{type(self).__name__} accepts no goals")
 
     def cancel(self, measured: JointReading) -> None:
-        """Give up the present goal, if any, and hold the measured position."""
+        """Cancel the present goal, if any, and hold the measured position."""
 
     def pop_status(self) -> GoalStatus | None:
-        """A goal's change of state that was not yet reported, or None."""
+        """The next unreported change of a goal's state, or None."""
         return None
 
     def counters(self) -> Mapping[str, int]:
-        """What it refused or went without, by name, since construction; e.g. `stale`, `refused_nonfinite`."""
+        """Counts of refused or missing input since construction, by name; e.g. `stale`, `refused_nonfinite`."""
         return {}
 
 
 def trajectory_goal(message: JointTrajectory) -> dict[str, Any]:
-    """The goal that executors with `goals="trajectory"` in their descriptor take, of plain numbers, strings and lists.
+    """Convert a message to a goal for executors with `goals="trajectory"` in their descriptor.
 
-    It starts when it is accepted: the stamp of the message is not used.
-
-    Returns:
-        Names and points, as
-        `{"trajectory": {"joint_names": […], "points": […]}}`. Each point has `time_from_start_ns` and, where the
-        message has them, `positions` [rad], `velocities` [rad/s] and `accelerations` [rad/s^2], in the order of the
-        names.
+    The goal is `{"trajectory": {"joint_names": […], "points": […]}}`. Each point has `time_from_start_ns` and, if the
+    message has them, `positions` [rad], `velocities` [rad/s] and `accelerations` [rad/s^2], in the order of the names.
+    It starts when it is accepted; the stamp of the message is ignored.
 
     Raises:
-        GoalRejected: for a point with efforts, which positions cannot follow.
+        GoalRejected: if a point has efforts, which cannot be followed by positions.
     """
     points = []
     for index, point in enumerate(message.points):

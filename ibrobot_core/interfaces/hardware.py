@@ -1,4 +1,4 @@
-"""Hardware: what reads joints and takes position commands; runs in the control process."""
+"""Hardware, which reads joints and accepts position commands, in the control process."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ class JointReading:
     velocity: Vector
     """[rad/s], shape (J,)."""
     effort: Vector
-    """[Nm], shape (J,); NaN where the hardware does not measure it."""
+    """[Nm], shape (J,); NaN if the hardware does not measure it."""
     stale: bool = False
-    """True when this repeats the last reading because a single reply was lost."""
+    """True if this repeats the last reading because a single reply was lost."""
 
 
 @attrs.frozen
 class Signal:
-    """Numbers that hardware publishes beside its joints, e.g. servo temperatures or a scene's ground truth."""
+    """Values that hardware publishes in addition to its joints, e.g. servo temperatures or a scene's ground truth."""
 
     topic: str
     size: int
@@ -39,55 +39,55 @@ class Signal:
 
 
 class Torque(Enum):
-    """What became of the joints' torque after `Hardware.relax`."""
+    """State of the joints' torque after `Hardware.relax`."""
 
     OFF = "off"
     """The hardware confirmed that every joint's torque is off."""
     UNKNOWN = "unknown"
-    """The command was sent, and nothing confirmed it, e.g. because the cable is out: joints may still hold."""
+    """The command was sent but not confirmed, e.g. because the cable is unplugged: joints may still hold."""
 
 
 class Severity(Enum):
-    """How serious a `Condition` is; the driver's options say where each begins."""
+    """Severity of a `Condition`; the driver's options define the levels."""
 
     WARNING = "warning"
-    """Logged once when it begins; the robot goes on."""
+    """Logged once when it begins; the robot continues."""
     FAULT = "fault"
-    """Stops the robot by `control.stop`, until a reset."""
+    """Stops the robot as `control.stop` says, until a reset."""
 
 
 @attrs.frozen
 class Condition:
-    """Something about a joint that is not as it should be, e.g. a servo that is hot."""
+    """An abnormal condition of a joint, e.g. a hot servo."""
 
     joint: str
     quantity: str
-    """What was measured: e.g. temperature, voltage, load, torque."""
+    """The measured quantity, e.g. temperature, voltage, load, torque."""
     value: float
     unit: str
-    """Of `value`, e.g. deg C, V; empty for a ratio or a switch."""
+    """Unit of `value`, e.g. deg C, V; empty for a ratio or a switch."""
     severity: Severity
     message: str
-    """One line: joint, value, limit, and what to do about it."""
+    """One line with joint, value, limit and remedy."""
     sheds_load: bool = False
-    """Whether less load is what helps, as with heat and overload: where it lasts, `control.shed` takes effect."""
+    """Whether a smaller load helps, as with heat and overload; if it lasts, `control.load_shedding` takes effect."""
 
 
 @attrs.frozen
 class Holding:
-    """Torque that stays on when nobody commands the joints any more."""
+    """Torque that stays on after the joints are no longer commanded."""
 
     where: str
-    """E.g. the serial port."""
+    """The place, e.g. the serial port."""
     command: str
-    """What to type to take it off, complete."""
+    """The complete command that switches it off."""
 
 
 class Hardware(ABC):
     """A group of joints. All methods are called from one thread of the control process; none may block beyond a tick.
 
-    A driver implements `connect`, `read`, `write` and `disconnect`; `relax`, `health`, `holding` and `signals` where
-    it can.
+    A driver implements `connect`, `read`, `write` and `disconnect` and, if possible, `relax`, `health`, `holding` and
+    `signals`.
     """
 
     joints: tuple[str, ...]
@@ -96,22 +96,22 @@ class Hardware(ABC):
 
     @abstractmethod
     def connect(self) -> None:
-        """Open and configure; joints hold where they are. Anything not finite or not found is an error here.
+        """Open and configure the hardware; joints hold their positions. Missing parts and non-finite values are errors.
 
-        Where it fails, it takes off the torque that it has put on.
+        If it fails, it switches off the torque that it has switched on.
 
         Raises:
-            HardwareError: e.g. no such port, or a servo that does not answer.
+            HardwareError: e.g. if the port does not exist, or a servo does not answer.
         """
 
     @abstractmethod
     def read(self) -> JointReading:
         """Measure all joints, now.
 
-        A lost reply that may be ridden out gives a reading that is `stale`; an error is a fault at once.
+        After a lost reply that can be tolerated, the reading is `stale`; an error is a fault at once.
 
         Raises:
-            HardwareError: when the hardware does not answer any more, or is not connected.
+            HardwareError: if the hardware does not answer, or is not connected.
         """
 
     @abstractmethod
@@ -119,51 +119,51 @@ class Hardware(ABC):
         """Command joint positions [rad], shape (J,), already checked and limited by the safety layer.
 
         Raises:
-            HardwareError: when the hardware does not take them, is not connected, or the shape is wrong.
+            HardwareError: if the hardware does not accept them or is not connected, or the shape is wrong.
         """
 
     @abstractmethod
     def disconnect(self) -> None:
-        """Release the port. Torque stays as it is. Safe to call twice, and after a failed `connect`."""
+        """Release the port, without changing the torque. Safe to call twice, and after a failed `connect`."""
 
     def relax(self) -> Torque:
-        """Take torque off; the arm falls. The next `write` puts it back on.
+        """Switch the torque off; the arm falls. The next `write` switches it on again.
 
-        An error that the joints report meanwhile, e.g. an overload, is no reason to leave torque on.
+        Errors that the joints report, e.g. an overload, must not keep the torque on.
 
         Returns:
             Whether the hardware confirmed it.
 
         Raises:
-            HardwareError: when a joint's torque is known to stay on.
-            NotSupported: where the hardware has no such thing; `control.stop: relax` is then refused.
+            HardwareError: if a joint's torque is known to stay on.
+            NotSupported: if the hardware has no torque control; `control.stop: relax` is then refused.
         """
-        raise NotSupported(f"{type(self).__name__} cannot take torque off")
+        raise NotSupported(f"{type(self).__name__} cannot switch its torque off")
 
     def undo_connect(self) -> None:
-        """Take off the torque that `connect` put on, because the start failed elsewhere. No joint has moved since.
+        """Switch off the torque that `connect` switched on, because the start failed elsewhere. No joint has moved.
 
-        By default all torque goes off, where that is supported; joints that held before may go on holding.
+        By default, all torque is switched off if that is supported. Joints that held before `connect` may keep holding.
 
         Raises:
-            HardwareError: when a joint's torque is known to stay on.
+            HardwareError: if a joint's torque is known to stay on.
         """
         with suppress(NotSupported):
             self.relax()
 
     def holding(self) -> Holding | None:
-        """What holds torque as far as is known, and how to take it off; None where nothing does.
+        """Where torque is on, as far as known, and how to switch it off; None if it is off.
 
-        Asked after `disconnect` or a failed `connect` too: it answers from memory. Where `relax` was not confirmed,
+        Also called after `disconnect` or a failed `connect`, so it answers from memory. If `relax` was not confirmed,
         joints count as holding.
         """
         return None
 
     def health(self) -> Sequence[Condition]:
-        """What is wrong with the joints at present, at most one condition for each joint and quantity.
+        """Present abnormal conditions of the joints, at most one per joint and quantity.
 
-        Called in every tick: it answers from memory what a slow read of the hardware found, and raises nothing.
-        A condition is in the answer for as long as it lasts; its value may change.
+        Called in every tick, so it answers from memory, with the result of an earlier slow read, and raises nothing. A
+        condition is listed as long as it lasts; its value may change.
         """
         return ()
 
@@ -171,7 +171,7 @@ class Hardware(ABC):
         """Clear latched faults so that `read` and `write` may work again. Called on `reset`."""
 
     def counters(self) -> Mapping[str, int]:
-        """What went by so far that a user should know of, e.g. retries; shown on `/diagnostics`."""
+        """Counts of events since construction, e.g. retries; shown on `/diagnostics`."""
         return {}
 
     def read_signal(self, index: int, out: Vector) -> None:
@@ -181,13 +181,13 @@ class Hardware(ABC):
 
 @attrs.frozen
 class EpisodeSetup:
-    """What a simulation is set up for: the seed of its random poses."""
+    """Set-up of a simulated episode: the seed of its random poses."""
 
     seed: int
 
 
 class SimulatedHardware(Hardware):
-    """Hardware whose time is ours: the loop advances it by exactly one period a tick."""
+    """Hardware with simulated time: the loop advances it by exactly one period per tick."""
 
     @abstractmethod
     def advance(self, step_ns: int) -> None:
@@ -195,13 +195,13 @@ class SimulatedHardware(Hardware):
 
     @abstractmethod
     def reset(self, episode: EpisodeSetup) -> None:
-        """Set up the scene again; equal seeds give equal scenes, bit by bit."""
+        """Reset the scene; equal seeds give equal scenes, bit by bit."""
 
     def success(self) -> bool | None:
-        """Whether the scene's task is done; None for a scene without one."""
+        """Whether the scene's task is done; None if it has no task."""
         return None
 
 
 def nan_vector(size: int) -> Vector:
-    """A vector of NaN, shape (size,): for what is not measured."""
+    """A vector of NaN, shape (size,), for quantities that are not measured."""
     return np.full(size, np.nan)

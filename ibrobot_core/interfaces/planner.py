@@ -1,4 +1,4 @@
-"""Planners: what turns a goal into a trajectory; runs in the host."""
+"""Planners, which compute a trajectory to a goal, in the host."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ OrientationPolicy = Literal["refuse", "nearest", "keep_axis", "arm_plane", "curr
 
 @attrs.frozen(eq=False)
 class JointGoal:
-    """Joint positions to reach; joints not named stay."""
+    """Joint positions to reach; other joints stay where they are."""
 
     joints: tuple[str, ...]
     positions: Vector
     """[rad], shape (len(joints),)."""
     tolerance: float = 0.0
-    """How far from its position each joint may end [rad], where the position itself is blocked."""
+    """Allowed distance of each joint from its goal position [rad], if that position is blocked."""
 
 
 @attrs.frozen
 class NamedGoal:
-    """A pose of `robot.description.poses`; its positions of the planned joints."""
+    """A pose of `robot.description.poses`, for the planned joints."""
 
     name: str
 
@@ -39,7 +39,7 @@ class PositionGoal:
     position: Vector3
     """[m]."""
     axis: Vector3 | None = None
-    """Where the tool's z axis shall point, e.g. (0, 0, -1) for down; of any length above 0. None leaves it free."""
+    """Direction of the tool's z axis, e.g. (0, 0, -1) for down; any nonzero length. None leaves it free."""
     position_tolerance: float = 0.001
     """[m]."""
     axis_tolerance: float = 0.01
@@ -56,26 +56,25 @@ class PoseGoal:
     orientation_tolerance: float | None = 0.01
     """[rad]; None leaves the orientation free."""
     beyond_reach: OrientationPolicy = "refuse"
-    """What to do with an orientation that the arm cannot take at this position, as with fewer than six joints: refuse;
-    take the nearest one; keep the direction of the tool's z axis; turn that axis into the plane in which the arm
-    stands; keep the tool's present orientation as nearly as possible; or leave the orientation free. The result says
-    how far off the orientation is."""
+    """How to treat an orientation that the arm cannot reach at this position, e.g. with fewer than six joints: refuse
+    it; use the nearest one; keep the direction of the tool's z axis; rotate that axis into the plane of the arm; stay
+    near the tool's present orientation; or leave the orientation free. The result has the deviation."""
 
 
 @attrs.frozen
 class AnyGoal:
-    """Alternatives: the planner takes the first that it can reach."""
+    """Alternative goals: the planner uses the first one that it can reach."""
 
     goals: tuple[JointGoal | NamedGoal | PositionGoal | PoseGoal, ...]
 
 
 @attrs.frozen
 class LinearGoal:
-    """A path of the tool centre point along straight lines through waypoints, from where the tool is."""
+    """A path of the tool centre point along straight lines through waypoints, from its present pose."""
 
     waypoints: tuple[PositionGoal | PoseGoal, ...]
     least_fraction: float = 1.0
-    """How much of the path, of its length, must be possible, in (0, 1]."""
+    """Fraction of the path's length that must be possible, in (0, 1]."""
 
 
 type Goal = JointGoal | NamedGoal | PositionGoal | PoseGoal | AnyGoal | LinearGoal
@@ -83,7 +82,7 @@ type Goal = JointGoal | NamedGoal | PositionGoal | PoseGoal | AnyGoal | LinearGo
 
 @attrs.frozen(eq=False)
 class PlanRequest:
-    """From where, to where, how fast."""
+    """A planning request: start, goal and speed."""
 
     joints: tuple[str, ...]
     """The joints to plan for; the trajectory has exactly these, in this order."""
@@ -95,39 +94,39 @@ class PlanRequest:
     acceleration_scaling: float = 1.0
     """Fraction of the acceleration limits, in (0, 1]."""
     others: Mapping[str, float] = attrs.field(factory=dict)
-    """Positions [rad] of joints that do not move meanwhile, e.g. the gripper's; those left out are taken to be at 0."""
+    """Positions [rad] of joints that do not move, e.g. the gripper; omitted joints are assumed to be at 0."""
 
 
 @attrs.frozen(eq=False)
 class PlanResult:
-    """A trajectory, and how it relates to what was asked."""
+    """A trajectory, and how well it meets the goal."""
 
     trajectory: JointTrajectory
     """From rest to rest, its first point at time zero."""
     fraction: float = 1.0
-    """How much of the path of a `LinearGoal` it covers."""
+    """Fraction of the path of a `LinearGoal` that it covers."""
     alternative: int = 0
-    """Which goal of an `AnyGoal` it reaches."""
+    """Index of the goal of an `AnyGoal` that it reaches."""
     position_error: float = 0.0
-    """Distance of the tool's end from the position asked for [m]."""
+    """Distance of the tool's final position from the goal [m]."""
     orientation_error: float = 0.0
-    """Angle between the tool's end and the orientation or axis asked for [rad]."""
+    """Angle between the tool's final orientation and the goal's orientation or axis [rad]."""
 
 
 class Planner(ABC):
-    """One call, one trajectory."""
+    """Computes trajectories."""
 
     @abstractmethod
     def plan(self, request: PlanRequest) -> PlanResult:
-        """A trajectory from rest at `start` to rest at the goal, within limits, its first point at time zero.
+        """Plan a trajectory from rest at `start` to rest at the goal, within limits, with its first point at time zero.
 
         Raises:
-            PlanningError: e.g. a goal out of reach or outside limits, or of a kind that this planner does not know;
-                with MoveIt's code for the reason.
+            PlanningError: e.g. if the goal is out of reach, outside limits, or of an unsupported kind; with MoveIt's
+                code for the reason.
         """
 
     def load(self) -> None:
-        """Prepare, e.g. load the collision model; when it returns the planner is ready."""
+        """Prepare the planner, e.g. load the collision model."""
 
     def close(self) -> None:
-        """Release what `load` took. Safe to call twice."""
+        """Release resources of `load`. Safe to call twice."""

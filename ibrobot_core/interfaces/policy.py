@@ -1,4 +1,4 @@
-"""Policies: what turns observations into chunks of actions, in three pure steps."""
+"""Policies, which compute action chunks from observations in three pure steps."""
 
 from __future__ import annotations
 
@@ -19,9 +19,10 @@ Tensors = Mapping[str, NDArray[np.generic]]
 
 @attrs.frozen(eq=False)
 class Frame:
-    """One tick's observations: key -> array, and the keys that are missing at this tick.
+    """The observations of one tick: key -> array, and the keys that are missing at this tick.
 
-    `values` has only what is there; images are (H, W, C) uint8, vectors (N,) float32. Nothing is ever filled in.
+    `values` has only available observations: images are (H, W, C) uint8, vectors (N,) float32. Missing ones are never
+    filled in.
     """
 
     stamp_ns: int
@@ -30,151 +31,150 @@ class Frame:
     prompt: str = ""
     prefix: Vector | None = None
     """The commands of the arm from this tick on, shape (K, A) with 1 <= K <= `chunk_size`, in the contract's units
-    and order; row i is for the same time as action i of the chunk. It is the actions still in the plan, never padded;
-    where the plan ran dry, the last one, which is held meanwhile. None at the beginning, and for a policy that does
-    not want it."""
+    and order. Row i is for the same time as action i of the chunk. These are the actions still in the plan, without
+    padding, or the held action if the plan ran dry. None at the beginning, and for policies that do not use it."""
     delay_steps: int = 0
-    """The latency to expect, in actions: so many of the prefix, 0 <= delay_steps <= K, are executed before the chunk
-    comes."""
+    """The expected latency in actions: the number of actions of the prefix, 0 <= delay_steps <= K, that will be
+    executed before the chunk arrives."""
     history: tuple[Frame, ...] = ()
-    """The frames of the ticks just before, oldest first, each complete and without prompt, prefix and history of its
-    own; at most `PolicySpec.history` of them, fewer where an episode begins or an observation was missing."""
+    """The frames of the preceding ticks, oldest first, each complete and without prompt, prefix and history; at most
+    `PolicySpec.history` of them, fewer at the start of an episode or after a missing observation."""
 
 
 @attrs.frozen
 class PolicySpec:
-    """What a policy needs and gives, compared with the contract before anything moves."""
+    """Inputs and outputs of a policy, compared with the contract before anything moves."""
 
     observations: Mapping[str, tuple[int, ...]]
-    """Keys that it reads, with their shapes; -1 stands for any size."""
+    """Keys of the inputs, with their shapes; -1 means any size."""
     actions: tuple[str, ...] | None
-    """Joint names of the action vector in order; None when the checkpoint does not say."""
+    """Joint names of the action vector, in order; None if the checkpoint does not state them."""
     action_size: int
     chunk_size: int
-    """The most actions that a chunk has."""
+    """Maximum number of actions in a chunk."""
     rate_hz: float | None = None
     """Rate of the actions in a chunk [Hz]; None: the contract's."""
     prompt: bool = False
-    """Whether it wants a prompt."""
+    """Whether it takes a prompt."""
     prefix: bool = False
-    """Whether it continues `Frame.prefix`: its chunk follows the first `delay_steps` actions of the prefix, and leads
-    from there to what it would do by itself (real-time chunking)."""
+    """Whether it continues `Frame.prefix` (real-time chunking): its chunk begins with the first `delay_steps` actions
+    of the prefix and continues smoothly from there."""
     stateful: bool = False
-    """Whether `infer` remembers the earlier requests of an episode, until `reset`. Such a policy serves one robot at a
+    """Whether the result of `infer` depends on earlier requests since `reset`. Such a policy serves one robot at a
     time."""
     history: int = 0
-    """How many ticks before the frame's own it sees, in `Frame.history`."""
+    """Number of earlier ticks that it uses, in `Frame.history`."""
     contract: Mapping[str, Any] | None = None
-    """What `Contract.canonical` gave of the contract that it was trained on; None when the checkpoint does not say."""
+    """`Contract.canonical` of the contract that it was trained on; None if the checkpoint does not state it."""
     norm_mode: str | None = None
-    """Unit of joint positions that it was trained in, as under `models`; None when the checkpoint does not say."""
+    """Unit of joint positions in training, as under `models`; None if the checkpoint does not state it."""
 
 
 def copied_tensors(tensors: Tensors) -> dict[str, NDArray[np.generic]]:
-    """The same arrays in memory of their own, e.g. outputs that the next `infer` would overwrite."""
+    """Copies of arrays, e.g. of outputs that the next `infer` would overwrite."""
     return {name: np.array(array) for name, array in tensors.items()}
 
 
 class PictureCodec(ABC):
-    """JPEG for tensors that are camera pictures: `uint8`, shape (H, W, 3) or (H, W, 1)."""
+    """JPEG for tensors that are camera images: `uint8`, shape (H, W, 3) or (H, W, 1)."""
 
     @abstractmethod
     def encode(self, name: str, picture: NDArray[np.uint8]) -> bytes | None:
-        """The picture as JPEG; None where the tensor of this name is to stay as it is."""
+        """Encode an image as JPEG; returns None if the tensor of this name must not be encoded."""
 
     @abstractmethod
     def decode(self, jpeg: memoryview, shape: tuple[int, int, int]) -> NDArray[np.uint8]:
-        """The picture of a JPEG, which is to be refused before it is decoded where its size is not `shape`."""
+        """Decode a JPEG. It must be refused before decoding if its size is not `shape`."""
 
 
 class Policy(ABC):
-    """Three steps, so that `infer` can run in another process or on another machine than the other two.
+    """A policy in three steps, so that `infer` can run in a different process or machine than the other two.
 
-    The constructor reads configuration and statistics only; `load` reads the weights. Where `infer` runs elsewhere, the
-    robot's side is constructed, reset, and asked to `preprocess` and `postprocess`, but never loaded.
+    The constructor reads configuration and statistics only; `load` reads the weights. If `infer` runs elsewhere, the
+    policy on the robot is constructed and reset, and it preprocesses and postprocesses, but it is never loaded.
 
-    `infer` is pure: whatever it depends on comes in its tensors, e.g. the seed of its noise, so that one server answers
-    many robots, and one that was restarted goes on. Earlier observations come in `Frame.history`. A policy whose
-    `infer` remembers all the same says so by `PolicySpec.stateful`.
+    `infer` is pure: its result depends only on its tensors, which include e.g. the seed of its noise. So one server can
+    serve many robots, and a restarted server can continue. Earlier observations are in `Frame.history`. A policy whose
+    `infer` does depend on earlier requests must set `PolicySpec.stateful`.
     """
 
     spec: PolicySpec
 
     @abstractmethod
     def preprocess(self, frame: Frame) -> Tensors:
-        """Observations -> the network's inputs.
+        """Convert observations to the network's inputs.
 
         Raises:
-            PolicyError: when the frame lacks a key that the policy needs.
+            PolicyError: if the frame lacks a key that the policy needs.
         """
 
     def check(self, tensors: Tensors) -> None:
-        """Check that a request, which may come from anywhere, has what `preprocess` makes; does nothing by default.
+        """Check that a request, possibly from an untrusted client, has the tensors of `preprocess`.
 
-        A server asks before it resets a policy that remembers for another robot.
+        Does nothing by default. A server calls it before it resets a stateful policy for another robot.
 
         Raises:
-            PolicyError: with what is missing or of another dtype or shape.
+            PolicyError: if tensors are missing or have a wrong dtype or shape; names them.
         """
 
     @abstractmethod
     def infer(self, tensors: Tensors) -> Tensors:
-        """Inputs -> raw outputs. The heavy step.
+        """Compute raw outputs from inputs. The heavy step.
 
-        Tensors are plain arrays of booleans, integers or floats; those that came from elsewhere cannot be written to.
-        Outputs may be overwritten by the next call: whoever keeps them copies them.
+        Tensors are plain arrays of booleans, integers or floats; received ones are read-only. The next call may
+        overwrite the outputs, so copy them to keep them.
         """
 
     @abstractmethod
     def postprocess(self, tensors: Tensors) -> NDArray[np.float64]:
-        """Raw outputs -> actions, shape (N, A) with 1 <= N <= `chunk_size`, in the contract's units and order."""
+        """Convert outputs to actions, shape (N, A) with 1 <= N <= `chunk_size`, in the contract's units and order."""
 
     def infer_batch(self, batch: Sequence[Tensors]) -> list[Tensors]:
-        """Outputs of several inputs, in their order. All inputs have the same names, dtypes and shapes.
+        """Compute the outputs of several inputs, in order. All inputs have the same names, dtypes and shapes.
 
-        One after the other by default. The outputs of a batch share no memory; the next call may overwrite them.
+        By default, one after the other. The outputs of a batch share no memory; the next call may overwrite them.
         """
         return [copied_tensors(self.infer(tensors)) for tensors in batch]
 
     def fingerprint(self) -> str:
-        """What both sides of `infer` must agree on; of the spec, where a policy does not add e.g. its statistics' hash.
+        """Fingerprint on which both sides of `infer` must agree: by default of the spec; policies may add statistics.
 
-        Known once constructed, without the weights, which the robot's side may lack. It has at most 128 bytes.
+        Available after construction, without weights, which the robot may not have. At most 128 bytes.
         """
         spec = attrs.asdict(self.spec)
         return hashlib.sha256(json.dumps(spec, sort_keys=True).encode()).hexdigest()[:16]
 
     def weights(self) -> str:
-        """Hash of the weights that `load` read; empty before, and for a policy that has none. At most 128 bytes."""
+        """Hash of the loaded weights; empty before `load`, and for a policy without weights. At most 128 bytes."""
         return ""
 
     def picture_codec(self, quality: int = 90) -> PictureCodec | None:
-        """What makes JPEG of the pictures among its inputs, and pictures of JPEG, for thin links.
+        """The JPEG codec for images among its inputs, for slow links.
 
         Args:
-            quality: of the JPEG, 1 to 100.
+            quality: JPEG quality, 1 to 100.
 
         Returns:
-            The codec; None where `preprocess` gives no pictures as they are, which is the default.
+            The codec; None, the default, if the tensors of `preprocess` contain no unprocessed images.
         """
         return None
 
     def check_weights(self) -> None:
-        """See, without loading them, that the weights are there and fit the configuration, as far as that is quick.
+        """Check quickly, without loading them, that the weights exist and fit the configuration.
 
         Raises:
-            PolicyError: where they are not.
+            PolicyError: if they do not.
         """
 
     def load(self) -> None:
-        """Load weights and warm up; when it returns the policy is ready.
+        """Load weights and warm up; afterwards the policy is ready.
 
         Raises:
-            PolicyError: e.g. no such checkpoint.
+            PolicyError: e.g. if the checkpoint does not exist.
         """
 
     def reset(self, seed: int) -> None:
-        """A new episode begins; forget the last."""
+        """Begin a new episode and discard the state of the last one."""
 
     def close(self) -> None:
         """Release memory and devices. Safe to call twice."""

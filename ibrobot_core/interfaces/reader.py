@@ -1,4 +1,4 @@
-"""Episode readers: what gives the messages of an episode back, also of one that was never finished."""
+"""Episode readers, which read the messages of an episode, finished or not."""
 
 from __future__ import annotations
 
@@ -15,66 +15,66 @@ from ibrobot_core.messages import Message
 
 @attrs.frozen(eq=False)
 class Recorded:
-    """A message as it was recorded."""
+    """A recorded message."""
 
     topic: str
     message: Message
     received_ns: int
-    """When the recorder's side had it [ns]: what alignment counts as the time of receipt."""
+    """Time of receipt on the recorder's side [ns]; alignment uses it as the time of receipt."""
     published_ns: int
-    """When it was sent [ns]; equal to `received_ns` where the episode does not tell them apart."""
+    """Time of sending [ns]; equal to `received_ns` if the episode does not distinguish them."""
 
 
 @attrs.frozen
 class TopicSummary:
-    """One topic of an episode."""
+    """A topic of an episode."""
 
     type: str
     """ROS 2 message type."""
     count: int
-    """Messages that can be read."""
+    """Number of readable messages."""
     dropped: int = 0
-    """Messages that the recorder says it lost."""
+    """Number of messages that the recorder lost."""
     missing: int = 0
-    """Messages that the recorder wrote and that cannot be read any more."""
+    """Number of recorded messages that can no longer be read."""
 
 
 @attrs.frozen
 class EpisodeSummary:
-    """What is known of an episode without decoding its messages."""
+    """Summary of an episode, available without decoding its messages."""
 
     path: Path
     finished: bool
-    """False where its writer was killed; what can be read is counted all the same."""
+    """False if its writer was killed; the counts then cover the readable part."""
     start_ns: int
     end_ns: int
-    """Receipt of the first and the last message [ns]; both 0 for an episode without messages."""
+    """Times of receipt of the first and the last message [ns]; both 0 for an episode without messages."""
     topics: Mapping[str, TopicSummary]
     metadata: Mapping[str, str]
-    """What the recorder was given: prompt, contract, fingerprint, calibration, versions; empty in foreign bags."""
+    """The recorder's metadata: prompt, contract, fingerprint, calibration, versions; empty in foreign bags."""
     outcome: str = "unknown"
-    """`unknown` where the episode is unfinished or lacks messages, whatever was stated: its end may be missing."""
+    """`unknown` if the episode is unfinished or lacks messages, because its end may be missing."""
     stated_outcome: str = "unknown"
-    """What the recorder stated at the end."""
+    """The outcome stated by the recorder."""
 
 
 @attrs.frozen
 class EpisodeAddress:
-    """Which episode is meant."""
+    """The address of an episode."""
 
     path: Path
     number: int | None = None
-    """From 0, in a dataset of many; None where none is said."""
+    """Number of the episode in a dataset, from 0; None if not given."""
     given: Mapping[str, str] = attrs.field(factory=dict)
-    """What the metadata of an episode is that has none, by the recorder's names: `contract`, `config`, `calibration`;
-    and `norm_mode`, the unit of its joints."""
+    """Metadata for an episode that has none, by the recorder's names: `contract`, `config`, `calibration`; and
+    `norm_mode`, the unit of its joints."""
 
     @classmethod
     def of(cls, path: Path, given: Mapping[str, str] | None = None) -> EpisodeAddress:
-        """The address of what a user calls `path`: an episode, or `DATASET:N`.
+        """Parse the path of an episode, or `DATASET:N`.
 
         Raises:
-            RecorderError: when nothing is there.
+            RecorderError: if it does not exist.
         """
         named = re.fullmatch(r"(.+):(\d+)", path.name)
         if path.exists():
@@ -85,33 +85,33 @@ class EpisodeAddress:
 
 
 class EpisodeReader(ABC):
-    """Reads one episode. Messages come one by one: an episode need not fit into memory."""
+    """Reads an episode, message by message, so that it need not fit into memory."""
 
     @abstractmethod
     def summary(self) -> EpisodeSummary:
-        """What is in the episode.
+        """Summarise the episode.
 
         Raises:
-            RecorderError: when it cannot be read.
+            RecorderError: if it cannot be read.
         """
 
     @abstractmethod
     def messages(self, topics: Collection[str] | None = None) -> Iterator[Recorded]:
-        """The messages of these topics (of all when None), in the order of receipt. May be called again.
+        """Yield the messages of these topics (all if None), in the order of receipt. Can be called repeatedly.
 
-        A message of a type that core does not know comes as a `messages.Message` made from its definition where the
-        episode brings one.
+        If the episode contains the definition of a type that core does not know, its messages are instances of a
+        `messages.Message` class made from it.
 
         Raises:
-            RecorderError: for damage in the midst of the file; what came before has been given.
+            RecorderError: if the file is damaged; earlier messages have been delivered.
         """
 
     @abstractmethod
     def digest(self) -> str:
-        """A hash of all messages as they are stored, with topics and stamps: copies have equal ones.
+        """Hash of all stored messages, with topics and stamps; equal for copies of an episode.
 
         Raises:
-            RecorderError: when they cannot be read.
+            RecorderError: if they cannot be read.
         """
 
     @abstractmethod

@@ -1,4 +1,4 @@
-"""Recorders: what writes an episode's messages to disk."""
+"""Recorders, which write an episode's messages to disk."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from ibrobot_core.messages import Message
 
 @attrs.frozen
 class EpisodeStart:
-    """What is known when an episode begins."""
+    """The beginning of an episode."""
 
     directory: Path
-    """Where to write; does not exist yet, its parent does."""
+    """Folder to write, which does not exist yet; its parent does."""
     stamp_ns: int
     topics: Mapping[str, str]
-    """Topic -> ROS 2 message type, for all that may be written."""
+    """Topic -> ROS 2 message type, for all topics that may be written."""
     metadata: Mapping[str, str]
-    """Prompt, contract, fingerprint, calibration, versions: string to string."""
+    """Prompt, contract, fingerprint, calibration, versions, as strings."""
     any_topic: bool = False
-    """Whether messages of topics that are not in `topics` are to be written too: of those that appear later."""
+    """Whether to write messages of topics that are not in `topics` because they appear later."""
 
 
 @attrs.frozen
 class EpisodeEnd:
-    """How an episode ended."""
+    """The end of an episode."""
 
     stamp_ns: int
     outcome: str
@@ -40,45 +40,45 @@ class EpisodeEnd:
 
 
 class Recorder(ABC):
-    """Writes one episode at a time. All methods are called from its own thread, unless they say otherwise."""
+    """Writes one episode at a time. All methods are called from the recorder's thread, unless stated otherwise."""
 
     min_free = 0
-    """Space on the disk that it leaves free [bytes]."""
+    """Disk space that it leaves free [bytes]."""
 
     @abstractmethod
     def begin(self, episode: EpisodeStart) -> None:
         """Open a new episode.
 
         Raises:
-            RecorderError: e.g. the directory exists, or cannot be written.
+            RecorderError: e.g. if the folder exists or cannot be written.
         """
 
     @abstractmethod
     def write(self, topic: str, message: Message, received_ns: int) -> None:
-        """Append one message. Topics that were not announced, or that this recorder does not keep, are passed over.
+        """Append a message. Topics that were not announced, or that this recorder does not store, are ignored.
 
         Raises:
-            RecorderError: e.g. no open episode, or a full disk; what was written before stays readable.
+            RecorderError: e.g. if no episode is open, or the disk is full; earlier messages remain readable.
         """
 
     @abstractmethod
     def end(self, episode: EpisodeEnd) -> Path | None:
-        """Close the episode; returns where it is, or None when it was discarded (and nothing is left)."""
+        """Close the episode; returns its path, or None if it was discarded and removed."""
 
     def size_of(self, message: Message) -> int:
-        """About how much a message takes on the disk [bytes]. Called from any thread, also between episodes."""
+        """Approximate size of a message on the disk [bytes]. Called from any thread, also between episodes."""
         return _size(message)
 
     def waiting(self) -> int:
-        """What was written and is not with the disk yet [bytes]. Called from any thread."""
+        """Amount of data that is not yet written to the disk [bytes]. Called from any thread."""
         return 0
 
     def close(self) -> None:
-        """Release everything; an episode still open is ended as `unknown`. Safe to call twice."""
+        """Release all resources; an open episode ends as `unknown`. Safe to call twice."""
 
 
 def _size(value: Any) -> int:
-    """Of a message, or of a value in one [bytes]."""
+    """Size of a message, or of a value in a message [bytes]."""
     if isinstance(value, np.ndarray):
         return int(value.nbytes)
     if isinstance(value, bytes | str):

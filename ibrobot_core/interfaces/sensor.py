@@ -1,4 +1,4 @@
-"""Sensors: what turns a device into messages; runs in the host."""
+"""Sensors, which publish the data of a device as messages, in the host."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ibrobot_core.messages import Message
 class Sensor(ABC):
     """A source of messages. One thread calls `open`, `read` and `close`; it may differ from the constructor's.
 
-    `topic` is where its messages go: `/camera/NAME/image_raw` for a camera.
+    `topic` is the topic of its messages: `/camera/NAME/image_raw` for a camera.
     """
 
     topic: str
@@ -21,17 +21,17 @@ class Sensor(ABC):
         """Open the device.
 
         Raises:
-            SensorError: e.g. no such device, or a format that it does not give.
+            SensorError: e.g. if the device does not exist, or does not offer the format.
         """
 
     @abstractmethod
     def read(self, timeout_s: float) -> Message | None:
-        """The newest message not yet returned, waiting up to `timeout_s` [s]; None when none came.
+        """The newest message that was not returned yet, waiting up to `timeout_s` [s]; None if none arrives.
 
-        Its header stamp is the time of capture. An old frame never comes under a new stamp.
+        Its header stamp is the time of capture. Old data must never get a new stamp.
 
         Raises:
-            SensorError: when the device is gone or not open.
+            SensorError: if the device is gone or not open.
         """
 
     @abstractmethod

@@ -1,4 +1,4 @@
-"""Teleoperation devices: what a person moves so that the robot moves; runs in the host."""
+"""Teleoperation devices, with which an operator moves the robot, in the host."""
 
 from __future__ import annotations
 
@@ -11,32 +11,32 @@ import attrs
 from ibrobot_core.interfaces.hardware import JointReading
 
 OperatorEvent = Literal["start", "success", "failure", "discard", "intervention"]
-"""What an operator asks of the run by a button of the device: begin an episode; end it as a success, as a failure, or
-leave nothing of it; take the robot from the policy, or give it back."""
+"""Requests of an operator to the run, by buttons of the device: begin an episode; end it as a success or a failure, or
+discard it; take the robot from the policy, or give it back."""
 
 
 @attrs.frozen
 class TeleopCommand:
-    """What the operator asks for at this instant."""
+    """The operator's command at one instant."""
 
     positions: Mapping[str, float] | None
-    """Joint name -> position [rad]; None while the deadman is released, and the robot holds."""
+    """Joint name -> position [rad]; None while the deadman is released, so that the robot holds."""
     estop: bool = False
     finished: bool = False
-    """True when the device has nothing more to give, e.g. the end of a recording."""
+    """True if the device has no further commands, e.g. at the end of a recording."""
     events: tuple[OperatorEvent, ...] = ()
-    """What the operator asked for since the last command, in order; each press once."""
+    """Requests since the last command, in order; one per press."""
 
 
 class Teleop(ABC):
-    """A device that gives joint positions. Its first positions after `activate` must be where the robot is."""
+    """A device that commands joint positions. Its first positions after `activate` must be those of the robot."""
 
     @abstractmethod
     def connect(self) -> None:
         """Open the device.
 
         Raises:
-            TeleopError: e.g. no such port, or no terminal.
+            TeleopError: e.g. if the port does not exist, or there is no terminal.
         """
 
     @abstractmethod
@@ -47,8 +47,8 @@ class Teleop(ABC):
             measured: the robot's joints in robot order, for devices that move relative to them.
 
         Raises:
-            TeleopError: when the device is gone or not connected; a fault, until a reset after which `disconnect` and
-                `connect` have brought it back.
+            TeleopError: if the device is gone or not connected. This is a fault until a reset, which calls `disconnect`
+                and `connect`.
         """
 
     @abstractmethod
@@ -62,5 +62,5 @@ class Teleop(ABC):
         """
 
     def help(self) -> str:
-        """What an operator must know, in a line or a few: keys, buttons."""
+        """Instructions for the operator, in a few lines: keys, buttons."""
         return ""

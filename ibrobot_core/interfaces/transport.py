@@ -1,4 +1,4 @@
-"""Transports: what carries bytes between processes and machines."""
+"""Transports, which carry bytes between processes and machines."""
 
 from __future__ import annotations
 
@@ -6,20 +6,20 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 
 type Payload = bytes | bytearray | memoryview
-"""Bytes, flat. What was received is not to be written to, and lives as long as a reference to it exists."""
+"""Flat bytes. Received payloads are read-only and live as long as they are referenced."""
 
 type Handler = Callable[[Payload, str | None], Payload]
-"""Makes the answer to a request. It is called with the request and the sender's name, as a certificate or password has
-proved it to the transport; None where nothing proves it. What a request says of itself is not a proof."""
+"""Computes the answer to a request. It receives the request and the sender's name, which the transport has verified by
+a certificate or password, or None if it is not verified."""
 
 HANDLER_THREADS = 16
-"""How many calls of a handler go on at the same time, where `serve` has no `workers`."""
+"""Default of `workers` in `serve`: maximum number of concurrent calls of a handler."""
 
 
 class Transport(ABC):
-    """Publish, subscribe, and request with a reply. Payloads are bytes; what they mean is the caller's.
+    """Publish, subscribe, and request with a reply. Payloads are bytes, whose meaning is up to the caller.
 
-    What is given to `publish` and `request` may be written to again when the call has returned.
+    The caller may modify payloads of `publish` and `request` after the call has returned.
     """
 
     @abstractmethod
@@ -27,25 +27,25 @@ class Transport(ABC):
         """Send to all subscribers of `topic`. Never blocks on a slow one.
 
         Raises:
-            TransportError: when closed.
+            TransportError: if closed.
         """
 
     @abstractmethod
     def subscribe(self, topic: str, callback: Callable[[Payload], object]) -> Callable[[], None]:
-        """Call `callback` with every payload on `topic`, in the order sent; returns a function that ends it.
+        """Call `callback` with every payload on `topic`, in the order sent; returns a function that unsubscribes.
 
-        An exception of `callback` is logged, and reaches neither the sender nor other subscribers.
+        An exception in `callback` is logged and does not affect the sender or other subscribers.
         """
 
     @abstractmethod
     def serve(self, name: str, handler: Handler, *, workers: int = HANDLER_THREADS) -> Callable[[], None]:
-        """Answer requests for `name`; returns a function that ends it. An exception of `handler` reaches the requester.
+        """Answer requests for `name`; returns a function that ends the service.
 
         Args:
-            name: what requests ask for.
-            handler: makes the answer to a request. It is called from several threads at the same time, so that a slow
-                answer does not delay the next.
-            workers: how many calls go on at the same time; further requests wait.
+            name: name of the service.
+            handler: computes the answer to a request. It is called concurrently from several threads, so that a slow
+                answer does not delay others. The requester receives its exceptions.
+            workers: maximum number of concurrent calls; further requests wait.
 
         Raises:
             TransportError: if this transport serves the name already.
@@ -53,23 +53,23 @@ class Transport(ABC):
 
     @abstractmethod
     def request(self, name: str, payload: Payload, timeout_s: float) -> Payload:
-        """Ask the server of `name` and wait up to `timeout_s` [s].
+        """Send a request to the server of `name` and wait up to `timeout_s` [s] for the answer.
 
-        A late answer is dropped, never given to a later request.
+        A late answer is dropped, and never assigned to a later request.
 
         Raises:
-            TransportError: when nobody serves it (at once), the server failed, or no answer came in time.
+            TransportError: if there is no server (at once), the server failed, or no answer arrived in time.
         """
 
     @abstractmethod
     def watch(self, name: str, changed: Callable[[bool], object]) -> Callable[[], None]:
-        """Tell whether anybody serves `name`; returns a function that ends it.
+        """Watch whether `name` has a server; returns a function that ends the watch.
 
-        `changed` is called with the present state before this returns, then at each change, one call at a time, in
-        another thread. A server that dies is a change as well. An exception of a later call is logged.
+        `changed` is called with the present state before this returns, then after each change, including the death of a
+        server, one call at a time, in another thread. Exceptions in later calls are logged.
 
         Raises:
-            TransportError: when closed.
+            TransportError: if closed.
         """
 
     def close(self) -> None:

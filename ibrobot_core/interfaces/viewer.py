@@ -1,4 +1,4 @@
-"""Viewers: what shows a person the robot; runs in the host."""
+"""Viewers, which show the robot to a user, in the host."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 
 
 class Viewer(ABC):
-    """Reads the bus (`ctx.bus`) and shows it. A viewer never slows the robot: it skips what it cannot show.
+    """Shows data of the bus (`ctx.bus`). A viewer never slows the robot down: it skips messages that it cannot show.
 
     All methods are called from one thread.
     """
@@ -16,12 +16,12 @@ class Viewer(ABC):
         """Show the window or start the server.
 
         Raises:
-            IbrobotError: e.g. no display.
+            IbrobotError: e.g. if there is no display.
         """
 
     @abstractmethod
     def update(self) -> bool:
-        """Show what is new on the bus; False once the person has closed it. Called about 30 times a second."""
+        """Show new data; returns False after the user has closed the viewer. Called about 30 times per second."""
 
     @abstractmethod
     def close(self) -> None:
