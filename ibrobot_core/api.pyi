@@ -18,6 +18,7 @@ from ibrobot_core.descriptors import (
     RecorderDescriptor as RecorderDescriptor,
     SectionDescriptor as SectionDescriptor,
     SensorDescriptor as SensorDescriptor,
+    SourceDescriptor as SourceDescriptor,
     TeleopDescriptor as TeleopDescriptor,
     TransportDescriptor as TransportDescriptor,
     ViewerDescriptor as ViewerDescriptor,

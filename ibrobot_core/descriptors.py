@@ -16,8 +16,9 @@ if TYPE_CHECKING:
 
     from ibrobot_core import interfaces
     from ibrobot_core.component import Component
-    from ibrobot_core.config.schema import RobotConfig
+    from ibrobot_core.config.schema import ControlMode, RobotConfig
     from ibrobot_core.launch.session import Session
+    from ibrobot_core.launch.sources.source_worker import SourceWorker
     from ibrobot_core.launch.transport import TransportLink
     from ibrobot_core.messages import CompressedImage, Image
     from ibrobot_core.robot import Robot
@@ -119,6 +120,15 @@ class ExecutorDescriptor(Descriptor["interfaces.Executor"]):
 @attrs.frozen
 class PlannerDescriptor(Descriptor["interfaces.Planner"]):
     """A motion planner."""
+
+
+@attrs.frozen
+class SourceDescriptor(Descriptor["SourceWorker"]):
+    """The command source of all control modes that have a key, e.g. `planner`; `type` is that key."""
+
+    make: Callable[[Session, ControlMode], SourceWorker] = attrs.field(kw_only=True)  # type: ignore[assignment]
+    """Run and mode -> the source. Called before anything starts: what it raises stops a wrong run, e.g. for goals that
+    make no sense. Imports what it needs when it is called, and opens nothing."""
 
 
 @attrs.frozen

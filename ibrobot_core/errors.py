@@ -58,7 +58,7 @@ class PluginError(IbrobotError):
 
 def plugin_type(kind: str, type: str) -> str:
     """The name of a type in messages, e.g. `teleop type 'joystick'`."""
-    named = {"command": f"ibrobot {type}", "section": f"section {type!r}"}
+    named = {"command": f"ibrobot {type}", "section": f"section {type!r}", "source": f"a mode with {type}"}
     return named.get(kind, f"{kind} type {type!r}")
 
 

@@ -64,6 +64,11 @@ def ibrobot_planners() -> Iterable[descriptors.PlannerDescriptor]:  # type: igno
 
 
 @hookspec
+def ibrobot_sources() -> Iterable[descriptors.SourceDescriptor]:  # type: ignore[empty-body]
+    """Command sources of control modes."""
+
+
+@hookspec
 def ibrobot_transports() -> Iterable[descriptors.TransportDescriptor]:  # type: ignore[empty-body]
     """Transports between processes and machines."""
 

@@ -41,6 +41,7 @@ KINDS: Mapping[str, str] = {
     "engine": "ibrobot_engines",
     "executor": "ibrobot_executors",
     "planner": "ibrobot_planners",
+    "source": "ibrobot_sources",
     "transport": "ibrobot_transports",
     "recorder": "ibrobot_recorders",
     "dataset": "ibrobot_datasets",

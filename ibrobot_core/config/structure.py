@@ -117,7 +117,12 @@ class SectionParser:
         sections.teleoperation = self._named("teleoperation", schema.TeleopConfig)
         for name, mode in (sections.plain.get("control_modes") or {}).items():
             if mode.planner is not None:
-                planner = self._component(("control_modes", name, "planner"), schema.PlannerConfig)
+                key: Key = ("control_modes", name, "planner")
+                planner = self._component(key, schema.PlannerConfig)
+                if ("source", "planner") not in self.registry.entries:
+                    error = self.registry.not_found("source", "planner")
+                    assert isinstance(error, PluginNotInstalled)
+                    self._missing.append(Missing(key, (*key, "type"), error))
                 sections.planners |= {name: planner} if planner is not None else {}
             if mode.inference is not None:
                 inference = self._component(("control_modes", name, "inference"), schema.InferenceConfig)

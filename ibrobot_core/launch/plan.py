@@ -12,7 +12,7 @@ from ibrobot_core.component import CONTROL, Component
 from ibrobot_core.config.missing import unavailable_modes
 from ibrobot_core.config.schema import ActionSpec, ObservationSpec, PeripheralConfig
 from ibrobot_core.contract.specs import Contract
-from ibrobot_core.descriptors import TransportDescriptor
+from ibrobot_core.descriptors import SourceDescriptor, TransportDescriptor
 from ibrobot_core.errors import ComponentFailed, NotSupported
 from ibrobot_core.launch.absence import describe
 from ibrobot_core.launch.control import ControlComponent
@@ -21,7 +21,6 @@ from ibrobot_core.launch.outputs.viewer import ViewerWorker
 from ibrobot_core.launch.perception import SensorWorker
 from ibrobot_core.launch.session import CommandSource, Session
 from ibrobot_core.launch.simulation import SimulatedEpisodes
-from ibrobot_core.launch.sources.planner import PlannerSource
 from ibrobot_core.launch.sources.policy import LoadedModel, PolicySource
 from ibrobot_core.launch.sources.source_worker import SourceWorker
 from ibrobot_core.launch.sources.teleop import TeleopSource
@@ -89,7 +88,9 @@ def mode_components(session: Session, name: str, link: TransportLink | None) -> 
     if mode.teleop is not None:
         return ModeComponents((), TeleopSource(session, mode, mode.teleop))
     if mode.planner is not None:
-        return ModeComponents((), PlannerSource(session, mode, mode.planner))
+        descriptor = session.registry.find("source", "planner")
+        assert isinstance(descriptor, SourceDescriptor)
+        return ModeComponents((), descriptor.make(session, mode))
     return ModeComponents((), CommandSource())
 
 

@@ -12,7 +12,6 @@ from ibrobot_core.errors import ComponentFailed, HardwareError, NotSupported, Pl
 from ibrobot_core.launch.control import ControlComponent
 from ibrobot_core.launch.plan import LaunchPlan, build_plan, mode_components
 from ibrobot_core.launch.session import Session
-from ibrobot_core.launch.sources.planner import check_goals
 from ibrobot_core.recording.service import EpisodeService
 from ibrobot_core.units import ns
 
@@ -30,7 +29,10 @@ class Runtime:
     """
 
     def __init__(self, session: Session) -> None:
-        check_goals(session)
+        if session.request.goals and session.config.control_modes[session.mode].planner is None:
+            planning = [name for name, mode in session.config.control_modes.items() if mode.planner]
+            remedy = f"--mode {' or --mode '.join(planning)}" if planning else "and this robot has none"
+            raise NotSupported(f"--goal needs a mode with a planner: {remedy}")
         self.session = session
         self.plan: LaunchPlan = build_plan(session)
         counted = self.plan.episodes_worker is not None or session.request.by_operator

@@ -21,6 +21,7 @@ from ibrobot_core.descriptors import (
     PolicyDescriptor,
     RecorderDescriptor,
     SensorDescriptor,
+    SourceDescriptor,
     TeleopDescriptor,
 )
 from ibrobot_core.errors import ConfigError
@@ -155,6 +156,7 @@ def registry(tmp_path: Path) -> Registry:
         ("engine", EngineDescriptor("far", _make, "on a server", FarOptions, uses_transport=True)),
         ("teleop", TeleopDescriptor("stick", _make, "a stick")),
         ("planner", PlannerDescriptor("straight", _make, "straight lines")),
+        ("source", SourceDescriptor("planner", make=_make, summary="goals")),
         ("executor", ExecutorDescriptor("waypoints", _make, "straight lines")),
         ("recorder", RecorderDescriptor("log", _make, "a log")),
     ]

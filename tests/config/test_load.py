@@ -271,6 +271,16 @@ def test_mode_whose_executor_is_not_installed_is_unavailable(base: str, load_tex
     assert "arm_trajectory" not in config.executors
 
 
+def test_mode_with_a_planner_is_unavailable_without_the_source_of_goals(
+    base: str, load_text: Load, registry: Registry
+) -> None:
+    del registry.entries["source", "planner"]
+    told = "a mode with planner needs a plugin that is not installed: pip install ibrobot-plugin-planning"
+    assert load_text(base).unavailable == {"plan": told}
+    with pytest.raises(ConfigError, match=rf"^robot.yaml:28: control_modes.plan.planner.type: {told}$"):
+        load_text(base, mode="plan")
+
+
 @pytest.mark.parametrize("mode", ["teleop", "plan"])
 def test_executor_of_the_contract_must_be_installed(faults_of_edit: Faults, mode: str) -> None:
     told = faults_of_edit("arm_position: {type: position", "arm_position: {type: trajectory", mode=mode)

@@ -59,8 +59,8 @@ NOTES = [
     "pip install ibrobot-plugin-keyboard",
     "mode servo is unavailable: teleop type 'twist' needs a plugin that is not installed: "
     "pip install ibrobot-plugin-servo",
-    "mode moveit_planning is unavailable: executor type 'trajectory', executor type 'gripper', planner type 'joint' "
-    "need plugins that are not installed: pip install ibrobot-plugin-planning",
+    "mode moveit_planning is unavailable: executor type 'trajectory', executor type 'gripper', planner type 'joint', "
+    "a mode with planner need plugins that are not installed: pip install ibrobot-plugin-planning",
 ]
 CAMERAS = (
     "camera top, camera wrist: sensor type 'opencv' needs a plugin that is not installed; "

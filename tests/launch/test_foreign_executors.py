@@ -17,15 +17,6 @@ def plugin(site: Site) -> None:
     site.add("foreign-executors", "foreign_executors.py")
 
 
-def test_a_goal_of_a_planner_reaches_an_executor_of_positions(runs: Runs) -> None:
-    runtime = runs.start("executors.arm_trajectory.type=approach", mode="plan", goals=("pan=0.3",))
-    while not runtime.step():
-        pass
-    assert runtime.summary()["goals_failed"] == 0
-    assert runtime.session.state is not None
-    assert runtime.session.state.command[0] == pytest.approx(0.3, abs=0.03)
-
-
 @pytest.mark.parametrize("behavior", ["hold", "relax"])
 def test_setpoints_reach_a_streaming_executor_with_options_of_its_own(runs: Runs, behavior: str) -> None:
     runtime = runs.start(

@@ -1,4 +1,4 @@
-"""The plugin's hooks: planner types `joint` and `rrt_connect`, executor types `trajectory` and `gripper`."""
+"""The plugin's hooks: planners, the command source of modes with one, executors of goals, and the section `world`."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from ibrobot_core.api import (
     OptionFault,
     PlannerDescriptor,
     SectionDescriptor,
+    SourceDescriptor,
     hookimpl,
 )
 from ibrobot_planning.executors.options import GripperOptions, TrajectoryOptions
@@ -18,7 +19,7 @@ from ibrobot_planning.options import JointPlannerOptions, RrtConnectOptions
 from ibrobot_planning.world_options import WorldOptions
 
 if TYPE_CHECKING:
-    from ibrobot_core.api import Component, Context, Executor, Planner, Robot, Session
+    from ibrobot_core.api import Component, Context, ControlMode, Executor, Planner, Robot, Session, SourceWorker
 
 
 def _joint(options: Any, ctx: Context) -> Planner:
@@ -55,6 +56,18 @@ def ibrobot_planners() -> Iterable[PlannerDescriptor]:
         type="rrt_connect", options=RrtConnectOptions, make=_rrt_connect, check=_find_engines,
         summary="around obstacles, to joint positions or poses of the tool, checked against padding after timing",
     )  # fmt: skip
+
+
+def _source(session: Session, mode: ControlMode) -> SourceWorker:
+    from ibrobot_planning.source import PlannerSource
+
+    return PlannerSource(session, mode)
+
+
+@hookimpl
+def ibrobot_sources() -> Iterable[SourceDescriptor]:
+    """Goals."""
+    yield SourceDescriptor(type="planner", make=_source, summary="moves to goals that a planner of any plugin plans")
 
 
 def _trajectory(options: Any, ctx: Context) -> Executor:

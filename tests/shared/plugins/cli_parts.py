@@ -10,6 +10,7 @@ from ibrobot_testing.fakes import (
     FakePlanner,
     FakePolicy,
     FakeRealHardware,
+    FakeSource,
     FakeTeleop,
     FakeTrajectoryExecutor,
 )
@@ -23,6 +24,7 @@ from ibrobot_core.descriptors import (
     PolicyDescriptor,
     RecorderDescriptor,
     SensorDescriptor,
+    SourceDescriptor,
     TeleopDescriptor,
     TransportDescriptor,
 )
@@ -128,6 +130,11 @@ def ibrobot_teleop():
     yield TeleopDescriptor("stick", lambda options, ctx: Stick(ctx), "a stick")
     yield TeleopDescriptor("bug", lambda options, ctx: Bug(ctx), "a bug")
     yield TeleopDescriptor("person", lambda options, ctx: Person(ctx), "a person")
+
+
+@hookimpl
+def ibrobot_sources():
+    yield SourceDescriptor("planner", make=FakeSource, summary="holds")
 
 
 @hookimpl

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any, override
+from collections.abc import Iterator
+from typing import Any
 
 import attrs
 from ibrobot_testing.fakes import FakeExecutor
 
-from ibrobot_core.api import Context, ExecutorDescriptor, JointReading, hookimpl, option
+from ibrobot_core.api import Context, ExecutorDescriptor, hookimpl, option
 
 
 @attrs.frozen
@@ -18,23 +18,10 @@ class Options:
     stiffness: float = option(1.0, help="of nothing")
 
 
-class Approaches(FakeExecutor):
-    """Takes `{"position": q}`, for its first joint."""
-
-    @override
-    def set_goal(self, goal_id: str, goal: Mapping[str, Any], measured: JointReading) -> None:
-        super().set_goal(goal_id, {"position": [goal["position"]]}, measured)
-
-
-def approaches(options: Any, ctx: Context) -> FakeExecutor:
-    return Approaches(ctx)
-
-
 def nearest(options: Any, ctx: Context) -> FakeExecutor:
     return FakeExecutor(ctx)
 
 
 @hookimpl
 def ibrobot_executors() -> Iterator[ExecutorDescriptor]:
-    yield ExecutorDescriptor("approach", approaches, "approaches a position", goals="position")
     yield ExecutorDescriptor("nearest", nearest, "follows the nearest point of a plan", Options, streams=True)

@@ -14,6 +14,7 @@ from ibrobot_testing.fakes import (
     FakeRealHardware,
     FakeRecorder,
     FakeSensor,
+    FakeSource,
     FakeTeleop,
     FakeTrajectoryExecutor,
 )
@@ -27,6 +28,7 @@ from ibrobot_core.descriptors import (
     PolicyDescriptor,
     RecorderDescriptor,
     SensorDescriptor,
+    SourceDescriptor,
     TeleopDescriptor,
 )
 from ibrobot_core.errors import HardwareError, MissingDependency, PolicyError, SensorError
@@ -218,6 +220,11 @@ def ibrobot_engines():
 def ibrobot_teleop():
     yield TeleopDescriptor("stick", make(Stick), "a stick")
     yield TeleopDescriptor("lever", make(FakeTeleop), "a lever with a deadman")
+
+
+@hookimpl
+def ibrobot_sources():
+    yield SourceDescriptor("planner", make=FakeSource, summary="holds")
 
 
 @hookimpl

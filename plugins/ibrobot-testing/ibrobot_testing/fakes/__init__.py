@@ -1,7 +1,15 @@
 """Minimal correct implementations of each kind, for tests and as examples."""
 
 from ibrobot_testing.fakes.control import FakeExecutor, FakeHardware, FakeRealHardware, FakeTrajectoryExecutor
-from ibrobot_testing.fakes.host import FakeEngine, FakePlanner, FakePolicy, FakeSensor, FakeTeleop, FakeViewer
+from ibrobot_testing.fakes.host import (
+    FakeEngine,
+    FakePlanner,
+    FakePolicy,
+    FakeSensor,
+    FakeSource,
+    FakeTeleop,
+    FakeViewer,
+)
 from ibrobot_testing.fakes.storage import FakeDataset, FakeRecorder
 from ibrobot_testing.fakes.transport import FakeTransport
 
@@ -15,6 +23,7 @@ __all__ = [
     "FakeRealHardware",
     "FakeRecorder",
     "FakeSensor",
+    "FakeSource",
     "FakeTeleop",
     "FakeTrajectoryExecutor",
     "FakeTransport",

@@ -1,4 +1,4 @@
-"""Fakes of components in the host: sensor, teleoperation device, policy, engine, planner and viewer."""
+"""Fakes of components in the host: sensor, teleoperation device, policy, engine, planner, source, viewer."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ibrobot_core.api import (
     Context,
+    ControlMode,
     Engine,
     Frame,
     Header,
@@ -29,6 +30,8 @@ from ibrobot_core.api import (
     PolicySpec,
     Sensor,
     SensorError,
+    Session,
+    SourceWorker,
     Subscription,
     Teleop,
     TeleopCommand,
@@ -160,6 +163,21 @@ class FakeEngine(Engine):
     @override
     def run(self, tensors: Tensors, request_id: int, deadline_ns: int) -> Tensors:
         return self.model.policy.infer(tensors)
+
+
+class FakeSource(SourceWorker):
+    """Commands nothing: the executors hold."""
+
+    def __init__(self, session: Session, mode: ControlMode) -> None:
+        super().__init__(session, mode, "holds")
+
+    @override
+    def begin_mode(self, seed: int) -> None:
+        pass
+
+    @override
+    def work(self, timeout_s: float) -> None:
+        self.pause(timeout_s)
 
 
 class FakePlanner(Planner):

@@ -11,12 +11,18 @@ from typing import Any, override
 import attrs
 import numpy as np
 
-from ibrobot_core.config.schema import ComponentConfig, ControlMode
-from ibrobot_core.errors import HardwareError, PlanningError
-from ibrobot_core.interfaces import JointGoal, Planner, PlanRequest, trajectory_goal
-from ibrobot_core.launch.session import Session
-from ibrobot_core.launch.sources.source_worker import SourceWorker
-from ibrobot_core.robot import Robot
+from ibrobot_core.api import (
+    ControlMode,
+    HardwareError,
+    JointGoal,
+    Planner,
+    PlanningError,
+    PlanRequest,
+    Robot,
+    Session,
+    SourceWorker,
+    trajectory_goal,
+)
 
 GO_TO = "/planning/go_to"
 
@@ -32,18 +38,31 @@ class _Motion:
 
 
 class PlannerSource(SourceWorker):
-    """Plans from where the robot is to each goal in turn; service `/planning/go_to` takes goals too."""
+    """Plans from where the robot is to each goal in turn; service `/planning/go_to` takes goals too.
 
-    def __init__(self, session: Session, mode: ControlMode, planner: ComponentConfig) -> None:
-        super().__init__(session, mode, f"planner {planner.type}")
-        self._component = planner
+    The goals of the request count for the mode in which the run begins.
+
+    Raises:
+        PlanningError: for a goal of the request that names no pose or joint of this robot.
+    """
+
+    def __init__(self, session: Session, mode: ControlMode) -> None:
+        assert mode.planner is not None
+        super().__init__(session, mode, f"planner {mode.planner.type}")
+        self._component = mode.planner
         self._goals: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._events: queue.SimpleQueue[Mapping[str, Any]] = queue.SimpleQueue()
         self._motion: _Motion | None = None
         self._numbers = itertools.count(1)
-        self._asked = len(session.request.goals)
+        asked = () if session.has_control else session.request.goals
+        self._asked = len(asked)
         self._done = 0
-        for goal in session.request.goals:
+        for goal in asked:
+            try:
+                parse_goal(goal, session.config.robot)
+            except PlanningError as error:
+                error.exit_code = 2
+                raise
             self._goals.put(goal)
 
     @override
@@ -174,21 +193,3 @@ def parse_goal(text: str, robot: Robot) -> dict[str, float]:
         if not math.isfinite(goal[joint]):
             raise PlanningError(f"goal {text!r}: {value!r} is not an angle in radians") from None
     return goal
-
-
-def check_goals(session: Session) -> None:
-    """Refuse goals that cannot be meant, before anything starts.
-
-    Raises:
-        PlanningError: for goals in a mode without a planner, and for one that names no pose or joint of this robot.
-    """
-    try:
-        if session.request.goals and session.config.control_modes[session.mode].planner is None:
-            planning = [name for name, mode in session.config.control_modes.items() if mode.planner]
-            remedy = f"--mode {' or --mode '.join(planning)}" if planning else "and this robot has none"
-            raise PlanningError(f"--goal needs a mode with a planner: {remedy}")
-        for goal in session.request.goals:
-            parse_goal(goal, session.config.robot)
-    except PlanningError as error:
-        error.exit_code = 2
-        raise
