@@ -114,7 +114,8 @@ _SHOULDERS = {
 _EXTRAS = {"guide": 0x01, "touchpad": 0x02, "misc": 0x04}
 
 
-def _byte(value: float) -> int:
+def stick_byte(value: float) -> int:
+    """A deflection of -1 to 1 as PlayStation pads send it."""
     return round(127.5 + 127.5 * value) if value else 128
 
 
@@ -133,7 +134,7 @@ def dualsense(
     triggers: tuple[float, float] = (0, 0), hat: tuple[int, int] = (0, 0),
 ) -> bytes:  # fmt: skip
     """A DualSense's USB report 0x01."""
-    sticks = [_byte(left[0]), _byte(-left[1]), _byte(right[0]), _byte(-right[1])]
+    sticks = [stick_byte(left[0]), stick_byte(-left[1]), stick_byte(right[0]), stick_byte(-right[1])]
     part = [*sticks, *(round(255 * each) for each in triggers), 7, *_sony(buttons, hat)]
     return bytes([0x01, *part]).ljust(64, b"\0")
 

@@ -163,7 +163,7 @@ def test_equal_seeds_and_reports_give_equal_motion(start: Start, hidapi: FakeHid
             path.append(run.position)
         paths.append(np.array(path))
         run.runtime.stop()
-    np.testing.assert_array_equal(*paths)
+    np.testing.assert_array_equal(paths[0], paths[1])
 
 
 def test_the_stop_button_stops_the_robot_and_a_reset_waits_for_the_deadman(start: Start):

@@ -115,8 +115,9 @@ def test_a_pad_that_went_before_it_was_opened_is_reported(finder: Finder, joysti
 
 @pytest.mark.parametrize("mapped", [True, False], ids=["in the database", "by number"])
 def test_a_pad_read_by_sdl_moves_the_arm_and_holds_when_it_is_unplugged(joysticks: Joysticks, mapped: bool):
-    mapping = {} if mapped else {"buttons": {"deadman": "button9"}, "joints": {"shoulder_pan": "axis0"}}
-    options = GamepadOptions(cartesian=False, via="sdl", **mapping)
+    options = GamepadOptions(cartesian=False, via="sdl")
+    if not mapped:
+        options = attrs.evolve(options, buttons={"deadman": "button9"}, joints={"shoulder_pan": "axis0"})
     pad = joysticks.plug(b"Pad", mapped=mapped)
     position, time_s = np.full(6, 0.3), 5.0
     with closing(_Connected(options)) as run:
