@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 from ibrobot_core.api import (
+    Command,
     ExecutorDescriptor,
     MissingDependency,
     OptionFault,
@@ -19,6 +20,8 @@ from ibrobot_planning.options import JointPlannerOptions, RrtConnectOptions
 from ibrobot_planning.world_options import WorldOptions
 
 if TYPE_CHECKING:
+    import click
+
     from ibrobot_core.api import Component, Context, ControlMode, Executor, Planner, Robot, Session, SourceWorker
 
 
@@ -117,3 +120,16 @@ def ibrobot_sections() -> Iterable[SectionDescriptor]:
         type="world", options=WorldOptions, make=_world, check=_find_engines, check_options=_check_world,
         summary="objects that planners avoid: boxes, spheres, cylinders, meshes, planes; services change them",
     )  # fmt: skip
+
+
+def _description() -> click.Command:
+    _find_engines()
+    from ibrobot_planning.commands import description
+
+    return description
+
+
+@hookimpl
+def ibrobot_commands() -> Iterable[Command]:
+    """`ibrobot description …`."""
+    yield Command("description", "Make files that describe a robot, e.g. an SRDF.", _description)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import override
 
@@ -32,12 +32,13 @@ from ibrobot_core.api import (
     Vector,
     ns,
 )
-from ibrobot_planning.arm import SRDF, Arm, Pair, robot_arm
+from ibrobot_planning.arm import SRDF, Arm, Pair, robot_arm, sorted_pair
 from ibrobot_planning.collision import Collisions, Contact, unchecked_pairs
 from ibrobot_planning.goals import Candidate, Tool, joint_target
 from ibrobot_planning.linear import linear_path
 from ibrobot_planning.options import RrtConnectOptions
 from ibrobot_planning.search import Space, connect, shortened
+from ibrobot_planning.semantics import urdf_names
 from ibrobot_planning.timing import Motion, timed
 from ibrobot_planning.world import World
 from ibrobot_planning.world_keeper import SNAPSHOT
@@ -85,22 +86,19 @@ class RrtConnectPlanner(Planner):
         self._tool = Tool(robot_model(robot))
         self._unchecked = unchecked_pairs(self._arm)
         if robot.description.srdf is not None and robot.description.urdf is not None:
-            self._srdf = read_srdf(robot.description.srdf, read_urdf(robot.description.urdf))
-            self._leave_out(self._srdf)
+            urdf = read_urdf(robot.description.urdf)
+            self._srdf = read_srdf(robot.description.srdf, urdf)
+            self._leave_out(self._srdf, {name: link for link, name in urdf_names(self._arm, urdf).items()})
 
-    def _leave_out(self, srdf: Srdf) -> None:
-        """Do not check pairs of the SRDF, which names links of the URDF: the MJCF may call them otherwise."""
+    def _leave_out(self, srdf: Srdf, links: Mapping[str, str]) -> None:
+        """Do not check pairs of the SRDF; `links` has the MJCF's links under the names of the URDF, which it uses."""
         for pair in srdf.may_touch:
-            unknown = [link for link in pair if link not in self.arm.frames]
+            unknown = [name for name in pair if name not in links]
             if unknown:
-                self._ctx.log.warning(
-                    "%s: pair %s is checked nevertheless: the MJCF has no link %r",
-                    srdf.path,
-                    " and ".join(pair),
-                    unknown[0],
-                )
+                message = "%s: %s and %s are checked nevertheless: no joint of the MJCF carries %s"
+                self._ctx.log.warning(message, srdf.path, *pair, unknown[0])
             else:
-                self._unchecked[pair] = SRDF
+                self._unchecked[sorted_pair(links[pair[0]], links[pair[1]])] = SRDF
 
     @property
     def arm(self) -> Arm:

@@ -1,0 +1,78 @@
+"""SRDFs: written from samples, and read by the planner."""
+
+from __future__ import annotations
+
+import logging
+
+import attrs
+import numpy as np
+import pytest
+from ibrobot_kinematics.srdf import read_srdf
+from ibrobot_kinematics.urdf import read_urdf
+from ibrobot_planning.arm import robot_arm
+from ibrobot_planning.collision import unchecked_pairs
+from ibrobot_planning.options import RrtConnectOptions
+from ibrobot_planning.rrt import RrtConnectPlanner
+from ibrobot_planning.semantics import srdf, urdf_names
+
+from ibrobot_core.api import Context, NamedGoal, PlanRequest, SteppedClock
+
+from .table_arm import ARM, make_robot
+
+CARRIED = {
+    "pan": "turret_link", "lift": "upper_link", "elbow": "lower_link", "flex": "wrist_link", "roll": "hand_link",
+    "jaw": "finger_link",
+}  # fmt: skip
+
+
+@pytest.fixture
+def described(tmp_path):
+    """The robot with a URDF whose links have names of their own."""
+    parents = ["foot_link", *CARRIED.values()]
+    parents[6] = "hand_link"
+    joints = "".join(
+        f'<joint name="{name}" type="revolute"><parent link="{parent}"/><child link="{child}"/>'
+        '<axis xyz="0 0 1"/><limit lower="-3" upper="3" velocity="3" effort="1"/></joint>'
+        for (name, child), parent in zip(CARRIED.items(), ["foot_link", *list(CARRIED.values())[:5]], strict=True)
+    )
+    links = "".join(f'<link name="{name}"/>' for name in ("foot_link", *CARRIED.values()))
+    path = tmp_path / "arm.urdf"
+    path.write_text(f'<robot name="tabletop">{links}{joints}</robot>')
+    robot = make_robot(tmp_path)
+    return attrs.evolve(robot, description=attrs.evolve(robot.description, urdf=path))
+
+
+def test_links_have_the_names_of_the_urdf(described):
+    names = urdf_names(robot_arm(described), read_urdf(described.description.urdf))
+    assert names == {
+        "base": "foot_link", "turret": "turret_link", "upper": "upper_link", "lower": "lower_link",
+        "wrist": "wrist_link", "hand": "hand_link", "finger": "finger_link",
+    }  # fmt: skip
+
+
+def test_a_written_srdf_is_read_with_groups_poses_and_pairs(described, tmp_path):
+    arm, urdf = robot_arm(described), read_urdf(described.description.urdf)
+    pairs = unchecked_pairs(arm, samples=2000, never=True)
+    path = tmp_path / "arm.srdf"
+    path.write_text(srdf(described, pairs, urdf_names(arm, urdf)))
+    found = read_srdf(path, urdf)
+    assert found.groups["arm"] == ARM
+    assert found.state("left", "arm").positions == {"pan": 1.0, "lift": 0.8, "elbow": 0.8, "flex": 0.5, "roll": 0.0}
+    assert ("foot_link", "turret_link") in found.may_touch
+    assert len(found.may_touch) == len(pairs)
+    assert "Never" in path.read_text()
+
+
+def test_the_planner_takes_pairs_and_poses_of_an_srdf(described, tmp_path, caplog):
+    path = tmp_path / "arm.srdf"
+    path.write_text(
+        '<robot name="tabletop"><group name="arm"><joint name="pan"/></group>'
+        '<group_state name="aside" group="arm"><joint name="pan" value="0.7"/></group_state>'
+        '<disable_collisions link1="foot_link" link2="hand_link" reason="User"/></robot>'
+    )
+    robot = attrs.evolve(described, description=attrs.evolve(described.description, srdf=path))
+    planner = RrtConnectPlanner(RrtConnectOptions(), Context("p", SteppedClock(0), logging.getLogger("test"), robot))
+    planner.load()
+    assert caplog.messages == []
+    result = planner.plan(PlanRequest(ARM, np.zeros(5), NamedGoal("aside")))
+    np.testing.assert_allclose(result.trajectory.points[-1].positions, [0.7, 0, 0, 0, 0], atol=1e-9)
