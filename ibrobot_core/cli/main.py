@@ -21,7 +21,6 @@ _FAILED, _WRONG, _INTERRUPTED = 1, 2, 130
 
 COMMANDS = {
     "launch": ("ibrobot_core.cli.launch:launch", "Run a robot, real or simulated."),
-    "record": ("ibrobot_core.cli.record:record", "Run a robot and record its episodes."),
     "config": ("ibrobot_core.cli.config:config", "Check and show robot YAMLs."),
     "plugins": ("ibrobot_core.cli.plugins:plugins", "List what the installed plugins offer."),
     "doctor": ("ibrobot_core.cli.doctor:doctor", "Check this machine, with the remedy for what it lacks."),

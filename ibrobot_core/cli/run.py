@@ -36,17 +36,9 @@ _PANEL_HZ = 8
 _PLAIN_PERIOD_S = 2.0
 
 
-MakeHooks = Callable[[Runtime], RunHooks]
-
-
-def no_hooks(runtime: Runtime) -> RunHooks:
-    """The hooks of a command that adds nothing to a run."""
-    return RunHooks()
-
-
 def run_robot(
     config: RobotConfig, request: LaunchRequest, *, headless: bool = False, dry_run: bool = False,
-    as_json: bool = False, make_hooks: MakeHooks = no_hooks,
+    as_json: bool = False, make_hooks: Callable[[Runtime], RunHooks] = lambda runtime: RunHooks(),
 ) -> None:  # fmt: skip
     """Run a robot as `ibrobot launch` does, to the end of the process, with exit status and summary.
 

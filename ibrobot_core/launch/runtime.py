@@ -258,7 +258,7 @@ class Runtime:
         worker = self.plan.episodes_worker if self.plan.episodes_worker in self._started else None
         if worker is not None:
             worker.stop()
-        session.pause_feed()
+        session.end_source()
         try:
             session.command("switch_mode", mode=mode)
         except BaseException:

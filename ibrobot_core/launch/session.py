@@ -262,8 +262,8 @@ class Session:
         if not self.held:
             self.command_source.begin(self.request.seed)
 
-    def pause_feed(self) -> None:
-        """End the mode's feed, until `feed`."""
+    def end_source(self) -> None:
+        """End the command source of the mode, until `begin_source`."""
         self.command_source.end()
 
     @property

@@ -51,7 +51,7 @@ class SimulatedEpisodes(SessionWorker):
 
     def _end_episode(self, outcome: str) -> None:
         session = self.session
-        session.pause_feed()
+        session.end_source()
         self._begun_ns = None
         self._episodes.end(outcome)
         if self._wanted is not None and self._episodes.number >= self._wanted:

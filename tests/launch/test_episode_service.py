@@ -9,8 +9,7 @@ import pytest
 import yaml
 
 from ibrobot_core.errors import DiskFull, NotSupported, RecorderError
-from ibrobot_core.recording.operator import Operator
-from ibrobot_core.recording.service import DISCARD, START, STATUS, STOP, EpisodeService
+from ibrobot_core.recording.service import DISCARD, START, STATUS, STOP
 
 if TYPE_CHECKING:
     from ibrobot_core.launch.runtime import Runtime
@@ -159,153 +158,8 @@ def test_buttons_without_a_meaning_in_a_run_are_reported(runs: Runs, caplog: pyt
     assert "intervention: mode teleop has no policy to take the robot from" in caplog.text
 
 
-def service(run: Runtime) -> EpisodeService:
-    assert run.episode_service is not None
-    return run.episode_service
-
-
-class TestOperator:
-    def watch(self, run: Runtime, **asked: Any) -> Operator:
-        assert run.episode_service is not None
-        return Operator(
-            run.session, run.episode_service,
-            **{"count": None, "reset_time_s": 0.0, "prompt": None, "auto": False, "keys": True, **asked},
-        )  # fmt: skip
-
-    def step(self, run: Runtime, operator: Operator, count: int) -> None:
-        for _ in range(count):
-            operator.step()
-            if run.step():
-                return
-
-    def test_tab_asks_for_a_prompt_and_enter_begins(self, run: Runtime):
-        operator = self.watch(run)
-        for key in ("tab", "h", "o", "p", "backspace", "space", "!"):
-            assert operator.key(key)
-        assert "ho !_" in operator.rows()[0][1]
-        assert not service(run).running
-        operator.key("enter")
-        assert service(run).running
-        assert "recording “ho !”" in operator.line()
-        operator.key("tab")
-        assert (service(run).running, service(run).saved) == (False, 1)
-        operator.key("tab")
-        operator.key("tab")
-        assert not service(run).running, "a second Tab goes back"
-        assert not operator.key("a"), "letters belong to the mode again"
-
-    def test_failure_and_discard(self, run: Runtime, runs: Runs):
-        operator = self.watch(run, prompt="pick")
-        for end in ("f11", "f12"):
-            operator.key("tab")
-            self.step(run, operator, 2)
-            operator.key(end)
-            self.step(run, operator, 2)
-        assert [event[2] for event in runs.parts.EVENTS if event[0] == "ended"] == ["failure", "discarded"]
-        assert service(run).saved == 1
-
-    def press(self, run: Runtime, runs: Runs, *events: str) -> None:
-        runs.parts.MADE["stick"].events = events
-
-    def test_buttons_of_the_device_begin_and_end_episodes(self, run: Runtime, runs: Runs):
-        operator = self.watch(run, prompt="pick")
-        for events in (("start",), ("success",), ("start",), ("failure",), ("start",), ("discard",)):
-            self.press(run, runs, *events)
-            self.step(run, operator, 3)
-            assert service(run).running == (events == ("start",))
-        assert [event[2] for event in runs.parts.EVENTS if event[0] == "ended"] == ["success", "failure", "discarded"]
-        assert service(run).saved == 2
-
-    def test_a_button_without_an_episode_to_end_says_so(self, run: Runtime, runs: Runs):
-        operator = self.watch(run, prompt="pick")
-        self.press(run, runs, "failure")
-        self.step(run, operator, 3)
-        assert ("", "failure: no episode is being recorded") in operator.rows()
-
-    def test_buttons_leave_episodes_alone_that_end_by_themselves(
-        self, run: Runtime, runs: Runs, caplog: pytest.LogCaptureFixture
-    ):
-        operator = self.watch(run, continuous=True, keys=False, prompt="watch")
-        self.step(run, operator, 3)
-        self.press(run, runs, "discard")
-        self.step(run, operator, 3)
-        assert service(run).running
-        assert "discard: this run begins and ends its episodes by itself" in caplog.text
-
-    def test_unattended_episodes_pause_and_end_with_the_count(self, run: Runtime, runs: Runs):
-        operator = self.watch(run, auto=True, count=2, reset_time_s=0.5, prompt="pick")
-        self.step(run, operator, 50 + 2)
-        assert service(run).saved == 1
-        assert "set up the scene again" in operator.line()
-        self.step(run, operator, 200)
-        assert run.session.finished.is_set()
-        assert operator.summary_rows()[0][1].startswith("2 of 2 episodes into")
-        ended = [event for event in runs.parts.EVENTS if event[0] == "ended"]
-        assert ended == [("ended", 1, "unknown"), ("ended", 2, "unknown")]
-
-    def test_why_it_does_not_begin_is_shown(self, runs: Runs, monkeypatch: pytest.MonkeyPatch):
-        monkeypatch.chdir(runs.folder)
-        runtime = runs.start(RECORDING, mode="plan", by_operator=True)
-        operator = self.watch(runtime, auto=True, prompt="")
-        ticks(runtime, 5)
-        self.step(runtime, operator, 3)
-        rows = operator.rows()
-        assert "topics are silent: /arm/commands" in rows[1][1]
-        assert [heading for heading, _ in rows] == ["record", "", "saved", "lost", "disk", "topics"]
-
-    @pytest.mark.parametrize("auto", [False, True])
-    def test_a_full_disk_ends_the_episode_and_it_does_not_count(
-        self, run: Runtime, runs: Runs, monkeypatch: pytest.MonkeyPatch, auto: bool
-    ):
-        def full(*_: object) -> None:
-            raise RecorderError("its disk has 1 MiB left")
-
-        operator = self.watch(run, prompt="pick", auto=auto, count=1)
-        if not auto:
-            operator.key("tab")
-        self.step(run, operator, 3)
-        assert service(run).running
-        with monkeypatch.context() as patch:
-            patch.setattr(runs.parts.MADE["recording"], "write", full)
-            self.step(run, operator, 3)
-        assert (service(run).running, service(run).saved) == (False, 0)
-        assert ("", "recording ended: its disk has 1 MiB left") in operator.rows()
-        assert run.session.finished.is_set() == auto, "the robot goes on where an operator is there"
-        if not auto:
-            operator.key("tab")
-            self.step(run, operator, 3)
-            assert service(run).running, "there is room again"
-            assert "" not in dict(operator.rows())
-
-    def test_unattended_the_run_ends_without_room_for_another_episode(
-        self, run: Runtime, runs: Runs, monkeypatch: pytest.MonkeyPatch
-    ):
-        operator = self.watch(run, auto=True, prompt="pick")
-        self.step(run, operator, 40)
-        monkeypatch.setattr(run.episode_service, "free_bytes", lambda: 1)
-        self.step(run, operator, 40)
-        assert run.session.finished.is_set()
-        assert (service(run).saved, len(run.session.outcome.faults)) == (1, 1)
-        assert "0 MiB left" in run.session.outcome.faults[0]
-
-    def test_continuous_is_one_episode_to_the_end_of_the_run(self, run: Runtime, runs: Runs):
-        operator = self.watch(run, continuous=True, keys=False, prompt="watch")
-        self.step(run, operator, 120)
-        assert service(run).elapsed_s() > 2 * run.session.config.contract.max_duration_s
-        assert operator.line().startswith("recording “watch”, 2 s, saved")
-        assert not operator.key("tab")
-        run.stop()
-        assert [event for event in runs.parts.EVENTS if event[0] == "ended"] == [("ended", 1, "unknown")]
-        assert (service(run).saved, folders(runs)) == (1, ["episode_000001"])
-
-    def test_continuous_means_nothing_where_the_mode_has_episodes(self, runs: Runs, monkeypatch: pytest.MonkeyPatch):
-        monkeypatch.chdir(runs.folder)
-        runtime = runs.start(RECORDING, mode="policy", by_operator=True)
-        with pytest.raises(NotSupported, match="mode policy begins and ends its episodes itself") as caught:
-            self.watch(runtime, continuous=True)
-        assert caught.value.exit_code == 2
-
-    def test_nobody_can_begin_an_episode_without_keys_and_auto(self, run: Runtime):
-        with pytest.raises(NotSupported, match="add --auto") as caught:
-            self.watch(run, keys=False)
-        assert caught.value.exit_code == 2
+def test_buttons_of_a_device_are_passed_to_what_records_episodes(run: Runtime, runs: Runs):
+    runs.parts.MADE["stick"].events = ("start", "discard")
+    ticks(run, 3)
+    events = run.session.operator_events
+    assert [events.get_nowait(), events.get_nowait(), events.empty()] == ["start", "discard", True]

@@ -1,4 +1,4 @@
-"""The plugin's hooks: the commands `ibrobot convert` and `ibrobot replay`."""
+"""The plugin's hooks: the commands `ibrobot convert`, `ibrobot record` and `ibrobot replay`."""
 
 from __future__ import annotations
 
@@ -17,6 +17,12 @@ def _convert() -> click.Command:
     return convert
 
 
+def _record() -> click.Command:
+    from ibrobot_data.record import record
+
+    return record
+
+
 def _replay() -> click.Command:
     from ibrobot_data.replay import replay
 
@@ -25,6 +31,7 @@ def _replay() -> click.Command:
 
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
-    """`ibrobot convert` and `ibrobot replay`."""
+    """`ibrobot convert`, `ibrobot record` and `ibrobot replay`."""
     yield Command("convert", "Make a dataset for training from episodes.", _convert)
+    yield Command("record", "Run a robot and record its episodes.", _record)
     yield Command("replay", "Play a recorded episode on a robot, and compare.", _replay)

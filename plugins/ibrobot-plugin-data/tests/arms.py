@@ -1,13 +1,27 @@
-"""A plugin for tests: two arms, one of them in a scene."""
+"""A plugin for tests: two arms, one of them in a scene; a stick, a policy and a recorder."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from typing import override
 
-from ibrobot_testing.fakes import FakeHardware, FakeRealHardware
+from ibrobot_testing.fakes import FakeHardware, FakePolicy, FakeRealHardware, FakeRecorder, FakeTeleop
 
-from ibrobot_core.api import EpisodeSetup, HardwareDescriptor, hookimpl
+from ibrobot_core.api import (
+    Context,
+    EpisodeSetup,
+    HardwareDescriptor,
+    JointReading,
+    PolicyDescriptor,
+    RecorderDescriptor,
+    TeleopDescriptor,
+    hookimpl,
+)
+
+STICKS: list[Stick] = []
+"""Those made so far."""
+ENDED: list[tuple[int, str]] = []
+"""Number and outcome of each episode that has ended."""
 
 
 class Scene(FakeHardware):
@@ -28,7 +42,41 @@ class Scene(FakeHardware):
         return self.seed != 13 and self.ticks >= 25
 
 
+class Stick(FakeTeleop):
+    """Pushed forward, all the time."""
+
+    def __init__(self, ctx: Context) -> None:
+        super().__init__(ctx)
+        self.velocity = 0.2
+        STICKS.append(self)
+
+    @override
+    def activate(self, measured: JointReading) -> None:
+        super().activate(measured)
+        self.deadman = True
+
+
 @hookimpl
 def ibrobot_hardware() -> Iterator[HardwareDescriptor]:
     yield HardwareDescriptor("scene", lambda options, ctx: Scene(ctx), "a scene", simulated=True)
     yield HardwareDescriptor("arm", lambda options, ctx: FakeRealHardware(ctx), "an arm")
+
+
+@hookimpl
+def ibrobot_teleop() -> Iterator[TeleopDescriptor]:
+    yield TeleopDescriptor("stick", lambda options, ctx: Stick(ctx), "a stick")
+
+
+@hookimpl
+def ibrobot_policies() -> Iterator[PolicyDescriptor]:
+    yield PolicyDescriptor("net", lambda options, ctx: FakePolicy(ctx), "a network")
+
+
+@hookimpl
+def ibrobot_recorders() -> Iterator[RecorderDescriptor]:
+    yield RecorderDescriptor("lines", lambda options, ctx: FakeRecorder(ctx), "lines of JSON")
+
+
+@hookimpl
+def ibrobot_episode_ended(episode: int, outcome: str) -> None:
+    ENDED.append((episode, outcome))

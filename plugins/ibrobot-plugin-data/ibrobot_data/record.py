@@ -8,10 +8,18 @@ from typing import Any
 
 import click
 
-from ibrobot_core.cli.launch import run_config
-from ibrobot_core.cli.options import run_options
-from ibrobot_core.launch.runtime import Runtime
-from ibrobot_core.recording.operator import Operator
+from ibrobot_core.api import (
+    LaunchRequest,
+    RobotConfig,
+    Runtime,
+    find_config,
+    installed_plugins,
+    load_config,
+    run_options,
+    run_overrides,
+    run_robot,
+)
+from ibrobot_data.operator import Operator
 
 
 @click.command()
@@ -38,7 +46,7 @@ def record(config: str | None, dataset: str | None, root: Path | None, **options
     continuous = options.pop("continuous")
     if continuous and (auto or options["episodes"] is not None or reset_time):
         raise click.UsageError("--continuous records one episode: leave --auto, --episodes and --reset-time out")
-    overrides = tuple(f"recording.{key}={value}" for key, value in (("dataset", dataset), ("root", root)) if value)
+    robot = _recorded(config, dataset, root, options)
     live = sys.stdin.isatty() and sys.stdout.isatty() and not options["headless"]
 
     def operator(runtime: Runtime) -> Operator:
@@ -48,4 +56,28 @@ def record(config: str | None, dataset: str | None, root: Path | None, **options
             auto=auto, continuous=continuous, keys=live,
         )  # fmt: skip
 
-    run_config(config, options, make_hooks=operator, recording=overrides, prompt=prompt or "")
+    request = LaunchRequest(
+        options["lockstep"], options["seed"], options["duration"], options["episodes"], options["goals"],
+        prompt=prompt or "", by_operator=True,
+    )  # fmt: skip
+    run_robot(
+        robot, request, headless=options["headless"], dry_run=options["dry_run"], as_json=options["as_json"],
+        make_hooks=operator,
+    )  # fmt: skip
+
+
+def _recorded(config: str | None, dataset: str | None, root: Path | None, options: dict[str, Any]) -> RobotConfig:
+    """The robot of a YAML, with a section `recording` where the YAML has none."""
+    registry = installed_plugins()
+    path = find_config(config, registry)
+    changes = run_overrides(options)
+    # An override within the section must not count as the section.
+    known = [change for change in changes if not change.startswith("recording.")]
+    robot = load_config(path, overrides=known, mode=options["mode"], sim=options["sim"], registry=registry)
+    made = []
+    if robot.recording is None:
+        made = [f"recording={{type: {registry.default('recorder')}, root: episodes, topics: contract}}"]
+    named = [f"recording.{key}={value}" for key, value in (("dataset", dataset), ("root", root)) if value]
+    return load_config(
+        path, overrides=(*made, *changes, *named), mode=options["mode"], sim=options["sim"], registry=registry
+    )

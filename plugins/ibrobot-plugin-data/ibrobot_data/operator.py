@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from math import inf
-from typing import TYPE_CHECKING, override
+from typing import override
 
-from ibrobot_core.errors import DiskFull, IbrobotError, NotSupported
-from ibrobot_core.interfaces import OperatorEvent
-from ibrobot_core.recording.service import EpisodeService
-from ibrobot_core.run_hooks import RunHooks
-from ibrobot_core.units import plural, seconds
-
-if TYPE_CHECKING:
-    from ibrobot_core.launch.session import Session
+from ibrobot_core.api import (
+    DiskFull,
+    EpisodeService,
+    IbrobotError,
+    NotSupported,
+    OperatorEvent,
+    RunHooks,
+    Session,
+    plural,
+    seconds,
+)
 
 _MIB = 1 << 20
 _START, _FAILURE, _DISCARD = "tab", "f11", "f12"
@@ -177,7 +180,7 @@ class Operator(RunHooks):
             self._begin(self._prompt)
             return
         # Letters of the prompt must not jog the arm.
-        self._run.pause_feed()
+        self._run.end_source()
         self._typed = ""
 
     def _type(self, key: str) -> None:

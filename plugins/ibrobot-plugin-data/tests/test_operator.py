@@ -1,0 +1,269 @@
+"""An operator's keys and buttons, and the flags of `ibrobot record`, with made-up runs in lockstep."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import attrs
+import pytest
+from ibrobot_data.operator import Operator
+from ibrobot_testing.fakes import FakeRecorder
+from ibrobot_testing.site import made_up_site
+
+from ibrobot_core.api import (
+    EpisodeService,
+    LaunchRequest,
+    NotSupported,
+    RecorderError,
+    Runtime,
+    Session,
+    SourceWorker,
+    installed_plugins,
+    load_config,
+)
+
+ROBOT = """\
+robot:
+  name: mini
+  joints:
+    - {name: pan, lower: -1.0, upper: 1.0, max_velocity: 2.0, max_acceleration: 10.0}
+    - {name: grip, lower: -1.0, upper: 1.0, max_velocity: 2.0, max_acceleration: 10.0}
+  groups: {arm: [pan], gripper: [grip]}
+hardware: {type: arm}
+simulation: {type: scene}
+executors:
+  arm_position: {type: position, group: arm}
+  grip_position: {type: position, group: gripper}
+models:
+  net: {type: net}
+control_modes:
+  teleop: {executors: [arm_position, grip_position], teleop: stick}
+  policy: {executors: [arm_position, grip_position], inference: {model: net}, dispatch: {watermark: 5}}
+  idle: {executors: [arm_position]}
+default_control_mode: teleop
+teleoperation:
+  stick: {type: stick}
+contract:
+  rate_hz: 25
+  max_duration_s: 1
+  observations:
+    - {key: observation.state, topic: /joint_states, select: [position.pan, position.grip]}
+  actions:
+    - {executor: arm_position, topic: /arm/commands}
+    - {executor: grip_position, topic: /grip/commands}
+control: {rate_hz: 50, stop: hold}
+recording: {type: lines, root: kept, dataset: pick}
+"""
+
+
+@attrs.frozen
+class Recording:
+    """A run and its operator."""
+
+    runtime: Runtime
+    operator: Operator
+
+    @property
+    def service(self) -> EpisodeService:
+        assert self.runtime.episode_service is not None
+        return self.runtime.episode_service
+
+    @property
+    def finished(self) -> bool:
+        return self.runtime.session.finished.is_set()
+
+    @property
+    def ended(self) -> list[tuple[int, str]]:
+        """Number and outcome of each episode that has ended."""
+        ended: list[tuple[int, str]] = sys.modules["arms"].ENDED
+        return ended
+
+    def keys(self, *keys: str) -> None:
+        for key in keys:
+            assert self.operator.key(key), key
+
+    def press(self, *events: str) -> None:
+        """Press buttons of the device."""
+        sys.modules["arms"].STICKS[-1].events = events
+
+    def step(self, count: int) -> None:
+        """Run for some ticks, or to the end of the run."""
+        for _ in range(count):
+            self.operator.step()
+            if self.runtime.step():
+                return
+
+
+Record = Callable[..., Recording]
+
+
+@pytest.fixture
+def record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Record]:
+    """Starts runs with an operator; stops those that a test leaves running."""
+    made: list[Runtime] = []
+    monkeypatch.chdir(tmp_path)
+    Path("mini.yaml").write_text(ROBOT)
+
+    def start(mode: str = "teleop", **asked: Any) -> Recording:
+        registry = installed_plugins()
+        config = load_config("mini.yaml", mode=mode, sim=True, registry=registry)
+        runtime = Runtime(Session(config, registry, LaunchRequest(lockstep=True, by_operator=True)))
+        made.append(runtime)
+        assert runtime.episode_service is not None
+        flags = {"count": None, "reset_time_s": 0.0, "prompt": None, "auto": False, "keys": True, **asked}
+        operator = Operator(runtime.session, runtime.episode_service, **flags)
+        runtime.start()
+        for _ in range(5):
+            assert not runtime.step()
+        return Recording(runtime, operator)
+
+    with made_up_site(tmp_path / "site", Path(__file__).parent, monkeypatch) as site:
+        site.add("arms", "arms.py")
+        yield start
+        for runtime in made:
+            runtime.stop()
+
+
+def test_tab_asks_for_a_prompt_and_enter_begins(record: Record):
+    run = record()
+    run.keys("tab", "h", "o", "p", "backspace", "space", "!")
+    assert "ho !_" in run.operator.rows()[0][1]
+    assert not run.service.running
+    run.keys("enter")
+    assert run.service.running
+    assert "recording “ho !”" in run.operator.line()
+    run.keys("tab")
+    assert (run.service.running, run.service.saved) == (False, 1)
+    run.keys("tab", "tab")
+    assert not run.service.running, "a second Tab goes back"
+    assert not run.operator.key("a"), "letters belong to the mode again"
+
+
+def test_the_arm_holds_while_a_prompt_is_typed(record: Record):
+    run = record()
+    source = run.runtime.session.command_source
+    assert isinstance(source, SourceWorker)
+    assert source.active
+    run.keys("tab", "w")
+    assert not source.active
+    run.keys("enter")
+    assert source.active
+
+
+def test_failure_and_discard(record: Record):
+    run = record(prompt="pick")
+    for end in ("f11", "f12"):
+        run.keys("tab")
+        run.step(2)
+        run.keys(end)
+        run.step(2)
+    assert run.ended == [(1, "failure"), (2, "discarded")]
+    assert run.service.saved == 1
+
+
+def test_buttons_of_the_device_begin_and_end_episodes(record: Record):
+    run = record(prompt="pick")
+    for event in ("start", "success", "start", "failure", "start", "discard"):
+        run.press(event)
+        run.step(3)
+        assert run.service.running == (event == "start")
+    assert run.ended == [(1, "success"), (2, "failure"), (3, "discarded")]
+    assert run.service.saved == 2
+
+
+def test_a_button_without_an_episode_to_end_says_so(record: Record):
+    run = record(prompt="pick")
+    run.press("failure")
+    run.step(3)
+    assert ("", "failure: no episode is being recorded") in run.operator.rows()
+
+
+def test_buttons_leave_episodes_alone_that_end_by_themselves(record: Record, caplog: pytest.LogCaptureFixture):
+    run = record(continuous=True, keys=False, prompt="watch")
+    run.step(3)
+    run.press("discard")
+    run.step(3)
+    assert run.service.running
+    assert "discard: this run begins and ends its episodes by itself" in caplog.text
+
+
+def test_unattended_episodes_pause_and_end_with_the_count(record: Record):
+    run = record(auto=True, count=2, reset_time_s=0.5, prompt="pick")
+    run.step(50 + 2)
+    assert run.service.saved == 1
+    assert "set up the scene again" in run.operator.line()
+    run.step(200)
+    assert run.finished
+    assert run.operator.summary_rows()[0][1].startswith("2 of 2 episodes into")
+    assert run.ended == [(1, "unknown"), (2, "unknown")]
+
+
+def test_why_it_does_not_begin_is_shown(record: Record):
+    run = record("idle", auto=True, prompt="")
+    run.step(3)
+    rows = run.operator.rows()
+    assert "topics are silent: /grip/commands" in rows[1][1]
+    assert [heading for heading, _ in rows] == ["record", "", "saved", "lost", "disk", "topics"]
+
+
+@pytest.mark.parametrize("auto", [False, True])
+def test_a_full_disk_ends_the_episode_and_it_does_not_count(
+    record: Record, monkeypatch: pytest.MonkeyPatch, auto: bool
+):
+    def full(*_: object) -> None:
+        raise RecorderError("its disk has 1 MiB left")
+
+    run = record(prompt="pick", auto=auto, count=1)
+    if not auto:
+        run.keys("tab")
+    run.step(3)
+    assert run.service.running
+    with monkeypatch.context() as patch:
+        patch.setattr(FakeRecorder, "write", full)
+        run.step(3)
+    assert (run.service.running, run.service.saved) == (False, 0)
+    assert ("", "recording ended: its disk has 1 MiB left") in run.operator.rows()
+    assert run.finished == auto, "the robot goes on where an operator is there"
+    if not auto:
+        run.keys("tab")
+        run.step(3)
+        assert run.service.running, "there is room again"
+        assert "" not in dict(run.operator.rows())
+
+
+def test_unattended_the_run_ends_without_room_for_another_episode(record: Record, monkeypatch: pytest.MonkeyPatch):
+    run = record(auto=True, prompt="pick")
+    run.step(40)
+    monkeypatch.setattr(run.service, "free_bytes", lambda: 1)
+    run.step(40)
+    assert run.finished
+    faults = run.runtime.session.outcome.faults
+    assert (run.service.saved, len(faults)) == (1, 1)
+    assert "0 MiB left" in faults[0]
+
+
+def test_continuous_is_one_episode_to_the_end_of_the_run(record: Record):
+    run = record(continuous=True, keys=False, prompt="watch")
+    run.step(120)
+    assert run.service.elapsed_s() > 2 * run.runtime.session.config.contract.max_duration_s
+    assert run.operator.line().startswith("recording “watch”, 2 s, saved")
+    assert not run.operator.key("tab")
+    run.runtime.stop()
+    assert run.ended == [(1, "unknown")]
+    assert run.service.saved == 1
+    assert [path.name for path in Path("kept/pick/episodes").iterdir()] == ["episode_000001"]
+
+
+def test_continuous_means_nothing_where_the_mode_has_episodes(record: Record):
+    with pytest.raises(NotSupported, match="mode policy begins and ends its episodes itself") as caught:
+        record("policy", continuous=True)
+    assert caught.value.exit_code == 2
+
+
+def test_nobody_can_begin_an_episode_without_keys_and_auto(record: Record):
+    with pytest.raises(NotSupported, match="add --auto") as caught:
+        record(keys=False)
+    assert caught.value.exit_code == 2
