@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 import attrs
 
-from ibrobot_core.api import Pose, Vector3, documented, option
-from ibrobot_planning.transforms import from_rpy
+from ibrobot_core.api import documented, option
 
 if TYPE_CHECKING:
     from ibrobot_planning.world import WorldObject
@@ -58,6 +57,8 @@ class ObjectOptions:
         Raises:
             ValueError: for a size that cannot be meant, or a mesh that cannot be read.
         """
+        from ibrobot_core.api import Pose, Vector3
+        from ibrobot_planning.transforms import from_rpy
         from ibrobot_planning.world import Box, Capsule, Cylinder, Plane, Shape, Sphere, WorldObject, read_mesh
 
         shape: Shape
