@@ -78,8 +78,7 @@ class EpisodeDataset:
             TemporaryFile(dir=folder).close()
         except OSError as error:
             raise RecorderError(
-                f"recording.root: {self._folder} cannot be written: {folder}: {error.strerror}; "
-                "--root records elsewhere"
+                f"recording.root: {self._folder} cannot be written: {folder}: {error.strerror}; choose another root"
             ) from None
 
     def _read(self) -> dict[str, Any]:

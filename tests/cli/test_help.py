@@ -62,11 +62,14 @@ def test_wrong_usage_exits_with_2(ibrobot: Ibrobot) -> None:
     assert "No such command 'lunch'" in ran.err
 
 
-def test_command_of_a_missing_plugin_names_the_package(ibrobot: Ibrobot, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("command", ["convert", "record", "replay"])
+def test_command_of_a_missing_plugin_names_the_package(
+    ibrobot: Ibrobot, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
     monkeypatch.setattr("ibrobot_core.plugins.installed_plugins", Registry)
-    ran = ibrobot("convert", "episodes", "--out", "dataset")
+    ran = ibrobot(command, "so101")
 
-    told = "error: ibrobot convert needs a plugin that is not installed: pip install ibrobot-plugin-data\n"
+    told = f"error: ibrobot {command} needs a plugin that is not installed: pip install ibrobot-plugin-data\n"
     assert (ran.code, ran.out, ran.err) == (2, "", told)
 
 

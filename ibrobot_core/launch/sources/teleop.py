@@ -79,7 +79,7 @@ class TeleopSource(SourceWorker):
         if event == "intervention":
             session.log.warning("%s: mode %s has no policy to take the robot from", event, self.mode.name)
         elif not session.request.by_operator:
-            session.log.warning("%s: this run records no episodes by hand; `ibrobot record` does", event)
+            session.log.warning("%s: this run records no episodes by hand", event)
         else:
             session.operator_events.put(event)
 
