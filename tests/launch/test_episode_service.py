@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
 import yaml
@@ -68,7 +68,7 @@ def test_services_begin_end_and_discard_episodes(run: Runtime, runs: Runs):
     assert ("ended", 1, "failure") in runs.parts.EVENTS
     assert ("ended", 2, "discarded") in runs.parts.EVENTS
     assert run.episode_service is not None
-    assert service(run).saved == 1
+    assert run.episode_service.saved == 1
     assert folders(runs) == ["episode_000001"]
 
 
