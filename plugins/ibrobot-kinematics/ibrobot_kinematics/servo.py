@@ -13,9 +13,10 @@ from enum import IntEnum
 import attrs
 import numpy as np
 
-from ibrobot_core.api import Vector, documented, ns, option, seconds
+from ibrobot_core.api import Vector, ns, seconds
 from ibrobot_kinematics.model import KinematicModel, TipPose
 from ibrobot_kinematics.quadratic import bounded_minimum
+from ibrobot_kinematics.servo_options import ServoOptions
 
 _LEVER_M = 0.1
 """Turning the tip by a radian weighs as much as moving it by this [m]."""
@@ -30,6 +31,7 @@ _AT_REST = 1e-6
 """Speed of joints [rad/s or m/s] that counts as none."""
 _LONGEST_TICK_S = 0.1
 """A longer gap between steps counts as a stop: what was missed is not made up for."""
+_DEFAULTS = ServoOptions()
 
 
 class ServoStatus(IntEnum):
@@ -45,33 +47,6 @@ class ServoStatus(IntEnum):
     JOINT_BOUND = 5
     """A joint is near its limit, or the tool at the edge of its reach."""
     DECELERATE_FOR_LEAVING_SINGULARITY = 6
-
-
-@documented
-@attrs.frozen
-class ServoOptions:
-    """When a tool slows down and stops."""
-
-    timeout: float = option(0.1, unit="s", gt=0, le=1, help="how long a twist is valid; then the tool slows to a stop")
-    max_linear: float = option(1.0, unit="m/s", gt=0, help="twists faster than that are refused")
-    max_angular: float = option(6.0, unit="rad/s", gt=0, help="twists that turn faster are refused")
-    lower_singularity_threshold: float = option(
-        30.0, gt=1, help="condition number of the Jacobian, at a lever of 0.1 m, from which the tool slows down"
-    )
-    hard_stop_singularity_threshold: float = option(100.0, gt=1, help="condition number at which it stops")
-    joint_limit_margin: float = option(
-        0.1, unit="rad", gt=0, help="distance from its limit within which a joint slows down from its full speed"
-    )
-    slow_distance: float = option(0.05, unit="m", gt=0, help="distance from an obstacle from which the tool slows down")
-    stop_distance: float = option(0.01, unit="m", ge=0, help="distance from an obstacle at which it stops")
-
-    def __attrs_post_init__(self) -> None:
-        for low, high in (
-            ("lower_singularity_threshold", "hard_stop_singularity_threshold"), ("stop_distance", "slow_distance"),
-        ):  # fmt: skip
-            below, above = attrs.asdict(self)[low], attrs.asdict(self)[high]
-            if not below < above:
-                raise ValueError(f"{low} is {below:g}, must be below {high}, which is {above:g}")
 
 
 @attrs.frozen(eq=False)
@@ -111,7 +86,7 @@ class Servo:
         model: KinematicModel,
         max_velocity: Vector,
         max_acceleration: Vector,
-        options: ServoOptions = ServoOptions(),
+        options: ServoOptions = _DEFAULTS,
         *,
         clearance: Callable[[Vector], float] | None = None,
         turn_weights: Sequence[float] = (0.05, 1.0, 1.0),

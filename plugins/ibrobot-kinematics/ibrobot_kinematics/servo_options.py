@@ -1,0 +1,34 @@
+"""When a tool that follows twists slows down and stops. Nothing here imports NumPy."""
+
+from __future__ import annotations
+
+import attrs
+
+from ibrobot_core.api import documented, option
+
+
+@documented
+@attrs.frozen
+class ServoOptions:
+    """When a tool slows down and stops."""
+
+    timeout: float = option(0.1, unit="s", gt=0, le=1, help="how long a twist is valid; then the tool slows to a stop")
+    max_linear: float = option(1.0, unit="m/s", gt=0, help="twists faster than that are refused")
+    max_angular: float = option(6.0, unit="rad/s", gt=0, help="twists that turn faster are refused")
+    lower_singularity_threshold: float = option(
+        30.0, gt=1, help="condition number of the Jacobian, at a lever of 0.1 m, from which the tool slows down"
+    )
+    hard_stop_singularity_threshold: float = option(100.0, gt=1, help="condition number at which it stops")
+    joint_limit_margin: float = option(
+        0.1, unit="rad", gt=0, help="distance from its limit within which a joint slows down from its full speed"
+    )
+    slow_distance: float = option(0.05, unit="m", gt=0, help="distance from an obstacle from which the tool slows down")
+    stop_distance: float = option(0.01, unit="m", ge=0, help="distance from an obstacle at which it stops")
+
+    def __attrs_post_init__(self) -> None:
+        for low, high in (
+            ("lower_singularity_threshold", "hard_stop_singularity_threshold"), ("stop_distance", "slow_distance"),
+        ):  # fmt: skip
+            below, above = attrs.asdict(self)[low], attrs.asdict(self)[high]
+            if not below < above:
+                raise ValueError(f"{low} is {below:g}, must be below {high}, which is {above:g}")
