@@ -20,6 +20,7 @@ _PARALLEL = 1e-4
 _NO_LENGTH = 1e-9
 _NEARLY_VERTICAL = 0.02
 """Horizontal part of a direction below which the pan is nearly undetermined and is sampled."""
+_PANS = 36
 _TURN = 2 * np.pi
 
 type Complex = np.ndarray[tuple[int, ...], np.dtype[np.complex128]]
@@ -81,12 +82,7 @@ class PanPlanarRoll:
         ax, ay, az = self.points * (self.frame @ axis)
         heading = np.arctan2(ay, ax)
         pan = np.array([heading, heading, heading + np.pi, heading + np.pi])
-        reach = abs(self.offset)
-        if reach > _NO_LENGTH:
-            cosine = (np.cos(pan) * y - np.sin(pan) * x - self.lateral) / reach
-            roll = np.arccos(np.clip(cosine, -1, 1)) * [1, -1, 1, -1] - np.angle(self.offset)
-        else:
-            roll = np.full(4, self._turned(start)[4])
+        roll = self._rolls_at(x, y, pan, np.array([1, -1, 1, -1]), start)
         branch = np.arange(4)
         if np.hypot(ax, ay) < _NEARLY_VERTICAL:
             rolls = self._rolls(start, 24)
@@ -99,15 +95,22 @@ class PanPlanarRoll:
     def at(self, position: Vector, axis: Vector | None, start: Vector, *, pitches: int, rolls: int) -> Candidates:
         """Four branches, two of the pan and two of the elbow; the free pitch and roll are sampled.
 
+        Near the pan's axis there are four more, in which the pan is sampled in place of the roll.
+
         The first sample is that of `start`. The arguments are as in `with_axis`; an axis only affects `turned`.
         """
         x, y, _ = self.frame @ (position - self.origin)
         at_start = self._turned(start)
         roll = self._rolls(start, rolls)
         pitch = at_start[1:4].sum() + np.arange(pitches) * (_TURN / pitches)
-        pan = np.concatenate(self._pans(x, y, roll))
-        pan, roll = np.repeat(pan, pitches), np.repeat(np.tile(roll, 2), pitches)
-        branch = np.repeat([0, 1], len(pan) // 2)
+        pan, roll = np.concatenate(self._pans(x, y, roll)), np.tile(roll, 2)
+        branch = np.repeat([0, 1], rolls)
+        if np.hypot(x, y) < 2 * abs(self.offset) + abs(self.lateral):
+            # So near the pan's axis all pans are possible, within a small range of rolls.
+            around, side = np.tile(np.arange(_PANS) * (_TURN / _PANS), 2), np.repeat([1, -1], _PANS)
+            pan, roll = np.append(pan, around), np.append(roll, self._rolls_at(x, y, around, side, start))
+            branch = np.append(branch, np.repeat([2, 3], _PANS))
+        pan, roll, branch = (np.repeat(each, pitches) for each in (pan, roll, branch))
         return self._solved(position, axis, start, pan, np.tile(pitch, len(pan) // pitches), roll, branch)
 
     def _turned(self, joints: Vector) -> Vector:
@@ -118,6 +121,14 @@ class PanPlanarRoll:
         """Samples of the roll within its limits, that of `start` first."""
         among = np.linspace(self.lower[4], self.upper[4], number - 1)
         return np.asarray((np.append(start[4], among) - self.reference[4]) * self.signs[4])
+
+    def _rolls_at(self, x: float, y: float, pan: Vector, side: Vector, start: Vector) -> Vector:
+        """The roll on each side with which the arm's plane, at each pan, contains the target."""
+        reach = abs(self.offset)
+        if reach < _NO_LENGTH:
+            return np.full(len(pan), self._turned(start)[4])
+        cosine = (np.cos(pan) * y - np.sin(pan) * x - self.lateral) / reach
+        return np.asarray(np.arccos(np.clip(cosine, -1, 1)) * side - np.angle(self.offset))
 
     def _pans(self, x: float, y: float, roll: Vector) -> tuple[Vector, Vector]:
         """Both pan angles at which the arm's plane, with this roll, contains the target."""

@@ -21,16 +21,21 @@ _POLISHING = 15
 """Iterations that correct the difference between the arm and its ideal geometry."""
 _NEAR_MISSES = 2
 """Number of searches from the candidates with the smallest errors, per branch of the closed form."""
-_ROUNDS = (16, 100)
+_ROUNDS = (12, 100)
 """Number of parallel searches after the one from the start."""
 _SHORT, _LONG = 5, 15
 """Iterations of all searches, and of the best ones."""
 _BEST = 4
 _LEAST_WEIGHT, _WEIGHT, _GREAT_WEIGHT = 10.0, 100.0, 1e4
 """Weights of position errors [rad/m]: minimum; if searches begin at the position; if position has priority."""
+_APART = 0.5
+"""Searches for the nearest point begin at configurations with a joint that differs by more [rad or m]."""
+_OUT_OF_REACH_M = 0.005
+_BY_POSITION = 8
+"""Where all that was found misses the position by more, this many searches start near the position."""
 _SHIFTS = 3
 """How often to shift the target until its position is met with the nearest orientation."""
-_ONE = 0.02
+_SAME = 0.02
 """Solutions whose joints all differ by less count as equal [rad or m]."""
 
 type Indices = np.ndarray[tuple[int], np.dtype[np.intp]]
@@ -218,11 +223,14 @@ def _placed(model: KinematicModel, start: Vector, joints: Vector) -> Vector:
     return q
 
 
-def _distinct(solutions: Vector) -> list[Vector]:
+def _distinct(solutions: Vector, apart: float = _SAME, most: int | None = None) -> list[Vector]:
+    """The first of those that differ in no joint by more than `apart` [rad or m]; at most `most`."""
     kept: list[Vector] = []
     for q in solutions:
-        if all(np.abs(q - other).max() > _ONE for other in kept):
+        if all(np.abs(q - other).max() > apart for other in kept):
             kept.append(q)
+            if len(kept) == most:
+                break
     return kept
 
 
@@ -234,12 +242,18 @@ def _nearest(model: KinematicModel, target: Target, near: Vector) -> Vector:
     methods, 1969).
     """
     off, turned = target.missed(model.forward(near))
-    near = np.concatenate([near[_ranked(off, turned, weight)[:_BEST]] for weight in (_WEIGHT, _GREAT_WEIGHT)])
-    shifted, shifts = near, np.zeros((len(near), 3))
-    if len(target.columns) > 1:
+    by_weight = (near[_ranked(off, turned, weight)] for weight in (_WEIGHT, _GREAT_WEIGHT))
+    begin = np.array([q for ranked in by_weight for q in _distinct(ranked, _APART, _BEST)])
+    iterations = _LONG
+    if len(target.columns) == 1:
+        near = begin
+    elif off.min() > _OUT_OF_REACH_M:
+        near = np.concatenate([begin, starts_from_table(model, target, near[0], _BY_POSITION, lever=0.0)])
+    else:
+        near, shifts, iterations = begin, np.zeros((len(begin), 3)), _SHORT
         for _ in range(_SHIFTS):
-            shifted = search(model, target, shifted, position_weight=_WEIGHT, iterations=_SHORT, shifts=shifts).joints
-            shifts += target.position - model.forward(shifted).position
-        near = np.concatenate([shifted, near[_BEST:]])
-    found = search(model, target, near, position_weight=_GREAT_WEIGHT, iterations=_LONG)
-    return np.asarray(found.best(1, _GREAT_WEIGHT)[0])
+            near = search(model, target, near, position_weight=_WEIGHT, iterations=_SHORT, shifts=shifts).joints
+            shifts += target.position - model.forward(near).position
+    found = search(model, target, near, position_weight=_GREAT_WEIGHT, iterations=iterations)
+    near = np.concatenate([found.joints, begin])
+    return np.asarray(near[_ranked(*target.missed(model.forward(near)), _GREAT_WEIGHT)[0]])

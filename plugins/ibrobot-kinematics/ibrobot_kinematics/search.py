@@ -21,7 +21,7 @@ _NO_GAIN = 1e-9
 _DAMPING, _LEAST_DAMPING = 1e-2, 1e-9
 _BOUND_PASSES = 2
 _TABLE_SIZE = 4096
-_TABLE_LEVER_M = 0.3
+TABLE_LEVER_M = 0.3
 """Weight of rotation when looking up starting points: a radian counts as much as this distance [m]."""
 
 type Flags = np.ndarray[tuple[int], np.dtype[np.bool_]]
@@ -160,7 +160,9 @@ def _bounded_step(hessian: Vector, gradient: Vector, damping: Vector, lower: Vec
     return step
 
 
-def starts_from_table(model: KinematicModel, target: Target, start: Vector, number: int) -> Vector:
+def starts_from_table(
+    model: KinematicModel, target: Target, start: Vector, number: int, *, lever: float = TABLE_LEVER_M
+) -> Vector:
     """Configurations whose tip is near the target, nearest first, shape (number, J).
 
     Args:
@@ -168,10 +170,11 @@ def starts_from_table(model: KinematicModel, target: Target, start: Vector, numb
         target: where to bring the tip.
         start: positions of the joints that do not move the tip, shape (J,).
         number: number of configurations, at most the size of the table.
+        lever: distance that counts as much as a rotation by one radian [m]; 0 for positions alone.
     """
     joints, tips = _table(model)
     off, turned = target.missed(tips)
-    nearest = np.argsort(np.hypot(off, _TABLE_LEVER_M * turned), kind="stable")[:number]
+    nearest = np.argsort(np.hypot(off, lever * turned), kind="stable")[:number]
     starts = np.tile(start, (number, 1))
     starts[:, model.moving] = joints[nearest]
     return starts

@@ -126,6 +126,14 @@ def test_where_only_the_axis_is_impossible_the_position_is_met(so101: KinematicM
     assert turned_there <= turned + 0.01
 
 
+def test_beside_the_axis_of_the_pan_all_pans_are_tried(so101: KinematicModel):
+    axis = np.array([-0.884988, -0.370749, -0.281677])
+    target = Target([0.0380025, 0.0015974, 0.4168580], axis=axis / np.linalg.norm(axis))
+    error = refused(so101, target)
+    assert error.position_error < 1e-5
+    assert error.rotation_error < 0.85
+
+
 def test_many_configurations_at_once_give_what_single_ones_do(so101: KinematicModel):
     q = anywhere(so101, 6, 3).reshape(2, 3, 6)
     tips, jacobians = so101.forward_and_jacobian(q)
