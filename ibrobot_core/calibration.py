@@ -1,4 +1,4 @@
-"""Calibrations: where each joint's zero and range lie in servo ticks; files as LeRobot and IB-Robot have them."""
+"""Calibrations: zero and range of each joint in servo ticks, in the file formats of LeRobot and IB-Robot."""
 
 from __future__ import annotations
 
@@ -18,37 +18,37 @@ from ibrobot_core.errors import CalibrationError
 from ibrobot_core.units import TICKS_PER_TURN
 
 VERSION = 2
-"""Of the companion file. Version 1 did not say where 0 rad is: it was the pose."""
+"""Version of the companion file. Version 1 had no `zero_at`; 0 rad was at the pose."""
 ZERO_AT_POSE, ZERO_AT_RANGE = "pose", "range"
 ZERO_AT: Mapping[str, str] = {
     ZERO_AT_POSE: "the pose that was set by hand at calibration (tick 2048)",
     ZERO_AT_RANGE: "the middle of each joint's calibrated range, as in LeRobot",
 }
-"""Where a joint is at 0 rad, and what that means."""
+"""The choices for the position of 0 rad, with their meaning."""
 MAX_HOMING_OFFSET = 2047
-"""Greatest homing offset that a servo can keep: sign and 11 bits."""
+"""Greatest homing offset that a servo can store (sign and 11 bits)."""
 MIDDLE_TICK = TICKS_PER_TURN // 2
 _LAST = TICKS_PER_TURN - 1
 
 
 @attrs.frozen
 class JointCalibration:
-    """One joint, by LeRobot's names (`MotorCalibration`)."""
+    """The calibration of one joint, with LeRobot's field names (`MotorCalibration`)."""
 
     id: int
-    """Of the servo."""
+    """Id of the servo."""
     drive_mode: int
-    """1 where radians fall while ticks grow."""
+    """1 if radians decrease as ticks increase."""
     homing_offset: int
-    """What the servo takes from its encoder's position before it reports it [ticks], -2047 to 2047."""
+    """Offset that the servo subtracts from its encoder position [ticks], -2047 to 2047."""
     range_min: int
     """Least reported position [ticks], 0 to 4094."""
     range_max: int
     """Greatest reported position [ticks], above `range_min`, at most 4095."""
     zero_at: str = ZERO_AT_POSE
-    """Where it is at 0 rad: one of `ZERO_AT`. LeRobot's files do not have it."""
+    """Position of 0 rad: one of `ZERO_AT`. Not present in LeRobot's files."""
     closed_at: float | None = None
-    """Its lower limit [rad], where the hardware anchors the joint at its closed end; recordings alone have it."""
+    """Lower limit [rad] if the hardware anchors the joint at its closed end; set only in recordings."""
 
     def __attrs_post_init__(self) -> None:
         for name, value in self.numbers().items():
@@ -79,7 +79,7 @@ class JointCalibration:
 
     @property
     def inverted(self) -> bool:
-        """Whether radians fall while ticks grow."""
+        """Whether radians decrease as ticks increase."""
         return self.drive_mode == 1
 
     @property
@@ -88,15 +88,15 @@ class JointCalibration:
         return (self.range_min + self.range_max) / 2
 
     def numbers(self) -> dict[str, int]:
-        """The numbers alone, as LeRobot's file has them."""
+        """The numbers in the form of LeRobot's file."""
         return {name: getattr(self, name) for name in _NUMBERS}
 
     def zero(self, lower: float | None = None) -> float:
-        """The tick at which the joint is at 0 rad: the encoder's middle or the range's, as `zero_at` says.
+        """The tick of 0 rad: the middle of the encoder or of the range, depending on `zero_at`.
 
         Args:
-            lower: for a joint that is anchored at its closed end instead, as a gripper is: its lower limit [rad]. The
-                closed end is at `range_min`, or at `range_max` where inverted.
+            lower: lower limit [rad] of a joint that is anchored at its closed end instead, such as a gripper. The
+                closed end is at `range_min`, or at `range_max` if inverted.
         """
         if lower is None:
             return float(MIDDLE_TICK) if self.zero_at == ZERO_AT_POSE else self.range_middle
@@ -113,17 +113,17 @@ class Calibration:
     """A whole arm."""
 
     joints: Mapping[str, JointCalibration]
-    """By name, in the order of the servos."""
+    """Joints by name, in the order of the servos."""
     robot: str = ""
-    """Which arm it is."""
+    """Name of the arm."""
     date: str = ""
-    """When it was made: ISO 8601, UTC."""
+    """Date of the calibration: ISO 8601, UTC."""
     adapter: str = ""
-    """USB serial number of the adapter that it was calibrated at; empty where that has none."""
+    """USB serial number of the adapter used for the calibration; empty if it has none."""
     version: int = VERSION
-    """Of the layout of the file beside the numbers."""
+    """Version of the companion file's layout."""
     path: Path | None = None
-    """Where it was loaded from."""
+    """The file it was loaded from."""
 
     def __attrs_post_init__(self) -> None:
         owners: dict[int, str] = {}
@@ -136,21 +136,21 @@ class Calibration:
 
     @property
     def zero_at(self) -> str:
-        """Where its joints are at 0 rad: one of `ZERO_AT`."""
+        """Position of 0 rad, the same for all joints: one of `ZERO_AT`."""
         return next((joint.zero_at for joint in self.joints.values()), ZERO_AT_POSE)
 
     def with_zero_at(self, zero_at: str) -> Calibration:
-        """The same calibration with 0 rad elsewhere."""
+        """A copy with another position of 0 rad."""
         return attrs.evolve(
             self, joints={name: attrs.evolve(joint, zero_at=zero_at) for name, joint in self.joints.items()}
         )
 
     def numbers(self) -> dict[str, dict[str, int]]:
-        """The numbers alone, as LeRobot's file has them."""
+        """The numbers in the form of LeRobot's file."""
         return {name: joint.numbers() for name, joint in self.joints.items()}
 
     def snapshot(self) -> dict[str, dict[str, Any]]:
-        """Joint -> fields of `JointCalibration` that a calibration has; `closed_at` is the hardware's."""
+        """The fields of `JointCalibration` by joint, without `closed_at`, which the hardware sets."""
         return {name: {**joint.numbers(), "zero_at": joint.zero_at} for name, joint in self.joints.items()}
 
     def fingerprint(self) -> str:
@@ -159,10 +159,10 @@ class Calibration:
 
 
 def calibration_path(name: str | Path) -> Path:
-    """Where a calibration lies.
+    """The path of a calibration.
 
     Args:
-        name: a path, which has a slash or ends in `.json`; or a name, which stands for `NAME.json` in
+        name: a path (anything with a slash or ending in `.json`), or a name, which stands for `NAME.json` in
             `$XDG_CONFIG_HOME/ibrobot/calibration` (`~/.config/ibrobot/calibration`).
     """
     if isinstance(name, Path) or "/" in name or name.endswith(".json"):
@@ -172,7 +172,7 @@ def calibration_path(name: str | Path) -> Path:
 
 
 def companion_path(path: Path) -> Path:
-    """The file beside a calibration that says what it is of: arm, date, adapter, place of 0 rad, hash."""
+    """The path of the companion file, which holds arm, date, adapter, position of 0 rad and hash."""
     return path.with_suffix(".meta.json")
 
 
@@ -181,17 +181,18 @@ def load_calibration(
 ) -> Calibration:
     """Load a calibration: LeRobot's JSON (motor -> numbers) or IB-Robot's (servo id -> numbers).
 
-    Its companion says where 0 rad is. A file without one is another program's: in LeRobot 0 is the middle of the range,
-    in IB-Robot the pose that was set by hand.
+    The companion file gives the position of 0 rad. A file without one comes from another program: in LeRobot 0 is the
+    middle of the range, in IB-Robot the pose set by hand.
 
     Args:
         name: a name or a path, see `calibration_path`.
-        joints: names of the joints that it must have; for IB-Robot's file, in the order of their ids from 1.
-        zero_at: put 0 rad there, one of `ZERO_AT`, whatever the companion says and whichever numbers it is of.
-        tool: the command with `calibrate` and `import` for this hardware, named in errors, e.g. `ibrobot my_arm`.
+        joints: names of the required joints; for IB-Robot's file, in the order of their ids from 1.
+        zero_at: position of 0 rad, one of `ZERO_AT`; overrides the companion file, whose hash is then not checked.
+        tool: the command that has `calibrate` and `import` for this hardware, for error messages, e.g.
+            `ibrobot my_arm`.
 
     Raises:
-        CalibrationError: when it is missing or cannot be true; names file, joint, key, value and what would be right.
+        CalibrationError: if it is missing or invalid; names file, joint, key, value and the valid values.
     """
     path = calibration_path(name)
     text, document = _document(path, tool)
@@ -241,7 +242,7 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _line(text: str, *keys: str) -> int:
-    """The line of the last of nested keys that is there."""
+    """The line of the innermost of the nested keys that exists."""
     position = 0
     for key in keys:
         found = re.compile(re.escape(json.dumps(key)) + r"\s*:").search(text, position)
@@ -260,7 +261,7 @@ def _joint(numbers: Any) -> JointCalibration:
 
 
 def _by_name(document: dict[str, Any], path: Path, joints: Sequence[str] | None) -> dict[str, Any]:
-    """IB-Robot's file as LeRobot's: servo ids become names, and are repeated as `id`."""
+    """Convert IB-Robot's format to LeRobot's: servo ids become names and are repeated as `id`."""
     if joints is None:
         raise CalibrationError(f"{path}: its joints are numbered; say which joint each number is")
     named = {}

@@ -1,4 +1,4 @@
-"""The two clocks: `real`, whose deadlines are wall time, and `lockstep`, which advances when a tick's work is done."""
+"""The two clocks: `real` follows wall time; `lockstep` advances when the work of a tick is done."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ibrobot_core.units import NS_PER_S
 
 
 class Clock(ABC):
-    """Where every stamp comes from, in integer nanoseconds."""
+    """The source of all time stamps, in integer nanoseconds."""
 
     @abstractmethod
     def now_ns(self) -> int:
@@ -18,14 +18,14 @@ class Clock(ABC):
 
     @abstractmethod
     def sleep_until(self, deadline_ns: int) -> None:
-        """Return at `deadline_ns` [ns] or at once when it has passed."""
+        """Return at `deadline_ns` [ns], or at once if it has passed."""
 
 
 class RealClock(Clock):
     """Monotonic time shifted to the Unix epoch once, so that stamps are dates and never jump.
 
     Args:
-        epoch_offset_ns: epoch time minus monotonic time [ns]. Processes of one run share the host's.
+        epoch_offset_ns: epoch time minus monotonic time [ns]. All processes of a run use the host's value.
     """
 
     def __init__(self, epoch_offset_ns: int | None = None) -> None:
@@ -54,14 +54,14 @@ class SteppedClock(Clock):
 
     @override
     def sleep_until(self, deadline_ns: int) -> None:
-        """Move time to `deadline_ns` when that lies ahead."""
+        """Move time to `deadline_ns` if that is in the future."""
         self._now_ns = max(self._now_ns, deadline_ns)
 
     def advance(self, step_ns: int) -> int:
-        """Move time on by `step_ns` [ns] and return it.
+        """Advance time by `step_ns` [ns] and return the new time.
 
         Raises:
-            ValueError: for a negative step, since no clock here runs backwards.
+            ValueError: for a negative step, because clocks never run backwards.
         """
         if step_ns < 0:
             raise ValueError(f"step_ns must not be negative, got {step_ns}")

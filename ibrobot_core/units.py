@@ -1,4 +1,4 @@
-"""Conversions between SI and the units of drivers and datasets; nowhere else are there any."""
+"""All conversions between SI and the units of drivers and datasets."""
 
 from __future__ import annotations
 
@@ -32,22 +32,22 @@ def radians(degrees: float) -> float:
 
 
 TICKS_PER_TURN = 4096
-"""Positions of a servo's encoder in one turn (12 bit)."""
+"""Encoder positions per turn of a servo (12 bit)."""
 
 NORM_MODES = ("radians", "degrees", "range_m100_100")
-"""Units that a dataset or a policy may have joint positions in: SI, or LeRobot's for an arm."""
+"""Units of joint positions in datasets and policies: SI or LeRobot's."""
 
 LEROBOT_MODES = ("range_m100_100", "range_0_100", "degrees")
-"""Units of joint positions in LeRobot, by the names of its `MotorNormMode`."""
+"""LeRobot's units of joint positions, named as in its `MotorNormMode`."""
 
 
 def ticks_to_radians[T: (float, NDArray[Any])](ticks: T, *, zero: ArrayLike = 2048.0, inverted: ArrayLike = False) -> T:
     """Servo ticks -> radians: `(ticks - zero) 2 pi / 4096`, negated for an inverted joint.
 
     Args:
-        ticks: positions as the servo reports them; a number, or an array of any shape.
+        ticks: positions reported by the servo; a number or an array of any shape.
         zero: the tick at which the joint is at 0 rad; a number, or one per joint.
-        inverted: whether radians fall while ticks grow (LeRobot's `drive_mode` 1); likewise.
+        inverted: whether radians decrease as ticks increase (LeRobot's `drive_mode` 1); likewise.
     """
     converted: T = (ticks - np.asarray(zero)) * _sign(inverted) * (2 * math.pi / TICKS_PER_TURN)
     return converted
@@ -66,15 +66,15 @@ def ticks_to_lerobot[T: (float, NDArray[Any])](
 ) -> T:
     """Servo ticks -> LeRobot's units, as its `MotorsBus` (0.6) normalises them.
 
-    - `range_m100_100`: `range_min`..`range_max` -> -100..100, clipped; negated where inverted.
-    - `range_0_100` (the gripper): -> 0..100, clipped; 100 less it where inverted.
+    - `range_m100_100`: `range_min`..`range_max` -> -100..100, clipped; negated if inverted.
+    - `range_0_100` (the gripper): -> 0..100, clipped; subtracted from 100 if inverted.
     - `degrees`: from the middle of the range, `360 / 4095` degrees a tick, neither clipped nor inverted.
 
     Args:
-        ticks: positions as the servo reports them; a number, or an array of any shape.
+        ticks: positions reported by the servo; a number or an array of any shape.
         mode: one of `LEROBOT_MODES`.
         range_min: the least position of the calibrated range [ticks]; a number, or one per joint.
-        range_max: the greatest; likewise.
+        range_max: the greatest position; likewise.
         inverted: LeRobot's `drive_mode` 1; likewise.
 
     Raises:
@@ -97,7 +97,7 @@ def ticks_to_lerobot[T: (float, NDArray[Any])](
 def lerobot_to_ticks[T: (float, NDArray[Any])](
     values: T, mode: str, *, range_min: ArrayLike, range_max: ArrayLike, inverted: ArrayLike = False
 ) -> T:
-    """LeRobot's units -> servo ticks, not rounded (LeRobot cuts the fraction off); see `ticks_to_lerobot`.
+    """LeRobot's units -> servo ticks, not rounded (LeRobot truncates them); see `ticks_to_lerobot`.
 
     Raises:
         ValueError: for an unknown mode or an empty range.
@@ -124,7 +124,7 @@ def radians_to_lerobot[T: (float, NDArray[Any])](
     zero: ArrayLike = 2048.0,
     inverted: ArrayLike = False,
 ) -> T:
-    """Radians -> LeRobot's units, by way of ticks that are not rounded; see `ticks_to_radians`, `ticks_to_lerobot`.
+    """Radians -> LeRobot's units, by way of unrounded ticks; see `ticks_to_radians`, `ticks_to_lerobot`.
 
     Raises:
         ValueError: for an unknown mode or an empty range.
@@ -142,7 +142,7 @@ def lerobot_to_radians[T: (float, NDArray[Any])](
     zero: ArrayLike = 2048.0,
     inverted: ArrayLike = False,
 ) -> T:
-    """LeRobot's units -> radians, by way of ticks that are not rounded; the inverse of `radians_to_lerobot`.
+    """LeRobot's units -> radians, by way of unrounded ticks; the inverse of `radians_to_lerobot`.
 
     Raises:
         ValueError: for an unknown mode or an empty range.
@@ -165,5 +165,5 @@ def _range(mode: str, range_min: ArrayLike, range_max: ArrayLike) -> tuple[Any, 
 
 
 def plural(number: int, noun: str) -> str:
-    """The noun as it follows a number of things: `1 episode`, `2 episodes`."""
+    """The noun in the form that fits the number: `1 episode`, `2 episodes`."""
     return noun if number == 1 else f"{noun}s"

@@ -121,7 +121,7 @@ def _stop_on_signals(session: Session, keys: KeyReader | None) -> None:
             os._exit(_INTERRUPTED_TWICE)
         if number == signal.SIGHUP:  # the terminal may be gone: what is written to it must not fail
             _discard(terminals)
-        if session.request.lockstep:  # nobody waits for the end, which comes at a tick
+        if session.request.lockstep:  # does not block: the run ends at a tick
             finish()
         else:  # see `on_signals`
             threading.Thread(target=finish, name="signal", daemon=True).start()

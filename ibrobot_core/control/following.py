@@ -15,7 +15,7 @@ class FollowingError:
 
     A joint is away when that is more than `distance` (or half of its `max_lead`, where that is less) plus what a servo
     lags behind at the setpoint's speed. Away for `timeout` without a break, it does not follow. Joints that grip may
-    stay away for ever: that is how they hold an object.
+    stay away indefinitely: that is how they hold an object.
 
     Args:
         options: distance and timeout.

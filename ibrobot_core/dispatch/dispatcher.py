@@ -1,4 +1,4 @@
-"""The dispatcher: asks for a chunk when the plan runs low, and joins what comes to the plan by time."""
+"""The dispatcher: requests a chunk when the plan runs low and merges each answer into the plan by time."""
 
 from __future__ import annotations
 
@@ -22,54 +22,54 @@ from ibrobot_core.robot import Robot, Vector
 from ibrobot_core.units import ns, seconds
 
 _FIRST_PAUSE_NS = 100_000_000
-"""Pause after a failed request; it doubles with each one that fails next."""
+"""Pause after a failed request; doubles with each consecutive failure."""
 _LONGEST_PAUSE_NS = 1_000_000_000
-"""Also between requests that are not answered: upper bound on how long a recovered model stays unused."""
+"""Longest pause, also between unanswered requests; bounds how long a recovered model stays unused."""
 _UNKNOWN = 4
-"""Requests within a chunk's time before any was answered, where the way to the model may be a long one."""
+"""Requests per chunk duration before the first answer, while the round-trip time is still unknown."""
 _SILENCE_NS = 2_000_000_000
-"""After this time missing observations are reported."""
+"""Missing observations are reported after this time."""
 
 SendPlan = Callable[[int, int, Vector], None]
 
 
 @attrs.define
 class DispatchStats:
-    """What happened, for diagnostics."""
+    """Counters and timings for diagnostics."""
 
     strategy: str = "ensemble"
     smoothing: bool = True
     """Whether chunks blend."""
     plan_length: int = 0
-    """Actions still to come."""
+    """Actions left in the plan."""
     watermark: int = 0
-    """At which plan length a chunk is asked for."""
+    """Plan length at which the next chunk is requested."""
     latency_ms: float = 0.0
-    """From the observation to its chunk, of the last one."""
+    """Time from the observation to the arrival of its chunk, for the last chunk."""
     latency_p50_ms: float = 0.0
-    """Of the newest."""
+    """Median of the recent latencies."""
     latency_p99_ms: float = 0.0
     queue_ms: float = 0.0
-    """As much of the last latency as the request waited for those of other robots."""
+    """The part of the last latency that the request spent queued behind other robots."""
     pace_ms: float = 0.0
-    """Time to leave from one request to the next, as the model's server asks; 0: any."""
+    """Minimum time between requests, set by the model's server; 0 for no minimum."""
     requests: int = 0
     retries: int = 0
-    """Requests sent because the one before was overdue."""
+    """Requests sent because the previous one was overdue."""
     chunks: int = 0
     late_chunks: int = 0
-    """Chunks wholly in the past when they came."""
+    """Chunks that were entirely in the past on arrival."""
     dropped_answers: int = 0
-    """Answers to requests that had timed out, were overtaken by a newer answer, or were from before a reset."""
+    """Answers to requests that had timed out, been overtaken by a newer answer, or preceded a reset."""
     failures: int = 0
-    """Requests that gave no chunk, those that timed out among them; all that were in flight in an outage are one."""
+    """Requests without a chunk, including timeouts; all requests in flight during one outage count as one."""
     timeouts: int = 0
     holds: int = 0
     """Times the plan ran dry."""
 
 
 def check_strategy(options: DispatchConfig, spec: PolicySpec) -> None:
-    """Whether the policy can do what `dispatch` asks.
+    """Check that the policy supports the configured strategy.
 
     Raises:
         ContractError: for `strategy: rtc` with a policy that cannot continue a plan.
@@ -82,24 +82,24 @@ def check_strategy(options: DispatchConfig, spec: PolicySpec) -> None:
 
 
 class Dispatcher:
-    """Pull: a chunk is asked for when no more than the watermark remains of the plan.
+    """Requests a chunk once the remaining plan is no longer than the watermark.
 
-    One request is in flight; another is sent for newer observations when that is overdue, and the answer that comes
-    first is used. Several are, where the way to the model takes so long that one at a time would let the plan end.
-    Where other robots use the model too, it keeps to the pace that the server asks for, as long as the plan lasts.
-    After failures it asks with growing pauses. Without an answer the plan ends and the arm holds; what comes then leads
-    over from there.
+    Normally one request is in flight. When it is overdue, a second one is sent with newer observations, and the first
+    answer wins. If the round trip is so long that the plan would run out, several requests are kept in flight. When
+    other robots share the model, the dispatcher keeps to the pace set by the server as long as the plan lasts. After
+    failures it retries with growing pauses. Without an answer the plan ends and the arm holds; the next chunk then
+    starts with a smooth transition from the held position.
 
     Args:
         contract: the robot's contract, with the model's extra observations.
-        spec: what the policy reads; only that is sampled.
+        spec: the policy's inputs; nothing else is sampled.
         options: watermark, strategy and smoothing.
         robot: for the limits of its joints.
-        bus: where observations are.
-        client: where the model is.
-        send: takes the plan: time of the first action [ns], step [ns], actions (N, A).
-        request_timeout_s: after which a request has failed.
-        prompt: the task, for policies that want one.
+        bus: the source of the observations.
+        client: runs the model.
+        send: called with the plan: time of the first action [ns], step [ns], actions (N, A).
+        request_timeout_s: time after which a request counts as failed.
+        prompt: the task, for policies that take one.
         units: of the policy's vectors; None for radians.
 
     Raises:
@@ -140,9 +140,9 @@ class Dispatcher:
             lead_in=lead_in if holds else None, continues=options.joins_by == "rtc",
         )  # fmt: skip
         self._latency = LatencyEstimate()
-        """All of it."""
+        """Total latency."""
         self._unqueued = LatencyEstimate()
-        """Without waiting for other robots: who asks earlier because others ask makes all wait longer."""
+        """Latency without queueing: requesting earlier because of a queue would only lengthen the queue."""
         self._chunk_length = spec.chunk_size
         self.stats = DispatchStats(options.joins_by, blends)
         self._log = logging.getLogger("ibrobot.dispatch")
@@ -152,11 +152,11 @@ class Dispatcher:
         """Requests that may still be answered, oldest first: id -> time of the observation [ns]."""
         self._pause_ns = self._overdue_ns = self._pace_ns = self._queued_ns = 0
         self._asked_ns = self._failed_ns = 0
-        """When a request was last sent, and when one failed."""
+        """Times of the last request and of the last failure [ns]."""
         self._returns = client.returns
 
     def begin(self, seed: int) -> None:
-        """A new episode, or a mode entered: forget plan, requests and observations, and start asking."""
+        """Start an episode or a mode: discard plan, requests and observations, and start requesting."""
         if self._sampler is not None:
             self._sampler.close()
         self._sampler = FrameSampler(self._contract, self._bus, tuple(self._spec.observations), self._spec.history)
@@ -170,18 +170,18 @@ class Dispatcher:
         self.stats.plan_length = 0
 
     def end(self) -> None:
-        """Stop asking; answers still to come are dropped."""
+        """Stop requesting; later answers are dropped."""
         if self._sampler is not None:
             self._sampler.close()
             self._sampler = None
 
     def toggle_smoothing(self, enabled: bool) -> None:
-        """Switch blending on or off for the chunks to come."""
+        """Switch blending on or off for later chunks."""
         self._smoother.toggle(enabled)
         self.stats.smoothing = enabled
 
     def tick(self, t_ns: int) -> None:
-        """One tick of the contract, at its time `t_ns` [ns]."""
+        """Run one tick of the contract, at time `t_ns` [ns]."""
         if self._sampler is None:
             return
         self._smoother.trim(t_ns)
@@ -210,7 +210,7 @@ class Dispatcher:
             self._ask(t_ns)
 
     def accept(self, chunk: Chunk, now_ns: int) -> None:
-        """Join an answer to the plan, and send the plan; one that nobody waits for any more is dropped."""
+        """Merge an answer into the plan and send the plan; drop the answer if its request is no longer open."""
         asked_ns = self._open.get(chunk.id) if self._sampler is not None else None
         if asked_ns is None:
             self.stats.dropped_answers += 1
@@ -218,7 +218,7 @@ class Dispatcher:
         if chunk.actions is None:
             if chunk.id == max(self._open):
                 self._fail(chunk.id, now_ns, chunk.error)
-            else:  # the newer one that follows it may be answered all the same
+            else:  # the newer request may still succeed
                 del self._open[chunk.id]
             return
         self._smoother.trim(now_ns)
@@ -228,7 +228,7 @@ class Dispatcher:
         except (ValueError, IndexError) as error:
             self._fail(chunk.id, now_ns, str(error))
             return
-        # A chunk for older observations is of no use any more.
+        # Chunks for older observations are useless from here on.
         self._open = {number: stamp_ns for number, stamp_ns in self._open.items() if number > chunk.id}
         self._count(chunk, now_ns, now_ns - asked_ns)
         self._settle()
@@ -258,31 +258,31 @@ class Dispatcher:
         return True
 
     def _continued(self, t_ns: int) -> tuple[Vector | None, int]:
-        """For real-time chunking, the commands of the arm from `t_ns` on, and how much of it before a chunk comes."""
+        """For real-time chunking: the commands from `t_ns` on, and how many of them precede the next chunk."""
         if self._options.joins_by != "rtc":
             return None, 0
         size = self._spec.chunk_size
         delay = self._steps(self._latency.upper_ns)
-        # While the arm is held, half of the chunk at least must move it.
+        # While the arm holds, at least half of the chunk must be left to move it.
         prefix = self._smoother.ahead(t_ns, min(max(delay, 1), (size + 1) // 2))
         if prefix is None:
             return None, 0
         return prefix[:size], min(delay, len(prefix), size)
 
     def _watermark(self) -> int:
-        """The plan length at which to ask."""
+        """The plan length at which the next chunk is requested."""
         if self._options.watermark != "auto":
             return int(self._options.watermark)
-        # Who had to wait for others asks later by as much: so the requests of a fleet spread over time.
+        # A request that was queued delays the next one by as much, which spreads a fleet's requests over time.
         spread = self._chunk_length // 2 - round(self._queued_ns / self._smoother.step_ns)
-        # Time for an answer, and, should that be lost, for another once the first is overdue.
+        # Time for one answer and, in case it is lost, for a second one.
         return max(spread, self._steps(2 * self._unqueued.upper_ns + self._slack_ns))
 
     def _too_soon(self, t_ns: int, remaining: int) -> bool:
-        """Whether the server's pace says to wait, and the plan lasts meanwhile.
+        """Whether to wait because of the server's pace.
 
-        Where it would not last, the robot asks just in time, unless answers take more than half of a chunk: then the
-        model cannot keep up with its robots, and who does not wait only makes it worse for all.
+        If the plan would not last that long, the robot requests just in time. The exception is a latency above half a
+        chunk: the model is then overloaded, and requesting early would make it worse for every robot.
         """
         if self._options.watermark != "auto" or t_ns - self._asked_ns >= self._pace_ns + self._queued_ns:
             return False
@@ -291,10 +291,10 @@ class Dispatcher:
         return not in_time or remaining > self._steps(usual_ns + self._slack_ns)
 
     def _overlaps(self, t_ns: int) -> bool:
-        """Whether it is time for a further request although some are on their way.
+        """Whether to send a further request while others are in flight.
 
-        An answer that takes most of a chunk's time leaves too little of it for the next to come in. Then they are asked
-        for so often that the plan lasts should one be lost.
+        An answer that takes most of a chunk's duration leaves too little time for the next one. Requests are then sent
+        often enough for the plan to survive the loss of one answer.
         """
         most, chunk_ns, upper_ns = self._client.parallel, self._chunk_length * self._smoother.step_ns, self._usual_ns()
         if most == 1 or self._options.watermark != "auto":
@@ -307,11 +307,11 @@ class Dispatcher:
         return len(expected) < most and t_ns - max(self._open.values()) >= spacing_ns
 
     def _steps(self, time_ns: int) -> int:
-        """A time in actions, rounded up."""
+        """A duration as a number of actions, rounded up."""
         return -(-time_ns // self._smoother.step_ns)
 
     def _count(self, chunk: Chunk, now_ns: int, latency_ns: int) -> None:
-        """An answer came."""
+        """Update the statistics with an answer."""
         assert chunk.actions is not None
         self._latency.add(now_ns, latency_ns)
         self._unqueued.add(now_ns, max(0, latency_ns - chunk.queued_ns))
@@ -324,21 +324,21 @@ class Dispatcher:
         stats.latency_p99_ms = self._latency.quantile_ns(0.99) / 1e6
 
     def _settle(self) -> None:
-        """The model answers: no pause, and the next answer is expected in the usual time; 0 when that is not known."""
+        """After an answer: reset the pause, and expect the next answer in the usual time (0 if unknown)."""
         self._pause_ns = _FIRST_PAUSE_NS
         self._overdue_ns = self._usual_ns() if self.stats.chunks else 0
 
     def _usual_ns(self) -> int:
-        """Within what time an answer comes [ns]."""
+        """Time within which an answer is expected [ns]."""
         return self._latency.upper_ns + self._slack_ns
 
     @property
     def _slack_ns(self) -> int:
-        """A tick for the asking, and one for the rounding [ns]."""
+        """One tick until the request is sent and one for rounding [ns]."""
         return 2 * self._contract.step_ns
 
     def _wait_for(self, frame: Frame) -> None:
-        """Nothing is asked, and the arm holds, while an observation is missing."""
+        """Note that an observation is missing; no request is sent, and the arm holds once the plan ends."""
         if self._waiting_since_ns is None:
             self._waiting_since_ns = frame.stamp_ns
         elif frame.stamp_ns - self._waiting_since_ns >= _SILENCE_NS:
@@ -348,7 +348,7 @@ class Dispatcher:
 
     def _fail(self, number: int, now_ns: int, why: str) -> None:
         asked_ns = self._open.pop(number)
-        if asked_ns < self._failed_ns:  # it was on its way already when this outage was noticed
+        if asked_ns < self._failed_ns:  # sent before this outage was noticed
             return
         self._failed_ns = now_ns
         self.stats.failures += 1

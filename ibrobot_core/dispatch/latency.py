@@ -1,4 +1,4 @@
-"""How long answers take: running quantiles of the newest latencies, and one to rely on."""
+"""Running quantiles of recent latencies, and an upper estimate."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ _UPPER = 0.98
 
 
 class LatencyEstimate:
-    """The latencies of the newest hundred answers, as far as they came within 10 s of the newest.
+    """Latencies of the last hundred answers, limited to the 10 s before the newest.
 
-    Quantiles rather than a mean and a deviation: a model beside other work is fast mostly and slow now and then, and
-    one answer that was held up for seconds must not count for more than one. Older answers expire by time, not by
-    count: after a hiccup, a robot that asks seldom would rely on it for minutes.
+    Quantiles are used instead of mean and deviation because a model on a shared machine is usually fast and
+    occasionally slow, and one answer delayed by seconds must not dominate the estimate. Answers expire by time as well
+    as by count; otherwise a robot with infrequent requests would be affected by one slow answer for minutes.
     """
 
     def __init__(self) -> None:
         self._newest: deque[tuple[int, int]] = deque(maxlen=_NEWEST)
-        """When each answer came, and its latency [ns]."""
+        """Arrival time and latency of each answer [ns]."""
         self._ordered: list[int] = []
 
     def add(self, now_ns: int, latency_ns: int) -> None:
-        """Take in the latency [ns] of an answer that came at `now_ns` [ns]."""
+        """Add the latency [ns] of an answer that arrived at `now_ns` [ns]."""
         self._newest.append((now_ns, latency_ns))
         while self._newest[0][0] < now_ns - _EXPIRE_NS:
             self._newest.popleft()
         self._ordered = sorted(latency for _, latency in self._newest)
 
     def quantile_ns(self, share: float) -> int:
-        """The latency that `share` (0..1) of the answers keep to [ns], interpolated; 0 before the first answer."""
+        """The quantile `share` (0..1) of the latencies [ns], interpolated; 0 before the first answer."""
         ordered = self._ordered
         if not ordered:
             return 0
@@ -44,10 +44,10 @@ class LatencyEstimate:
 
     @property
     def upper_ns(self) -> int:
-        """What an answer hardly exceeds [ns]: the 98th percentile, the larger the fewer answers it rests on.
+        """An upper estimate of the latency [ns]: the 98th percentile with a margin that shrinks with more answers.
 
-        Three times the first latency, twice after two, and so on towards the percentile itself: with few answers the
-        slow ones have not been seen yet. 0 before the first.
+        Three times the latency after one answer, twice after two, and so on towards the percentile itself, because a
+        small sample may not contain a slow answer yet. 0 before the first.
         """
         count = len(self._ordered)
         return round(self.quantile_ns(_UPPER) * (1 + 2 / count)) if count else 0

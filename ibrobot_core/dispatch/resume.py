@@ -1,4 +1,4 @@
-"""Leading over: the first actions of a plan go on from where the arm is held, or from the plan before."""
+"""Lead-in: a smooth transition from the held position, or from the previous plan, into a new plan."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ import numpy as np
 from ibrobot_core.robot import Vector
 
 _SHARE = 0.5
-"""Of the limits, what leading over may take by itself; the rest is for the chunk's own motion."""
+"""Fraction of the limits available to the lead-in; the rest is left to the chunk's own motion."""
 
 
 @attrs.frozen(eq=False)
 class LeadIn:
-    """Leads from where the arm is held, or from a plan, into a chunk.
+    """Makes a chunk start at the held position, or on the previous plan.
 
     Args:
-        step_s: time from one action to the next [s].
+        step_s: time between actions [s].
         max_velocity: of each joint [rad/s], shape (A,).
         max_acceleration: of each joint [rad/s^2], shape (A,).
     """
@@ -28,19 +28,19 @@ class LeadIn:
     max_acceleration: Vector
 
     def __call__(self, before: Vector, actions: Vector) -> Vector:
-        """The actions, shape (N, A), changed so that they go on from `before`.
+        """Return the actions, shape (N, A), changed so that they continue from `before`.
 
-        What is missing to where the arm would be, and to its speed there, is added and fades along a cubic that takes
-        half of the limits of the joint with the furthest to go. A chunk shorter than that ends on the way.
+        The differences in position and speed are added to the actions and fade out along a cubic, which uses half of
+        the limits of the joint with the longest way. A chunk shorter than the cubic ends before it has faded out.
 
         Args:
-            before: the commands of the arm otherwise: at the first of the actions, and at the next, shape (2, A); or
-                where it is held, shape (1, A).
-            actions: the commands from now on.
+            before: the commands without the new chunk: those at the first and second action, shape (2, A); or the
+                position at which the arm is held, shape (1, A).
+            actions: the new commands.
         """
         gap = before[0] - actions[0]
         if not gap.any():
-            return actions  # they go on from there by themselves
+            return actions  # they already continue from there
         lag = before[-1] - before[0] - (actions[1 % len(actions)] - actions[0])
         speed = np.abs(lag) / self.step_s
         # Over a time T, the cubic from a distance has the peaks 1.5 / T and 6 / T^2, the one from a speed 1 and 4 / T.

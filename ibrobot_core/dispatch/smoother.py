@@ -1,4 +1,4 @@
-"""The temporal smoother: joins arriving action chunks into one plan, blending where they overlap in time."""
+"""The temporal smoother: merges action chunks into one plan and blends them where they overlap in time."""
 
 from __future__ import annotations
 
@@ -23,25 +23,26 @@ class TemporalSmoother:
 
         plan = (plan * cumsum(w)[c - 1] + new * w[c]) / cumsum(w)[c]
 
-    Steps that the plan does not have yet are appended. With smoothing off, the chunk replaces the plan from the
-    chunk's start on.
+    Steps beyond the end of the plan are appended. With smoothing off, the chunk replaces the plan from the chunk's
+    start on.
 
-    Time decides, never a count of executed actions: action i of a chunk belongs to `start_ns + i * step_ns`. A chunk
-    whose start falls between two steps of the plan goes to the nearest: observations are stamped on the contract's
-    ticks, so this is jitter, the error is at most half a step and does not add up, and every action stays as the
-    policy gave it, where interpolation would low-pass each chunk once more. A chunk that nothing of the plan touches
-    starts at its own exact times.
+    Chunks are aligned by time, never by a count of executed actions: action i of a chunk belongs to
+    `start_ns + i * step_ns`. If a chunk starts between two steps of the plan, it is aligned with the nearest one.
+    Observations are stamped on the contract's ticks, so the offset is jitter of at most half a step and does not
+    accumulate. Interpolation would low-pass each chunk once more; without it, every action stays as the policy
+    returned it. A chunk that does not touch the plan keeps its exact times.
 
-    Not thread-safe: one thread owns it. Arrays that `plan` returned never change afterwards.
+    Not thread-safe; one thread owns it. Arrays returned by `plan` never change afterwards.
 
     Args:
-        step_ns: time from one action to the next [ns].
+        step_ns: time between actions [ns].
         action_size: numbers in an action, A.
         coeff: `c` in `w_k = exp(-c k)`; positive favours old predictions, negative new ones, 0 is the plain mean.
         enabled: whether chunks blend.
-        lead_in: leads over from the old plan, its action for the first of the new and the next, shape (2, A), to the
-            new one, shape (M, A); after it ran dry from its last, shape (1, A), which is held. None where it is not.
-        continues: whether a chunk that replaces a running plan continues it: what it misses it by is led over too.
+        lead_in: makes the new plan, shape (M, A), continue from the old one, given as its actions at the first two
+            steps of the new plan, shape (2, A), or, after the plan ran dry, as the held last action, shape (1, A).
+            None if the arm does not hold the last action.
+        continues: whether a chunk that replaces a running plan is also adjusted by `lead_in` to continue it.
 
     Raises:
         ValueError: for a step or a size below one, or a coefficient out of range.
@@ -67,13 +68,13 @@ class TemporalSmoother:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the plan and the time: a new episode begins."""
+        """Discard the plan and the time for a new episode."""
         self._set(0, np.empty((0, self.action_size)), np.empty(0, dtype=np.intp))
         self._now_ns: int | None = None
         self._held: Vector | None = None
 
     def toggle(self, enabled: bool) -> None:
-        """Switch smoothing on or off for the chunks to come; the plan stays."""
+        """Switch smoothing on or off for later chunks; the plan stays."""
         self.enabled = enabled
 
     def plan(self) -> tuple[int, Vector]:
@@ -81,15 +82,15 @@ class TemporalSmoother:
         return self._start_ns, self._positions
 
     def remaining(self, now_ns: int) -> int:
-        """How many actions are later than `now_ns`; 0 when the plan ran dry."""
+        """The number of actions after `now_ns`; 0 when the plan ran dry."""
         begun = (now_ns - self._start_ns) // self.step_ns + 1
         return min(max(len(self._positions) - begun, 0), len(self._positions))
 
     def ahead(self, t_ns: int, held: int) -> Vector | None:
-        """The commands of the arm from `t_ns` on: the plan's actions, shape (K, A), the first that nearest to `t_ns`.
+        """The commands from `t_ns` on: the plan's actions, shape (K, A), starting with the one nearest to `t_ns`.
 
-        Where the plan ran dry the last action stands there `held` times, K = held. None before the
-        first plan, where the last action is not held, and where the plan begins later.
+        After the plan ran dry: the last action, repeated `held` times (K = held). None before the first plan, if the
+        last action is not held, and if the plan begins later.
         """
         offset = (t_ns - self._start_ns + self.step_ns // 2) // self.step_ns
         if len(self._positions) and offset < 0:
@@ -100,7 +101,7 @@ class TemporalSmoother:
         return None if last is None or self._lead_in is None else np.tile(last, (held, 1))
 
     def trim(self, now_ns: int) -> None:
-        """Drop the actions whose step is over at `now_ns`; the one in effect stays: interpolation starts there."""
+        """Drop the actions whose step is over at `now_ns`, but keep the current one to interpolate from."""
         self._now_ns = now_ns if self._now_ns is None else max(now_ns, self._now_ns)
         over = (now_ns - self._start_ns) // self.step_ns
         if over >= len(self._positions):
@@ -111,18 +112,18 @@ class TemporalSmoother:
             self._set(self._start_ns + over * self.step_ns, self._positions[over:], self._counts[over:])
 
     def update(self, chunk: NDArray[np.floating], start_ns: int) -> int:
-        """Join a chunk to the plan.
+        """Merge a chunk into the plan.
 
         Args:
             chunk: actions, shape (N, A) with N >= 1.
-            start_ns: time of the first action [ns]: that of the observation it answers.
+            start_ns: time of the first action [ns], which is the time of its observation.
 
         Returns:
-            How many of its actions joined: those that are past, by the last `trim`, do not. With 0, the chunk came
-            too late to be of use and the plan is as it was.
+            The number of actions merged, without those already past at the last `trim`. 0 means that the chunk
+            arrived too late and the plan is unchanged.
 
         Raises:
-            ValueError: for another shape, or values that are not finite; the plan stays as it was.
+            ValueError: for a wrong shape or values that are not finite; the plan is unchanged.
         """
         actions = np.asarray(chunk, dtype=np.float64)
         if actions.ndim != 2 or actions.shape[1] != self.action_size or not len(actions):
@@ -131,10 +132,10 @@ class TemporalSmoother:
             raise ValueError(f"a chunk must be finite, got {_first_not_finite(actions)}")
         length = len(self._positions)
         offset = (start_ns - self._start_ns + self.step_ns // 2) // self.step_ns
-        # An observation is never from the future: a chunk that begins beyond the end shows that the plan ran dry.
+        # Observations are never from the future, so a chunk that begins beyond the end means that the plan ran dry.
         if not length or offset > length or (offset <= 0 and not self.enabled):
             return self._begin(actions, start_ns)
-        actions = actions[max(-offset, 0) :]  # a trimmed plan begins with the action in effect: what is earlier is past
+        actions = actions[max(-offset, 0) :]  # a trimmed plan begins with the current action; earlier ones are past
         offset = max(offset, 0)
         if not len(actions):
             return 0
@@ -149,7 +150,7 @@ class TemporalSmoother:
         return len(actions)
 
     def _begin(self, actions: Vector, start_ns: int) -> int:
-        """A plan of this chunk alone, from the action in effect on."""
+        """Start a plan from this chunk alone, beginning with the current action."""
         past = 0 if self._now_ns is None else max((self._now_ns - start_ns) // self.step_ns, 0)
         rest = len(actions) - past
         if rest <= 0:
@@ -166,7 +167,7 @@ class TemporalSmoother:
         return actions if before is None or self._lead_in is None else self._lead_in(before, actions)
 
     def _blend(self, actions: Vector, offset: int) -> None:
-        """Blend `actions` into the plan from its step `offset` on; what reaches beyond its end is appended."""
+        """Blend `actions` into the plan from step `offset` on; append those beyond its end."""
         length, end = len(self._positions), offset + len(actions)
         shared = min(length, end)
         positions = np.empty((max(length, end), self.action_size))

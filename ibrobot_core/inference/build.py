@@ -1,4 +1,4 @@
-"""A policy as a robot YAML describes it, in a process that runs nothing else of the robot."""
+"""Builds a policy from a robot YAML, in a process that runs no other part of the robot."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from ibrobot_core.plugins import Registry
 
 
 def build_policy(config: RobotConfig, registry: Registry, name: str, seed: int = 0) -> Policy:
-    """The model `name` of `config`, constructed and not loaded.
+    """Construct the model `name` of `config` without loading it.
 
     Raises:
-        PluginError: when its plugin is not installed.
+        PluginError: if its plugin is not installed.
         PolicyError: e.g. for a checkpoint without its statistics.
     """
     model = config.models[name]

@@ -1,4 +1,4 @@
-"""Inference: what takes a frame and gives back a chunk, wherever the model runs."""
+"""Inference clients: turn a frame into a chunk of actions, wherever the model runs."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from ibrobot_core.units import ns
 _CLOSE_TIMEOUT_S = 1.0
 _ALONE = contextlib.nullcontext()
 _PATIENCE_S = 600.0
-"""How long a request is waited for where nothing else says so."""
+"""Default timeout of a request."""
 
 
 @attrs.frozen(eq=False)
 class DispatchInfer:
-    """A request for a chunk: the observations, stamped, and an id that its answer carries."""
+    """A request for a chunk: stamped observations and an id, which the answer repeats."""
 
     id: int
     frame: Frame
@@ -35,64 +35,64 @@ class DispatchInfer:
 
 @attrs.frozen(eq=False)
 class Chunk:
-    """The answer to a request: actions, shape (N, A), the first for `start_ns`; or why there are none."""
+    """The answer to a request: actions, shape (N, A), the first for `start_ns`; or the error."""
 
     id: int
     start_ns: int
     actions: Vector | None
     error: str = ""
     queued_ns: int = 0
-    """For how long the request waited for those of other robots [ns]."""
+    """Time that the request spent queued behind other robots [ns]."""
     pace_ns: int = 0
-    """Time to leave from one request to the next, as the server asks [ns]; 0: any."""
+    """Minimum time between requests, set by the server [ns]; 0 for no minimum."""
 
 
 class InferenceClient(ABC):
-    """Takes requests, and answers them some time later, not always in order."""
+    """Takes requests and answers them later, not necessarily in order."""
 
     @property
     def parallel(self) -> int:
-        """How many requests may be on their way at a time so that each is answered as soon as if it were alone."""
+        """The number of requests that may be in flight at once without slowing each other down."""
         return 1
 
     @property
     def returns(self) -> int:
-        """How often a model that was away has come back: requests that wait for it need not wait any more."""
+        """How often an unreachable model has come back; a change means that a new request need not wait."""
         return 0
 
     @abstractmethod
     def submit(self, request: DispatchInfer) -> None:
-        """Begin; returns at once."""
+        """Start a request; returns at once."""
 
     @abstractmethod
     def poll(self, timeout_s: float = 0.0) -> Chunk | None:
-        """An answer that came, waiting for one up to `timeout_s` [s].
+        """Return an answer, waiting up to `timeout_s` [s] for one.
 
         Raises:
-            PolicyError: when the policy could not be reset, so that nothing it says can be trusted.
+            PolicyError: if the policy could not be reset, so that its answers cannot be trusted.
         """
 
     @abstractmethod
     def reset(self, seed: int) -> None:
-        """A new episode begins: the policy forgets the last before it sees a later request."""
+        """Start a new episode: the policy is reset before it sees a later request."""
 
     @abstractmethod
     def close(self) -> None:
-        """End; safe to call twice."""
+        """Close the client. Safe to call twice."""
 
 
 def run_policy(
     policy: Policy, engine: Engine, request: DispatchInfer, deadline_ns: int,
     turn: contextlib.AbstractContextManager[object] = _ALONE,
 ) -> Chunk:  # fmt: skip
-    """The three steps, one after the other. A policy that raises gives a chunk with its error: the arm holds.
+    """Preprocess, infer and postprocess. If the policy raises, the chunk carries the error and the arm holds.
 
     Args:
         policy: pre- and postprocesses.
         engine: runs `infer`.
-        request: what to answer.
-        deadline_ns: when nobody waits any more, by `time.monotonic_ns()`.
-        turn: entered for what the policy does here.
+        request: the request to answer.
+        deadline_ns: time after which the answer is no longer needed, by `time.monotonic_ns()`.
+        turn: entered while the policy itself runs.
     """
     stamp_ns = request.frame.stamp_ns
     try:
@@ -100,7 +100,7 @@ def run_policy(
             tensors = policy.preprocess(request.frame)
         outputs = engine.infer(tensors, request.id, deadline_ns)
         with turn:
-            actions = np.array(policy.postprocess(outputs), dtype=np.float64)  # a policy may reuse its own
+            actions = np.array(policy.postprocess(outputs), dtype=np.float64)  # a policy may reuse its array
     except PolicyError as error:
         return Chunk(request.id, stamp_ns, None, str(error))
     except Exception as error:
@@ -113,11 +113,11 @@ def run_policy(
 
 
 class LockstepClient(InferenceClient):
-    """Runs the policy in `submit`, so that a chunk costs no simulated time: for lockstep.
+    """Runs the policy inside `submit`, so that inference takes no simulated time; for lockstep.
 
     Args:
         policy: pre- and postprocesses.
-        engine: where `infer` runs; here where left out.
+        engine: runs `infer`; by default the policy itself, in this process.
     """
 
     def __init__(self, policy: Policy, engine: Engine | None = None) -> None:
@@ -146,15 +146,15 @@ class LockstepClient(InferenceClient):
 
 
 class EngineClient(InferenceClient):
-    """Runs the policy in threads of this process, up to as many as its engine takes requests; `infer` where that is.
+    """Runs pre- and postprocessing in threads of this process, at most one per parallel request of the engine.
 
-    A request that waits behind slow ones is not run at all when a newer one, or a reset, waits behind it: nobody
-    waits for its answer any more. The policy itself is called by one thread at a time.
+    A queued request is skipped when a newer request or a reset is queued behind it, because its answer is no longer
+    needed. The policy itself is called by one thread at a time.
 
     Args:
         policy: pre- and postprocesses.
-        engine: where `infer` runs; here where left out.
-        timeout_s: for how long the answer of a request is waited for, from its submission on.
+        engine: runs `infer`; by default the policy itself, in this process.
+        timeout_s: time from submission after which the answer of a request is no longer needed [s].
     """
 
     def __init__(self, policy: Policy, engine: Engine | None = None, timeout_s: float = _PATIENCE_S) -> None:
@@ -170,7 +170,7 @@ class EngineClient(InferenceClient):
     @property
     @override
     def parallel(self) -> int:
-        # A model that takes most of the time itself would only let them wait, and look at older observations.
+        # If the model itself takes most of the time, further requests would only queue, with older observations.
         stats, most = self._engine.stats, self._engine.parallel
         there_ms = stats.model_ms + stats.queue_ms
         return min(most, max(1, round(stats.infer_ms / there_ms))) if there_ms else most
@@ -209,7 +209,7 @@ class EngineClient(InferenceClient):
 
     def _put(self, work: tuple[DispatchInfer, int] | int) -> None:
         self._work.put(work)
-        # One thread for as long as one will do: each has memory of its own for large messages, which grows cold.
+        # Prefer one thread: each has its own buffers for large messages, and unused ones fall out of the cache.
         if not self._idle.acquire(blocking=False) and len(self._threads) < self._engine.parallel:
             thread = threading.Thread(target=self._run, name="inference", daemon=True)
             self._threads.append(thread)
@@ -217,7 +217,7 @@ class EngineClient(InferenceClient):
 
     def _run(self) -> None:
         while True:
-            with self._taking:  # what was submitted before a reset begins before it, and what follows after it
+            with self._taking:  # keeps requests and resets in the order submitted
                 work = self._next()
                 if work is None:
                     return

@@ -8,7 +8,7 @@ from ibrobot_core.interfaces import Engine, Policy, Tensors
 
 
 class LocalEngine(Engine):
-    """The policy itself. Its owner resets and closes it."""
+    """Calls the policy directly; the policy's owner resets and closes it."""
 
     def __init__(self, policy: Policy) -> None:
         super().__init__("monolithic")

@@ -45,6 +45,12 @@ OUT = {
     r"\bthat there (?:is|are) not\b": "unknown, missing",
     r"(?<![Tt]here\x20)\bis no (?:URDF|MJCF|MCAP|file|folder|joint|number|episode|certificate)\b": "is not a",
     r"\bwhich that is\b|\bwho that is\b": "name it",
+    r"\b[Ww]hoever\b": "the caller, the user",
+    r"\bnobody waits\b|\bwaits? (?:for )?any more\b": "no longer needed, no longer queued",
+    r"\bof no known\b": "unknown",
+    r"\bso many \w+ at a time\b": "at most N at once",
+    r"\b[Ll]ead(?:s|ing)? over\b|\bled over\b": "lead-in, transition",
+    r"\bas (?:it|he) is asked\b|\bas it is told\b": "as configured, as requested",
 }
 """Pattern -> what to write."""
 

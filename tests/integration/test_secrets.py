@@ -52,7 +52,7 @@ class Lab:
         texts = {name: text.encode() for name, text in self.printed.items()}
         texts |= {str(path): path.read_bytes() for path in self.folder.rglob("*") if path.is_file()}
         secrets = [*SECRETS.values(), LITERAL]
-        # Whoever types a secret into a command line shows it to the machine; the command must not repeat it.
+        # A secret typed on a command line is visible on the machine; the command must not repeat it.
         return [f"{name}: {each}" for name, text in texts.items() for each in secrets if each.encode() in text]
 
 

@@ -40,7 +40,7 @@ def test_a_list_of_topics_must_have_the_contracts(runs: Runs):
         RecorderError, match=r"recording.topics leaves out .*/arm/commands.*which the contract needs.*add th"
     ):
         runs.make(RECORDING, "recording.topics=[/joint_states]", mode="teleop", by_operator=True)
-    runs.make(RECORDING, "recording.topics=[/joint_states]", mode="teleop")  # a log, which nobody waits for
+    runs.make(RECORDING, "recording.topics=[/joint_states]", mode="teleop")  # a log; the run does not wait for it
 
 
 @pytest.mark.parametrize("root", ["/proc/none", "file/below"])

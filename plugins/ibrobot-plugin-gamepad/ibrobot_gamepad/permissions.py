@@ -11,7 +11,7 @@ from ibrobot_gamepad.hid import find_hid
 from ibrobot_gamepad.reports import KINDS, MODELS, THREEDCONNEXION
 
 RULES = "/etc/udev/rules.d/60-ibrobot-gamepad.rules"
-"""Before 73-seat-late.rules, which gives what is tagged `uaccess` to whoever sits at the machine."""
+"""Must sort before 73-seat-late.rules, which gives devices tagged `uaccess` to the user logged in at the machine."""
 WRITE_RULES = f"ibrobot gamepad udev | sudo tee {RULES} && sudo udevadm control --reload, then plug it in again"
 _LOGITECH = "*:046D:C6*"
 """SpaceMice of Logitech's time."""

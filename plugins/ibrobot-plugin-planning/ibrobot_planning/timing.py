@@ -4,7 +4,7 @@
 2. The fastest speed along the path follows from a backward and a forward pass over a grid of it (reachability analysis;
    Pham and Pham, "A new approach to time-optimal path parameterization based on reachability analysis", 2018).
 3. A moving average over time bounds the jerk. The average of positions, velocities and accelerations within limits is
-   within the same limits, but leaves the path a little: whoever asked for the path checks the result.
+   within the same limits, but leaves the path a little: the caller checks the result.
 """
 
 from __future__ import annotations

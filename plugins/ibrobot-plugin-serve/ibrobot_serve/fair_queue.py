@@ -24,10 +24,10 @@ class FairQueue[T]:
         return len(self._waiting)
 
     def put(self, robot: str, item: T) -> T | None:
-        """Have an item wait: in the place of the robot's earlier one, where that waits still, or as the last.
+        """Queue an item: in place of the robot's earlier item if that is still queued, otherwise at the end.
 
         Returns:
-            The item that does not wait any more: the earlier one; or this one, where the queue is full.
+            The item dropped: the earlier one, or this one if the queue is full; None if none was.
         """
         with self._changed:
             earlier = self._waiting.get(robot)

@@ -1,4 +1,4 @@
-"""Pacing: how often each robot of a server may ask, so that its model keeps up and nobody waits long."""
+"""Pacing: limits each robot's request rate so that the model keeps up and queues stay short."""
 
 from __future__ import annotations
 

@@ -124,8 +124,8 @@ class InferenceService:
     """Serves `infer` of a loaded policy under `service_name(model)`, and its statistics under `health_name(model)`.
 
     Args:
-        policy: loaded; whoever made it closes it, after the service.
-        transport: where robots are; whoever made it closes it, after the service.
+        policy: the loaded policy; the caller closes it, after the service.
+        transport: the connection to the robots; the caller closes it, after the service.
         model: what robots call it.
         options: how requests are queued.
         codec: for pictures that come as JPEG.

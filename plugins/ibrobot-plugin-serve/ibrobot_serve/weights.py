@@ -11,17 +11,17 @@ def check_weights(before: str, now: str, whose: str, *, accept: bool) -> None:
     """Compare the weights of a restarted model to the weights before.
 
     Args:
-        before: hash of those that acted; empty at the first start.
-        now: hash of those that would act.
-        whose: which model, for the message.
-        accept: whether others may act, with a warning.
+        before: hash of the previous weights; empty at the first start.
+        now: hash of the new weights; empty if unknown.
+        whose: name of the model, for the message.
+        accept: whether to log a warning and use different weights, instead of raising.
 
     Raises:
-        PolicyError: when they are others, and are not accepted.
+        PolicyError: if the weights differ and `accept` is False.
     """
     if before in ("", now):
         return
-    told = f"{whose} came back with other weights, {now or 'of no known hash'}; those that acted were {before}"
+    change = f"{whose} restarted with different weights: hash {now or 'unknown'}, previously {before}"
     if not accept:
-        raise PolicyError(f"{told}; start the run again, or set inference.accept_new_weights: true")
-    logging.getLogger("ibrobot.inference").warning("%s; they act from now on", told)
+        raise PolicyError(f"{change}; start the run again, or set inference.accept_new_weights: true")
+    logging.getLogger("ibrobot.inference").warning("%s; the new weights are used from now on", change)

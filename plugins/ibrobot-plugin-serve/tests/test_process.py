@@ -200,9 +200,9 @@ def test_process_that_starts_again_with_other_weights_is_accepted_only_where_the
         if accept:
             outputs = engine.infer({"x": np.arange(3)}, 2, time.monotonic_ns() + PATIENCE_NS)
             assert outputs["twice"].tolist() == [0, 2, 4]
-            assert "the model's process came back with other weights, b2; those that acted were a1" in caplog.text
+            assert "the model's process restarted with different weights: hash b2, previously a1" in caplog.text
         else:
-            with pytest.raises(PolicyError, match="the model's process came back with other weights, b2"):
+            with pytest.raises(PolicyError, match="the model's process restarted with different weights: hash b2"):
                 engine.infer({"x": np.arange(3)}, 2, time.monotonic_ns() + PATIENCE_NS)
         assert engine.stats.weights == ("b2" if accept else "a1")
     finally:

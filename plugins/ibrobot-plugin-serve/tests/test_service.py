@@ -547,7 +547,7 @@ def test_server_that_comes_back_with_other_weights_is_refused():
             remote.infer({"x": np.ones(1)}, 2, deadline())
         for number in (3, 4):
             with pytest.raises(
-                PolicyError, match=r"came back with other weights, b2; those that acted were a1; start the"
+                PolicyError, match=r"restarted with different weights: hash b2, previously a1; start the"
             ):
                 remote.infer({"x": np.ones(1)}, number, deadline())
         assert remote.stats.weights == "a1"
@@ -565,7 +565,10 @@ def test_other_weights_are_accepted_with_a_warning_where_the_user_says_so(caplog
             remote.infer({"x": np.ones(1)}, 1, deadline())
         assert remote.infer({"x": np.ones(1)}, 2, deadline())["twice"].tolist() == [2]
         assert remote.stats.weights == "b2"
-        assert "came back with other weights, b2; those that acted were a1; they act from now on" in caplog.text
+        assert (
+            "restarted with different weights: hash b2, previously a1; the new weights are used from now on"
+            in caplog.text
+        )
         remote.close()
 
 

@@ -131,7 +131,7 @@ class Emulator:
     def _serve(self) -> None:
         try:
             self._loop()
-        except BaseException as error:  # noqa: BLE001 - kept for whoever stops the emulator
+        except BaseException as error:  # noqa: BLE001 - re-raised when the emulator is stopped
             self._error = error
 
     def _loop(self) -> None:

@@ -10,5 +10,5 @@ from ibrobot_gamepad.permissions import udev_rules
 
 @click.command()
 def udev() -> None:
-    """Print the udev rule that lets whoever sits at this machine open gamepads and SpaceMice."""
+    """Print the udev rule that lets the user logged in at this machine open gamepads and SpaceMice."""
     echo(udev_rules())
