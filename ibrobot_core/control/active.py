@@ -1,4 +1,4 @@
-"""The executors of a mode and the joints that each owns: they take plans and goals, and give setpoints."""
+"""The executors of a mode and the joints that each owns: they take plans and goals and return setpoints."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ibrobot_core.robot import Robot, Vector
 
 @attrs.frozen(eq=False)
 class _Owned:
-    """An executor and the robot's columns that it owns."""
+    """An executor and the indices of its joints in robot order."""
 
     name: str
     executor: Executor
@@ -32,15 +32,15 @@ class _Owned:
 
 
 class ActiveExecutors:
-    """The executors that are active, among all of a robot; without one, nothing moves the joints.
+    """The active executors of a robot; joints without an active executor do not move.
 
     Args:
         robot: the robot.
         executors: name -> executor.
-        report: given a `goal` event whenever a goal changes its state.
+        report: called with a `goal` event whenever the state of a goal changes.
 
     Attributes:
-        want_relax: whether one asked for torque off at the last `update`.
+        want_relax: whether an executor requested torque off at the last `update`.
     """
 
     def __init__(
@@ -55,13 +55,13 @@ class ActiveExecutors:
         return bool(self._active)
 
     def enter(self, names: Iterable[str], measured: JointReading) -> None:
-        """Activate the executors of a mode where the joints are."""
+        """Activate the executors of a mode at the measured positions."""
         self._active = [self._all[name] for name in names]
         for owned in self._active:
             owned.executor.activate(owned.reading(measured))
 
     def leave(self, measured: JointReading) -> None:
-        """Deactivate all; their goals are cancelled."""
+        """Deactivate all executors and cancel their goals."""
         for owned in self._active:
             owned.executor.cancel(owned.reading(measured))
             self._report_goals(owned)
@@ -69,17 +69,17 @@ class ActiveExecutors:
         self._active = []
 
     def set_plan(self, plan: PlanRecord) -> None:
-        """Give a plan to those that accept one and whose joints it has."""
+        """Pass a plan to the active executors that accept plans and whose joints it contains."""
         for owned in self._active:
             if owned.executor.accepts_plans and plan.mask[owned.columns].all():
                 owned.executor.set_plan(Plan(plan.start_ns, plan.step_ns, plan.positions[:, owned.columns]))
 
     def update(self, measured: JointReading, now_ns: int | None) -> list[tuple[NDArray[np.intp], Vector]]:
-        """The robot's columns that each owns, and its setpoints for them [rad].
+        """Return the joint indices of each active executor and its setpoints for them [rad].
 
         Args:
             measured: all joints.
-            now_ns: the time, where that of the reading is too old [ns].
+            now_ns: the current time [ns], if the reading's stamp is too old.
         """
         setpoints = []
         self.want_relax = False
@@ -90,10 +90,10 @@ class ActiveExecutors:
         return setpoints
 
     def set_goal(self, executor: str, goal_id: str, goal: Mapping[str, Any], measured: JointReading) -> None:
-        """Give a goal to an executor.
+        """Pass a goal to an executor.
 
         Raises:
-            GoalRejected: for one that is not active, or that refuses it.
+            GoalRejected: if the executor is not active or rejects the goal.
         """
         active = {owned.name: owned for owned in self._active}
         if executor not in active:
@@ -101,12 +101,12 @@ class ActiveExecutors:
         active[executor].executor.set_goal(goal_id, goal, active[executor].reading(measured))
 
     def cancel(self, measured: JointReading) -> None:
-        """Cancel all goals; the executors hold."""
+        """Cancel all goals; the executors then hold."""
         for owned in self._active:
             owned.executor.cancel(owned.reading(measured))
 
     def counters(self) -> dict[str, dict[str, int]]:
-        """What each executor counts, those that are not active too."""
+        """The counters of all executors, including inactive ones."""
         return {name: dict(owned.executor.counters()) for name, owned in self._all.items()}
 
     def _report_goals(self, owned: _Owned) -> None:

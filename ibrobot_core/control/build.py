@@ -1,4 +1,4 @@
-"""From a robot YAML to a control core: the hardware and executors that it names, made by their plugins."""
+"""Builds a control core from a robot YAML: its hardware and executors, created by their plugins."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from ibrobot_core.plugins import Registry
 
 
 def build_core(config: RobotConfig, registry: Registry, clock: Clock, seed: int) -> ControlCore:
-    """The control core of `config`; nothing is connected yet.
+    """Build the control core of `config` without connecting any hardware.
 
     Raises:
-        ConfigError: where there is neither hardware nor a simulation.
-        PluginError: when a plugin is missing.
+        ConfigError: if the robot has neither hardware nor a simulation.
+        PluginError: if a plugin is missing.
     """
     simulation = config.simulation if config.simulated else None
 

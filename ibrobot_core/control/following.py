@@ -1,4 +1,4 @@
-"""Following error: joints that stay away from their setpoints, because something blocks them or they have no torque."""
+"""Following error: detects joints that stay away from their setpoints because they are blocked or lack torque."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from ibrobot_core.units import ns
 
 
 class FollowingError:
-    """Watches how far each joint's setpoint is from its measured position.
+    """Monitors the distance between setpoint and measured position of each joint.
 
-    A joint is away when that is more than `distance` (or half of its `max_lead`, where that is less) plus what a servo
-    lags behind at the setpoint's speed. Away for `timeout` without a break, it does not follow. Joints that grip may
-    stay away indefinitely: that is how they hold an object.
+    A joint is away if the distance exceeds `distance` (or half of its `max_lead`, if that is less) plus the usual lag
+    of a servo at the setpoint's speed. A joint that is away for `timeout` without interruption does not follow. Joints
+    that grip may stay away indefinitely, because that is how they hold an object.
 
     Args:
-        options: distance and timeout.
+        options: `distance` and `timeout`.
         robot: the joints; J is their number.
         period_ns: the control period [ns]; `check` is called at most once in each.
     """
@@ -37,15 +37,15 @@ class FollowingError:
         return self._ticks >= self._longest
 
     def check(self, setpoint: Vector, velocity: Vector, measured: Vector) -> str:
-        """Take one tick's figures, all of shape (J,).
+        """Check the values of one tick, all of shape (J,).
 
         Args:
             setpoint: the command of the joints [rad].
-            velocity: how fast that moves [rad/s].
-            measured: where they are [rad].
+            velocity: speed of the setpoint [rad/s].
+            measured: measured positions [rad].
 
         Returns:
-            What is wrong and what to do about it, for the joint that is furthest away; empty where all follow.
+            Problem and remedy for the joint that is furthest away; empty if all joints follow.
         """
         away = np.abs(setpoint - measured)
         self._ticks = np.where(away > self._distance + LAG_S * np.abs(velocity), self._ticks + 1, 0)

@@ -1,4 +1,4 @@
-"""The hardware of a robot as one: several components, each owning joints, read and written in parallel in a tick."""
+"""All hardware of a robot as one object: several components with their own joints, read and written in parallel."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ _LOG = logging.getLogger("ibrobot.control")
 
 
 class HardwareGroup:
-    """All the hardware of a robot, in robot order.
+    """All hardware of a robot, with joints in robot order.
 
     Args:
         robot: the joints.
-        parts: name -> hardware; together they own every joint once.
+        parts: name -> hardware; each joint belongs to exactly one part.
     """
 
     def __init__(self, robot: Robot, parts: dict[str, Hardware]) -> None:
@@ -43,12 +43,12 @@ class HardwareGroup:
         self._pool = ThreadPoolExecutor(len(parts)) if len(parts) > 1 else None
         self.signals: tuple[Signal, ...] = tuple(s for part in parts.values() for s in part.signals)
         self._signal_values: Vector = np.full(sum(s.size for s in self.signals), np.nan)
-        # One part that owns every joint in order: no gathering in the tick.
+        # A single part with all joints in order needs no copying in the tick.
         only = next(iter(parts.values()))
         self._single = only if len(parts) == 1 and only.joints == robot.joint_names else None
 
     def connect(self) -> None:
-        """Connect all; where one fails, those before it are as they were."""
+        """Connect all parts; if one fails, restore the parts connected before it."""
         connected: list[str] = []
         try:
             for name, part in self._parts.items():
@@ -60,7 +60,7 @@ class HardwareGroup:
             raise
 
     def undo_connect(self, names: Collection[str] | None = None) -> None:
-        """Take off the torque that `connect` put on, of all parts or those of `names`; what stays on is logged."""
+        """Switch off the torque that `connect` switched on, for all parts or `names`; log what stays on."""
         for name, part in self._parts.items():
             if names is None or name in names:
                 try:
@@ -69,11 +69,11 @@ class HardwareGroup:
                     _LOG.error("torque of %s cannot be taken off: %s", name, error)
 
     def holding(self) -> list[Holding]:
-        """What holds torque, as far as is known."""
+        """The parts known to hold torque."""
         return [holding for part in self._parts.values() if (holding := part.holding()) is not None]
 
     def health(self) -> Sequence[Condition]:
-        """What is wrong with the joints of all parts."""
+        """The conditions of the joints of all parts."""
         if self._single is not None:
             return self._single.health()
         return [condition for part in self._parts.values() for condition in part.health()]
@@ -86,10 +86,10 @@ class HardwareGroup:
             self._pool.shutdown()
 
     def read(self) -> JointReading:
-        """Measure every joint; the stamp is the oldest of the parts'.
+        """Measure every joint; the stamp is the oldest of all parts.
 
         Raises:
-            HardwareError: with the name of the part that failed.
+            HardwareError: if a part fails; names the part.
         """
         if self._single is not None:
             return self._single.read()
@@ -104,7 +104,7 @@ class HardwareGroup:
         """Command every joint [rad], shape (J,).
 
         Raises:
-            HardwareError: with the name of the part that failed.
+            HardwareError: if a part fails; names the part.
         """
         if self._single is not None and not self._off:
             self._single.write(command)
@@ -113,43 +113,43 @@ class HardwareGroup:
         self._each(lambda part: part.write(commands[id(part)]), but=self._off)
 
     def relax(self) -> dict[str, Torque | IbrobotError]:
-        """Take torque off; for each part what became of it, or why its torque stays on.
+        """Switch torque off; return for each part the result, or the error that kept its torque on.
 
-        From then on only parts whose torque stays on are written, until `resume`.
+        Until `resume`, only parts whose torque stays on are written.
         """
         outcomes: dict[str, Torque | IbrobotError] = dict(zip(self._parts, self._each(_relaxed), strict=True))
         self._off = {name for name, outcome in outcomes.items() if isinstance(outcome, Torque)}
         return outcomes
 
     def resume(self) -> None:
-        """Write all parts again: the next `write` puts torque back on."""
+        """Write all parts again; the next `write` switches torque back on."""
         self._off.clear()
 
     @property
     def holds(self) -> bool:
-        """Whether any part is still written, so that its joints hold."""
+        """Whether any part is still written, so that its joints hold their position."""
         return len(self._off) < len(self._parts)
 
     def require_relax(self) -> None:
-        """Raise where a part cannot take torque off.
+        """Check that every part can switch torque off.
 
         Raises:
-            NotSupported: naming the part.
+            NotSupported: if a part cannot; names the part.
         """
         for name, part in self._parts.items():
             if type(part).relax is Hardware.relax:
                 raise NotSupported(f"control.stop: relax: hardware {name!r} cannot take torque off; use hold or a pose")
 
     def reset_faults(self) -> None:
-        """Clear the faults that parts have latched."""
+        """Clear the latched faults of all parts."""
         self._each(lambda part: part.reset_faults())
 
     def counters(self) -> dict[str, dict[str, int]]:
-        """What the parts count, per part; those that count nothing left out."""
+        """The counters of each part; parts without counters are omitted."""
         return {name: counts for name, part in self._parts.items() if (counts := dict(part.counters()))}
 
     def read_signals(self) -> Vector:
-        """The signals of all parts one after the other, shape (S,); the array is reused by the next call."""
+        """The concatenated signals of all parts, shape (S,); the next call reuses the array."""
         begin = 0
         for part in self._parts.values():
             for index, signal in enumerate(part.signals):
@@ -158,15 +158,15 @@ class HardwareGroup:
         return self._signal_values
 
     def advance(self, step_ns: int) -> None:
-        """Advance those that are simulated."""
+        """Advance the simulated parts."""
         for part in self._simulated:
             part.advance(step_ns)
 
     def reset_episode(self, episode: EpisodeSetup) -> None:
-        """Set up simulated scenes again.
+        """Reset the simulated scenes.
 
         Raises:
-            NotSupported: where no part is simulated.
+            NotSupported: if no part is simulated.
         """
         if not self._simulated:
             raise NotSupported("only a simulation can be set up again")
@@ -174,7 +174,7 @@ class HardwareGroup:
             part.reset(episode)
 
     def success(self) -> bool | None:
-        """Whether the scene's task is done; None where there is none."""
+        """Whether the scene's task is done; None if it has no task."""
         return self._simulated[0].success() if self._simulated else None
 
     def _each(self, act: Callable[[Hardware], Any], but: Collection[str] = ()) -> Sequence[Any]:
@@ -182,7 +182,7 @@ class HardwareGroup:
         if self._pool is None:
             return [_named(name, partial(act, part)) for name, part in parts]
         futures = [(name, self._pool.submit(act, part)) for name, part in parts]
-        wait([future for _, future in futures])  # also where one fails: no part is called twice at once
+        wait([future for _, future in futures])  # even if one fails, so that no part is called twice at once
         return [_named(name, future.result) for name, future in futures]
 
 

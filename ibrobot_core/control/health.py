@@ -1,4 +1,4 @@
-"""Conditions of joints over time: what begins, what is a fault, what has lasted so long that load must be shed."""
+"""Conditions of joints over time: when they begin, which are faults, and which have lasted until load must be shed."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ _Key = tuple[str, str]
 
 
 class Health:
-    """Remembers since when each condition has lasted; a warning is logged when it begins.
+    """Tracks how long each condition has lasted, and logs a warning when one begins.
 
     Args:
-        options: how long conditions that shedding load helps against may last.
+        options: how long a condition may last before load is shed.
         log: for warnings.
     """
 
@@ -27,14 +27,14 @@ class Health:
         self._since_ns: dict[_Key, int] = {}
         self._severity: dict[_Key, Severity] = {}
         self.conditions: Sequence[Condition] = ()
-        """The present ones."""
+        """The current conditions."""
 
     def restart(self) -> None:
-        """Begin to count the time again."""
+        """Restart the timing of all conditions."""
         self._since_ns.clear()
 
     def update(self, conditions: Sequence[Condition], now_ns: int) -> None:
-        """Take the present conditions at `now_ns` [ns]."""
+        """Update with the conditions at `now_ns` [ns]."""
         found = {(condition.joint, condition.quantity): condition for condition in conditions}
         for key, condition in found.items():
             if condition.severity is Severity.WARNING and key not in self._severity:
@@ -47,11 +47,11 @@ class Health:
 
     @property
     def fault(self) -> str:
-        """The message of a condition that is a fault; empty where none is."""
+        """The message of a condition that is a fault; empty if there is none."""
         return next((each.message for each in self.conditions if each.severity is Severity.FAULT), "")
 
     def overdue(self, now_ns: int) -> str:
-        """The message of a condition that has lasted for so long that load must be shed; empty where none has."""
+        """The message of a condition that has lasted until load must be shed; empty if there is none."""
         for condition in self.conditions:
             since_ns = self._since_ns.get((condition.joint, condition.quantity), now_ns)
             if now_ns - since_ns >= self._after_ns:

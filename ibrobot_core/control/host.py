@@ -1,4 +1,4 @@
-"""The host's side of control: the same calls whether the loop runs in its own process or, in lockstep, in this one."""
+"""The host's side of control, with one interface for a loop in its own process or, in lockstep, in this process."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from ibrobot_core.plugins import Registry
 
 _START_TIMEOUT_S = 60.0
 _GLANCE_S = 0.1
-"""How often a start looks whether it is given up."""
+"""Interval at which a start checks whether it was given up."""
 _REPLY_TIMEOUT_S = 5.0
 _STOP_TIMEOUT_S = 15.0
-"""A control process that takes longer to end is killed; to stop at a pose takes up to 10 s."""
+"""Time after which a control process that has not ended is killed; moving to a stop pose takes up to 10 s."""
 _GONE = "the control process is gone"
 
 OnState = Callable[[ControlState], None]
@@ -36,13 +36,13 @@ OnEvent = Callable[[Mapping[str, Any]], None]
 
 
 class ControlHost(ABC):
-    """Starts control, hands it plans and commands, and passes its states and events on.
+    """Starts control, sends it plans and commands, and forwards its states and events.
 
     Attributes:
-        signals: topic and size of each of the hardware's signals; known once `start` returned.
-        report: the last `loop` and `counters` that control gave.
-        refused: real-time settings that the machine refused, a line each.
-        holding: what held torque when control ended, and how to take it off, a line each.
+        signals: topic and size of each hardware signal; known after `start`.
+        report: the last `loop` and `counters` reported by control.
+        refused: real-time settings refused by the machine, one line each.
+        holding: parts that held torque when control ended, and how to switch it off, one line each.
     """
 
     def __init__(self, on_state: OnState, on_event: OnEvent) -> None:
@@ -55,19 +55,19 @@ class ControlHost(ABC):
 
     @abstractmethod
     def start(self) -> None:
-        """Connect the hardware and begin to tick.
+        """Connect the hardware and start ticking.
 
         Raises:
-            IbrobotError: e.g. when the hardware does not connect.
+            IbrobotError: e.g. if the hardware does not connect.
         """
 
     @abstractmethod
     def call(self, do: str, **arguments: Any) -> Mapping[str, Any]:
-        """Have a command carried out; returns its answer, with the `generation` that holds from now on.
+        """Execute a command and return its answer, with the `generation` valid from now on.
 
         Raises:
-            HardwareError: when it is refused.
-            ComponentFailed: when control is gone.
+            HardwareError: if the command is refused.
+            ComponentFailed: if control has died.
         """
 
     @abstractmethod
@@ -76,7 +76,7 @@ class ControlHost(ABC):
 
     @abstractmethod
     def stop(self, *, unmoved: bool = False) -> None:
-        """Stop the robot by the configured behaviour, and end control. Safe to call twice.
+        """Stop the robot with the configured behaviour and end control. Safe to call twice.
 
         Args:
             unmoved: the run failed before anything moved the robot: the torque that its start put on goes off again.
@@ -84,7 +84,7 @@ class ControlHost(ABC):
 
 
 class InlineControl(ControlHost):
-    """Control within this thread, for lockstep: `step` is one tick."""
+    """Control in the calling thread, for lockstep; `step` runs one tick."""
 
     def __init__(
         self,
@@ -116,7 +116,7 @@ class InlineControl(ControlHost):
         self._started = True
 
     def step(self) -> None:
-        """One tick at the clock's time."""
+        """Run one tick at the clock's time."""
         state = self._core.tick()
         self._on_state(state)
         self._punctuality.tick(self._clock.now_ns(), 0, 0)
@@ -154,17 +154,17 @@ class InlineControl(ControlHost):
 
 
 class ControlClient(ControlHost):
-    """Control in a process of its own. A thread here receives its states and events and notices its death.
+    """Control in a separate process. A thread receives its states and events and detects its death.
 
     Args:
         config: the robot YAML.
-        clock: the run's.
-        seed: for simulated hardware.
-        on_state: given each state, in that thread.
-        on_event: given each event, in that thread.
-        on_death: called when it dies.
-        given_up: set when a start is no longer wanted: the robot then stops, wherever it is on its way.
-        aftermath: what to say beside its death.
+        clock: the clock of the run.
+        seed: seed for simulated hardware.
+        on_state: called with each state, in that thread.
+        on_event: called with each event, in that thread.
+        on_death: called when the process dies.
+        given_up: set to abort a start; the robot then stops at once, even on its way to a pose.
+        aftermath: text appended to the report of its death.
     """
 
     def __init__(
@@ -202,7 +202,7 @@ class ControlClient(ControlHost):
         try:
             self._await_ready(child)
         except IbrobotError:
-            child.channel.close()  # one that is not ready yet stops for it as soon as it is
+            child.channel.close()  # a process that is not ready yet stops once it is
             self._end(child)
             raise
         self._thread = threading.Thread(target=self._receive, args=(child,), name="control link", daemon=True)
@@ -267,7 +267,7 @@ class ControlClient(ControlHost):
         self._end(self._child)
 
     def _end(self, child: Child) -> None:
-        """Wait for the process, and let go of all that was shared with it."""
+        """Wait for the process to end and release the shared resources."""
         if child.end(_STOP_TIMEOUT_S):
             logging.getLogger("ibrobot").error(
                 "the control process did not end within %g s: killed%s", _STOP_TIMEOUT_S, self._aftermath
@@ -296,18 +296,18 @@ class ControlClient(ControlHost):
             self.holding = child.failed["holding"]
         if not self._stopping:
             self._on_death(self._failure(child, "the control process died"))
-        # Only then those that wait for an answer, so that the cause is reported and not its consequence.
+        # Wake waiting callers only afterwards, so that the cause is reported and not its consequence.
         for number in list(self._replies):
             self._take({"reply": number, "error": _GONE})
 
     def _pass_on(self, child: Child) -> None:
-        """Pass on what control says, until it is gone."""
+        """Forward states and messages until control has ended."""
         assert self._memory is not None
         while not child.channel.closed:
             ready, _, _ = select.select([self._wake, child.channel.fileno()], [], [])
             if self._wake in ready:
                 os.read(self._wake, 65536)
-            # States after the socket: all that was measured before an answer is published before the answer is seen.
+            # Read states after the socket, so that everything measured before an answer is published before the answer.
             messages = child.receive()
             for state in self._memory.read_states():
                 self._on_state(state)
@@ -329,5 +329,5 @@ class ControlClient(ControlHost):
 
     @property
     def lost_states(self) -> int:
-        """States that this side came too late for."""
+        """The number of states overwritten before they were read."""
         return self._memory.lost if self._memory is not None else 0

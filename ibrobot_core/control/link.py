@@ -1,11 +1,11 @@
-"""Where host and control process meet: shared memory for states and plans. Rare commands and events go elsewhere.
+"""Shared memory between host and control process, for states and plans. Commands and events use a socket.
 
-The memory is an unnamed file passed by descriptor, so that nothing is left behind however the two end, and there is no
-lock that a dead peer could hold: each record carries its sequence number and a checksum, and a torn one is passed over.
+The memory is an unnamed file passed by descriptor, so that nothing is left behind even if a process is killed. There is
+no lock that a dead peer could hold: each record carries a sequence number and a checksum, and torn records are skipped.
 
-Nothing here relies on the order in which one processor sees another's stores (weak on ARM): a reader copies
-a record, and believes the copy if its checksum covers just this sequence number and these bytes. Any mixture of two
-records, in whatever order its parts became visible, fails that but for 1 in 2^32, and is read again a tick later.
+Nothing here relies on the order in which one processor sees another's stores (weak on ARM). A reader copies a record
+and accepts the copy if the checksum matches its sequence number and bytes. Any mixture of two records fails this check,
+except for 1 in 2^32, and is read again a tick later.
 """
 
 from __future__ import annotations
@@ -24,27 +24,27 @@ from ibrobot_core.errors import HardwareError
 from ibrobot_core.robot import Vector
 
 STATE_SLOTS = 256
-"""States kept for the host: 2.5 s at 100 Hz."""
+"""Number of states kept for the host: 2.5 s at 100 Hz."""
 PLAN_ROWS = 2048
-"""The longest plan, in setpoints."""
+"""Maximum length of a plan, in setpoints."""
 _SEQUENCE_BYTES = 8
 _PLAN_HEAD_BYTES = 48
-"""Of a plan's integers, before its mask; its checksum covers what follows the first two, `seq` and `crc`."""
+"""The integers of a plan, before its mask; the checksum covers everything after the first two, `seq` and `crc`."""
 
 
 @attrs.frozen(eq=False)
 class ControlState:
-    """What the control loop knows after a tick; arrays in robot order."""
+    """The state of the control loop after a tick; arrays in robot order."""
 
     tick: int
     stamp_ns: int
     late_ns: int
-    """How late the tick began [ns]."""
+    """Delay of the tick's start [ns]."""
     generation: int
-    """Counts mode switches and resets; a plan made before one is not followed after it."""
+    """Counts mode switches and resets; plans from an earlier generation are not followed."""
     estop: bool
     stale: bool
-    """Whether the reading repeats an older one."""
+    """Whether the reading repeats an earlier one."""
     success: bool | None
     position: Vector
     velocity: Vector
@@ -52,12 +52,12 @@ class ControlState:
     command: Vector
     """Command written to the hardware [rad], shape (J,)."""
     signals: Vector
-    """All signals of the hardware, one after the other, shape (S,)."""
+    """All hardware signals, concatenated, shape (S,)."""
 
 
 @attrs.frozen(eq=False)
 class PlanRecord:
-    """Setpoints for the joints in `mask`, by time."""
+    """Timed setpoints for the joints in `mask`."""
 
     generation: int
     start_ns: int
@@ -65,7 +65,7 @@ class PlanRecord:
     mask: NDArray[np.bool_]
     """Shape (J,)."""
     positions: Vector
-    """[rad], shape (N, J); columns outside the mask mean nothing."""
+    """Setpoints [rad], shape (N, J); columns outside the mask are ignored."""
 
 
 @attrs.frozen
@@ -77,7 +77,7 @@ class LinkLayout:
 
     @property
     def state(self) -> np.dtype[Any]:
-        """One slot of the ring of states."""
+        """One slot of the state ring."""
         vector = ("f8", (self.joints,))
         integers = [(name, "i8") for name in ("tick", "stamp", "late", "generation", "estop", "stale", "success")]
         arrays = [(name, *vector) for name in ("position", "velocity", "effort", "command")]
@@ -100,7 +100,7 @@ class SharedMemory:
     """The ring of states (written by the control process) and the newest plan (written by the host).
 
     Args:
-        descriptor: of a file from `create_memory`; grown to size here, closed by `close`.
+        descriptor: file descriptor from `create_memory`; the file is resized here and closed by `close`.
         layout: the sizes that both sides agree on.
     """
 
@@ -122,12 +122,12 @@ class SharedMemory:
         self._plan_seq = 0
         self._seen_plan = 0
         self.lost = 0
-        """States that the reader came too late for."""
+        """The number of states overwritten before they were read."""
         self.torn = 0
-        """Records that were being written while they were read, and read again later."""
+        """The number of records that changed while being read, and were read again."""
 
     def write_state(self, state: ControlState) -> None:
-        """Append a state; the oldest makes room."""
+        """Append a state, overwriting the oldest."""
         self._written += 1
         body = self._body
         success = -1 if state.success is None else int(state.success)
@@ -152,7 +152,7 @@ class SharedMemory:
             if 0 <= seq < wanted:
                 return states
             if seq > wanted:
-                # Overtaken: go on with the oldest that cannot be overwritten at once.
+                # Overtaken: continue with the oldest state that is not about to be overwritten.
                 resume = seq - STATE_SLOTS // 2
                 self.lost += resume - wanted
                 self._read = resume - 1
@@ -168,7 +168,7 @@ class SharedMemory:
         """Replace the plan.
 
         Raises:
-            ValueError: when it has no row, or more than `PLAN_ROWS`.
+            ValueError: if it has no rows or more than `PLAN_ROWS`.
         """
         rows = len(plan.positions)
         if not 0 < rows <= PLAN_ROWS:
@@ -188,7 +188,7 @@ class SharedMemory:
         slot["seq"] = self._plan_seq
 
     def read_plan(self) -> PlanRecord | None:
-        """The newest plan, or None when it was read already."""
+        """The newest plan, or None if it was already read."""
         sequences = self._plans["seq"]
         index = int(np.argmax(sequences))
         seq = int(sequences[index])
@@ -207,13 +207,13 @@ class SharedMemory:
         return PlanRecord(generation, start_ns, step_ns, mask, positions)
 
     def _plan_bytes(self, index: int, rows: int) -> memoryview:
-        """A plan's slot, as far as `rows` setpoints use it."""
+        """The part of a plan's slot used by `rows` setpoints."""
         begin = self._split + index * self._plan_size
         used = _PLAN_HEAD_BYTES + self._row_bytes * (1 + max(0, min(rows, PLAN_ROWS)))
         return self._bytes[begin : begin + used]
 
     def close(self) -> None:
-        """Unmap; the memory is gone when both sides have."""
+        """Unmap the memory; it is freed once both sides have unmapped it."""
         del self._states, self._plans
         self._bytes.release()
         self._map.close()
@@ -221,7 +221,7 @@ class SharedMemory:
 
 
 def _plan_checksum(plan: memoryview | bytes, seq: int) -> int:
-    """Of a plan's bytes under a sequence number."""
+    """The checksum of a plan's bytes under a sequence number."""
     return crc32(plan[2 * _SEQUENCE_BYTES :], seq)
 
 
@@ -236,10 +236,10 @@ def _state(record: Any) -> ControlState:
 
 
 def raise_error(reply: Mapping[str, Any]) -> Mapping[str, Any]:
-    """A reply, unless it says that its command failed.
+    """Return a reply, or raise if its command failed.
 
     Raises:
-        HardwareError: with the words of the control loop.
+        HardwareError: with the message of the control loop.
     """
     if "error" in reply:
         raise HardwareError(str(reply["error"]))

@@ -1,4 +1,4 @@
-"""The `position` executor: follows a plan of setpoints by time, and says so when the plan has run dry."""
+"""The `position` executor: follows a plan of timed setpoints and reports when the plan has run dry."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from ibrobot_core.units import ns, seconds
 
 
 class PositionExecutor(Executor):
-    """Goes through the setpoints of its plan with continuous acceleration; a plan of length one is a teleop command.
+    """Follows the setpoints of its plan with continuous acceleration; a plan of length one is a teleop command.
 
-    Between setpoints it follows a cubic spline, never beyond the joints' limits where they are within. A plan that has
-    begun already is joined within one step, with neither a jump nor a change of speed. Before the plan's first setpoint
-    is due it holds, and goes there over the last step before it. After the last one it holds it; once that is older
-    than `stale_timeout`, the plan is stale and `safety_behavior` applies: `hold` keeps the last setpoint that was given
-    out, `relax` asks for torque off until another plan comes.
+    Between setpoints it follows a cubic spline, which stays within the joint limits if the setpoints do. A plan that
+    has already begun is joined within one step, without a jump in position or speed. Until one step before the first
+    setpoint the executor holds; it moves there during that step. After the last setpoint it holds that setpoint. Once
+    the setpoint is older than `stale_timeout`, the plan is stale and `safety_behavior` applies: `hold` keeps the last
+    output, `relax` requests torque off until a new plan arrives.
     """
 
     accepts_plans: ClassVar[bool] = True
@@ -40,7 +40,7 @@ class PositionExecutor(Executor):
         self._plan: Plan | None = None
         self._curve: Spline | None = None
         self._joining: Vector | None = None
-        """What the setpoint had to the plan when that came, and its speed, over a step, to the plan's; shape (2, J)."""
+        """Offset from the plan, and of the speed times a step, when the plan arrived; shape (2, J)."""
         self._joined_at_ns = 0
         self._lowest = self._highest = self._setpoint
         self._approach_ns = 0
@@ -61,7 +61,7 @@ class PositionExecutor(Executor):
 
     @override
     def set_plan(self, plan: Plan) -> None:
-        """Replace the plan; one that is no finite (N, J) with a positive step is counted, and the old one stays."""
+        """Replace the plan; one that is not a finite (N, J) with a positive step is counted and ignored."""
         try:
             positions = np.array(plan.positions, dtype=np.float64)
         except (TypeError, ValueError):
@@ -77,7 +77,7 @@ class PositionExecutor(Executor):
             self._approach_ns = max(self._stamp_ns, plan.start_ns - plan.step_ns)
             self._approach_from = self._setpoint
             self._curve = _curve(self._plan) if len(positions) > 1 else None
-            # A spline swings a little beyond its points.
+            # A spline overshoots its points slightly.
             self._lowest = np.minimum(self._lower, positions.min(axis=0))
             self._highest = np.maximum(self._upper, positions.max(axis=0))
             self._join()
@@ -97,7 +97,7 @@ class PositionExecutor(Executor):
             else:
                 self._setpoint = self._at(plan, now_ns)
         if self.wants_relax:
-            # The arm falls: whatever comes next starts from where it lies.
+            # The arm falls: the next plan starts from the measured position.
             self._setpoint = np.where(np.isfinite(measured.position), measured.position, self._setpoint)
         if now_ns > before_ns:
             self._velocity = (self._setpoint - before) / seconds(now_ns - before_ns)
@@ -111,7 +111,7 @@ class PositionExecutor(Executor):
 
     @override
     def counters(self) -> Mapping[str, int]:
-        """`stale`: times a plan ran dry; `refused_*`: plans refused."""
+        """`stale`: number of plans that ran dry; `refused_*`: number of plans refused."""
         return dict(self._counters)
 
     def _at(self, plan: Plan, now_ns: int) -> Vector:
@@ -130,7 +130,7 @@ class PositionExecutor(Executor):
         return setpoint
 
     def _join(self) -> None:
-        """Keep what the setpoint that was given out has to the plan, to let it fade over a step."""
+        """Store the offset of the last output from the plan, which then fades out over a step."""
         plan, curve = self._plan, self._curve
         self._joining = None
         if plan is not None and curve is not None and plan.start_ns <= self._stamp_ns:
@@ -146,7 +146,7 @@ class PositionExecutor(Executor):
 
 
 def _between(here: Vector, there: Vector, done: float) -> Vector:
-    """Linear between two setpoints, `done` in 0..1."""
+    """Interpolate linearly between two setpoints, `done` in 0..1."""
     result: Vector = here + done * (there - here)
     return result
 

@@ -128,7 +128,7 @@ def test_a_policy_that_cannot_continue_a_plan_is_refused(make_rig: type[Rig]) ->
         make_rig(strategy="rtc", prefix=False)
 
 
-def test_what_a_chunk_misses_the_plan_by_is_led_over(make_rig: type[Rig]) -> None:
+def test_a_lead_in_bridges_the_gap_between_plan_and_chunk(make_rig: type[Rig]) -> None:
     """A policy continues the plan about, as guided flows do."""
     rig = make_rig(watermark=9, strategy="rtc", timeout_s=60.0)
     rig.tick()
