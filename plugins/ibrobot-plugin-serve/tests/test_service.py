@@ -646,7 +646,7 @@ def test_all_requests_on_their_way_in_an_outage_are_one_failure():
     transport.close()
 
 
-def test_the_engine_does_not_send_answers_that_are_no_longer_needed():
+def test_the_engine_does_not_send_expired_requests():
     with served() as cloud, engine(cloud) as remote:
         with pytest.raises(PolicyError, match="expired before it was sent"):
             remote.infer({"x": np.zeros(1)}, 1, time.monotonic_ns())
