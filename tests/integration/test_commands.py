@@ -42,6 +42,7 @@ WRONG_FILES = {
     "certs BAD --robot one": ("missing", "folder"),
     "contract init BAD": (),
     "contract init EPISODE -o BAD": ("missing",),
+    "description srdf BAD": (),
     "episodes delete BAD --yes": (),
     "episodes export BAD /joint_states -o new.csv": (),
     "episodes export EPISODE /joint_states -o BAD": ("missing", "binary", "empty"),
@@ -68,13 +69,17 @@ WRONG_FILES = {
     "feetech setup-motors BAD --yes": (),
     "feetech torque off BAD --yes": (),
     "feetech torque off no_port --robot BAD --yes": (),
+    "gamepad map BAD": (),
     "topic echo /a --config BAD": (),
     "topic hz /a --config BAD": (),
     "topic list --config BAD": (),
     "topic pub /a std_msgs/msg/Bool {data:true} --config BAD": (),
 }
 """Command line -> the kinds of files that are right there."""
-WITHOUT_FILES = {"config schema", "plugins show", "doctor", "camera list", "feetech find-port"}
+WITHOUT_FILES = {
+    "config schema", "plugins show", "doctor", "camera list", "feetech find-port", "gamepad list", "gamepad test",
+    "gamepad udev",
+}  # fmt: skip
 KINDS = ("missing", "folder", "binary", "unreadable", "empty")
 
 
@@ -196,6 +201,7 @@ JSON = {
     "episodes list . --json": 0,
     "episodes list BAD --json": 2,
     "feetech monitor BAD --json": 2,
+    "gamepad list --json": 0,
 }
 """Command line -> its exit code; None where it depends on the machine."""
 INTERRUPTED = """
