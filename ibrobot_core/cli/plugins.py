@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import sys
 from typing import Any
 
 import attrs
 import click
 
 from ibrobot_core.errors import PluginError
+from ibrobot_core.options import did_you_mean
 from ibrobot_core.outside import echo
 from ibrobot_core.plugins import Entry, Registry, installed_plugins
 
@@ -21,13 +23,12 @@ def plugins(ctx: click.Context, as_json: bool) -> None:
     if ctx.invoked_subcommand is not None:
         return
     registry = installed_plugins()
-    entries = [registry.entries[key] for key in sorted(registry.entries)]
+    rows = [_row(registry, registry.entries[key]) for key in sorted(registry.entries)]
     if as_json:
         broken = [attrs.asdict(failure) for failure in registry.failures]
-        echo(json.dumps({"plugins": [_row(registry, entry) for entry in entries], "broken": broken}, indent=2))
+        echo(json.dumps({"plugins": rows, "broken": broken}, indent=2))
         return
     columns = ("kind", "type", "package", "version", "summary")
-    rows = [_row(registry, entry) for entry in entries]
     _print_table(columns, [[str(row[column]) for column in columns] for row in rows])
     for row in rows:
         if row["missing"] is not None:
@@ -46,7 +47,8 @@ def show(type_: str, as_json: bool) -> None:
     registry = installed_plugins()
     entries = [registry.entries[key] for key in sorted(registry.entries) if key[1] == type_]
     if not entries:
-        raise PluginError(_unknown(registry, type_))
+        remark = did_you_mean(type_, sorted({t for _, t in registry.entries}), "installed")
+        raise PluginError(f"unknown type {type_!r}{remark}{registry.broken}")
     found = [
         {**_row(registry, entry), "options": [attrs.asdict(option) for option in described(entry.descriptor.options)]}
         for entry in entries
@@ -67,27 +69,19 @@ def show(type_: str, as_json: bool) -> None:
 
 def _row(registry: Registry, entry: Entry) -> dict[str, Any]:
     missing = registry.missing(entry.kind, entry.descriptor.type)
+    lacking = missing and {"what": missing.missing, "apt": list(missing.apt), "remedy": missing.remedy}
     return {
         "kind": entry.kind,
         "type": entry.descriptor.type,
         "package": entry.package,
         "version": entry.version,
         "summary": entry.descriptor.summary,
-        "missing": None
-        if missing is None
-        else {"what": missing.missing, "apt": list(missing.apt), "remedy": missing.remedy},
+        "missing": lacking,
     }
 
 
 def _lacking(row: dict[str, Any]) -> str:
     return f"{row['missing']['what']}; {row['missing']['remedy']}"
-
-
-def _unknown(registry: Registry, type_: str) -> str:
-    from ibrobot_core.options import did_you_mean
-
-    remark = did_you_mean(type_, sorted({t for _, t in registry.entries}), "installed")
-    return f"unknown type {type_!r}{remark}{registry.broken}"
 
 
 def _text(value: Any) -> str:
@@ -96,8 +90,6 @@ def _text(value: Any) -> str:
 
 def _print_table(columns: tuple[str, ...], rows: list[list[str]]) -> None:
     """A table as wide as the terminal; all of every cell where there is none to fit it into."""
-    import sys
-
     from rich.table import Table
 
     from ibrobot_core.screen import Screen

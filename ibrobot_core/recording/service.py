@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import shutil
 import threading
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, override
@@ -154,8 +154,7 @@ class EpisodeService(Episodes):
         folder = self.folder
         while not folder.exists():
             folder = folder.parent
-        disk = os.statvfs(folder)
-        return disk.f_bavail * disk.f_frsize
+        return shutil.disk_usage(folder).free
 
     def status(self) -> Mapping[str, Any]:
         """What a front end shows."""
