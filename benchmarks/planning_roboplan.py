@@ -9,6 +9,7 @@ import tempfile
 import time
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import coal
 import numpy as np
@@ -51,7 +52,7 @@ def _collision(placed: Vector, shape: str) -> str:
     return f"<collision>{_origin(placed)}<geometry>{shape}</geometry></collision>"
 
 
-def _shape(geometry: object, folder: Path, name: str) -> str:
+def _shape(geometry: Any, folder: Path, name: str) -> str:
     if isinstance(geometry, coal.Box):
         x, y, z = 2 * geometry.halfSide
         return f'<box size="{x} {y} {z}"/>'
@@ -148,9 +149,11 @@ def measure_roboplan(maker: Maker, kind: str, tasks: list[Problem], seconds: flo
         cpus.append(time.process_time() - cpu)
         durations.append(motion.duration)
         assert all(b > a for a, b in pairwise(motion.times.tolist()))
-    wall, cpu = (f"{1000 * np.median(each):.0f} (p95 {1000 * np.percentile(each, 95):.0f})" for each in (walls, cpus))
+    wall_ms, cpu_ms = (
+        f"{1000 * np.median(each):.0f} (p95 {1000 * np.percentile(each, 95):.0f})" for each in (walls, cpus)
+    )
     print(
-        f"{'':12s} roboplan {len(walls)}/{len(tasks)} in {seconds:g} s; wall {wall} ms, CPU {cpu} ms; motion"
+        f"{'':12s} roboplan {len(walls)}/{len(tasks)} in {seconds:g} s; wall {wall_ms} ms, CPU {cpu_ms} ms; motion"
         f" {np.median(durations):.2f} s" + (f"; failed {failed[:3]}" if failed else ""),
         flush=True,
     )
