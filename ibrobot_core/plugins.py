@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from difflib import get_close_matches
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
@@ -263,12 +263,6 @@ def _reason(error: BaseException) -> str:
     return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
 
 
-def _manager() -> pluggy.PluginManager:
-    manager = pluggy.PluginManager("ibrobot")
-    manager.add_hookspecs(hookspecs)
-    return manager
-
-
 def _check_names(plugin: Any) -> None:
     """Refuse functions that look like hooks but are none, marked or not: a typo would otherwise pass in silence."""
     known = {name for name in vars(hookspecs) if name.startswith("ibrobot_")}
@@ -278,17 +272,24 @@ def _check_names(plugin: Any) -> None:
             raise ValueError(f"unknown hook {name!r}" + (f", did you mean {close[0]!r}?" if close else ""))
 
 
-def _collect(registry: Registry, plugin: str, package: str, version: str, manager: pluggy.PluginManager) -> None:
-    """Call the registering hooks; a plugin that raises in one offers nothing."""
+def _add(registry: Registry, plugin: str, package: str, version: str, load: Callable[[], Any]) -> None:
+    """Load a plugin and call its registering hooks; one that raises, whether then or in a hook, offers nothing."""
+    manager = pluggy.PluginManager("ibrobot")
+    manager.add_hookspecs(hookspecs)
     offers: dict[str, list[Any]] = {}
-    stage = ""
+    stage = "import"
     try:
+        loaded = load()
+        stage = "hooks"
+        _check_names(loaded)
+        manager.register(loaded, plugin)
+        manager.check_pending()
         for stage in (*KINDS.values(), *_UNTYPED):
             offers[stage] = [each for result in getattr(manager.hook, stage)() for each in result]
             wrong = [each for each in offers[stage] if not isinstance(each, descriptors.Descriptor)]
             if wrong and stage in KINDS.values():
                 raise TypeError(f"expected a Descriptor, got {wrong[0]!r}")
-    except Exception as error:  # noqa: BLE001 - contained: reported where the plugin is asked for
+    except (Exception, SystemExit) as error:  # noqa: BLE001 - contained: reported where the plugin is asked for
         registry.failures.append(Failure(plugin, package, stage, _reason(error)))
         return
     for kind, descriptor in ((kind, each) for kind, hook in KINDS.items() for each in offers[hook]):
@@ -305,25 +306,6 @@ def _collect(registry: Registry, plugin: str, package: str, version: str, manage
     registry.managers[plugin] = manager
 
 
-def _load(registry: Registry, entry_point: EntryPoint) -> None:
-    package = entry_point.dist.name if entry_point.dist else "?"
-    version = entry_point.dist.version if entry_point.dist else "?"
-    try:
-        plugin = entry_point.load()
-    except (Exception, SystemExit) as error:  # noqa: BLE001 - contained: reported where the plugin is asked for
-        registry.failures.append(Failure(entry_point.name, package, "import", _reason(error)))
-        return
-    manager = _manager()
-    try:
-        _check_names(plugin)
-        manager.register(plugin, entry_point.name)
-        manager.check_pending()
-    except Exception as error:  # noqa: BLE001 - contained: reported where the plugin is asked for
-        registry.failures.append(Failure(entry_point.name, package, "hooks", _reason(error)))
-        return
-    _collect(registry, entry_point.name, package, version, manager)
-
-
 def discover(found: Iterable[EntryPoint] | None = None) -> Registry:
     """Load the built-in plugin and every installed one. Never raises for a plugin's fault: see `Registry.failures`.
 
@@ -333,11 +315,10 @@ def discover(found: Iterable[EntryPoint] | None = None) -> Registry:
     from ibrobot_core import __version__, builtin
 
     registry = Registry()
-    manager = _manager()
-    manager.register(builtin, "core")
-    _collect(registry, "core", "ibrobot-core", __version__, manager)
-    for entry_point in sorted(entry_points(group=ENTRY_POINT_GROUP) if found is None else found, key=lambda e: e.name):
-        _load(registry, entry_point)
+    _add(registry, "core", "ibrobot-core", __version__, lambda: builtin)
+    for entry in sorted(entry_points(group=ENTRY_POINT_GROUP) if found is None else found, key=lambda e: e.name):
+        package, version = (entry.dist.name, entry.dist.version) if entry.dist else ("?", "?")
+        _add(registry, entry.name, package, version, entry.load)
     return registry
 
 

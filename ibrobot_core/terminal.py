@@ -11,7 +11,6 @@ import threading
 import tty
 import weakref
 from contextlib import suppress
-from types import TracebackType
 from typing import Any
 
 from ibrobot_core.errors import TeleopError
@@ -153,9 +152,7 @@ class KeyReader:
         self.open()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *raised: object) -> None:
         self.close()
 
     def _read(self) -> None:

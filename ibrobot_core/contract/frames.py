@@ -213,10 +213,6 @@ class FrameSampler:
             self._drain(t_ns)
             self._assembler.advance(t_ns)
 
-    def resets(self) -> dict[str, int]:
-        """How often the stamps of a topic jumped, per topic; topics without a jump left out."""
-        return self._assembler.resets()
-
     def close(self) -> None:
         """Leave the bus. Safe to call twice."""
         for subscription in self._subscriptions:

@@ -176,12 +176,8 @@ class SharedMemory:
         self._plan_seq += 1
         slot = self._plans[self._plan_seq % 2]
         slot["seq"] = -1
-        slot["generation"], slot["start"], slot["step"], slot["rows"] = (
-            plan.generation,
-            plan.start_ns,
-            plan.step_ns,
-            rows,
-        )
+        slot["generation"], slot["start"], slot["step"] = plan.generation, plan.start_ns, plan.step_ns
+        slot["rows"] = rows
         slot["mask"] = plan.mask
         slot["positions"][:rows] = plan.positions
         slot["crc"] = _plan_checksum(self._plan_bytes(self._plan_seq % 2, rows), self._plan_seq)

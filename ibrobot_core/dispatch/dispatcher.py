@@ -177,7 +177,7 @@ class Dispatcher:
 
     def toggle_smoothing(self, enabled: bool) -> None:
         """Switch blending on or off for later chunks."""
-        self._smoother.toggle(enabled)
+        self._smoother.enabled = enabled
         self.stats.smoothing = enabled
 
     def tick(self, t_ns: int) -> None:

@@ -32,7 +32,8 @@ class TemporalSmoother:
     accumulate. Interpolation would low-pass each chunk once more; without it, every action stays as the policy
     returned it. A chunk that does not touch the plan keeps its exact times.
 
-    Not thread-safe; one thread owns it. Arrays returned by `plan` never change afterwards.
+    Not thread-safe; one thread owns it. Arrays returned by `plan` never change afterwards. `enabled` may change between
+    chunks; the plan stays.
 
     Args:
         step_ns: time between actions [ns].
@@ -72,10 +73,6 @@ class TemporalSmoother:
         self._set(0, np.empty((0, self.action_size)), np.empty(0, dtype=np.intp))
         self._now_ns: int | None = None
         self._held: Vector | None = None
-
-    def toggle(self, enabled: bool) -> None:
-        """Switch smoothing on or off for later chunks; the plan stays."""
-        self.enabled = enabled
 
     def plan(self) -> tuple[int, Vector]:
         """The time of the first action [ns] and the actions, shape (M, A), read-only; `(0, empty)` without a plan."""

@@ -211,11 +211,6 @@ class Session:
         self._control = control
 
     @property
-    def policy(self) -> Callable[[], Mapping[str, str]] | None:
-        """Says which policy acts, and with which weights; None in a mode without one."""
-        return self.acting.described if self.acting is not None else None
-
-    @property
     def has_control(self) -> bool:
         """Whether control was made."""
         return self._control is not None

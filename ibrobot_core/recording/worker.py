@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import TYPE_CHECKING, override
 
@@ -31,31 +31,6 @@ _SILENT_NS = NS_PER_S
 """A topic without a message for so long is silent [ns]."""
 
 
-@attrs.frozen
-class _Begin:
-    """An episode begins, with what was latched then, and what had been lost on the way here by then."""
-
-    start: EpisodeStart
-    latched: tuple[Received, ...]
-    lost: Mapping[str, int]
-
-    @property
-    def stamp_ns(self) -> int:
-        return self.start.stamp_ns
-
-
-@attrs.frozen
-class _End:
-    """An episode ends; `provisional`: nothing has gone wrong with it so far, and it is to be kept."""
-
-    end: EpisodeEnd
-    provisional: bool
-
-    @property
-    def stamp_ns(self) -> int:
-        return self.end.stamp_ns
-
-
 class RecordingWorker(Worker):
     """Writes what is on the bus while an episode is on.
 
@@ -70,7 +45,8 @@ class RecordingWorker(Worker):
         self._session = session
         self._config = config
         self._contract = Contract.from_config(session.config)
-        self._orders: deque[_Begin | _End] = deque()
+        self._orders: deque[tuple[int, Callable[[], None]]] = deque()
+        """Beginnings and ends of episodes that are still to be carried out: stamp [ns] and what to do."""
         self._order = threading.Lock()
         """Held while an order is stamped and queued, and while orders and messages are taken: neither overtakes."""
         self._open = False
@@ -114,17 +90,19 @@ class RecordingWorker(Worker):
             start = episode_start(
                 session.config, self._config, topics, mode=session.mode, seed=seed, stamp_ns=session.bus.snapshot_ns(),
                 lockstep=session.request.lockstep, prompt=prompt, plugins=session.registry.versions(),
-                policy=session.policy() if session.policy is not None else None,
+                policy=session.acting.described() if session.acting is not None else None,
             )  # fmt: skip
             latched = tuple(i for i in session.bus.latched().values() if i.received_ns <= start.stamp_ns)
-            self._orders.append(_Begin(start, latched, self._incoming.lost.copy()))
+            begin = partial(self._open_episode, start, latched, self._incoming.lost.copy())
+            self._orders.append((start.stamp_ns, begin))
 
     def end(self, outcome: str) -> None:
         """Messages up to here belong to the episode."""
         with self._order:
             provisional = outcome != "discarded" and self.failure is None
             self._provisional += provisional
-            self._orders.append(_End(EpisodeEnd(self._session.bus.snapshot_ns(), outcome), provisional))
+            end = EpisodeEnd(self._session.bus.snapshot_ns(), outcome)
+            self._orders.append((end.stamp_ns, partial(self._end_episode, end, provisional)))
 
     @property
     def saved(self) -> int:
@@ -140,11 +118,11 @@ class RecordingWorker(Worker):
             items = [*([first] if first is not None else []), *self._incoming.drain()]
         for item in items:
             self._note(item)
-            while orders and orders[0].stamp_ns < item.received_ns:
-                self._carry_out(self._recorder, orders.popleft())
-            self._write(self._recorder, item, item.received_ns)
-        for order in orders:
-            self._carry_out(self._recorder, order)
+            while orders and orders[0][0] < item.received_ns:
+                orders.popleft()[1]()
+            self._write(item, item.received_ns)
+        for _, carry_out in orders:
+            carry_out()
 
     def rates(self) -> dict[str, float]:
         """Measured rate of each topic that is recorded [Hz]; 0 for one that came once."""
@@ -194,36 +172,36 @@ class RecordingWorker(Worker):
             self._newest[item.topic] = item.message
             self._seen.setdefault(item.topic, deque(maxlen=_RATE_WINDOW)).append(item.received_ns)
 
-    def _carry_out(self, recorder: Recorder, order: _Begin | _End) -> None:
-        if isinstance(order, _Begin):
-            self.failure = None
-            self._lost = order.lost
-            self._open = self._did(partial(recorder.begin, order.start))
-            if not self._open:
-                return
-            for item in order.latched:
-                self._write(recorder, item, order.stamp_ns)
-        else:
-            whole = self._finish(recorder, order.end)
-            with self._order:
-                self._provisional -= order.provisional
-                self._whole += order.provisional and whole
-            self._report_absent()
+    def _open_episode(self, start: EpisodeStart, latched: Iterable[Received], lost: Mapping[str, int]) -> None:
+        """Open an episode, with what was latched and what had been lost on the way here when it began."""
+        self.failure = None
+        self._lost = lost
+        self._open = self._did(partial(self._recorder.begin, start))
+        for item in latched:
+            self._write(item, start.stamp_ns)
 
-    def _finish(self, recorder: Recorder, end: EpisodeEnd) -> bool:
+    def _end_episode(self, end: EpisodeEnd, provisional: bool) -> None:
+        """End the open episode; `provisional`: when the end was asked for it was whole, and it is to be kept."""
+        whole = self._finish(end)
+        with self._order:
+            self._provisional -= provisional
+            self._whole += provisional and whole
+        self._report_absent()
+
+    def _finish(self, end: EpisodeEnd) -> bool:
         """End the open episode, if any; whether it is whole."""
         if not self._open:
             return False
         self._open = False
         # Counted now: what waited when the episode ended may have been lost since.
         dropped = {topic: n for topic, n in self.lost().items() if self._keeps(topic)}
-        return self._did(partial(recorder.end, attrs.evolve(end, dropped=dropped)))
+        return self._did(partial(self._recorder.end, attrs.evolve(end, dropped=dropped)))
 
-    def _write(self, recorder: Recorder, item: Received, received_ns: int) -> None:
+    def _write(self, item: Received, received_ns: int) -> None:
         if not self._open or not self._keeps(item.topic):
             return
-        if not self._did(partial(recorder.write, item.topic, item.message, received_ns)):
-            self._finish(recorder, EpisodeEnd(received_ns, "unknown"))
+        if not self._did(partial(self._recorder.write, item.topic, item.message, received_ns)):
+            self._finish(EpisodeEnd(received_ns, "unknown"))
 
     def _did(self, act: Callable[[], object]) -> bool:
         """Let the recorder do something; a failure of any kind is a fault of the episode, and no other's."""

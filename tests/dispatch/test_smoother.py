@@ -192,11 +192,11 @@ def test_toggle_applies_to_the_chunks_to_come() -> None:
     smoother = TemporalSmoother(STEP, 1, coeff=0.0)
     smoother.update(np.zeros((4, 1)), T0)
     smoother.update(np.ones((4, 1)), T0)
-    smoother.toggle(False)
+    smoother.enabled = False
     np.testing.assert_allclose(smoother.plan()[1], 0.5)
     smoother.update(np.full((4, 1), 3.0), T0 + STEP)
     np.testing.assert_allclose(smoother.plan()[1][:, 0], [0.5, 3, 3, 3, 3])
-    smoother.toggle(True)
+    smoother.enabled = True
     smoother.update(np.full((4, 1), 5.0), T0 + STEP)
     np.testing.assert_allclose(smoother.plan()[1][:, 0], [0.5, 4, 4, 4, 4])
 
