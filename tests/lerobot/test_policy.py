@@ -254,8 +254,8 @@ def test_a_first_run_that_fails_is_reported(folders: dict[str, Path], monkeypatc
         ({STATE: np.zeros(6, np.float32)}, "observation.state is float32 (6,), must be float32 (1, 6)"),
         ({STATE: np.zeros((1, 6))}, "observation.state is float64 (1, 6), must be float32 (1, 6)"),
         ({TOP: np.zeros((480, 640, 3), np.uint8)}, f"{TOP} is uint8 (480, 640, 3), must be uint8 (96, 96, 3)"),
-        ({"prefix": np.zeros((1, 2, 6), np.float32)}, "prefix is not known"),
-        ({SEED: None, "sed": np.zeros(1)}, "seed is missing, must be int64 (1,); sed is not known"),
+        ({"prefix": np.zeros((1, 2, 6), np.float32)}, "prefix is unknown"),
+        ({SEED: None, "sed": np.zeros(1)}, "seed is missing, must be int64 (1,); sed is unknown"),
     ],
 )
 def test_a_request_that_another_client_got_wrong_is_reported(
