@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -42,7 +43,7 @@ def planner(**options: float) -> JointPlanner:
     return JointPlanner(JointPlannerOptions(max_jerk=JERK, **options), CONTEXT)
 
 
-def request(start: list[float], goal: dict[str, float], **scaling: float) -> PlanRequest:
+def request(start: list[float], goal: dict[str, float], **scaling: Any) -> PlanRequest:
     return PlanRequest(
         ROBOT.joint_names, np.array(start), JointGoal(tuple(goal), np.array(list(goal.values()))), **scaling
     )
