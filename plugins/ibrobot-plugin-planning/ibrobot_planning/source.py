@@ -1,195 +1,402 @@
-"""Planning: goals, named or joint by joint, become trajectories for the executors of a planning mode."""
+"""Planning: goals become trajectories for the executors of a planning mode."""
 
 from __future__ import annotations
 
 import itertools
-import math
 import queue
-from collections.abc import Mapping
+import threading
+from collections import deque
+from collections.abc import Callable, Mapping
 from typing import Any, override
 
 import attrs
 import numpy as np
 
 from ibrobot_core.api import (
+    AnyGoal,
     ControlMode,
+    Goal,
     HardwareError,
     JointGoal,
+    JointState,
+    NotSupported,
+    OrientationPolicy,
+    PlanCode,
     Planner,
     PlanningError,
     PlanRequest,
-    Robot,
+    PlanResult,
+    Pose,
+    PoseGoal,
+    PoseStamped,
     Session,
     SourceWorker,
+    String,
+    ns,
+    seconds,
     trajectory_goal,
 )
+from ibrobot_planning.goal_text import Target, target
+from ibrobot_planning.motion import MoveResult, MoveToConfiguration, MoveToPose, Outcome
 
 GO_TO = "/planning/go_to"
+"""Takes a goal, as text or as a goal of `ibrobot_core.api`, in place of the present one; answers with its number."""
+RESULT = "/planning/result"
+"""Number of a goal -> its `MoveResult`; None while it is under way."""
+CANCEL = "/planning/cancel"
+"""Drops all goals: the robot slows down and holds."""
+MOVE_TO_POSE = "/moveit_gateway/move_to_pose"
+"""Takes a `MoveToPose`, and answers with a `MoveResult` when the motion has ended."""
+MOVE_TO_CONFIGURATION = "/moveit_gateway/move_to_configuration"
+"""Takes a `MoveToConfiguration`, and answers with a `MoveResult` when the motion has ended."""
+CMD_POSE = "/cmd_pose"
+"""geometry_msgs/msg/PoseStamped or Pose: a goal."""
+MOTION_STATUS = "/moveit_gateway/motion_status"
+"""std_msgs/msg/String: `idle`, `executing`, `succeeded` or `failed`, as IB-Robot's gateway has it."""
+FRAMES = ("", "base", "base_link")
+"""Names of the base frame in `/cmd_pose`."""
+_STATUS_NS = ns(0.1)
+_GLANCE_S = 0.5
+_ENDED = MoveResult(False, "the mode or the run ended", 0.0, "CANCELLED", PlanCode.PREEMPTED)
+_KEPT = 100
+"""How many results are kept for `RESULT`."""
+_POLICIES: tuple[OrientationPolicy, ...] = ("keep_axis", "arm_plane", "current", "free")
 
 
-@attrs.define
-class _Motion:
-    """A goal under way: what each executor still has to say."""
+@attrs.define(eq=False)
+class _Move:
+    """A goal on its way to the executors."""
 
     number: int
-    text: str
-    waiting: set[str]
+    target: Target
+    asked: bool = False
+    """Whether the run ends when all such goals have."""
+    waiting: set[str] = attrs.field(factory=set)
+    """Executors that have not ended yet."""
     failures: list[str] = attrs.field(factory=list)
+    begun_ns: int | None = None
+    planned: PlanResult | None = None
+    dropped: str = ""
+    """Why it stops before its end; empty while it does not."""
+    result: MoveResult | None = None
+    ended: threading.Event = attrs.field(factory=threading.Event)
 
 
 class PlannerSource(SourceWorker):
-    """Plans from where the robot is to each goal in turn; service `/planning/go_to` takes goals too.
+    """Moves to goals, planned from where the robot is.
 
-    The goals of the request count for the mode in which the run begins.
+    The goals of the request are reached one after the other, in the mode in which the run begins. A goal of a service
+    or of `/cmd_pose` takes the place of all others: the robot first slows down along its trajectory.
 
     Raises:
-        PlanningError: for a goal of the request that names no pose or joint of this robot.
+        PlanningError: for a goal of the request that makes no sense for this robot.
     """
 
     def __init__(self, session: Session, mode: ControlMode) -> None:
         assert mode.planner is not None
         super().__init__(session, mode, f"planner {mode.planner.type}")
         self._component = mode.planner
-        self._goals: queue.SimpleQueue[str] = queue.SimpleQueue()
-        self._events: queue.SimpleQueue[Mapping[str, Any]] = queue.SimpleQueue()
-        self._motion: _Motion | None = None
         self._numbers = itertools.count(1)
-        asked = () if session.has_control else session.request.goals
-        self._asked = len(asked)
-        self._done = 0
-        for goal in asked:
+        self._inbox: queue.SimpleQueue[Mapping[str, Any] | _Move | None] = queue.SimpleQueue()
+        """Events of executors; goals that take the place of others; None to cancel."""
+        self._queue: deque[_Move] = deque()
+        self._move: _Move | None = None
+        self._moves: dict[int, _Move] = {}
+        self._status = ""
+        self._status_ns = 0
+        self._worker = 0
+        for goal in () if session.has_control else session.request.goals:
             try:
-                parse_goal(goal, session.config.robot)
+                self._queue.append(self._new(goal, asked=True))
             except PlanningError as error:
                 error.exit_code = 2
                 raise
-            self._goals.put(goal)
+        self._asked = len(self._queue)
+        self._ends = bool(self._queue)
+        self._over = False
+        self._services: dict[str, Callable[[Any], Any]] = {
+            GO_TO: lambda goal: self._submit(goal).number,
+            RESULT: self._result,
+            CANCEL: lambda request: self._inbox.put(None),
+            MOVE_TO_POSE: self._move_to_pose,
+            MOVE_TO_CONFIGURATION: self._move_to_configuration,
+        }
 
     @override
     def setup(self) -> None:
         self._planner: Planner = self.session.make("planner", self._component, self._component.type)
         self.on_end.callback(self._planner.close)
+        self._poses = self.session.bus.subscribe(CMD_POSE, 1)
+        self.on_end.callback(self._poses.close)
+        self.on_end.callback(self._drop_all)
         self._planner.load()
-
-    def go_to(self, goal: str) -> None:
-        """Queue a goal: a pose's name, or `joint=radians,joint=radians`.
-
-        Raises:
-            PlanningError: for one that names no pose or joint of this robot.
-        """
-        parse_goal(goal, self.session.config.robot)
-        self._goals.put(goal)
 
     @override
     def begin_mode(self, seed: int) -> None:
-        if self._motion is not None:
-            self._finish(self._motion.text, ["control was reset"])
-        self.session.bus.serve(GO_TO, self.go_to)
+        if self._move is not None:
+            self._finish(self._move, "EXECUTION_FAILED", PlanCode.CONTROL_FAILED, "control was reset")
+        self._poses.drain()
+        for name, handler in self._services.items():
+            self.session.bus.serve(name, handler)
+        self._show("idle")
 
     @override
     def end_mode(self) -> None:
-        self.session.bus.unserve(GO_TO)
+        for name in self._services:
+            self.session.bus.unserve(name)
 
     @override
     def take_goal(self, event: Mapping[str, Any]) -> None:
-        self._events.put(event)
+        self._inbox.put(event)
 
     @override
     def work(self, timeout_s: float) -> None:
+        self._worker = threading.get_ident()
         try:
-            event = self._events.get(timeout_s > 0, timeout_s or None)
+            items = [self._inbox.get(timeout_s > 0, timeout_s or None)]
+            while not self._inbox.empty():
+                items.append(self._inbox.get())
         except queue.Empty:
-            event = None
+            items = []
         with self.lock:
-            if event is not None:
-                self._advance(event)
-            if self.active and self._motion is None and not self._goals.empty():
-                self._begin(self._goals.get())
+            for item in items:
+                if isinstance(item, Mapping):
+                    self._advance(item)
+                else:
+                    self._replace(item)
+            if not self.active:
+                return
+            self._take_pose()
+            if self._move is None and self._queue:
+                self._begin(self._queue.popleft())
+            if self._move is not None and self.session.clock.now_ns() - self._status_ns >= _STATUS_NS:
+                self._show("executing")
 
-    def _begin(self, text: str) -> None:
-        session, number = self.session, next(self._numbers)
+    def _new(self, goal: str | Goal, velocity_scaling: float = 1.0, *, asked: bool = False) -> _Move:
+        parsed = target(goal, self.session.config.robot, velocity_scaling)
+        self._executors(parsed)
+        return _Move(next(self._numbers), parsed, asked)
+
+    def _submit(self, goal: str | Goal, velocity_scaling: float = 1.0) -> _Move:
+        """Have a goal take the place of all others."""
+        move = self._known(self._new(goal, velocity_scaling))
+        self._inbox.put(move)
+        return move
+
+    def _known(self, move: _Move) -> _Move:
+        """Keep a goal for `RESULT`."""
+        self._moves[move.number] = move
+        while len(self._moves) > _KEPT:
+            self._moves.pop(next(iter(self._moves)))
+        return move
+
+    def _result(self, number: int) -> MoveResult | None:
+        if not isinstance(number, int) or number not in self._moves:
+            raise PlanningError(f"no goal {number!r}; {GO_TO} answers with the number of a goal")
+        return self._moves[number].result
+
+    def _move_to_pose(self, request: MoveToPose) -> MoveResult:
+        if not isinstance(request, MoveToPose):
+            raise PlanningError(f"{MOVE_TO_POSE} takes a MoveToPose, got {type(request).__name__}")
+        return self._wait(_nearest(request.target_pose), request.velocity_scaling)
+
+    def _move_to_configuration(self, request: MoveToConfiguration) -> MoveResult:
+        if not isinstance(request, MoveToConfiguration):
+            raise PlanningError(f"{MOVE_TO_CONFIGURATION} takes a MoveToConfiguration, got {type(request).__name__}")
+        state: JointState = request.target_joint_state
+        return self._wait(JointGoal(state.name, state.position), request.velocity_scaling)
+
+    def _wait(self, goal: Goal, velocity_scaling: float) -> MoveResult:
+        """Submit a goal and wait for its end; one that makes no sense is REJECTED."""
+        if self.session.request.lockstep and threading.get_ident() == self._worker:
+            raise NotSupported(
+                f"this service waits for the motion: in lockstep call it from another thread, or {GO_TO}"
+            )
         try:
-            goals = self._plan(text)
+            move = self._submit(goal, velocity_scaling or 1.0)
         except PlanningError as error:
-            self._finish(text, [str(error)])
+            return MoveResult(False, str(error), 0.0, "REJECTED", error.code)
+        while not move.ended.wait(_GLANCE_S) and not self._over:
+            pass
+        return move.result or _ENDED
+
+    def _take_pose(self) -> None:
+        received = self._poses.get()
+        if received is None:
             return
-        self._motion = _Motion(number, text, set(goals))
+        message = received.message
+        try:
+            if isinstance(message, PoseStamped):
+                if message.header.frame_id not in FRAMES:
+                    names = ", ".join(filter(None, FRAMES))
+                    raise PlanningError(f"frame {message.header.frame_id!r} is not the base; it is called {names}")
+                message = message.pose
+            if not isinstance(message, Pose):
+                raise PlanningError(f"takes geometry_msgs/msg/PoseStamped or Pose, got {message.ros_type}")
+            self._replace(self._known(self._new(_nearest(message))))
+        except PlanningError as error:
+            self.session.log.error("%s: %s", CMD_POSE, error)
+            self._show("failed")
+
+    def _replace(self, move: _Move | None) -> None:
+        """Drop all goals for `move`, or to hold where it is None."""
+        why = f"replaced by goal {move.target.text}" if move is not None else "cancelled"
+        dropped = list(self._queue)
+        self._queue.clear()
+        if move is not None:
+            self._queue.append(move)
+        for other in dropped:
+            self._finish(other, "CANCELLED", PlanCode.PREEMPTED, why)
+        if self._move is not None and not self._move.dropped:
+            self._stop(self._move, why)
+
+    def _stop(self, move: _Move, why: str) -> None:
+        """Have the executors that move slow down; the goal ends when they have."""
+        session = self.session
+        move.dropped = why
+        for name in sorted(move.waiting):
+            stop: Mapping[str, Any] = {"stop": True}
+            if session.config.executors[name].goals == "position":
+                joint = session.config.robot.indices(session.config.executors[name].joints)[0]
+                stop = {"position": float(self._commanded()[joint])}
+            try:
+                session.control.call("goal", executor=name, goal_id=f"{move.number}:stop:{name}", goal=stop)
+            except HardwareError as error:
+                session.log.warning("%s does not slow down, and is cancelled: %s", name, error)
+                session.control.call("cancel")
+                return
+
+    def _commanded(self) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+        # From the commanded positions, not from where the joints sag to: the setpoint makes no step.
+        state = self.session.state
+        return state.command if state is not None else self.session.measured().position
+
+    def _begin(self, move: _Move) -> None:
+        session = self.session
+        move.begun_ns = session.clock.now_ns()
+        self._show("executing")
+        try:
+            goals = self._plan(move)
+        except PlanningError as error:
+            self._finish(move, "PLANNING_FAILED", error.code, str(error))
+            return
+        self._move, move.waiting = move, set(goals)
         try:
             for executor, goal in goals.items():
-                session.control.call("goal", executor=executor, goal_id=f"{number}:{executor}", goal=goal)
+                session.control.call("goal", executor=executor, goal_id=f"{move.number}:{executor}", goal=goal)
         except HardwareError as error:
             session.control.call("cancel")  # those that took their goal already
-            self._finish(text, [str(error)])
+            self._finish(move, "EXECUTION_FAILED", PlanCode.CONTROL_FAILED, str(error))
 
-    def _plan(self, text: str) -> dict[str, Mapping[str, Any]]:
-        """Executor -> its goal."""
-        session = self.session
-        robot, measured = session.config.robot, session.measured()
-        goal = parse_goal(text, robot)
-        # From the commanded positions, not from where the joints sag to: the setpoint makes no step.
-        told = session.state.command if session.state is not None else measured.position
-        goals: dict[str, Mapping[str, Any]] = {}
-        for name in self.mode.executors:
-            executor = session.config.executors[name]
-            mine = [joint for joint in executor.joints if joint in goal]
-            if not mine:
-                continue
-            if executor.goals == "position":
-                goals[name] = {"position": goal[mine[0]]}
-                continue
-            request = PlanRequest(
-                executor.joints,
-                told[robot.indices(executor.joints)],
-                JointGoal(tuple(mine), np.array([goal[joint] for joint in mine])),
-                others=dict(zip(robot.joint_names, told.tolist(), strict=True)),
+    def _executors(self, parsed: Target) -> dict[str, Goal | float]:
+        """Executor -> what it is to reach: planned for, or a position [rad].
+
+        Raises:
+            PlanningError: where no executor of the mode can reach the goal.
+        """
+        executors = {name: self.session.config.executors[name] for name in self.mode.executors}
+        found: dict[str, Goal | float] = {}
+        for name, executor in executors.items():
+            mine = [joint for joint in executor.joints if joint in parsed.joints]
+            if mine and executor.goals == "position":
+                found[name] = parsed.joints[mine[0]]
+            elif mine:
+                found[name] = JointGoal(tuple(mine), np.array([parsed.joints[joint] for joint in mine]))
+        if parsed.tool is None:
+            return found
+        arms = [name for name, executor in executors.items() if executor.goals == "trajectory"]
+        if len(arms) != 1:
+            raise PlanningError(
+                f"goal {parsed.text!r}: mode {self.mode.name} has {len(arms)} executors of trajectories,"
+                " a goal of the tool needs one",
+                PlanCode.INVALID_GROUP_NAME,
             )
-            goals[name] = trajectory_goal(self._planner.plan(request).trajectory)
-        if not goals:
-            raise PlanningError(f"goal {text!r}: no executor of mode {self.mode.name} has these joints")
+        if arms[0] in found:
+            joints = ", ".join(joint for joint in parsed.joints if joint in executors[arms[0]].joints)
+            raise PlanningError(
+                f"goal {parsed.text!r}: {joints} moves the tool, and cannot be given beside its position",
+                PlanCode.INVALID_GOAL_CONSTRAINTS,
+            )
+        return {arms[0]: parsed.tool, **found}
+
+    def _plan(self, move: _Move) -> dict[str, Mapping[str, Any]]:
+        """Executor -> its goal."""
+        robot, start = self.session.config.robot, self._commanded()
+        wanted = self._executors(move.target)
+        if not wanted:
+            raise PlanningError(f"goal {move.target.text!r}: no executor of mode {self.mode.name} has these joints")
+        goals: dict[str, Mapping[str, Any]] = {}
+        for name, goal in wanted.items():
+            if isinstance(goal, float):
+                goals[name] = {"position": goal}
+                continue
+            joints = self.session.config.executors[name].joints
+            others = dict(zip(robot.joint_names, start.tolist(), strict=True))
+            request = PlanRequest(
+                joints, start[robot.indices(joints)], goal, velocity_scaling=move.target.velocity_scaling, others=others
+            )
+            planned = self._planner.plan(request)
+            goals[name] = trajectory_goal(planned.trajectory)
+            if goal is move.target.tool:
+                move.planned = planned
         return goals
 
     def _advance(self, event: Mapping[str, Any]) -> None:
-        motion = self._motion
-        if motion is None or event["state"] == "executing" or event["goal"] != f"{motion.number}:{event['executor']}":
+        move, name = self._move, str(event["executor"])
+        if move is None or event["state"] == "executing":
             return
-        motion.waiting.discard(str(event["executor"]))
-        if event["state"] != "succeeded":
-            motion.failures.append(f"{event['executor']} {event['state']}: {event['message']}")
-        if not motion.waiting:
-            self._finish(motion.text, motion.failures)
-
-    def _finish(self, text: str, failures: list[str]) -> None:
-        self._motion = None
-        self._done += 1
-        if failures:
-            self.session.outcome.goals_failed += 1
-            self.session.log.error("goal %s failed: %s", text, "; ".join(failures))
+        stopped = event["goal"] == f"{move.number}:stop:{name}"
+        if not stopped and event["goal"] != f"{move.number}:{name}":
+            return
+        if not stopped and f"goal {move.number}:stop:{name}" in str(event["message"]):
+            return  # it still slows down
+        move.waiting.discard(name)
+        if event["state"] != "succeeded" and not move.dropped:
+            move.failures.append(f"{name} {event['state']}: {event['message']}")
+        if move.waiting:
+            return
+        if move.dropped:
+            self._finish(move, "CANCELLED", PlanCode.PREEMPTED, move.dropped)
+        elif move.failures:
+            self._finish(move, "EXECUTION_FAILED", PlanCode.CONTROL_FAILED, "; ".join(move.failures))
         else:
-            self.session.log.info("goal %s reached", text)
-        if self._asked and self._done >= self._asked:
-            self.session.finish()
+            self._finish(move, "SUCCEEDED", PlanCode.SUCCESS, "")
+
+    def _finish(self, move: _Move, outcome: Outcome, code: PlanCode, message: str) -> None:
+        session, success = self.session, outcome == "SUCCEEDED"
+        if move is self._move:
+            self._move = None
+        duration = seconds(session.clock.now_ns() - move.begun_ns) if move.begun_ns is not None else 0.0
+        errors = (move.planned.position_error, move.planned.orientation_error) if move.planned is not None else ()
+        move.result = MoveResult(success, message, duration, outcome, code, *errors)
+        move.ended.set()
+        if success:
+            session.log.info("goal %s reached", move.target.text)
+        elif outcome == "CANCELLED":
+            session.log.info("goal %s dropped: %s", move.target.text, message)
+        else:
+            session.log.error("goal %s failed: %s", move.target.text, message)
+        if not success and (move.asked or outcome != "CANCELLED"):
+            session.outcome.goals_failed += 1
+        self._show("succeeded" if success else "failed")
+        self._asked -= move.asked
+        if self._ends and not self._asked and not self._queue and self._move is None:
+            session.finish()
+
+    def _show(self, status: str) -> None:
+        """Publish the motion status."""
+        self._status_ns = self.session.clock.now_ns()
+        self.session.bus.publish(MOTION_STATUS, String(status), latched=True)
+
+    def _drop_all(self) -> None:
+        """End all goals, so that nothing waits for them."""
+        self.end()
+        self._over = True
+        for move in self._moves.values():
+            move.result = move.result or _ENDED
+            move.ended.set()
 
 
-def parse_goal(text: str, robot: Robot) -> dict[str, float]:
-    """Joint -> position [rad] of a goal: a pose's name, or `joint=radians,joint=radians`.
-
-    Raises:
-        PlanningError: for one that names no pose or joint of this robot.
-    """
-    if "=" not in text:
-        try:
-            return dict(zip(robot.joint_names, robot.pose(text).tolist(), strict=True))
-        except KeyError as error:
-            raise PlanningError(f"goal {text!r}: {error.args[0]}; or give joints, e.g. wrist_flex=0.5") from None
-    goal = {}
-    for part in text.split(","):
-        joint, _, value = (piece.strip() for piece in part.partition("="))
-        if joint not in robot.joint_names:
-            raise PlanningError(f"goal {text!r}: no joint {joint!r}; the joints are: {', '.join(robot.joint_names)}")
-        try:
-            goal[joint] = float(value)
-        except ValueError:
-            goal[joint] = math.nan
-        if not math.isfinite(goal[joint]):
-            raise PlanningError(f"goal {text!r}: {value!r} is not an angle in radians") from None
-    return goal
+def _nearest(pose: Pose) -> AnyGoal:
+    """A pose with the orientation policies of IB-Robot's gateway, in their order."""
+    return AnyGoal(tuple(PoseGoal(pose, beyond_reach=policy) for policy in _POLICIES))

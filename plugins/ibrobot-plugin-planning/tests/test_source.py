@@ -115,7 +115,11 @@ def test_reset_fails_the_goal_under_way_and_the_next_is_tried(start: Make):
 @pytest.mark.parametrize(
     ("goal", "told"),
     [
-        ("hom", "goal 'hom': no pose 'hom'; the poses are: home, up; or give joints, e.g. wrist_flex=0.5"),
+        (
+            "hom",
+            "goal 'hom': no pose 'hom'; the poses are: home, up;"
+            " or give joints, e.g. wrist_flex=0.5, or a position, e.g. xyz=0.2,0.0,0.1",
+        ),
         ("tilt=1", "goal 'tilt=1': no joint 'tilt'; the joints are: pan, grip"),
         ("pan=1,grip=wide", "goal 'pan=1,grip=wide': 'wide' is not an angle in radians"),
         ("pan=nan", "goal 'pan=nan': 'nan' is not an angle in radians"),

@@ -270,6 +270,33 @@ def test_cancelling_holds_the_measured_position() -> None:
     assert arm.statuses() == []
 
 
+def test_stop_slows_down_along_the_trajectory() -> None:
+    arm = Arm()
+    arm.go(goal(point(4.0, (1.0, 0.5))))
+    arm.at(2.0)
+    arm.go({"stop": True}, "stop")
+    path = np.array([arm.at(time) for time in np.arange(2.01, 3.5, 0.01).tolist()])
+    np.testing.assert_allclose(path[:, 1], path[:, 0] / 2, atol=1e-9)
+    assert 0.5 < path[-1, 0] < 0.9
+    assert (np.diff(path[:, 0]) >= 0).all()
+    assert [(each.goal_id, each.state) for each in arm.statuses()] == [
+        ("goal", GoalState.EXECUTING), ("goal", GoalState.CANCELED),
+        ("stop", GoalState.EXECUTING), ("stop", GoalState.SUCCEEDED),
+    ]  # fmt: skip
+
+
+def test_stop_at_rest_succeeds_at_once() -> None:
+    arm = Arm((0.2, 0.1))
+    arm.go({"stop": True}, "stop")
+    assert [each.state for each in arm.statuses()] == [GoalState.EXECUTING, GoalState.SUCCEEDED]
+    assert arm.at(0.1) == [0.2, 0.1]
+
+
+def test_stop_says_true() -> None:
+    with pytest.raises(GoalRejected, match=r"a goal that stops is {'stop': True}, got {'stop': 1.5}"):
+        Arm().go({"stop": 1.5})
+
+
 def test_deactivation_ends_the_goal() -> None:
     arm = Arm()
     arm.go(goal(point(1.0, (1.0, 0.0))))

@@ -28,11 +28,27 @@ START_TOLERANCE_RAD = 0.1
 """How far from the present setpoint a trajectory's point at time zero may lie."""
 
 
+_STOP_SHARE = 0.8
+"""Of the acceleration limits, what a stop uses: it is computed from tick to tick."""
+
+
+@attrs.define(eq=False)
+class _Stop:
+    """How far a trajectory that slows down has come."""
+
+    stamp_ns: int
+    phase_ns: float
+    """Time of the trajectory that is reached [ns]."""
+    rate: float = 1.0
+    """How fast that time passes, 1 to 0."""
+
+
 @attrs.frozen(eq=False)
 class _Running:
     goal_id: str
     goal: TrajectoryGoal
     spline: Spline
+    stop: _Stop | None = None
 
 
 class TrajectoryExecutor(Executor):
@@ -43,6 +59,9 @@ class TrajectoryExecutor(Executor):
     planned from: it must lie near the setpoint, which then stands for it. The last point is held. Success: the measured
     position comes within the goal tolerance, at the end or up to `goal_time` after it. A joint further off its path
     than the path tolerance, or late, aborts the goal. Aborting and cancelling hold the measured position.
+
+    The goal `{"stop": True}` slows down along the trajectory under way, within the acceleration limits, and holds where
+    it comes to rest.
     """
 
     def __init__(self, options: TrajectoryOptions, ctx: Context) -> None:
@@ -50,6 +69,7 @@ class TrajectoryExecutor(Executor):
         self._options = options
         indices = ctx.robot.indices(ctx.joints)
         self._lower, self._upper = ctx.robot.lower[indices], ctx.robot.upper[indices]
+        self._acceleration = ctx.robot.max_acceleration[indices]
         self._held: Vector | None = None
         self._running: _Running | None = None
         self._statuses: deque[GoalStatus] = deque()
@@ -72,7 +92,8 @@ class TrajectoryExecutor(Executor):
             goal_id: names it in `pop_status`.
             goal: `trajectory`: `joint_names` and `points`, each of `time_from_start_ns`, `positions` and, in all
                 points or in none, `velocities`, `accelerations`; optionally `path_tolerance` and `goal_tolerance`
-                [rad], a number or one by joint name, and `goal_time` [s]: 0 means the options' value, -1 none.
+                [rad], a number or one by joint name, and `goal_time` [s]: 0 means the options' value, -1 none. Or
+                `{"stop": True}`.
             measured: the joints now; its stamp is when the trajectory starts.
 
         Raises:
@@ -80,6 +101,9 @@ class TrajectoryExecutor(Executor):
         """
         if self._held is None:
             raise GoalRejected("the executor is not active")
+        if "stop" in goal:
+            self._begin_stop(goal_id, goal, measured.stamp_ns)
+            return
         parsed = parse_goal(goal, self.joints, self._options)
         outside = (parsed.positions[-1] < self._lower) | (parsed.positions[-1] > self._upper)
         if outside.any():
@@ -93,14 +117,33 @@ class TrajectoryExecutor(Executor):
         self._running = _Running(goal_id, parsed, spline)
         self._statuses.append(GoalStatus(goal_id, GoalState.EXECUTING))
 
+    def _begin_stop(self, goal_id: str, goal: Mapping[str, Any], now_ns: int) -> None:
+        if goal != {"stop": True}:
+            raise GoalRejected(f"a goal that stops is {{'stop': True}}, got {dict(goal)!r}")
+        running = self._running
+        self._end(GoalState.CANCELED, f"stopped by goal {goal_id}")
+        self._statuses.append(GoalStatus(goal_id, GoalState.EXECUTING))
+        if running is None:
+            self._statuses.append(GoalStatus(goal_id, GoalState.SUCCEEDED))
+        else:
+            stop = running.stop or _Stop(now_ns, now_ns)
+            self._running = _Running(goal_id, running.goal, running.spline, stop)
+
     @override
     def update(self, measured: JointReading) -> Vector:
+        stop = self._running.stop if self._running is not None else None
+        if self._running is not None and stop is not None:
+            self._slow_down(self._running.spline, stop, measured.stamp_ns)
         setpoint, _, _ = self._sample(measured.stamp_ns)
         running = self._running
         if running is None:
             return setpoint.copy()
         error = np.abs(setpoint - measured.position)
-        if measured.stamp_ns < running.spline.end_ns:
+        if stop is not None and stop.rate == 0:
+            self._held = setpoint.copy()
+            self._end(GoalState.SUCCEEDED, "")
+            return setpoint.copy()
+        if stop is not None or measured.stamp_ns < running.spline.end_ns:
             beyond = _exceeds(error, running.goal.path_tolerance)
             if beyond.any():
                 why = self._deviation(beyond, error, running.goal.path_tolerance, "off its path")
@@ -127,10 +170,33 @@ class TrajectoryExecutor(Executor):
 
     def _sample(self, now_ns: int) -> tuple[Vector, Vector, Vector]:
         """The setpoint at `now_ns` [ns] with its velocity and acceleration, each shape (J,)."""
-        if self._running is not None:
-            return self._running.spline.at(now_ns)
+        running = self._running
+        if running is not None and running.stop is not None:
+            position, velocity, acceleration = running.spline.at(round(running.stop.phase_ns))
+            return position, velocity * running.stop.rate, acceleration * running.stop.rate**2
+        if running is not None:
+            return running.spline.at(now_ns)
         assert self._held is not None, "an executor is activated before it is updated"
         return self._held, np.zeros_like(self._held), np.zeros_like(self._held)
+
+    def _slow_down(self, spline: Spline, stop: _Stop, now_ns: int) -> None:
+        """Advance a stop to `now_ns` [ns]."""
+        passed_ns = now_ns - stop.stamp_ns
+        ends = (stop.phase_ns, stop.phase_ns + stop.rate * passed_ns)
+        # Acceleration of a joint: velocity * (change of the rate) + acceleration * rate^2, both of the spline.
+        change = min(0.0, max(self._fastest_change(spline, end_ns, stop.rate) for end_ns in ends))
+        rate = max(0.0, stop.rate + change * seconds(passed_ns))
+        stop.phase_ns = min(stop.phase_ns + (stop.rate + rate) / 2 * passed_ns, spline.end_ns)
+        stop.stamp_ns, stop.rate = now_ns, rate if stop.phase_ns < spline.end_ns else 0.0
+
+    def _fastest_change(self, spline: Spline, phase_ns: float, rate: float) -> float:
+        """How fast the rate may fall there [1/s], negative."""
+        _, velocity, acceleration = spline.at(round(phase_ns))
+        moving = velocity != 0
+        if not moving.any():
+            return -np.inf
+        left = _STOP_SHARE * self._acceleration + np.sign(velocity) * acceleration * rate**2
+        return float((-left[moving] / np.abs(velocity[moving])).max())
 
     def _spline(self, goal: TrajectoryGoal, now_ns: int) -> Spline:
         """The goal's points in time [ns], begun at the setpoint of the moment."""

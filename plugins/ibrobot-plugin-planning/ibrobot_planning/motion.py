@@ -1,0 +1,48 @@
+"""What the services of a planning mode take and answer: IB-Robot's requests and result as attrs classes."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import attrs
+
+from ibrobot_core.api import JointState, PlanCode, Pose
+
+type Outcome = Literal["SUCCEEDED", "REJECTED", "PLANNING_FAILED", "EXECUTION_FAILED", "CANCELLED"]
+
+
+@attrs.frozen
+class MoveToPose:
+    """Request of ibrobot_msgs/srv/MoveToPose."""
+
+    target_pose: Pose
+    """Of the tool centre point, in the base frame."""
+    velocity_scaling: float = 0.0
+    """Fraction of the velocity limits, in (0, 1]; 0 means 1."""
+
+
+@attrs.frozen
+class MoveToConfiguration:
+    """Request of ibrobot_msgs/srv/MoveToConfiguration."""
+
+    target_joint_state: JointState
+    """Names and positions [rad]; joints that it does not name stay."""
+    velocity_scaling: float = 0.0
+    """Fraction of the velocity limits, in (0, 1]; 0 means 1."""
+
+
+@attrs.frozen
+class MoveResult:
+    """Response of ibrobot_msgs/srv/MoveToPose, with MoveIt's code."""
+
+    success: bool
+    message: str
+    """Why not, in one sentence; empty after a success."""
+    execution_time_s: float
+    outcome: Outcome
+    code: PlanCode
+    """`code.name` is MoveIt's, e.g. NO_IK_SOLUTION."""
+    position_error_m: float = 0.0
+    """Distance of the planned tool position from the one asked for [m]."""
+    orientation_error_rad: float = 0.0
+    """Angle between the planned orientation, or axis, and the one asked for [rad]."""

@@ -1,0 +1,312 @@
+"""Motions of an arm with five joints: services and topics of a planning mode, cancelling and replacing goals."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from ibrobot_planning.motion import MoveResult, MoveToConfiguration, MoveToPose
+from ibrobot_planning.source import (
+    CANCEL,
+    CMD_POSE,
+    GO_TO,
+    MOTION_STATUS,
+    MOVE_TO_CONFIGURATION,
+    MOVE_TO_POSE,
+    RESULT,
+)
+
+from ibrobot_core.api import (
+    Header,
+    JointState,
+    NotSupported,
+    PlanCode,
+    PlanningError,
+    Pose,
+    PoseStamped,
+    PositionGoal,
+    Quaternion,
+    Runtime,
+    String,
+    Vector,
+    Vector3,
+)
+
+from .conftest import Make
+from .table_arm import JOINTS, make_robot
+
+RATE_HZ = 100.0
+VELOCITY, ACCELERATION = 3.0, 10.0
+DOWN = Quaternion(1.0, 0.0, 0.0, 0.0)
+
+
+def robot_yaml(folder: Path) -> str:
+    robot = make_robot(folder)
+    joints = "".join(
+        f"    - {{name: {j.name}, lower: {j.lower}, upper: {j.upper}, max_velocity: {VELOCITY},"
+        f" max_acceleration: {ACCELERATION}}}\n"
+        for j in robot.joints
+    )
+    poses = ", ".join(f"{name}: {list(values)}" for name, values in robot.description.poses.items())
+    return f"""\
+robot:
+  name: tabletop
+  joints:
+{joints}  groups: {{arm: [pan, lift, elbow, flex, roll], gripper: [jaw]}}
+  description: {{mjcf: arm.xml, tip: tip, poses: {{{poses}}}}}
+hardware: {{type: arm}}
+simulation: {{type: scene}}
+executors:
+  arm: {{type: trajectory, group: arm}}
+  gripper: {{type: gripper, group: gripper}}
+control_modes:
+  plan: {{executors: [arm, gripper], planner: {{type: rrt_connect}}}}
+  joint: {{executors: [arm, gripper], planner: {{type: joint, velocity_scaling: 0.9, acceleration_scaling: 0.9}}}}
+  idle: {{executors: [arm]}}
+default_control_mode: plan
+control: {{rate_hz: {RATE_HZ:g}, stop: hold}}
+"""
+
+
+@pytest.fixture
+def run(start: Make, tmp_path: Path) -> Callable[..., Runtime]:
+    def started(**asked: Any) -> Runtime:
+        return start(text=robot_yaml(tmp_path), **asked)
+
+    return started
+
+
+def command(runtime: Runtime) -> Vector:
+    assert runtime.session.state is not None
+    return runtime.session.state.command.copy()
+
+
+def finish(runtime: Runtime, number: int, commands: list[Vector] | None = None) -> MoveResult:
+    """Step until a goal has ended."""
+    for _ in range(2000):
+        runtime.step()
+        if commands is not None:
+            commands.append(command(runtime))
+        result = runtime.session.bus.call(RESULT, number)
+        if result is not None:
+            assert isinstance(result, MoveResult)
+            return result
+    raise AssertionError("the goal does not end")
+
+
+def go(runtime: Runtime, goal: Any) -> MoveResult:
+    return finish(runtime, runtime.session.bus.call(GO_TO, goal))
+
+
+def test_position_with_an_axis_and_the_gripper(run):
+    runtime = run()
+    result = go(runtime, "xyz=0.2,0.05,0.1 axis=down jaw=0.5")
+    assert (result.success, result.outcome, result.code, result.message) == (True, "SUCCEEDED", PlanCode.SUCCESS, "")
+    assert result.execution_time_s > 0.2
+    assert result.position_error_m < 1e-3
+    assert runtime.session.state.position[5] == pytest.approx(0.5, abs=0.05)
+
+
+def test_goal_of_the_command_line_takes_a_position(run):
+    runtime = run(goals=("xyz=0.2,0.05,0.1 axis=down", "left"))
+    while not runtime.step():
+        pass
+    assert runtime.summary()["goals_failed"] == 0
+    np.testing.assert_allclose(runtime.session.state.position[:5], [1.0, 0.8, 0.8, 0.5, 0.0], atol=0.05)
+
+
+def test_result_has_the_code_and_the_sentence_of_the_planner(run):
+    runtime = run()
+    result = go(runtime, PositionGoal(Vector3(2.0, 0.0, 0.1)))
+    assert (result.success, result.outcome, result.code.name) == (False, "PLANNING_FAILED", "NO_IK_SOLUTION")
+    assert "reach" in result.message
+    assert result.execution_time_s == 0.0
+    assert runtime.summary()["goals_failed"] == 1
+
+
+def test_planner_of_joints_refuses_goals_of_the_tool(run):
+    result = go(run(mode="joint"), "xyz=0.2,0.05,0.1")
+    assert result.code is PlanCode.UNRECOGNIZED_GOAL_TYPE
+    assert result.message.startswith("planner type 'joint' knows joint goals only")
+
+
+@pytest.mark.parametrize("stamped", [True, False], ids=["PoseStamped", "Pose"])
+def test_cmd_pose_is_a_goal(run, stamped: bool):
+    runtime = run()
+    seen = runtime.session.bus.subscribe(MOTION_STATUS, 1000)
+    pose = Pose(Vector3(0.2, 0.05, 0.1), DOWN)
+    runtime.session.bus.publish(CMD_POSE, PoseStamped(Header(0, "base_link"), pose) if stamped else pose)
+    for _ in range(300):
+        runtime.step()
+    shown = [item.message.data for item in seen.drain() if isinstance(item.message, String)]
+    assert shown[0] == "idle"
+    assert set(shown[1:-1]) == {"executing"}
+    assert shown[-1] == "succeeded"
+    assert len(shown) > 5, "it is published while the robot moves"
+
+
+@pytest.mark.parametrize(
+    ("message", "told"),
+    [
+        (PoseStamped(Header(0, "camera"), Pose()), "frame 'camera' is not the base; it is called base, base_link"),
+        (String("up"), "takes geometry_msgs/msg/PoseStamped or Pose, got std_msgs/msg/String"),
+    ],
+)
+def test_wrong_cmd_pose_moves_nothing(run, message, told: str, caplog: pytest.LogCaptureFixture):
+    runtime = run()
+    before = command(runtime)
+    runtime.session.bus.publish(CMD_POSE, message)
+    for _ in range(20):
+        runtime.step()
+    assert f"/cmd_pose: {told}" in caplog.text
+    np.testing.assert_array_equal(command(runtime), before)
+
+
+def call(runtime: Runtime, service: str, request: object) -> MoveResult:
+    """Call a service that waits from a thread of its own."""
+    answers: list[MoveResult] = []
+    thread = threading.Thread(target=lambda: answers.append(runtime.session.bus.call(service, request)))
+    thread.start()
+    for _ in range(20000):
+        runtime.step()
+        if not thread.is_alive():
+            break
+    thread.join(10.0)
+    return answers[0]
+
+
+def test_move_to_pose_waits_for_the_motion(run):
+    result = call(run(), MOVE_TO_POSE, MoveToPose(Pose(Vector3(0.2, 0.05, 0.1), DOWN), 0.5))
+    assert result.success
+    assert result.position_error_m < 1e-3
+    assert result.orientation_error_rad <= np.pi
+
+
+def test_move_to_configuration_waits_for_the_motion(run):
+    runtime = run()
+    state = JointState(Header(0), ("pan", "jaw"), np.array([0.4, 0.3]), np.empty(0), np.empty(0))
+    assert call(runtime, MOVE_TO_CONFIGURATION, MoveToConfiguration(state)).success
+    assert runtime.session.state.position[[0, 5]] == pytest.approx([0.4, 0.3], abs=0.05)
+
+
+def test_request_that_makes_no_sense_is_rejected(run):
+    runtime = run()
+    state = JointState(Header(0), ("tilt",), np.array([0.4]), np.empty(0), np.empty(0))
+    result = call(runtime, MOVE_TO_CONFIGURATION, MoveToConfiguration(state))
+    assert (result.outcome, result.message) == ("REJECTED", f"no joint 'tilt'; the joints are: {', '.join(JOINTS)}")
+    result = call(runtime, MOVE_TO_POSE, MoveToPose(Pose(), 1.5))
+    assert result.message == "velocity_scaling is 1.5, must be above 0 and at most 1"
+
+
+def test_end_of_the_run_ends_a_service_that_waits(run):
+    runtime = run()
+    answers: list[MoveResult] = []
+    request = MoveToPose(Pose(Vector3(0.2, 0.05, 0.1), DOWN))
+    thread = threading.Thread(target=lambda: answers.append(runtime.session.bus.call(MOVE_TO_POSE, request)))
+    runtime.step()
+    thread.start()
+    runtime.stop()
+    thread.join(10.0)
+    assert answers[0].outcome == "CANCELLED"
+
+
+@pytest.mark.parametrize(
+    ("service", "request_", "error", "told"),
+    [
+        (GO_TO, "xyz=1", PlanningError, "goal 'xyz=1': xyz takes 3 numbers, got 1"),
+        (
+            GO_TO, "xyz=0.2,0,0.1 pan=1", PlanningError,
+            "goal 'xyz=0.2,0,0.1 pan=1': pan moves the tool, and cannot be given beside its position",
+        ),
+        (RESULT, 99, PlanningError, "no goal 99; /planning/go_to answers with the number of a goal"),
+        (MOVE_TO_POSE, Pose(), PlanningError, "/moveit_gateway/move_to_pose takes a MoveToPose, got Pose"),
+        (
+            MOVE_TO_CONFIGURATION, "up", PlanningError,
+            "/moveit_gateway/move_to_configuration takes a MoveToConfiguration, got str",
+        ),
+        (MOVE_TO_POSE, MoveToPose(Pose()), NotSupported, "this service waits for the motion: "),
+    ],
+)  # fmt: skip
+def test_wrong_request_is_an_error(run, service: str, request_: object, error: type[Exception], told: str):
+    runtime = run()
+    runtime.step()
+    with pytest.raises(error) as failure:
+        runtime.session.bus.call(service, request_)
+    assert str(failure.value).startswith(told)
+
+
+def assert_within_limits(runtime: Runtime, commands: list[Vector]) -> None:
+    """No command of the arm steps beyond its limits, and the safety layer had nothing to correct."""
+    path = np.array(commands)[:, :5]
+    velocities = np.diff(path, axis=0) * RATE_HZ
+    assert np.abs(velocities).max() <= VELOCITY * 1.001
+    assert np.abs(np.diff(velocities, axis=0)).max() * RATE_HZ <= ACCELERATION * 1.02
+    corrected = runtime.session.counts()["interventions"]
+    assert {joint: corrected.get(joint, 0) for joint in JOINTS[:5]} == dict.fromkeys(JOINTS[:5], 0)
+
+
+def random_goal(rng: np.random.Generator) -> str:
+    return ",".join(f"{joint}={value:.3f}" for joint, value in zip(JOINTS[:5], rng.uniform(-1.2, 1.2, 5), strict=True))
+
+
+def test_goals_cancelled_and_replaced_step_nowhere(run):
+    runtime = run(mode="joint", seed=3)
+    rng = np.random.default_rng(3)
+    bus, commands = runtime.session.bus, [command(runtime)]
+    outcomes = []
+    for number in range(40):
+        goal = bus.call(GO_TO, random_goal(rng))
+        for _ in range(int(rng.integers(1, 80))):
+            runtime.step()
+            commands.append(command(runtime))
+        if number % 2:
+            bus.call(CANCEL, None)
+            outcomes.append(finish(runtime, goal, commands).outcome)
+            still = command(runtime)
+            for _ in range(5):
+                runtime.step()
+                commands.append(command(runtime))
+            np.testing.assert_allclose(command(runtime), still, atol=1e-9)
+        else:
+            following = bus.call(GO_TO, random_goal(rng))
+            outcomes.append(finish(runtime, goal, commands).outcome)
+            assert finish(runtime, following, commands).success
+    assert outcomes.count("CANCELLED") >= 36, outcomes
+    assert_within_limits(runtime, commands)
+    assert runtime.summary()["goals_failed"] == 0
+
+
+def test_replaced_goal_says_by_what(run):
+    runtime = run(mode="joint")
+    first = runtime.session.bus.call(GO_TO, "left")
+    for _ in range(20):
+        runtime.step()
+    assert runtime.session.bus.call(RESULT, first) is None
+    runtime.session.bus.call(GO_TO, "up")
+    result = finish(runtime, first)
+    assert (result.outcome, result.code, result.message) == ("CANCELLED", PlanCode.PREEMPTED, "replaced by goal up")
+
+
+def test_cancel_before_the_first_goal_holds(run):
+    runtime = run(mode="joint")
+    before = command(runtime)
+    runtime.session.bus.call(CANCEL, None)
+    for _ in range(5):
+        runtime.step()
+    np.testing.assert_array_equal(command(runtime), before)
+
+
+def test_goals_of_the_request_that_are_cancelled_end_the_run(run):
+    runtime = run(mode="joint", goals=("left", "up"))
+    for _ in range(20):
+        runtime.step()
+    runtime.session.bus.call(CANCEL, None)
+    for _ in range(200):
+        if runtime.step():
+            break
+    assert runtime.session.finished.is_set()
+    assert runtime.summary()["goals_failed"] == 2
