@@ -184,7 +184,6 @@ from ibrobot_core.units import (
     lerobot_to_radians as lerobot_to_radians,
     lerobot_to_ticks as lerobot_to_ticks,
     ns as ns,
-    plural as plural,
     radians as radians,
     radians_to_lerobot as radians_to_lerobot,
     radians_to_ticks as radians_to_ticks,

@@ -162,8 +162,3 @@ def _range(mode: str, range_min: ArrayLike, range_max: ArrayLike) -> tuple[Any, 
     if not np.all(low < high):
         raise ValueError(f"range_min ({low}) must be below range_max ({high})")
     return low, high
-
-
-def plural(number: int, noun: str) -> str:
-    """The noun in the form that fits the number: `1 episode`, `2 episodes`."""
-    return noun if number == 1 else f"{noun}s"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from typing import Any
 
@@ -136,28 +136,6 @@ class FrameAssembler:
             if len(pieces) == len(parts):
                 values[key] = pieces[0] if len(pieces) == 1 else _concatenate(pieces)
         return Frame(t_ns, values, frozenset(self._keys) - frozenset(values))
-
-    def frames(self, messages: Iterable[tuple[str, Message, int]], ticks: Iterable[int]) -> Iterator[Frame]:
-        """Frames from recorded messages: at each tick, bit for bit the frame that a live run would have had.
-
-        Args:
-            messages: topic, message and time of receipt [ns], in the order of receipt, over all topics.
-            ticks: the times of the frames [ns], ascending.
-
-        Raises:
-            ContractError: for messages out of the order of receipt, or one that does not fit the contract.
-        """
-        source = iter(messages)
-        coming, last_ns = next(source, None), None
-        for t_ns in ticks:
-            while coming is not None and coming[2] <= t_ns:
-                topic, message, received_ns = coming
-                if last_ns is not None and received_ns < last_ns:
-                    came = f"{topic} at {received_ns} ns came after {last_ns} ns"
-                    raise ContractError(f"messages must come in the order of receipt; {came}")
-                self.take(topic, message, received_ns)
-                coming, last_ns = next(source, None), received_ns
-            yield self.frame(t_ns)
 
 
 class FrameSampler:

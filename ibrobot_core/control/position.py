@@ -118,7 +118,8 @@ class PositionExecutor(Executor):
         """The plan's setpoint [rad] at `now_ns`, shape (J,)."""
         if now_ns < plan.start_ns:
             done = max(0, now_ns - self._approach_ns) / (plan.start_ns - self._approach_ns)
-            return _between(self._approach_from, plan.positions[0], done)
+            approached: Vector = self._approach_from + done * (plan.positions[0] - self._approach_from)
+            return approached
         if self._curve is None:
             only: Vector = plan.positions[0]
             return only
@@ -143,12 +144,6 @@ class PositionExecutor(Executor):
         self._counters[counter] += 1
         if self._counters[counter] == 1:
             self._log.warning("refused a plan: %s; further ones are counted as %s", why, counter)
-
-
-def _between(here: Vector, there: Vector, done: float) -> Vector:
-    """Interpolate linearly between two setpoints, `done` in 0..1."""
-    result: Vector = here + done * (there - here)
-    return result
 
 
 def _curve(plan: Plan) -> Spline:

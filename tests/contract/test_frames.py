@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from ibrobot_data.ticks import frames
 from ibrobot_testing.contexts import ARM, GRIPPER, START_NS
 from ibrobot_testing.images import encode_image
 
@@ -113,17 +114,17 @@ def test_live_and_offline_are_equal_bit_by_bit(contract: Contract, events: list[
         clock.advance(1)
     assert bus.dropped() == {}
     ticks = [frame.stamp_ns for frame in live]
-    offline = list(FrameAssembler(contract).frames(bag, ticks))
+    offline = list(frames(FrameAssembler(contract), bag, ticks))
     assert len(offline) == len(live)
     assert all(equal(a, b) for a, b in zip(live, offline, strict=True))
     # Which other ticks there are makes no difference either.
     between = sorted({*ticks, *range(START_NS, clock.now_ns(), 7 * MS)})
-    denser = {frame.stamp_ns: frame for frame in FrameAssembler(contract).frames(bag, between)}
+    denser = {frame.stamp_ns: frame for frame in frames(FrameAssembler(contract), bag, between)}
     assert all(equal(denser[frame.stamp_ns], frame) for frame in live)
 
 
 def offline(contract: Contract, messages: Iterable[tuple[str, Message, int]], *ticks: int) -> list[Frame]:
-    return list(FrameAssembler(contract).frames(messages, ticks))
+    return list(frames(FrameAssembler(contract), messages, ticks))
 
 
 def test_a_frame_has_what_is_there_and_names_what_is_not(contract: Contract) -> None:
@@ -265,7 +266,7 @@ def test_jumps_are_counted_per_topic(contract: Contract) -> None:
     ]
     assembler = FrameAssembler(contract)
     assert assembler.resets() == {}
-    list(assembler.frames(bag, [20_000 * MS]))
+    list(frames(assembler, bag, [20_000 * MS]))
     assert assembler.resets() == {"/joint_states": 1}
 
 
@@ -292,8 +293,8 @@ def test_offline_messages_must_be_in_the_order_of_receipt(contract: Contract) ->
 
 
 def test_ticks_may_go_on_for_ever(contract: Contract) -> None:
-    endless = FrameAssembler(contract).frames(
-        [("/joint_states", joint_state(0, 1.0), 0)], itertools.count(0, contract.step_ns)
+    endless = frames(
+        FrameAssembler(contract), [("/joint_states", joint_state(0, 1.0), 0)], itertools.count(0, contract.step_ns)
     )
     assert [len(frame.values) for frame in itertools.islice(endless, 3)] == [1, 1, 1]
 
@@ -369,7 +370,7 @@ def test_a_foreign_message_without_a_header_needs_to_go_by_receipt(make_config: 
         return Contract.from_config(make_config((spec,)))
 
     received = [("/touch", Touch(0.5), 7)]
-    (frame,) = FrameAssembler(contract("receive")).frames(received, [8])
+    (frame,) = frames(FrameAssembler(contract("receive")), received, [8])
     np.testing.assert_array_equal(frame.values["observation.touch"], np.array([0.5], np.float32))
     with pytest.raises(ContractError, match=r"a lamp_msgs/msg/Touch has no header; give `align: \{stamp: receive\}`"):
-        list(FrameAssembler(contract("header")).frames(received, [8]))
+        list(frames(FrameAssembler(contract("header")), received, [8]))

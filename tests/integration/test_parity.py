@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from ibrobot_camera.camera import OpenCvCamera
 from ibrobot_camera.options import OpenCvOptions
-from ibrobot_data.ticks import Ticks
+from ibrobot_data.ticks import Ticks, frames
 from ibrobot_mcap.options import McapOptions
 from ibrobot_mcap.reader import Rosbag2Reader
 from ibrobot_mcap.recorder import McapRecorder
@@ -174,7 +174,7 @@ def test_frames_from_the_bag_are_those_of_the_run(tmp_path: Path, block: int) ->
         seen = record(tmp_path / f"bag_{seed}", spec, sent)
         reader = installed_plugins().open_episode(tmp_path / f"bag_{seed}")
         messages = ((each.topic, each.message, each.received_ns) for each in reader.messages(spec.topics))
-        converted = list(FrameAssembler(spec).frames(messages, [frame.stamp_ns for frame in seen]))
+        converted = list(frames(FrameAssembler(spec), messages, [frame.stamp_ns for frame in seen]))
         assert len(converted) == len(seen)
         for live, later in zip(seen, converted, strict=True):
             assert_equal(live, later)
@@ -234,7 +234,7 @@ def test_pictures_of_a_motion_jpeg_camera(tmp_path: Path) -> None:
     assert [bytes(raw.data).endswith(one) for raw, one in zip(reader.raw(), sent, strict=True)] == [True] * 20
     messages = ((each.topic, each.message, each.received_ns) for each in reader.messages(spec.topics))
     for live, later in zip(
-        seen, FrameAssembler(spec).frames(messages, [frame.stamp_ns for frame in seen]), strict=True
+        seen, frames(FrameAssembler(spec), messages, [frame.stamp_ns for frame in seen]), strict=True
     ):
         assert not live.missing
         assert_equal(live, later)
@@ -273,7 +273,7 @@ def test_a_whole_run_in_simulation(site: Any, tmp_path: Path, rendering: None) -
     reader = registry.open_episode(path)
     messages = ((each.topic, each.message, each.received_ns) for each in reader.messages(spec.topics))
     for live, later in zip(
-        kept, FrameAssembler(spec).frames(messages, [frame.stamp_ns for frame in kept]), strict=True
+        kept, frames(FrameAssembler(spec), messages, [frame.stamp_ns for frame in kept]), strict=True
     ):
         assert_equal(live, later)
     reader.close()

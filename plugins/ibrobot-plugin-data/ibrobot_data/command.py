@@ -25,11 +25,11 @@ from ibrobot_core.api import (
     Flag,
     echo,
     installed_plugins,
-    plural,
     with_closed_ends,
     wrong_input,
 )
 from ibrobot_data.request import MISSING, OUTCOMES, ConversionRequest, EpisodeReport, Report
+from ibrobot_data.words import plural
 
 if TYPE_CHECKING:
     from ibrobot_core.api import RobotConfig

@@ -14,9 +14,9 @@ from ibrobot_core.api import (
     OperatorEvent,
     RunHooks,
     Session,
-    plural,
     seconds,
 )
+from ibrobot_data.words import plural
 
 _MIB = 1 << 20
 _START, _FAILURE, _DISCARD = "tab", "f11", "f12"

@@ -19,6 +19,7 @@ from ibrobot_core.api import (
     ContractError,
     EpisodeReader,
     Feature,
+    Frame,
     FrameAssembler,
     Int32,
     Message,
@@ -164,6 +165,32 @@ class _Source:
         return True
 
 
+def frames(
+    assembler: FrameAssembler, messages: Iterable[tuple[str, Message, int]], ticks: Iterable[int]
+) -> Iterator[Frame]:
+    """Frames from recorded messages: at each tick, bit for bit the frame that a live run would have had.
+
+    Args:
+        assembler: of the contract.
+        messages: topic, message and time of receipt [ns], in the order of receipt, over all topics.
+        ticks: the times of the frames [ns], ascending.
+
+    Raises:
+        ContractError: for messages out of the order of receipt, or one that does not fit the contract.
+    """
+    source = iter(messages)
+    coming, last_ns = next(source, None), None
+    for t_ns in ticks:
+        while coming is not None and coming[2] <= t_ns:
+            topic, message, received_ns = coming
+            if last_ns is not None and received_ns < last_ns:
+                came = f"{topic} at {received_ns} ns came after {last_ns} ns"
+                raise ContractError(f"messages must come in the order of receipt; {came}")
+            assembler.take(topic, message, received_ns)
+            coming, last_ns = next(source, None), received_ns
+        yield assembler.frame(t_ns)
+
+
 class Ticks:
     """The rows of an episode, from the first tick at which everything is there to the last message.
 
@@ -216,7 +243,7 @@ class Ticks:
         source, before, rows = self._source, frozenset[str](), 0
         last: dict[str, NDArray[Any]] = {}
         absent = frozenset(self._contract.observations)
-        for frame in self._assembler.frames(source, source.ticks(self._contract.step_ns)):
+        for frame in frames(self._assembler, source, source.ticks(self._contract.step_ns)):
             if source.is_over(frame.stamp_ns):
                 break
             if not last:

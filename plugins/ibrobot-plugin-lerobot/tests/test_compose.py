@@ -56,9 +56,10 @@ def part(key: str, topic: str, type_: str, select: list[str]) -> ObservationPart
 def again(contract: Contract, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The frame of the messages made of `values`."""
     made = Composer(contract)(values, STAMP_NS)
-    received = [(topic, message, STAMP_NS) for topic, message in made.items()]
-    (frame,) = FrameAssembler(contract).frames(received, [STAMP_NS])
-    return dict(frame.values)
+    assembler = FrameAssembler(contract)
+    for topic, message in made.items():
+        assembler.take(topic, message, STAMP_NS)
+    return dict(assembler.frame(STAMP_NS).values)
 
 
 @pytest.mark.parametrize(("type_", "select"), SELECTS)

@@ -274,6 +274,13 @@ def test_sqlite_message_with_another_time_than_its_index_is_damage(tmp_path, whe
         read(tmp_path / "bag")
 
 
+def assemble(contract, reader):
+    assembler = FrameAssembler(contract)
+    for each in reader.messages(contract.topics):
+        assembler.take(each.topic, each.message, each.received_ns)
+    return assembler.frame(stamp(1))
+
+
 @pytest.mark.parametrize(("old", "new"), [("[] name", "[] nAme"), ("[] position", " position"), ("header", "hEader")])
 def test_standard_type_that_a_bag_defines_otherwise_gives_no_rows(tmp_path, old, new):
     """Its messages have the standard type's name and not its fields; a damaged definition is one way to get there."""
@@ -284,10 +291,8 @@ def test_standard_type_that_a_bag_defines_otherwise_gives_no_rows(tmp_path, old,
     part = ObservationPart(
         "observation.state", "/it", JointState.ros_type, ("position.pan",), None, Align(), Feature("float32", (1,))
     )
-    with reading(file) as reader:
-        stream = ((each.topic, each.message, each.received_ns) for each in reader.messages({"/it"}))
-        with pytest.raises(IbrobotError, match="/it"):
-            list(FrameAssembler(Contract(100.0, (part,), ())).frames(stream, [stamp(1)]))
+    with reading(file) as reader, pytest.raises(IbrobotError, match="/it"):
+        assemble(Contract(100.0, (part,), ()), reader)
     problems_of(file, longest_gap=10.0)  # raises nothing
 
 
