@@ -166,7 +166,8 @@ def _reader(kind: str, leaves: list[Leaf]) -> _Read:
     """Reads a run of leaves of one kind, and one array where they are of arrays."""
     field = leaves[0].field
     if kind == "foreign":
-        return _foreign_reader([leaf.field.split(".") for leaf in leaves])
+        paths = [leaf.field.split(".") for leaf in leaves]
+        return lambda message: np.array([_number_at(message, path) for path in paths], dtype=np.float64)
     if kind == "number":
         reads = [attrgetter(leaf.field) for leaf in leaves]
         return lambda message: np.array([read(message) for read in reads], dtype=np.float64)
@@ -209,10 +210,6 @@ def _element_reader(field: str, elements: list[int]) -> _Read:
     return values
 
 
-def _foreign_reader(paths: list[list[str]]) -> _Read:
-    return lambda message: np.array([_number_at(message, path) for path in paths], dtype=np.float64)
-
-
 def _number_at(message: Any, path: Sequence[str]) -> float:
     """The number that a path leads to in a message whose class nobody knew before."""
     value = value_at(message, path)
@@ -220,7 +217,8 @@ def _number_at(message: Any, path: Sequence[str]) -> float:
         return float(value)
     if isinstance(value, tuple | list | np.ndarray):
         raise ContractError(f"{'.'.join(path)!r} leads to {len(value)} elements; they go by number, e.g. .0")
-    raise ContractError(f"{'.'.join(path)!r} leads to no number{_fields_of(value)}")
+    there = f"; available: {', '.join(attrs.fields_dict(type(value)))}" if attrs.has(type(value)) else ""
+    raise ContractError(f"{'.'.join(path)!r} leads to no number{there}")
 
 
 def value_at(message: Any, path: Sequence[str]) -> Any:
@@ -248,7 +246,3 @@ def value_at(message: Any, path: Sequence[str]) -> Any:
         else:
             return value if isinstance(value, tuple | list | np.ndarray) else None
     return value
-
-
-def _fields_of(value: Any) -> str:
-    return f"; available: {', '.join(attrs.fields_dict(type(value)))}" if attrs.has(type(value)) else ""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Callable, Mapping
-from enum import Enum
 from typing import Any
 
 import attrs
@@ -189,7 +188,7 @@ class ControlCore:
             "executors": self._executors.counters(),
             "hardware": self._hardware.counters(),
             "loop": dict(self._counts),
-            "conditions": [attrs.asdict(each, value_serializer=_plain) for each in self._health.conditions],
+            "conditions": [attrs.asdict(each) for each in self._health.conditions],
         }
 
     def begin_stop(self, *, unmoved: bool = False) -> None:
@@ -483,8 +482,3 @@ class ControlCore:
 
     def _cancel(self) -> None:
         self._executors.cancel(self._measured)
-
-
-def _plain(_: object, __: object, value: Any) -> Any:
-    """For JSON."""
-    return value.value if isinstance(value, Enum) else value

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from enum import Enum
+from enum import Enum, StrEnum
 
 import attrs
 import numpy as np
@@ -47,7 +47,7 @@ class Torque(Enum):
     """The command was sent but not confirmed, e.g. because the cable is unplugged: joints may still hold."""
 
 
-class Severity(Enum):
+class Severity(StrEnum):
     """Severity of a `Condition`; the driver's options define the levels."""
 
     WARNING = "warning"

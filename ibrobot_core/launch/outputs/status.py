@@ -65,7 +65,7 @@ class Status(SessionWorker):
 
 def _of_joint(condition: Mapping[str, Any], robot: str) -> DiagnosticStatus:
     """A condition of a joint, as control reports it."""
-    level = DiagnosticStatus.ERROR if condition["severity"] == Severity.FAULT.value else DiagnosticStatus.WARN
+    level = DiagnosticStatus.ERROR if condition["severity"] == Severity.FAULT else DiagnosticStatus.WARN
     values = {condition["quantity"]: f"{condition['value']:.4g} {condition['unit']}".rstrip()}
     return DiagnosticStatus(level, f"joint {condition['joint']}", condition["message"], robot, _values(values))
 
