@@ -15,6 +15,7 @@ import numpy as np
 from ibrobot_core.api import (
     AnyGoal,
     ControlMode,
+    ControlState,
     Goal,
     HardwareError,
     JointGoal,
@@ -58,6 +59,8 @@ FRAMES = ("", "base", "base_link")
 _STATUS_NS = ns(0.1)
 _GLANCE_S = 0.5
 _ENDED = MoveResult(False, "the mode or the run ended", 0.0, "CANCELLED", PlanCode.PREEMPTED)
+_STILL_RAD = 1e-4
+"""Commands that change less from one look to the next stand still."""
 _KEPT = 100
 """How many results are kept for `RESULT`."""
 _POLICIES: tuple[OrientationPolicy, ...] = ("keep_axis", "arm_plane", "current", "free")
@@ -105,6 +108,7 @@ class PlannerSource(SourceWorker):
         self._status = ""
         self._status_ns = 0
         self._worker = 0
+        self._seen: ControlState | None = None
         for goal in () if session.has_control else session.request.goals:
             try:
                 self._queue.append(self._new(goal, asked=True))
@@ -167,7 +171,7 @@ class PlannerSource(SourceWorker):
             if not self.active:
                 return
             self._take_pose()
-            if self._move is None and self._queue:
+            if self._move is None and self._queue and self._at_rest():
                 self._begin(self._queue.popleft())
             if self._move is not None and self.session.clock.now_ns() - self._status_ns >= _STATUS_NS:
                 self._show("executing")
@@ -265,6 +269,14 @@ class PlannerSource(SourceWorker):
                 session.log.warning("%s does not slow down, and is cancelled: %s", name, error)
                 session.control.call("cancel")
                 return
+
+    def _at_rest(self) -> bool:
+        """Whether the commands stand still: the safety layer may follow the executors with a delay."""
+        state, seen = self.session.state, self._seen
+        if state is None or (seen is not None and state.stamp_ns == seen.stamp_ns):
+            return False
+        self._seen = state
+        return seen is not None and bool(np.abs(state.command - seen.command).max() < _STILL_RAD)
 
     def _commanded(self) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
         # From the commanded positions, not from where the joints sag to: the setpoint makes no step.
