@@ -174,7 +174,7 @@ def test_a_servo_that_dies_is_named_and_the_others_hold(bench: Bench) -> None:
     run.send_signal(signal.SIGINT)
     out, err = bench.end()
     assert run.returncode == 1
-    assert "servo 3 (elbow_flex), present_position: no good reply for 201 ticks" in err
+    assert "servo 3 (elbow_flex), present_position: no valid reply for 201 ticks" in err
     (fault,) = json.loads(out.splitlines()[-1])["faults"]
     assert fault.startswith(f"{bench.emulator.port}, servo 3 (elbow_flex)")
     assert [on for i, on in enumerate(bench.torque()) if i != 2] == [True] * 5

@@ -61,7 +61,7 @@ def test_cube_lies_in_the_bin_and_only_the_emulator_says_so(ibrobot: tuple[str, 
     summary = json.loads(told.splitlines()[-1])
     assert not summary["simulated"]
     assert summary["faults"] == []
-    assert said.get(timeout=PATIENCE_S) == "success: the scene's task is done\n"
+    assert said.get(timeout=PATIENCE_S) == "success: the task of the scene is done\n"
     assert said.empty()
     assert emulator.returncode == 0
     assert not link.is_symlink()
