@@ -244,7 +244,6 @@ from ibrobot_core.inference.build import build_policy as build_policy
 from ibrobot_core.recording.dataset import EpisodeDataset as EpisodeDataset
 from ibrobot_core.recording.service import EpisodeService as EpisodeService
 from ibrobot_core.recording.episode import episode_folder as episode_folder, robot_metadata as robot_metadata
-from ibrobot_core.probes import Probes as Probes, ProbeServer as ProbeServer
 from ibrobot_core.control.realtime import go_real_time as go_real_time
 from ibrobot_core.memory import create_memory as create_memory, set_malloc as set_malloc
 from ibrobot_core.child import Channel as Channel, Child as Child, open_parent as open_parent

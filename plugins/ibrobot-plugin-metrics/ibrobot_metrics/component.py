@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import override
 
+from ibrobot_monitoring import Probes, ProbeServer
 from prometheus_client import generate_latest
 
-from ibrobot_core.api import CONTROL, Component, Probes, ProbeServer, Session
+from ibrobot_core.api import CONTROL, Component, Session
 from ibrobot_metrics.collector import RunCollector
 from ibrobot_metrics.options import MetricsOptions
 

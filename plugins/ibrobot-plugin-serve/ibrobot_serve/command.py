@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import Any
 
 import click
+from ibrobot_monitoring import ProbeServer
 
 from ibrobot_core.api import (
     ConfigError,
     Context,
     LogFormatter,
     Policy,
-    ProbeServer,
     Problem,
     RealClock,
     Registry,

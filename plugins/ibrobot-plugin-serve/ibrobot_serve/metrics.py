@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any, override
 
+from ibrobot_monitoring import Probes
 from prometheus_client import generate_latest
 from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from ibrobot_core.api import Probes
 from ibrobot_serve.service import InferenceService
 
 _COUNTS = ("requests", "answered", "failed", "expired")

@@ -8,10 +8,10 @@ from collections.abc import Iterator
 
 import attrs
 import pytest
+from ibrobot_monitoring import Probes, ProbeServer
+from ibrobot_monitoring import probes as module
 
-from ibrobot_core import probes as module
-from ibrobot_core.errors import IbrobotError
-from ibrobot_core.probes import Probes, ProbeServer
+from ibrobot_core.api import IbrobotError
 
 
 @attrs.define

@@ -13,7 +13,7 @@ from typing import Any, override
 
 import attrs
 
-from ibrobot_core.errors import IbrobotError
+from ibrobot_core.api import IbrobotError
 
 _HOST = "127.0.0.1"
 _NAMES = frozenset({"127.0.0.1", "localhost", "[::1]"})
