@@ -244,7 +244,8 @@ class TestReadOnlyFolder:
     def test_record(self, run: Run, read_only: Path):
         done = record_picks(run, read_only)
         assert done.code == 2
-        assert f"recording.root: {read_only}/picks cannot be written: {read_only}: {ONLY_READ}; choose another root" in done.err
+        refused = f"{read_only}/picks cannot be written: {read_only}: {ONLY_READ}"
+        assert f"recording.root: {refused}; choose another root" in done.err
 
     def test_convert_and_the_way_back(self, run: Run, bags: Path, dataset: Path, read_only: Path):
         done = run("convert", bags, "--out", read_only / "set")
