@@ -1,4 +1,4 @@
-"""One tick of control: read, executors, safety, write; modes, goals, faults and stop behaviours around it."""
+"""The control core: read, executors, safety and write in each tick; modes, goals, faults and stop behaviours."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ from ibrobot_core.robot import Vector
 from ibrobot_core.units import ns
 
 EMERGENCY_STOP = "emergency stop"
-"""The fault that a person raises."""
+"""The fault raised by `/estop`."""
 _FIRST_READINGS = 10
-"""Of so many, one must be new: a single reply may be lost."""
+"""Attempts to get a new reading at the start, since single replies may be lost."""
 _POSE_SPEED = 0.25
-"""Fraction of the velocity limits at which start and stop move to a pose."""
+"""Speed of motions to a start or stop pose, as a fraction of the velocity limits."""
 _POSE_TIMEOUT_S = 10.0
 _POSE_TOLERANCE = 0.2
-"""How far a joint may hang from a commanded startup pose [rad]."""
+"""Largest distance of a joint from the commanded startup pose, e.g. due to its weight [rad]."""
 
 
 class ControlCore:
-    """The control loop's work, without its timing: `tick` once a period, `handle` for commands, `events` for the host.
+    """The control loop without its timing: `tick` once per period, `handle` for commands, `events` for the host.
 
     Args:
         config: the robot YAML.
-        hardware: all of the robot's hardware; connected by `start`.
+        hardware: all hardware of the robot; connected by `start`.
         executors: name -> executor.
-        clock: where stamps come from.
+        clock: the source of stamps.
     """
 
     def __init__(
@@ -61,12 +61,12 @@ class ControlCore:
         self._stopping = False
         self._following = FollowingError(config.control.following_error, config.robot, self.period_ns)
         self._yielded: Vector | None = None
-        """Where joints that did not follow rest while the fault lasts [rad], NaN for the others; shape (J,)."""
+        """Held positions of joints that did not follow, until a reset [rad]; NaN for the others, shape (J,)."""
         self._target: Vector | None = None
         self._health = Health(config.control.load_shedding, self._log)
         self._shedding = self._has_shed = False
         self._unwell = ""
-        """The fault, where it is a condition of a joint."""
+        """The fault, if a joint's condition caused it; otherwise empty."""
         self._arriving = False
         self._tick = 0
         self._commands: dict[str, Callable[..., Mapping[str, Any] | None]] = {
@@ -83,19 +83,19 @@ class ControlCore:
         self.generation = 0
         self.fault = ""
         self.events: deque[Mapping[str, Any]] = deque()
-        """Events for the host: `goal` and `fault`."""
+        """Events for the host, of kinds `goal` and `fault`."""
         self._executors = ActiveExecutors(config.robot, executors, self.events.append)
         self.state: ControlState | None = None
-        """After a tick, what it found and did."""
+        """Readings and commands of the last tick; None before the first."""
 
     def start(self, mode: str) -> None:
-        """Connect, take the joints over where they are, and enter `mode` once `arrived`.
+        """Connect, hold the joints at their measured positions, and enter `mode` once `arrived`.
 
-        Where that fails, the torque that it put on is off again.
+        On failure, torque switched on here is switched off again.
 
         Raises:
-            HardwareError: when the hardware does not connect or its first reading is not a valid position.
-            NotSupported: where the stop behaviour is `relax` and a part has no such thing.
+            HardwareError: if the hardware does not connect or its first reading is not a valid position.
+            NotSupported: if the stop behaviour is `relax` and a part cannot relax.
         """
         if self._config.control.stop == "relax":
             self._hardware.require_relax()
@@ -115,17 +115,17 @@ class ControlCore:
             self._switch_mode(mode)
 
     def arrived(self) -> bool:
-        """Whether the robot is in its mode; until then it moves to its startup pose: tick on.
+        """Whether the robot has entered its mode. Until then it moves to its startup pose; keep calling `tick`.
 
         Raises:
-            HardwareError: when a fault came on the way, or it took too long.
+            HardwareError: on a fault during the motion, or if the motion takes too long.
         """
         if not self._arriving:
             return True
         if self.fault or self._target is None:
             raise HardwareError(f"control.startup: {self._config.control.startup}: {self.fault}")
         away = np.abs(self._measured.position - self._target)
-        # The mode begins at the measured positions: those of an old reading would pull the robot back on its way.
+        # The mode starts from the measured positions; those of an old reading would pull the robot back.
         if self._at_target and not self._measured.stale and away.max() <= _POSE_TOLERANCE:
             self._target, self._arriving = None, False
             self._switch_mode(self.mode)
@@ -139,11 +139,11 @@ class ControlCore:
         return False
 
     def tick(self, late_ns: int = 0, periods: int = 1) -> ControlState:
-        """One cycle.
+        """Run one cycle.
 
         Args:
-            late_ns: how late the cycle begins [ns], noted in the state.
-            periods: periods since the last tick; more than one after missed ticks, so that simulated time keeps up.
+            late_ns: delay of the cycle's start [ns], stored in the state.
+            periods: periods since the last tick; more than one after missed ticks, to keep simulated time in step.
         """
         self._read()
         signals = self._read_signals()
@@ -163,14 +163,14 @@ class ControlCore:
         return self.state
 
     def set_plan(self, plan: PlanRecord) -> None:
-        """Give a plan to the active executors of its joints; one from before a mode switch or reset is counted."""
+        """Pass a plan to the active executors of its joints; plans of an earlier generation are only counted."""
         if plan.generation != self.generation or self.fault:
             self._counts["old_plans"] += 1
             return
         self._executors.set_plan(plan)
 
     def handle(self, command: Mapping[str, Any]) -> dict[str, Any]:
-        """Carry out a command of the host and answer it; a refused one is answered with `error`."""
+        """Execute a command of the host and return the reply; the reply to a refused command has the key `error`."""
         if self._stopping:
             return {"reply": command["id"], "error": f"{command['do']}: refused, the robot is stopping"}
         arguments = {key: value for key, value in command.items() if key not in ("do", "id")}
@@ -181,7 +181,7 @@ class ControlCore:
         return {"reply": command["id"], "generation": self.generation, **result}
 
     def counters(self) -> dict[str, Any]:
-        """Every intervention and refusal so far: of the safety layer, of the executors, of the loop."""
+        """Counts of all interventions and refusals by the safety layer, the executors, the hardware and the loop."""
         return {
             "safety": dict(self._safety.counters()),
             "joints": dict(self._safety.interventions),
@@ -192,10 +192,11 @@ class ControlCore:
         }
 
     def begin_stop(self, *, unmoved: bool = False) -> None:
-        """Start the configured stop behaviour; tick until `stopped`.
+        """Start the configured stop behaviour; keep calling `tick` until `stopped`.
 
         Args:
-            unmoved: the start failed elsewhere before anything moved the robot: the torque it put on goes off again.
+            unmoved: whether nothing has moved the robot, since the start failed elsewhere; torque that the start
+                switched on is then switched off again.
         """
         self._stopping = True
         self._leave()
@@ -212,7 +213,7 @@ class ControlCore:
             self._move_to(pose)
 
     def holding(self) -> list[str]:
-        """What holds torque, and how to take it off; a line each. Also after `close`."""
+        """One line for each part that holds torque, with the command that switches it off. Also valid after `close`."""
         return [f"{each.where} holds torque; to take it off: {each.command}" for each in self._hardware.holding()]
 
     @property
@@ -222,12 +223,12 @@ class ControlCore:
 
     @property
     def signal_size(self) -> int:
-        """Numbers in all signals together."""
+        """Total size of all signals."""
         return sum(signal.size for signal in self.signals)
 
     @property
     def stopped(self) -> bool:
-        """Whether the stop behaviour is done."""
+        """Whether the stop behaviour has finished."""
         if self._relaxed:
             return True
         if self._target is None or self._late_to_pose:
@@ -235,7 +236,7 @@ class ControlCore:
         return self._at_target
 
     def abandon(self) -> None:
-        """After a bug in the loop, when it cannot tick any more: torque off if that is the stop behaviour."""
+        """Switch torque off if the stop behaviour is `relax`; for a loop that cannot tick because of a bug."""
         if self.state is not None and self._config.control.stop == "relax":
             self._relax("the control loop failed")
 
@@ -270,7 +271,7 @@ class ControlCore:
         try:
             measured = self._hardware.read()
         except HardwareError as error:
-            # The driver has ridden out what can be.
+            # The driver has already retried what it can.
             self._counts["read_errors"] += 1
             measured = attrs.evolve(self._measured, stale=True)
             self._raise_fault(str(error))
@@ -286,29 +287,29 @@ class ControlCore:
         try:
             return self._hardware.read_signals()
         except HardwareError:
-            # Unlike the joints, no reason to stop for; missing is missing.
+            # Unlike missing joints, missing signals do not stop the robot.
             self._counts["signal_errors"] += 1
             return np.full(self.signal_size, np.nan)
 
     def _stale(self) -> None:
-        """A tick without a new state: a fault once that has lasted for `state_timeout`."""
+        """Handle a tick without a new state; raise a fault once states have been missing for `state_timeout`."""
         age_ns = self._clock.now_ns() - self._answered_ns
         if age_ns >= self._state_timeout_ns:
             self._raise_fault(f"the joints do not answer: no state for {age_ns / 1e6:.0f} ms")
 
     def _check_following(self) -> None:
-        """Stop where a joint does not follow, and press no longer against what blocks it."""
+        """Raise a fault if a joint does not follow, and stop pressing against the obstacle."""
         if self.fault or self._relaxed or self._measured.stale:
             return
-        told, measured = self._safety.current, self._measured.position
-        fault = self._following.check(told, self._safety.velocity, measured)
+        commanded, measured = self._safety.current, self._measured.position
+        fault = self._following.check(commanded, self._safety.velocity, measured)
         if fault:
             self._counts["following_errors"] += 1
             self._raise_fault(fault)
             self._yielded = np.where(self._following.lost, measured, np.nan)
 
     def _check_health(self) -> None:
-        """Stop where a condition is a fault; shed load where it has lasted for too long."""
+        """Raise a fault for a severe condition; shed load once it has lasted too long."""
         conditions = self._hardware.health()
         if conditions or self._health.conditions:
             now_ns = self._clock.now_ns()
@@ -324,12 +325,12 @@ class ControlCore:
 
     @property
     def _may_shed_in_motion(self) -> bool:
-        """Whether the way to the pose may go on: not after an emergency stop, nor while the joints are silent."""
+        """Whether the motion to the pose may continue: no emergency stop, and the joints answer."""
         silent = self._clock.now_ns() - self._answered_ns >= self._state_timeout_ns
         return self._target is not None and not (self._late_to_pose or self._safety.estopped or silent)
 
     def _shed(self, why: str) -> None:
-        """Move to the pose for it, where nothing but the joints' health forbids motion, and then relax."""
+        """Move to the load-shedding pose, unless a fault other than the joints' health prevents motion, then relax."""
         options = self._config.control.load_shedding
         moves = options.pose and self.fault in ("", self._unwell)
         then = f"goes to pose {options.pose} and relaxes" if moves else "relaxes"
@@ -353,12 +354,12 @@ class ControlCore:
             self._raise_fault(str(error))
 
     def _desired(self) -> Vector | None:
-        """What is asked for in this tick; None to brake and hold."""
+        """The desired positions of this tick [rad], shape (J,); None to brake and hold."""
         if self._target is not None:
             return None if self._late_to_pose else self._safety.towards(self._target, _POSE_SPEED)
         if not self._executors:
             return self._yield()
-        # A plan goes on by time where a single reply was lost.
+        # Where a single reply was lost, a plan continues by the clock.
         now_ns = self._clock.now_ns() if self._measured.stale else None
         setpoints = self._executors.update(self._measured, now_ns)
         relax = self._executors.want_relax
@@ -372,7 +373,7 @@ class ControlCore:
         return desired
 
     def _relax(self, why: str) -> None:
-        """Take torque off, and say for each part whether that is so, whatever fault is set already."""
+        """Switch torque off and report the outcome for each part, even if a fault is already set."""
         outcomes = self._hardware.relax()
         self._relaxed = not self._hardware.holds
         off = [name for name, outcome in outcomes.items() if outcome is Torque.OFF]
@@ -386,7 +387,7 @@ class ControlCore:
                 self._announce(f"torque of {name} cannot be taken off: {outcome}", "holds")
 
     def _restore_torque(self) -> bool:
-        """Torque comes back: start from where the joints lie. False where that is not known: a fault."""
+        """Switch torque on at the measured positions. Raise a fault and return False if they are unknown."""
         try:
             if self._measured.stale:
                 raise HardwareError("the joints do not answer")
@@ -414,13 +415,13 @@ class ControlCore:
             self._relax("fault")
 
     def _announce(self, fault: str, then: str) -> None:
-        """Tell the host of a fault, also beside one that is set; `then` is what the robot does."""
+        """Report a fault to the host, even if another is set; `then` states what the robot does."""
         stamp_ns = self._clock.now_ns()
         if not self.fault:
             self.fault = fault
             self._leave()
             self._target = None
-        # With the generation, the host knows which faults a later reset cleared.
+        # The generation lets the host know which faults a later reset cleared.
         self.events.append(
             {"event": "fault", "fault": fault, "then": then, "stamp_ns": stamp_ns, "generation": self.generation}
         )
@@ -453,15 +454,15 @@ class ControlCore:
         self._raise_fault(EMERGENCY_STOP)
 
     def _reset(self) -> dict[str, Any]:
-        """Clear faults and the emergency stop, and enter the mode again from where the joints are.
+        """Clear faults and the emergency stop, and enter the mode again at the measured positions.
 
-        Answers with the fault that was `cleared`, empty where none was set.
+        The reply's `cleared` is the cleared fault, or empty if none was set.
         """
         cleared = self.fault
         if not self._safety.at_rest and not self._relaxed:
             if cleared:
-                raise HardwareError("the robot still brakes: reset it when it stands")
-            # It moves as commanded: only the executors begin again, and the commands go on within the limits.
+                raise HardwareError("the robot is still braking: reset it when it has stopped")
+            # The robot moves as commanded: restart the executors only, so that commands continue within the limits.
             self._switch_mode(self.mode)
         else:
             self._restart_executors()

@@ -1,6 +1,7 @@
-"""The control process: owns the hardware and nothing else, and stops the robot when the host is gone.
+"""The control process: owns the hardware and nothing else, and stops the robot when the host dies.
 
-Started by `ibrobot_core.control.host` as a `Child` with the descriptors MEMORY and WAKE; the order says which robot.
+`ibrobot_core.control.host` starts it as a `Child` with the descriptors MEMORY and WAKE, and then sends the robot's
+configuration.
 """
 
 from __future__ import annotations
@@ -49,9 +50,9 @@ class ControlProcess:
         self._terminated = False
 
     def run(self) -> None:
-        """Tick until stopped: by the host's command, by its death, or by SIGTERM; each ends in the stop behaviour."""
+        """Tick until the host commands a stop, the host dies, or SIGTERM arrives; then run the stop behaviour."""
         signal.signal(signal.SIGTERM, self._terminate)
-        self._report("report")  # the first call of anything is slow: here no tick waits for it
+        self._report("report")  # the first call is slow, so make it before the first tick
         period = self._core.period_ns
         deadline = self._clock.now_ns() + period
         periods = 1
@@ -60,7 +61,7 @@ class ControlProcess:
             late = self._clock.now_ns() - deadline
             self._cycle(deadline, late, periods)
             if self._handle_commands():
-                # It was waited for, e.g. hardware that is set up again after a fault: no tick was missed.
+                # A slow command, e.g. hardware set up again after a fault, does not count as missed ticks.
                 deadline, periods = self._clock.now_ns() + period, 1
                 continue
             deadline += period
@@ -75,8 +76,8 @@ class ControlProcess:
             self._core.set_plan(plan)
         self._memory.write_state(self._core.tick(late, periods))
         self._punctuality.tick(deadline, late, periods - 1)
-        self._tell_host()
-        # A process that the host forked keeps the socket open beyond the host's death.
+        self._report_to_host()
+        # A process forked by the host keeps the socket open after the host's death.
         if self._channel.closed or os.getppid() != self._host:
             self._begin_stop("the host is gone", unmoved=self._ready is not None)
         elif self._terminated:
@@ -86,7 +87,7 @@ class ControlProcess:
             self._ready = None
 
     def _handle_commands(self) -> bool:
-        """Carry out the host's commands; whether that took longer than a period."""
+        """Execute the host's commands; return whether this took longer than a period."""
         begun_ns = self._clock.now_ns()
         for command in self._channel.receive():
             if command["do"] == "stop":
@@ -95,8 +96,8 @@ class ControlProcess:
                 self._channel.send(self._core.handle(command))
         return self._clock.now_ns() - begun_ns > self._core.period_ns
 
-    def _tell_host(self) -> None:
-        # A full pipe wakes the host as well as one more byte would; a closed one shows on the socket.
+    def _report_to_host(self) -> None:
+        # A full pipe wakes the host too; a closed pipe shows on the socket.
         with contextlib.suppress(OSError):
             os.write(self._wake, b".")
         while self._core.events:
@@ -146,7 +147,7 @@ def main(parent: int, memory: int, wake: int) -> int:
     finally:
         if core is not None:
             core.close()
-            if channel.closed:  # nobody else can say it
+            if channel.closed:  # the host can no longer report it
                 for line in core.holding():
                     echo(line, err=True)
         channel.flush(FAREWELL_S)

@@ -1,4 +1,4 @@
-"""Real-time settings of this process, where the machine permits them, and what it did not permit."""
+"""Real-time settings of this process, as far as the machine permits them."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ _MCL_CURRENT_AND_FUTURE = 3
 
 
 def go_real_time(priority: int) -> list[str]:
-    """SCHED_FIFO for every thread, locked memory, no garbage collection in the loop.
+    """Set SCHED_FIFO for every thread, lock memory, and disable garbage collection.
 
     Args:
-        priority: of SCHED_FIFO, 1..99.
+        priority: priority for SCHED_FIFO, 1..99.
 
     Returns:
-        What was refused, with the remedy, a line each; empty where all was granted.
+        One line for each refused setting, with the remedy; empty if all were granted.
     """
     refused = []
     gc.collect()

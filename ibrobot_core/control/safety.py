@@ -1,4 +1,4 @@
-"""The safety layer: the one way to the motors; keeps commands within position, velocity and acceleration limits."""
+"""The safety layer: keeps every command to the motors within position, velocity and acceleration limits."""
 
 from __future__ import annotations
 
@@ -12,30 +12,30 @@ from ibrobot_core.robot import Robot, Vector
 from ibrobot_core.units import seconds
 
 KINDS = ("estop", "nonfinite", "unmeasured", "first_command", "position", "lead", "velocity", "acceleration")
-"""Why a joint was not given what was asked for. A joint counts once a tick, under the first of these that applies."""
+"""Reasons for changing a desired setpoint. A joint counts once per tick, under the first reason that applies."""
 
 
 class SafetyLayer:
-    """Turns desired setpoints into the commands for the hardware, one tick at a time.
+    """Turns desired setpoints into hardware commands, one tick at a time.
 
-    From `activate` on, at every tick and for every joint, whatever is asked for:
+    From `activate` on, at every tick and for every joint, for any desired setpoint:
     `lower <= p <= upper`, `|p - m| <= max_lead`, `|p - p'| <= max_velocity * dt` and
     `|(p - p') - (p' - p'')| <= max_acceleration * dt^2`, where p, p', p'' are the last three commands, m is the
-    measured position and dt is the period. So that braking never ends beyond a position limit, nor beyond max_lead
-    from where the joint is now, a step is taken only if braking from it at max_acceleration stops in time.
+    measured position and dt is the period. A step is taken only if braking from it at max_acceleration stops in time,
+    so that braking never ends beyond a position limit, nor further than max_lead from the measured position.
 
-    The order is that of precedence. The first two always hold, the first before the second. The last two yield where a
-    joint's measured position moves away from the command so that no braking stops in time, e.g. because a person pushes
-    it; where p' itself is too far from m, p starts at rest at max_lead from it.
+    The inequalities are in order of precedence. The first two always hold, the first before the second. The last two
+    yield if a joint's measured position moves away from the command faster than braking allows, e.g. because a person
+    pushes the joint; if p' itself is too far from m, p starts at rest at max_lead from m.
 
-    What can be had within these limits passes unchanged, bit by bit. After something that could not, the command
-    catches up as fast as the limits allow and brakes so as not to overshoot.
+    Setpoints within these limits pass unchanged, bit for bit. After a setpoint beyond them, the command catches up as
+    fast as the limits allow and brakes so as not to overshoot.
 
-    Not thread-safe: it belongs to the control loop.
+    Not thread-safe; only the control loop uses it.
 
     Args:
         robot: joints and their limits; J is their number.
-        period_ns: the control period [ns]; `apply` is called once in each.
+        period_ns: the control period [ns]; call `apply` once per period.
     """
 
     def __init__(self, robot: Robot, period_ns: int) -> None:
@@ -46,11 +46,11 @@ class SafetyLayer:
         self._lower = robot.lower.astype(np.float64)
         self._upper = robot.upper.astype(np.float64)
         self._max_lead = robot.max_lead
-        # Velocities are kept as steps [rad per tick], accelerations as changes of step: no rounding by dt comes in.
+        # Velocities are steps [rad per tick] and accelerations changes of step, so that dt adds no rounding.
         max_step = robot.max_velocity * self._period_s
         self._change = robot.max_acceleration * self._period_s**2
-        # A plan that runs exactly at a limit exceeds it by rounding, and braking along the limit must make up for
-        # rounding: half of the slack is for what is commanded here, the whole of it for what is passed.
+        # A plan that runs exactly at a limit exceeds it by rounding, and braking along the limit must compensate
+        # rounding: computed commands use half of the slack, setpoints passed unchanged all of it.
         largest = np.maximum(np.abs(self._lower), np.abs(self._upper))
         slack = np.maximum(1e-10 * np.minimum(max_step, self._change), 32 * np.spacing(largest))
         self._max_step, self._max_change, self._half_slack = max_step + slack / 2, self._change + slack / 2, slack / 2
@@ -62,12 +62,12 @@ class SafetyLayer:
         self._active = False
 
     def activate(self, measured: Vector) -> None:
-        """Start at rest from the measured positions [rad], shape (J,). Also to be called when torque returns.
+        """Start at rest from the measured positions [rad], shape (J,). Call it again when torque returns.
 
-        A joint outside its limits may stay there or move inwards, never further out; counted as `outside`.
+        A joint outside its limits may stay there or move inwards, never further out; it counts as `outside`.
 
         Raises:
-            HardwareError: when a position is not finite: a start from nowhere is none.
+            HardwareError: if a position is not finite.
         """
         position = _vector(measured, len(self._names))
         if position is None:
@@ -86,13 +86,13 @@ class SafetyLayer:
         self._active = True
 
     def apply(self, desired: object, measured: Vector) -> Vector:
-        """One tick: the positions [rad] for the hardware, shape (J,), always finite.
+        """Return the commands of one tick [rad], shape (J,), always finite.
 
         Args:
-            desired: positions [rad], shape (J,), a numpy array; None for silence. A joint brakes and holds where
-                its value is missing, not finite, or where the joint is not measured; all do on a wrong length or type.
+            desired: positions [rad], a numpy array of shape (J,), or None. A joint brakes and holds if its value is not
+                finite or the joint is not measured; all joints do for None, a wrong length or a wrong type.
             measured: positions [rad], shape (J,); NaN where a joint is not measured. While they repeat an older
-                reading the command goes no further than `max_lead` from that.
+                reading, the command stays within `max_lead` of it.
 
         Raises:
             RuntimeError: before the first `activate`.
@@ -118,14 +118,14 @@ class SafetyLayer:
         return command.copy()
 
     def estop(self) -> None:
-        """Latch the emergency stop: every joint brakes at its limit and holds; what is asked for is not followed."""
+        """Latch the emergency stop: every joint brakes at its limit and holds, and desired setpoints are ignored."""
         self._estopped = True
 
     def reset(self, measured: Vector) -> None:
         """Release the emergency stop and start at rest from the measured positions [rad], shape (J,).
 
         Raises:
-            HardwareError: when a position is not finite; the stop stays latched.
+            HardwareError: if a position is not finite; the stop stays latched.
         """
         self.activate(measured)
         self._estopped = False
@@ -147,31 +147,31 @@ class SafetyLayer:
 
     @property
     def at_rest(self) -> bool:
-        """Whether the last command moved no joint: a stop is complete."""
+        """Whether the last command moved no joint, so that a stop is complete."""
         return not self._step.any()
 
     def towards(self, target: Vector, speed: float) -> Vector:
-        """What to ask for in this tick [rad], shape (J,), on a gentle way to rest at `target` [rad], shape (J,).
+        """The desired positions of this tick [rad], shape (J,), for a motion that ends at rest at `target` [rad].
 
-        It speeds up, goes at `speed` (0..1) times the velocity limits, and brakes, all within the limits.
+        The motion accelerates, cruises at `speed` (0..1) times the velocity limits, and brakes, within the limits.
         """
         gap = target - self._position
         step = np.copysign(np.minimum(_reach(np.abs(gap), self._change), speed * self._max_step), gap)
         return self._position + _limited(step, self._step - self._change, self._step + self._change)
 
     def counters(self) -> Mapping[str, int]:
-        """Counts since construction: joint-ticks for each of `KINDS`; `outside` joints; refused and missing vectors."""
+        """Counts since construction: joint-ticks for each of `KINDS`, `outside` joints, refused and missing vectors."""
         return dict(zip(KINDS, self._counts.sum(axis=1).tolist(), strict=True)) | self._events
 
     @property
     def interventions(self) -> Mapping[str, int]:
-        """By joint, the ticks at which the joint was not given what was asked for."""
+        """Joint -> number of ticks in which its setpoint was changed."""
         totals = self._counts.sum(axis=0) + self._events["wrong_length"]
         return dict(zip(self._names, totals.tolist(), strict=True))
 
     def _bounds(self, seen: Vector, known: NDArray[np.bool_]) -> tuple[Vector, Vector]:
         """Lowest and highest command of this tick [rad], by position limits and lead; shapes (J,)."""
-        # A joint that started outside may come in, and then not go back out.
+        # A joint that started outside its limits may move inwards, and then not back out.
         lower, upper = np.minimum(self._lower, self._position), np.maximum(self._upper, self._position)
         lead = self._max_lead
         if not known.all():
@@ -187,7 +187,7 @@ class SafetyLayer:
             self._step, self._target = np.where(left, 0.0, self._step), np.where(left, np.nan, self._target)
         target = _limited(np.where(follow, wanted, position), lower, upper)
         ahead = target - position
-        # Where the target moves smoothly it is expected to go on; otherwise to be a place to stop at.
+        # A target that moves smoothly is expected to continue; any other is treated as a place to stop.
         target_step = target - self._target
         smooth = np.abs(target_step - self._target_step) <= self._max_change + slack
         expected = np.where(smooth, target_step, 0.0)
@@ -195,11 +195,11 @@ class SafetyLayer:
         slowest = np.maximum(self._step - self._max_change, -self._max_step)
         fastest = np.minimum(self._step + self._max_change, self._max_step)
         room_below, room_above = _reach(np.array((position - lower, upper - position)), self._change)
-        # Beyond the room to brake by a quarter only: the next step has to make up for it within the slack.
+        # Only a quarter of the slack beyond the room to brake: the next step must compensate for it within the slack.
         within = (ahead <= np.minimum(fastest + slack, room_above + slack / 4)) & (
             ahead >= np.maximum(slowest - slack, -room_below - slack / 4)
         )
-        # Arriving faster than the target goes would overshoot it; while already on it, it leads.
+        # Arriving faster than the target moves would overshoot it; a joint already on the target follows it.
         matched = (self._target == position) | (np.abs(ahead - expected) <= self._max_change + slack)
         passes = follow & within & matched
 
@@ -209,7 +209,7 @@ class SafetyLayer:
             gap = ahead - expected
             step = np.where(follow, expected + np.copysign(_reach(np.abs(gap), self._change), gap), 0.0)
             step = _limited(step, slowest, fastest)
-            # Last, since a position limit must hold even where rounding leaves no step that satisfies all.
+            # Last, since a position limit must hold even if rounding leaves no step that satisfies all limits.
             step = _limited(step, -room_below, room_above)
             command = np.where(passes, target, _limited(position + step, lower, upper))
         self._step = command - position
@@ -221,19 +221,19 @@ class SafetyLayer:
     def _count(
         self, differs: NDArray[np.bool_], wanted: Vector, known: NDArray[np.bool_], before: Vector, bound: Vector
     ) -> None:
-        """Count the joints that `differs` marks, each under the first of `KINDS` that applies.
+        """Count the joints marked in `differs`, each under the first of `KINDS` that applies.
 
         Args:
             differs: shape (J,).
             wanted: shape (J,).
-            known: which joints are measured, shape (J,).
+            known: whether each joint is measured, shape (J,).
             before: the last commands, shape (J,).
             bound: the furthest command of this tick in the direction of `wanted`, shape (J,).
         """
         lower, upper = np.minimum(self._lower, before), np.maximum(self._upper, before)
         step = _limited(wanted, lower, upper) - before
         room = np.abs(bound - before)
-        # A lead limits the joint from where braking for it begins.
+        # The lead limits a joint as soon as braking for it begins.
         leads = (np.abs(wanted - before) > room) & (_reach(room, self._change) < self._max_step)
         reasons = np.array(
             (
@@ -252,20 +252,20 @@ class SafetyLayer:
 
 
 def _vector(value: object, size: int) -> Vector | None:
-    """`value` as float64 where it is an array of `size` real numbers, else None."""
+    """`value` as float64 if it is an array of `size` real numbers, else None."""
     if isinstance(value, np.ndarray) and value.shape == (size,) and value.dtype.kind in "fiu" and value.itemsize <= 8:
         return value.astype(np.float64, copy=False)
     return None
 
 
 def _limited(value: Vector, lower: Vector, upper: Vector) -> Vector:
-    """`value` within `lower` and `upper`; np.clip takes twice the time for a handful of joints."""
+    """Clip `value` to `lower` and `upper`; np.clip takes twice as long for a few joints."""
     result: Vector = np.minimum(np.maximum(value, lower), upper)
     return result
 
 
 def _reach(distance: Vector, change: Vector) -> Vector:
-    """The largest step from which braking by `change` a tick ends no further than `distance`; shapes (..., J).
+    """The largest step from which braking by `change` per tick ends within `distance`; shapes (..., J).
 
     A step u, then u - D, u - 2 D, … while positive, covers (n + 1) u - D n (n + 1) / 2 with n = floor(u / D).
     """

@@ -1,4 +1,4 @@
-"""Splines through points in time: linear, cubic or quintic by what is known at the points."""
+"""Splines through timed points: linear, cubic or quintic, depending on the derivatives given."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from ibrobot_core.robot import Vector
 from ibrobot_core.units import NS_PER_S
 
 _TAPS = 16
-"""How many points to each side count for a velocity; those beyond would change it by a billionth."""
+"""Points used on each side for a velocity; points further away would change it by a billionth."""
 _RATIO = 3**0.5 - 2
 _KERNEL = 3 * _RATIO ** np.abs(np.arange(-_TAPS, _TAPS + 1)) / (2 * 3**0.5)
 
@@ -18,16 +18,16 @@ Sample = tuple[Vector, Vector, Vector]
 
 
 def smooth_velocities(positions: Vector, step_s: float) -> Vector:
-    """Velocities [rad/s], shape (N, J), with which a cubic spline has continuous accelerations too.
+    """Velocities [rad/s], shape (N, J), that give a cubic spline continuous accelerations.
 
-    It begins without acceleration and ends at rest.
+    The spline starts with zero acceleration and ends at rest.
 
     Args:
         positions: [rad], shape (N, J), N >= 2.
-        step_s: time from each to the next [s].
+        step_s: time between points [s].
     """
-    # m[i-1] + 4 m[i] + m[i+1] = 3 (p[i+1] - p[i-1]) for the velocities m, on positions that go on for ever, mirrored at
-    # the end and at the beginning, there with the other sign. The inverse of that is the kernel.
+    # m[i-1] + 4 m[i] + m[i+1] = 3 (p[i+1] - p[i-1]) for the velocities m, on positions extended without end: mirrored
+    # at the end, and with opposite sign at the beginning. The kernel is the inverse.
     last = len(positions) - 1
     phase = np.arange(-_TAPS - 1, last + _TAPS + 2) % (4 * last)
     half = phase % (2 * last)
@@ -39,9 +39,9 @@ def smooth_velocities(positions: Vector, step_s: float) -> Vector:
 
 
 class Spline:
-    """Passes through every point with the derivatives given there: continuous in all that is given.
+    """A curve through every point with the given derivatives, which are continuous.
 
-    Positions alone make straight lines; with velocities the pieces are cubic, with accelerations too quintic.
+    Positions alone give straight lines, velocities cubic pieces, and accelerations quintic pieces.
 
     Args:
         times_ns: strictly increasing [ns], shape (N,), N >= 2.
@@ -87,7 +87,7 @@ class Spline:
         return int(self._times_ns[-1])
 
     def at(self, time_ns: int) -> Sample:
-        """The sample at `time_ns` [ns]: before the first point the first, from the last on that, at rest."""
+        """The sample at `time_ns` [ns]; the start of the spline before it, the last point at rest after it."""
         if time_ns >= self.end_ns:
             return self._last.copy(), np.zeros_like(self._last), np.zeros_like(self._last)
         time_ns = max(time_ns, int(self._times_ns[0]))

@@ -1,4 +1,4 @@
-"""How punctual a loop is: lateness of its ticks, and ticks missed."""
+"""Timing statistics of a loop: lateness of its ticks, and missed ticks."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 
 REPORT_TICKS = 20
-"""Ticks between two reports of punctuality and counters to the host."""
+"""Ticks between two reports of timing and counters to the host."""
 _BINS = 20_001
 """Resolution of lateness in microseconds; more than 20 ms counts as 20 ms."""
 
 
 class Punctuality:
-    """Counts every tick of a run by its lateness in microseconds; a microsecond a tick, and no memory that grows."""
+    """A histogram of the ticks' lateness in microseconds, of constant size; takes about 1 us per tick."""
 
     def __init__(self) -> None:
         self._counts = np.zeros(_BINS, dtype=np.int64)
@@ -23,7 +23,7 @@ class Punctuality:
         self._last_ns = 0
 
     def tick(self, deadline_ns: int, late_ns: int, missed: int) -> None:
-        """Note a tick due at `deadline_ns` that began `late_ns` after it, and `missed` ticks skipped before it."""
+        """Count a tick due at `deadline_ns` that began `late_ns` later, and the `missed` ticks skipped before it."""
         if not self._ticks:
             self._first_ns = deadline_ns
         self._counts[min(max(late_ns // 1000, 0), _BINS - 1)] += 1

@@ -127,7 +127,7 @@ class TestEmergencyStop:
         rig.call("estop")
         rig.tick()
 
-        assert "still brakes" in rig.call("reset")["error"]
+        assert "still braking" in rig.call("reset")["error"]
         assert rig.tick().estop
 
     def test_a_reset_on_the_move_makes_no_step(self, make_rig):
