@@ -1,1 +1,1 @@
-"""Recording: where episodes are kept, and what is written beside their messages."""
+"""Recording: datasets, episodes, their metadata, and the worker that writes them."""

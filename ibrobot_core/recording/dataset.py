@@ -1,4 +1,4 @@
-"""A dataset's own file, `dataset.yaml` beside its episodes: which robot, which contract, the last prompt."""
+"""The file `dataset.yaml` of a dataset, with its robot, contract and last prompt."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from ibrobot_core.errors import RecorderError
 
 
 class EpisodeDataset:
-    """The dataset in a folder.
+    """A dataset of episodes in a folder.
 
     Args:
-        folder: `ROOT/DATASET`; need not exist.
+        folder: `ROOT/DATASET`; may be missing.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -25,10 +25,10 @@ class EpisodeDataset:
 
     @property
     def prompt(self) -> str:
-        """The last prompt; empty where there was none.
+        """The last prompt; empty if none was given.
 
         Raises:
-            RecorderError: when `dataset.yaml` cannot be read.
+            RecorderError: if `dataset.yaml` cannot be read.
         """
         return str(self._read().get("prompt", ""))
 
@@ -37,15 +37,15 @@ class EpisodeDataset:
         self._write({**self._read(), "prompt": prompt})
 
     def join(self, contract: Contract, robot: str, robot_type: str) -> None:
-        """Check that an episode of this contract may join the others, and make the dataset for the first.
+        """Check that the dataset has this contract, and create `dataset.yaml` for the first episode.
 
         Args:
-            contract: of the episode.
-            robot: the robot's name.
-            robot_type: as LeRobot names it.
+            contract: the contract of the new episode.
+            robot: the name of the robot.
+            robot_type: LeRobot's name for the type of robot.
 
         Raises:
-            RecorderError: when they have another contract, or the file cannot be written.
+            RecorderError: if the dataset has another contract, or the file cannot be written.
         """
         self.check(contract)
         known = self._read()
@@ -54,10 +54,10 @@ class EpisodeDataset:
             self._write({**facts, "fingerprint": contract.fingerprint(), "contract": contract.canonical(), **known})
 
     def check(self, contract: Contract) -> None:
-        """Check that an episode of this contract may join the others.
+        """Check that the dataset has this contract, or no episodes.
 
         Raises:
-            RecorderError: when they have another contract; shows both.
+            RecorderError: if it has another contract; shows the difference.
         """
         known = self._read()
         if known.get("fingerprint", contract.fingerprint()) != contract.fingerprint():
@@ -68,10 +68,10 @@ class EpisodeDataset:
             )
 
     def check_writable(self) -> None:
-        """Check that the dataset's folder is writable; leaves no files.
+        """Check that the dataset's folder is writable, without leaving files.
 
         Raises:
-            RecorderError: when they cannot.
+            RecorderError: if it is not.
         """
         folder = next(path for path in (self._folder, *self._folder.absolute().parents) if path.exists())
         try:

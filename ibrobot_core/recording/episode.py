@@ -1,4 +1,4 @@
-"""Where an episode is recorded and what is known of it: `ROOT/DATASET/episodes/episode_000001`."""
+"""Folder and metadata of an episode, `ROOT/DATASET/episodes/episode_000001`."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _PREFIX = "episode_"
 
 
 def episode_folder(dataset: Path, number: int) -> Path:
-    """Where episode `number`, from 1, of a dataset lies."""
+    """The folder of episode `number`, from 1, of a dataset."""
     return dataset / "episodes" / f"{_PREFIX}{number:06d}"
 
 
@@ -30,31 +30,31 @@ def episode_start(
     lockstep: bool, prompt: str = "", plugins: Mapping[str, str] | None = None,
     policy: Mapping[str, str] | None = None,
 ) -> EpisodeStart:  # fmt: skip
-    """The start of the next episode of the dataset.
+    """The start of the dataset's next episode.
 
     Args:
         config: the robot.
         recording: its `recording` section.
-        topics: every topic on the bus: topic -> message type; those that the section asks for are kept. Where it
-            asks for the contract's, they are all there from the start, also the ones that nobody published yet; where
-            it asks for all, or names some, others may come later (`any_topic`).
+        topics: topic -> message type for every topic on the bus. For `topics: contract` the episode has all topics of
+            the contract, including those not published yet; otherwise it has the requested ones of these topics, and
+            more may follow (`any_topic`).
         mode: the control mode.
-        seed: of the scene.
-        stamp_ns: when it begins [ns].
+        seed: the seed of the scene.
+        stamp_ns: start of the episode [ns].
         lockstep: whether equal runs must give equal bytes.
-        prompt: what the operator calls the task.
-        plugins: packages of the plugins, and their versions.
-        policy: which policy acts, and with which weights; None where none does.
+        prompt: the operator's description of the task.
+        plugins: package -> version of the plugins.
+        policy: the acting policy and its weights; None without a policy.
 
     Raises:
-        RecorderError: when the folder cannot be made, or the dataset has episodes of another contract.
+        RecorderError: if the folder cannot be created, or the dataset has another contract.
     """
     contract = Contract.from_config(config)
     root = recording.folder / "episodes"
     try:
         root.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise RecorderError(f"recording.root: {root} cannot be made: {error.strerror}") from None
+        raise RecorderError(f"recording.root: {root} cannot be created: {error.strerror}") from None
     EpisodeDataset(root.parent).join(contract, config.robot.name, config.robot.robot_type)
     metadata = {
         "robot": config.robot.name, "robot_type": config.robot.robot_type, "mode": mode, "prompt": prompt,
@@ -75,12 +75,12 @@ def episode_start(
 
 
 def robot_metadata(contract: Contract, document: Mapping[str, Any], calibrations: Mapping[str, Any]) -> dict[str, str]:
-    """Metadata of an episode, by the names that a recorder's metadata has.
+    """Metadata of an episode, with the keys used in recordings.
 
     Args:
-        contract: of the episode.
-        document: the robot YAML as plain values; empty where it is not known.
-        calibrations: hardware -> joint -> fields of `JointCalibration`; empty where they are not known.
+        contract: the contract of the episode.
+        document: the robot YAML as plain values; empty if unknown.
+        calibrations: hardware -> joint -> fields of `JointCalibration`; empty if unknown.
     """
     robot = document.get("robot") or {}
     found = {"contract": json.dumps(contract.canonical()), "fingerprint": contract.fingerprint()}
@@ -91,7 +91,7 @@ def robot_metadata(contract: Contract, document: Mapping[str, Any], calibrations
 
 
 def is_kept(topic: str, recording: RecordingConfig, contract: Contract) -> bool:
-    """Whether the `recording` section asks for `topic`."""
+    """Whether the `recording` section selects `topic`."""
     if recording.topics == "contract":
         return topic in contract.topics
     return recording.topics == "all" or topic in recording.topics

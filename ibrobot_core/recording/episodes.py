@@ -1,4 +1,4 @@
-"""The life of episodes: numbered, counted, and announced to plugins."""
+"""The life cycle of episodes: numbering, counting, and hooks for plugins."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ if TYPE_CHECKING:
 
 
 class Episodes:
-    """Begins and ends episodes. One thread at a time uses it."""
+    """Begins and ends episodes. Not thread-safe."""
 
     def __init__(self, session: Session) -> None:
         self._session = session
         self.number = 0
-        """Of the present episode, from 1; 0 before the first."""
+        """Number of the present episode, from 1; 0 before the first."""
         self.running = False
         self.prompt = session.request.prompt
-        """Of the next episode."""
+        """Prompt of the next episode."""
         self.begun_ns = 0
-        """When the present episode began [ns]."""
+        """Start of the present episode [ns]."""
 
     def begin(self) -> None:
-        """The next episode begins."""
+        """Begin the next episode."""
         session = self._session
         self.number += 1
         self.running = True
@@ -30,7 +30,7 @@ class Episodes:
         session.emit("ibrobot_episode_started", episode=self.number, mode=session.mode)
 
     def end(self, outcome: str) -> None:
-        """The present episode, if any, ends as `success`, `failure`, `discarded` or `unknown`."""
+        """End the present episode, if any, with outcome `success`, `failure`, `discarded` or `unknown`."""
         if not self.running:
             return
         session = self._session

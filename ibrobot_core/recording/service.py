@@ -19,31 +19,31 @@ if TYPE_CHECKING:
     from ibrobot_core.launch.session import Session
 
 START = "/record_episode/start"
-"""Request: a prompt, or None for the last. Begins an episode."""
+"""Begins an episode. Request: a prompt, or None for the last prompt."""
 STOP = "/record_episode/stop"
-"""Request: `success`, `failure` or `unknown`. Ends it."""
+"""Ends the episode. Request: `success`, `failure` or `unknown`."""
 DISCARD = "/record_episode/discard"
-"""Request: None. Ends it, and nothing is left of it."""
+"""Ends and deletes the episode. Request: None."""
 STATUS = "/record_episode/status"
-"""Request: None. Returns what `EpisodeService.status` says."""
+"""Returns `EpisodeService.status`. Request: None."""
 OUTCOMES = ("success", "failure", "unknown")
 _MIB = 1 << 20
 
 
 class EpisodeService(Episodes):
-    """Recorded episodes, which the mode or an operator begins and ends. The operator's part is safe in any thread.
+    """Recorded episodes, begun and ended by the mode or an operator. The operator's methods are thread-safe.
 
     Args:
         session: the run.
-        recording: what records them.
-        by_mode: whether the mode begins and ends them itself, so that here they can only be watched.
+        recording: the worker that records them.
+        by_mode: whether the mode begins and ends them, so that an operator can only watch.
 
     Attributes:
-        by_mode: whether the mode begins and ends episodes itself.
+        by_mode: whether the mode begins and ends episodes.
 
     Raises:
-        RecorderError: when the dataset has episodes of another contract or cannot be written, or an operator is to
-            record and `recording.topics` leaves out a topic of the contract.
+        RecorderError: if the dataset has another contract or cannot be written, or if `recording.topics` leaves out a
+            topic of the contract in a run where an operator records.
     """
 
     def __init__(self, session: Session, recording: RecordingWorker, *, by_mode: bool) -> None:
@@ -56,7 +56,7 @@ class EpisodeService(Episodes):
         self.folder = config.folder
         self._dataset = EpisodeDataset(self.folder)
         contract = Contract.from_config(session.config)
-        with wrong_input():  # `recording.root` or `recording.dataset` names what cannot be used
+        with wrong_input():  # the cause is `recording.root` or `recording.dataset`
             self._dataset.check_writable()
             self._dataset.check(contract)
         left_out = [topic for topic in contract.topics if not is_kept(topic, config, contract)]
@@ -79,20 +79,20 @@ class EpisodeService(Episodes):
 
     @property
     def saved(self) -> int:
-        """Episodes that were recorded whole and kept."""
+        """Number of complete episodes that were kept."""
         return self._recording.saved
 
     @property
     def failure(self) -> RecorderError | None:
-        """Why the recording of the present or last episode ended before it; None where it did not."""
+        """The error that cut short the recording of the present or last episode; None without an error."""
         return self._recording.failure
 
     @property
     def last_prompt(self) -> str:
-        """The prompt of the last episode, also of an earlier run.
+        """The prompt of the last episode, possibly of an earlier run.
 
         Raises:
-            RecorderError: when the dataset's file cannot be read.
+            RecorderError: if the dataset's file cannot be read.
         """
         return self.prompt or self._dataset.prompt
 
@@ -100,23 +100,23 @@ class EpisodeService(Episodes):
         """Begin an episode.
 
         Args:
-            prompt: what the task is called; the last one's when None.
+            prompt: description of the task; None repeats the last prompt.
 
         Raises:
-            RecorderError: when one is on, or a topic of the contract is silent; says which.
-            DiskFull: when the disk has no room for an episode of `contract.max_duration_s` at the rates of now.
-            NotSupported: where the mode begins episodes itself.
+            RecorderError: if an episode is being recorded, or topics of the contract are silent; names them.
+            DiskFull: if the disk has no room for an episode of `contract.max_duration_s` at present rates.
+            NotSupported: if the mode begins episodes itself.
         """
         with self._lock:
-            self._check_mine()
+            self._check_by_operator()
             if self.running:
                 raise RecorderError("an episode is being recorded; end it first")
             if silent := self._recording.silent():
-                told = ", ".join(
+                topics = ", ".join(
                     f"{topic} ({'nothing yet' if age is None else f'nothing for {age:.1f} s'})"
                     for topic, age in silent.items()
                 )
-                raise RecorderError(f"not recording: the contract's topics are silent: {told}")
+                raise RecorderError(f"not recording: the contract's topics are silent: {topics}")
             self._check_space()
             self.prompt = self.last_prompt if prompt is None else prompt
             self.begin()
@@ -124,40 +124,40 @@ class EpisodeService(Episodes):
                 self._dataset.prompt = self.prompt
 
     def stop(self, outcome: str = "unknown") -> None:
-        """End the episode.
+        """End the present episode.
 
         Raises:
-            RecorderError: when none is on, or for an unknown outcome.
-            NotSupported: where the mode ends episodes itself.
+            RecorderError: if no episode is being recorded, or for an unknown outcome.
+            NotSupported: if the mode ends episodes itself.
         """
         if outcome not in OUTCOMES:
             raise RecorderError(f"outcome must be one of {', '.join(OUTCOMES)}, not {outcome!r}")
         self._end(outcome)
 
     def discard(self) -> None:
-        """End the episode, and leave nothing of it.
+        """End the present episode and delete it.
 
         Raises:
-            RecorderError: when none is on.
-            NotSupported: where the mode ends episodes itself.
+            RecorderError: if no episode is being recorded.
+            NotSupported: if the mode ends episodes itself.
         """
         self._end("discarded")
 
     def elapsed_s(self) -> float:
-        """Since the episode began [s]; 0 where none is on."""
+        """Time since the episode began [s]; 0 without an episode."""
         if not self.running:
             return 0.0
         return seconds(self._session.clock.now_ns() - self.begun_ns)
 
     def free_bytes(self) -> int:
-        """Space left on the disk of the dataset."""
+        """Free space on the dataset's disk [bytes]."""
         folder = self.folder
         while not folder.exists():
             folder = folder.parent
         return shutil.disk_usage(folder).free
 
     def status(self) -> Mapping[str, Any]:
-        """What a front end shows."""
+        """The state of recording, for a user interface."""
         failure = self._recording.failure
         return {
             "recording": self.running, "episode": self.number, "saved": self.saved,
@@ -170,7 +170,7 @@ class EpisodeService(Episodes):
         }  # fmt: skip
 
     def serve(self) -> None:
-        """Offer the services."""
+        """Register the services on the bus."""
         bus = self._session.bus
         bus.serve(START, self.start)
         bus.serve(STOP, self.stop)
@@ -178,13 +178,13 @@ class EpisodeService(Episodes):
         bus.serve(STATUS, lambda _: self.status())
 
     def unserve(self) -> None:
-        """Offer them no more."""
+        """Remove the services from the bus."""
         for service in (START, STOP, DISCARD, STATUS):
             self._session.bus.unserve(service)
 
     def _end(self, outcome: str) -> None:
         with self._lock:
-            self._check_mine()
+            self._check_by_operator()
             if not self.running:
                 raise RecorderError("no episode is being recorded")
             self.end(outcome)
@@ -200,6 +200,6 @@ class EpisodeService(Episodes):
                 f"and {kept / _MIB:.0f} MiB stay free; make room, record elsewhere (recording.root), or shorten it"
             )
 
-    def _check_mine(self) -> None:
+    def _check_by_operator(self) -> None:
         if self.by_mode:
             raise NotSupported(f"mode {self._session.mode} begins and ends its episodes itself")

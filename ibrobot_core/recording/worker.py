@@ -1,4 +1,4 @@
-"""Recording: a queue from the bus to the recorder's own thread, which no publisher waits for."""
+"""The recording worker: a queue from the bus to the recorder's thread, which never blocks publishers."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ if TYPE_CHECKING:
     from ibrobot_core.launch.session import Session
 
 _DEPTH = 4096
-"""Messages that may wait for the recorder."""
+"""Length of the queue to the recorder, in messages."""
 _RATE_WINDOW = 31
-"""Messages that a measured rate looks back on."""
+"""Number of messages over which a rate is measured."""
 _SILENT_NS = NS_PER_S
-"""A topic without a message for so long is silent [ns]."""
+"""A topic without a message for this time is silent [ns]."""
 
 
 class RecordingWorker(Worker):
-    """Writes what is on the bus while an episode is on.
+    """Writes the bus's messages to a recorder during an episode.
 
-    A recorder that fails, e.g. on a full disk, ends its episode's recording with a fault; the robot goes on,
-    and the next episode is recorded again.
+    If the recorder fails, e.g. on a full disk, the recording of the episode ends with a fault. The robot continues, and
+    the next episode is recorded again.
     """
 
     def __init__(self, session: Session, config: RecordingConfig) -> None:
@@ -45,25 +45,26 @@ class RecordingWorker(Worker):
         self._session = session
         self._config = config
         self._contract = Contract.from_config(session.config)
-        self._orders: deque[tuple[int, Callable[[], None]]] = deque()
-        """Beginnings and ends of episodes that are still to be carried out: stamp [ns] and what to do."""
-        self._order = threading.Lock()
-        """Held while an order is stamped and queued, and while orders and messages are taken: neither overtakes."""
+        self._pending: deque[tuple[int, Callable[[], None]]] = deque()
+        """Pending begins and ends of episodes: stamp [ns] and action."""
+        self._pending_lock = threading.Lock()
+        """Held while an action is stamped and queued, and while actions and messages are taken, to keep their order."""
         self._open = False
         self._seen: dict[str, deque[int]] = {}
         """Topic -> times of the last messages [ns]."""
         self._newest: dict[str, Message] = {}
         """Topic -> its last message."""
         self._sizes: dict[str, int] = {}
-        """Topic -> size of a message of it [bytes], measured once an episode, since pictures may have to be encoded."""
+        """Topic -> size of a message [bytes], measured once per episode, since images may have to be encoded."""
         self._lost: Mapping[str, int] = {}
-        """Topic -> messages lost on the way here, before the present episode."""
+        """Topic -> messages lost in the queue before the present episode."""
         self._reported_absent = False
         self._whole = 0
+        """Complete episodes that were kept."""
         self._provisional = 0
-        """Episodes kept whole, and those that have ended and are not written to their ends yet."""
+        """Episodes that have ended but are not completely written yet."""
         self.failure: RecorderError | None = None
-        """Why the recording of the present or last episode ended before it; None where it did not."""
+        """The error that cut short the recording of the present or last episode; None without an error."""
 
     @override
     def setup(self) -> None:
@@ -76,17 +77,17 @@ class RecordingWorker(Worker):
         self.on_end.callback(self.work, 0.0)
 
     def begin(self, number: int, prompt: str) -> None:
-        """From here on messages belong to a new episode.
+        """Begin an episode; it gets all messages from now on.
 
         Raises:
-            RecorderError: when it cannot be recorded where it should.
+            RecorderError: if the episode cannot be recorded in its dataset.
         """
         session = self._session
         self.failure = None
         self._sizes = {}
         topics = {topic: type_ for topic, (type_, _) in session.bus.topics().items()}
         seed = session.request.seed + number - 1
-        with self._order:
+        with self._pending_lock:
             start = episode_start(
                 session.config, self._config, topics, mode=session.mode, seed=seed, stamp_ns=session.bus.snapshot_ns(),
                 lockstep=session.request.lockstep, prompt=prompt, plugins=session.registry.versions(),
@@ -94,38 +95,38 @@ class RecordingWorker(Worker):
             )  # fmt: skip
             latched = tuple(i for i in session.bus.latched().values() if i.received_ns <= start.stamp_ns)
             begin = partial(self._open_episode, start, latched, self._incoming.lost.copy())
-            self._orders.append((start.stamp_ns, begin))
+            self._pending.append((start.stamp_ns, begin))
 
     def end(self, outcome: str) -> None:
-        """Messages up to here belong to the episode."""
-        with self._order:
+        """End the episode; messages up to now belong to it."""
+        with self._pending_lock:
             provisional = outcome != "discarded" and self.failure is None
             self._provisional += provisional
             end = EpisodeEnd(self._session.bus.snapshot_ns(), outcome)
-            self._orders.append((end.stamp_ns, partial(self._end_episode, end, provisional)))
+            self._pending.append((end.stamp_ns, partial(self._end_episode, end, provisional)))
 
     @property
     def saved(self) -> int:
-        """Episodes that have ended and are kept; one that turns out not to be written to its end is taken back."""
-        with self._order:
+        """Number of episodes kept, including those still being written; incomplete ones are subtracted later."""
+        with self._pending_lock:
             return self._whole + self._provisional
 
     @override
     def work(self, timeout_s: float) -> None:
         first = self._incoming.get(timeout_s)
-        with self._order:
-            orders, self._orders = self._orders, deque()
+        with self._pending_lock:
+            pending, self._pending = self._pending, deque()
             items = [*([first] if first is not None else []), *self._incoming.drain()]
         for item in items:
             self._note(item)
-            while orders and orders[0][0] < item.received_ns:
-                orders.popleft()[1]()
+            while pending and pending[0][0] < item.received_ns:
+                pending.popleft()[1]()
             self._write(item, item.received_ns)
-        for _, carry_out in orders:
-            carry_out()
+        for _, action in pending:
+            action()
 
     def rates(self) -> dict[str, float]:
-        """Measured rate of each topic that is recorded [Hz]; 0 for one that came once."""
+        """Measured rate of each recorded topic [Hz]; 0 after a single message."""
         rates = {}
         for topic, stamps in self._seen.copy().items():
             span_ns = stamps[-1] - stamps[0]
@@ -133,7 +134,7 @@ class RecordingWorker(Worker):
         return rates
 
     def flow(self) -> float:
-        """What an episode takes on the disk, by the rates and the messages of now [bytes/s]."""
+        """Disk space that an episode takes per second, from present rates and message sizes [bytes/s]."""
         for topic, message in self._newest.copy().items():
             if topic not in self._sizes:
                 self._sizes[topic] = self._recorder.size_of(message)
@@ -142,15 +143,15 @@ class RecordingWorker(Worker):
 
     @property
     def min_free(self) -> int:
-        """Space on the disk that the recorder leaves free [bytes]."""
+        """Disk space that the recorder leaves free [bytes]."""
         return self._recorder.min_free
 
     def waiting(self) -> int:
-        """What the recorder has taken and not written yet [bytes]."""
+        """Data accepted by the recorder and not written yet [bytes]."""
         return self._recorder.waiting()
 
     def silent(self) -> dict[str, float | None]:
-        """The contract's topics without a message for a second: topic -> for how long [s], None: none ever came."""
+        """Silent topics of the contract: topic -> time since the last message [s], None if there was none."""
         now_ns = self._session.clock.now_ns()
         found: dict[str, float | None] = {}
         for topic in self._contract.topics:
@@ -162,7 +163,7 @@ class RecordingWorker(Worker):
         return found
 
     def lost(self) -> dict[str, int]:
-        """Messages that were lost on the way here during the present episode, per topic."""
+        """Topic -> messages lost in the queue during the present episode."""
         return {
             topic: n for topic, total in self._incoming.lost.copy().items() if (n := total - self._lost.get(topic, 0))
         }
@@ -173,7 +174,7 @@ class RecordingWorker(Worker):
             self._seen.setdefault(item.topic, deque(maxlen=_RATE_WINDOW)).append(item.received_ns)
 
     def _open_episode(self, start: EpisodeStart, latched: Iterable[Received], lost: Mapping[str, int]) -> None:
-        """Open an episode, with what was latched and what had been lost on the way here when it began."""
+        """Open an episode; `latched` and `lost` are the latched messages and the lost ones counted when it began."""
         self.failure = None
         self._lost = lost
         self._open = self._did(partial(self._recorder.begin, start))
@@ -181,19 +182,19 @@ class RecordingWorker(Worker):
             self._write(item, start.stamp_ns)
 
     def _end_episode(self, end: EpisodeEnd, provisional: bool) -> None:
-        """End the open episode; `provisional`: when the end was asked for it was whole, and it is to be kept."""
+        """End the open episode; `provisional` if it was complete at the request to end it, and is to be kept."""
         whole = self._finish(end)
-        with self._order:
+        with self._pending_lock:
             self._provisional -= provisional
             self._whole += provisional and whole
         self._report_absent()
 
     def _finish(self, end: EpisodeEnd) -> bool:
-        """End the open episode, if any; whether it is whole."""
+        """End the open episode, if any; return whether it is complete."""
         if not self._open:
             return False
         self._open = False
-        # Counted now: what waited when the episode ended may have been lost since.
+        # Counted now, since messages that were queued when the episode ended may have been lost later.
         dropped = {topic: n for topic, n in self.lost().items() if self._keeps(topic)}
         return self._did(partial(self._recorder.end, attrs.evolve(end, dropped=dropped)))
 
@@ -204,7 +205,7 @@ class RecordingWorker(Worker):
             self._finish(EpisodeEnd(received_ns, "unknown"))
 
     def _did(self, act: Callable[[], object]) -> bool:
-        """Let the recorder do something; a failure of any kind is a fault of the episode, and no other's."""
+        """Call the recorder; return False after a failure of any kind, which ends the recording of the episode."""
         try:
             act()
         except RecorderError as error:
@@ -219,7 +220,7 @@ class RecordingWorker(Worker):
     def _fail(self, error: RecorderError) -> None:
         session = self._session
         if self.failure is not None:
-            return  # what follows from the first is no news
+            return  # report the first failure, not its consequences
         self.failure = error
         fault = f"recording ended: {error_line(error)}"
         session.add_fault(fault)
@@ -227,16 +228,16 @@ class RecordingWorker(Worker):
         session.emit("ibrobot_fault_raised", fault=fault)
 
     def _report_absent(self) -> None:
-        """Say once, after the first episode, which listed topics never came: a misspelt one never will."""
+        """Report once, after the first episode, the listed topics without messages: they may be misspelt."""
         listed = self._config.topics if isinstance(self._config.topics, tuple) else ()
         absent = [topic for topic in listed if topic not in self._seen]
         if absent and not self._reported_absent:
             self._reported_absent = True
-            there = ", ".join(self._session.bus.topics())
+            available = ", ".join(self._session.bus.topics())
             self._session.log.warning(
-                "recording.topics: nothing of %s has come so far, nor was recorded; available: %s",
+                "recording.topics: no message on %s so far, so none was recorded; available: %s",
                 ", ".join(absent),
-                there,
+                available,
             )
 
     def _keeps(self, topic: str) -> bool:

@@ -219,9 +219,9 @@ def test_a_listed_topic_that_nobody_publishes_is_reported_once(
         ticks(runtime, 3)
         runtime.plan.episodes.end("success")
         ticks(runtime, 1)
-    told = "recording.topics: nothing of /joint_stats has come so far, nor was recorded; available: "
-    assert caplog.text.count(told) == 1
-    assert "/joint_states" in caplog.text.partition(told)[2]
+    warning = "recording.topics: no message on /joint_stats so far, so none was recorded; available: "
+    assert caplog.text.count(warning) == 1
+    assert "/joint_states" in caplog.text.partition(warning)[2]
 
 
 def test_recording_says_which_policy_acts_with_which_weights(runs: Runs, monkeypatch: pytest.MonkeyPatch):
