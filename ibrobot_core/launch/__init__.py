@@ -1,1 +1,1 @@
-"""Launch: a plan of components from a robot YAML, and the runtime that starts, watches and stops them."""
+"""Launch: the plan of a run's components, and the runtime that starts, monitors and stops them."""

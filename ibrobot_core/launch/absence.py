@@ -1,4 +1,4 @@
-"""Sensors that this machine cannot run: a run goes on without them, but refuses what needs their messages."""
+"""Sensors that this machine cannot run. A run continues without them, but refuses parts that need their messages."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from ibrobot_core.plugins import Registry
 
 @attrs.frozen
 class AbsentSensor:
-    """A peripheral that cannot run here."""
+    """A peripheral that cannot run on this machine."""
 
     name: str
     label: str
     """Kind and name, e.g. `camera top`."""
     topic: str
-    """Where its messages would go."""
+    """The topic of its messages."""
     missing: MissingDependency
 
 
 def absent_sensors(config: RobotConfig, registry: Registry) -> tuple[AbsentSensor, ...]:
-    """The peripherals whose types lack something on this machine.
+    """The peripherals whose plugins lack a dependency on this machine.
 
     Raises:
-        MissingDependency: for one whose topic is not known before it runs, so that nobody can say what needs it.
+        MissingDependency: for a peripheral whose topic is unknown before it runs, so that its users are unknown too.
     """
     absent = []
     for name, peripheral in config.peripherals.items():
@@ -50,8 +50,8 @@ def refuse(absent: Iterable[AbsentSensor], user: str, needs: Callable[[str], boo
 
     Args:
         absent: the absent sensors.
-        user: what it is, for the error.
-        needs: whether it needs the messages on a topic.
+        user: name of the part, for the error.
+        needs: returns whether the part needs the messages on a topic.
 
     Raises:
         MissingDependency: with the remedy.
@@ -61,12 +61,12 @@ def refuse(absent: Iterable[AbsentSensor], user: str, needs: Callable[[str], boo
 
 
 def describe(absent: Iterable[AbsentSensor]) -> str:
-    """The absent sensors with what is missing and the remedy, on one line; empty where there are none."""
+    """The absent sensors, their missing dependencies and the remedies, on one line; empty if none are absent."""
     return "; and ".join(f"{labels}: {missing}" for missing, labels in _by_cause(absent))
 
 
 def _by_cause(absent: Iterable[AbsentSensor]) -> list[tuple[MissingDependency, str]]:
-    """What is missing, each once, and the sensors that lack it."""
+    """Each missing dependency with the sensors that lack it."""
     causes: dict[str, list[AbsentSensor]] = {}
     for sensor in absent:
         causes.setdefault(str(sensor.missing), []).append(sensor)

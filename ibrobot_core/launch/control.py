@@ -1,4 +1,4 @@
-"""Control: the process (or, in lockstep, the loop here) that owns the hardware; its states become messages."""
+"""The control component: starts the process (or, in lockstep, the loop) that owns the hardware."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ class ControlComponent(Component):
 
 
 def _aftermath(session: Session) -> str:
-    """What is to do about hardware that no process commands any more."""
+    """The advice for hardware that no process commands now."""
     commands: dict[str, None] = {}
     for part in () if session.config.simulated else session.config.hardware.values():
         descriptor = session.registry.find("hardware", part.type)

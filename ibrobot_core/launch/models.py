@@ -1,4 +1,4 @@
-"""A model against the robot: what can be compared before its weights are loaded, and before anything is powered."""
+"""Checks of models against the robot, before weights are loaded and torque is switched on."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ def check_model(config: RobotConfig, model: ModelConfig, spec: PolicySpec, log: 
 
     Args:
         config: the robot.
-        model: its entry under `models`.
-        spec: of its policy.
-        log: for what is odd, and no error.
+        model: the policy's entry under `models`.
+        spec: the policy's spec.
+        log: receives warnings.
 
     Returns:
-        The conversion to the policy's unit of joint positions; None where that is radians.
+        The conversion to the policy's unit of joint positions; None for radians.
 
     Raises:
-        ContractError: where they differ, with both sides.
-        CalibrationError: when the unit needs a calibration that is not there.
+        ContractError: for a difference; shows both sides.
+        CalibrationError: if the unit needs a calibration that is missing.
     """
     contract = Contract.from_config(config, model.extra_observations)
     try:
@@ -64,7 +64,7 @@ def check_models(config: RobotConfig, registry: Registry, modes: Iterable[str]) 
         A line for each model.
 
     Raises:
-        ConfigError: with a problem for each model that does not fit, or cannot be read.
+        ConfigError: with a problem for each model that does not fit or cannot be read.
     """
     used = [mode.inference for name in modes if (mode := config.control_modes[name]).inference is not None]
     loaded_here = {inference.model for inference in used if inference.weights_here}

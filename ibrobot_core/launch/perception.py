@@ -1,4 +1,4 @@
-"""Perception: a worker for each peripheral, which publishes what its sensor gives."""
+"""Perception: one worker per peripheral publishes the messages of its sensor."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from ibrobot_core.units import seconds
 
 _READY_TIMEOUT_S = 30.0
 _RATE_WINDOW = 31
-"""Messages that the measured rate looks back on."""
+"""Number of messages over which the rate is measured."""
 
 
 class SensorWorker(SessionWorker):
-    """Opens a sensor and publishes its messages; ready when the first has come."""
+    """Opens a sensor and publishes its messages; ready after the first message."""
 
     def __init__(self, session: Session, peripheral: PeripheralConfig, needs: tuple[str, ...]) -> None:
         super().__init__(

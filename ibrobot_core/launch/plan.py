@@ -1,4 +1,4 @@
-"""The plan of a run: its components, what each needs, and the order in which they start; stopping reverses it."""
+"""The plan of a run: its components, their dependencies and starting order; they stop in reverse order."""
 
 from __future__ import annotations
 
@@ -34,31 +34,31 @@ from ibrobot_core.recording.worker import RecordingWorker
 
 @attrs.frozen
 class ModeComponents:
-    """What a mode adds to a run."""
+    """The components that a mode adds to a run."""
 
     models: tuple[LoadedModel, ...]
     source: CommandSource
 
     def components(self) -> list[Component]:
-        """In starting order."""
+        """The components in starting order."""
         return [*self.models, *([self.source] if isinstance(self.source, SourceWorker) else [])]
 
 
 @attrs.frozen
 class LaunchPlan:
-    """Components in starting order."""
+    """The components of a run in starting order."""
 
     components: tuple[Component, ...]
     link: TransportLink | None
-    """To other machines; None where nothing in the run needs one."""
+    """The transport to other machines; None if nothing in the run needs one."""
     mode: ModeComponents
-    """What the first mode brings; among `components` too."""
+    """The components of the first mode, which `components` contains too."""
     episodes: Episodes
     episodes_worker: SimulatedEpisodes | None
     without: str
-    """The sensors that this machine cannot run, and why; empty where there are none."""
+    """The sensors that this machine cannot run, and why; empty if it can run all."""
     unavailable: Mapping[str, str]
-    """Mode -> why it cannot be entered."""
+    """Mode -> why it is unavailable."""
 
     def facts(self) -> dict[str, Any]:
         """The plan as `--dry-run --json` prints it."""
@@ -77,7 +77,7 @@ class LaunchPlan:
 
 
 def mode_components(session: Session, name: str, link: TransportLink | None) -> ModeComponents:
-    """The components of a mode; nothing is loaded yet."""
+    """The components of a mode, without loading anything."""
     mode = session.config.control_modes[name]
     if session.request.source is not None and name == session.config.default_control_mode:
         return ModeComponents((), session.request.source(session, mode))
@@ -95,17 +95,17 @@ def mode_components(session: Session, name: str, link: TransportLink | None) -> 
 
 
 def _sensors(session: Session) -> list[PeripheralConfig]:
-    """The peripherals that can run here."""
+    """The peripherals that can run on this machine."""
     absent = {sensor.name for sensor in session.absent}
     return [peripheral for name, peripheral in session.config.peripherals.items() if name not in absent]
 
 
 def build_plan(session: Session) -> LaunchPlan:
-    """All components of a run, in the order in which they can start.
+    """Build the plan of a run.
 
     Raises:
-        MissingDependency: when something needs a sensor that cannot run on this machine.
-        NotSupported: for a contract with topics that only foreign bags have.
+        MissingDependency: if a component needs a sensor that cannot run on this machine.
+        NotSupported: for a contract with topics that exist only in foreign bags.
     """
     config = session.config
     modes = config.control_modes.values()
@@ -114,14 +114,14 @@ def build_plan(session: Session) -> LaunchPlan:
     foreign = next((spec for spec in specs if spec.foreign), None)
     if foreign is not None and (config.recording is not None or any(mode.inference for mode in modes)):
         raise NotSupported(
-            f"contract: {foreign.key}: {foreign.topic} is foreign, and comes from bags alone: this contract is for "
-            "a conversion; a robot's own has nothing of the kind"
+            f"contract: {foreign.key}: {foreign.topic} is foreign, and exists only in bags: use this contract to "
+            "convert bags, and one without foreign topics to run a robot"
         )
     unknown = next((spec for spec in config.contract.signals if spec.type not in MESSAGE_TYPES), None)
     if unknown is not None and config.recording is not None:
         raise NotSupported(
-            f"contract.signals: {unknown.key}: {unknown.type} cannot be recorded here, but only be read from bags; "
-            f"known are: {', '.join(MESSAGE_TYPES)}"
+            f"contract.signals: {unknown.key}: {unknown.type} cannot be recorded, only read from bags; "
+            f"known types: {', '.join(MESSAGE_TYPES)}"
         )
     if config.recording is not None:
         kept = partial(is_kept, recording=config.recording, contract=Contract.from_config(config))
@@ -161,7 +161,7 @@ def build_plan(session: Session) -> LaunchPlan:
 
 
 def _ordered(components: list[Component]) -> list[Component]:
-    """In the order given, but nothing before what it needs."""
+    """The components in the given order, but each after the ones it needs."""
     remaining, ordered, started = list(components), [], set[str]()
     while remaining:
         ready = next((c for c in remaining if set(c.needs) <= started), None)

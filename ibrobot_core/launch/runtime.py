@@ -19,11 +19,11 @@ SET_MODE = "/set_mode"
 RESET = "/reset"
 ESTOP = "/estop"
 _GLANCE_S, _GLANCES = 0.1, 100
-"""How long the first joint state is waited for at a time [s], and how often: time passes for a stopped process too."""
+"""Timeout [s] and number of waits for the first joint state; several, since time passes for a stopped process too."""
 
 
 class Runtime:
-    """One run. `start`, then `step` (lockstep) or `wait` until it has ended, then `stop`; `summary` at any time.
+    """One run. Call `start`, then `step` (lockstep) or `wait` until the run has ended, then `stop`.
 
     Services on the bus: `/set_mode` (a mode's name), `/reset`, `/estop`.
     """
@@ -43,16 +43,17 @@ class Runtime:
             )
         episodes = self.plan.episodes
         self.episode_service = episodes if isinstance(episodes, EpisodeService) else None
-        """Where an operator begins and ends episodes; None in a run that records nothing."""
+        """The service by which an operator begins and ends episodes; None in a run without recording."""
         self._mode_components = self.plan.mode
         session.command_source = self.plan.mode.source
         self._started: list[Component] = []
         self._begun_ns = session.clock.now_ns()
 
     def start(self, on_start: Callable[[str], None] = lambda name: None) -> None:
-        """Start every component, each when all it needs is ready. Where one fails, those before it are stopped.
+        """Start every component once the components it needs are ready.
 
-        When the run is ended meanwhile, by Ctrl-C, what was started is stopped again and nothing is raised.
+        If a component fails, those started before it are stopped. If Ctrl-C ends the run during the start, the started
+        components are stopped and nothing is raised.
 
         Args:
             on_start: called with the name of each component before it starts.
@@ -88,14 +89,14 @@ class Runtime:
             self.episode_service.serve()
 
     def wait(self, timeout_s: float) -> bool:
-        """Wait up to `timeout_s` [s] for the end of the run; True when it has come."""
+        """Wait up to `timeout_s` [s] for the end of the run; return whether it has ended."""
         duration = self.session.request.duration_s
         if duration is not None and self.session.clock.now_ns() - self._begun_ns >= ns(duration):
             self.session.finish()
         return self.session.finished.wait(timeout_s)
 
     def step(self) -> bool:
-        """Lockstep: advance by one control period, with all of the tick's work; True when the run has ended."""
+        """Lockstep: run one control period with all work due in it; return whether the run has ended."""
         session = self.session
         clock = session.clock
         assert isinstance(clock, SteppedClock)
@@ -108,12 +109,12 @@ class Runtime:
         return self.wait(0.0)
 
     def switch_mode(self, name: str) -> None:
-        """Enter another mode: its components become ready first, then ownership of the joints changes within one tick.
+        """Enter another mode: start its components, then change the owner of the joints within one tick.
 
-        The present mode goes on where a reset made the robot hold, and is left alone otherwise.
+        For the present mode, continue it if a reset made the robot hold; otherwise do nothing.
 
         Raises:
-            IbrobotError: when there is no such mode or its components do not start; the present mode goes on.
+            IbrobotError: if there is no such mode or its components do not start; the present mode continues.
         """
         session = self.session
         if name not in session.config.control_modes:
@@ -145,15 +146,15 @@ class Runtime:
             self.plan.episodes.begin()
 
     def reset(self) -> str:
-        """Clear faults and the emergency stop; the mode begins again from where the joints are.
+        """Clear faults and the emergency stop, and restart the mode at the measured positions.
 
-        A mode that moves the robot by itself does not: after a fault the robot holds until the mode is entered again.
+        An autonomous mode does not restart: after a fault the robot holds until the operator enters the mode again.
 
         Returns:
-            What the robot does now, and how to go on.
+            What the robot does now, and how to continue.
 
         Raises:
-            IbrobotError: when the hardware, or what the mode needs, does not answer yet.
+            IbrobotError: if the hardware, or a device that the mode needs, does not answer yet.
         """
         session = self.session
         session.command_source.recover()
@@ -166,7 +167,7 @@ class Runtime:
         return f"reset; {then}"
 
     def _go_on(self) -> None:
-        """Enter the mode again in which a reset made the robot hold."""
+        """Enter the present mode again after a reset made the robot hold."""
         session = self.session
         session.command("switch_mode", mode=session.mode)
         session.held = False
@@ -176,7 +177,7 @@ class Runtime:
         session.log.info("mode %s goes on", session.mode)
 
     def stop(self) -> None:
-        """Stop every component, the last started first. Errors are logged, so that all are stopped."""
+        """Stop every component in reverse starting order. Errors are logged, so that all are stopped."""
         session = self.session
         session.finish()
         session.bus.unserve(SET_MODE)
@@ -192,10 +193,10 @@ class Runtime:
         self._stop_all(started)
 
     def raise_failure(self) -> None:
-        """Raise what ended the run, if something failed.
+        """Raise the failure that ended the run, if any.
 
         Raises:
-            ComponentFailed: component and cause on one line.
+            ComponentFailed: with component and cause on one line.
         """
         if self.session.failure is not None:
             failure = ComponentFailed(self.session.failure_text)
@@ -203,7 +204,7 @@ class Runtime:
             raise failure
 
     def summary(self) -> dict[str, Any]:
-        """What `--json` prints, with what the source of the first mode reports."""
+        """The summary as `--json` prints it, including facts from the first mode's command source."""
         session = self.session
         outcome = session.outcome
         report = session.control.report if session.has_control else {"loop": {}, "counters": {}}
@@ -240,19 +241,19 @@ class Runtime:
             raise failure from error
 
     def _stop_all(self, components: list[Component]) -> None:
-        """Stop `components`, the last first; what one raises is logged, so that all are stopped."""
+        """Stop `components` in reverse order. Errors are logged, so that all are stopped."""
         for component in reversed(components):
             try:
                 component.stop()
             except Exception as error:  # noqa: BLE001 - contained: the others must be stopped all the same
-                self.session.log.error("%s did not stop well: %s", component.name, error_line(error))
+                self.session.log.error("%s did not stop cleanly: %s", component.name, error_line(error))
                 if isinstance(component, ControlComponent) and self.session.failure is None:
                     self.session.failure = component.name, error
 
     def _change_owner(self, mode: str) -> None:
-        """Have control switch; where it refuses, the present mode goes on.
+        """Switch the mode of control; if control refuses, the present mode continues.
 
-        Simulated episodes belong to the mode in which the run began: they end with it.
+        Simulated episodes belong to the first mode and end with it.
         """
         session = self.session
         worker = self.plan.episodes_worker if self.plan.episodes_worker in self._started else None
@@ -278,12 +279,12 @@ class Runtime:
                     return
                 self.raise_failure()
                 states.get(_GLANCE_S)
-            raise HardwareError("control is ready but gives no joint states")
+            raise HardwareError("control is ready but sends no joint states")
         finally:
             states.close()
 
     def _begin_mode(self) -> None:
-        """A mode without simulated episodes: it begins where the robot is, as one open-ended episode."""
+        """Begin a mode without simulated episodes: one open-ended episode from the robot's present state."""
         session = self.session
         self._await_state()
         assert session.state is not None

@@ -1,4 +1,4 @@
-"""A run's shared state: config, clock, bus, control, faults, and the mode that is active."""
+"""The shared state of a run: config, clock, bus, control, faults, and the active mode."""
 
 from __future__ import annotations
 
@@ -32,38 +32,38 @@ if TYPE_CHECKING:
 
 @attrs.frozen
 class LaunchRequest:
-    """What a user asks of a run; the options of `ibrobot launch`."""
+    """The user's request for a run: the options of `ibrobot launch`."""
 
     lockstep: bool = False
-    """Whether time is simulated, and advances when all work of a tick is done."""
+    """Whether time is simulated, and advances once all work of a tick is done."""
     seed: int = 0
-    """Of the first episode; later ones count up."""
+    """Seed of the first episode; each later episode adds 1."""
     duration_s: float | None = None
-    """When the run ends [s]; None: it ends by itself, or when the user ends it."""
+    """Duration of the run [s]; None for a run without a time limit."""
     episodes: int | None = None
-    """After how many episodes the run ends."""
+    """Number of episodes after which the run ends."""
     goals: tuple[str, ...] = ()
-    """For a mode with a planner, as `--goal` takes them."""
+    """Goals for a mode with a planner, in the syntax of `--goal`."""
     keys: Callable[[], Any] | None = None
     """Subscribes to the keys of the terminal, e.g. `KeyReader.subscribe`."""
     prompt: str = ""
-    """What episodes are recorded under."""
+    """Prompt of recorded episodes."""
     by_operator: bool = False
-    """Whether an operator begins and ends episodes, rather than the mode."""
+    """Whether an operator begins and ends episodes, instead of the mode."""
     source: Callable[[Session, ControlMode], SourceWorker] | None = None
-    """Makes the command source of the mode in which the run begins, in place of the one that the YAML says."""
+    """Makes the command source of the first mode, in place of the one in the YAML."""
 
 
 @attrs.define
 class Outcome:
-    """What came of a run."""
+    """The outcome of a run."""
 
     episodes: int = 0
     successes: int = 0
     faults: list[str] = attrs.field(factory=list)
     goals_failed: int = 0
     holding: list[str] = attrs.field(factory=list)
-    """What holds torque after the run, and how to take it off, a line each."""
+    """One line for each part that holds torque after the run, with the command that switches it off."""
 
 
 @attrs.frozen
@@ -73,22 +73,22 @@ class ActingPolicy:
     dispatch: DispatchStats
     engine: EngineStats
     described: Callable[[], Mapping[str, str]]
-    """Which policy it is, and with which weights."""
+    """Name and weights of the policy."""
 
 
 @attrs.define
 class SensorFigures:
-    """What is measured of a sensor."""
+    """Measurements of a sensor's messages."""
 
     received: int
-    """Messages so far."""
+    """Number of messages so far."""
     rate_hz: float
     age_s: float | None
-    """Age of the newest message when it was published, by its stamp; None for messages without one."""
+    """Age of the newest message at publication, by its stamp [s]; None for messages without a stamp."""
 
 
 class CommandSource:
-    """What gives the active executors something to do in a mode, from `begin` to `end`. This one gives nothing.
+    """Commands the active executors of a mode, from `begin` to `end`. The base class sends nothing.
 
     Attributes:
         autonomous: whether it moves the robot without an operator. Such a source does not start again after a reset
@@ -107,7 +107,7 @@ class CommandSource:
         """Recover from a failure; called before a reset.
 
         Raises:
-            IbrobotError: when it cannot; the fault stays.
+            IbrobotError: if it cannot recover; the fault stays.
         """
 
     def take_goal(self, event: Mapping[str, Any]) -> None:
@@ -118,43 +118,43 @@ class CommandSource:
         return ""
 
     def summary_rows(self) -> list[tuple[str, str]]:
-        """What it reports in the summary of the run: heading and text of each row."""
+        """Rows for the summary of the run: heading and text."""
         return []
 
     def facts(self) -> dict[str, Any]:
-        """What it adds to the summary as JSON."""
+        """Facts for the summary as JSON."""
         return {}
 
 
 class Session:
-    """What the components of a run share. Everything here is safe to read from any thread.
+    """The state shared by the components of a run. All attributes may be read from any thread.
 
     Attributes:
         config: the robot YAML.
         registry: the plugins.
-        request: what the user asks of the run.
-        clock: the run's time: real, or stepped in lockstep.
+        request: the user's request.
+        clock: the clock of the run; real, or stepped in lockstep.
         bus: topics and services within the host process.
         state: the newest state of the joints and of control; None before the first.
-        mode: name of the control mode that is active.
-        generation: counts mode switches and resets; a plan of an earlier generation moves nothing.
-        acting: the policy that acts; None in a mode without one.
-        sensors: sensor -> what is measured of it, of those that have given messages.
-        outcome: what came of the run so far.
-        failure: the component that died and why; None while all is well.
+        mode: name of the active control mode.
+        generation: counts mode switches and resets; plans of an earlier generation are ignored.
+        acting: the policy that moves the robot; None in a mode without inference.
+        sensors: sensor -> its measurements, for sensors that have published messages.
+        outcome: the outcome of the run so far.
+        failure: the component that died and why; None without a failure.
         finished: set when the run should stop.
-        operator_events: what the operator asked for by buttons of a teleoperation device, for what records episodes.
-        log: where the run writes its log.
-        command_source: what gives the active executors something to do.
+        operator_events: the operator's button presses on a teleoperation device, e.g. to begin and end episodes.
+        log: the log of the run.
+        command_source: the source that commands the active executors.
         held: whether the robot holds after the reset of a fault, until the operator enters the mode again.
-        start_failed: whether the run ended before all of it had started: nothing has moved the robot.
+        start_failed: whether the run ended before all components had started, so that nothing has moved the robot.
     """
 
     def __init__(self, config: RobotConfig, registry: Registry, request: LaunchRequest) -> None:
         self.config = config
         self.registry = registry
         self.request = request
-        # Lockstep begins at a fixed time, so that equal seeds give equal stamps.
+        # Lockstep starts at a fixed time, so that equal seeds give equal stamps.
         self.clock: Clock = SteppedClock(0) if request.lockstep else RealClock()
         self.bus = Bus(self.clock)
         self.outcome = Outcome()
@@ -176,7 +176,7 @@ class Session:
 
     @cached_property
     def absent(self) -> tuple[AbsentSensor, ...]:
-        """The sensors that this machine cannot run, looked for once.
+        """The sensors that this machine cannot run; determined once.
 
         Raises:
             MissingDependency: as `absent_sensors`.
@@ -187,8 +187,8 @@ class Session:
         """Refuse a part of the run that needs the messages of a sensor that cannot run here.
 
         Args:
-            user: what it is, for the error.
-            needs: whether it needs the messages on a topic.
+            user: name of the part, for the error.
+            needs: returns whether the part needs the messages on a topic.
 
         Raises:
             MissingDependency: with the remedy.
@@ -200,10 +200,10 @@ class Session:
         """The host's side of control.
 
         Raises:
-            ComponentFailed: before it was made.
+            ComponentFailed: before control was created.
         """
         if self._control is None:
-            raise ComponentFailed("control is not there yet")
+            raise ComponentFailed("control has not started yet")
         return self._control
 
     @control.setter
@@ -212,31 +212,31 @@ class Session:
 
     @property
     def has_control(self) -> bool:
-        """Whether control was made."""
+        """Whether control was created."""
         return self._control is not None
 
     def context(self, name: str, **more: Any) -> Context:
-        """The context for a plugin's `make` in the host; `more` are further fields of it."""
+        """The context for a plugin's `make` in the host, with the further fields `more`."""
         request = self.request
         return self.config.context(name, self.clock, request.seed, bus=self.bus, keys=request.keys, **more)
 
     def make(self, kind: str, component: ComponentConfig, name: str, **more: Any) -> Any:
-        """What the plugin of a component of the YAML makes; `name` and `more` are those of its context."""
+        """Make a component of the YAML by its plugin; `name` and `more` go into the context."""
         return self.registry.find(kind, component.type).make(component.options, self.context(name, **more))
 
     def measured(self) -> JointReading:
-        """The newest state.
+        """The newest joint state.
 
         Raises:
-            ComponentFailed: before the first.
+            ComponentFailed: before the first state.
         """
         state = self.state
         if state is None:
-            raise ComponentFailed("no joint state has come yet")
+            raise ComponentFailed("no joint state has been received yet")
         return JointReading(state.stamp_ns, state.position, state.velocity, state.effort, state.stale)
 
     def send_plan(self, start_ns: int, step_ns: int, joints: tuple[str, ...], positions: Vector) -> None:
-        """Give control a plan: positions [rad], shape (N, len(joints)), the first at `start_ns` [ns]."""
+        """Send control a plan: positions [rad], shape (N, len(joints)), the first at `start_ns` [ns]."""
         robot = self.config.robot
         columns = robot.indices(joints)
         mask = np.zeros(len(robot.joints), dtype=bool)
@@ -246,8 +246,8 @@ class Session:
         self.control.write_plan(PlanRecord(self.generation, start_ns, step_ns, mask, full))
 
     def command(self, do: str, **arguments: Any) -> Mapping[str, Any]:
-        """Have control carry out a command that begins a new generation: a mode switch, a reset. Returns its answer."""
-        with self._commanding:  # the generation of the last command must be the one that stays
+        """Execute a command that begins a new generation, e.g. a mode switch, and return control's answer."""
+        with self._commanding:  # keep the generation of the last command
             answer = self.control.call(do, **arguments)
             self.generation = int(answer["generation"])
             return answer
@@ -263,31 +263,31 @@ class Session:
 
     @property
     def mode_keys(self) -> dict[str, str]:
-        """Key -> the mode that it enters: `F1` to `F9`, in the order of the file."""
+        """Key -> the mode it enters: `F1` to `F9`, in file order."""
         return {f"F{i}": name for i, name in enumerate(tuple(self.config.control_modes)[:9], 1)}
 
     def to_go_on(self) -> str:
-        """What the operator does to enter the present mode again."""
+        """Instruction for entering the present mode again."""
         keys = [key for key, mode in self.mode_keys.items() if mode == self.mode]
         return f"{f'press {keys[0]}' if keys else 'call /set_mode'} to go on with {self.mode}"
 
     def add_fault(self, fault: str, generation: int | None = None) -> None:
-        """Note a fault that was raised in `generation`, the present one when None."""
+        """Add a fault raised in `generation`; None stands for the present one."""
         self.outcome.faults.append(fault)
         self._faults.append((self.generation if generation is None else generation, fault))
 
     @property
     def failure_text(self) -> str:
-        """The component that died and why, on one line; empty while all is well."""
+        """The component that died and why, on one line; empty without a failure."""
         return f"{self.failure[0]}: {error_line(self.failure[1])}" if self.failure is not None else ""
 
     @property
     def faults(self) -> tuple[str, ...]:
-        """Faults that no reset has cleared yet; `outcome.faults` has all of the run."""
+        """Faults not cleared by a reset yet; `outcome.faults` has all faults of the run."""
         return tuple(fault for generation, fault in self._faults if generation >= self.generation)
 
     def counts(self) -> dict[str, Mapping[str, Any]]:
-        """All that is counted and measured in a run, in groups such as `loop` and `executor NAME`."""
+        """All counters and measurements of the run, in groups such as `loop` and `executor NAME`."""
         report = self.control.report
         counters: Mapping[str, Any] = report["counters"]
         groups = {"loop": {**report["loop"], **counters.get("loop", {})}, "safety": counters.get("safety", {})}
@@ -304,11 +304,11 @@ class Session:
         return groups
 
     def emit(self, event: str, **facts: Any) -> None:
-        """Tell plugins of an event: this robot, at this time where `facts` has no other `stamp_ns`."""
+        """Call the plugins' hooks for an event, with the robot's name and, unless given, the present `stamp_ns`."""
         self.registry.emit(event, **{"robot": self.config.robot.name, "stamp_ns": self.clock.now_ns(), **facts})
 
     def finish(self) -> None:
-        """End the run in good order."""
+        """End the run in an orderly way."""
         self.finished.set()
 
     def fail(self, component: str, error: Exception) -> None:
@@ -319,10 +319,10 @@ class Session:
 
 
 class SessionWorker(Worker):
-    """A worker of a run, whose failure ends it.
+    """A worker of a run; its failure ends the run.
 
     Args:
-        session: the run; an attribute, too.
+        session: the run; also an attribute.
         name: unique within the run.
         summary: one line for `--dry-run`.
         needs: names of the components that must be ready before this one starts, e.g. `CONTROL`.

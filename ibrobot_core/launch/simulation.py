@@ -1,4 +1,4 @@
-"""Simulation: sets episodes up, one after the other, and judges them by the scene's own predicate."""
+"""Simulation: sets up episodes one after another, and evaluates them by the scene's success predicate."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ibrobot_core.units import NS_PER_S, ns
 
 
 class SimulatedEpisodes(SessionWorker):
-    """Episodes of a policy in a simulated scene; seeds count up from the run's."""
+    """Episodes of a policy in a simulated scene; seeds count up from the seed of the run."""
 
     def __init__(self, session: Session, episodes: Episodes, needs: tuple[str, ...]) -> None:
         wanted = session.request.episodes
@@ -32,7 +32,7 @@ class SimulatedEpisodes(SessionWorker):
     def _judge(self, session: Session) -> None:
         state = session.state
         if self._begun_ns is None:
-            # Setting up the scene again would clear an emergency stop, and move on: both are for a person to do.
+            # Setting up the scene again would clear an emergency stop and move the robot; only a person may do so.
             if not (session.held or (state is not None and state.estop)):
                 self._begin_episode()
         elif state is not None and state.generation == session.generation and state.success:

@@ -1,4 +1,4 @@
-"""Transport: the run's way to other machines."""
+"""Transport: the connection of a run to other machines."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ NAME = "transport"
 
 
 class TransportLink(Component):
-    """Opens the transport that the YAML names, for whatever in the run talks to other machines."""
+    """Opens the transport named in the YAML, for components that communicate with other machines."""
 
     def __init__(self, session: Session, section: Section) -> None:
         super().__init__(NAME, f"transport {section.type}")
@@ -27,10 +27,10 @@ class TransportLink(Component):
         """The transport.
 
         Raises:
-            ComponentFailed: before it is opened.
+            ComponentFailed: before it is open.
         """
         if self._transport is None:
-            raise ComponentFailed("the transport is not there yet")
+            raise ComponentFailed("the transport is not open yet")
         return self._transport
 
     @override

@@ -165,7 +165,7 @@ def test_one_that_does_not_stop_well_keeps_no_other_from_stopping(runs: Runs, ca
     runtime = runs.start(mode="teleop")
     runs.parts.TROUBLE["side"] = "stays open"
     runtime.stop()
-    assert "sensor:side did not stop well: OSError: the port is gone" in caplog.text
+    assert "sensor:side did not stop cleanly: OSError: the port is gone" in caplog.text
     assert "close top" in runs.parts.CALLS
     runtime.raise_failure()
 

@@ -1,1 +1,1 @@
-"""What shows or publishes a run: status, shared topics, the viewer."""
+"""Outputs of a run: status, shared topics, the viewer."""

@@ -1,4 +1,4 @@
-"""Status: publishes what the robot is doing on `/robot_status` and every count on `/diagnostics`."""
+"""Status: publishes the robot's state on `/robot_status` and all counters on `/diagnostics`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _OF_DISPATCH = (
 
 
 class Status(SessionWorker):
-    """Five times a second, from what control and the dispatcher report."""
+    """Publishes the reports of control and the dispatcher, five times a second."""
 
     def __init__(self, session: Session, needs: tuple[str, ...]) -> None:
         super().__init__(session, "status", "/robot_status and /diagnostics", needs)

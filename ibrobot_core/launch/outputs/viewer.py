@@ -1,4 +1,4 @@
-"""Viewer: a window or page that shows the robot; it works in the host and never slows it."""
+"""Viewer: a window or web page that shows the robot; runs in the host."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Execution: the model of an inference mode, and the dispatcher that keeps the plan filled from it."""
+"""The command source of an inference mode: its model, and the dispatcher that keeps the plan filled."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ TOGGLE_SMOOTHING = "/action_dispatcher/toggle_smoothing"
 
 
 class LoadedModel(Component):
-    """Makes a policy, compares it with the contract, and has it loaded where it runs, before anything is powered."""
+    """Creates a policy, compares it with the contract, and loads it, before torque is switched on."""
 
     def __init__(self, session: Session, inference: InferenceConfig, link: TransportLink | None) -> None:
         model = session.config.models[inference.model]
@@ -35,24 +35,24 @@ class LoadedModel(Component):
         self._model = model
         self.contract = Contract.from_config(session.config, model.extra_observations)
         self.units: JointUnits | None = None
-        """Of the policy's vectors, once started; None for radians."""
+        """The unit conversion of the policy's vectors, once started; None for radians."""
         self._policy: Policy | None = None
         self._engine: Engine | None = None
 
     @property
     def policy(self) -> Policy:
-        """The policy; loaded where its `infer` runs here."""
+        """The policy; loaded if its `infer` runs in this process."""
         assert self._policy is not None
         return self._policy
 
     @property
     def engine(self) -> Engine:
-        """Where its `infer` runs, ready."""
+        """The engine that runs the policy's `infer`; ready."""
         assert self._engine is not None
         return self._engine
 
     def described(self) -> dict[str, str]:
-        """Which policy acts, and with which weights, for recordings."""
+        """Name and weights of the policy, for recordings."""
         model, engine = self._model, self.engine
         return {
             "model": model.name, "type": model.type, "fingerprint": self.policy.fingerprint(),
@@ -86,7 +86,7 @@ class LoadedModel(Component):
 
 
 class PolicySource(SourceWorker):
-    """The dispatcher on the contract's ticks, fed by a model."""
+    """Runs the dispatcher on the contract's ticks, with chunks from a model."""
 
     autonomous = True
 
@@ -118,7 +118,7 @@ class PolicySource(SourceWorker):
         self._step_ns = contract.step_ns
 
     def toggle_smoothing(self, enabled: bool) -> None:
-        """Service: switch the blending of chunks on or off, from the next chunk on."""
+        """Service: enable or disable the blending of chunks, from the next chunk on."""
         with self.lock:
             self._dispatcher.toggle_smoothing(enabled)
 
@@ -149,7 +149,7 @@ class PolicySource(SourceWorker):
                 behind = (now_ns - self._next_ns) // self._step_ns
                 self._dispatcher.tick(self._next_ns + behind * self._step_ns)
                 self._next_ns += (behind + 1) * self._step_ns
-                # In lockstep the answer is there already.
+                # In lockstep the answer has already arrived.
                 if self.session.request.lockstep and (chunk := self._client.poll()) is not None:
                     self._dispatcher.accept(chunk, now_ns)
 

@@ -1,4 +1,4 @@
-"""The base of command sources that work in steps: of a policy, a teleoperation device, a planner, and of plugins."""
+"""Base class of the command sources for policies, teleoperation devices, planners and plugins."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from ibrobot_core.launch.session import CommandSource, Session, SessionWorker
 
 
 class SourceWorker(SessionWorker, CommandSource):
-    """A command source with its own thread (in lockstep: its own step), for one mode.
+    """A command source for one mode, with its own thread or, in lockstep, its own step.
 
     `setup` runs once, then `work` repeatedly, and `teardown` at the end. `begin_mode` and `end_mode` run between two
-    units of work. A source sends setpoints with `session.send_plan`, and ends the run with `session.finish`. What it
-    raises ends the run too.
+    units of work. A source sends setpoints with `session.send_plan`. `session.finish` ends the run, and so does an
+    exception.
 
     Args:
-        session: of the run.
+        session: the run.
         mode: the mode whose executors it commands.
         summary: one line for `--dry-run`.
         needs: names of the components that must be ready before it starts.
 
     Attributes:
-        session: of the run.
+        session: the run.
         mode: the mode.
-        active: whether the mode is entered; `work` sends nothing otherwise.
-        lock: held during `begin_mode` and `end_mode`. Hold it where `work` checks `active` and sends commands.
+        active: whether the mode is entered; `work` must not send commands otherwise.
+        lock: held during `begin_mode` and `end_mode`. Hold it while `work` checks `active` and sends commands.
     """
 
     def __init__(self, session: Session, mode: ControlMode, summary: str, needs: tuple[str, ...] = (CONTROL,)) -> None:

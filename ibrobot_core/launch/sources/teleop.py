@@ -1,4 +1,4 @@
-"""Teleop: reads the device with every joint state, and gives control plans of length one."""
+"""Teleop: reads the device at every joint state, and sends control plans of one setpoint."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from ibrobot_core.launch.sources.source_worker import SourceWorker
 
 
 class TeleopSource(SourceWorker):
-    """A teleoperation device. It joins at the plan: there is one way to the motors.
+    """A teleoperation device, which commands the robot by plans as all command sources do.
 
-    A device that fails while the robot follows is a fault; a reset connects it again.
+    A failure of the device while the robot follows it is a fault; a reset connects the device again.
     """
 
     def __init__(self, session: Session, mode: ControlMode, device: str) -> None:

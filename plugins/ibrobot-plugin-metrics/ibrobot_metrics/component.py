@@ -52,11 +52,11 @@ def unready(session: Session) -> str:
     """Why the robot does not do its work now; empty where it does."""
     state = session.state
     if state is None:
-        return "no joint state has come yet"
+        return "no joint state has been received yet"
     if state.estop:
         return "the emergency stop is latched"
     if state.stale:
-        return "the hardware gives no joint states"
+        return "the hardware sends no joint states"
     if session.acting is not None and not session.acting.engine.alive:
         return "the model is gone"
     return ""

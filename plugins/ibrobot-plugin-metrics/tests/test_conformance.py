@@ -60,7 +60,7 @@ def test_metrics_have_the_numbers_of_now(session: Session, port: MetricsPort) ->
 
 def test_robot_without_a_joint_state_is_healthy_and_not_ready(port: MetricsPort) -> None:
     assert get(port, "/healthz") == (200, "ok\n")
-    assert get(port, "/readyz") == (503, "no joint state has come yet\n")
+    assert get(port, "/readyz") == (503, "no joint state has been received yet\n")
 
 
 def test_run_that_failed_is_unhealthy(session: Session, port: MetricsPort) -> None:
