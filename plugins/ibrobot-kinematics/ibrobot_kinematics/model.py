@@ -78,8 +78,8 @@ class KinematicModel:
             q: joint positions, shape (…, J).
 
         Returns:
-            Shape (…, 6, J): velocity of the tip's origin [m/s] in rows 0-2 and angular velocity of the tip [rad/s] in
-            rows 3-5 for each joint at unit speed, both in the base frame.
+            Array of shape (…, 6, J), in the base frame. Rows 0-2 have the velocity of the tip's origin [m/s], rows 3-5
+            the angular velocity of the tip [rad/s], for each joint at unit speed.
         """
         return self.forward_and_jacobian(q)[1]
 
