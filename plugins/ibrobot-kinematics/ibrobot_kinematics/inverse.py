@@ -127,9 +127,10 @@ def _solutions(
         exact, near_misses = _by_closed_form(model, arm, target, start, every)
         if exact:
             return exact
-    tolerances = position_tolerance, rotation_tolerance
+    # A wider tolerance is for targets that the arm cannot reach exactly: it lets no search end earlier.
+    tolerances = position_tolerance, min(rotation_tolerance, ROTATION_TOLERANCE_RAD)
     least = _LEAST_WEIGHT if arm is None else _WEIGHT
-    weight = float(np.clip(rotation_tolerance / position_tolerance, least, _GREAT_WEIGHT))
+    weight = float(np.clip(tolerances[1] / position_tolerance, least, _GREAT_WEIGHT))
     for starts in _rounds(model, target, start, near_misses, every):
         first = search(model, target, starts, position_weight=weight, iterations=_SHORT)
         found = search(

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import click
 
+from ibrobot_core.api import echo
+
 
 @click.group()
 def description() -> None:
@@ -42,6 +44,6 @@ def srdf(config: str, samples: int, seed: int, output: Path | None) -> None:
     names = {link: link for link in arm.frames} if urdf is None else urdf_names(arm, read_urdf(urdf))
     text = written(robot, pairs, names)
     if output is None:
-        click.echo(text, nl=False)
+        echo(text.removesuffix("\n"))
     else:
         output.write_text(text, encoding="utf-8")
