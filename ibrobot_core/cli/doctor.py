@@ -55,12 +55,11 @@ def python_version() -> Check:
 
 def plugin_checks(registry: Registry) -> list[Check]:
     """How many work, and one failed check for each that does not."""
-    working = sorted({entry.package for entry in registry.entries.values()})
     broken = [
         Check(f"plugin {failure.plugin}", False, str(failure), f"repair or remove it: pip uninstall {failure.package}")
         for failure in registry.failures
     ]
-    return [Check("plugins", True, ", ".join(working)), *broken]
+    return [Check("plugins", True, ", ".join(registry.versions())), *broken]
 
 
 def types(registry: Registry) -> list[Check]:

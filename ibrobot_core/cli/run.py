@@ -96,14 +96,9 @@ def _run(runtime: Runtime, hooks: RunHooks, *, live: bool, as_json: bool) -> int
         session.log.info("%s from %s: %s, mode %s", config.robot.name, config.source, where, session.mode)
         runtime.start(display.starting)
         stack.callback(runtime.stop)
-        if session.request.lockstep:
-            while not runtime.step():
-                hooks.step()
-                display.show()
-        else:
-            while not runtime.wait(1.0 / _PANEL_HZ):
-                hooks.step()
-                display.show()
+        while not (runtime.step() if session.request.lockstep else runtime.wait(1.0 / _PANEL_HZ)):
+            hooks.step()
+            display.show()
     outcome = session.outcome
     if any(fault != EMERGENCY_STOP for fault in outcome.faults):
         return _FAULTED
@@ -199,8 +194,7 @@ class _Panel:
         while not self._pressed.empty():
             self._handle_key(self._pressed.get())
         session = self._runtime.session
-        help_text = session.command_source.help()
-        help_text = "\n".join(text for text in (help_text, self._hooks.help()) if text)
+        help_text = "\n".join(text for text in (session.command_source.help(), self._hooks.help()) if text)
         self._rates.sample(session)
         self._display.update(panel(session, self._log, self._rates, help_text, self._hooks.rows()), refresh=True)
 
@@ -216,10 +210,9 @@ class _Panel:
     def _handle_key(self, key: str) -> None:
         if self._hooks.key(key):
             return
-        modes = self._runtime.session.mode_keys
         if key == "f10":
             self._try(self._runtime.reset)
-        elif (mode := modes.get(key.upper())) is not None:
+        elif (mode := self._runtime.session.mode_keys.get(key.upper())) is not None:
             self._try(lambda: self._runtime.switch_mode(mode))
 
     def _try(self, act: Callable[[], object]) -> None:

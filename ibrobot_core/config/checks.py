@@ -63,25 +63,21 @@ class Checks:
         if not names:
             self.document.add((*at, "joints"), "a robot needs at least one joint")
         self._name((*at, "name"), robot.name)
-        for i, name in enumerate(names):
-            self._name((*at, "joints", i, "name"), name)
-        for group in robot.groups:
-            self._name((*at, "groups", group), group)
-        for pose in robot.description.poses:
-            self._name((*at, "description", "poses", pose), pose)
-        for i, name in enumerate(names):
-            if name in names[:i]:
-                self.document.add((*at, "joints", i, "name"), f"a second joint named {name!r}")
-        for group, members in robot.groups.items():
-            for i, joint in enumerate(members):
-                self.document.refer((*at, "groups", group, i), joint, names, "joint")
-            self._unique((*at, "groups", group), members, "joint")
         grouped = {joint for members in robot.groups.values() for joint in members}
         for i, name in enumerate(names):
+            self._name((*at, "joints", i, "name"), name)
+            if name in names[:i]:
+                self.document.add((*at, "joints", i, "name"), f"a second joint named {name!r}")
             if name not in grouped:
                 message = f"joint {name!r} is in no group, so no executor can own it; add it to one under robot.groups"
                 self.document.add((*at, "joints", i), message)
+        for group, members in robot.groups.items():
+            self._name((*at, "groups", group), group)
+            for i, joint in enumerate(members):
+                self.document.refer((*at, "groups", group, i), joint, names, "joint")
+            self._unique((*at, "groups", group), members, "joint")
         for pose, positions in robot.description.poses.items():
+            self._name((*at, "description", "poses", pose), pose)
             self._pose((*at, "description", "poses", pose), robot, positions)
         self._models(robot)
 
@@ -91,17 +87,13 @@ class Checks:
         described = robot.description
         for model, path in (("mjcf", described.mjcf), ("urdf", described.urdf), ("srdf", described.srdf)):
             key: Key = ("robot", "description", model)
-            if path is None:
-                continue
-            if not path.is_file():
+            if path is not None and not path.is_file():
                 self.document.add(key, f"no such file: {path}; a relative path starts at the folder of the YAML file")
-                continue
-            if model not in READERS:
-                continue
-            try:
-                known.append(READERS[model](path))
-            except ModelError as error:
-                self.document.add(key, str(error))
+            elif path is not None and model in READERS:
+                try:
+                    known.append(READERS[model](path))
+                except ModelError as error:
+                    self.document.add(key, str(error))
         for i, joint in enumerate(robot.joints):
             limits = [each.limits[joint.name] for each in known if joint.name in each.limits]
             if limits and not joint.beyond_model:

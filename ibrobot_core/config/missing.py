@@ -7,6 +7,7 @@ from typing import Any
 
 import attrs
 
+from ibrobot_core.config.schema import ContractConfig
 from ibrobot_core.config.yaml_nodes import Document, Key
 from ibrobot_core.errors import PluginNotInstalled, plugin_type
 from ibrobot_core.plugins import install_command
@@ -41,11 +42,13 @@ def split(
         Mode -> why it is unavailable, of the other modes.
     """
     modes: Mapping[str, Any] = plain.get("control_modes") or {}
-    used = {name: _used(name, mode) for name, mode in modes.items()}
-    observed = _observed(document, plain)
-    used = {name: keys | observed if modes[name].inference is not None else keys for name, keys in used.items()}
-    always = _acting(plain) | (observed if "recording" in document.root else set[Key]())
-    now = always | used.get(entered or "", set())
+    contract = plain.get("contract") or ContractConfig()
+    # The executors of the contract, whose commands a run publishes in every mode, and the peripherals that it observes.
+    acting: set[Key] = {("executors", spec.executor) for spec in contract.actions}
+    names = {spec.peripheral for spec in contract.observations}
+    observed: set[Key] = {key for key, item in document.items("peripherals") if str(item.get("name")) in names}
+    used = {name: _used(name, mode, observed) for name, mode in modes.items()}
+    now = acting | (observed if "recording" in document.root else set()) | used.get(entered or "", set())
     needed = [each for each in missing if everything or each.key in now or not _may_wait(document, each.key)]
     if needed:
         document.add(needed[0].place, describe(each.error for each in needed))
@@ -77,28 +80,15 @@ def describe(errors: Iterable[PluginNotInstalled]) -> str:
     return "; ".join(texts)
 
 
-def _used(name: str, mode: Any) -> set[Key]:
-    """What drives a mode, and moves its joints."""
+def _used(name: str, mode: Any, observed: set[Key]) -> set[Key]:
+    """What drives a mode, and moves its joints; with a model, what the contract observes too."""
     keys: set[Key] = {("control_modes", name, "planner"), ("control_modes", name, "inference")}
     keys |= {("executors", executor) for executor in mode.executors}
     if mode.teleop is not None:
         keys.add(("teleoperation", mode.teleop))
     if mode.inference is not None:
-        keys.add(("models", str(mode.inference.get("model"))))
+        keys |= {("models", str(mode.inference.get("model"))), *observed}
     return keys
-
-
-def _acting(plain: Mapping[str, Any]) -> set[Key]:
-    """The executors of the contract, whose commands a run publishes in every mode."""
-    contract = plain.get("contract")
-    return {("executors", spec.executor) for spec in contract.actions} if contract is not None else set()
-
-
-def _observed(document: Document, plain: Mapping[str, Any]) -> set[Key]:
-    """The peripherals that the contract observes."""
-    contract = plain.get("contract")
-    names = {spec.peripheral for spec in contract.observations} if contract is not None else set()
-    return {key for key, item in document.items("peripherals") if str(item.get("name")) in names}
 
 
 def _may_wait(document: Document, key: Key) -> bool:

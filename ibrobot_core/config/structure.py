@@ -224,10 +224,9 @@ class SectionParser:
             return self.registry.find(kind.plugin_kind, type_)
         except PluginNotInstalled as error:
             self._missing.append(Missing(key, (*key, kind.type_key()), error))
-            return None
         except PluginError as error:
             faults.add((kind.type_key(),), str(error))
-            return None
+        return None
 
     def _options(
         self, descriptor: Descriptor[Any], kind: type[schema.ComponentConfig], value: Mapping[str, Any], faults: Faults

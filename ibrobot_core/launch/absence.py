@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 
 import attrs
 
@@ -45,27 +45,12 @@ def absent_sensors(config: RobotConfig, registry: Registry) -> tuple[AbsentSenso
     return tuple(absent)
 
 
-def refuse(absent: Iterable[AbsentSensor], user: str, needs: Callable[[str], bool]) -> None:
-    """Refuse a part of a run that needs the messages of an absent sensor.
-
-    Args:
-        absent: the absent sensors.
-        user: name of the part, for the error.
-        needs: returns whether the part needs the messages on a topic.
-
-    Raises:
-        MissingDependency: with the remedy.
-    """
-    for missing, labels in _by_cause(sensor for sensor in absent if needs(sensor.topic)):
-        raise MissingDependency(f"{user} needs {labels}: {missing.missing}", apt=missing.apt, remedy=missing.remedy)
-
-
 def describe(absent: Iterable[AbsentSensor]) -> str:
     """The absent sensors, their missing dependencies and the remedies, on one line; empty if none are absent."""
-    return "; and ".join(f"{labels}: {missing}" for missing, labels in _by_cause(absent))
+    return "; and ".join(f"{labels}: {missing}" for missing, labels in by_cause(absent))
 
 
-def _by_cause(absent: Iterable[AbsentSensor]) -> list[tuple[MissingDependency, str]]:
+def by_cause(absent: Iterable[AbsentSensor]) -> list[tuple[MissingDependency, str]]:
     """Each missing dependency with the sensors that lack it."""
     causes: dict[str, list[AbsentSensor]] = {}
     for sensor in absent:

@@ -180,9 +180,8 @@ class Runtime:
         """Stop every component in reverse starting order. Errors are logged, so that all are stopped."""
         session = self.session
         session.finish()
-        session.bus.unserve(SET_MODE)
-        session.bus.unserve(RESET)
-        session.bus.unserve(ESTOP)
+        for service in (SET_MODE, RESET, ESTOP):
+            session.bus.unserve(service)
         if self.episode_service is not None:
             self.episode_service.unserve()
         started, self._started = self._started, []

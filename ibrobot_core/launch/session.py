@@ -18,9 +18,9 @@ from ibrobot_core.component import Worker, error_line
 from ibrobot_core.config import RobotConfig
 from ibrobot_core.config.schema import ComponentConfig, ControlMode
 from ibrobot_core.control.link import ControlState, PlanRecord
-from ibrobot_core.errors import ComponentFailed
+from ibrobot_core.errors import ComponentFailed, MissingDependency
 from ibrobot_core.interfaces import Context, EngineStats, JointReading, OperatorEvent
-from ibrobot_core.launch.absence import AbsentSensor, absent_sensors, refuse
+from ibrobot_core.launch.absence import AbsentSensor, absent_sensors, by_cause
 from ibrobot_core.plugins import Registry
 from ibrobot_core.robot import Vector
 
@@ -193,7 +193,8 @@ class Session:
         Raises:
             MissingDependency: with the remedy.
         """
-        refuse(self.absent, user, needs)
+        for missing, labels in by_cause(sensor for sensor in self.absent if needs(sensor.topic)):
+            raise MissingDependency(f"{user} needs {labels}: {missing.missing}", apt=missing.apt, remedy=missing.remedy)
 
     @property
     def control(self) -> ControlHost:

@@ -67,13 +67,10 @@ class LoadedModel(Component):
         topics = {part.topic for key in policy.spec.observations for part in self.contract.parts(key)}
         session.refuse_absent(f"model {model.name!r}", topics.__contains__)
         self._policy = policy
-        engine: Engine = session.make("engine", self._inference, model.name, model=self._context(policy))
-        self._engine = engine
-        engine.start()
-
-    def _context(self, policy: Policy) -> ModelContext:
-        session, transport = self._session, self._link.transport if self._link is not None else None
-        return ModelContext(session.config, policy, transport, self._inference.request_timeout, session.finished)
+        transport = self._link.transport if self._link is not None else None
+        context = ModelContext(session.config, policy, transport, self._inference.request_timeout, session.finished)
+        self._engine = session.make("engine", self._inference, model.name, model=context)
+        self.engine.start()
 
     @override
     def stop(self) -> None:

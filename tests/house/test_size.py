@@ -1,0 +1,13 @@
+"""The size of core; `python tests/house/source_lines.py` shows that of each plugin, too."""
+
+from source_lines import ROOT, count
+
+LIMIT = 10_000
+
+
+def test_core_has_at_most_ten_thousand_source_lines():
+    lines = count(ROOT / "ibrobot_core")
+    table = "\n".join(f"{number:6} {folder}" for folder, number in lines.most_common())
+    assert lines.total() <= LIMIT, (
+        f"{lines.total()} source lines, at most {LIMIT}; move or simplify something:\n{table}"
+    )
