@@ -97,8 +97,7 @@ def option(
             raise ValueError(f"{value} is not a finite number")
 
     validators = [check] if validator is None else [check, validator]
-    if factory is not None:
-        return attrs.field(factory=factory, metadata=metadata, validator=validators, repr=shown, alias=key)
+    default = default if factory is None else attrs.Factory(factory)
     return attrs.field(default=default, metadata=metadata, validator=validators, repr=shown, alias=key)
 
 

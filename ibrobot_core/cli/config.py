@@ -12,6 +12,7 @@ import click
 from ibrobot_core.cli.options import run_options
 from ibrobot_core.errors import ConfigError, PluginError
 from ibrobot_core.outside import echo
+from ibrobot_core.plugins import installed_plugins
 
 config_options = run_options("config", "sim", "overrides", "mode")
 
@@ -36,7 +37,6 @@ def check(
     from ibrobot_core.config.missing import unavailable_modes
     from ibrobot_core.launch.absence import absent_sensors, describe
     from ibrobot_core.launch.models import check_models
-    from ibrobot_core.plugins import installed_plugins
 
     try:
         path = find_config(config, installed_plugins())
@@ -70,7 +70,6 @@ def show(config: str | None, sim: bool, overrides: tuple[str, ...], mode: str | 
     from ibrobot_core.config import find_config, load_config
     from ibrobot_core.config.missing import describe
     from ibrobot_core.config.show import to_yaml
-    from ibrobot_core.plugins import installed_plugins
 
     found = load_config(find_config(config, installed_plugins()), overrides=overrides, mode=mode, sim=sim)
     if found.missing:
@@ -82,6 +81,5 @@ def show(config: str | None, sim: bool, overrides: tuple[str, ...], mode: str | 
 def schema() -> None:
     """Print a JSON Schema of robot YAMLs for editors, with the options of every installed plugin."""
     from ibrobot_core.config.jsonschema import json_schema
-    from ibrobot_core.plugins import installed_plugins
 
     echo(json.dumps(json_schema(installed_plugins()), indent=2))

@@ -157,19 +157,13 @@ class Checks:
 
     def _devices(self) -> None:
         """No two components open one device. Of teleoperation one is open at a time."""
-        users: dict[str, str] = {}
-        for part in self.sections.active():
-            users |= self._opened(part, users)
-        for part in self.sections.teleoperation.values():
-            self._opened(part, users)
-
-    def _opened(self, part: ParsedComponent[Any], users: Mapping[str, str]) -> dict[str, str]:
-        """Device -> who opens it, of one component; those that others open too are faults."""
-        devices = part.descriptor.devices(part.component.options)
-        for option, device in devices.items():
-            if device in users:
-                self.document.add((*part.key, option), f"{device} is used by {users[device]} already")
-        return {device: self.document.dotted(part.key) for device in devices.values() if device not in users}
+        users: dict[str, Key] = {}
+        for part in (*self.sections.active(), *self.sections.teleoperation.values()):
+            for option, device in part.descriptor.devices(part.component.options).items():
+                if (user := users.get(device, part.key)) != part.key:
+                    self.document.add((*part.key, option), f"{device} is used by {self.document.dotted(user)} already")
+                elif part.key[0] != "teleoperation":
+                    users[device] = part.key
 
     def _executors(self, robot: Robot) -> None:
         for part in self.sections.executors.values():

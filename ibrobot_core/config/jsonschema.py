@@ -52,7 +52,7 @@ class _Schemas:
             (is_literal, lambda kind: {"enum": list(get_args(kind))}),
             (is_sequence, self._of_sequence),
             (is_mapping, self._of_mapping),
-            (_is_component, self._of_component),
+            (lambda kind: isinstance(kind, type) and issubclass(kind, ComponentConfig), self._of_component),
             (attrs.has, lambda kind: self.of_fields(fields(kind))),
         ):
             if fits(kind):
@@ -85,7 +85,7 @@ class _Schemas:
         _, item = get_args(kind) or (str, Any)
         one = self.of_type(item)
         several = {"type": "object", "additionalProperties": one}
-        if _is_component(item) and item.may_be_alone:
+        if (component := component_of(item)) is not None and component.may_be_alone:
             return {"if": {"required": ["type"]}, "then": one, "else": several}
         return several
 
@@ -128,7 +128,3 @@ class _Schemas:
         if default not in (attrs.NOTHING, None):
             schema["default"] = plain(default)
         return schema
-
-
-def _is_component(kind: Any) -> bool:
-    return isinstance(kind, type) and issubclass(kind, ComponentConfig)

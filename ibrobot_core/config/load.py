@@ -125,7 +125,8 @@ def _override(document: Document, overrides: Sequence[str], mode: str | None) ->
 def _build(document: Document, source: Path, sim: bool, registry: Registry, communicates: bool = False) -> RobotConfig:
     sections = SectionParser(document, registry, source.absolute().parent, sim).sections()
     check_known(document)
-    entered = _entered(document, sections)
+    simulated = document.get("simulation", "default_control_mode") if sections.simulated else None
+    entered = simulated or sections.plain.get("default_control_mode")
     unavailable = split(document, sections.plain, sections.missing, entered, everything=communicates)
     Checks(document, sections, communicates).run()
     contract_checks = ContractChecks(document, sections)
@@ -202,12 +203,6 @@ def _component[C: ComponentConfig](part: ParsedComponent[C] | None) -> C | None:
 
 def _components[C: ComponentConfig](sections: Mapping[str, ParsedComponent[C]]) -> dict[str, C]:
     return {name: part.component for name, part in sections.items()}
-
-
-def _entered(document: Document, sections: ParsedSections) -> Any:
-    """The mode in which the run begins, as the document says it."""
-    simulated = document.get("simulation", "default_control_mode") if sections.simulated else None
-    return simulated or sections.plain.get("default_control_mode")
 
 
 def _not_installed(document: Document, sections: ParsedSections) -> dict[str, PeripheralConfig]:

@@ -52,12 +52,9 @@ def put(document: Document, path: str, value: Document, place: Place) -> None:
             document.places[key] = place
         holder = holder[part]
     # What lies below has no place of its own any more, so that its faults are reported as the override's.
-    for known in [k for k in document.places if k[: len(key)] == key]:
-        del document.places[known]
-    document.places[key] = place
-    for known in [k for k in document.references if k[: len(key)] == key]:
-        del document.references[known]
-    document.references |= {(*key, *inner): text for inner, text in value.references.items()}
+    document.places = {k: known for k, known in document.places.items() if k[: len(key)] != key} | {key: place}
+    others = {k: text for k, text in document.references.items() if k[: len(key)] != key}
+    document.references = others | {(*key, *inner): text for inner, text in value.references.items()}
 
 
 def _part(holder: Any, word: str) -> str | int:
