@@ -1,1 +1,1 @@
-"""The contract: how topics become tensors and actions become messages, the same live and offline."""
+"""The contract: how topics become tensors and actions become messages, identically live and offline."""

@@ -1,4 +1,4 @@
-"""Alignment: which sample of a stream is its value at a tick. The one place that decides it, live and offline."""
+"""Alignment: selects the sample of a stream that is its value at a tick, both live and offline."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ibrobot_core.units import NS_PER_S
 
 @attrs.frozen(eq=False)
 class Sample[T]:
-    """A value with the stamp that counts for alignment and the time of its receipt [ns]."""
+    """A value with the stamp used for alignment and the time of receipt [ns]."""
 
     stamp_ns: int
     received_ns: int
@@ -20,34 +20,34 @@ class Sample[T]:
 
 
 class Stream[T]:
-    """One topic's samples, and the one that counts at a tick.
+    """The samples of one topic, and the choice of the sample valid at a tick.
 
-    At tick `t` only samples count whose stamp is `<= t` and that were received by `t`: what a live run could not
-    have seen yet, a conversion does not see either. Of these the newest by stamp is chosen, of equal stamps the one
-    received last; then `hold` gives it at any age, `asof` if `t - stamp <= tol_ms`, `drop` if `stamp > t - step`.
+    At tick `t`, only samples with a stamp `<= t` that were received by `t` are considered, so that a conversion sees
+    no more than a live run. The sample with the newest stamp is chosen; of equal stamps, the one received last. `hold`
+    accepts it at any age, `asof` if `t - stamp <= tol_ms`, `drop` if `stamp > t - step`.
 
-    A jump of the stamps resets the stream: all earlier samples are forgotten, and `resets` counts it. With a limit of
+    A jump of the stamps resets the stream: it drops all earlier samples and increments `resets`. With a limit of
     `max(1 s, 2 steps)`, a jump is
 
-    - a stamp further than the limit ahead of the newest so far, or behind it. A smaller step back is a message
-      that came out of order, and has its place by its stamp. (A sender whose clock is set back by less than the limit
-      therefore goes unnoticed until it has caught up; `asof` and `drop` bound the age of what is used meanwhile.)
-    - a stamp further than the limit ahead of its own receipt: the sender's clock is not ours, and nobody knows at which
-      tick the sample would be due. It is not kept.
+    - a stamp further than the limit ahead of the newest so far, or behind it. A smaller step back is an
+      out-of-order message, sorted by its stamp. (A sender whose clock is set back by less than the limit therefore
+      goes unnoticed until it has caught up; until then `asof` and `drop` bound the age of the value.)
+    - a stamp further than the limit ahead of its own receipt. The sender's clock differs from ours, and the tick at
+      which the sample is due is unknown. The sample is dropped.
 
-    So what is kept is bounded: the chosen sample, those stamped ahead of the tick by the limit at most, and those
-    added but not yet received at the tick.
+    Memory is therefore bounded: the stream keeps the chosen sample, samples stamped ahead of the tick by at most the
+    limit, and samples received after the tick.
 
     Args:
-        align: strategy, the stamp that counts, and for `asof` the greatest age.
-        step_ns: time from tick to tick [ns].
+        align: strategy, stamp, and for `asof` the maximum age.
+        step_ns: time between ticks [ns].
     """
 
     def __init__(self, align: Align, step_ns: int) -> None:
         self.resets = 0
         self._by_header = align.stamp == "header"
         self._limit_ns = max(NS_PER_S, 2 * step_ns)
-        # The age up to which a sample counts [ns]; `stamp > t - step` is, in integers, an age of step - 1 at most.
+        # Maximum age of a sample [ns]; in integers, `stamp > t - step` is an age of at most step - 1.
         tolerance_ns = round((align.tol_ms or 0.0) * 1e6)
         self._max_age_ns = {"hold": None, "asof": tolerance_ns, "drop": step_ns - 1}[align.strategy]
         self._unseen: deque[Sample[T]] = deque()
@@ -63,13 +63,13 @@ class Stream[T]:
         Args:
             stamp_header_ns: the header's stamp [ns]; None for a message without a header.
             received_ns: time of receipt [ns].
-            value: what `at` gives back, untouched.
+            value: the value that `at` returns, unchanged.
 
         Raises:
-            ValueError: when it was received before its predecessor, or lacks the header stamp that should count.
+            ValueError: if it was received before its predecessor, or lacks a required header stamp.
         """
         if self._received_ns is not None and received_ns < self._received_ns:
-            raise ValueError(f"samples come in the order of receipt, got {received_ns} after {self._received_ns} ns")
+            raise ValueError(f"samples must be in the order of receipt, got {received_ns} after {self._received_ns} ns")
         stamp_ns = stamp_header_ns if self._by_header else received_ns
         if stamp_ns is None:
             raise ValueError("a stream aligned by header stamps got a sample without one; align it by `stamp: receive`")
@@ -77,10 +77,10 @@ class Stream[T]:
         self._unseen.append(Sample(stamp_ns, received_ns, value))
 
     def at(self, t_ns: int) -> Sample[T] | None:
-        """The sample that counts at tick `t_ns` [ns], or None where it is missing.
+        """The sample valid at tick `t_ns` [ns], or None if it is missing.
 
         Raises:
-            ValueError: for a tick before the last one asked for.
+            ValueError: for a tick before the last requested one.
         """
         if self._tick_ns is not None and t_ns < self._tick_ns:
             raise ValueError(f"ticks must not go back, got {t_ns} ns after {self._tick_ns} ns")
@@ -96,7 +96,7 @@ class Stream[T]:
         return self._chosen
 
     def _take(self, sample: Sample[T]) -> None:
-        """See a sample at last: note a jump, and keep it until it is due."""
+        """Process a received sample: detect a jump, and keep the sample until it is due."""
         from_future = sample.stamp_ns - sample.received_ns > self._limit_ns
         newest_ns = sample.stamp_ns if self._newest_ns is None else self._newest_ns
         if from_future or abs(sample.stamp_ns - newest_ns) > self._limit_ns:
@@ -110,7 +110,7 @@ class Stream[T]:
         self._ahead.append(sample)
 
     def _choose(self, t_ns: int) -> None:
-        """Move the choice on to the newest sample that is due; `_ahead` is in the order of receipt."""
+        """Choose the newest sample that is due; `_ahead` is in the order of receipt."""
         ahead = []
         for sample in self._ahead:
             if sample.stamp_ns > t_ns:

@@ -1,4 +1,4 @@
-"""Whether a policy fits the contract, asked before anything moves."""
+"""Check that a policy fits the contract, before anything moves."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from ibrobot_core.interfaces.policy import PolicySpec
 
 
 def check_policy(contract: Contract, spec: PolicySpec, norm_mode: str = "radians") -> None:
-    """Compare what a policy reads and gives with what the robot has.
+    """Compare the observations and actions of a policy with those of the robot.
 
     Args:
-        contract: the robot's, with the model's extra observations.
-        spec: the policy's.
-        norm_mode: unit of the joints in the policy's vectors, as the robot YAML says it.
+        contract: the contract of the robot, with the model's extra observations.
+        spec: the spec of the policy.
+        norm_mode: unit of the joints in the policy's vectors, from the robot YAML.
 
     Raises:
-        ContractError: for an observation that the contract lacks or has in another shape, and for an action of another
-            size or other joints, e.g. the same ones in another order; where the policy says what it was trained on,
-            also for another unit, rate, topic, selection or alignment. Every difference with both sides.
+        ContractError: for an observation that is missing in the contract or has another shape, and for an action of
+            another size, other joints or another order of joints. If the policy states its training contract, also
+            for another unit, rate, topic, selection or alignment. Shows both sides of every difference.
     """
     faults = []
     for key, wanted in spec.observations.items():
@@ -40,20 +40,20 @@ def check_policy(contract: Contract, spec: PolicySpec, norm_mode: str = "radians
         faults.append(_fault("norm_mode", f"trained in {spec.norm_mode}", f"the model's norm_mode is {norm_mode}"))
     if spec.contract is not None and not faults:
         trained = Contract.from_canonical(_restricted(spec.contract, spec))
-        here = Contract.from_canonical(_restricted(contract.canonical(), spec))
-        faults += [trained.difference(here, names=("policy", "contract"))] if trained != here else []
+        present = Contract.from_canonical(_restricted(contract.canonical(), spec))
+        faults += [trained.difference(present, names=("policy", "contract"))] if trained != present else []
     if faults:
         raise ContractError("the policy does not fit the contract:\n" + "\n".join(faults))
 
 
 def _restricted(canonical: Mapping[str, Any], spec: PolicySpec) -> dict[str, Any]:
-    """A contract with no more observations than the policy reads."""
+    """A contract reduced to the observations that the policy reads."""
     seen = {key: parts for key, parts in canonical["observations"].items() if key in spec.observations}
     return {**canonical, "observations": seen}
 
 
 def _fits(wanted: Sequence[int], given: Sequence[int]) -> bool:
-    """Equal but for dimensions that either side leaves open."""
+    """Whether two shapes are equal, except for dimensions that either side leaves open."""
     return len(wanted) == len(given) and all(w == g or -1 in (w, g) for w, g in zip(wanted, given, strict=True))
 
 

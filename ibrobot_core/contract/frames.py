@@ -1,4 +1,4 @@
-"""Frames: all observations of a tick, sampled live from the bus or offline from recorded messages by the same code."""
+"""Frames: all observations of a tick, assembled from the bus or from recorded messages by the same code."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ type _Array = NDArray[np.generic]
 
 
 class _Part:
-    """One topic's part of an observation: its stream, and the decoded value of the sample last chosen."""
+    """One topic's part of an observation: its stream, and the decoded value of the last chosen sample."""
 
     def __init__(self, part: ObservationPart, step_ns: int) -> None:
         self.part = part
@@ -47,7 +47,7 @@ class _Part:
                 f"{self.part.key}: {self.part.topic}: its bag defines {message.ros_type} otherwise than ROS 2 does"
             )
         stamp_ns = getattr(getattr(message, "header", None), "stamp_ns", None)
-        if stamp_ns is None and self.part.align.stamp == "header":  # of a type that nobody knew before
+        if stamp_ns is None and self.part.align.stamp == "header":  # of a type that only the bag defines
             raise ContractError(f"{self.part.key}: a {self.part.type} has no header; give `align: {{stamp: receive}}`")
         self.stream.add(stamp_ns, received_ns, message)
 
@@ -61,7 +61,7 @@ class _Part:
         return self._value
 
     def _decode(self, message: Message) -> _Array | None:
-        """The message's value, read-only; None for a vector with something in it that was not measured."""
+        """The message's value, read-only; None for a vector with unmeasured elements."""
         try:
             value = self._read(message)
         except ContractError as error:
@@ -76,14 +76,14 @@ class _Part:
 
 
 class FrameAssembler:
-    """Messages in, frames out. Live sampling and conversion differ only in where the messages come from.
+    """Assembles messages into frames. Live sampling and conversion differ only in the source of the messages.
 
-    Images are decoded once for each sample, and nothing is decoded that no frame asks for. Arrays in frames are
-    read-only, since the frames of several ticks may share them.
+    Each sample is decoded at most once, and only if a frame needs it. Arrays in frames are read-only, since the frames
+    of several ticks may share them.
 
     Args:
-        contract: what to assemble.
-        keys: the observations wanted; all when None.
+        contract: the contract that defines the frames.
+        keys: the observations to assemble; None for all.
 
     Raises:
         ContractError: for a key that the contract does not have.
@@ -101,34 +101,34 @@ class FrameAssembler:
             self._topics.setdefault(part.part.topic, []).append(part)
 
     def topics(self) -> Mapping[str, bool]:
-        """The topics that it wants, and whether they carry images."""
+        """Topic -> whether it carries images, for all topics needed."""
         return {topic: parts[0].part.image is not None for topic, parts in self._topics.items()}
 
     def resets(self) -> dict[str, int]:
-        """How often the stamps of a topic jumped, per topic; topics without a jump left out."""
+        """Topic -> number of jumps of its stamps, for topics with jumps."""
         counts = {topic: max(part.stream.resets for part in parts) for topic, parts in self._topics.items()}
         return {topic: count for topic, count in counts.items() if count}
 
     def take(self, topic: str, message: Message, received_ns: int) -> None:
-        """Take a message in, each topic's in the order of receipt; those of other topics are passed over.
+        """Add a message, in the order of receipt for each topic; messages of other topics are ignored.
 
         Raises:
-            ContractError: for a message of another type than the contract's.
+            ContractError: for a message of a type other than the contract's.
         """
         for part in self._topics.get(topic, ()):
             part.take(message, received_ns)
 
     def advance(self, t_ns: int) -> None:
-        """Move on to tick `t_ns` [ns] without decoding; forget what no later tick can choose."""
+        """Advance to tick `t_ns` [ns] without decoding; drop samples that no later tick can choose."""
         for parts in self._keys.values():
             for part in parts:
                 part.stream.at(t_ns)
 
     def frame(self, t_ns: int) -> Frame:
-        """The frame at tick `t_ns` [ns]; ticks never go back.
+        """The frame at tick `t_ns` [ns]; ticks must not decrease.
 
         Raises:
-            ContractError: for a chosen message that does not fit the contract, e.g. without a joint that is selected.
+            ContractError: for a chosen message that does not fit the contract, e.g. one without a selected joint.
         """
         values = {}
         for key, parts in self._keys.items():
@@ -139,19 +139,19 @@ class FrameAssembler:
 
 
 class FrameSampler:
-    """Frames from the bus, live. One thread owns it.
+    """Samples frames from the bus. Not thread-safe.
 
-    A frame at `t` has what was received by `t`, so that the frame made from the recording is the same bit for bit.
-    It follows that `t` should be `Bus.snapshot_ns()`, or a tick a little before it. Queues hold the newest 32 images
-    or 256 other messages of a topic; where frames are asked for less often, call `advance` at every tick, or the
-    queues run over (`Bus.dropped` counts that).
+    A frame at `t` contains everything received by `t`, so that the frame made from the recording is identical bit for
+    bit. Use `Bus.snapshot_ns()` for `t`, or a tick shortly before it. Queues hold the newest 32 images or 256 other
+    messages of a topic. If frames are not sampled at every tick, call `advance` at the others, or the queues overflow
+    (counted by `Bus.dropped`).
 
     Args:
-        contract: what to sample.
-        bus: where the messages are.
-        keys: the observations wanted; all when None.
-        history: how many ticks before its own a frame has in `Frame.history`. Every tick is then decoded, also those
-            that neither `sample` nor `advance` were called for.
+        contract: the contract that defines the frames.
+        bus: the bus with the messages.
+        keys: the observations to sample; None for all.
+        history: number of earlier ticks in `Frame.history`. If above 0, every tick is decoded, even those for which
+            neither `sample` nor `advance` was called.
 
     Raises:
         ContractError: for a key that the contract does not have.
@@ -162,14 +162,14 @@ class FrameSampler:
         self._step_ns = contract.step_ns
         self._history = history
         self._recent: deque[Frame] = deque(maxlen=history + 1)
-        """The frames of the newest ticks, all complete, each one step after the other."""
+        """The frames of the newest ticks, all complete, one step apart."""
         depths = {True: _IMAGE_DEPTH, False: _VECTOR_DEPTH}
         topics = self._assembler.topics()
         self._subscriptions = [bus.subscribe(topic, depths[is_image]) for topic, is_image in topics.items()]
         self._early: dict[str, Received] = {}
 
     def sample(self, t_ns: int) -> Frame:
-        """The frame at tick `t_ns` [ns]; ticks never go back.
+        """The frame at tick `t_ns` [ns]; ticks must not decrease.
 
         Raises:
             ContractError: for a message that does not fit the contract.
@@ -184,7 +184,7 @@ class FrameSampler:
         return self._remember(t_ns)
 
     def advance(self, t_ns: int) -> None:
-        """Take in what was received by tick `t_ns` [ns], decoding nothing that no history needs."""
+        """Process the messages received by tick `t_ns` [ns]; decode only what a history needs."""
         if self._history:
             self.sample(t_ns)
         else:
@@ -192,12 +192,12 @@ class FrameSampler:
             self._assembler.advance(t_ns)
 
     def close(self) -> None:
-        """Leave the bus. Safe to call twice."""
+        """Unsubscribe from the bus. Safe to call twice."""
         for subscription in self._subscriptions:
             subscription.close()
 
     def _remember(self, t_ns: int) -> Frame:
-        """The frame at `t_ns` and its history; frames before a gap are not history of those after it."""
+        """The frame at `t_ns` with its history, which ends at a gap."""
         self._drain(t_ns)
         frame = self._assembler.frame(t_ns)
         if self._recent and self._recent[-1].stamp_ns == t_ns:
@@ -210,7 +210,7 @@ class FrameSampler:
         return attrs.evolve(frame, history=past)
 
     def _drain(self, t_ns: int) -> None:
-        """Move what was received by `t_ns` from the queues to the streams; the rest waits in the bounded queues."""
+        """Move messages received by `t_ns` from the queues to the streams; the others stay in the bounded queues."""
         for subscription in self._subscriptions:
             while (item := self._early.pop(subscription.topic, None) or subscription.get()) is not None:
                 if item.received_ns > t_ns:

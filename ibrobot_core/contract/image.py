@@ -1,4 +1,4 @@
-"""Images: Image messages <-> numpy arrays, for the encodings of sensor_msgs, and resizing without a library."""
+"""Images: conversion of messages to numpy arrays, for the encodings of sensor_msgs, and resizing."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ _LUMA = np.array([299, 587, 114], dtype=np.uint32)
 
 
 def pixels(message: Image) -> NDArray[np.generic]:
-    """The pixels of a message as it encodes them, shape (H, W, C), in native byte order; a view where that suffices.
+    """The pixels of a message in its encoding, shape (H, W, C), in native byte order; a view if possible.
 
     Raises:
-        ContractError: for an unknown encoding, or fewer bytes than its size needs.
+        ContractError: for an unknown encoding, or too few bytes for the size.
     """
     if message.encoding not in ENCODINGS:
         raise ContractError(f"image encoding {message.encoding!r} is not one of: {', '.join(ENCODINGS)}")
@@ -51,14 +51,14 @@ def pixels(message: Image) -> NDArray[np.generic]:
 
 
 def decode_image(message: Image | CompressedImage, spec: ImageSpec) -> NDArray[np.generic]:
-    """The array that the contract asks for: resized, then converted to its encoding.
+    """Decode an image as the contract specifies: resize it, then convert its encoding.
 
     Returns:
-        Shape (H, W, C): uint8 for rgb8, bgr8 and mono8; uint16 for 16UC1 [mm]; float32 for 32FC1 [m]. Depth is 0 where
-        there is no reading: in 32FC1, REP 118 has NaN there, -inf too near and inf too far to measure.
+        Shape (H, W, C): uint8 for rgb8, bgr8 and mono8; uint16 for 16UC1 [mm]; float32 for 32FC1 [m]. Depth is 0 for
+        pixels without a reading, which REP 118 marks in 32FC1 by NaN, -inf (too near) and inf (too far).
 
     Raises:
-        ContractError: for a malformed message, or an encoding that does not become the one asked for.
+        ContractError: for a malformed message, or an encoding that cannot be converted.
     """
     if isinstance(message, CompressedImage):
         message = installed_plugins().decode(message)
@@ -69,11 +69,11 @@ def decode_image(message: Image | CompressedImage, spec: ImageSpec) -> NDArray[n
 
 
 def resize(array: NDArray[np.generic], height: int, width: int) -> NDArray[np.generic]:
-    """An image of another size, the same bits on every machine.
+    """Resize an image, with the same bits on every machine.
 
-    Colours (uint8) are averaged over the area that each new pixel covers, in exact integer arithmetic, half rounded up;
-    enlarged, that repeats pixels. Depth (uint16, float32) is picked from the pixel under the new one's centre:
-    a mean over an edge, or with a pixel that has no reading, would be a surface that is not there.
+    Colours (uint8) are averaged over the area of each new pixel, in exact integer arithmetic, half rounded up; when
+    enlarging, this repeats pixels. Depth (uint16, float32) is taken from the pixel under the new pixel's centre, since
+    a mean over an edge, or with a pixel without a reading, would create a false surface.
 
     Args:
         array: shape (H, W, C).
@@ -82,7 +82,7 @@ def resize(array: NDArray[np.generic], height: int, width: int) -> NDArray[np.ge
     """
     if array.dtype != np.uint8:
         return np.ascontiguousarray(array[_centres(array.shape[0], height)[:, None], _centres(array.shape[1], width)])
-    # Rows first: they are contiguous, and leave less to do for the columns.
+    # Rows first: they are contiguous, and reduce the work for the columns.
     rows = _Cover.of(array.shape[0], height)
     columns = _Cover.of(array.shape[1], width)
     total = rows.units * columns.units
@@ -95,7 +95,7 @@ def resize(array: NDArray[np.generic], height: int, width: int) -> NDArray[np.ge
 
 @attrs.frozen
 class _Cover:
-    """What new pixels cover of the old ones along an axis, in whole units: `units` each, an old pixel being `unit`."""
+    """Coverage of old pixels by new ones along an axis, in whole units: `units` per new and `unit` per old pixel."""
 
     new: int
     units: int
@@ -107,14 +107,14 @@ class _Cover:
         return cls(new, old // divisor, new // divisor)
 
     def sums(self, array: NDArray[Any], axis: int, most: int) -> NDArray[Any]:
-        """Sums along `axis`, each old pixel weighted with its covered units, of the least type that holds `most`."""
+        """Sums along `axis` of old pixels weighted by their covered units, in the smallest type that holds `most`."""
         kind: Any = next(t for t in (np.uint16, np.uint32, np.uint64) if most <= np.iinfo(t).max)
         result: NDArray[Any] = np.zeros([self.new if i == axis else n for i, n in enumerate(array.shape)], dtype=kind)
-        if self.unit == 1:  # whole pixels: neighbours are added, nothing is weighted
+        if self.unit == 1:  # whole pixels: add neighbours without weights
             for k in range(self.units):
                 result += array[(slice(None),) * axis + (slice(k, None, self.units),)]
             return result
-        term = np.empty_like(result)  # fresh pages for every product would cost more than the products
+        term = np.empty_like(result)  # new pages for every product would cost more than the products
         begin = np.arange(self.new, dtype=np.int64) * self.units
         for tap in range(-(-self.units // self.unit) + 1):
             pixel = begin // self.unit + tap
@@ -126,18 +126,18 @@ class _Cover:
 
 
 def _centres(old: int, new: int) -> NDArray[np.intp]:
-    """The old pixel under each new one's centre, shape (new,)."""
+    """The old pixel under the centre of each new pixel, shape (new,)."""
     return ((2 * np.arange(new) + 1) * old // (2 * new)).astype(np.intp)
 
 
 def _convert(array: NDArray[Any], given: str, wanted: str) -> NDArray[Any]:
-    """Pixels of encoding `given` as `wanted`; colours are reordered, alpha goes, grey is BT.601 luma."""
+    """Convert pixels from encoding `given` to `wanted`: reorder colours, drop alpha, use BT.601 luma for grey."""
     if given == wanted == "32FC1":
         return np.where(np.isfinite(array), array, np.float32(0))
     if given == wanted or (given, wanted) == ("mono16", "16UC1"):
         return array
     if array.dtype != np.uint8 or wanted not in ("rgb8", "bgr8", "mono8"):
-        raise ContractError(f"an image encoded as {given} does not become {wanted}; see `image.encoding`")
+        raise ContractError(f"an image encoded as {given} cannot be converted to {wanted}; see `image.encoding`")
     if given == "mono8":
         return np.repeat(array, 3, axis=2)
     rgb = array[..., 2::-1] if given.startswith("bgr") else array[..., :3]

@@ -1,4 +1,4 @@
-"""Joint positions at the edge of datasets and policies: radians, or one of LeRobot's units."""
+"""Conversion of joint positions between radians and LeRobot's units, for datasets and policies."""
 
 from __future__ import annotations
 
@@ -26,30 +26,30 @@ _NUMBERS = ("range_min", "range_max", "inverted")
 
 @attrs.frozen
 class _Elements:
-    """Elements of a vector that are joints' positions of one unit."""
+    """Elements of a vector that are joint positions of one unit."""
 
     indices: NDArray[np.intp]
     mode: str
     calibration: Mapping[str, NDArray[Any]]
-    """What `radians_to_lerobot` takes of it, one number for each element."""
+    """Arguments of `radians_to_lerobot`, one number per element."""
 
 
 class JointUnits:
-    """Converts the joint positions of observations and actions; velocities, efforts and all else stay as they are.
+    """Converts the joint positions of observations and actions; leaves velocities, efforts and all else unchanged.
 
-    `degrees` and `range_m100_100` are LeRobot's units of an arm's joints. A joint that the hardware anchors at its
-    closed end is 0 to 100 in both, as LeRobot has it.
+    `degrees` and `range_m100_100` are LeRobot's units for the joints of an arm. As in LeRobot, a joint that the
+    hardware anchors at its closed end ranges from 0 to 100 in both.
 
     Args:
         norm_mode: one of `units.NORM_MODES`.
-        contract: which elements are joints' positions.
-        calibration: joint -> fields of `JointCalibration`. Numbers of LeRobot alone have 0 rad at the pose, as
-            recordings had that do not say where it is.
-        document: the robot YAML as plain values: which joints are anchored where `calibration` does not have
-            `closed_at`, as in older recordings and where the hardware's plugin is not installed.
+        contract: the contract, which states the elements that are joint positions.
+        calibration: joint -> fields of `JointCalibration`. With LeRobot's fields alone, 0 rad is at the pose, as in
+            old recordings that do not state it.
+        document: the robot YAML as plain values; states the anchored joints if `calibration` has no `closed_at`, as
+            in older recordings, or if the hardware's plugin is not installed.
 
     Raises:
-        CalibrationError: when a joint's calibration is needed and missing.
+        CalibrationError: if the calibration of a joint is needed and missing.
     """
 
     def __init__(
@@ -70,17 +70,17 @@ class JointUnits:
             self._elements[key] = [_elements(mode, named, calibration, closed) for mode, named in modes.items()]
 
     def __call__(self, values: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-        """Radians -> the unit: the values of a tick, or any of them, joints last; arrays that change are copied."""
+        """Convert values of a tick from radians to the unit; joints on the last axis. Copies arrays that change."""
         return {key: self._converted(key, value, radians_to_lerobot) for key, value in values.items()}
 
     def frame(self, frame: Frame) -> Frame:
-        """A frame with its history and its prefix in the unit."""
+        """Convert a frame with its history and prefix to the unit."""
         prefix = None if frame.prefix is None else self._converted(ACTION, frame.prefix, radians_to_lerobot)
         history = tuple(self.frame(each) for each in frame.history)
         return attrs.evolve(frame, values=self(frame.values), prefix=prefix, history=history)
 
     def radians(self, key: str, value: NDArray[Any]) -> NDArray[Any]:
-        """The unit -> radians, of the vectors of one key, joints last."""
+        """Convert the vectors of one key from the unit to radians; joints on the last axis."""
         return self._converted(key, value, lerobot_to_radians)
 
     def _converted(self, key: str, value: NDArray[Any], convert: Callable[..., NDArray[Any]]) -> NDArray[Any]:
@@ -93,12 +93,12 @@ class JointUnits:
 
 
 def calibrations(config: RobotConfig) -> dict[str, dict[str, dict[str, Any]]]:
-    """The calibrations of the hardware in use, by its name, as recordings keep them; nothing for a simulation.
+    """The calibrations of the hardware in use, by its name, as stored in recordings; empty for a simulation.
 
     Each joint has `closed_at`.
 
     Raises:
-        CalibrationError: when one cannot be read.
+        CalibrationError: if a calibration cannot be read.
     """
     return {
         name: with_closed_ends(load_calibration(each.calibration).snapshot(), config)
@@ -108,7 +108,7 @@ def calibrations(config: RobotConfig) -> dict[str, dict[str, dict[str, Any]]]:
 
 
 def with_closed_ends(calibration: Mapping[str, Mapping[str, Any]], config: RobotConfig) -> dict[str, dict[str, Any]]:
-    """A calibration, joint -> fields of `JointCalibration`, with `closed_at` as the robot's hardware has it."""
+    """A calibration, joint -> fields of `JointCalibration`, completed with the hardware's `closed_at`."""
     return {
         joint: {**numbers, "closed_at": config.closed_ends[joint]} if joint in config.closed_ends else dict(numbers)
         for joint, numbers in calibration.items()
@@ -116,7 +116,7 @@ def with_closed_ends(calibration: Mapping[str, Mapping[str, Any]], config: Robot
 
 
 def _position_joints(contract: Contract) -> dict[str, dict[int, str]]:
-    """Key -> element -> joint, of all elements that are a joint's position."""
+    """Key -> element -> joint, for all elements that are joint positions."""
     found: dict[str, dict[int, str]] = {ACTION: dict(enumerate(contract.action_joints))}
     for key in contract.observations:
         at = 0
@@ -144,7 +144,7 @@ def _elements(
 
 
 def _closed_ends(calibration: Mapping[str, Mapping[str, Any]], document: Mapping[str, Any]) -> dict[str, float]:
-    """Joint -> its lower limit [rad], of the joints that are anchored at their closed end."""
+    """Joint -> its lower limit [rad], for joints anchored at their closed end."""
     hardware = document.get("hardware") or {}
     components = [hardware] if "type" in hardware else list(hardware.values())
     anchored = {name for each in components for name in each.get("anchored", ("gripper",))}

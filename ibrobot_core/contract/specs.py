@@ -1,4 +1,4 @@
-"""The contract itself: which observations and actions there are, of what shape, and a stable hash of it."""
+"""The contract: observations, actions and signals with their shapes, and a stable fingerprint."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _IMAGE_DTYPES = {"16UC1": "uint16", "32FC1": "float32"}
 
 @attrs.frozen
 class ObservationPart:
-    """One topic's part of an observation, with everything that the YAML leaves open filled in."""
+    """One topic's part of an observation, with defaults filled in."""
 
     key: str
     topic: str
@@ -32,14 +32,14 @@ class ObservationPart:
     """Paths into the message; none for an image."""
     image: ImageSpec | None
     align: Align
-    """`stamp` is `receive` where the message type has no header."""
+    """Its `stamp` is `receive` for message types without a header."""
     feature: Feature
-    """Of this part alone; a dimension is -1 where only the messages know it."""
+    """Shape of this part alone; -1 for a dimension that only the messages determine."""
 
 
 @attrs.frozen
 class ActionPart:
-    """The part of the action vector that one executor takes."""
+    """The part of the action vector for one executor."""
 
     executor: str
     topic: str
@@ -47,52 +47,52 @@ class ActionPart:
     safety_behavior: str
     joints: tuple[str, ...]
     select: tuple[str, ...] = ()
-    """Paths to the joints' numbers in foreign messages; none where `data` has them, in order."""
+    """Paths to the joints' numbers in foreign messages; empty if `data` has them in order."""
     align: str = "hold"
-    """Which command a tick's action is: `hold`, the newest sent by then; `next`, the first sent after it."""
+    """The command that is a tick's action: `hold`, the newest sent by the tick; `next`, the first sent after it."""
 
 
 @attrs.frozen
 class SignalPart:
-    """A topic that says something of a dataset's rows which no policy sees."""
+    """A topic that fills a column of a dataset that policies do not see."""
 
     key: str
     """`TASK`, `next.reward` or `next.done`."""
     topic: str
     type: str
     path: str
-    """To the text or number in a message."""
+    """Path to the text or number in a message."""
     align: str = "hold"
-    """As an action's."""
+    """As `ActionPart.align`."""
 
     @property
     def feature(self) -> Feature:
-        """The column of a dataset that it fills; a task has a column of its own kind."""
+        """The column of a dataset that it fills, except for a task."""
         return Feature("bool" if self.key == "next.done" else "float32", (1,))
 
 
 @attrs.frozen(slots=False)
 class Contract:
-    """Rate, observations, actions and signals of a robot: what recorder, converter and inference share.
+    """Rate, observations, actions and signals of a robot, shared by recorder, converter and inference.
 
     Units are SI: radians, metres, seconds; vectors are float32, images (H, W, C).
     """
 
     rate_hz: float
     observation_parts: tuple[ObservationPart, ...]
-    """In file order; the parts of one key concatenate."""
+    """Observation parts in file order; the parts of one key concatenate."""
     action_parts: tuple[ActionPart, ...]
-    """In file order; their joints concatenate to the action vector."""
+    """Action parts in file order; their joints concatenate to the action vector."""
     signal_parts: tuple[SignalPart, ...] = ()
-    """Of datasets alone."""
+    """Signals, used only in datasets."""
 
     @classmethod
     def from_config(cls, config: RobotConfig, extra: Sequence[ObservationSpec] = ()) -> Contract:
-        """The contract of a robot YAML, whose rules loading has checked.
+        """The contract of a robot YAML, checked by loading.
 
         Args:
             config: the robot.
-            extra: further observations, e.g. a model's `extra_observations`; under a key that exists they concatenate.
+            extra: further observations, e.g. a model's `extra_observations`; they concatenate under existing keys.
         """
         parts = tuple(_observation(spec, config) for spec in (*config.contract.observations, *extra))
         actions = tuple(_action(spec, config) for spec in config.contract.actions)
@@ -103,13 +103,13 @@ class Contract:
 
     @classmethod
     def from_canonical(cls, canonical: Mapping[str, Any]) -> Contract:
-        """The contract that gave `canonical`, e.g. read back from an episode; of equal fingerprint.
+        """The contract with this `canonical` form, e.g. from an episode; it has the same fingerprint.
 
-        What shapes no data is not in there: the executors, which go by their topics here, and what follows when
-        setpoints go stale.
+        The canonical form lacks what does not affect data: names of executors, which are named by their topics here,
+        and the behaviour for stale setpoints.
 
         Raises:
-            ContractError: when it is not what `canonical` gives.
+            ContractError: if it is not a canonical form.
         """
         try:
             parts = [
@@ -119,36 +119,36 @@ class Contract:
             signals = [SignalPart(**each) for each in canonical.get("signals", ())]
             contract = cls(float(canonical["rate_hz"]), tuple(parts), tuple(actions), tuple(signals))
         except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise ContractError(f"not a contract as it is recorded: {error!r}") from None
+            raise ContractError(f"not a recorded contract: {error!r}") from None
         if canonical.get("version") != contract.canonical()["version"]:
-            raise ContractError(f"a contract of version {canonical.get('version')}, known is 1")
+            raise ContractError(f"a contract of version {canonical.get('version')}; the only known version is 1")
         return contract
 
     @cached_property
     def step_ns(self) -> int:
-        """Time from tick to tick [ns]."""
+        """Time between ticks [ns]."""
         return round(NS_PER_S / self.rate_hz)
 
     @cached_property
     def observations(self) -> Mapping[str, Feature]:
-        """Observation key -> dtype, shape and names, parts concatenated, in file order."""
+        """Observation key -> dtype, shape and names, with parts concatenated, in file order."""
         keys = dict.fromkeys(part.key for part in self.observation_parts)
         return {key: _joined([part.feature for part in self.parts(key)]) for key in keys}
 
     @cached_property
     def action_joints(self) -> tuple[str, ...]:
-        """The joints of the action vector, in its order."""
+        """The joints of the action vector, in order."""
         return tuple(joint for part in self.action_parts for joint in part.joints)
 
     @cached_property
     def topics(self) -> Mapping[str, str]:
-        """Every topic of the contract, observations, actions and signals: topic -> message type."""
+        """Topic -> message type, for all observations, actions and signals."""
         parts: Iterable[ObservationPart | ActionPart | SignalPart]
         parts = (*self.observation_parts, *self.action_parts, *self.signal_parts)
         return {part.topic: part.type for part in parts}
 
     def without_signals(self) -> Contract:
-        """What robots and policies share of it, and what a dataset gives back."""
+        """The contract without signals, as shared by robots and policies."""
         return attrs.evolve(self, signal_parts=())
 
     def parts(self, key: str) -> tuple[ObservationPart, ...]:
@@ -156,15 +156,15 @@ class Contract:
         return tuple(part for part in self.observation_parts if part.key == key)
 
     def features(self) -> dict[str, Feature]:
-        """Columns of a dataset made by this contract, as LeRobot describes them: observations, then `action`."""
+        """Columns of a dataset with this contract, in LeRobot's format: observations, then `action`."""
         names = tuple(f"{joint}.pos" for joint in self.action_joints)
         action = {"action": Feature("float32", (len(names),), names)} if names else {}
         return {**self.observations, **action}
 
     def canonical(self) -> dict[str, Any]:
-        """What shapes the data, as plain JSON values: what `fingerprint` hashes and `difference` compares.
+        """Everything that affects data, as plain JSON values; `fingerprint` hashes and `difference` compares it.
 
-        The order of observation keys shapes nothing and is not hashed; that of the parts of a key and of joints is.
+        The order of observation keys does not affect data and is not hashed; the order of parts and of joints is.
         """
         return {
             "version": 1,
@@ -185,11 +185,11 @@ class Contract:
         return hashlib.sha256(text.encode()).hexdigest()
 
     def difference(self, other: Contract | Mapping[str, Any], names: tuple[str, str] = ("this", "other")) -> str:
-        """What differs in shaping the data, both sides one above the other; empty where the fingerprints are equal.
+        """The differences that affect data, showing both sides; empty if the fingerprints are equal.
 
         Args:
-            other: a contract, or what its `canonical` gave, e.g. read back from a bag.
-            names: what to call the two sides.
+            other: a contract, or its `canonical` form, e.g. from a bag.
+            names: names of the two sides.
         """
         sides = [_flat(self.canonical()), _flat(other.canonical() if isinstance(other, Contract) else other)]
         width = max(len(name) for name in names)
@@ -203,10 +203,10 @@ class Contract:
 
 
 def _observation(spec: ObservationSpec, config: RobotConfig) -> ObservationPart:
-    """Find the paths and the shape of a spec."""
+    """The observation part of a spec, with paths and shape."""
     peripheral = config.peripherals[spec.peripheral] if spec.peripheral is not None else None
     spec = completed(spec, peripheral.kind if peripheral is not None else "")
-    # A picture is a picture, however it is sent.
+    # The type of image message does not affect data.
     type_ = Image.ros_type if spec.type == CompressedImage.ros_type else spec.type
     known = MESSAGE_TYPES.get(type_)
     has_header = known is None or "header" in attrs.fields_dict(known)
@@ -224,7 +224,7 @@ def _vector(key: str, topic: str, type_: str, selection: Selection, align: Align
 
 
 def _recorded_observation(key: str, part: Mapping[str, Any]) -> ObservationPart:
-    """A part as `_canonical` gives it."""
+    """The observation part of a canonical form."""
     align = Align(**part["align"])
     if part["encoding"] is None:
         return _vector(key, part["topic"], part["type"], Selection(part["type"], part["select"]), align)
@@ -276,7 +276,7 @@ def _canonical(part: ObservationPart) -> dict[str, Any]:
 
 
 def _flat(canonical: Mapping[str, Any]) -> dict[str, str]:
-    """One line for each observation and for the action, to print and to compare."""
+    """One line per observation and one for the action, to print and compare."""
     rows = {name: str(canonical[name]) for name in ("version", "units", "rate_hz")}
     for key, parts in canonical["observations"].items():
         for i, part in enumerate(parts):
