@@ -10,7 +10,7 @@ __version__ = "0.1.0"
 
 
 def __getattr__(name: str) -> object:
-    """`hookimpl`, imported when it is asked for: the command's first moments import nothing; see `cli.command`."""
+    """Import `hookimpl` on first use, so that the command starts without imports; see `cli.command`."""
     if name == "hookimpl":
         from ibrobot_core.hookspecs import hookimpl
 

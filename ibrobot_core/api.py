@@ -2,9 +2,9 @@
 
     from ibrobot_core.api import Context, Teleop, TeleopCommand, TeleopDescriptor, hookimpl, option
 
-A name is imported from its module when it is first used, so that a plugin's descriptors load nothing heavy. Names here
-are stable; the page "Public API" of the documentation says what that means. Everything else in `ibrobot_core` may
-change at any time.
+Each name is imported from its module on first use, so that a plugin's descriptors import nothing heavy. Names here
+are stable, as the page "Public API" of the documentation defines. Everything else in `ibrobot_core` may change at any
+time.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 
 
 def _homes() -> dict[str, str]:
-    """Name -> the module that it lives in, by the stub beside this file, which type checkers read."""
+    """Name -> module that defines it, from this module's stub, which type checkers read."""
     stub = ast.parse(Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8"))
     imports = (node for node in stub.body if isinstance(node, ast.ImportFrom))
     return {alias.name: str(node.module) for node in imports for alias in node.names}
@@ -28,7 +28,7 @@ __all__ = list(_HOMES)
 
 
 def home_of(name: str) -> str:
-    """The module that a name of the API lives in."""
+    """The module that defines a name of the API."""
     return _HOMES[name]
 
 

@@ -1,4 +1,4 @@
-"""Bugs, of ibrobot or of a plugin: one line for the terminal, which names the file that has the traceback."""
+"""Reports of bugs in ibrobot or a plugin: one line for the terminal, which names the file with the traceback."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import traceback
 from ibrobot_core.outside import printable
 
 DEBUG = "IBROBOT_DEBUG"
-"""Environment variable that has tracebacks printed, in the processes of a run too; `ibrobot --debug` sets it."""
+"""Environment variable that enables tracebacks in all processes of a run; `ibrobot --debug` sets it."""
 _NOTED = "its traceback is in "
 
 
 def describe_bug(error: BaseException) -> str:
-    """What was raised and where, and the file that has the traceback, which is written once for each error."""
+    """The error, its place, and the file with its traceback, which is written once per error."""
     text = printable("".join(traceback.format_exception(error)))
     message = f"{type(error).__name__}: {error}".strip().removesuffix(":").replace("\n", "; ")
     if os.environ.get(DEBUG):
@@ -27,7 +27,7 @@ def describe_bug(error: BaseException) -> str:
             file, name = tempfile.mkstemp(prefix="ibrobot-", suffix=".log")
             with open(file, "w", encoding="utf-8", errors="backslashreplace") as log:
                 log.write(text)
-        except OSError as full:  # e.g. no space: the terminal is the only place left
+        except OSError as full:  # e.g. no space: print the traceback instead
             sys.stderr.write(text)
             return f"{message} (no file for its traceback: {full.strerror})"
         notes = [f"{_NOTED}{name}"]
@@ -36,7 +36,7 @@ def describe_bug(error: BaseException) -> str:
 
 
 def _place(error: BaseException) -> str:
-    """The package and line that raised; empty for an error that nothing raised."""
+    """The package and line that raised the error; empty for an error that was not raised."""
     frames = traceback.extract_tb(error.__traceback__)
     if not frames:
         return ""

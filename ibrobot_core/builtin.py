@@ -1,4 +1,4 @@
-"""What core itself offers, as plugins do: executor `position`, engine `monolithic`, and `local` for no transport."""
+"""The built-in plugin: executor `position`, engine `monolithic`, and transport `local`, which means none."""
 
 from __future__ import annotations
 
@@ -28,25 +28,25 @@ def _monolithic(options: Any, ctx: Context) -> Engine:
 
 
 def _local(options: Any, ctx: Context) -> Transport:
-    raise NotSupported("transport local leads nowhere: a run with it stays in this process, and asks for none")
+    raise NotSupported("transport local connects to nothing: a run with it stays in this process")
 
 
 @hookimpl
 def ibrobot_executors() -> Iterable[ExecutorDescriptor]:
-    """The one that policies and teleoperation need."""
+    """The executor for policies and teleoperation."""
     yield ExecutorDescriptor(
         type="position", options=PositionOptions, make=_position, streams=True,
-        summary="follows a stream of setpoints; holds when it goes stale",
+        summary="follows a stream of setpoints; holds when they go stale",
     )  # fmt: skip
 
 
 @hookimpl
 def ibrobot_engines() -> Iterable[EngineDescriptor]:
-    """In the host."""
+    """The engine that runs the model in the host process."""
     yield EngineDescriptor(type="monolithic", make=_monolithic, summary="in the host process")
 
 
 @hookimpl
 def ibrobot_transports() -> Iterable[TransportDescriptor]:
-    """The word for none."""
+    """The transport of a run without other machines."""
     yield TransportDescriptor(type="local", make=_local, summary="none: everything stays in this process")

@@ -1,7 +1,7 @@
-"""Child processes: a channel to each, shared memory beside it, an end within a time, and the cause of a death.
+"""Child processes: start them, exchange messages, end them within a time limit, and report why they died.
 
-A child runs `python -m MODULE CHANNEL DESCRIPTOR…`, with descriptors that it inherits. The first message on the channel
-is its order. Its log records come back on the channel, and, where it fails, an event `failed` with the `error`.
+A child runs `python -m MODULE CHANNEL DESCRIPTOR…` and inherits the descriptors. The first message on the channel is
+its order. The child sends its log records on the channel, and an event `failed` with the `error` if it fails.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from typing import Any, override
 from ibrobot_core.errors import ComponentFailed
 
 FAREWELL_S = 1.0
-"""How long a child's last messages wait for a parent that does not read."""
+"""Time for which a child's last messages wait for a parent that does not read [s]."""
 
 
 class Channel:
-    """JSON objects, a line each, over a stream socket; a dead peer raises nothing, it shows in `closed`.
+    """Sends JSON objects as lines over a stream socket. A dead peer raises no error; it sets `closed`.
 
-    Nothing here waits for a peer that does not read, so that a stopped host cannot stop the control loop.
+    `send` never waits for a peer that does not read, so that a stopped host cannot stop the control loop.
     """
 
     def __init__(self, connection: socket.socket) -> None:
@@ -38,21 +38,21 @@ class Channel:
         self._unsent = bytearray()
         self._sending = threading.Lock()
         self.closed = False
-        """Whether the peer is gone."""
+        """Whether the peer has closed the connection or died."""
 
     def fileno(self) -> int:
-        """For `select`."""
+        """The socket's descriptor, for `select`."""
         return self._socket.fileno()
 
     def send(self, message: Mapping[str, Any]) -> None:
-        """Send an object, at once or with a later call as the peer reads; `closed` shows where the peer is gone."""
+        """Send an object without blocking; a later call sends what the peer does not read yet."""
         line = json.dumps(message, separators=(",", ":")).encode() + b"\n"
         with self._sending:
             self._unsent += line
             self._flush()
 
     def flush(self, timeout_s: float = FAREWELL_S) -> None:
-        """Wait up to `timeout_s` [s] for the peer to read what is yet unsent."""
+        """Wait up to `timeout_s` [s] for the peer to read the unsent data."""
         deadline = time.monotonic() + timeout_s
         while self.backlog and not self.closed and (left := deadline - time.monotonic()) > 0:
             select.select([], [self._socket], [], left)
@@ -61,7 +61,7 @@ class Channel:
 
     @property
     def backlog(self) -> int:
-        """Bytes that the peer was not ready to take yet."""
+        """Number of unsent bytes."""
         return len(self._unsent)
 
     def _flush(self) -> None:
@@ -74,7 +74,7 @@ class Channel:
                 self.closed = True
 
     def receive(self) -> list[dict[str, Any]]:
-        """The objects that have arrived whole."""
+        """The objects that have arrived completely."""
         if self._unsent:
             with self._sending:
                 self._flush()
@@ -95,10 +95,10 @@ class Channel:
         return [json.loads(line) for line in lines]
 
     def wait(self, timeout_s: float | None) -> list[dict[str, Any]]:
-        """The objects that arrive within `timeout_s` [s], as soon as there is one; None waits for as long as it takes.
+        """Wait up to `timeout_s` [s], or without limit if None, for at least one object.
 
         Raises:
-            ComponentFailed: when the peer is gone.
+            ComponentFailed: if the peer has closed the connection or died.
         """
         while True:
             messages = self.receive()
@@ -111,66 +111,66 @@ class Channel:
                 return []
 
     def close(self) -> None:
-        """Hang up."""
+        """Close the connection."""
         self.closed = True
         self._socket.close()
 
 
 class Child:
-    """The parent's side: a child process, and the channel to it.
+    """The parent's side of a child process and its channel.
 
     Args:
-        module: what the child runs.
-        order: the first message, to which `host`, the parent's process id, is added.
-        descriptors: what it inherits beside the channel; they stay open here.
+        module: the module that the child runs.
+        order: the first message, completed by `host`, the parent's process id.
+        descriptors: further descriptors for the child; they stay open in the parent.
 
     Attributes:
-        channel: to the child.
-        failed: the event with which it failed; None where it did not say.
+        channel: the channel to the child.
+        failed: the child's event `failed`; None if it has not sent one.
     """
 
     def __init__(self, module: str, order: Mapping[str, Any], *descriptors: int) -> None:
-        ours, theirs = socket.socketpair()
-        with theirs:
-            inherited = (theirs.fileno(), *descriptors)
-            # A session of its own: Ctrl-C in the terminal is for the host, which then ends the child in order.
+        own_end, child_end = socket.socketpair()
+        with child_end:
+            inherited = (child_end.fileno(), *descriptors)
+            # A new session: Ctrl-C in the terminal reaches the host alone, which then ends the child in an orderly way.
             self._process = subprocess.Popen(
                 [sys.executable, "-m", module, *map(str, inherited)],
                 pass_fds=inherited,
                 stdin=subprocess.DEVNULL,
                 start_new_session=True,
             )
-        self.channel = Channel(ours)
+        self.channel = Channel(own_end)
         self.failed: Mapping[str, Any] | None = None
         self._waiting: list[Mapping[str, Any]] = []
         self.channel.send({**order, "host": os.getpid()})
 
     @property
     def pid(self) -> int:
-        """Its process id."""
+        """The process id of the child."""
         return self._process.pid
 
     def receive(self) -> list[Mapping[str, Any]]:
-        """The messages that have arrived, without log records and failures: those are taken care of."""
+        """The messages that have arrived, except log records and failures, which are handled here."""
         messages, self._waiting = self._waiting, []
         return messages + self._sifted(self.channel.receive())
 
     def wait(self, timeout_s: float) -> Mapping[str, Any] | None:
-        """The next such message, if it arrives within `timeout_s` [s].
+        """The next message as in `receive`, or None if none arrives within `timeout_s` [s].
 
         Raises:
-            ComponentFailed: when the child is gone.
+            ComponentFailed: if the child has died.
         """
         if not self._waiting:
             self._waiting = self._sifted(self.channel.wait(timeout_s))
         return self._waiting.pop(0) if self._waiting else None
 
     def kill(self) -> None:
-        """End it at once."""
+        """Kill the child."""
         self._process.kill()
 
     def end(self, timeout_s: float) -> bool:
-        """Wait up to `timeout_s` [s] for its end, and kill it after; whether it had to be killed."""
+        """Wait up to `timeout_s` [s] for the child to end, then kill it; return whether it was killed."""
         try:
             self._process.wait(timeout_s)
         except subprocess.TimeoutExpired:
@@ -180,7 +180,7 @@ class Child:
         return False
 
     def cause(self, timeout_s: float) -> str:
-        """Why it ended, in its own words where it gave any. It is ended as `end` does."""
+        """End the child as `end` does, and return why it ended: its own error if it sent one, else its exit status."""
         self.end(timeout_s)
         if self.failed is not None:
             return str(self.failed["error"])
@@ -201,7 +201,7 @@ class Child:
 
 
 class _ToParent(logging.Handler):
-    """Sends log records to the parent, which owns the terminal; a parent that does not read misses them."""
+    """Sends log records to the parent, which owns the terminal; drops them if the parent does not read."""
 
     def __init__(self, channel: Channel) -> None:
         super().__init__()
@@ -215,7 +215,7 @@ class _ToParent(logging.Handler):
 
 
 def open_parent(descriptor: int) -> Channel:
-    """The child's side: the channel to the parent. From now on log records go there; Ctrl-C is for the parent alone."""
+    """The child's side: open the channel to the parent, send log records there, and leave Ctrl-C to the parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     channel = Channel(socket.socket(fileno=descriptor))
     root = logging.getLogger("ibrobot")

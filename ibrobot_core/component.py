@@ -1,4 +1,4 @@
-"""Components: what a run is made of; each starts, becomes ready, works, and stops, in a thread or in lockstep."""
+"""Components: the parts of a run, which start, become ready, work and stop, in a thread or in lockstep."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from ibrobot_core.bugs import describe_bug
 from ibrobot_core.errors import ComponentFailed, IbrobotError
 
 CONTROL = "control"
-"""Name of the component that owns the hardware. What needs joint states names it in `needs`."""
+"""Name of the component that owns the hardware; components that need joint states list it in `needs`."""
 _POLL_S = 0.1
-"""The longest that a unit of work may wait, so that a stop is seen."""
+"""Longest wait of a unit of work, so that a worker notices a stop [s]."""
 _STOP_TIMEOUT_S = 5.0
-"""How long a unit of work may go on after a stop."""
+"""Time that a unit of work may continue after a stop [s]."""
 
 
 class Component(ABC):
@@ -37,27 +37,27 @@ class Component(ABC):
 
     @abstractmethod
     def start(self) -> None:
-        """Begin, and return when ready.
+        """Start, and return when ready.
 
         Raises:
-            IbrobotError: when it cannot.
+            IbrobotError: if it cannot start.
         """
 
     @abstractmethod
     def stop(self) -> None:
-        """End. Safe to call twice, and after a failed `start`."""
+        """Stop. Safe to call twice, and after a failed `start`."""
 
     def step(self, now_ns: int) -> None:
-        """Lockstep: do what is due at `now_ns` [ns]."""
+        """Lockstep: do the work due at `now_ns` [ns]."""
 
 
 class Worker(Component):
-    """A component that repeats one unit of work: in a thread of its own, or once a tick in lockstep.
+    """A component that repeats a unit of work, in its own thread, or once per tick in lockstep.
 
     Args:
         on_failure: called with the exception that ended the thread.
-        lockstep: no thread; `step` works.
-        ready_timeout_s: how long `start` waits to be ready.
+        lockstep: whether `step` does the work, without a thread.
+        ready_timeout_s: time for which `start` waits until the worker is ready [s].
     """
 
     def __init__(
@@ -74,31 +74,31 @@ class Worker(Component):
         self._ready = threading.Event()
         self._failure: Exception | None = None
         self.on_end = ExitStack()
-        """What `setup` opens it gives a way to close: `on_end.callback(device.close)`. The last is closed first."""
+        """Cleanups registered by `setup`, e.g. `on_end.callback(device.close)`, run in reverse order."""
         self.given_up = threading.Event()
-        """Set when the run ends, so that `start` waits no longer."""
+        """Set when the run ends, so that `start` stops waiting."""
 
     def setup(self) -> None:
-        """Make and open what is needed."""
+        """Create and open the resources that `work` needs."""
 
     @abstractmethod
     def work(self, timeout_s: float) -> None:
-        """Do one unit of work, waiting for it no longer than `timeout_s` [s]."""
+        """Do one unit of work; wait for it at most `timeout_s` [s]."""
 
     def teardown(self) -> None:
-        """Close what `setup` opened; also called when it failed. By default what was given to `on_end` is called."""
+        """Close the resources opened by `setup`, even if it failed. By default, run the callbacks of `on_end`."""
         self.on_end.close()
 
     def pause(self, timeout_s: float) -> None:
-        """Wait `timeout_s` [s], or until the stop."""
+        """Wait `timeout_s` [s], or until a stop."""
         self._end.wait(timeout_s)
 
     def is_ready(self) -> bool:
-        """Whether dependants may start; asked after `setup` and each unit of work."""
+        """Whether dependent components may start; called after `setup` and each unit of work."""
         return True
 
     def not_ready(self) -> str:
-        """Why it is not ready, for the error when it does not become so."""
+        """Why the worker is not ready, for the error after `ready_timeout_s`."""
         return "not ready"
 
     @override
@@ -131,14 +131,14 @@ class Worker(Component):
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join(_STOP_TIMEOUT_S)
             if self._thread.is_alive():
-                raise ComponentFailed(f"{self.name} hangs: still at work {_STOP_TIMEOUT_S:g} s after it was to end")
+                raise ComponentFailed(f"{self.name} hangs: still working {_STOP_TIMEOUT_S:g} s after the stop")
             self._thread = None
         if self._lockstep and self._set_up:
             self._set_up = False
             self.teardown()
 
     def _run(self) -> None:
-        # All workers: one that another program keeps waiting while it holds Python's lock keeps all others waiting.
+        # Raise all workers: one preempted by another program while it holds the GIL would block all others.
         raise_thread_priority()
         try:
             try:
@@ -158,25 +158,26 @@ class Worker(Component):
 
 
 def error_text(error: BaseException) -> str:
-    """An error in words, in as many lines as it has."""
+    """The message of an error, possibly in several lines."""
     return str(error).strip() if isinstance(error, IbrobotError) else describe_bug(error)
 
 
 def error_line(error: BaseException) -> str:
-    """An error on one line."""
+    """The message of an error on one line."""
     return error_text(error).replace("\n", "; ")
 
 
 def exit_code(error: BaseException) -> int:
-    """The exit status of a run that `error` ended."""
+    """The exit status of a run ended by `error`."""
     return error.exit_code if isinstance(error, IbrobotError) else 1
 
 
 def raise_thread_priority() -> None:
-    """Give the calling thread the lowest real-time priority (SCHED_RR), where the machine permits it.
+    """Give the calling thread the lowest real-time priority (SCHED_RR), if the machine permits it.
 
-    It and the threads that it starts then run before all ordinary programs, and after the control loop. For a thread
-    that works for a bounded time and then waits. What was refused is not reported: the control loop does that.
+    The thread and the threads it starts then take precedence over ordinary programs, but not over the control loop.
+    Use it for threads that work for a bounded time and then wait. Refusals are not reported here, but by the control
+    loop.
     """
     with suppress(AttributeError, OSError):
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(os.sched_get_priority_min(os.SCHED_RR)))

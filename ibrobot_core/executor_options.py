@@ -1,4 +1,4 @@
-"""Options of executors that follow setpoints; apart from these so that listing plugins imports no control code."""
+"""Options of executors that follow setpoints, in their own module so that listing plugins imports no control code."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from ibrobot_core.options import documented, option
 class StreamOptions:
     """Options of any executor that follows a stream of setpoints."""
 
-    stale_timeout: float = option(0.25, unit="s", gt=0, help="age of the last setpoint at which it is stale")
+    stale_timeout: float = option(0.25, unit="s", gt=0, help="age at which the last setpoint becomes stale")
     safety_behavior: str = option(
-        "hold", choices=("hold", "relax"), help="what follows when it is stale; the contract's action may say it too"
+        "hold", choices=("hold", "relax"), help="behaviour for stale setpoints, here or in the contract's action"
     )
 
 

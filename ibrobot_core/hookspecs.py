@@ -1,4 +1,4 @@
-"""The hooks. Registering hooks are called once, at discovery, and yield descriptors; event hooks tell what happened.
+"""The hooks. Registration hooks run once, at discovery, and yield descriptors; event hooks report events.
 
 A plugin is a module (or object) named by an entry point of group `ibrobot`:
 
@@ -11,7 +11,7 @@ with functions marked `@ibrobot_core.hookimpl`, each yielding descriptors:
     def ibrobot_teleop():
         yield TeleopDescriptor(type="wave", summary="waves with one joint", options=WaveOptions, make=_make_wave)
 
-An implementation may leave out arguments that it does not need.
+An implementation may omit arguments that it does not need.
 """
 
 from __future__ import annotations
@@ -50,12 +50,12 @@ def ibrobot_policies() -> Iterable[descriptors.PolicyDescriptor]:  # type: ignor
 
 @hookspec
 def ibrobot_engines() -> Iterable[descriptors.EngineDescriptor]:  # type: ignore[empty-body]
-    """Engines: places where the model of a policy runs."""
+    """Engines, which run the model of a policy."""
 
 
 @hookspec
 def ibrobot_executors() -> Iterable[descriptors.ExecutorDescriptor]:  # type: ignore[empty-body]
-    """Executors, ahead of the safety layer in the control process."""
+    """Executors, which run in the control process and send their setpoints to the safety layer."""
 
 
 @hookspec

@@ -1,4 +1,4 @@
-"""Memory that processes share, as an unnamed file that leaves nothing behind; and how glibc keeps what was freed."""
+"""Memory shared between processes, as an unnamed file, and settings of glibc's malloc."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import os
 import tempfile
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
-"""Of `mallopt`, from glibc's malloc.h."""
+"""Parameters of `mallopt`, from glibc's malloc.h."""
 
 
 def create_memory() -> int:
@@ -19,15 +19,15 @@ def create_memory() -> int:
 
 
 def set_malloc(map_from: int, keep: int) -> None:
-    """Say which memory glibc gives back when it is freed; does nothing with another C library.
+    """Set which freed memory glibc returns to the system; does nothing with other C libraries.
 
-    By itself it learns from what was freed, so that memory depends on the order in which threads free.
+    By default, glibc adapts its thresholds, so that memory usage depends on the order in which threads free memory.
 
     Args:
-        map_from: what is at least as large is mapped on its own, and given back at once [bytes]; 32 MiB at most.
-        keep: how much of the smaller may stay free at the end of the heap [bytes].
+        map_from: size from which allocations are mapped separately and returned at once [bytes]; 32 MiB at most.
+        keep: free memory that may stay at the end of the heap [bytes].
 
-    An operator's own `MALLOC_MMAP_THRESHOLD_` stands.
+    A `MALLOC_MMAP_THRESHOLD_` set by the operator takes precedence.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None and "MALLOC_MMAP_THRESHOLD_" not in os.environ:

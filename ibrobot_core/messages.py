@@ -40,13 +40,13 @@ class Message:
     ros_type: ClassVar[str] = ""
 
     def __init_subclass__(cls, ros_type: str = "") -> None:
-        if ros_type:  # attrs makes each class a second time, without it
+        if ros_type:  # attrs creates each class a second time, without `ros_type`
             cls.ros_type = ros_type
 
 
 @attrs.frozen
 class Header:
-    """std_msgs/msg/Header: when and in which frame. `stamp_ns` is `stamp` [ns]."""
+    """std_msgs/msg/Header: time and frame of a message. `stamp_ns` is `stamp` [ns]."""
 
     stamp_ns: int = 0
     frame_id: str = ""
@@ -285,7 +285,7 @@ class TFMessage(Message, ros_type="tf2_msgs/msg/TFMessage"):
 
 @attrs.frozen
 class JointTrajectoryPoint:
-    """trajectory_msgs/msg/JointTrajectoryPoint; arrays (J,), or (0,) where not given; time from the start [ns]."""
+    """trajectory_msgs/msg/JointTrajectoryPoint; arrays (J,), or (0,) if not given; time from the start [ns]."""
 
     time_from_start_ns: int
     positions: NDArray[np.float64] = attrs.field(default=_NOTHING, converter=_float64s, eq=_EQUAL)
@@ -346,7 +346,7 @@ class Variant(Message, ros_type="ibrobot_msgs/msg/Variant"):
 
 @attrs.frozen
 class VariantsList(Message, ros_type="ibrobot_msgs/msg/VariantsList"):
-    """ibrobot_msgs/msg/VariantsList: named tensors that belong to one instant."""
+    """ibrobot_msgs/msg/VariantsList: named tensors of one instant."""
 
     header: Header
     variants: tuple[Variant, ...]
@@ -354,7 +354,7 @@ class VariantsList(Message, ros_type="ibrobot_msgs/msg/VariantsList"):
 
 @attrs.frozen
 class RobotStatus(Message, ros_type="ibrobot_msgs/msg/RobotStatus"):
-    """ibrobot_msgs/msg/RobotStatus: what the robot is doing."""
+    """ibrobot_msgs/msg/RobotStatus: mode, faults and state of the robot."""
 
     header: Header
     robot: str

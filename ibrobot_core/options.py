@@ -1,4 +1,4 @@
-"""Options of plugins and config sections: attrs fields that carry unit, help and range, and check themselves."""
+"""Options of plugins and config sections: attrs fields with unit, help and range, which validate their values."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ class NoOptions:
 
 @attrs.frozen
 class OptionFault:
-    """What is wrong with an option beside the rest of the robot, e.g. a joint that the robot does not have."""
+    """A conflict between an option and the rest of the robot, e.g. a joint that the robot does not have."""
 
     option: tuple[str | int, ...]
-    """The option, and where in it: `("inverted", 1)` is the second item of `inverted`."""
+    """The option, or an item in it: `("inverted", 1)` is the second item of `inverted`."""
     message: str
 
 
 def did_you_mean(word: str, known: Sequence[str], what: str) -> str:
-    """What should have stood for `word`: the nearest of `known`, or all of them."""
+    """A hint for a misspelt `word`: the closest of `known`, or all of them."""
     close = get_close_matches(word, known, 1)
     return f", did you mean {close[0]!r}?" if close else f"; {what}: {', '.join(known) or 'none'}"
 
 
 HIDDEN = "***"
-"""What stands for a secret."""
+"""Text shown in place of a secret."""
 
 
 def _hidden(value: object) -> str:
@@ -66,18 +66,18 @@ def option(
     """An attrs field for an options class.
 
     Args:
-        default: value where the YAML says nothing; none makes the option required.
+        default: default value; without one, the option is required.
         unit: SI unit or word, shown by `ibrobot plugins show` and in the JSON Schema.
-        help: one line that says what it does.
-        ge: least allowed value; `gt`, `le`, `lt` likewise.
-        gt: value that must be exceeded.
-        le: greatest allowed value.
-        lt: value that must not be reached.
+        help: one-line description.
+        ge: lower bound, inclusive.
+        gt: lower bound, exclusive.
+        le: upper bound, inclusive.
+        lt: upper bound, exclusive.
         choices: the allowed values.
-        factory: makes the default, for mutable ones.
-        validator: a further attrs validator; it raises ValueError with what would be right.
-        secret: never shown or written; recordings and `config show` have `${NAME}` as the YAML has it, else `***`.
-        key: what the YAML calls it, where that is not the field's name.
+        factory: creates the default, for mutable values.
+        validator: a further attrs validator; its ValueError states the valid values.
+        secret: whether to hide the value; recordings and `config show` contain `${NAME}` as in the YAML, else `***`.
+        key: the key in the YAML, if it differs from the field's name.
     """
     bounds = {"ge": ge, "gt": gt, "le": le, "lt": lt}
     metadata = {"unit": unit, "help": help, "choices": tuple(choices) if choices is not None else None, **bounds}
@@ -102,7 +102,7 @@ def option(
 
 
 def documented[C](cls: type[C]) -> type[C]:
-    """Class decorator: append what `option` says of each field to the docstring, for `help()` and the API pages."""
+    """Class decorator: add the `help` and `unit` of each option to the docstring, for `help()` and the API pages."""
     lines = [
         f"    {field.alias}: {field.metadata['help']}{unit}."
         for field in attrs.fields(cls)  # type: ignore[arg-type]
@@ -114,18 +114,18 @@ def documented[C](cls: type[C]) -> type[C]:
 
 
 def not_a_key(default: Any = attrs.NOTHING, *, factory: Any = None, repr: bool = True, eq: bool = True) -> Any:
-    """An attrs field of a section's class that loading fills in, and that the file cannot give."""
+    """An attrs field of a section's class that is set by loading, and not a key in the file."""
     default = default if factory is None else attrs.Factory(factory)
     return attrs.field(default=default, metadata={"key": False}, repr=repr, eq=eq)
 
 
 def fields(kind: type[Any]) -> Mapping[str, attrs.Attribute[Any]]:
-    """The keys that an options class takes, with resolved types."""
+    """The keys of an options class, with resolved types."""
     attrs.resolve_types(kind)
     return {str(field.alias): field for field in attrs.fields(kind) if field.init and field.metadata.get("key", True)}
 
 
 def default_of(field: attrs.Attribute[Any]) -> Any:
-    """A field's default, made where it is a factory; `attrs.NOTHING` where it is required."""
+    """The default of a field, created by its factory if it has one; `attrs.NOTHING` if the field is required."""
     default: Any = field.default
     return default.factory() if isinstance(default, attrs.Factory) else default  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""Discovery: plugins found through entry points, each in a manager of its own so that a broken one harms no other."""
+"""Discovery of plugins through entry points, each in its own manager, so that a broken plugin affects no other."""
 
 from __future__ import annotations
 
@@ -48,13 +48,13 @@ KINDS: Mapping[str, str] = {
     "viewer": "ibrobot_viewers",
     "section": "ibrobot_sections",
 }
-"""Plugin kind -> the hook that registers it."""
+"""Plugin kind -> its registration hook."""
 _UNTYPED = ("ibrobot_readers", "ibrobot_decoders", "ibrobot_configs", "ibrobot_commands")
-"""Hooks that register what no section of a YAML names by `type`."""
+"""Registration hooks for objects that the YAML does not name by `type`."""
 
 OFFICIAL = Path(__file__).with_name("official_plugins.json")
-"""What this project's own packages offer: package -> kind -> types; kind `default` has the kinds whose default type the
-package brings. A missing plugin can so be named. `python tests/house/official_plugins.py` writes it."""
+"""The types in this project's packages: package -> kind -> types; kind `default` lists the kinds whose default type the
+package contains. Errors name missing plugins from it. `python tests/house/official_plugins.py` writes it."""
 EXTRAS = Path(__file__).with_name("official_extras.json")
 """Extra of `ibrobot` -> the packages that it installs. `python tests/house/official_plugins.py` writes it."""
 
@@ -63,12 +63,12 @@ _log = logging.getLogger("ibrobot.plugins")
 
 @attrs.frozen
 class Failure:
-    """A plugin that could not be used, and why."""
+    """A plugin that failed to load, and why."""
 
     plugin: str
     package: str
     stage: str
-    """`import`, `hooks` (a misspelt or ill-formed one), or the name of the hook that raised."""
+    """`import`, `hooks` (for a misspelt or malformed hook), or the name of the hook that raised."""
     reason: str
 
     def __str__(self) -> str:
@@ -78,7 +78,7 @@ class Failure:
 
 @attrs.frozen
 class Entry:
-    """A descriptor with where it comes from."""
+    """A descriptor with its plugin and package."""
 
     kind: str
     descriptor: descriptors.Descriptor[Any]
@@ -89,7 +89,7 @@ class Entry:
 
 @attrs.define
 class Registry:
-    """All that the installed plugins offer, and the plugins that failed."""
+    """The descriptors of all installed plugins, and the plugins that failed."""
 
     entries: dict[tuple[str, str], Entry] = attrs.field(factory=dict)
     failures: list[Failure] = attrs.field(factory=list)
@@ -100,7 +100,7 @@ class Registry:
     managers: dict[str, pluggy.PluginManager] = attrs.field(factory=dict)
 
     def types(self, kind: str) -> list[str]:
-        """The types offered of a kind, sorted."""
+        """The available types of a kind, sorted."""
         return sorted(t for k, t in self.entries if k == kind)
 
     def of_kind(self, kind: str) -> list[descriptors.Descriptor[Any]]:
@@ -108,14 +108,14 @@ class Registry:
         return [self.entries[kind, type_].descriptor for type_ in self.types(kind)]
 
     def versions(self) -> dict[str, str]:
-        """Package -> version, of those that offer something, sorted."""
+        """Package -> version of the packages that provide descriptors, sorted."""
         return dict(sorted({entry.package: entry.version for entry in self.entries.values()}.items()))
 
     def find(self, kind: str, type_: str) -> descriptors.Descriptor[Any]:
         """The descriptor of `type_`.
 
         Raises:
-            PluginError: when no installed plugin offers it; says which package would, or which plugin is broken.
+            PluginError: if no installed plugin provides it; names the package to install, or the broken plugin.
         """
         entry = self.entries.get((kind, type_))
         if entry is None:
@@ -123,7 +123,7 @@ class Registry:
         return entry.descriptor
 
     def sections(self, config: RobotConfig) -> Iterator[tuple[descriptors.SectionDescriptor, Any]]:
-        """The plugins' sections that count for a robot, each with its options; None where the file lacks it."""
+        """The plugins' sections for a robot with their options; None for a section that the file lacks."""
         for name in self.types("section"):
             descriptor = self.find("section", name)
             assert isinstance(descriptor, descriptors.SectionDescriptor)
@@ -132,10 +132,10 @@ class Registry:
                 yield descriptor, None if section is None else section.options
 
     def default(self, kind: str) -> str:
-        """The type of a kind that commands take where none is named.
+        """The default type of a kind for commands.
 
         Raises:
-            PluginError: when no installed plugin offers one, or several do; says which package would.
+            PluginError: if none or several of the installed plugins provide a default; names a package to install.
         """
         found = [entry for (k, _), entry in self.entries.items() if k == kind and entry.descriptor.default]
         if len(found) == 1:
@@ -144,10 +144,10 @@ class Registry:
             packages = ", ".join(f"{entry.descriptor.type} ({entry.package})" for entry in found)
             raise PluginError(f"name the type of the {kind}: several plugins offer a default: {packages}")
         package = next(name for name, offers in official_plugins().items() if kind in offers.get("default", ()))
-        raise PluginError(f"no {kind} is named, and no installed plugin offers a default one: pip install {package}")
+        raise PluginError(f"no {kind} is named, and no installed plugin has a default: pip install {package}")
 
     def missing(self, kind: str, type_: str) -> MissingDependency | None:
-        """What this machine lacks for `type_`; None where it lacks nothing. A check that fails is reported too.
+        """The dependency that this machine lacks for `type_`, or None. A check that raises is reported too.
 
         Raises:
             PluginError: as `find`.
@@ -166,11 +166,11 @@ class Registry:
         """A reader of an episode.
 
         Args:
-            path: where it is; `DATASET:N` is episode N, from 0, of a dataset.
-            given: what its metadata is, for one without; see `EpisodeAddress`.
+            path: path of the episode; `DATASET:N` is episode N, from 0, of a dataset.
+            given: metadata for an episode without its own; see `EpisodeAddress`.
 
         Raises:
-            RecorderError: when nothing is there, no installed plugin reads it, or it cannot be read.
+            RecorderError: if the path does not exist, no installed plugin reads its format, or it cannot be read.
         """
         from ibrobot_core.interfaces import EpisodeAddress
 
@@ -186,10 +186,10 @@ class Registry:
         raise RecorderError(f"{path}: not an episode of a known format; installed: {formats or 'none'}{hint}")
 
     def decode(self, picture: CompressedImage) -> Image:
-        """The pixels of a compressed picture.
+        """Decode a compressed image.
 
         Raises:
-            ContractError: when no installed plugin decodes its format, or it is damaged.
+            ContractError: if no installed plugin decodes its format, or the image is damaged.
         """
         for decoder in self.decoders:
             if (image := decoder.make()(picture)) is not None:
@@ -198,7 +198,7 @@ class Registry:
         raise ContractError(f"no installed plugin decodes a {picture.format!r} picture; those decoded are: {formats}")
 
     def not_found(self, kind: str, type_: str) -> PluginError:
-        """Why nothing offers a type, and what to install or mend; a command is of kind `command`."""
+        """The error for an unavailable type or command (kind `command`), with the package to install or to repair."""
         package = next((name for name, offers in official_plugins().items() if type_ in offers.get(kind, ())), None)
         for failure in self.failures:
             if failure.package == package:
@@ -211,11 +211,11 @@ class Registry:
 
     @property
     def broken(self) -> str:
-        """The plugins that failed, to append to the message that something unknown was asked for."""
+        """The plugins that failed, for appending to errors about unknown names."""
         return "".join(f"; {failure}" for failure in self.failures)
 
     def doctor(self) -> list[descriptors.Check]:
-        """The checks of all plugins; a plugin whose check raises is itself a failed check."""
+        """The checks of all plugins; a check that raises becomes a failed check."""
         checks: list[descriptors.Check] = []
         for name, manager in self.managers.items():
             try:
@@ -226,7 +226,7 @@ class Registry:
         return checks
 
     def emit(self, event: str, **facts: Any) -> None:
-        """Call every plugin with an event. One that raises is logged; the others are called all the same."""
+        """Call the event hook of every plugin. Errors are logged and do not affect other plugins."""
         for name, manager in self.managers.items():
             try:
                 getattr(manager.hook, event)(**facts)
@@ -236,13 +236,13 @@ class Registry:
 
 @cache
 def official_plugins() -> Mapping[str, Mapping[str, list[str]]]:
-    """What `OFFICIAL` says."""
+    """The content of `OFFICIAL`."""
     found: dict[str, dict[str, list[str]]] = json.loads(OFFICIAL.read_bytes())
     return found
 
 
 def install_command(packages: Iterable[str]) -> str:
-    """One line that installs packages: the smallest extra of `ibrobot` that has all of several, or their names."""
+    """A command that installs packages: the smallest extra of `ibrobot` that covers several, or their names."""
     wanted = list(dict.fromkeys(packages))
     extras: dict[str, list[str]] = json.loads(EXTRAS.read_bytes())
     covering = [name for name, content in extras.items() if len(wanted) > 1 and set(wanted) <= set(content)]
@@ -252,19 +252,19 @@ def install_command(packages: Iterable[str]) -> str:
 
 
 def example_type(kind: str) -> str:
-    """A type of a kind to show in a message: this project's own default, installed or not."""
+    """A type of a kind as an example for messages: this project's default, even if not installed."""
     return next(offers[kind][0] for offers in official_plugins().values() if kind in offers.get("default", ()))
 
 
 def _reason(error: BaseException) -> str:
     lines = str(error).strip().splitlines()
     if isinstance(error, pluggy.PluginValidationError):
-        return f"{lines[0]}: {lines[-1]}"  # what is wrong comes last
+        return f"{lines[0]}: {lines[-1]}"  # the last line has the cause
     return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
 
 
 def _check_names(plugin: Any) -> None:
-    """Refuse functions that look like hooks but are none, marked or not: a typo would otherwise pass in silence."""
+    """Refuse functions with the name prefix of hooks that are not hooks, so that typos do not go unnoticed."""
     known = {name for name in vars(hookspecs) if name.startswith("ibrobot_")}
     for name in vars(plugin) if isinstance(plugin, ModuleType) else dir(plugin):
         if name.startswith("ibrobot_") and name not in known and hasattr(getattr(plugin, name), "ibrobot_impl"):
@@ -273,7 +273,7 @@ def _check_names(plugin: Any) -> None:
 
 
 def _add(registry: Registry, plugin: str, package: str, version: str, load: Callable[[], Any]) -> None:
-    """Load a plugin and call its registering hooks; one that raises, whether then or in a hook, offers nothing."""
+    """Load a plugin and call its registration hooks; a plugin that raises is registered as a failure."""
     manager = pluggy.PluginManager("ibrobot")
     manager.add_hookspecs(hookspecs)
     offers: dict[str, list[Any]] = {}
@@ -307,10 +307,10 @@ def _add(registry: Registry, plugin: str, package: str, version: str, load: Call
 
 
 def discover(found: Iterable[EntryPoint] | None = None) -> Registry:
-    """Load the built-in plugin and every installed one. Never raises for a plugin's fault: see `Registry.failures`.
+    """Load the built-in plugin and all installed plugins. A plugin's failure raises nothing; see `Registry.failures`.
 
     Args:
-        found: entry points to load; the installed ones of group `ibrobot` when None.
+        found: entry points to load; None for the installed ones of group `ibrobot`.
     """
     from ibrobot_core import __version__, builtin
 

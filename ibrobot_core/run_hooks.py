@@ -4,27 +4,27 @@ from __future__ import annotations
 
 
 class RunHooks:
-    """What a command adds to a run. This one adds nothing."""
+    """A command's additions to a run. The base class adds nothing."""
 
     def step(self) -> None:
-        """Do what is due; called a few times a second, and in lockstep at every tick."""
+        """Do periodic work; called a few times per second, and in lockstep at every tick."""
 
     def key(self, key: str) -> bool:
-        """Act on a key; False for one that has no meaning here."""
+        """Handle a key; return False for an unknown key."""
         return False
 
     def rows(self) -> list[tuple[str, str]]:
-        """Heading and text, for the panel."""
+        """Rows for the panel: heading and text."""
         return []
 
     def line(self) -> str:
-        """For a plain line of status."""
+        """Text for a plain status line."""
         return ""
 
     def help(self) -> str:
-        """The keys, for the panel."""
+        """Help on the keys, for the panel."""
         return ""
 
     def summary_rows(self) -> list[tuple[str, str]]:
-        """Heading and text, for the summary of the run."""
+        """Rows for the summary of the run: heading and text."""
         return []

@@ -1,4 +1,4 @@
-"""Tables and live panels in a terminal: the one way to Rich, in which no text is ever markup."""
+"""Tables and live panels in a terminal, by Rich without markup. All use of Rich goes through this module."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ibrobot_core.outside import printable
 
 
 class Screen(Console):
-    """A console that shows every text as it is: without markup, emoji codes, highlighting or control characters."""
+    """A console that shows text literally: without markup, emoji codes, highlighting or control characters."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**{**options, "markup": False, "emoji": False, "highlight": False})
@@ -22,5 +22,5 @@ class Screen(Console):
 
 
 def styled(value: object, style: str = "", **options: Any) -> Text:
-    """A text with a style, and otherwise as it is; `options` are those of Rich's `Text`."""
+    """A literal text with a style; `options` are those of Rich's `Text`."""
     return Text(printable(str(value)), style, **options)

@@ -35,7 +35,7 @@ type _Read = Callable[[Any], NDArray[np.generic]]
 
 @attrs.frozen
 class Leaf:
-    """One path, resolved: a number, an element of an array, a joint's element, or a whole array."""
+    """A resolved path: a number, an element of an array, a joint's element, or a whole array."""
 
     field: str
     kind: str
@@ -45,22 +45,22 @@ class Leaf:
 
     @property
     def label(self) -> str:
-        """As LeRobot would name it: `shoulder_pan.pos`; else the path itself."""
+        """LeRobot's name if it has one, e.g. `shoulder_pan.pos`; else the path."""
         if self.kind == "joint":
             return f"{self.part}.{_LEROBOT_SUFFIX[self.field]}"
         return f"{self.field}.{self.part}" if self.part else self.field
 
 
 class Selection:
-    """What a spec takes out of its messages, checked against the message's class when it is made.
+    """Extracts numbers from messages; the constructor checks the paths against the message's class.
 
-    `position.shoulder_pan` is looked up in the message's `name`, once for each order of names that is met.
-    `data.0` is an element, `data` the whole array, `orientation` all of its numbers. Without any path it is
-    the numbers of the whole message, or for a JointState the positions of the robot's joints in their order.
+    `position.shoulder_pan` is looked up in the message's `name`, once for each order of names.
+    `data.0` is an element, `data` the whole array, `orientation` all of its numbers. Without paths, the selection has
+    the numbers of the whole message, or for a JointState the positions of the robot's joints in robot order.
 
-    foreign bags define types that core does not know: there every path, e.g. `wrench.force.x` or `tags.0.id`, is
-    looked up in the messages, and leads to one number. So is a path into a list of parts of a known type, e.g.
-    `points.0.positions.2`.
+    Foreign bags define types that core does not know. For these, every path, e.g. `wrench.force.x` or `tags.0.id`, is
+    looked up in the messages and must lead to one number. The same applies to a path into a list of parts of a known
+    type, e.g. `points.0.positions.2`.
 
     Args:
         type_name: the ROS 2 message type, e.g. `sensor_msgs/msg/JointState`.
@@ -68,7 +68,7 @@ class Selection:
         joints: the robot's joints.
 
     Raises:
-        ContractError: for an unknown type without paths, or a path that leads to no number of a known one.
+        ContractError: for an unknown type without paths, or a path that leads to no number of a known type.
     """
 
     def __init__(self, type_name: str, select: Sequence[str] = (), joints: Sequence[str] = ()) -> None:
@@ -84,12 +84,12 @@ class Selection:
             self.paths = tuple(select) or _default(message_type, joints)
             leaves = [leaf for path in self.paths for leaf in _resolve(message_type, path)]
         self.leaves = tuple(leaves)
-        """What each number of the vector is, in its order; one for a whole array."""
+        """One leaf per number of the vector, in order; one for a whole array."""
         unknown = any(leaf.kind == "array" for leaf in leaves)
         self.size = -1 if unknown else len(leaves)
-        """Length of the vector; -1 where a whole array is taken, whose length only the messages know."""
+        """Length of the vector; -1 with a whole array, whose length only the messages determine."""
         self.names: tuple[str, ...] = () if unknown else tuple(leaf.label for leaf in leaves)
-        """One name per element; none where the length is unknown."""
+        """One name per element; empty if the length is unknown."""
         runs = groupby(leaves, lambda leaf: (leaf.kind, leaf.field if leaf.kind not in ("number", "foreign") else ""))
         self._reads = [_reader(kind, list(run)) for (kind, _), run in runs]
 
@@ -97,7 +97,7 @@ class Selection:
         """The vector, float32, shape (size,).
 
         Raises:
-            ContractError: when the message lacks a joint or an element.
+            ContractError: if the message lacks a joint or an element.
         """
         if len(self._reads) == 1:
             return self._reads[0](message).astype(np.float32)
@@ -114,7 +114,7 @@ def _default(message_type: type[Message], joints: Sequence[str]) -> tuple[str, .
 
 
 def _resolve(message_type: type[Any], path: str) -> list[Leaf]:
-    """The leaves that `path` leads to."""
+    """The leaves of `path`."""
     owner: type[Any] = message_type
     tokens = path.split(".")
     for depth, token in enumerate(tokens):
@@ -138,15 +138,15 @@ def _resolve(message_type: type[Any], path: str) -> list[Leaf]:
 
 
 def _part_leaves(part: type[Any], path: str, field: str, rest: str) -> list[Leaf]:
-    """The leaves below an element of a list of parts; how many there are, only the messages know."""
+    """The leaves below an element of a list of parts, whose length only the messages determine."""
     number, _, inner = rest.partition(".")
     if not (number.isascii() and number.isdigit()):
-        raise ContractError(f"{path!r}: {field} is a list, its elements go by number, e.g. {field}.0")
+        raise ContractError(f"{path!r}: {field} is a list; select an element by number, e.g. {field}.0")
     if not inner:
         raise ContractError(f"{path!r} leads to no number, but to a {part.__name__}")
     leaves = _resolve(part, inner)
     if any(leaf.kind == "array" for leaf in leaves):
-        raise ContractError(f"{path!r} is an array, its elements go by number, e.g. {path}.0")
+        raise ContractError(f"{path!r} is an array; select an element by number, e.g. {path}.0")
     return [Leaf(f"{field}.{number}.{leaf.label}", "foreign") for leaf in leaves]
 
 
@@ -158,12 +158,12 @@ def _array_leaf(message_type: type[Any], path: str, field: str, rest: str) -> Le
     if not rest:
         return Leaf(field, "array")
     if not (rest.isascii() and rest.isdigit()):
-        raise ContractError(f"{path!r}: {field} is an array, its elements go by number, e.g. {field}.0")
+        raise ContractError(f"{path!r}: {field} is an array; select an element by number, e.g. {field}.0")
     return Leaf(field, "element", rest)
 
 
 def _reader(kind: str, leaves: list[Leaf]) -> _Read:
-    """Reads a run of leaves of one kind, and one array where they are of arrays."""
+    """A reader for consecutive leaves of one kind and, for arrays, of one array."""
     field = leaves[0].field
     if kind == "foreign":
         paths = [leaf.field.split(".") for leaf in leaves]
@@ -211,25 +211,25 @@ def _element_reader(field: str, elements: list[int]) -> _Read:
 
 
 def _number_at(message: Any, path: Sequence[str]) -> float:
-    """The number that a path leads to in a message whose class nobody knew before."""
+    """The number at a path in a message of a type that only bags define."""
     value = value_at(message, path)
     if isinstance(value, int | float | np.number | np.bool_):
         return float(value)
     if isinstance(value, tuple | list | np.ndarray):
-        raise ContractError(f"{'.'.join(path)!r} leads to {len(value)} elements; they go by number, e.g. .0")
-    there = f"; available: {', '.join(attrs.fields_dict(type(value)))}" if attrs.has(type(value)) else ""
-    raise ContractError(f"{'.'.join(path)!r} leads to no number{there}")
+        raise ContractError(f"{'.'.join(path)!r} leads to {len(value)} elements; select one by number, e.g. .0")
+    fields = f"; available: {', '.join(attrs.fields_dict(type(value)))}" if attrs.has(type(value)) else ""
+    raise ContractError(f"{'.'.join(path)!r} leads to no number{fields}")
 
 
 def value_at(message: Any, path: Sequence[str]) -> Any:
-    """What a path leads to in a message; None where it leads on from a number or text.
+    """The value at a path in a message; None if the path continues beyond a number or text.
 
     Args:
-        message: any message, also of a type that only bags define.
-        path: names of fields, and numbers of elements.
+        message: any message, including types that only bags define.
+        path: names of fields and numbers of elements.
 
     Raises:
-        ContractError: for a field or an element that is not there.
+        ContractError: for a missing field or element.
     """
     value: Any = message
     for depth, token in enumerate(path):

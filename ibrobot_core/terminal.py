@@ -1,4 +1,4 @@
-"""The terminal's keys: one owner of standard input, which decodes what is typed and gives it to all who subscribed."""
+"""Keys of the terminal: one reader of standard input decodes the typed keys and sends them to all subscribers."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from typing import Any
 from ibrobot_core.errors import TeleopError
 
 _ESCAPE_S = 0.05
-"""Time [s] after which an escape that nothing followed was the key and not the beginning of a sequence."""
+"""Time after which a lone escape is the key, not the start of a sequence [s]."""
 
 _NAMED = {" ": "space", "\r": "enter", "\n": "enter", "\t": "tab", "\x7f": "backspace", "\b": "backspace"}
 _LETTERS = {
@@ -32,25 +32,25 @@ _NUMBERS = {
 """First parameter of a sequence that ends with `~` -> key."""
 
 _SEQUENCE = re.compile(rb"\x1b(?:\[\[([A-E])|\[([0-?]*)[ -/]*([@-Z\\-~])|O([A-Za-z]))")
-"""An escape sequence: the Linux console's f1 to f5, a control sequence, or one in application mode."""
+"""An escape sequence: f1 to f5 of the Linux console, a control sequence, or a key in application mode."""
 _BEGINNING = re.compile(rb"\x1b(?:\[(?:\[|[0-?]*[ -/]*)|O)?")
-"""What may yet become one."""
+"""An incomplete escape sequence."""
 
 
 def decode(typed: bytes, *, final: bool) -> tuple[list[str], bytes]:
-    """Turn what a terminal sent into keys.
+    """Decode the bytes sent by a terminal into keys.
 
-    Keys are printable characters as they are, and `space`, `enter`, `tab`, `backspace`, `esc`, `up`, `down`, `left`,
+    Keys are printable characters, and `space`, `enter`, `tab`, `backspace`, `esc`, `up`, `down`, `left`,
     `right`, `home`, `end`, `insert`, `delete`, `page_up`, `page_down`, `f1` to `f12`; modifiers of the named ones are
-    ignored. Unknown sequences, control characters and invalid UTF-8 are ignored. An escape is never lost: where
-    it begins no sequence it is `esc`.
+    ignored. Unknown sequences, control characters and invalid UTF-8 are ignored. An escape that starts no sequence is
+    `esc`.
 
     Args:
-        typed: the bytes, beginning at a key.
-        final: True when nothing follows for now, so that a lone escape is the key.
+        typed: the bytes, starting at a key.
+        final: whether no more bytes follow for now, so that a lone escape is the key.
 
     Returns:
-        The keys, and the bytes of an incomplete last one, to which the next ones belong; none when `final`.
+        The keys, and the bytes of an incomplete last key, to be continued by the next bytes; empty if `final`.
     """
     keys: list[str] = []
     while typed:
@@ -81,7 +81,7 @@ def decode(typed: bytes, *, final: bool) -> tuple[list[str], bytes]:
 
 
 def _character_length(first: int) -> int:
-    """Bytes of a UTF-8 character by its first one; 1 for what cannot begin one."""
+    """Length of a UTF-8 character in bytes, by its first byte; 1 for an invalid first byte."""
     return 2 if 0xC2 <= first < 0xE0 else 3 if 0xE0 <= first < 0xF0 else 4 if 0xF0 <= first < 0xF5 else 1
 
 
@@ -94,10 +94,10 @@ def _sequence_key(console: str, parameters: str, last: str, application: str) ->
 
 
 class KeyReader:
-    """Reads keys from a terminal while open, and gives each to every subscriber.
+    """Reads keys from a terminal while open, and sends each to every subscriber.
 
-    The terminal shows no typed characters meanwhile; Ctrl-C and its like remain signals. Use it as a context manager:
-    the terminal is put back as it was however the block is left.
+    Meanwhile the terminal does not echo typed characters; Ctrl-C and similar keys still send signals. Use it as a
+    context manager, which always restores the terminal.
 
     Args:
         fd: the terminal; standard input by default.
@@ -112,14 +112,14 @@ class KeyReader:
         self._wake: tuple[int, int] = (-1, -1)
 
     def open(self) -> None:
-        """Begin to read.
+        """Start reading.
 
         Raises:
-            TeleopError: when there is no terminal.
+            TeleopError: if standard input is not a terminal.
         """
         if not os.isatty(self._fd):
             raise TeleopError(
-                "keys need a terminal, but standard input is none: start it in one, without a pipe or a '<'"
+                "keys need a terminal, but standard input is not one: start it in a terminal, without a pipe or '<'"
             )
         self._saved = termios.tcgetattr(self._fd)
         self._wake = os.pipe()
@@ -128,7 +128,7 @@ class KeyReader:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop reading and put the terminal back as it was; typed keys not yet read are dropped. Safe to call twice."""
+        """Stop reading, drop unread keys and restore the terminal. Safe to call twice."""
         if self._thread is None:
             return
         thread, self._thread = self._thread, None
@@ -142,7 +142,7 @@ class KeyReader:
                 os.close(end)
 
     def subscribe(self) -> queue.SimpleQueue[str]:
-        """A new queue of the keys typed from now on; it is fed as long as a reference to it exists."""
+        """A new queue of the keys typed from now on, filled while a reference to it exists."""
         subscriber: queue.SimpleQueue[str] = queue.SimpleQueue()
         with self._lock:
             self._subscribers.add(subscriber)

@@ -130,7 +130,7 @@ def test_events_reach_all_though_one_raises(registry: Registry, caplog: pytest.L
 
 
 def test_transport_local_is_the_word_for_none() -> None:
-    with pytest.raises(NotSupported, match="transport local leads nowhere"):
+    with pytest.raises(NotSupported, match="transport local connects to nothing"):
         discover([]).find("transport", "local").make(NoOptions(), host_context())
 
 

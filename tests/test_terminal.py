@@ -180,7 +180,7 @@ def test_a_terminal_that_goes_away_ends_quietly():
 def test_without_a_terminal_it_says_what_to_do():
     out, into = os.pipe()
     try:
-        with pytest.raises(TeleopError, match="need a terminal, but standard input is none: start it in one"):
+        with pytest.raises(TeleopError, match="need a terminal, but standard input is not one: start it in a terminal"):
             KeyReader(out).open()
     finally:
         os.close(out)

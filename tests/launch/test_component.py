@@ -131,7 +131,7 @@ def test_one_that_hangs_is_named_and_left(monkeypatch: pytest.MonkeyPatch):
     probe.start()
     assert probe.worked.acquire(timeout=PATIENCE_S)
     monkeypatch.setattr(module, "_STOP_TIMEOUT_S", 0.01)
-    with pytest.raises(ComponentFailed, match=r"^probe hangs: still at work 0\.01 s after it was to end$"):
+    with pytest.raises(ComponentFailed, match=r"^probe hangs: still working 0\.01 s after the stop$"):
         probe.stop()
     monkeypatch.setattr(module, "_STOP_TIMEOUT_S", PATIENCE_S)
     release.set()

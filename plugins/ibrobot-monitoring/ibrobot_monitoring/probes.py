@@ -17,9 +17,9 @@ from ibrobot_core.api import IbrobotError
 
 _HOST = "127.0.0.1"
 _NAMES = frozenset({"127.0.0.1", "localhost", "[::1]"})
-"""What a client may call this machine: a web page whose name was made to point here calls it otherwise."""
+"""Accepted host names in requests; others come from web pages whose name was redirected to this machine."""
 _REQUEST_S = 2.0
-"""How long a client may take for its request, and for reading the answer [s]."""
+"""Time for a client to send its request and read the answer [s]."""
 _TEXT = "text/plain; charset=utf-8"
 _METRICS = "text/plain; version=0.0.4; charset=utf-8"
 _log = logging.getLogger("ibrobot.metrics")
@@ -27,25 +27,25 @@ _log = logging.getLogger("ibrobot.metrics")
 
 @attrs.frozen(eq=False)
 class Probes:
-    """What a port for monitoring answers. Each function is called in the server's thread."""
+    """Answers of a monitoring port. Each function is called in the server's thread."""
 
     metrics: Callable[[], bytes]
-    """All metrics, in Prometheus' text format 0.0.4."""
+    """Returns all metrics, in Prometheus' text format 0.0.4."""
     unhealthy: Callable[[], str]
-    """Why this process should be replaced; empty where it should not."""
+    """Returns why this process should be restarted; empty if it is healthy."""
     unready: Callable[[], str]
-    """Why it cannot do its work now; empty where it can."""
+    """Returns why this process cannot do its work now; empty if it is ready."""
 
 
 class ProbeServer:
     """Answers `GET /metrics`, `/healthz` and `/readyz` on the loopback interface, one client after another.
 
     Args:
-        port: 0 for any that is free.
-        probes: what to say.
+        port: the port; 0 for any free port.
+        probes: the answers.
 
     Raises:
-        IbrobotError: when the port cannot be had.
+        IbrobotError: if the port is not available.
     """
 
     def __init__(self, port: int, probes: Probes) -> None:
@@ -61,11 +61,11 @@ class ProbeServer:
 
     @property
     def url(self) -> str:
-        """Where it listens."""
+        """The server's URL."""
         return f"http://{_HOST}:{self._server.server_port}/metrics"
 
     def close(self) -> None:
-        """End. Safe to call twice."""
+        """Stop. Safe to call twice."""
         self._server.shutdown()
         self._thread.join()
         self._server.server_close()
@@ -78,12 +78,12 @@ class _Server(HTTPServer):
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """One request; then the connection ends."""
+    """Answers one request per connection."""
 
     probes: Probes
     server_version, sys_version = "ibrobot", ""
     timeout = _REQUEST_S
-    """Of each read and write; a client that sends a byte now and then meets the timer."""
+    """Timeout of each read and write [s]; a timer stops clients that send a byte now and then."""
 
     @override
     def setup(self) -> None:
@@ -101,13 +101,13 @@ class _Handler(BaseHTTPRequestHandler):
         """Answer."""
         hosts = self.headers.get_all("Host", [])
         if len(hosts) != 1 or re.sub(r":\d+$", "", hosts[0]).lower() not in _NAMES:
-            self._say(403, b"this is for clients on this machine: ask for localhost or 127.0.0.1\n")
+            self._reply(403, b"only clients on this machine may connect: use localhost or 127.0.0.1\n")
             return
         try:
-            self._say(*self._answer())
+            self._reply(*self._answer())
         except Exception:  # noqa: BLE001 - contained: what fails here must not end the server
             _log.exception("metrics failed")
-            self._say(500, b"failed; the log says why\n")
+            self._reply(500, b"failed; see the log\n")
 
     def _answer(self) -> tuple[int, bytes, str]:
         match self.path.split("?", 1)[0]:
@@ -121,11 +121,11 @@ class _Handler(BaseHTTPRequestHandler):
                 return 404, b"available: /metrics, /healthz and /readyz\n", _TEXT
 
     def _refuse(self) -> None:
-        self._say(405, b"GET only\n")
+        self._reply(405, b"GET only\n")
 
     do_HEAD = do_POST = do_PUT = do_PATCH = do_DELETE = do_OPTIONS = do_TRACE = _refuse
 
-    def _say(self, status: int, body: bytes, kind: str = _TEXT) -> None:
+    def _reply(self, status: int, body: bytes, kind: str = _TEXT) -> None:
         self.send_response(status)
         self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(len(body)))
@@ -138,7 +138,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.wfile.write(body)
 
     def _give_up(self) -> None:
-        with contextlib.suppress(OSError):  # it may be over already
+        with contextlib.suppress(OSError):  # the connection may already be closed
             self.connection.shutdown(socket.SHUT_RDWR)
 
     @override
