@@ -102,7 +102,7 @@ def test_default_type_is_the_one_whose_descriptor_says_so(site: Site) -> None:
 
 
 def test_missing_default_type_names_the_package_to_install() -> None:
-    with pytest.raises(PluginError, match=r"no recorder is named, .* default one: pip install ibrobot-plugin-mcap"):
+    with pytest.raises(PluginError, match=r"no recorder is named, .* has a default: pip install ibrobot-plugin-mcap"):
         Registry().default("recorder")
 
 

@@ -11,7 +11,7 @@ from ibrobot_core.interfaces.policy import PolicySpec
 
 
 def check_policy(contract: Contract, spec: PolicySpec, norm_mode: str = "radians") -> None:
-    """Compare the observations and actions of a policy with those of the robot.
+    """Compare a policy's observations and actions to the robot's.
 
     Args:
         contract: the contract of the robot, with the model's extra observations.
