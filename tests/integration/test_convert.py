@@ -171,7 +171,7 @@ def test_interrupted_by_the_keyboard_it_says_what_is_kept(bags: Path, tmp_path: 
         told = process.stderr.read()
     assert process.returncode == 130, told
     assert "frames (1 of 4" in first
-    assert "interrupted; finished episodes are kept, and the same command goes on from there" in told
+    assert "interrupted; finished episodes are kept: run the same command again to continue" in told
     assert "Traceback" not in told
     result = run(*arguments, "--json")
     assert result.report["resumed"] >= 1, result.err
@@ -184,7 +184,7 @@ def test_many_with_the_same_fault_are_reported_together(tmp_path: Path) -> None:
     result = run(tmp_path / "bags", "--out", tmp_path / "set")
     (told,) = [line for line in result.err.splitlines() if line.startswith("left out")]
     assert told.count("episode_00000") == 3
-    assert told.count("brings no contract") == 1
+    assert told.count("has no contract") == 1
 
 
 def test_a_bad_episode_is_reported_and_left_out(bags: Path, tmp_path: Path) -> None:
@@ -203,7 +203,7 @@ def test_a_bad_episode_is_reported_and_left_out(bags: Path, tmp_path: Path) -> N
     file.write_bytes(content.replace(b"sensor_msgs/msg/JointState", b"sensor_msgs/msg/Joint\xff\xff\xff\xff\xff"))
     result = run(episodes, "--out", tmp_path / "set")
     assert result.code == 1
-    assert "left out mixed/episode_000002: no message of /wrist, which the contract has; available: " in result.err
+    assert "left out mixed/episode_000002: no message of /wrist, which the contract needs; available: " in result.err
     assert "left out mixed/episode_000004: its contract differs from that of mixed/episode_000001:" in result.err
     assert "left out mixed/episode_000005: " in result.err
     assert "left out mixed/episode_000006: " in result.err
@@ -232,7 +232,7 @@ def test_a_contract_that_differs_from_the_recorded_one_is_refused(bags: Path, tm
     arguments = (bags / "episode_000001", "--config", tmp_path / "robot.yaml", "--out", tmp_path / "set")
     result = run(*arguments)
     assert result.code == 1
-    assert "recorded with another contract; --force-contract takes --config's:" in result.err
+    assert "recorded with another contract; --force-contract uses that of --config:" in result.err
     assert "/wrist" in result.err
     result = run(*arguments, "--force-contract", "--prompt", "x")
     assert result.code == 0, result.err
@@ -284,7 +284,7 @@ def test_appending_takes_what_is_new_and_fits(bags: Path, tmp_path: Path) -> Non
     assert "nothing was added" in again.out
     assert all(digest(out)[name] == known for name, known in before.items() if not name.startswith("meta"))
     otherwise = run(bags, "--out", out, "--append", "--success")
-    assert "was made otherwise: success False, now True" in otherwise.err
+    assert "was made with other settings: success False, now True" in otherwise.err
 
 
 def test_appending_tells_episodes_by_their_content_whatever_they_are_called(tmp_path: Path) -> None:
@@ -296,7 +296,7 @@ def test_appending_tells_episodes_by_their_content_whatever_they_are_called(tmp_
     assert (added.report["episodes"], added.report["passed_over"]) == (1, 0), added.err
     shutil.copytree(tmp_path / "monday", tmp_path / "copy/of_monday")
     twice = run(tmp_path / "copy", tmp_path / "tuesday", "--out", out, "--append")
-    assert twice.err.count("in the dataset already") == 2
+    assert twice.err.count("already in the dataset") == 2
     copied = run(tmp_path / "copy", tmp_path / "monday", "--out", tmp_path / "once", "--json")
     assert [each["passed_over"] for each in copied.report["reports"]] == ["", "is a copy of blocks/episode_000001"]
 
@@ -446,7 +446,7 @@ def test_an_episode_without_a_contract_needs_one(tmp_path: Path) -> None:
     record(tmp_path / "bag", 1, 0.4, contract=None)
     result = run(tmp_path / "bag", "--out", tmp_path / "set")
     assert result.code == 1
-    assert "the episode brings no contract; name the robot YAML that has it by --config" in result.err
+    assert "the episode has no contract; name a robot YAML that has it with --config" in result.err
 
 
 def test_only_episodes_of_an_outcome(tmp_path: Path) -> None:

@@ -303,7 +303,7 @@ class TestTruncatedChunk:
         assert report["finished"] is False
         assert 10 < report["frames"] < 40
         again = run("convert", cut, "--out", tmp_path / "told", "--no-videos", "--missing", "hold")
-        assert f"unfinished cut/episode_000001: its {report['frames']} frames are of what could be read" in again.err
+        assert f"unfinished cut/episode_000001: it has the {report['frames']} frames that could be read" in again.err
 
     def test_repair_makes_it_whole(self, run: Run, cut: Path):
         done = run("episodes", "repair", cut)
@@ -345,7 +345,7 @@ class TestOtherContract:
     def test_convert_back_with_another_contract(self, run: Run, dataset: Path, tmp_path: Path):
         done = run("convert", dataset, "--to", "bag", "--out", tmp_path / "back", "--config", "so101_blind")
         assert done.code == 1
-        assert "was made with another contract than --config's:" in done.err
+        assert "was made with another contract than that of --config:" in done.err
         assert "--config: " in done.err
         assert "dataset: " in done.err
         assert not (tmp_path / "back").exists()
@@ -371,7 +371,7 @@ class TestMissingTopic:
     def test_convert_names_it(self, run: Run, silent: Path, tmp_path: Path):
         done = run("convert", silent, "--out", tmp_path / "set")
         assert done.code == 1
-        assert "no message of /top, /commands, which the contract has; available: /joint_states, /wrist" in done.err
+        assert "no message of /top, /commands, which the contract needs; available: /joint_states, /wrist" in done.err
         assert not (tmp_path / "set").exists()
 
     def test_verify_names_it(self, run: Run, silent: Path):

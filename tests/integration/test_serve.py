@@ -143,7 +143,7 @@ def test_a_server_whose_model_hangs_starts_again(
     tensors = {"x": np.zeros(1)}
     try:
         remote.start()
-        with pytest.raises(PolicyError, match=r"the model hangs: it has been at work on .* more than 0\.5 s"):
+        with pytest.raises(PolicyError, match=r"the model hangs: it has worked on .* more than 0\.5 s"):
             remote.infer(tensors, 1, time.monotonic_ns() + 60_000_000_000)
         assert process.stdout is not None
         served = process.stdout.readline()
@@ -161,7 +161,7 @@ def test_a_server_whose_model_hangs_starts_again(
         out, err = process.communicate(timeout=60)
         assert process.returncode == 0
         assert "1 requests, 1 answered" in out
-        assert "E the server starts again, with the same command line" in err
+        assert "E the server restarts, with the same command line" in err
     finally:
         remote.close()
         network.close()
@@ -176,7 +176,7 @@ def test_a_server_whose_model_hangs_starts_again(
         (("so101_blind", "--model", "other"), "one of scripted_pick"),
         (("nowhere", "--type", "scripted_pick"), "no such folder"),
         ((".", "--type", "nothing_of_this_name"), "nothing_of_this_name"),
-        ((".",), ". is a folder: give the plugin of the model in it"),
+        ((".",), ". is a folder: name the plugin of its model"),
     ],
 )
 def test_a_wrong_command_line_is_reported(

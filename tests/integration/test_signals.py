@@ -137,8 +137,8 @@ def test_signals_shape_the_data_and_do_not_come_back_from_a_dataset(bag: Path, t
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("/instruction", "/nowhere", "no message of /nowhere, which the contract has"),
-        ("/instruction", "/reward, type: std_msgs/msg/Float32", "'data' leads to no text in a std_msgs/msg/Float32"),
+        ("/instruction", "/nowhere", "no message of /nowhere, which the contract needs"),
+        ("/instruction", "/reward, type: std_msgs/msg/Float32", "'data' is not a text in a std_msgs/msg/Float32"),
         ("/reward, align: next", "/reward, select: [value]", "next.reward: /reward.*no field 'value'; available: data"),
         ("/reward, align: next", "/done", "next.reward: /done.* is a std_msgs/msg/Float32, got a std_msgs/msg/Bool"),
     ],

@@ -1,4 +1,4 @@
-"""A robot whose arm and gripper are jogged: what keyboards, gamepads and other jog devices have in common."""
+"""Jog of a robot's arm and gripper, shared by keyboards, gamepads and other jog devices."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from ibrobot_kinematics.mjcf import robot_model
 from ibrobot_kinematics.servo import Servo
 
 _LEVER_M = 0.1
-"""Where twists are compared, a turn of one radian counts as this way [m]."""
+"""Length that corresponds to one radian when twists are compared [m]."""
 
 
 class JogArm:
-    """Where the joints of a robot go from their setpoints, within the limits and speeds of its joints.
+    """Computes the next setpoints of a robot, within the limits and speeds of its joints.
 
-    All vectors of joints are in the robot's order. An arm that rests outside its limits may come in; no joint goes out.
+    All joint vectors are in the robot's order. A joint outside its limits may move inwards; no joint moves outwards.
 
     Args:
         robot: the robot.
-        gripper: its group of joints that is the gripper; all other joints are the arm.
+        gripper: name of the gripper's group of joints; all other joints are the arm.
 
     Attributes:
         robot: the robot.
         arm: names of the arm's joints.
-        gripper: names of the gripper's joints; none where the robot lacks the group.
+        gripper: names of the gripper's joints; empty if the robot lacks the group.
     """
 
     def __init__(self, robot: Robot, gripper: str) -> None:
@@ -38,13 +38,13 @@ class JogArm:
         """The sum of the steps in which the tool moved [ns]."""
 
     def load_model(self, remedy: str) -> None:
-        """Load what `move_tool` needs.
+        """Load the model that `move_tool` needs.
 
         Args:
-            remedy: how to do without it, e.g. `cartesian: false`, for the error.
+            remedy: how to do without the model, for the error, e.g. `cartesian: false`.
 
         Raises:
-            TeleopError: where the robot has no model of its arm, or one that does not fit.
+            TeleopError: when the robot has no model of its arm, or one that does not fit.
         """
         if self.robot.description.mjcf is None:
             raise TeleopError(f"Cartesian jog needs robot.description.mjcf: set it, or {remedy}")
@@ -57,11 +57,11 @@ class JogArm:
 
     @property
     def tool_moves(self) -> bool:
-        """Whether the tool has a velocity from `move_tool`; no twist slows it down to a stop."""
+        """Whether the tool still moves after `move_tool`; zero velocities slow it down to a stop."""
         return self._servo is not None and bool(self._servo.velocity.any())
 
     def stop_tool(self) -> None:
-        """Take the tool to be at rest, e.g. since something else holds the arm."""
+        """Assume that the tool is at rest, e.g. because another component holds the arm."""
         if self._servo is not None:
             self._servo.reset(self._servo.position)
 
@@ -71,11 +71,11 @@ class JogArm:
         return self._bounded(before, before + np.clip(velocity, -most, most) * dt)
 
     def move_towards(self, before: Vector, pose: Vector, speed: float, dt: float) -> Vector:
-        """Setpoints `dt` [s] after `before` on the straight way to `pose`, both [rad], shape (J,), all joints in step.
+        """Setpoints `dt` [s] after `before` on the straight line to `pose`, both [rad], shape (J,).
 
         Args:
             before: the setpoints before.
-            pose: where to go.
+            pose: the target positions.
             speed: of the joints [rad/s].
             dt: the step [s].
         """
@@ -85,13 +85,13 @@ class JogArm:
         return self._bounded(before, before + share * way)
 
     def move_tool(self, before: Vector, linear: Vector, turn: Vector, dt: float) -> Vector:
-        """Setpoints `dt` [s] after `before`, both [rad], shape (J,), where the tool moves, as `Servo` moves it.
+        """Setpoints `dt` [s] after `before`, both [rad], shape (J,), while the tool moves as with `Servo`.
 
         Args:
-            before: the setpoints before. Where they are not those of the last call, the tool begins at rest there.
+            before: the setpoints before. If they differ from those of the last call, the tool starts there at rest.
             linear: velocity of the tool in the base frame [m/s], shape (3,).
-            turn: angular velocity about the tool's own axes [rad/s], shape (3,). The z axis is where the tool points:
-                roll turns about it, pitch about y, and the heading, about x, is held as well as the arm can.
+            turn: angular velocity about the tool's own axes [rad/s], shape (3,). The tool points along z:
+                roll turns about z, pitch about y. The arm holds the heading, about x, as well as it can.
             dt: the step [s].
 
         Raises:
@@ -119,32 +119,33 @@ class JogArm:
 
 @attrs.frozen
 class JogMotion:
-    """What a device asks for at one instant."""
+    """The motion that a device requests at one instant."""
 
     velocity: Vector
-    """Of each joint [rad/s], shape (J,); not of the arm's where the tool moves."""
+    """Of each joint [rad/s], shape (J,); ignored for the arm's joints while the tool moves."""
     linear: Vector = attrs.field(factory=lambda: np.zeros(3))
     """Of the tool, as `JogArm.move_tool` takes it."""
     turn: Vector = attrs.field(factory=lambda: np.zeros(3))
     """Of the tool, as `JogArm.move_tool` takes it."""
     pose: Vector | None = None
-    """Where all joints go instead [rad], shape (J,)."""
+    """Target of all joints, in place of velocities [rad], shape (J,)."""
     pose_speed: float = 0.0
-    """How fast they go there [rad/s]."""
+    """Speed towards the target [rad/s]."""
 
 
 class VelocityJog:
     """Integrates the velocities of a jog device into setpoints.
 
-    - Joints at rest keep their setpoint while the robot is within `follow` of it, and follow the robot beyond: an arm
-      that a person pushes away does not spring back.
-    - What reverses starts over from the measured position: the operator does not wait until a lead is used up.
-    - No setpoint is further from the measured position than `Joint.max_lead`. Where a joint of the arm would be, the
-      tool waits.
+    - Joints at rest keep their setpoint while the robot is within `follow` of it. Beyond, the setpoint follows the
+      robot, so an arm that a person pushes away does not spring back.
+    - A joint that reverses starts from the measured position, so the operator does not wait for the lead to shrink.
+    - No setpoint is further from the measured position than `Joint.max_lead`. The tool waits before a joint of the arm
+      would be.
 
     Args:
         arm: the robot.
-        follow: how far a joint at rest may be from its setpoint [rad]; more than it sags under load, or it creeps.
+        follow: how far a joint at rest may be from its setpoint [rad]. More than
+            its sag under load, or the joint creeps.
     """
 
     def __init__(self, arm: JogArm, follow: float) -> None:
@@ -166,7 +167,7 @@ class VelocityJog:
 
         Args:
             measured: positions of the joints [rad], shape (J,).
-            motion: what the device asks for.
+            motion: the motion that the device requests.
             dt: the step [s].
         """
         if self._setpoint is None:

@@ -38,7 +38,7 @@ _MIB = 1 << 20
 _ONLY_TO_BAG = ("numbers",)
 _ONLY_TO_DATASET = ("append", "type_", "force_contract", "missing", "outcomes", "success", "jobs")
 _MUCH = 0.1
-"""An episode that lost more of its ticks is named."""
+"""The report names episodes that lost a larger share of their ticks."""
 _MISSING = attrs.fields(ConversionRequest).missing.default
 
 
@@ -61,30 +61,35 @@ def _flags_of_writers(command: Callable[..., Any]) -> Callable[..., Any]:
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="The dataset: a new folder.")
 @click.option("--to", type=click.Choice(("dataset", "bag")), default="dataset", show_default=True, help="What to make.")
 @click.option("--episodes", "numbers", metavar="N,N-M", help="Which of a dataset's, from 0; all when left out.")
-@click.option("--append", is_flag=True, help="Add to the dataset that is there what is not in it yet.")
-@click.option("--type", "type_", help="Dataset writer; by default the one that an installed plugin offers as such.")
+@click.option("--append", is_flag=True, help="Add new episodes to an existing dataset.")
+@click.option("--type", "type_", help="Dataset writer; by default that of an installed plugin.")
 @_flags_of_writers
 @click.option("--set", "sets", multiple=True, metavar="OPTION=VALUE", help="Any other option of the dataset writer.")
 @click.option("--config", metavar="CONFIG", help="Robot YAML, or one with a contract alone; for foreign bags.")
-@click.option("--force-contract", is_flag=True, help="Take --config's contract where the recorded one differs.")
-@click.option("--norm-mode", type=click.Choice(NORM_MODES), help="Unit of the dataset's joints, else radians.")
-@click.option("--calibration", metavar="NAME", help="In place of the recorded one, for --norm-mode.")
+@click.option("--force-contract", is_flag=True, help="Use --config's contract even if the recorded one differs.")
+@click.option("--norm-mode", type=click.Choice(NORM_MODES), help="Unit of the dataset's joints; by default radians.")
+@click.option("--calibration", metavar="NAME", help="For --norm-mode, in place of the recorded one.")
 @click.option(
     "--missing", type=click.Choice(MISSING), default=_MISSING, show_default=True,
-    help="Where something is missing: refuse the episode, skip the tick, or hold the last value.",
+    help="If an observation is missing: refuse the episode, skip the tick, or hold the last value.",
 )  # fmt: skip
 @click.option("--outcome", "outcomes", multiple=True, type=click.Choice(OUTCOMES), help="Only these; repeatable.")
 @click.option("--prompt", default="", metavar="TEXT", help="Task of episodes recorded without one.")
 @click.option("--success", is_flag=True, help="Add next.success: true in the last row of a success.")
-@click.option("--jobs", type=click.IntRange(min=1), metavar="N", help="Episodes side by side; one for two CPU cores.")
+@click.option(
+    "--jobs",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="Episodes in parallel; by default half the CPU cores.",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print the report as JSON.")
 @click.pass_context
 def convert(context: click.Context, /, to: str, as_json: bool, **asked: Any) -> None:
-    """Make a dataset for training from recorded episodes, or with --to bag the way back.
+    """Make a dataset for training from recorded episodes, or with --to bag episodes from a dataset.
 
     EPISODES are episodes, folders of them such as episodes/default, or DATASET:N; with --to bag it is one dataset.
-    Interrupted, the same command goes on where it was. An episode that cannot be converted is reported and left out;
-    the command then exits with 1.
+    After an interruption, run the same command again to continue. An episode that cannot be converted is reported and
+    left out; the command then exits with 1.
     """
     given = [name for name in asked if context.get_parameter_source(name) is ParameterSource.COMMANDLINE]
     only_other = _ONLY_TO_BAG if to == "dataset" else (*_ONLY_TO_DATASET, *_flags())
@@ -95,12 +100,12 @@ def convert(context: click.Context, /, to: str, as_json: bool, **asked: Any) -> 
         with wrong_input():
             report = (_to_bags if to == "bag" else _to_dataset)(as_json=as_json, **asked)
     except KeyboardInterrupt:
-        echo("interrupted; finished episodes are kept, and the same command goes on from there", err=True)
+        echo("interrupted; finished episodes are kept: run the same command again to continue", err=True)
         sys.exit(130)
     if as_json:
         echo(json.dumps(report.summary()))
     else:
-        _tell(report)
+        _print_report(report)
     if report.failed or not (report.converted or all(each.passed_over for each in report.episodes)):
         sys.exit(1)
 
@@ -119,7 +124,7 @@ def _to_dataset(
     request = ConversionRequest(
         out, _options("dataset", type_, (*overrides, *sets)), type_,
         outcomes=outcomes or OUTCOMES, jobs=jobs or _jobs(), norm_mode=norm_mode or "radians",
-        **_told(config, calibration), **asked,
+        **_given(config, calibration), **asked,
     )  # fmt: skip
     found = find_episodes(episodes)
     with _progress(len(found), as_json) as watch:
@@ -141,7 +146,7 @@ def _to_bags(
     dataset, recorder = installed_plugins().default("dataset"), installed_plugins().default("recorder")
     writer = make_writer(ConversionRequest(address.path, _options("dataset", dataset, ()), dataset))
     if (summary := writer.summary(address.path)) is None:
-        raise DatasetError(f"{address.path}: there is no dataset of type {dataset}")
+        raise DatasetError(f"{address.path}: not a dataset of type {dataset}")
     chosen = (address.number,) if address.number is not None else _numbers(numbers, summary.episodes)
     robot = _robot(config) if config is not None else None
     request = BagRequest(
@@ -176,7 +181,7 @@ def _numbers(text: str | None, total: int) -> tuple[int, ...]:
 
 
 def _jobs() -> int:
-    """One for two CPU cores: a job decodes while its cameras are encoded beside it."""
+    """One for every two CPU cores: a job decodes images while others are encoded."""
     return max(1, (os.cpu_count() or 1) // 2)
 
 
@@ -193,8 +198,8 @@ def _robot(config: str) -> RobotConfig:
     return load_contract(find_config(config, installed_plugins()))
 
 
-def _told(config: str | None, calibration: str | None) -> dict[str, Any]:
-    """What a robot YAML and a calibration say of the conversion."""
+def _given(config: str | None, calibration: str | None) -> dict[str, Any]:
+    """Fields of the request that come from a robot YAML and a calibration."""
     numbers = _calibration(calibration)
     if config is None:
         return {"calibration": numbers}
@@ -216,7 +221,7 @@ def _calibration(name: str | None) -> Mapping[str, Mapping[str, Any]] | None:
 
 @contextmanager
 def _progress(episodes: int, quiet: bool) -> Iterator[Any]:
-    """What shows how far the conversion is: a bar on a terminal, else a line an episode."""
+    """A function that shows the progress: a bar on a terminal, otherwise one line per episode."""
     begin, done = time.monotonic(), 0
 
     def rate(frames: int) -> str:
@@ -237,8 +242,8 @@ def _progress(episodes: int, quiet: bool) -> Iterator[Any]:
 
     from ibrobot_core.api import Screen, styled
 
-    told, speed = (TextColumn(each, markup=False) for each in ("{task.description}", "{task.fields[rate]}"))
-    with Progress(told, BarColumn(), speed, TimeRemainingColumn(), console=Screen(stderr=True)) as bar:
+    counts, speed = (TextColumn(each, markup=False) for each in ("{task.description}", "{task.fields[rate]}"))
+    with Progress(counts, BarColumn(), speed, TimeRemainingColumn(), console=Screen(stderr=True)) as bar:
         task = bar.add_task(f"0 of {episodes} episodes", total=None, rate="")
 
         def move(frames: int, total: int, report: EpisodeReport | None) -> None:
@@ -259,9 +264,9 @@ def _progress(episodes: int, quiet: bool) -> Iterator[Any]:
         yield move
 
 
-def _tell(report: Report) -> None:
+def _print_report(report: Report) -> None:
     summary = report.summary()
-    for error in dict.fromkeys(each.error for each in report.failed):  # many may have the same
+    for error in dict.fromkeys(each.error for each in report.failed):  # several may have the same error
         sources = ", ".join(each.source for each in report.failed if each.error == error)
         echo(f"left out {sources}: {error}", err=True)
     for each in report.episodes:
@@ -270,7 +275,7 @@ def _tell(report: Report) -> None:
     done = report.converted
     for each in done:
         if not each.finished:
-            echo(f"unfinished {each.source}: its {each.frames} frames are of what could be read", err=True)
+            echo(f"unfinished {each.source}: it has the {each.frames} frames that could be read", err=True)
     if not done:
         echo(f"nothing was added to {report.out}")
         return

@@ -1,4 +1,4 @@
-"""One episode -> a dataset of one episode in the staging folder: what a job does, in any process."""
+"""Conversion of one episode into a staged dataset of one episode; runs in any process."""
 
 from __future__ import annotations
 
@@ -47,12 +47,12 @@ _RECORD = "episode.json"
 type _Row = tuple[dict[str, NDArray[Any]], str]
 """Key -> value, and the task."""
 _VERSION = 3
-"""Of what a unit is made of; older ones are made again."""
+"""Version of the unit format; units of an older one are converted again."""
 
 
 @attrs.frozen
 class Job:
-    """One episode to convert, and the unit that it becomes: a folder that is there whole or not at all."""
+    """One episode to convert, and the folder of its unit, which exists completely or not at all."""
 
     request: ConversionRequest
     episode: Path
@@ -66,7 +66,7 @@ class Unit:
 
     path: Path
     key: str
-    """Of the request and the episode's files: an equal one need not be converted again."""
+    """Hash of the request and the episode's files: a unit with an equal key need not be converted again."""
     report: EpisodeReport
     fps: float
     features: Mapping[str, Feature]
@@ -74,7 +74,7 @@ class Unit:
     robot_type: str
     calibration: Mapping[str, Mapping[str, Any]]
     document: Mapping[str, Any]
-    """The robot YAML as plain values; empty where it is not known."""
+    """The robot YAML as plain values; empty if unknown."""
     recorded: Mapping[str, str]
     """The episode's metadata."""
 
@@ -85,7 +85,7 @@ class Unit:
 
 
 def make_writer(request: ConversionRequest) -> DatasetWriter:
-    """The dataset writer that is asked for.
+    """The dataset writer that the request names.
 
     Raises:
         PluginError: when it is not installed.
@@ -97,7 +97,7 @@ def make_writer(request: ConversionRequest) -> DatasetWriter:
 
 
 def unit_key(job: Job) -> str:
-    """What a unit was made of: the request, as far as it shapes the data, and the episode's files."""
+    """Hash of the input of a unit: the parts of the request that affect the data, and the episode's files."""
     request = job.request
     contract = request.contract.canonical() if request.contract is not None else None
     shaping = [
@@ -113,7 +113,7 @@ def unit_key(job: Job) -> str:
 
 
 def read_unit(path: Path) -> Unit | None:
-    """The unit at `path`; None where there is none."""
+    """The unit at `path`; None if there is none."""
     try:
         record = json.loads((path / _RECORD).read_bytes())
     except FileNotFoundError:
@@ -126,11 +126,11 @@ def read_unit(path: Path) -> Unit | None:
 
 
 def convert_episode(job: Job, progress: Callable[[int], None]) -> EpisodeReport:
-    """Convert an episode into its unit; a fault is named in the report and leaves no files.
+    """Convert an episode into its unit. After a fault, the report has the error and no files remain.
 
     Args:
-        job: what to convert.
-        progress: is called with the frames done since the last time.
+        job: the episode and its unit.
+        progress: called with the number of frames done since the last call.
     """
     making = job.unit.with_name(f"{job.unit.name}.making")
     shutil.rmtree(making, ignore_errors=True)
@@ -158,7 +158,7 @@ def convert_episode(job: Job, progress: Callable[[int], None]) -> EpisodeReport:
 
 
 def unexpected(error: Exception) -> str:
-    """An error that no interface allows, in words, with the place where it was raised."""
+    """The message of an error that no interface allows, with the line that raised it."""
     place = traceback.extract_tb(error.__traceback__)[-1]
     where = f"{Path(place.filename).name}:{place.lineno}"
     return f"{type(error).__name__}: {error} (at {where}): a fault in ibrobot or a plugin; please report it"
@@ -177,7 +177,7 @@ def _write(
     job: Job, key: str, reader: EpisodeReader, summary: EpisodeSummary, report: EpisodeReport, folder: Path,
     progress: Callable[[int], None],
 ) -> Unit:  # fmt: skip
-    """Write the dataset of one episode, and beside it what the unit is."""
+    """Write the dataset of one episode, and the record that describes the unit."""
     request = job.request
     contract = _contract(request, summary)
     document = request.document or _recorded(summary, "config")
@@ -238,7 +238,7 @@ def _add(writer: DatasetWriter, row: _Row, request: ConversionRequest, report: E
 
 
 def _features(contract: Contract, values: Mapping[str, NDArray[Any]], success: bool) -> dict[str, Feature]:
-    """The contract's features, with the sizes that only the messages know, and its signals."""
+    """The contract's features, with the sizes found in the messages, and its signals."""
     features = {key: attrs.evolve(each, shape=values[key].shape) for key, each in contract.features().items()}
     features |= {part.key: part.feature for part in contract.signal_parts if part.key != TASK_KEY}
     return features | ({SUCCESS: Feature("bool", (1,))} if success else {})
@@ -248,21 +248,21 @@ def _contract(request: ConversionRequest, summary: EpisodeSummary) -> Contract:
     recorded = recorded_contract(summary.metadata)
     if request.contract is None:
         if recorded is None:
-            raise ContractError("the episode brings no contract; name the robot YAML that has it by --config")
+            raise ContractError("the episode has no contract; name a robot YAML that has it with --config")
         return recorded
     if recorded is None:
         return request.contract
     if request.contract.fingerprint() != recorded.fingerprint() and not request.force_contract:
         difference = request.contract.difference(recorded, names=("--config", "recorded"))
-        raise ContractError(f"recorded with another contract; --force-contract takes --config's:\n{difference}")
+        raise ContractError(f"recorded with another contract; --force-contract uses that of --config:\n{difference}")
     return request.contract
 
 
 def recorded_contract(metadata: Mapping[str, str]) -> Contract | None:
-    """The contract that an episode was recorded by; None for one without.
+    """The contract of a recorded episode; None if it has none.
 
     Raises:
-        ContractError: when it cannot be read, or is not the one that its fingerprint is of.
+        ContractError: when it cannot be read, or does not match its fingerprint.
     """
     if "contract" not in metadata:
         return None
@@ -271,12 +271,12 @@ def recorded_contract(metadata: Mapping[str, str]) -> Contract | None:
     except (ValueError, RecursionError) as error:
         raise ContractError(f"the recorded contract cannot be read: {error}") from None
     if metadata.get("fingerprint", contract.fingerprint()) != contract.fingerprint():
-        raise ContractError("the recorded contract is damaged: it is not the one that the recorded fingerprint is of")
+        raise ContractError("the recorded contract is damaged: it does not match the recorded fingerprint")
     return contract
 
 
 def _recorded(summary: EpisodeSummary, name: str) -> Mapping[str, Any]:
-    """A JSON object from the episode's metadata; empty where there is none."""
+    """A JSON object from the episode's metadata; empty if there is none."""
     try:
         document = json.loads(summary.metadata.get(name, "{}"))
     except ValueError as error:
@@ -287,7 +287,7 @@ def _recorded(summary: EpisodeSummary, name: str) -> Mapping[str, Any]:
 def _completed(
     calibration: Mapping[str, Mapping[str, Any]], recorded: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, dict[str, Any]]:
-    """A calibration with the recorded joints' `closed_at` where it does not have its own."""
+    """A calibration, completed with the recorded `closed_at` of joints that lack it."""
     ends = {joint: {"closed_at": each["closed_at"]} for joint, each in recorded.items() if "closed_at" in each}
     return {joint: {**ends.get(joint, {}), **numbers} for joint, numbers in calibration.items()}
 
@@ -299,7 +299,7 @@ def _joined(calibrations: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         try:
             Calibration({joint: JointCalibration(**numbers)})
         except (TypeError, ValueError) as error:
-            raise RecorderError(f"the recorded calibration of {joint!r} cannot be true: {error}") from None
+            raise RecorderError(f"the recorded calibration of {joint!r} is invalid: {error}") from None
     return joined
 
 

@@ -1,4 +1,4 @@
-"""What a robot YAML says of episodes and datasets that keep nothing themselves."""
+"""Metadata from a robot YAML, for episodes and datasets without their own."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from ibrobot_core.api import (
 
 
 def load_contract(path: str | Path) -> RobotConfig:
-    """Read and check a robot YAML for its contract, or a file that has a `contract` section alone.
+    """Read and check a robot YAML for its contract, or a file with a `contract` section alone.
 
-    Such a file is for converting foreign bags: its actions have `joints` in place of an executor. Its config is of a
-    robot without a name or joints.
+    Such a file is for converting foreign bags: its actions have `joints` in place of an executor. The robot of its
+    config has no name and no joints.
 
     Raises:
-        ConfigError: with everything that is wrong, in file order.
+        ConfigError: with all errors, in file order.
     """
     document = read_document(path)
     if set(document.root) != {"contract"}:
@@ -55,7 +55,7 @@ def load_contract(path: str | Path) -> RobotConfig:
 def metadata_from_config(
     config: RobotConfig, norm_mode: str | None = None, calibration: Mapping[str, Mapping[str, Any]] | None = None
 ) -> dict[str, str]:
-    """What a robot YAML tells of a dataset that keeps nothing itself; see `EpisodeAddress.given`.
+    """Metadata from a robot YAML, for a dataset without its own; see `EpisodeAddress.given`.
 
     Args:
         config: the robot YAML.

@@ -1,4 +1,4 @@
-"""Which episode of a dataset is which, wherever it lies and whatever it is called."""
+"""Identity of episodes, independent of their folders and names."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from uuid import UUID
 from ibrobot_core.api import DatasetError, EpisodeReader, EpisodeSummary
 
 UUID_KEY = "uuid"
-"""Of the metadata: random where an episode was recorded live, made of the other metadata where it was in lockstep."""
+"""Key of the metadata. The value is random for a live recording, and derived from the other metadata in lockstep."""
 
 
 def identity(reader: EpisodeReader, summary: EpisodeSummary) -> str:
-    """What tells an episode, as it is now, from every other: equal for copies, other for another part of it.
+    """Hash of an episode in its present state: equal for copies, different for another part of it.
 
     A random UUID with counts and stamps identifies it without reading the messages; otherwise their content does.
 
@@ -31,10 +31,10 @@ def identity(reader: EpisodeReader, summary: EpisodeSummary) -> str:
 
 
 class KnownEpisodes:
-    """The episodes that a dataset has.
+    """The episodes in a dataset.
 
     Args:
-        kept: what it keeps of each; see `provenance`.
+        kept: what the dataset stores about each; see `provenance`.
     """
 
     def __init__(self, kept: Iterable[Mapping[str, Any]] = ()) -> None:
@@ -45,18 +45,18 @@ class KnownEpisodes:
         self._empty = not episodes
 
     def find(self, source: str, reader: EpisodeReader, summary: EpisodeSummary) -> str:
-        """Why the episode need not be added; empty where it is new.
+        """Why the episode need not be added; empty if it is new.
 
         Raises:
-            DatasetError: when the dataset has another state of it.
+            DatasetError: when the dataset has the episode in another state.
             RecorderError: when it cannot be read.
         """
         if self._empty:
             return ""
         if (source, summary.start_ns) in self._names:
-            return "in the dataset already, by its name and its start: the dataset is older than episodes' identities"
+            return "already in the dataset, by its name and start: the dataset is older than episodes' identities"
         if identity(reader, summary) in self._identities:
-            return "in the dataset already"
+            return "already in the dataset"
         if (known := self._uuids.get(_random_uuid(summary.metadata))) is not None:
             raise DatasetError(
                 f"the dataset has another state of this episode, as {known}: it was converted before it was finished, "
@@ -66,7 +66,7 @@ class KnownEpisodes:
 
 
 def _random_uuid(metadata: Mapping[str, str]) -> str:
-    """The episode's UUID; empty where it has none, or one that others may have too."""
+    """The episode's UUID; empty if it has none, or one that is not random."""
     try:
         uuid = UUID(metadata.get(UUID_KEY, ""))
     except ValueError:

@@ -20,25 +20,25 @@ from ibrobot_data.words import plural
 
 _MIB = 1 << 20
 _START, _FAILURE, _DISCARD = "tab", "f11", "f12"
-"""The keys; `_START` also ends an episode as a success. None is one that a person jogs with."""
+"""The keys; `_START` also ends an episode as a success. None of them jogs the robot."""
 
 
 class Operator(RunHooks):
-    """What the operator does, or in a run without one the flags: begins episodes, ends them, pauses between them.
+    """Begins and ends episodes, and pauses between them, by the operator's keys or by the flags.
 
     Args:
         run: the run.
         service: begins and ends its episodes.
         count: episodes to record; None: until Ctrl-C.
         reset_time_s: pause after an episode, for setting the scene up again [s].
-        prompt: of all episodes; None asks for it, with Enter for the last one.
-        auto: begin every episode by itself, and end it after the contract's `max_duration_s`. Where the recorder
-            fails, or the disk has no room for another one, the run ends.
-        continuous: one episode, from when everything is there to the end of the run.
-        keys: whether there is a terminal whose keys the operator presses.
+        prompt: of all episodes; None asks the operator, and Enter repeats the last one.
+        auto: begin every episode automatically, and end it after the contract's `max_duration_s`. If the recorder
+            fails, or the disk has no room for another episode, the run ends.
+        continuous: one episode, from the first complete set of messages to the end of the run.
+        keys: whether the run has a terminal for the operator's keys.
 
     Raises:
-        NotSupported: with `continuous` where the mode begins and ends episodes itself, or when nobody can begin one.
+        NotSupported: with `continuous` if the mode begins and ends episodes itself, or if nothing can begin one.
     """
 
     def __init__(
@@ -48,7 +48,7 @@ class Operator(RunHooks):
         if service.by_mode and continuous:
             raise NotSupported(f"--continuous: mode {run.mode} begins and ends its episodes itself")
         if not (service.by_mode or auto or continuous or keys):
-            raise NotSupported("without a terminal nobody can begin an episode: add --auto")
+            raise NotSupported("without a terminal no key can begin an episode: add --auto")
         self._run = run
         self._service = service
         self._count = count
@@ -59,7 +59,7 @@ class Operator(RunHooks):
         self._longest_s = inf if continuous else run.config.contract.max_duration_s
         self._not_before_s = 0.0
         self._typed: str | None = None
-        """What is typed of a prompt; None while nothing is asked."""
+        """The typed part of a prompt; None while none is asked for."""
         self._complaint = ""
 
     def _clock_s(self) -> float:
@@ -67,7 +67,7 @@ class Operator(RunHooks):
 
     @override
     def step(self) -> None:
-        """Do what is due; called a few times a second."""
+        """Begin or end an episode when it is due; called a few times a second."""
         while not self._run.operator_events.empty():
             self._press(self._run.operator_events.get())
         if self._service.by_mode:
@@ -77,7 +77,7 @@ class Operator(RunHooks):
             if service.failure is not None:
                 self._end(lambda: service.stop("unknown"))
                 self._refuse(f"recording ended: {service.failure}")
-                if self._auto:  # nobody is there to put it right
+                if self._auto:  # no operator can correct it
                     self._run.finish()
             elif service.elapsed_s() >= self._longest_s:
                 self._run.log.info("the episode is %g s long (contract.max_duration_s): ended", self._longest_s)
@@ -89,7 +89,7 @@ class Operator(RunHooks):
 
     @override
     def key(self, key: str) -> bool:
-        """Act on a key; False for one that has no meaning here."""
+        """Act on a key; False if the key has no meaning here."""
         if self._service.by_mode or self._continuous:
             return False
         if self._typed is not None:
@@ -107,10 +107,10 @@ class Operator(RunHooks):
         return True
 
     def _press(self, event: OperatorEvent) -> None:
-        """Act on a button of a teleoperation device. It begins an episode under the last prompt: nobody types there."""
+        """Act on a button of a teleoperation device. It begins an episode with the last prompt."""
         service = self._service
         if service.by_mode or self._continuous:
-            self._run.log.warning("%s: this run begins and ends its episodes by itself", event)
+            self._run.log.warning("%s: this run begins and ends its episodes automatically", event)
         elif event == "start":
             self._begin(self._prompt)
         elif not service.running:
@@ -216,7 +216,7 @@ class Operator(RunHooks):
 
     def _refuse(self, why: str) -> None:
         self._complaint = why
-        if self._auto:  # what keeps an episode from being recorded rarely passes at once
+        if self._auto:  # retry after a pause: the cause rarely disappears at once
             self._not_before_s = max(self._not_before_s, self._clock_s() + 1.0)
 
     def _end(self, act: Callable[[], None]) -> None:

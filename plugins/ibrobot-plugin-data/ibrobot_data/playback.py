@@ -1,4 +1,4 @@
-"""The motion in an episode: commanded and measured positions, by time; how near a replay came."""
+"""The motion in an episode: commanded and measured positions over time, and the error of a replay."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from ibrobot_core.api import (
 
 @attrs.frozen(eq=False)
 class Track:
-    """Joint vectors by time."""
+    """Joint vectors over time."""
 
     times: Vector
     """[s], shape (N,), ascending."""
@@ -31,7 +31,7 @@ class Track:
     """[rad], shape (N, J); NaN where a joint was not measured."""
 
     def at(self, times: Vector) -> Vector:
-        """Linear between its vectors, and its first and last beyond them: shape (len(times), J)."""
+        """Positions at times, shape (len(times), J): interpolated; constant before the first and after the last."""
         return np.stack([np.interp(times, self.times, column) for column in self.positions.T], axis=1)
 
 
@@ -43,10 +43,10 @@ class Playback:
     commands: Track
     """Commanded positions."""
     states: Track | None
-    """Where they were; None where the episode has no joint states."""
+    """Measured positions; None if the episode has no joint states."""
     outcome: str
     seed: int | None
-    """Of the scene; None where the episode does not tell."""
+    """Of the scene; None if the episode does not have it."""
 
     @property
     def duration(self) -> float:
@@ -56,10 +56,10 @@ class Playback:
     def tracking(self, measured: Track) -> dict[str, dict[str, float]]:
         """How far a replay was from the recording: joint -> `rms_rad` and `max_rad`.
 
-        Joints, and times, of which the recording has no state are left out.
+        Joints and times without a recorded state are left out.
 
         Args:
-            measured: where the replay was, by the recording's time.
+            measured: positions in the replay, over the recording's time.
         """
         if self.states is None:
             return {}
@@ -81,15 +81,15 @@ def read_playback(reader: EpisodeReader, contract: Contract) -> Playback:
         contract: which topics carry the commands, and of which joints.
 
     Raises:
-        ContractError: for a command of another length than the contract says.
+        ContractError: for a command with another length than in the contract.
         RecorderError: when a topic has no commands, or the episode cannot be read.
     """
     summary = reader.summary()
     present = {topic: each for topic, each in summary.topics.items() if each.count}
     for part in contract.action_parts:
         if part.topic not in present:
-            told = ", ".join(sorted(present)) or "none"
-            raise RecorderError(f"{summary.path}: no message of {part.topic}, so nothing to replay; available: {told}")
+            names = ", ".join(sorted(present)) or "none"
+            raise RecorderError(f"{summary.path}: no message of {part.topic}, so nothing to replay; available: {names}")
     if not contract.action_parts:
         raise RecorderError(f"{summary.path}: its contract has no action, so there is nothing to replay")
     states = next((topic for topic, each in present.items() if each.type == JointState.ros_type), None)

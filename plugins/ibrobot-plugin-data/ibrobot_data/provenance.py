@@ -1,4 +1,4 @@
-"""What a dataset keeps of where it comes from; the readers of dataset plugins read it back."""
+"""Provenance of a dataset, stored in its metadata; the readers of dataset plugins read it."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from ibrobot_data.episode import Unit
 from ibrobot_data.request import ConversionRequest
 
 _KEPT_ONCE = ("contract", "fingerprint", "config", "calibration", "prompt")
-"""What an episode's metadata says that lies elsewhere in the dataset's."""
+"""Keys of an episode's metadata that the dataset stores elsewhere."""
 
 
 def conversion(request: ConversionRequest) -> dict[str, Any]:
-    """What all episodes of a dataset must have been asked for alike."""
+    """The settings that must be equal for all episodes of a dataset."""
     options = attrs.asdict(request.options)
     return {"writer": request.type, "options": options, "norm_mode": request.norm_mode, "success": request.success}
 
 
 def provenance(request: ConversionRequest, old: DatasetSummary | None, units: Sequence[Unit]) -> dict[str, Any]:
-    """What the dataset keeps of its making: contract, robots, calibrations, and where each episode comes from."""
+    """Provenance of the dataset: contract, robots, calibrations, and the source of each episode."""
     before: Mapping[str, Any] = old.metadata if old is not None else {}
     calibrations, configs = dict(before.get("calibrations", {})), dict(before.get("configs", {}))
     episodes = list(before.get("episodes", ()))
@@ -44,7 +44,7 @@ def provenance(request: ConversionRequest, old: DatasetSummary | None, units: Se
 
 
 def _file(kept: dict[str, Any], document: Mapping[str, Any]) -> str:
-    """Keep a document once, under a name that equal ones share; nothing, and no name, for an empty one."""
+    """Store a document once, under a hash of its content, and return this name; empty for an empty document."""
     if not document:
         return ""
     name = hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()[:12]

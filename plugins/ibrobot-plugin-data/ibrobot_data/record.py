@@ -26,8 +26,8 @@ from ibrobot_data.operator import Operator
 @run_options()
 @click.option("--dataset", metavar="NAME", help="Folder of the episodes, below the root.")
 @click.option("--root", type=click.Path(path_type=Path), help="Folder of all datasets.")
-@click.option("--prompt", metavar="TEXT", help="What the task is called; asked for where it is left out.")
-@click.option("--auto", is_flag=True, help="Begin episodes by itself; end them after contract.max_duration_s.")
+@click.option("--prompt", metavar="TEXT", help="Description of the task; asked for if left out.")
+@click.option("--auto", is_flag=True, help="Begin episodes automatically; end them after contract.max_duration_s.")
 @click.option("--continuous", is_flag=True, help="One episode, from the start of the run to its end.")
 @click.option(
     "--reset-time", type=click.FloatRange(min=0), default=0.0, metavar="S", help="Pause between episodes [s]."
@@ -35,10 +35,10 @@ from ibrobot_data.operator import Operator
 def record(config: str | None, dataset: str | None, root: Path | None, **options: Any) -> None:
     """Run a robot and record its episodes as bags.
 
-    CONFIG is a robot YAML as for `ibrobot launch`; where it has no `recording` section, episodes go to
-    episodes/default. In simulation a policy's episodes are recorded unattended, with the scene's own judgement. In all
-    other modes keys begin and end them; without a terminal --auto does, or --continuous records without a break, in
-    files as recording.split_size and recording.split_duration say.
+    CONFIG is a robot YAML as for `ibrobot launch`. If it has no `recording` section, episodes go to episodes/default.
+    In simulation a policy's episodes begin and end by themselves, and the scene decides on success. In all other modes
+    keys begin and end them. Without a terminal, use --auto, or --continuous for one episode without a break;
+    recording.split_size and recording.split_duration divide it into files.
 
     Exits as `ibrobot launch` does.
     """
@@ -67,7 +67,7 @@ def record(config: str | None, dataset: str | None, root: Path | None, **options
 
 
 def _recorded(config: str | None, dataset: str | None, root: Path | None, options: dict[str, Any]) -> RobotConfig:
-    """The robot of a YAML, with a section `recording` where the YAML has none."""
+    """The robot of a YAML, with a section `recording` added if the YAML has none."""
     registry = installed_plugins()
     path = find_config(config, registry)
     changes = run_overrides(options)

@@ -43,30 +43,30 @@ _MODE = "replay"
 @run_options("config", "sim", "lockstep")
 @click.option(
     "--speed", type=click.FloatRange(min=0, min_open=True), default=1.0, show_default=True, metavar="X",
-    help="Seconds of the recording in a second.",
+    help="Seconds of the recording per second.",
 )  # fmt: skip
-@click.option("--force-contract", is_flag=True, help="Replay where only the observations of CONFIG differ.")
-@click.option("--norm-mode", type=click.Choice(NORM_MODES), help="Unit of joints in a dataset that does not say it.")
-@click.option("--calibration", metavar="NAME", help="Of such a dataset, where its unit needs one.")
+@click.option("--force-contract", is_flag=True, help="Replay even if the observations of CONFIG differ.")
+@click.option("--norm-mode", type=click.Choice(NORM_MODES), help="Unit of joints in a dataset that does not state it.")
+@click.option("--calibration", metavar="NAME", help="Of such a dataset, if its unit needs one.")
 @run_options("overrides", "window", "headless", "dry_run", "as_json")
 def replay(
     episode: Path, config: str | None, speed: float, force_contract: bool, norm_mode: str | None,
     calibration: str | None, **options: Any,
 ) -> None:  # fmt: skip
-    """Play the commands of a recorded EPISODE, and tell how near the joints came to the recorded ones.
+    """Play the commands of a recorded EPISODE, and compare the joints with the recorded ones.
 
     EPISODE is a folder such as episodes/pick/episodes/episode_000001, or DATASET:N, episode N from 0 of a dataset.
-    CONFIG is a robot YAML as for `ibrobot launch`; the one that the episode was recorded with when left out. The robot
-    goes slowly to where the episode begins, follows its commands by their times, within the limits of the safety layer,
-    and stops. With --sim the scene is set up by the recorded seed.
+    CONFIG is a robot YAML as for `ibrobot launch`; by default the recorded one. The robot moves slowly to the first
+    command, follows the commands at their times, within the limits of the safety layer, and stops. With --sim the
+    recorded seed sets up the scene.
 
-    Exits as `ibrobot launch` does; with 3 where the recorded episode was a success in its scene and this one is not.
+    Exits as `ibrobot launch` does; with 3 if the recorded episode succeeded in its scene and the replay does not.
     """
     changes, sim = run_overrides(options), options["sim"]
     robot = _named(config, changes, sim=sim) if config is not None else None
     numbers = load_calibration(calibration).snapshot() if calibration is not None else None
-    told = metadata_from_config(robot, norm_mode, numbers) if robot is not None else None
-    with wrong_input(), closing(installed_plugins().open_episode(episode, told)) as reader:
+    given = metadata_from_config(robot, norm_mode, numbers) if robot is not None else None
+    with wrong_input(), closing(installed_plugins().open_episode(episode, given)) as reader:
         summary = reader.summary()
         robot = robot or _recorded(summary, changes, sim=sim)
         contract = Contract.from_config(robot)
@@ -85,14 +85,14 @@ def replay(
 
 
 def _without_sensors(robot: RobotConfig) -> RobotConfig:
-    """The robot without cameras and other sensors, and without the observations of these: a replay needs none."""
+    """The robot without cameras and other sensors, and without their observations: a replay needs none."""
     observations = tuple(spec for spec in robot.contract.observations if spec.peripheral is None)
     contract = attrs.evolve(robot.contract, observations=observations)
     return attrs.evolve(robot, peripherals={}, contract=contract, recording=None)
 
 
 def _named(config: str, changes: tuple[str, ...], *, sim: bool) -> RobotConfig:
-    """The robot of a YAML, with one mode more: that of the replay."""
+    """The robot of a YAML, with the mode of the replay added."""
     registry = installed_plugins()
     path = find_config(config, registry)
     robot = load_config(path, overrides=changes, sim=sim, registry=registry)
@@ -100,10 +100,10 @@ def _named(config: str, changes: tuple[str, ...], *, sim: bool) -> RobotConfig:
 
 
 def _recorded(summary: EpisodeSummary, changes: tuple[str, ...], *, sim: bool) -> RobotConfig:
-    """The robot that an episode was recorded with, likewise."""
+    """The robot of a recorded episode, with the mode of the replay added."""
     text = summary.metadata.get("config")
     if text is None:
-        raise RecorderError(f"{summary.path}: brings no robot YAML; name one: ibrobot replay {summary.path} CONFIG")
+        raise RecorderError(f"{summary.path}: has no robot YAML; name one: ibrobot replay {summary.path} CONFIG")
     try:
         document = json.loads(text)
     except ValueError as error:
@@ -120,7 +120,7 @@ def _mode(robot: RobotConfig) -> str:
 
 
 def _check(contract: Contract, summary: EpisodeSummary, name: str, *, force: bool) -> None:
-    """Check that the episode was recorded with this contract; one without its own goes by CONFIG's."""
+    """Check that the episode was recorded with this contract; an episode without its own uses that of CONFIG."""
     try:
         recorded = recorded_contract(summary.metadata)
     except ContractError as error:

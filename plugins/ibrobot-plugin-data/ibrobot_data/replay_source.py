@@ -1,4 +1,4 @@
-"""Replay: gives control the commands of a recorded episode, after a slow way to the first of them."""
+"""Replay: sends control the commands of a recorded episode, after a slow approach to the first."""
 
 from __future__ import annotations
 
@@ -21,30 +21,30 @@ from ibrobot_core.api import (
 from ibrobot_data.playback import Playback, Track
 
 _APPROACH_SPEED = 0.5
-"""Greatest speed on the way to the first command [rad/s]; `max_velocity` bounds it too."""
+"""Maximum speed of the approach to the first command [rad/s]; `max_velocity` also limits it."""
 _PEAK_SPEED, _PEAK_ACCELERATION = 1.5, 6.0
-"""Greatest first and second derivative of `_ease`."""
+"""Maximum first and second derivative of `_ease`."""
 _AHEAD_NS = NS_PER_S
-"""How much of the motion control is given at a time [ns]."""
+"""Duration of the motion that one plan covers [ns]."""
 _SETTLE_NS = NS_PER_S
-"""How long a scene may take to succeed after the last command, where it did in the recording [ns]."""
+"""How long a scene may take to succeed after the last command, if the recording succeeded [ns]."""
 
 
 @attrs.frozen(eq=False)
 class Replay:
-    """What is to be replayed, and how fast."""
+    """An episode to replay, and its speed."""
 
     source: str
-    """What the user calls it."""
+    """The episode's name on the command line."""
     playback: Playback
     speed: float = 1.0
-    """Seconds of the recording in a second."""
+    """Seconds of the recording per second."""
 
 
 class ReplaySource(SourceWorker):
-    """Plays an episode once, and ends the run. The commands go the way of a teleop's, through executors and safety.
+    """Plays an episode once, and ends the run. Its commands pass through executors and safety, as those of a teleop.
 
-    In simulation the scene is set up by the recorded seed first. A fault ends the replay.
+    In simulation the recorded seed sets up the scene first. A fault ends the replay.
     """
 
     autonomous = True
@@ -56,12 +56,12 @@ class ReplaySource(SourceWorker):
         self._columns = session.config.robot.indices(replay.playback.joints)
         self._states: Subscription | None = None
         self._begun_ns: int | None = None
-        """When the way to the first command began [ns]; None before."""
+        """When the approach began [ns]; None before."""
         self._rows: Vector = np.empty((0, 0))
-        """One setpoint for each control period from then on [rad], shape (N, J)."""
+        """One setpoint for each control period since then [rad], shape (N, J)."""
         self._approach_ns = 0
         self._sent = 0
-        """Rows that control has."""
+        """Number of rows sent to control."""
         self._measured: list[tuple[int, Vector]] = []
         self._success: bool | None = None
 
@@ -98,7 +98,7 @@ class ReplaySource(SourceWorker):
         elapsed_ns = state.stamp_ns - self._begun_ns
         here, ahead = elapsed_ns // self._period_ns, _AHEAD_NS // self._period_ns
         if 0 < self._sent <= here and self._sent < len(self._rows):
-            # This side was held up until control had nothing left: go on from where that holds, and cut nothing out.
+            # This side was delayed until control had no setpoints left: continue where control holds, and skip none.
             pause_ns = (here - self._sent + 1) * self._period_ns
             self._begun_ns += pause_ns
             elapsed_ns -= pause_ns
@@ -116,7 +116,7 @@ class ReplaySource(SourceWorker):
         self._end_when_done(elapsed_ns - (len(self._rows) - 1) * self._period_ns)
 
     def _setpoints(self, begin: Vector) -> Vector:
-        """The way to the first command from `begin` [rad], shape (J,), and the commands, at every control period."""
+        """The approach from `begin` [rad], shape (J,), and the commands, one row for each control period."""
         playback, session = self._replay.playback, self.session
         away = playback.commands.positions[0] - begin
         robot = session.config.robot
@@ -162,7 +162,7 @@ class ReplaySource(SourceWorker):
         return {"replay": self.report()}
 
     def report(self) -> dict[str, Any]:
-        """What became of it, as JSON values."""
+        """The result, as JSON values."""
         replay = self._replay
         tracking = {}
         if self._measured:

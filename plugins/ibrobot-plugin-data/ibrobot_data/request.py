@@ -1,4 +1,4 @@
-"""What is asked of a conversion, and what it tells at its end."""
+"""The request for a conversion, and its report."""
 
 from __future__ import annotations
 
@@ -20,23 +20,22 @@ class ConversionRequest:
     """One conversion. Equal requests over equal episodes give equal bytes, whatever the number of jobs."""
 
     out: Path
-    """Where the dataset is or shall be."""
+    """The dataset's folder."""
     options: Any
     """Of the dataset writer."""
     type: str
     """Of the dataset writer."""
     contract: Contract | None = None
-    """In place of the recorded ones; episodes that were not recorded by ibrobot need it."""
+    """Replaces the recorded ones; episodes that ibrobot did not record need it."""
     document: Mapping[str, Any] | None = None
-    """The robot YAML that `contract` is of, as plain values."""
+    """The robot YAML of `contract`, as plain values."""
     force_contract: bool = False
     """Whether `contract` may differ from the recorded ones."""
     calibration: Mapping[str, Mapping[str, Any]] | None = None
-    """Joint -> fields of `JointCalibration`, in place of the recorded ones."""
+    """Joint -> fields of `JointCalibration`; replaces the recorded ones."""
     norm_mode: str = option("radians", choices=NORM_MODES)
     missing: str = option("skip", choices=MISSING)
-    """What a tick is worth at which something is missing: the episode is refused, the tick left out, or the last
-    value held."""
+    """How to treat a tick with a missing observation: refuse the episode, skip the tick, or hold the last value."""
     outcomes: tuple[str, ...] = OUTCOMES
     """Episodes of other outcomes are passed over."""
     prompt: str = ""
@@ -44,9 +43,9 @@ class ConversionRequest:
     success: bool = False
     """Whether to add `next.success`: true at the last row of a successful episode."""
     append: bool = False
-    """Whether `out` may have a dataset that grows."""
+    """Whether to add to a dataset in `out`."""
     jobs: int = option(1, ge=1)
-    """Episodes converted side by side, each in a process of its own."""
+    """Episodes converted in parallel, each in its own process."""
 
 
 def _pairs(lists: Iterable[Iterable[int]]) -> tuple[tuple[int, int], ...]:
@@ -56,7 +55,7 @@ def _pairs(lists: Iterable[Iterable[int]]) -> tuple[tuple[int, int], ...]:
 
 @attrs.frozen
 class EpisodeReport:
-    """What became of one episode."""
+    """Result for one episode."""
 
     source: str
     """`DATASET/EPISODE`, or the folder's name."""
@@ -66,27 +65,27 @@ class EpisodeReport:
     cuts: tuple[tuple[int, int], ...] = attrs.field(default=(), converter=_pairs)
     """Where ticks were left out: the number of the row that follows, from 0, and how many ticks."""
     held: int = 0
-    """Ticks at which something was missing and its last value stands."""
+    """Ticks with a missing observation, at which its last value was held."""
     gaps: Mapping[str, int] = attrs.field(factory=dict)
     """Key -> how often it went missing."""
     resets: Mapping[str, int] = attrs.field(factory=dict)
     """Topic -> how often its stamps jumped."""
     lost: Mapping[str, int] = attrs.field(factory=dict)
-    """Topic -> messages that the recorder says it lost."""
+    """Topic -> messages that the recorder lost by its own count."""
     missing: Mapping[str, int] = attrs.field(factory=dict)
-    """Topic -> messages that were recorded and that cannot be read any more."""
+    """Topic -> recorded messages that can no longer be read."""
     finished: bool = True
-    """False where its recorder was killed, or the file was cut: it has what could be read."""
+    """False if its recorder was killed or the file was cut off; the episode then has the readable part."""
     outcome: str = "unknown"
     prompt: str = ""
     start_ns: int = 0
     """Of the episode's first message [ns]."""
     identity: str = ""
-    """What tells the episode from others; see `identity`."""
+    """Hash that identifies the episode; see `identity`."""
     error: str = ""
-    """Why it was left out; empty where it was not."""
+    """Why it was left out; empty if it was not."""
     passed_over: str = ""
-    """Why it was not looked at; empty where it was."""
+    """Why it was not converted; empty if it was."""
 
     @property
     def kept(self) -> bool:
@@ -96,25 +95,25 @@ class EpisodeReport:
 
 @attrs.frozen
 class Report:
-    """What became of a conversion."""
+    """Result of a conversion."""
 
     out: Path
     episodes: tuple[EpisodeReport, ...]
-    """In the order given."""
+    """In the order of the request."""
     size_bytes: int
-    """Of the whole dataset; 0 where there is none."""
+    """Of the whole dataset; 0 if there is none."""
     seconds: float
     resumed: int
     """Episodes that an earlier, interrupted run had converted."""
 
     @property
     def converted(self) -> tuple[EpisodeReport, ...]:
-        """The episodes that are in the dataset now and were not before."""
+        """The episodes added to the dataset."""
         return tuple(each for each in self.episodes if each.kept)
 
     @property
     def failed(self) -> tuple[EpisodeReport, ...]:
-        """The episodes that were left out for a fault."""
+        """The episodes left out because of an error."""
         return tuple(each for each in self.episodes if each.error)
 
     def summary(self) -> dict[str, Any]:

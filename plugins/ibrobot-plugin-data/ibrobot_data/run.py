@@ -1,4 +1,4 @@
-"""A whole conversion: finds episodes, converts them side by side into staged units, and merges these in order."""
+"""A whole conversion: finds episodes, converts them in parallel into staged units, and merges these in order."""
 
 from __future__ import annotations
 
@@ -48,22 +48,22 @@ from ibrobot_data.provenance import conversion, provenance
 from ibrobot_data.request import ConversionRequest, EpisodeReport, Report
 
 STAGING = ".staging"
-"""Where converted episodes wait within the dataset's folder."""
+"""Folder within the dataset for converted episodes until the merge."""
 _POLL_S = 0.2
 _END_S = 5.0
 """A converting process that takes longer to end after Ctrl-C is killed."""
 _MAP_FROM, _KEEP = 512 << 10, 8 << 20
-"""Pictures are given back when freed [bytes]: among smaller things they would leave gaps, more with every minute."""
+"""Thresholds of malloc [bytes]: freed images go back to the system, since they would fragment the heap."""
 
 Watch = Callable[[int, int, EpisodeReport | None], None]
-"""Told frames done, frames in all by estimate, and the episode that has just been done, if any."""
+"""Receives the frames done, the estimated total, and the report of the episode just done, if any."""
 
 
 def find_episodes(paths: Sequence[Path]) -> list[Path]:
-    """The episodes that `paths` name: episodes, `DATASET:N`, or folders of them; each once, numbers in order.
+    """The episodes that `paths` name: episodes, `DATASET:N`, or folders of them. Each appears once, in numeric order.
 
     Raises:
-        RecorderError: for a path that is none, or has none below.
+        RecorderError: for a path that neither is nor contains an episode.
     """
     readers = [reader for reader in installed_plugins().readers if not reader.numbered]
 
@@ -80,7 +80,7 @@ def find_episodes(paths: Sequence[Path]) -> list[Path]:
         address = EpisodeAddress.of(path)
         here = [path] if address.number is not None else list(below(path))
         if not here:
-            installed_plugins().open_episode(path).close()  # says what would have been an episode
+            installed_plugins().open_episode(path).close()  # raises the error that explains what an episode is
         found |= {each.resolve(): each for each in here}
     return list(found.values())
 
@@ -90,12 +90,12 @@ def convert(
 ) -> Report:
     """Convert episodes into the dataset at `request.out`, in the order given.
 
-    An episode that cannot be converted is named in the report and left out. Converted episodes are kept until all are
-    done: after an interruption, the same call goes on from there.
+    The report names episodes that cannot be converted; they are left out. Converted episodes are kept until all are
+    done, so after an interruption the same call continues.
 
     Raises:
-        DatasetError: when `out` has a dataset and `append` is not asked for, or one that these episodes do not fit;
-            or it cannot be written.
+        DatasetError: when `out` has a dataset and `append` is false, when these episodes do not fit the dataset, or
+            when it cannot be written.
         PluginError: when the dataset writer is not installed.
     """
     begin = time.monotonic()
@@ -117,7 +117,7 @@ def convert(
 
 @contextmanager
 def _staging(request: ConversionRequest) -> Iterator[tuple[Path, DatasetSummary | None]]:
-    """The staging folder, for this conversion alone, and the dataset that is there already."""
+    """The staging folder, locked for this conversion, and the existing dataset."""
     out = request.out
     try:
         if out.exists() and not (out / STAGING).exists() and any(out.iterdir()):
@@ -132,7 +132,7 @@ def _staging(request: ConversionRequest) -> Iterator[tuple[Path, DatasetSummary 
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                raise DatasetError(f"{out}: another conversion into it is running") from None
+                raise DatasetError(f"{out}: another conversion into this folder is running") from None
             try:
                 yield out / STAGING, old
             finally:
@@ -142,7 +142,7 @@ def _staging(request: ConversionRequest) -> Iterator[tuple[Path, DatasetSummary 
 
 
 def _tidy(out: Path) -> None:
-    """Take folders away again in which nothing came to be."""
+    """Remove folders that stayed empty."""
     staging = out / STAGING
     if staging.is_dir() and all(path.name == "lock" for path in staging.iterdir()):
         shutil.rmtree(staging)
@@ -152,18 +152,18 @@ def _tidy(out: Path) -> None:
 
 def _check_old(request: ConversionRequest, old: DatasetSummary) -> None:
     if not request.append:
-        raise DatasetError(f"{request.out}: there is a dataset already; --append adds to it")
+        raise DatasetError(f"{request.out}: already has a dataset; --append adds to it")
     known = old.metadata.get("conversion")
     if known is None:
-        raise DatasetError(f"{request.out}: was not made by ibrobot convert, which does not know what is in it")
+        raise DatasetError(f"{request.out}: not made by ibrobot convert; convert into another folder")
     asked = conversion(request)
     wrong = [f"{name} {known.get(name)}, now {asked[name]}" for name in asked if known.get(name) != asked[name]]
     if wrong:
-        raise DatasetError(f"{request.out}: was made otherwise: {'; '.join(wrong)}")
+        raise DatasetError(f"{request.out}: was made with other settings: {'; '.join(wrong)}")
 
 
 class _Plan:
-    """Which episodes there are, and what is still to be done for each."""
+    """The episodes, and the work left for each."""
 
     def __init__(
         self, request: ConversionRequest, staging: Path, old: DatasetSummary | None, episodes: Sequence[Path]
@@ -172,7 +172,7 @@ class _Plan:
         self._reports: dict[str, EpisodeReport] = {}
         self._jobs: dict[str, Job] = {}
         self._expected: dict[str, int] = {}
-        """Source -> frames, by its length."""
+        """Source -> number of frames, estimated from its length."""
         self.resumed = 0
         self.sources: list[str] = []
         known = KnownEpisodes(old.metadata["episodes"] if old is not None else ())
@@ -210,12 +210,12 @@ class _Plan:
             self._expected[source] = round(seconds(summary.end_ns - summary.start_ns) * rate_hz) + 1
 
     def units(self) -> list[Unit]:
-        """The units that are staged now, in the order of the episodes."""
+        """The staged units, in the order of the episodes."""
         found = [read_unit(self._jobs[source].unit) for source in self.sources if source in self._jobs]
         return [unit for unit in found if unit is not None]
 
     def run(self, watch: Watch) -> dict[str, EpisodeReport]:
-        """Convert what is not staged yet; source -> report."""
+        """Convert the episodes that are not staged yet; returns source -> report."""
         todo = []
         for source, job in self._jobs.items():
             unit = read_unit(job.unit)
@@ -236,14 +236,14 @@ _done: Any = None
 
 
 def _begin_process(done: Any) -> None:
-    global _done  # noqa: PLW0603 - how a pool gives its processes what cannot be sent with each job
+    global _done  # noqa: PLW0603 - the initializer of a pool can only pass shared memory by a global
     _done = done
     set_malloc(_MAP_FROM, _KEEP)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
 def _end_with_parent() -> None:
-    """A process whose parent was killed must not write beside the next run."""
+    """Exit when the parent is killed, so as not to write at the same time as the next run."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()
@@ -262,16 +262,16 @@ def _convert_in_process(job: Job) -> EpisodeReport:
 def _run_in_processes(
     jobs: Sequence[Job], limit: int, watch: Callable[[int, EpisodeReport | None], None]
 ) -> Iterator[EpisodeReport]:
-    """Each episode in a process of its own, so that what encoders leave in memory goes with it."""
+    """Convert each episode in its own process, which frees the memory that encoders leak."""
     if not jobs:
         return
     context = multiprocessing.get_context("forkserver")
-    # Reader and writer have been imported here by now: a fork of a server that has them too begins at once.
+    # Reader and writer are imported by now. A server that has them too forks processes that start at once.
     context.set_forkserver_preload([name for name in sys.modules if name.startswith("ibrobot_")])
     done = context.Value("q", 0)
     pool = ProcessPoolExecutor(min(limit, len(jobs)), context, _begin_process, (done,), max_tasks_per_child=1)
     try:
-        with _deaf():
+        with _deferred_signals():
             forkserver.ensure_running()
             waiting: set[Future[EpisodeReport]] = {pool.submit(_convert_in_process, job) for job in jobs}
         while waiting:
@@ -283,8 +283,8 @@ def _run_in_processes(
                 yield report
     except BrokenProcessPool:
         raise DatasetError(
-            "a converting process was killed, e.g. for want of memory; the episodes done are kept: "
-            "the same command goes on from there, with fewer --jobs if need be"
+            "a converting process was killed, e.g. because memory ran out; finished episodes are kept: "
+            "run the same command again, with fewer --jobs if needed"
         ) from None
     except KeyboardInterrupt:
         end_processes(multiprocessing.active_children())
@@ -294,7 +294,7 @@ def _run_in_processes(
 
 
 def end_processes(processes: Sequence[BaseProcess]) -> None:
-    """End processes, and kill those that take longer than `_END_S`."""
+    """Terminate processes, and kill those that take longer than `_END_S`."""
     for process in processes:
         process.terminate()
     deadline_s = time.monotonic() + _END_S
@@ -305,18 +305,15 @@ def end_processes(processes: Sequence[BaseProcess]) -> None:
 
 
 @contextmanager
-def _deaf() -> Iterator[None]:
-    """Ctrl-C waits meanwhile, and never reaches the processes begun here: each would tell where it was just then.
-
-    SIGTERM and SIGHUP wait, too.
-    """
+def _deferred_signals() -> Iterator[None]:
+    """Defer Ctrl-C, SIGTERM and SIGHUP; block Ctrl-C in the processes started here, which would print tracebacks."""
     if threading.current_thread() is not threading.main_thread():
-        yield  # where Ctrl-C does not come
+        yield  # Python delivers signals to the main thread alone
         return
     came: list[int] = []
-    # Any thread may get them.
+    # Any thread may receive them.
     handlers = {number: signal.signal(number, lambda number, _: came.append(number)) for number in end_signals()}
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # what is begun inherits it
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # child processes inherit it
     try:
         yield
     finally:
@@ -328,7 +325,7 @@ def _deaf() -> Iterator[None]:
 
 
 def _refuse_misfits(units: Sequence[Unit], old: DatasetSummary | None) -> dict[str, EpisodeReport]:
-    """The reports of units that do not fit the dataset, or the first unit where there is none yet."""
+    """Reports of the units that do not fit the dataset, or the first unit if there is no dataset yet."""
     if not units:
         return {}
     fps, features, contract = units[0].fps, units[0].features, units[0].contract
@@ -351,7 +348,7 @@ def _refuse_misfits(units: Sequence[Unit], old: DatasetSummary | None) -> dict[s
 
 
 def _pass_over_copies(units: Sequence[Unit]) -> dict[str, EpisodeReport]:
-    """The reports of units that are another's copy."""
+    """Reports of the units that are copies of others."""
     first: dict[str, str] = {}
     copies = {}
     for unit in units:
@@ -370,5 +367,5 @@ def _source(path: Path, taken: Sequence[str]) -> str:
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
-    """Orders names by the numbers in them."""
+    """Sort key that orders names by the numbers in them."""
     return [(int(piece), "") if piece.isdigit() else (-1, piece) for piece in re.split(r"(\d+)", path.name)]

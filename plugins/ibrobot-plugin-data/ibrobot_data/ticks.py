@@ -33,18 +33,18 @@ from ibrobot_core.api import (
 
 ACTION = "action"
 _LONGEST_SILENCE_S = 60
-"""Without a message of any topic [s]; a damaged stamp would otherwise make rows for years."""
+"""Longest time without a message of any topic [s]; a damaged stamp would otherwise produce rows for years."""
 _COMMAND = Align("hold", "receive")
-"""The command in effect at a tick is the newest that was sent by then, however old."""
+"""The command in effect at a tick is the newest sent until then, at any age."""
 
 
 def with_action(contract: Contract) -> Contract:
     """The contract whose observations include the action: the commands of the executors, read back from their topics.
 
-    With `align: hold` a row has the command in effect at its tick: what the robot was following when it saw the
-    observation, the safety layer's limits included. At the control rate that is one control period old at most; of
-    commands as slow as the ticks it is the one before the observation. With `align: next` it is the first command
-    after the tick. Signals are aligned likewise; tasks come as their numbers in `Ticks.tasks`.
+    With `align: hold` a row has the command in effect at its tick: the one that the robot followed at the observation,
+    after the safety layer. Commands at the control rate are at most one control period old; of commands as slow as the
+    ticks it is the one before the observation. With `align: next` it is the first command
+    after the tick. Signals are aligned in the same way; tasks are numbers, which index `Ticks.tasks`.
     """
     features = {part.topic: Feature("float32", (len(part.joints),)) for part in contract.action_parts}
     parts = tuple(
@@ -62,7 +62,7 @@ def with_action(contract: Contract) -> Contract:
 
 
 def _source_of(part: ActionPart | SignalPart) -> str:
-    """What the stream of a part's messages is called: its topic, or a name of its own where they are changed."""
+    """Name of the stream of a part's messages: its topic, or a derived name if the messages are changed."""
     changes = ["next"] * (part.align == "next") + [TASK_KEY] * _is_task(part)
     return f"{part.topic} ({', '.join(changes)})" if changes else part.topic
 
@@ -77,15 +77,15 @@ def _is_task(part: ActionPart | SignalPart) -> bool:
 
 
 class _Following:
-    """The messages of a topic, each as if received when the one before it was, or the episode began.
+    """The messages of a topic, each with the time of receipt of the one before it, or of the episode's start.
 
-    The newest of these by a tick is then the first that was really received after it.
+    The newest of these at a tick is then the first that was received after it.
     """
 
     def __init__(self, reader: EpisodeReader, part: ActionPart | SignalPart) -> None:
         self._reader, self._part = reader, part
         self.end_ns: int | None = None
-        """Receipt of the last message [ns], which none follows; None as long as it is not known."""
+        """Receipt of the last message [ns]; None until it is known."""
 
     def __iter__(self) -> Iterator[Recorded]:
         before_ns = self._reader.summary().start_ns
@@ -96,7 +96,7 @@ class _Following:
 
 
 class _Tasks:
-    """Messages with a text, each as the number of its text in `texts`."""
+    """Messages with a text, each replaced by the index of its text in `texts`."""
 
     def __init__(self, messages: Iterable[Recorded], part: SignalPart, texts: list[str]) -> None:
         self._messages, self._part, self._texts = messages, part, texts
@@ -192,12 +192,12 @@ def frames(
 
 
 class Ticks:
-    """The rows of an episode, from the first tick at which everything is there to the last message.
+    """The rows of an episode, from the first complete tick to the last message.
 
     Args:
         reader: the episode.
         contract: observations, actions and rate.
-        missing: `refuse`, `skip` or `hold`; what a later tick is worth at which something is missing.
+        missing: `refuse`, `skip` or `hold`: how to treat a later tick with a missing observation.
 
     Raises:
         RecorderError: when a topic of the contract has no message.
@@ -209,12 +209,12 @@ class Ticks:
         absent = [topic for topic in contract.topics if topic not in present]
         if absent:
             has = ", ".join(sorted(present)) or "none"
-            raise RecorderError(f"no message of {', '.join(absent)}, which the contract has; available: {has}")
+            raise RecorderError(f"no message of {', '.join(absent)}, which the contract needs; available: {has}")
         self._contract = with_action(contract)
         self._signals = frozenset(_source_of(part) for part in contract.signal_parts)
         self._missing = missing
         self.tasks: list[str] = []
-        """The texts of the task's topic; a row has the number of its own."""
+        """The texts of the task's topic; each row has an index into them."""
         self._source = _Source(reader, contract, self.tasks)
         self._assembler = FrameAssembler(self._contract)
         self.cuts: list[tuple[int, int]] = []
@@ -237,7 +237,7 @@ class Ticks:
         """Key -> value of each row; once.
 
         Raises:
-            RecorderError: when something is missing and that is to be refused, or is missing all the time.
+            RecorderError: when an observation is missing at every tick, or with `refuse` at one.
             ContractError: for a message that does not fit the contract.
         """
         source, before, rows = self._source, frozenset[str](), 0
@@ -260,15 +260,15 @@ class Ticks:
             yield last
         if not last:
             what = f"{', '.join(sorted(absent))} is missing at every one" if absent else "each time another was missing"
-            raise RecorderError(f"there is no tick at which every observation and action is there: {what}")
+            raise RecorderError(f"no tick has every observation and action: {what}")
 
     def _take(self, missing: frozenset[str], t_ns: int, row: int) -> bool:
-        """Whether a tick at which something is missing gives a row, which would be number `row`."""
+        """Whether a tick with a missing observation gives a row, which would be number `row`."""
         if self._missing == "refuse":
             at_s = seconds(t_ns - self._source.first_ns)
             raise RecorderError(
                 f"{', '.join(sorted(missing))} is missing {at_s:.3f} s after the beginning; "
-                "--missing skip leaves such ticks out, --missing hold takes the last value"
+                "--missing skip leaves such ticks out, --missing hold repeats the last value"
             )
         if self._missing == "skip":
             before = self.cuts.pop()[1] if self.cuts and self.cuts[-1][0] == row else 0
@@ -279,9 +279,9 @@ class Ticks:
 
 
 def _text_at(message: Message, path: str) -> str:
-    """The text that a path leads to."""
+    """The text at a path."""
     value = value_at(message, path.split("."))
     if isinstance(value, str):
         return value
     there = f"; available: {', '.join(attrs.fields_dict(type(value)))}" if attrs.has(type(value)) else ""
-    raise ContractError(f"{path!r} leads to no text in a {message.ros_type}{there}")
+    raise ContractError(f"{path!r} is not a text in a {message.ros_type}{there}")

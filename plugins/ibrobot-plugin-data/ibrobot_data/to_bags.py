@@ -1,4 +1,4 @@
-"""The way back: episodes of a dataset -> recorded episodes, one message of each topic at every tick."""
+"""Episodes of a dataset -> recorded episodes, with one message of each topic at every tick."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ from ibrobot_core.api import (
 from ibrobot_data.request import EpisodeReport, Report
 
 _STAGING = ".staging"
-"""Where an episode is written within the folder, until it is whole."""
+"""Folder within the output for episodes until they are complete."""
 _DIGEST = "source_digest"
-"""Key of the metadata: what tells the dataset's episode from others."""
-_TOLD_EVERY = 30
-"""Messages of a topic from one sign of life to the next."""
+"""Key of the metadata: hash that identifies the dataset's episode."""
+_PROGRESS_EVERY = 30
+"""Messages of a topic between two progress reports."""
 
 type Watch = Callable[[int, int, EpisodeReport | None], None]
 
@@ -57,17 +57,17 @@ class BagRequest:
     type: str
     """Of the recorder."""
     contract: Contract | None = None
-    """What the dataset's contract must be; None takes it as it is."""
+    """The contract that the dataset must have; None accepts any."""
     given: Mapping[str, str] = attrs.field(factory=dict)
-    """Of a dataset that says nothing of itself; see `EpisodeAddress`."""
+    """Metadata for a dataset without its own; see `EpisodeAddress`."""
     prompt: str = ""
     """Task of episodes without one."""
 
 
 def convert_to_bags(request: BagRequest, watch: Watch = lambda done, total, report: None) -> Report:
-    """Write episodes of a dataset as recorded ones; an episode appears whole or not at all.
+    """Write episodes of a dataset as recorded ones; each is written completely or not at all.
 
-    Those that are there already are passed over, so that an interrupted conversion goes on from there.
+    Existing ones are passed over, so an interrupted conversion can continue.
 
     Raises:
         PluginError: when the recorder is not installed.
@@ -108,7 +108,7 @@ class _Job:
         self._making = request.out / _STAGING / self._target.name
 
     def run(self, progress: Callable[[int], None]) -> EpisodeReport:
-        """Convert it; a fault is named in the report and leaves no files."""
+        """Convert the episode. After a fault, the report has the error and no files remain."""
         report = EpisodeReport(self._path.name)
         reader: EpisodeReader | None = None
         try:
@@ -129,7 +129,7 @@ class _Job:
         return attrs.evolve(report, frames=frames)
 
     def _known(self, summary: EpisodeSummary, digest: str) -> str:
-        """Why it need not be converted: what lies there is it."""
+        """Why it need not be converted: the target is this episode."""
         reader = installed_plugins().open_episode(self._target)
         try:
             there = reader.summary()
@@ -138,7 +138,7 @@ class _Job:
         found = there.metadata.get("source", "a recording"), there.metadata.get(_DIGEST)
         if found != (self._source(summary), digest):
             raise RecorderError(f"{self._target}: is another episode ({found[0]}); convert into another folder")
-        return "there already"
+        return "already converted"
 
     def _source(self, summary: EpisodeSummary) -> str:
         return summary.metadata.get("source", self._path.name)
@@ -148,7 +148,7 @@ class _Job:
         asked = self._request.contract.without_signals() if self._request.contract is not None else contract
         if asked.fingerprint() != contract.fingerprint():
             difference = asked.difference(contract, names=("--config", "dataset"))
-            raise ContractError(f"{self._path}: was made with another contract than --config's:\n{difference}")
+            raise ContractError(f"{self._path}: was made with another contract than that of --config:\n{difference}")
         EpisodeDataset(self._request.out).check(contract)
         return contract
 
@@ -169,11 +169,11 @@ class _Job:
             for item in reader.messages(contract.topics):
                 recorder.write(item.topic, item.message, item.received_ns)
                 counts[item.topic] += 1
-                if counts[item.topic] % _TOLD_EVERY == 0:
+                if counts[item.topic] % _PROGRESS_EVERY == 0:
                     progress(max(counts.values()))
             recorder.end(EpisodeEnd(summary.end_ns, summary.outcome))
         except BaseException:
-            with suppress(RecorderError):  # what it could not write either is no news
+            with suppress(RecorderError):  # the first error matters
                 recorder.close()
             raise
         EpisodeDataset(self._request.out).join(contract, metadata.get("robot", ""), metadata.get("robot_type", ""))
@@ -183,7 +183,7 @@ class _Job:
 
 
 def _make_recorder(request: BagRequest) -> Recorder:
-    # A stepped clock makes it write at once, and equal datasets give equal files.
+    # With a stepped clock it writes immediately, and equal datasets give equal files.
     ctx = Context("convert", SteppedClock(0), logging.getLogger("ibrobot.convert"), Robot("convert", ()))
     recorder: Recorder = installed_plugins().find("recorder", request.type).make(request.options, ctx)
     return recorder

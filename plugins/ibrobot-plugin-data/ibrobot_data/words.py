@@ -4,5 +4,5 @@ from __future__ import annotations
 
 
 def plural(number: int, noun: str) -> str:
-    """The noun as it follows a number of things: `1 episode`, `2 episodes`."""
+    """The noun after a number: `1 episode`, `2 episodes`."""
     return noun if number == 1 else f"{noun}s"

@@ -187,7 +187,7 @@ def test_buttons_leave_episodes_alone_that_end_by_themselves(record: Record, cap
     run.press("discard")
     run.step(3)
     assert run.service.running
-    assert "discard: this run begins and ends its episodes by itself" in caplog.text
+    assert "discard: this run begins and ends its episodes automatically" in caplog.text
 
 
 def test_unattended_episodes_pause_and_end_with_the_count(record: Record):

@@ -1,4 +1,4 @@
-"""The plugin's hooks: section `description`, which robots with a URDF or with mounted sensors need not write."""
+"""The plugin's hooks: section `description`, which is optional for robots with a URDF or mounted sensors."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def _check(config: RobotConfig) -> Iterable[OptionFault]:
 
 @hookimpl
 def ibrobot_sections() -> Iterable[SectionDescriptor]:
-    """What robot_state_publisher does in ROS."""
+    """The section `description`, the counterpart of robot_state_publisher."""
     yield SectionDescriptor(
         type="description", make=_publisher, without_section=_has_frames, check_config=_check,
         summary="/tf, /tf_static and /robot_description from the URDF and the mounts of sensors; has no keys",

@@ -1,4 +1,4 @@
-"""What is wrong with a robot's frames: models that make no tree, and mounts that loop or hang loose."""
+"""Checks of a robot's frames: models must be trees, and mounts must lead to them without loops."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _URDF, _SRDF = ("robot", "description", "urdf"), ("robot", "description", "srdf"
 
 
 def faults(config: RobotConfig) -> Iterator[OptionFault]:
-    """All of them, each with its place in the YAML; those of a model also name file and line there."""
+    """All errors, each with its key in the YAML; those in a model also name its file and line."""
     description = config.robot.description
     urdf: Urdf | None = None
     if description.urdf is not None:
@@ -41,7 +41,7 @@ def _mounts(frames: list[MountedFrame], urdf: Urdf | None) -> Iterator[OptionFau
     for frame in frames:
         for name in filter(None, (frame.name, frame.optical)):
             if name in definers:
-                message = f"frame {name!r} is {definers[name]} already; give another name by transform.frame"
+                message = f"frame {name!r} is already {definers[name]}; set another name in transform.frame"
                 yield OptionFault((*_place(frame), "frame"), message)
             definers.setdefault(name, f"a frame of peripheral {frame.peripheral!r}")
         parents.setdefault(frame.name, frame.mount.parent)
@@ -52,12 +52,12 @@ def _mounts(frames: list[MountedFrame], urdf: Urdf | None) -> Iterator[OptionFau
         parent = frame.mount.parent
         if urdf is not None and parent not in definers:
             remark = did_you_mean(parent, list(definers), "the frames are")
-            yield OptionFault(place, f"frame {frame.name!r} hangs loose: no frame {parent!r}{remark}")
+            yield OptionFault(place, f"frame {frame.name!r} has an unknown parent {parent!r}{remark}")
         chain = [frame.name]
         while chain[-1] in parents and chain[-1] not in chain[:-1]:
             chain.append(parents[chain[-1]])
         if chain[-1] == frame.name and len(chain) > 1:
-            yield OptionFault(place, f"frame {frame.name!r} hangs on itself: {' -> '.join(reversed(chain))}")
+            yield OptionFault(place, f"frame {frame.name!r} is its own ancestor: {' -> '.join(reversed(chain))}")
 
 
 def _place(frame: MountedFrame) -> tuple[str | int, ...]:

@@ -1,4 +1,4 @@
-"""Frames: where the child of a URDF's joint is in its parent, and where sensors are mounted."""
+"""Frames: poses of the links of a URDF in their parents, and of mounted sensors."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ class MountedFrame:
     """A frame that a peripheral's `transform` defines."""
 
     index: int
-    """Of the peripheral in the file."""
+    """Index of the peripheral in the file."""
     peripheral: str
     name: str
     mount: Mount
     optical: str
-    """The frame of a camera's pictures; empty for other sensors."""
+    """The frame of a camera's images; empty for other sensors."""
 
     def transforms(self, stamp_ns: int) -> tuple[TransformStamped, ...]:
         """The frame in its parent, and a camera's optical frame in it."""
@@ -51,7 +51,7 @@ def mounted(config: RobotConfig) -> Iterator[MountedFrame]:
 
 
 def transform(joint: UrdfJoint, position: float, stamp_ns: int) -> TransformStamped:
-    """The child of a joint in its parent, at a position [rad or m] where the joint moves."""
+    """Pose of a joint's child in its parent, at a position [rad or m] if the joint moves."""
     translation, rotation = Vector3(*joint.xyz), from_rpy(*joint.rpy)
     x, y, z = joint.axis
     if joint.type == "prismatic":
@@ -64,7 +64,7 @@ def transform(joint: UrdfJoint, position: float, stamp_ns: int) -> TransformStam
 
 
 def from_rpy(roll: float, pitch: float, yaw: float) -> Quaternion:
-    """Fixed-axis roll, pitch, yaw [rad], as URDF has them."""
+    """Quaternion of fixed-axis roll, pitch, yaw [rad], as in URDF."""
     result = Quaternion(0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2))
     result = _product(result, Quaternion(0.0, math.sin(pitch / 2), 0.0, math.cos(pitch / 2)))
     return _product(result, Quaternion(math.sin(roll / 2), 0.0, 0.0, math.cos(roll / 2)))

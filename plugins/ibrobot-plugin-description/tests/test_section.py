@@ -216,7 +216,7 @@ def test_mount_may_carry_a_mount(load: Callable[..., RobotConfig]) -> None:
     assert (top.frame, top.xyz) == ("lens", (0.0, 0.0, 0.0))
 
 
-HANGS = "robot.yaml:9: peripherals.top.transform.parent: frame 'top_frame' hangs"
+TOP_PARENT = "robot.yaml:9: peripherals.top.transform.parent: frame 'top_frame'"
 TOP, WRIST = "robot.yaml:9: peripherals.top.transform", "robot.yaml:10: peripherals.wrist.transform"
 
 
@@ -224,19 +224,19 @@ TOP, WRIST = "robot.yaml:9: peripherals.top.transform", "robot.yaml:10: peripher
     ("top", "wrist", "told"),
     [
         ("transform: {}", "", f"{TOP}.parent: required key is missing"),
-        ("transform: {parent: tol}", "", f"{HANGS} loose: no frame 'tol', did you mean 'tool'?"),
-        ("transform: {parent: map}", "", f"{HANGS} loose: no frame 'map'; the frames are: "
+        ("transform: {parent: tol}", "", f"{TOP_PARENT} has an unknown parent 'tol', did you mean 'tool'?"),
+        ("transform: {parent: map}", "", f"{TOP_PARENT} has an unknown parent 'map'; the frames are: "
          "base_link, shoulder, tool, top_frame, top_optical_frame"),
-        ("transform: {parent: top_frame}", "", f"{HANGS} on itself: top_frame -> top_frame"),
+        ("transform: {parent: top_frame}", "", f"{TOP_PARENT} is its own ancestor: top_frame -> top_frame"),
         ("transform: {parent: top_optical_frame}", "",
-         f"{HANGS} on itself: top_frame -> top_optical_frame -> top_frame"),
+         f"{TOP_PARENT} is its own ancestor: top_frame -> top_optical_frame -> top_frame"),
         ("transform: {parent: wrist_frame}", "transform: {parent: top_frame}",
-         f"{HANGS} on itself: top_frame -> wrist_frame -> top_frame\n"
-         f"{WRIST}.parent: frame 'wrist_frame' hangs on itself: wrist_frame -> top_frame -> wrist_frame"),
+         f"{TOP_PARENT} is its own ancestor: top_frame -> wrist_frame -> top_frame\n"
+         f"{WRIST}.parent: frame 'wrist_frame' is its own ancestor: wrist_frame -> top_frame -> wrist_frame"),
         ("transform: {parent: tool, frame: shoulder}", "",
-         f"{TOP}.frame: frame 'shoulder' is a link of robot.urdf already; give another name by transform.frame"),
+         f"{TOP}.frame: frame 'shoulder' is already a link of robot.urdf; set another name in transform.frame"),
         ("transform: {parent: tool, frame: eye}", "transform: {parent: tool, frame: eye}",
-         f"{WRIST}.frame: frame 'eye' is a frame of peripheral 'top' already; give another name by transform.frame"),
+         f"{WRIST}.frame: frame 'eye' is already a frame of peripheral 'top'; set another name in transform.frame"),
         ("transform: {parent: tool, xyz: [0, 0]}", "", f"{TOP}.xyz: expected a list of 3 values, got 2"),
         ("transform: {parent: tool, xyz: [0, 0, .nan]}", "", f"{TOP}: xyz, rpy and quaternion must be finite numbers"),
         ("transform: {parent: tool, rpy: [0, 0, 0], quaternion: [0, 0, 0, 1]}", "",

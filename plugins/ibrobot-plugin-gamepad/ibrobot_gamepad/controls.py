@@ -1,4 +1,4 @@
-"""What an operator holds at one instant: axes and buttons by name, the same names for every make."""
+"""The state of a device: axes and buttons by name, with the same names for every make."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ PAD_BUTTONS = (
     "south", "east", "west", "north", "left_shoulder", "right_shoulder", "left_stick", "right_stick",
     "back", "start", "guide", "touchpad", "misc",
 )  # fmt: skip
-"""The four on the right by their place; `south` is A of Xbox, B of Nintendo, the cross of PlayStation."""
+"""The four on the right are named by position: `south` is A on Xbox, B on Nintendo, the cross on PlayStation pads."""
 MOUSE_AXES = ("x", "y", "z", "roll", "pitch", "yaw")
-"""-1 to 1: forward, left, up, and turns about these (right-hand rule)."""
+"""-1 to 1: forward, left, up, and rotations about these axes (right-hand rule)."""
 MOUSE_BUTTONS = ("left", "right", *(f"button{n}" for n in range(3, 49)))
 
 _RAW_AXIS = re.compile(r"axis\d{1,2}|hat\d_[xy]")
 _RAW_BUTTON = re.compile(r"button\d{1,2}")
 _PULLED = 0.5
-"""Where an axis counts as a pressed button."""
+"""Deflection beyond which an axis counts as a pressed button."""
 
 
 def is_raw_axis(name: str) -> bool:
@@ -46,10 +46,10 @@ class Controls:
     axes: Mapping[str, float]
     """Name -> deflection, -1 to 1, triggers 0 to 1."""
     buttons: frozenset[str]
-    """Those that are pressed."""
+    """The pressed ones."""
 
     def value(self, control: str) -> float:
-        """Deflection of an axis; 1 for a pressed button; 0 for what the device lacks."""
+        """Deflection of an axis; 1 for a pressed button; 0 for a control that the device lacks."""
         return self.axes.get(control, 1.0 if control in self.buttons else 0.0)
 
     def pressed(self, control: str) -> bool:
@@ -63,7 +63,7 @@ def pad(
     """The state of a standard pad.
 
     Args:
-        sticks: left x, left y, right x, right y; beyond -1 and 1 they are cut off.
+        sticks: left x, left y, right x, right y; clipped to -1 and 1.
         triggers: left, right.
         hat: the directional pad, right and up.
         buttons: name and whether it is pressed.

@@ -1,4 +1,4 @@
-"""The devices that are plugged in, and one that is open."""
+"""Connected devices, and the interface of an open one."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Via = Literal["hid", "sdl"]
 
 
 class DeviceGone(Exception):
-    """The device was unplugged, switched off or carried out of reach."""
+    """The device was unplugged, switched off or moved out of range."""
 
 
 class Device(ABC):
@@ -24,13 +24,13 @@ class Device(ABC):
 
     @abstractmethod
     def poll(self, now_ns: int) -> list[Controls]:
-        """What it sent since the last call, oldest first; never blocks.
+        """The states sent since the last call, oldest first; never blocks.
 
         Args:
-            now_ns: the time [ns], by which the silence of a device is measured that never stops sending.
+            now_ns: the time [ns], for detecting the silence of a device that sends continuously.
 
         Raises:
-            DeviceGone: when it is not there any more.
+            DeviceGone: when it is no longer there.
         """
 
     @abstractmethod
@@ -40,14 +40,14 @@ class Device(ABC):
 
 @attrs.frozen
 class Found:
-    """A device that is plugged in."""
+    """A connected device."""
 
     name: str
     vendor: int
     product: int
     serial: str
     model: str
-    """Whose reports it sends, or what SDL calls it."""
+    """Model of its reports, or its name in SDL."""
     via: Via
     open: Callable[[], Device] = attrs.field(eq=False, repr=False)
     """Opens it.
@@ -59,17 +59,17 @@ class Found:
 
     @property
     def id(self) -> str:
-        """As the option `device` takes it."""
+        """Id for the option `device`."""
         return f"{self.vendor:04x}:{self.product:04x}" + (f":{self.serial}" if self.serial else "")
 
     def matches(self, wanted: str) -> bool:
-        """Whether it is the one that the option `device` names."""
-        mine, theirs = self.id.split(":", 2), wanted.split(":", 2)
-        return not wanted or [part.lower() for part in mine[: len(theirs)]] == [part.lower() for part in theirs]
+        """Whether the option `device` names it."""
+        own, asked = self.id.split(":", 2), wanted.split(":", 2)
+        return not wanted or [part.lower() for part in own[: len(asked)]] == [part.lower() for part in asked]
 
 
 class Finder:
-    """Finds the devices of a kind, those first whose own reports are known.
+    """Finds the devices of a kind; those with known reports come first.
 
     Args:
         kind: gamepads or SpaceMice.
@@ -89,7 +89,7 @@ class Finder:
             start_sdl()
 
     def find(self) -> list[Found]:
-        """The devices that are plugged in."""
+        """The connected devices."""
         found: list[Found] = []
         if self._hid:
             from ibrobot_gamepad.hid import find_hid
@@ -102,7 +102,7 @@ class Finder:
         return found
 
     def close(self) -> None:
-        """Release the libraries, after the devices that were opened. Safe to call twice."""
+        """Release the libraries; close opened devices first. Safe to call twice."""
         if self._sdl:
             from ibrobot_gamepad.sdl import stop_sdl
 
@@ -111,10 +111,10 @@ class Finder:
 
 
 def open_first(found: Sequence[Found], wanted: str) -> tuple[Found, Device] | None:
-    """Open the first device that matches; None where there is none.
+    """Open the first device that matches; None if there is none.
 
     Raises:
-        TeleopError: where all that match are there but cannot be opened; says what to do.
+        TeleopError: when no matching device can be opened; names the remedy.
     """
     refused: list[str] = []
     for each in found:

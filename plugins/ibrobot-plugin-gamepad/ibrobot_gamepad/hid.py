@@ -1,4 +1,4 @@
-"""Devices whose own reports are read, by hidapi."""
+"""Devices with known reports, read by hidapi."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from ibrobot_gamepad.reports import Kind, Model, model_of
 _LONGEST = 128
 """Bytes of the longest report, and some more."""
 _MOST = 256
-"""Reports that one poll reads at most: a device that floods keeps nobody waiting."""
+"""Maximum number of reports per poll, so that a flooding device cannot block the robot."""
 _SILENT_NS = ns(0.3)
-"""After which a device that never stops sending is out of reach."""
+"""Silence after which a continuously sending device counts as out of range."""
 _ASK_NS = ns(0.5)
-"""How often a device is asked again for what it must send first."""
+"""Period of repeated requests for the data that a device must send first."""
 
 
 def _hidapi() -> Any:
-    """The binding; on Linux the one to the kernel's hidraw devices, the other one sees none."""
+    """The binding; on Linux that to the kernel's hidraw devices, since the other one finds none."""
     if sys.platform == "linux":
         import hidraw
 
@@ -33,7 +33,7 @@ def _hidapi() -> Any:
 
 
 def find_hid(kind: Kind) -> list[Found]:
-    """The devices of a kind whose reports are known."""
+    """The devices of a kind with known reports."""
     found: dict[bytes, Found] = {}
     for entry in _hidapi().enumerate():
         model = model_of(entry["vendor_id"], entry["product_id"], entry["usage_page"], entry["usage"])
@@ -55,8 +55,8 @@ class HidDevice(Device):
     """A device that sends reports of a model.
 
     Args:
-        path: as hidapi names it.
-        model: whose reports it sends.
+        path: its path in hidapi.
+        model: its reports.
 
     Raises:
         OSError: when it cannot be opened, e.g. without the permission.
@@ -82,12 +82,12 @@ class HidDevice(Device):
                 self._spoke, self._heard_ns = True, now_ns
             elif not self._spoke:
                 self._ask(now_ns)
-        except (OSError, ValueError) as error:  # ValueError: hidapi's word for a device that was closed
+        except (OSError, ValueError) as error:  # ValueError: hidapi raises it for a closed device
             raise DeviceGone(str(error)) from error
         if self._heard_ns is None:
             self._heard_ns = now_ns
         if self._spoke and self._model.streams and now_ns - self._heard_ns > _SILENT_NS:
-            raise DeviceGone("it sends nothing any more")
+            raise DeviceGone("it stopped sending")
         return states
 
     @override
@@ -107,7 +107,7 @@ class HidDevice(Device):
         return states
 
     def _ask(self, now_ns: int) -> None:
-        """Ask for what the model must send before its reports mean anything."""
+        """Request the data that the parser needs before it can read reports."""
         if self._model.opening and (self._asked_ns is None or now_ns - self._asked_ns > _ASK_NS):
             self._asked_ns = now_ns
             for request in self._model.opening:

@@ -1,4 +1,4 @@
-"""Which control does what on a robot: the defaults, and what the YAML changes of them."""
+"""Assignment of controls to functions of a robot: the defaults, and changes in the YAML."""
 
 from __future__ import annotations
 
@@ -47,11 +47,11 @@ class Axis:
 
 @attrs.frozen
 class ControlMap:
-    """Which control does what on a robot; functions without a control are left out."""
+    """Controls of a robot's functions; functions without a control are left out."""
 
     joints: Mapping[str, Axis]
     tool: Mapping[str, Axis]
-    """Empty where the tool cannot be jogged."""
+    """Empty if the tool cannot be jogged."""
     buttons: Mapping[str, str]
     """Function -> button."""
     poses: Mapping[str, str]
@@ -68,10 +68,10 @@ class ControlMap:
 
 
 def control_map(options: GamepadOptions | SpaceMouseOptions, robot: Robot) -> ControlMap:
-    """The controls that options give a robot.
+    """The assignment that options define for a robot.
 
     Raises:
-        TeleopError: where they do not fit the robot.
+        TeleopError: when they do not fit the robot.
     """
     for fault in check_mapping(options, robot):
         raise TeleopError(f"{'.'.join(str(part) for part in fault.option)}: {fault.message}")
@@ -136,7 +136,7 @@ def _chosen(defaults: Mapping[str, str], own: Mapping[str, str]) -> dict[str, st
 
 
 def _doubles(options: GamepadOptions | SpaceMouseOptions, robot: Robot) -> Iterator[OptionFault]:
-    """A fault for each control that the file gives a second meaning."""
+    """A fault for each control to which the file assigns a second function."""
     is_pad = isinstance(options, GamepadOptions)
     _, arm = _parts(options, robot)
     known_poses = {name: at for name, at in (_PAD_POSES if is_pad else {}).items() if name in robot.description.poses}
@@ -154,6 +154,6 @@ def _doubles(options: GamepadOptions | SpaceMouseOptions, robot: Robot) -> Itera
             plain = control.removeprefix("-")
             first, other = taken.setdefault(plain, (option, name))
             if (first, other) != (option, name):
-                message = f"{plain!r} is both {other} and {name}, must be one of them"
+                message = f"{plain!r} is both {other} and {name}: assign it to one of them"
                 faults[OptionFault((option if name in own[option] else first,), message)] = None
     yield from faults

@@ -1,4 +1,4 @@
-"""What the YAML may say under `type: gamepad` and `type: spacemouse` of teleoperation."""
+"""Options of `type: gamepad` and `type: spacemouse` under `teleoperation`."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ FUNCTIONS = (
     "deadman", "toggle", "gripper_open", "gripper_close", "gripper", "estop",
     "start", "success", "failure", "discard", "intervention",
 )  # fmt: skip
-"""What `buttons` maps; `gripper` opens and closes in turns."""
+"""The functions in `buttons`; `gripper` opens and closes alternately."""
 _DEVICE = re.compile(r"[0-9a-fA-F]{4}:[0-9a-fA-F]{4}(:.+)?")
 
 
@@ -44,17 +44,17 @@ class Layout:
     axes: tuple[str, ...]
     buttons: tuple[str, ...]
     raw: bool
-    """Whether there are devices whose controls have numbers alone."""
+    """Whether controls may have numbers in place of names."""
 
     def check_axis(self, name: str) -> str | None:
-        """What is wrong with the name of an axis; it may begin with `-`."""
+        """The error in the name of an axis, which may begin with `-`; None if it is valid."""
         plain = name.removeprefix("-")
         if plain in (NONE, *self.axes) or (self.raw and is_raw_axis(plain)):
             return None
         return f"unknown axis {name!r}{did_you_mean(plain, self.axes, 'the axes are')}"
 
     def check_button(self, name: str) -> str | None:
-        """What is wrong with the name of a button; an axis is one, too, where it is more than half way."""
+        """The error in the name of a button; None if it is valid. An axis works as a button, too."""
         if name in (NONE, *self.axes, *self.buttons) or (self.raw and (is_raw_button(name) or is_raw_axis(name))):
             return None
         known = (*self.buttons, *self.axes)
@@ -94,7 +94,7 @@ def _buttons(layout: Layout) -> Any:
                 raise ValueError(f"unknown function {function!r}{known}")
             _refuse(function, layout.check_button(control))
         if value.get("deadman") == NONE:
-            raise ValueError("deadman: must have a button: nothing may move that nobody asks for")
+            raise ValueError("deadman: must have a button: the robot moves only while it is held")
 
     return option(
         factory=dict, help=f"function -> button or `none`, where not the default; functions: {', '.join(FUNCTIONS)}",
@@ -118,14 +118,14 @@ def _refuse(key: str, fault: str | None) -> None:
 @documented
 @attrs.frozen
 class JogOptions:
-    """What gamepads and SpaceMice have in common."""
+    """Options that gamepads and SpaceMice share."""
 
     device: str = option("", help="VENDOR:PRODUCT or VENDOR:PRODUCT:SERIAL; empty: the first", validator=_check_device)
     joint_speed: float = option(0.8, unit="rad/s", gt=0, help="speed of a joint at full deflection, and to poses")
     tool_speed: float = option(0.1, unit="m/s", gt=0, help="speed of the tool at full deflection")
     turn_speed: float = option(0.8, unit="rad/s", gt=0, help="speed of turning the tool at full deflection")
     gripper_speed: float = option(1.5, unit="rad/s", gt=0, help="speed of the gripper with its trigger pulled")
-    dead_zone: float = option(0.1, ge=0, lt=0.9, help="share of an axis' way that counts as rest")
+    dead_zone: float = option(0.1, ge=0, lt=0.9, help="deflection below which an axis counts as at rest")
     follow: float = option(
         0.1, unit="rad", ge=0, help="how far a joint at rest may be from its setpoint before the setpoint follows"
     )
@@ -139,10 +139,10 @@ class JogOptions:
 class GamepadOptions(JogOptions):
     """Options of `type: gamepad`; the joints' own limits bound every speed."""
 
-    start: str = option("joints", choices=("joints", "tool"), help="what the sticks move at first")
+    start: str = option("joints", choices=("joints", "tool"), help="what the sticks move initially")
     via: str = option(
         "auto", choices=("auto", "hid", "sdl"),
-        help="how the pad is read: its own reports (hid), SDL's mapping database (sdl), or whichever knows it",
+        help="how to read the pad: its own reports (hid), SDL's mapping database (sdl), or the first that knows it",
     )  # fmt: skip
     joints: Mapping[str, str] = _joints(PAD)
     tool: Mapping[str, str] = _tool(PAD)
@@ -155,7 +155,7 @@ class GamepadOptions(JogOptions):
 class SpaceMouseOptions(JogOptions):
     """Options of `type: spacemouse`; the joints' own limits bound every speed."""
 
-    start: str = option("tool", choices=("joints", "tool"), help="what the cap moves at first")
+    start: str = option("tool", choices=("joints", "tool"), help="what the cap moves initially")
     joints: Mapping[str, str] = _joints(MOUSE)
     tool: Mapping[str, str] = _tool(MOUSE)
     buttons: Mapping[str, str] = _buttons(MOUSE)

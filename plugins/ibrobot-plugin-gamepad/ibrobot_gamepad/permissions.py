@@ -1,4 +1,4 @@
-"""Which devices the user may open, and the udev rule that permits it."""
+"""Permissions of the user to open devices, and the udev rule that grants them."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ RULES = "/etc/udev/rules.d/60-ibrobot-gamepad.rules"
 """Must sort before 73-seat-late.rules, which gives devices tagged `uaccess` to the user logged in at the machine."""
 WRITE_RULES = f"ibrobot gamepad udev | sudo tee {RULES} && sudo udevadm control --reload, then plug it in again"
 _LOGITECH = "*:046D:C6*"
-"""SpaceMice of Logitech's time."""
+"""SpaceMice made by Logitech."""
 _JOYSTICKS = "by-*/*-event-joystick"
 
 
 def udev_rules() -> str:
-    """The rule that lets users open the devices whose reports are known, over USB and Bluetooth."""
+    """The rule that lets users open devices with known reports, over USB and Bluetooth."""
     vendors = sorted({vendor for model in MODELS for vendor, _ in model.ids} | {THREEDCONNEXION})
     parents = [f"*:{vendor:04X}:*" for vendor in vendors] + [_LOGITECH]
     lines = [f'KERNEL=="hidraw*", KERNELS=="{parent}", MODE="0660", TAG+="uaccess"' for parent in parents]
@@ -27,10 +27,10 @@ def udev_rules() -> str:
 
 
 def checks(joysticks: Path = Path("/dev/input")) -> Iterator[Check]:
-    """A line for each device: hidraw, which pads with known reports need, and evdev, which all others need."""
+    """A check for each device: of hidraw for devices with known reports, and of evdev for all others."""
     for kind in KINDS:
         for found in find_hid(kind):
-            # Elsewhere than on Linux a path is not a file's.
+            # On other systems than Linux a path is not that of a file.
             allowed = not found.path.startswith("/dev/") or os.access(found.path, os.R_OK | os.W_OK)
             text = f"{found.name} ({found.id}) at {found.path}"
             yield Check(kind, allowed, text if allowed else f"{text}: no permission", WRITE_RULES)

@@ -1,7 +1,7 @@
 """All other pads, by SDL: its mapping database knows their axes and buttons.
 
-SDL reads what the kernel's drivers make of a pad, e.g. of Xbox pads over USB and the wireless dongle. It must not read
-reports itself: that would set up devices which `ibrobot_gamepad.hid` has open.
+SDL reads pads through the kernel's drivers, e.g. Xbox pads over USB and the wireless dongle. It must not read reports
+itself: that would reconfigure devices that `ibrobot_gamepad.hid` has open.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from ibrobot_gamepad.devices import Device, DeviceGone, Found
 
 _FULL = 32768
 _HINTS = {
-    b"SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS": b"1",  # there is no window
+    b"SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS": b"1",  # ibrobot has no window
     b"SDL_JOYSTICK_HIDAPI": b"0",
     b"SDL_NO_SIGNAL_HANDLERS": b"1",
-    b"SDL_GAMECONTROLLER_USE_BUTTON_LABELS": b"0",  # buttons by their place
+    b"SDL_GAMECONTROLLER_USE_BUTTON_LABELS": b"0",  # buttons by position
 }
 _BUTTONS = {
     "south": "A", "east": "B", "west": "X", "north": "Y", "left_shoulder": "LEFTSHOULDER",
@@ -38,10 +38,10 @@ def _sdl() -> Any:
 
 
 def start_sdl() -> None:
-    """Have SDL watch joysticks, until as many calls of `stop_sdl`.
+    """Let SDL watch joysticks, until `stop_sdl` is called as often as this.
 
     Raises:
-        TeleopError: where it does not start.
+        TeleopError: when it does not start.
     """
     sdl2 = _sdl()
     for hint, value in _HINTS.items():
@@ -51,13 +51,13 @@ def start_sdl() -> None:
 
 
 def stop_sdl() -> None:
-    """Undo a `start_sdl`; joysticks that are open must be closed before."""
+    """Undo a `start_sdl`; close open joysticks first."""
     sdl2 = _sdl()
     sdl2.SDL_QuitSubSystem(sdl2.SDL_INIT_GAMECONTROLLER)
 
 
 def find_sdl() -> list[Found]:
-    """The joysticks that SDL sees, once it was started."""
+    """The joysticks that SDL finds after `start_sdl`."""
     sdl2 = _sdl()
     sdl2.SDL_GameControllerUpdate()
     return [_found(sdl2, index) for index in range(max(0, sdl2.SDL_NumJoysticks()))]
@@ -75,7 +75,7 @@ def _found(sdl2: Any, index: int) -> Found:
 
 
 class SdlDevice(Device):
-    """A joystick of SDL: with the names of a standard pad where the database has it, else with numbers.
+    """A joystick of SDL. Its controls have the names of a standard pad if the database knows it, otherwise numbers.
 
     Args:
         number: SDL's number of the connection.
@@ -89,7 +89,7 @@ class SdlDevice(Device):
         indices = range(sdl2.SDL_NumJoysticks())
         index = next((i for i in indices if sdl2.SDL_JoystickGetDeviceInstanceID(i) == number), None)
         if index is None:
-            raise OSError("unplugged meanwhile")
+            raise OSError("unplugged in the meantime")
         self._controller = sdl2.SDL_GameControllerOpen(index) if sdl2.SDL_IsGameController(index) else None
         self._joystick = sdl2.SDL_JoystickOpen(index)
         if not self._joystick:

@@ -25,20 +25,20 @@ from ibrobot_gamepad.options import GamepadOptions, SpaceMouseOptions
 from ibrobot_gamepad.reports import Kind
 
 _LOOK_NS = ns(0.5)
-"""How often a device is looked for while none is there."""
+"""Period of the search while no device is connected."""
 _LONGEST_STEP_S = 0.1
-"""What one command moves at most: a host that stood still does not make up for it in one leap."""
+"""Maximum motion of one command [s]: after a pause of the host the robot does not jump."""
 _EVENTS: tuple[OperatorEvent, ...] = get_args(OperatorEvent)
 _GRIPPER = ("gripper_open", "gripper_close", "gripper")
 _POSE = "pose "
-"""What begins the function of a button that drives to a pose."""
+"""Prefix of the function of a button that drives to a pose."""
 
 
 class JogTeleop(Teleop):
-    """Jogs with the first device of its kind that is plugged in, now or later. Time is that of the measurements.
+    """Jogs with the first device of its kind, connected before or after the launch. Time is that of the measurements.
 
-    While no device is there, the robot holds. What is pressed when a device comes, or when the mode begins, counts as
-    released: the deadman is pressed again before anything moves.
+    Without a device the robot holds. Buttons held when a device connects, or when the mode begins, count as released:
+    the operator must press the deadman again before anything moves.
     """
 
     def __init__(self, options: GamepadOptions | SpaceMouseOptions, ctx: Context) -> None:
@@ -60,16 +60,16 @@ class JogTeleop(Teleop):
         self._looked_ns: int | None = None
         self._complaint = ""
         self._estop = False
-        """Whether the emergency stop was pressed and not passed on yet."""
+        """Whether the emergency stop was pressed and is not yet reported."""
         self._opens = False
-        """Whether the button that opens and closes the gripper in turns opens it."""
+        """Whether the next press of the button `gripper` opens the gripper."""
         self._forget()
 
     def _forget(self) -> None:
-        """Begin with a device of which nothing is known yet."""
+        """Reset the state for a new device."""
         self._controls: Controls | None = None
         self._pressed: frozenset[str] = frozenset(self._buttons)
-        """Functions whose buttons are pressed; all of them until the device says otherwise."""
+        """Functions whose buttons are pressed; all of them until the device has sent a state."""
         self._rest: dict[str, float] = {}
         """Gripper control -> its first value, for those that have not moved yet."""
         self._release()
@@ -77,7 +77,7 @@ class JogTeleop(Teleop):
     def _release(self) -> None:
         self._engaged = False
         self._toggle_ns: int | None = None
-        """When the toggle button was pressed [ns]; None once it counted, or while it is up."""
+        """When the toggle button was pressed [ns]; None after the toggle, or while it is released."""
         self._moved_ns: int | None = None
         """When the last setpoint was computed [ns]; None while nothing moves."""
 
@@ -94,7 +94,7 @@ class JogTeleop(Teleop):
 
     @override
     def activate(self, measured: JointReading) -> None:
-        self._take(self._poll(measured.stamp_ns), measured.stamp_ns)  # pressed for something else
+        self._take(self._poll(measured.stamp_ns), measured.stamp_ns)  # discards buttons pressed before
         self._release()
         self._jog.restart(measured.position)
 
@@ -133,12 +133,12 @@ class JogTeleop(Teleop):
         return f"{self._name or f'no {self._kind} yet'}: moves {moves}\n{self._map.help()}"
 
     def _poll(self, now_ns: int) -> Sequence[Controls]:
-        """What the device sent, if one is there."""
+        """The new states of the device, if one is connected."""
         if self._finder is not None and self._device is None and self._is_due(now_ns):
             self._looked_ns = now_ns
             try:
                 self._look(self._finder)
-            except TeleopError as error:  # e.g. the permissions of a device that has just come are not set yet
+            except TeleopError as error:  # e.g. udev has not yet set the permissions of a new device
                 if str(error) != self._complaint:
                     self._complaint = str(error)
                     self._ctx.log.warning("%s: %s", self._ctx.name, error)
@@ -169,7 +169,7 @@ class JogTeleop(Teleop):
         self._forget()
 
     def _take(self, states: Sequence[Controls], now_ns: int) -> tuple[OperatorEvent, ...]:
-        """Take over what the device sent; returns what the operator asked for."""
+        """Process the new states; returns the operator's events."""
         events: list[OperatorEvent] = []
         if states and self._controls is None:
             self._ctx.log.info("%s: %s", self._ctx.name, self._name)
@@ -194,7 +194,7 @@ class JogTeleop(Teleop):
         return tuple(events)
 
     def _functions(self, controls: Controls) -> frozenset[str]:
-        """The functions whose buttons are pressed; those of the gripper only once their controls have moved."""
+        """Functions whose buttons are pressed; those of the gripper only after their controls have moved."""
         for function in _GRIPPER:
             if (control := self._buttons.get(function)) is not None:
                 value = controls.value(control)
@@ -231,12 +231,12 @@ class JogTeleop(Teleop):
         return axis.value(controls, self._options.dead_zone) if axis is not None else 0.0
 
     def _gripper(self, controls: Controls) -> float:
-        """How fast the gripper opens, as a share of its speed; negative where it closes."""
+        """Speed of the gripper as a fraction of its maximum; negative for closing."""
         opens, closes, turns = (self._moved(controls, function) for function in _GRIPPER)
         return opens - closes + (turns if self._opens else -turns)
 
     def _moved(self, controls: Controls, function: str) -> float:
-        """The deflection of a gripper control, 0 to 1; 0 until it has moved since the device came."""
+        """Deflection of a gripper control, 0 to 1; 0 until it has moved since the device connected."""
         control = self._buttons.get(function)
         if control is None or np.isfinite(self._rest.get(control, 0.0)):
             return 0.0

@@ -77,8 +77,8 @@ PAD = {
     "joints: {pan: 7}": "joints.pan: expected text, got 7 (quote it: '7')",
     "joints: {pam: left_y}": "joints.pam: unknown joint, did you mean 'pan'?",
     "joints: {grip: left_y}": "joints.grip: unknown joint; the arm has: pan, lift",
-    "joints: {pan: left_y}": "joints: 'left_y' is both pan and lift, must be one of them",
-    "joints: {pan: left_trigger}": "joints: 'left_trigger' is both gripper_open and pan, must be one of them",
+    "joints: {pan: left_y}": "joints: 'left_y' is both pan and lift: assign it to one of them",
+    "joints: {pan: left_trigger}": "joints: 'left_trigger' is both gripper_open and pan: assign it to one of them",
     "tool: {forward: left_y}": "tool: unknown axis of the tool 'forward'; they are: x, y, z, roll, pitch, yaw",
     "tool: {rol: left_y}": "tool: unknown axis of the tool 'rol', did you mean 'roll'?",
     "tool: {x: lefty}": "tool: x: unknown axis 'lefty', did you mean 'left_y'?",
@@ -87,13 +87,13 @@ PAD = {
     "buttons: {estop: soth}": "buttons: estop: unknown button 'soth', did you mean 'south'?",
     "buttons: {estop: A}": "buttons: estop: unknown button 'A'; the buttons are: south, east, west, north, ",
     "buttons: {estop: button}": "buttons: estop: unknown button 'button'",
-    "buttons: {deadman: none}": "buttons: deadman: must have a button: nothing may move that nobody asks for",
-    "buttons: {estop: south}": "buttons: 'south' is both estop and success, must be one of them",
-    "buttons: {estop: left_x}": "buttons: 'left_x' is both estop and pan, must be one of them",
+    "buttons: {deadman: none}": "buttons: deadman: must have a button: the robot moves only while it is held",
+    "buttons: {estop: south}": "buttons: 'south' is both estop and success: assign it to one of them",
+    "buttons: {estop: left_x}": "buttons: 'left_x' is both estop and pan: assign it to one of them",
     "poses: {hom: west}": "poses.hom: unknown pose, did you mean 'home'?",
     "poses: {rest: north}": "poses.rest: unknown pose; the robot has: home",
     "poses: {home: wst}": "poses: home: unknown button 'wst', did you mean 'west'?",
-    "poses: {home: start}": "poses: 'start' is both start and home, must be one of them",
+    "poses: {home: start}": "poses: 'start' is both start and home: assign it to one of them",
 }
 
 
@@ -108,7 +108,7 @@ MOUSE = {
     "joints: {pan: left_x}": "joints: pan: unknown axis 'left_x'; the axes are: x, y, z, roll, pitch, yaw",
     "joints: {pan: axis0}": "joints: pan: unknown axis 'axis0'; the axes are: x, y, z, roll, pitch, yaw",
     "buttons: {deadman: south}": "buttons: deadman: unknown button 'south'; the buttons are: left, right, button3, ",
-    "buttons: {gripper: left}": "buttons: 'left' is both deadman and gripper, must be one of them",
+    "buttons: {gripper: left}": "buttons: 'left' is both deadman and gripper: assign it to one of them",
     "via: sdl": "via: unknown key",
 }
 

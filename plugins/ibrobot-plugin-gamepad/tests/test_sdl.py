@@ -109,7 +109,7 @@ def test_a_pad_that_went_before_it_was_opened_is_reported(finder: Finder, joysti
     pad = joysticks.plug(b"Xbox 360 Controller", mapped=True)
     (found,) = [each for each in finder.find() if each.id == "045e:028e"]
     joysticks.unplug(pad)
-    with pytest.raises(OSError, match="unplugged meanwhile"):
+    with pytest.raises(OSError, match="unplugged in the meantime"):
         found.open()
 
 

@@ -17,14 +17,14 @@ _SLOWEST, _FASTEST = 0.1, 4.0
 """Bounds of the factor that the speed keys change."""
 
 _GRIPPER, _HOME = "<gripper>", "<home>"
-"""Axes beside the joints' names and the tool's."""
+"""Axes in addition to the joints and those of the tool."""
 _MOTIONS = {"gripper_open": (_GRIPPER, 1), "gripper_close": (_GRIPPER, -1), "home": (_HOME, 1)}
 
 
 class KeyboardTeleop(Teleop):
-    """Moves while keys keep coming; a terminal tells of presses and repeats only, never of releases.
+    """Moves while keys repeat, since a terminal reports presses and repeats but no releases.
 
-    Each press moves for `hold` seconds from the tick that saw it. Time is that of the measurements.
+    Each press moves for `hold` seconds from the tick that reads it. Time is that of the measurements.
     """
 
     def __init__(self, options: KeyboardOptions, ctx: Context) -> None:
@@ -60,7 +60,7 @@ class KeyboardTeleop(Teleop):
         self._held.clear()
         self._moved_ns = None
         self._arm.stop_tool()
-        while self._next_key() is not None:  # typed for something else
+        while self._next_key() is not None:  # discards earlier keys
             pass
 
     @override
@@ -70,7 +70,7 @@ class KeyboardTeleop(Teleop):
         now_ns = measured.stamp_ns
         self._held = {axis: held for axis, held in self._held.items() if now_ns < held[1]}
         if not self._moves():
-            # What is pressed now begins to move now: a host that stood still does not make up for it in one leap.
+            # The motion begins now, so after a pause of the host the robot does not jump.
             self._moved_ns = None
         while (key := self._next_key()) is not None:
             action = self._keymap.action(self._mode, key)
@@ -128,7 +128,7 @@ class KeyboardTeleop(Teleop):
         after = before
         jogs_tool = self._mode == "cartesian" and _HOME not in self._held
         if self._arm.tool_moves or (jogs_tool and any(axis in self._held for axis in CARTESIAN_AXES)):
-            # Where anything else is asked for, the tool slows down to a stop first.
+            # Before any other motion the tool slows down to a stop.
             x, y, z, pitch, roll = (self._direction(axis) if jogs_tool else 0 for axis in CARTESIAN_AXES)
             linear = np.array([x, y, z]) * options.cartesian_speed * speed
             turn = np.array([0.0, pitch, roll]) * options.joint_speed * speed

@@ -172,7 +172,9 @@ def test_an_encoding_that_changes_is_refused(bench):
     made = bench(images="jpeg")
     made.begin(topics=(CAMERA,))
     made.write(1, CAMERA, picture)
-    with pytest.raises(RecorderError, match=f"{CAMERA}: a 16UC1 picture cannot become JPEG, only rgb8, bgr8, mono8"):
+    with pytest.raises(
+        RecorderError, match=f"{CAMERA}: a 16UC1 image cannot be encoded as JPEG, only rgb8, bgr8, mono8"
+    ):
         made.recorder.write(CAMERA, picture(1, "16UC1", 1, "uint16"), stamp(1))
 
 

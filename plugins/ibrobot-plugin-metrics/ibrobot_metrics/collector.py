@@ -1,4 +1,4 @@
-"""What a run counts and measures, as Prometheus' families of metrics."""
+"""Counters and measurements of a run, as metric families of Prometheus."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from prometheus_client.registry import Collector
 from ibrobot_core.api import Session
 
 _NAMED_BY_KEY = {"interventions": "joint", "bus drops": "topic"}
-"""Groups whose keys are names of joints or topics: they are labels."""
+"""Groups whose keys are names of joints or topics, which become labels."""
 _GAUGES = frozenset({"plan_length", "watermark", "lateness_p50_us", "lateness_p99_us"})
-"""Whole numbers that do not only grow."""
+"""Integers that can also decrease."""
 _UNITS = {"_ms": ("_seconds", 1e-3), "_us": ("_seconds", 1e-6), "_s": ("_seconds", 1.0), "_hz": ("_hertz", 1.0)}
 _LABEL_SIZE = 200
 NO_LABELS: Mapping[str, str] = MappingProxyType({})
@@ -29,11 +29,11 @@ class RunCollector(Collector):
 
     @override
     def collect(self) -> Iterable[Metric]:
-        """All numbers of the run as they are now."""
+        """The present values of all numbers of the run."""
         session = self._session
         state, outcome = session.state, session.outcome
         families = Families({"robot": session.config.robot.name})
-        families.add("mode", 1, {"mode": session.mode}, about="the mode that is active")
+        families.add("mode", 1, {"mode": session.mode}, about="the active mode")
         families.add("estop", state is not None and state.estop, about="whether the emergency stop is latched")
         families.add("faults", len(outcome.faults), counter=True)
         families.add("episodes", outcome.episodes, counter=True)
@@ -47,7 +47,7 @@ class Families(Collector):
     """Families of metrics, filled one value at a time.
 
     Args:
-        labels: those of every value.
+        labels: labels of every value.
     """
 
     def __init__(self, labels: Mapping[str, str]) -> None:
@@ -63,14 +63,14 @@ class Families(Collector):
         counter: bool = False,
         about: str = "",
     ) -> None:
-        """Take in one value.
+        """Add one value.
 
         Args:
             name: without the prefix `ibrobot_`; a unit at its end is changed to a base unit: `_ms` to `_seconds`.
             value: in the unit of the name.
-            labels: further ones; the first values of a family say which it has.
-            counter: whether it only grows.
-            about: help.
+            labels: further labels; the first value of a family determines their names.
+            counter: whether the value only increases.
+            about: help text.
         """
         for suffix, (unit, factor) in _UNITS.items():
             if name.endswith(suffix):
@@ -90,7 +90,7 @@ class Families(Collector):
 
 
 def _add_group(families: Families, group: str, values: Mapping[str, Any]) -> None:
-    """A group of `/diagnostics`, without its texts."""
+    """Add the numbers of a group of `/diagnostics`."""
     if (label := _NAMED_BY_KEY.get(group)) is not None:
         for name, value in values.items():
             families.add(group, value, {label: name}, counter=True)

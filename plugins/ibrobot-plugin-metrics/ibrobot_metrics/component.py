@@ -1,4 +1,4 @@
-"""The component of the section: a port with the metrics of a run, and whether the robot is well."""
+"""The component of the section: a port with the metrics and the health of a run."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class MetricsPort(Component):
 
     @property
     def url(self) -> str:
-        """Where they are, once started."""
+        """URL of the metrics, once started."""
         assert self._server is not None
         return self._server.url
 
@@ -44,12 +44,12 @@ class MetricsPort(Component):
 
 
 def unhealthy(session: Session) -> str:
-    """Why the run should be started again; empty where it should not."""
+    """Why the run must be restarted; empty if it need not."""
     return session.failure_text or ("the run is over" if session.finished.is_set() else "")
 
 
 def unready(session: Session) -> str:
-    """Why the robot does not do its work now; empty where it does."""
+    """Why the robot cannot work now; empty if it can."""
     state = session.state
     if state is None:
         return "no joint state has been received yet"

@@ -10,6 +10,6 @@ from ibrobot_core.api import documented, option
 @documented
 @attrs.frozen
 class MetricsOptions:
-    """Where the metrics are."""
+    """Options of the section `metrics`."""
 
-    port: int = option(ge=0, le=65535, help="of 127.0.0.1, where /metrics, /healthz and /readyz are; 0: any free one")
+    port: int = option(ge=0, le=65535, help="port of 127.0.0.1 for /metrics, /healthz and /readyz; 0: any free port")

@@ -34,7 +34,7 @@ def _serve() -> click.Command:
 
 @hookimpl
 def ibrobot_engines() -> Iterable[EngineDescriptor]:
-    """In another process, and on a server."""
+    """Engines that run the model in another process or on a server."""
     yield EngineDescriptor(type="process", make=_process, summary="in a process of its own", options=ProcessOptions)
     yield EngineDescriptor(
         type="distributed", make=_distributed, summary="on a server", options=DistributedOptions,
@@ -45,4 +45,4 @@ def ibrobot_engines() -> Iterable[EngineDescriptor]:
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
     """`ibrobot serve`."""
-    yield Command("serve", "Run a model for robots elsewhere.", _serve)
+    yield Command("serve", "Run a model for robots on other machines.", _serve)

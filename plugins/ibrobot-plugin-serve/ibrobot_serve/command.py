@@ -47,45 +47,45 @@ _PANEL_PERIOD_S = 0.5
 
 @click.command()
 @click.argument("what", metavar="CONFIG|MODEL_DIR")
-@click.option("--model", help="Which of the models in CONFIG; may be left out where there is one.")
-@click.option("--sim", is_flag=True, help="Read CONFIG as for a simulation: plugins of its hardware are not needed.")
+@click.option("--model", help="Name of the model in CONFIG; optional if it has only one.")
+@click.option("--sim", is_flag=True, help="Read CONFIG as for a simulation: its hardware plugins are not needed.")
 @click.option("--type", "type_", help="Plugin of the policy in MODEL_DIR, e.g. lerobot.")
-@click.option("--name", help="What robots call the model; its name in CONFIG, or the folder's.")
+@click.option("--name", help="Name of the model for robots; by default its name in CONFIG, or the folder's.")
 @click.option(
     "--set", "overrides", multiple=True, metavar="PATH=VALUE",
     help="Override a key of CONFIG, e.g. control.rate_hz=50, or an option of the policy in MODEL_DIR, e.g. device=cpu.",
 )  # fmt: skip
 @click.option(
     "--listen", multiple=True, metavar="ENDPOINT",
-    help="Where robots connect to, in place of the transport's connect; by default this machine with MODEL_DIR.",
+    help="Address for robots, in place of the transport's connect; with MODEL_DIR, by default this machine.",
 )  # fmt: skip
 @click.option(
     "--transport", "transport_options", multiple=True, metavar="OPTION=VALUE",
     help="Option of the transport, e.g. users=users.txt.",
 )  # fmt: skip
-@click.option("--batch", type=click.IntRange(min=1), default=8, show_default=True, help="Most requests at a time.")
-@click.option("--queue", type=click.IntRange(min=1), default=64, show_default=True, help="Most requests that wait.")
+@click.option("--batch", type=click.IntRange(min=1), default=8, show_default=True, help="Maximum requests per batch.")
+@click.option("--queue", type=click.IntRange(min=1), default=64, show_default=True, help="Maximum waiting requests.")
 @click.option(
     "--patience", type=click.FloatRange(0, 1000), default=0.0, show_default=True, metavar="MS",
-    help="How long a batch that is not full waits for more requests.",
+    help="How long an incomplete batch waits for more requests.",
 )  # fmt: skip
 @click.option(
     "--hang-timeout", type=click.FloatRange(min=0, min_open=True), default=30.0, show_default=True, metavar="S",
-    help="A model that is at work on one batch for longer hangs: requests fail, and the server starts again.",
+    help="A model that works on one batch for longer hangs: requests fail, and the server restarts.",
 )  # fmt: skip
 @click.option(
     "--metrics-port", type=click.IntRange(0, 65535), metavar="PORT",
-    help="Port of 127.0.0.1 for /metrics (Prometheus), /healthz and /readyz; 0: any that is free.",
+    help="Port of 127.0.0.1 for /metrics (Prometheus), /healthz and /readyz; 0: any free port.",
 )  # fmt: skip
 @click.option(
     "--drain", type=click.FloatRange(min=0), default=10.0, show_default=True, metavar="S",
-    help="At the end, how long to wait for requests that are there.",
+    help="How long to wait for pending requests at the end.",
 )  # fmt: skip
 def serve(what: str, **options: Any) -> None:
-    """Run a model for robots elsewhere.
+    """Run a model for robots on other machines.
 
-    CONFIG is a robot YAML, whose model and transport are used; MODEL_DIR is a folder with a model, for --type.
-    Robots reach it by `execution_mode: distributed`. Ctrl-C or SIGTERM answers what is there, then ends.
+    CONFIG is a robot YAML, which names model and transport; MODEL_DIR is a folder with a model, for --type.
+    Robots use it by `execution_mode: distributed`. Ctrl-C or SIGTERM answers pending requests, then ends.
     """
     registry = installed_plugins()
     handler = logging.StreamHandler(sys.stderr)
@@ -102,7 +102,7 @@ def serve(what: str, **options: Any) -> None:
         begun_s = time.monotonic()
         policy.load()
         logging.getLogger("ibrobot").info("%s loaded in %.1f s", name, time.monotonic() - begun_s)
-        stopping = threading.Event()  # only from now on: until here either signal ends it at once
+        stopping = threading.Event()  # from here on; before, either signal ends the process at once
         on_signals(stopping.set)
         transport = make_transport()
         limits = ServiceOptions(options["batch"], options["queue"], options["patience"] / 1000, options["hang_timeout"])
@@ -121,7 +121,7 @@ def serve(what: str, **options: Any) -> None:
             echo(f"serving {name} (policy {policy.fingerprint()}); Ctrl-C ends")
             _show(service, stopping)
             if not hung.is_set() and not service.drain(options["drain"]):
-                logging.getLogger("ibrobot").warning("requests that were there were not answered in time")
+                logging.getLogger("ibrobot").warning("pending requests were not answered in time")
         finally:
             service.close()
             if metrics is not None:
@@ -136,8 +136,8 @@ def serve(what: str, **options: Any) -> None:
 
 
 def _start_again() -> None:
-    """Replace this process by one with the same command line: nothing else ends a thread that hangs."""
-    logging.getLogger("ibrobot").error("the server starts again, with the same command line")
+    """Replace this process by one with the same command line: nothing else ends a hanging thread."""
+    logging.getLogger("ibrobot").error("the server restarts, with the same command line")
     sys.stdout.flush()
     sys.stderr.flush()
     os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
@@ -146,7 +146,7 @@ def _start_again() -> None:
 def _from_config(what: str, registry: Registry, options: dict[str, Any]) -> tuple[str, Policy, Callable[[], Transport]]:
     """Name, policy and transport of a robot YAML."""
     if Path(what).is_dir():
-        raise click.UsageError(f"{what} is a folder: give the plugin of the model in it, e.g. --type lerobot")
+        raise click.UsageError(f"{what} is a folder: name the plugin of its model, e.g. --type lerobot")
     path = find_config(what, registry)
     transport = _transport_type(path, options["overrides"])
     listening = _listening(registry, transport, options["listen"]) if transport and options["listen"] else []
@@ -176,9 +176,9 @@ def _from_folder(
 ) -> tuple[str, Policy, Callable[[], Transport]]:
     """Name, policy and transport of a folder with a model."""
     if not folder.is_dir():
-        raise click.UsageError(f"{folder}: no such folder; with --type it must be one with a model")
+        raise click.UsageError(f"{folder}: no such folder; with --type, give a folder with a model")
     if options["model"]:
-        raise click.UsageError("--model chooses one of CONFIG's models; MODEL_DIR has but one, which --name names")
+        raise click.UsageError("--model selects a model of CONFIG; MODEL_DIR has only one, which --name names")
     context = _context(Robot("server", ()))
     policies = registry.find("policy", options["type_"])
     overrides = [f"path={folder.absolute()}", *options["overrides"]]
@@ -200,7 +200,7 @@ def _from_folder(
 
 
 def _transport_type(path: Path, overrides: Sequence[str]) -> str:
-    """The type that the `transport` section names, before anything is checked; empty where there is none."""
+    """The type in the `transport` section, read before any checks; empty if there is none."""
     try:
         text = path.read_text(encoding="utf-8", errors="replace")
     except OSError as error:
@@ -227,7 +227,7 @@ def _context(robot: Robot) -> Context:
 
 
 def _show(service: InferenceService, stopping: threading.Event) -> None:
-    """Tell how it goes, until it is to stop: as a table in a terminal, else as a line now and then."""
+    """Show the statistics until `stopping` is set: as a table in a terminal, otherwise as a line every ten seconds."""
     if not sys.stdout.isatty():
         while not stopping.wait(_PLAIN_PERIOD_S):
             echo(_line(service.statistics()))

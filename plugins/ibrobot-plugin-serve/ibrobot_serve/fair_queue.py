@@ -43,7 +43,7 @@ class FairQueue[T]:
         Args:
             most: how many items.
             alike: whether an item may go with the first.
-            patience_s: for how long to wait for more than there are [s].
+            patience_s: how long to wait until `most` items are queued [s].
 
         Returns:
             Nothing after `end`, once the queue is empty.
@@ -59,14 +59,14 @@ class FairQueue[T]:
             return taken
 
     def clear(self) -> list[T]:
-        """Take all that wait, in turn."""
+        """Take all waiting items, in turn."""
         with self._changed:
             taken = list(self._waiting.values())
             self._waiting.clear()
             return taken
 
     def end(self) -> None:
-        """Wait no longer for what may come."""
+        """Make `take` stop waiting for items."""
         with self._changed:
             self._ended = True
             self._changed.notify_all()

@@ -1,4 +1,4 @@
-"""What a server of a model counts, for Prometheus, and whether it is well."""
+"""Counters of a model server for Prometheus, and its health."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _Rows = Mapping[tuple[str, ...], Mapping[str, Any]]
 
 
 def probes(service: InferenceService) -> Probes:
-    """What an HTTP port says of a service."""
+    """The answers of a service's HTTP port."""
     return Probes(
         lambda: generate_latest(ServiceCollector(service)),
         lambda: "the model hangs" if service.state == "hangs" else "",
@@ -35,21 +35,21 @@ class ServiceCollector(Collector):
 
     @override
     def collect(self) -> Iterable[Metric]:
-        """All numbers as they are now."""
+        """The present values of all numbers."""
         statistics = self._service.statistics()
         model = statistics["model"]
-        malformed = CounterMetricFamily("ibrobot_serve_malformed", "payloads that are no request", labels=["model"])
+        malformed = CounterMetricFamily("ibrobot_serve_malformed", "payloads that are not requests", labels=["model"])
         malformed.add_metric([model], statistics["malformed"])
         batches = CounterMetricFamily("ibrobot_serve_batches", "by requests in one run", labels=["model", "size"])
         for size, count in statistics["batches"].items():
             batches.add_metric([model, size], count)
-        # All robots together, since a robot that was not heard of for long is forgotten.
+        # Totals over all robots, since the service forgets robots that are silent for long.
         together: _Rows = {(model,): statistics}
         each: _Rows = {(model, name[:_LABEL_SIZE]): counts for name, counts in statistics["robots"].items()}
         return [
             _gauge("uptime_seconds", "time since the start", model, statistics["uptime_s"]),
             _gauge("waiting", "robots whose requests wait", model, statistics["waiting"]),
-            _gauge("pace_seconds", "time that robots leave between requests", model, statistics["pace_ms"] / 1e3),
+            _gauge("pace_seconds", "time between the requests of a robot", model, statistics["pace_ms"] / 1e3),
             malformed,
             batches,
             *_answers("ibrobot_serve", ("model",), together),
@@ -66,7 +66,7 @@ def _gauge(name: str, about: str, model: str, value: float) -> Metric:
 def _answers(prefix: str, labels: tuple[str, ...], rows: _Rows) -> Iterable[Metric]:
     """Requests and their latencies, for each row's values of the labels."""
     for name in _COUNTS:
-        counter = CounterMetricFamily(f"{prefix}_{name}", "requests, by what came of them", labels=labels)
+        counter = CounterMetricFamily(f"{prefix}_{name}", "requests, by result", labels=labels)
         for values, counts in rows.items():
             counter.add_metric(values, counts[name])
         yield counter

@@ -28,7 +28,7 @@ from ibrobot_core.api import (
 from ibrobot_serve.wire import WIRE_LIMITS, WireDecoder, WireEncoder, WireKind, WireMessage
 
 _GLANCE_S = 0.5
-"""How often to check whether the host is alive [s]."""
+"""Period of the check that the host is alive [s]."""
 _NICE = 5
 """Below the priority of the host, which reads cameras and sends plans while the model computes."""
 
@@ -49,7 +49,7 @@ class ModelLoop:
         """Answer until the host hangs up."""
         while True:
             try:
-                order = self.channel.wait(None)[-1]  # earlier ones were given up
+                order = self.channel.wait(None)[-1]  # the host gave up the earlier ones
             except ComponentFailed:
                 return
             size = self._answered(order["id"], order["size"])
@@ -66,7 +66,7 @@ class ModelLoop:
             outputs = self.policy.infer(message.tensors)
             latency_ms = (time.monotonic_ns() - begun_ns) / 1e6
             return self._put(WireMessage(WireKind.ANSWER, request_id, outputs, latency_ms=latency_ms))
-        except Exception as error:  # noqa: BLE001 - contained: one request's fault is its own answer
+        except Exception as error:  # noqa: BLE001 - contained: the answer has the error
             return self._put(WireMessage(WireKind.FAILURE, request_id, text=error_text(error)))
 
     def _put(self, message: WireMessage) -> int:

@@ -12,7 +12,7 @@ from ibrobot_core.api import NS_PER_S
 _TARGET = 0.8
 """Share of the model's time that requests may take. At 0.8, random arrivals wait for two requests' time on average."""
 _GROWTH = 1.25
-"""How much more often than now a robot might ask: one that keeps to its pace may want more."""
+"""Assumed growth of each robot's demand: a robot that keeps its pace may want to ask more often."""
 _WINDOW_NS = 5 * NS_PER_S
 _RENEWED_NS = NS_PER_S // 5
 _BATCHES_KEPT = 64
@@ -21,28 +21,28 @@ _BATCHES_KEPT = 64
 class Pacing:
     """The time that each robot of a server should leave between its requests.
 
-    The model's time is shared by max-min fairness: a robot that asks seldom gets what it wants, and what it leaves is
-    shared by the others. As long as all together want less than the model can do, nobody is held back. Demand is
+    Max-min fairness divides the model's time: a robot that asks seldom gets what it wants, and the others share the
+    rest. As long as the total demand is below the model's capacity, no robot is limited. Demand is
     measured over 5 s, and the cost of a request by the median batch of the cheapest size, so that neither grows
     because the model stood still for a while. May be used by several threads.
     """
 
     def __init__(self) -> None:
         self._asked: OrderedDict[str, deque[int]] = OrderedDict()
-        """When each robot asked within the window, by when it asked last."""
+        """Times of each robot's requests within the window, in the order of the last request."""
         self._batches: deque[tuple[int, int]] = deque(maxlen=_BATCHES_KEPT)
         self._pace_ns = 0
         self._renew_ns = 0
         self._lock = threading.Lock()
 
     def ask(self, robot: str, now_ns: int) -> None:
-        """Note that a robot asks."""
+        """Count a request of a robot."""
         with self._lock:
             self._asked.setdefault(robot, deque()).append(now_ns)
             self._asked.move_to_end(robot)
 
     def work(self, requests: int, took_ns: int) -> None:
-        """Note that a batch of so many requests took so long [ns]."""
+        """Record the size and the duration [ns] of a batch."""
         with self._lock:
             self._batches.append((requests, took_ns))
 
@@ -63,20 +63,20 @@ class Pacing:
                 del self._asked[robot]
 
     def _cost_ns(self) -> float:
-        """What a request takes of the model's time [ns], in batches of the size that does most."""
+        """Model time per request [ns], in batches of the most efficient size."""
         sizes = {size for size, _ in self._batches}
         return min((median(ns for n, ns in self._batches if n == size) / size for size in sizes), default=0.0)
 
 
 def fair_pace_ns(counts: Iterable[int], cost_ns: float) -> int:
-    """The pace of the robots that ask most, so that all together take no more than the target of the model's time.
+    """The pace of the robots that ask most, with which all robots together stay within the model's target load.
 
     Args:
-        counts: of each robot, how often it asked within the window.
-        cost_ns: what a request takes [ns].
+        counts: number of requests of each robot within the window.
+        cost_ns: model time per request [ns].
 
     Returns:
-        The pace [ns]; 0 where nobody needs to be held back, as where there is one robot only.
+        The pace [ns]; 0 if no robot needs a limit, as with a single robot.
     """
     wanted = sorted(_GROWTH * count for count in counts)
     if len(wanted) < 2 or not cost_ns:

@@ -45,7 +45,7 @@ class ProcessEngine(Engine):
         seed: the run's.
         given_up: set when the run ends, e.g. while the model loads.
         hang_timeout_s: a process that works on one request for longer hangs [s].
-        accept_new_weights: go on, with a warning, when the process starts again with other weights.
+        accept_new_weights: continue, with a warning, if the process restarts with other weights.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class ProcessEngine(Engine):
         self._child: Child | None = None
         self._hang_timeout_s = hang_timeout_s
         self._sent = 0
-        """The id of the newest request."""
+        """Id of the newest request."""
         self._at_work_s: float | None = None
         """When the process began its current request [s]; None between requests."""
         self._deaths = 0
@@ -111,7 +111,7 @@ class ProcessEngine(Engine):
             self._sent = request_id
             self._at_work_s = self._at_work_s or time.monotonic()
             while (event := self._await("answer", child, deadline_s))["id"] != request_id:
-                pass  # of a request that was given up
+                pass  # the answer to an abandoned request
             # The memory belongs to the next answer; this one is kept.
             answer = self._decoder.decode(bytes(self._answer[: event["size"]]))
         self._deaths = 0
@@ -163,7 +163,7 @@ class ProcessEngine(Engine):
                 raise PolicyError("the model was closed")
             if self._at_work_s is not None and time.monotonic() - self._at_work_s > self._hang_timeout_s:
                 child.kill()
-                raise self._died(child, f"it hung, at work on one request for more than {self._hang_timeout_s:g} s")
+                raise self._died(child, f"it hung, working on one request for more than {self._hang_timeout_s:g} s")
             if time.monotonic() >= deadline_s:
                 state = "did not answer" if self.stats.alive else "is still loading"
                 raise PolicyError(f"the model's process {child.pid} {state} in time")
@@ -189,7 +189,7 @@ class ProcessEngine(Engine):
         child = self._child
         if child is None:
             if (left := self._start_again_s - time.monotonic()) > 0:
-                raise PolicyError(f"the model's process died; it starts again in {left:.1f} s")
+                raise PolicyError(f"the model's process died; it restarts in {left:.1f} s")
             self.stats.restarts += 1
             child = self._spawn()
         if not self.stats.alive:
@@ -204,7 +204,7 @@ class ProcessEngine(Engine):
         self._deaths += 1
         self._start_again_s = time.monotonic() + pause_s
         if self.stats.requests and not self._closed.is_set():
-            self._log.error("the model's process %d died: %s; it starts again in %g s", child.pid, how, pause_s)
+            self._log.error("the model's process %d died: %s; it restarts in %g s", child.pid, how, pause_s)
         return PolicyError(f"the model's process {child.pid} died: {how}")
 
     def _reap(self) -> None:
@@ -219,5 +219,5 @@ class ProcessEngine(Engine):
 
     @property
     def _patience_s(self) -> float:
-        """For how long the process may end by itself [s]."""
+        """How long the process may take to exit [s]."""
         return 0.0 if self._closed.is_set() else _END_TIMEOUT_S

@@ -50,18 +50,18 @@ _PARALLEL = 8
 class RemoteEngine(Engine):
     """The model on a server; the robot's side has no weights.
 
-    While the server is away, requests fail and the arm holds. Once it is back it answers again, because each request
-    contains all that a server needs. The transport reconnects by itself.
+    While the server is unreachable, requests fail and the arm holds. Once it is back it answers again, because each
+    request contains everything that a server needs. The transport reconnects by itself.
 
     Args:
-        policy: the robot's side, which must have the fingerprint of the server's.
-        transport: the way to the server; its owner closes it.
-        model: what the server calls the model.
-        robot: this robot's name; made unique among the server's robots.
+        policy: the robot's side; its fingerprint must equal that of the server's.
+        transport: the connection to the server; its owner closes it.
+        model: name of the model on the server.
+        robot: this robot's name; a suffix makes it unique among the server's robots.
         start_timeout_s: how long `start` waits for a server [s].
-        codec: encodes camera pictures as JPEG, for slow links.
+        codec: encodes camera images as JPEG, for slow links.
         limits: the server's.
-        accept_new_weights: go on, with a warning, with a server that comes back with other weights.
+        accept_new_weights: continue, with a warning, if the server restarts with other weights.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class RemoteEngine(Engine):
         super().__init__("distributed")
         self._policy = policy
         self._fingerprint = policy.fingerprint()
-        """With the server's weights, once it is known."""
+        """Includes the server's weights, once they are known."""
         self._accept_new_weights = accept_new_weights
         self._changed = threading.Event()
         """Set when an answer came from another policy."""
@@ -85,7 +85,7 @@ class RemoteEngine(Engine):
         self._buffers = [Buffer() for _ in range(self.parallel)]
         """Free buffers."""
         self._episode = time.time_ns()
-        """From the time, so that no restart with the same certificate repeats an episode's number."""
+        """Starts at the time, so that a restart with the same certificate does not repeat an episode's number."""
         self._end_watch: Callable[[], None] | None = None
 
     @classmethod
@@ -93,7 +93,7 @@ class RemoteEngine(Engine):
         """The engine that a robot YAML describes.
 
         Raises:
-            PolicyError: for `jpeg_quality`, where the policy sends no pictures as they are.
+            PolicyError: for `jpeg_quality`, if the policy sends no raw images.
         """
         model = ctx.model
         assert model is not None
@@ -102,10 +102,8 @@ class RemoteEngine(Engine):
         if options.jpeg_quality is not None:
             codec = model.policy.picture_codec(options.jpeg_quality)
             if codec is None:
-                raise PolicyError(
-                    f"model {ctx.name!r}: jpeg_quality cannot be used, the policy sends no pictures as they are"
-                )
-            message = "model %s: pictures are sent as JPEG of quality %d, with a loss"
+                raise PolicyError(f"model {ctx.name!r}: jpeg_quality cannot be used: the policy sends no raw images")
+            message = "model %s: images are sent as JPEG of quality %d, which is lossy"
             logging.getLogger("ibrobot.inference").info(message, ctx.name, options.jpeg_quality)
         return cls(
             model.policy, model.transport, options.server_model or ctx.name, ctx.robot.name,
@@ -154,8 +152,8 @@ class RemoteEngine(Engine):
             raise PolicyError(f"the server of {self._model}: {answer.text}")
         if answer.id != request_id or answer.fingerprint != fingerprint:
             raise PolicyError(
-                f"the server of {self._model} answered request {answer.id} by policy {answer.fingerprint!r}, "
-                f"asked was {request_id} by {fingerprint!r}"
+                f"the server of {self._model} answered request {answer.id} with policy {answer.fingerprint!r}; "
+                f"expected request {request_id} with policy {fingerprint!r}"
             )
         self.stats.queue_ms = min(answer.queued_ns / 1e6, answer.latency_ms)
         self.stats.model_ms = answer.latency_ms - self.stats.queue_ms
@@ -168,10 +166,10 @@ class RemoteEngine(Engine):
             end()
 
     def _look_again(self) -> None:
-        """Ask which policy the server has now.
+        """Check which policy the server has now.
 
         Raises:
-            PolicyError: when it is another, or has other weights that are not accepted.
+            PolicyError: when the policy differs, or its weights differ and are not accepted.
         """
         with self._looking:
             if not self._changed.is_set():
@@ -203,12 +201,12 @@ class RemoteEngine(Engine):
             health = None
         if not isinstance(health, dict):
             raise PolicyError(
-                f"what serves {health_name(self._model)} is not an ibrobot server: {bytes(reply)[:40]!r}…"
+                f"the server of {health_name(self._model)} is not an ibrobot server: {bytes(reply)[:40]!r}…"
             )
         return health
 
     def _differences(self, health: Mapping[str, Any], fingerprint: str) -> str:
-        """Both policies, where they differ."""
+        """The differences of both policies."""
         known = health["spec"] if isinstance(health.get("spec"), dict) else {}
         ours = json.loads(json.dumps(attrs.asdict(self._policy.spec)))
         lines = [f"the policy on the server is not the robot's model {self._model!r}:"]
@@ -218,6 +216,6 @@ class RemoteEngine(Engine):
         lines.append(f"  fingerprint\n      robot: {fingerprint}\n     server: {health.get('fingerprint')}")
         if len(lines) == 2:  # the fingerprint alone
             lines.append(
-                "  they look alike, but files or options differ, e.g. statistics: copy the server's, without weights"
+                "  equal specs, but files or options differ, e.g. statistics: copy the server's files, without weights"
             )
         return "\n".join(lines)

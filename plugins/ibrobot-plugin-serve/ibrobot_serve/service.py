@@ -42,45 +42,45 @@ from ibrobot_serve.wire import (
 )
 
 _ROBOTS_KEPT = 256
-"""Robots whose counts are kept; those heard of last."""
+"""Number of robots whose counts are kept: the most recent ones."""
 _LATENCIES_KEPT = 1000
 _LEASE_NS = 5 * NS_PER_S
-"""How long a model that remembers stays with a silent robot, where another asks."""
+"""How long a stateful model stays with a silent robot while another asks."""
 _LONGEST_WAIT_S = 600.0
 _GLANCE_S = 1.0
-"""The longest that the watchdog sleeps."""
+"""Maximum sleep of the watchdog."""
 
 
 @attrs.frozen
 class ServiceOptions:
-    """How requests are queued and put together."""
+    """How requests are queued and batched."""
 
     batch: int = 8
-    """The most requests for one `infer_batch`."""
+    """Maximum number of requests for one `infer_batch`."""
     queue: int = 64
-    """The most requests that wait, one of each robot."""
+    """Maximum number of waiting requests, one per robot."""
     patience_s: float = 0.0
-    """How long a batch that is not full waits for more requests [s]; 0: only what waits already goes together."""
+    """How long an incomplete batch waits for more requests [s]; 0: it takes only requests already waiting."""
     hang_timeout_s: float = 30.0
-    """After which a model that is at work on one batch is taken to hang [s]."""
+    """A model that works on one batch for longer counts as hanging [s]."""
     limits: WireLimits = WIRE_LIMITS
 
 
 @attrs.define
 class RobotCounts:
-    """What one robot asked, and how long its answers took."""
+    """Requests of one robot, and the latencies of its answers."""
 
     requests: int = 0
     answered: int = 0
     failed: int = 0
-    """Answered with why there is no chunk; `expired` ones among them."""
+    """Answered with an error; includes `expired` ones."""
     expired: int = 0
-    """Begun too late, so never begun."""
+    """Not begun, because the deadline had passed."""
     heard_ns: int = 0
     latencies_ms: deque[float] = attrs.field(factory=lambda: deque(maxlen=_LATENCIES_KEPT))
 
     def summary(self) -> dict[str, Any]:
-        """For people and programs."""
+        """The counts and latencies, as JSON values."""
         p50, p99 = np.percentile(self.latencies_ms or [0.0], [50, 99])
         counts = {name: getattr(self, name) for name in ("requests", "answered", "failed", "expired")}
         return {**counts, "latency_p50_ms": round(float(p50), 2), "latency_p99_ms": round(float(p99), 2)}
@@ -88,7 +88,7 @@ class RobotCounts:
 
 @attrs.frozen(eq=False)
 class _Outcome:
-    """What came of a request: outputs, or why there are none."""
+    """Result of a request: outputs, or an error."""
 
     outputs: Tensors | None
     error: str = ""
@@ -98,7 +98,7 @@ class _Outcome:
 
 @attrs.frozen(eq=False)
 class _Ticket:
-    """A request that waits for its turn. The first outcome counts."""
+    """A waiting request. Its first outcome counts."""
 
     message: WireMessage
     arrived_ns: int
@@ -126,9 +126,9 @@ class InferenceService:
     Args:
         policy: the loaded policy; the caller closes it, after the service.
         transport: the connection to the robots; the caller closes it, after the service.
-        model: what robots call it.
+        model: name of the model for robots.
         options: how requests are queued.
-        codec: for pictures that come as JPEG.
+        codec: decodes images sent as JPEG.
         on_hang: called once when the model hangs. Nothing can stop its thread: replace the process.
     """
 
@@ -150,11 +150,11 @@ class InferenceService:
         self._robots: OrderedDict[str, RobotCounts] = OrderedDict()
         self._batches: Counter[int] = Counter()
         self._malformed = 0
-        self._at_work = 0
+        self._pending = 0
         self._idle = threading.Condition(self._lock)
         self._draining = False
         self._work: tuple[int, list[_Ticket]] | None = None
-        """What the model is at work on, and since when [ns]."""
+        """The start time [ns] and the tickets of the present batch."""
         self._on_hang = on_hang
         self._closed = threading.Event()
         self._owner: tuple[str, int] | None = None
@@ -169,10 +169,10 @@ class InferenceService:
         """Begin to answer.
 
         Raises:
-            TransportError: when the name is served already.
+            TransportError: when another server has this name.
         """
         options = self._options
-        # Each request that waits holds a worker: there must be one left to say that the queue is full.
+        # Each waiting request holds a worker; one more must be left to answer that the queue is full.
         workers = options.queue + options.batch + 1
         self._ends.append(self._transport.serve(health_name(self._model), self._health, workers=1))
         self._ends.append(self._transport.serve(service_name(self._model), self._answer, workers=workers))
@@ -180,13 +180,13 @@ class InferenceService:
         self._watchdog.start()
 
     def drain(self, timeout_s: float) -> bool:
-        """Refuse what comes from now on, and wait for what is there to be answered; whether all was, in time [s]."""
+        """Refuse new requests, and wait until all pending ones are answered; returns whether they were, in time [s]."""
         with self._idle:
             self._draining = True
-            return self._idle.wait_for(lambda: self._at_work == 0, timeout_s)
+            return self._idle.wait_for(lambda: self._pending == 0, timeout_s)
 
     def close(self) -> None:
-        """End; what still waits is answered with an error. Safe to call twice."""
+        """Stop, and answer waiting requests with an error. Safe to call twice."""
         self._draining = True
         self._closed.set()
         self._queue.end()
@@ -199,14 +199,14 @@ class InferenceService:
 
     @property
     def state(self) -> str:
-        """What `…/health` says: `ready`, `draining`, or `hangs`."""
+        """The state in `…/health`: `ready`, `draining`, or `hangs`."""
         work = self._work
         if work is not None and time.monotonic_ns() - work[0] > self._options.hang_timeout_s * NS_PER_S:
             return "hangs"
         return "draining" if self._draining else "ready"
 
     def statistics(self) -> dict[str, Any]:
-        """What `…/health` answers."""
+        """The answer of `…/health`."""
         pace_ms = self._pacing.pace_ns(time.monotonic_ns()) / 1e6
         with self._lock:
             robots = {name: counts.summary() for name, counts in self._robots.items()}
@@ -233,17 +233,17 @@ class InferenceService:
             with self._lock:
                 self._malformed += 1
             return self._encoder.encode(WireMessage(WireKind.FAILURE, 0, text=str(error)))
-        if sender is not None:  # whatever name the request claims
+        if sender is not None:  # regardless of the name in the request
             message = attrs.evolve(message, robot=sender)
         with self._idle:
             refused = self._refusal(message)
-            self._at_work += 1
+            self._pending += 1
         try:
             outcome = _Outcome(None, refused) if refused else self._wait_for(message, arrived_ns)
             return self._reply(message, outcome, arrived_ns)
         finally:
             with self._idle:
-                self._at_work -= 1
+                self._pending -= 1
                 self._idle.notify_all()
 
     def _refusal(self, message: WireMessage) -> str:
@@ -263,11 +263,11 @@ class InferenceService:
         patience_ns = min(message.deadline_ns, round(_LONGEST_WAIT_S * NS_PER_S))
         ticket = _Ticket(message, arrived_ns, arrived_ns + patience_ns)
         self._pacing.ask(message.robot, arrived_ns)
-        gave_way = self._queue.put(message.robot, ticket)
-        if gave_way is ticket:
+        replaced = self._queue.put(message.robot, ticket)
+        if replaced is ticket:
             ticket.fail(f"the server is full: {self._options.queue} requests wait")
-        elif gave_way is not None:
-            gave_way.fail(f"not begun: the newer request {message.id} of this robot took its place")
+        elif replaced is not None:
+            replaced.fail(f"not begun: the newer request {message.id} of this robot replaced it")
         try:
             return ticket.outcomes.get(timeout=max(0.0, (ticket.deadline_ns - time.monotonic_ns()) / NS_PER_S))
         except queue.Empty:
@@ -277,7 +277,7 @@ class InferenceService:
         now_ns = time.monotonic_ns()
         latency_ms = (now_ns - arrived_ns) / 1e6
 
-        def said(kind: WireKind, outputs: Tensors, text: str = "") -> Payload:
+        def encoded(kind: WireKind, outputs: Tensors, text: str = "") -> Payload:
             answer = WireMessage(
                 kind, message.id, outputs, message.robot, self._fingerprint, text, message.stamp_ns,
                 latency_ms=latency_ms, queued_ns=outcome.queued_ns, pace_ns=self._pacing.pace_ns(now_ns),
@@ -287,9 +287,9 @@ class InferenceService:
         error, reply = outcome.error, None
         if outcome.outputs is not None:
             try:
-                reply = said(WireKind.ANSWER, outcome.outputs)
-            except WireError as unsaid:
-                error = f"the policy's outputs: {unsaid}"
+                reply = encoded(WireKind.ANSWER, outcome.outputs)
+            except WireError as invalid:
+                error = f"the policy's outputs: {invalid}"
         with self._lock:
             for counts in (self._all, self._counts(message.robot)):
                 counts.requests += 1
@@ -297,7 +297,7 @@ class InferenceService:
                 counts.failed += reply is None
                 counts.expired += outcome.expired
                 counts.latencies_ms.append(latency_ms)
-        return reply if reply is not None else said(WireKind.FAILURE, {}, error)
+        return reply if reply is not None else encoded(WireKind.FAILURE, {}, error)
 
     def _counts(self, robot: str) -> RobotCounts:
         counts = self._robots.setdefault(robot, RobotCounts())
@@ -314,7 +314,7 @@ class InferenceService:
             live = [ticket for ticket in batch if ticket.deadline_ns > now_ns]
             for ticket in batch:
                 if ticket not in live:
-                    ticket.fail("expired before its turn came; it was not begun", expired=True)
+                    ticket.fail("expired before its turn; it was not begun", expired=True)
             if live:
                 self._work = (now_ns, live)
                 self._run(live, now_ns)
@@ -328,7 +328,7 @@ class InferenceService:
             self._owner_heard_ns = now_ns
 
     def _watch(self) -> None:
-        """Tell all who wait that the model hangs, once it does."""
+        """Fail all waiting requests once the model hangs."""
         while not self._closed.wait(min(_GLANCE_S, self._options.hang_timeout_s / 4)):
             work = self._work
             if work is None or self.state != "hangs":
@@ -340,10 +340,10 @@ class InferenceService:
             return
 
     def _hang(self) -> str:
-        return f"the model hangs: it has been at work on one batch for more than {self._options.hang_timeout_s:g} s"
+        return f"the model hangs: it has worked on one batch for more than {self._options.hang_timeout_s:g} s"
 
     def _infer(self, live: list[_Ticket]) -> bool:
-        """Answer the tickets; whether there were outputs for all together."""
+        """Answer the tickets; returns whether the whole batch succeeded."""
         begun_ns = time.monotonic_ns()
         with self._lock:
             self._batches[len(live)] += 1
@@ -354,10 +354,10 @@ class InferenceService:
             ]
             if len(outputs) != len(live):
                 raise PolicyError(f"{len(outputs)} outputs for a batch of {len(live)}")
-        except Exception as error:  # noqa: BLE001 - contained: a request that the policy cannot take is refused
+        except Exception as error:  # noqa: BLE001 - contained: the request is refused
             if len(live) == 1:
-                live[0].fail(self._told(error))
-            else:  # one of them must not spoil the others
+                live[0].fail(self._error_text(error))
+            else:  # one faulty request must not fail the others
                 for ticket in live:
                     self._infer([ticket])
             return False
@@ -367,10 +367,10 @@ class InferenceService:
         return True
 
     def _enter(self, ticket: _Ticket, now_ns: int) -> bool:
-        """Whether a model that remembers may answer this robot; reset where its episode is a new one.
+        """Whether a stateful model may answer this robot; resets the model for a new episode.
 
-        The model becomes the robot's once it has answered: a request that it cannot take is no reason to keep others
-        away, or to forget what another robot's episode was.
+        The robot becomes the owner with the first answer, so that an invalid request neither blocks other robots nor
+        ends the episode of the present owner.
         """
         message = ticket.message
         if self._owner is not None and self._owner[0] != message.robot and now_ns - self._owner_heard_ns < _LEASE_NS:
@@ -379,18 +379,18 @@ class InferenceService:
         try:
             self._policy.check(message.tensors)
         except Exception as error:  # noqa: BLE001 - contained: the robot gets the error
-            ticket.fail(self._told(error))
+            ticket.fail(self._error_text(error))
             return False
         if self._owner != (message.robot, message.episode):
             self._owner = None
             try:
                 self._policy.reset(message.seed)
             except Exception as error:  # noqa: BLE001 - contained: the robot gets the error
-                ticket.fail(f"the policy's reset failed: {self._told(error)}")
+                ticket.fail(f"the policy's reset failed: {self._error_text(error)}")
                 return False
         return True
 
-    def _told(self, error: Exception) -> str:
+    def _error_text(self, error: Exception) -> str:
         if isinstance(error, IbrobotError):
             return str(error)
         self._log.error("%s", "".join(traceback.format_exception(error)))

@@ -1,4 +1,4 @@
-"""The wire format between a robot and where its model runs: a fixed head, texts, a table of tensors, their bytes.
+"""The wire format between a robot and its model: a fixed header, texts, a table of tensors, and their bytes.
 
 `docs/reference/wire.md` describes it byte by byte. Nothing that is received is evaluated, and every claim that a frame
 makes about itself is checked against its length and the limits before anything is made of it.
@@ -24,7 +24,7 @@ from ibrobot_core.api import Payload, PictureCodec, Tensors, WireError
 MAGIC = b"IBRW"
 VERSION = 1
 ALIGNMENT = 64
-"""Bytes; every tensor's buffer begins at a multiple of it, counted from the frame's first byte."""
+"""Alignment of tensors [bytes], counted from the frame's first byte."""
 
 _NUMBERS = struct.Struct("<4sHBBQqqQqd")
 _SIZES = struct.Struct("<QIHHH6s")
@@ -44,17 +44,17 @@ _LAYOUTS_KEPT = 512
 
 
 def service_name(model: str) -> str:
-    """What a transport calls the service of a model."""
+    """Name of a model's service on a transport."""
     return f"infer/{model}"
 
 
 def health_name(model: str) -> str:
-    """What a transport calls its health."""
+    """Name of its health service."""
     return f"{service_name(model)}/health"
 
 
 def whole_fingerprint(fingerprint: str, weights: str) -> str:
-    """Of a policy with its weights: requests and answers carry it, so that one side notices when the other's change.
+    """Fingerprint of a policy with its weights. Requests and answers carry it, so that each side notices changes.
 
     Args:
         fingerprint: `Policy.fingerprint`.
@@ -64,7 +64,7 @@ def whole_fingerprint(fingerprint: str, weights: str) -> str:
 
 
 class WireKind(enum.IntEnum):
-    """What a frame is."""
+    """The kinds of frames."""
 
     REQUEST = 1
     """Tensors for `infer`."""
@@ -103,14 +103,14 @@ class WireMessage:
     """Of the request; its answer carries the same."""
     tensors: Tensors = attrs.field(factory=dict)
     robot: str = ""
-    """Who asks: unique among a server's robots."""
+    """Name of the sender, unique among a server's robots."""
     fingerprint: str = ""
     """Of the sender's policy."""
     text: str = ""
     stamp_ns: int = 0
     """When the robot sent the request, by its own clock; the answer repeats it."""
     deadline_ns: int = 0
-    """In a request: how long after its arrival the answer is of use [ns]. The clocks of both sides need not agree."""
+    """In a request: how long after its arrival the answer is useful [ns]. The clocks of both sides need not agree."""
     episode: int = 0
     """In a request: counts the robot's episodes; a policy that remembers is reset with `seed` where it changes."""
     seed: int = 0
@@ -123,7 +123,7 @@ class WireMessage:
 
 
 class NoPictures(PictureCodec):
-    """Sends all tensors as they are, and takes no JPEG."""
+    """Sends all tensors unchanged, and accepts no JPEG."""
 
     @override
     def encode(self, name: str, picture: NDArray[np.uint8]) -> bytes | None:
@@ -131,12 +131,12 @@ class NoPictures(PictureCodec):
 
     @override
     def decode(self, jpeg: memoryview, shape: tuple[int, int, int]) -> NDArray[np.uint8]:
-        raise WireError("JPEG, which is not spoken here")
+        raise WireError("JPEG, which this side does not support")
 
 
 @attrs.frozen(eq=False)
 class _Place:
-    """Where a frame has a tensor, or its JPEG."""
+    """Position of a tensor, or of its JPEG, in a frame."""
 
     name: str
     dtype: np.dtype[np.generic]
@@ -260,7 +260,7 @@ def _fresh(size: int) -> memoryview:
 
 
 class Buffer:
-    """Memory reused for one frame after another: to allocate memory for a large frame costs more than to fill it."""
+    """Memory reused for consecutive frames: allocating memory for a large frame costs more than filling it."""
 
     def __init__(self) -> None:
         self._memory = bytearray()

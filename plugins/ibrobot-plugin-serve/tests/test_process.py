@@ -102,7 +102,7 @@ def test_a_process_that_dies_is_reported_and_starts_again(
     with pytest.raises(PolicyError, match=f"process {died} died: {how}"):
         ask(do)
     assert not engine.stats.alive
-    assert f"process {died} died: {how}; it starts again in 0 s" in caplog.text
+    assert f"process {died} died: {how}; it restarts in 0 s" in caplog.text
     outputs = ask()
     assert outputs["pid"] == engine.pid != died
     assert outputs["seeds"].tolist() == [5], "it knows the episode"
@@ -115,9 +115,9 @@ def test_one_that_keeps_dying_is_started_less_and_less_often(
     for pause_s in (0, 1, 2):
         with pytest.raises(PolicyError, match="killed by SIGKILL"):
             ask("die")
-        assert f"it starts again in {pause_s} s" in caplog.text
+        assert f"it restarts in {pause_s} s" in caplog.text
         engine._start_again_s += 600 - pause_s  # so that the pause is not over yet, however slow this machine is
-        with pytest.raises(PolicyError, match=r"starts again in [456]\d\d\.\d s"):
+        with pytest.raises(PolicyError, match=r"restarts in [456]\d\d\.\d s"):
             ask()
         engine._start_again_s = 0.0
 
@@ -166,10 +166,10 @@ def test_a_process_that_hangs_is_replaced(
         with pytest.raises(PolicyError, match=r"did not answer in time|it hung") as caught:
             ask("hang", patience_ns=60_000_000)
         said.append(str(caught.value))
-    assert said[-1] == f"the model's process {hung} died: it hung, at work on one request for more than 0.2 s"
+    assert said[-1] == f"the model's process {hung} died: it hung, working on one request for more than 0.2 s"
     assert len(said) > 2
     assert not engine.stats.alive
-    assert "it hung, at work on one request for more than 0.2 s; it starts again in 0 s" in caplog.text
+    assert "it hung, working on one request for more than 0.2 s; it restarts in 0 s" in caplog.text
     engine._hang_timeout_s = PATIENCE_NS / 1e9  # this machine may be busy
     outputs = ask()
     assert outputs["pid"] == engine.pid != hung

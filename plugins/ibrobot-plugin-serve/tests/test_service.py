@@ -213,7 +213,7 @@ def test_the_newest_request_of_a_robot_takes_the_place_of_one_that_waits():
         older = cloud.asked("greedy", 20)
         others = [cloud.asked(f"robot {i}", i) for i in (1, 2)]
         newer = cloud.ask("greedy", 21, id=6)
-        assert failure(older) == "not begun: the newer request 6 of this robot took its place"
+        assert failure(older) == "not begun: the newer request 6 of this robot replaced it"
         cloud.policy.gate.release(10)
         assert [outputs(future) for future in (newer, *others)] == [[42], [2], [4]]
         assert cloud.policy.batches == [[0], [21], [1], [2]]
@@ -264,7 +264,7 @@ def test_a_full_queue_turns_away_what_comes():
         waiting = [cloud.asked(f"robot {i}", i) for i in (1, 2)]
         assert failure(cloud.ask("robot 3", 3)) == "the server is full: 2 requests wait"
         newer = cloud.ask("robot 2", 4)
-        assert "took its place" in failure(waiting[1]), "it needs no further place"
+        assert "replaced it" in failure(waiting[1]), "it needs no further place"
         cloud.policy.gate.release(10)
         assert [outputs(future) for future in (waiting[0], newer)] == [[2], [8]]
 
@@ -387,7 +387,7 @@ def test_a_request_that_is_refused_does_not_make_a_policy_forget(monkeypatch: py
 def test_a_model_that_hangs_fails_all_requests_at_once_and_says_so(caplog: pytest.LogCaptureFixture):
     with served(hang_timeout_s=0.02) as cloud:
         stuck = cloud.busy()
-        said = "the model hangs: it has been at work on one batch for more than 0.02 s"
+        said = "the model hangs: it has worked on one batch for more than 0.02 s"
         assert failure(stuck) == said
         assert cloud.hung.wait(PATIENCE_S)
         assert failure(cloud.ask("robot", 1)) == said
@@ -463,7 +463,7 @@ def test_the_engine_tells_both_sides_where_the_policies_differ():
         with pytest.raises(ContractError, match=r"chunk_size\n +robot: 99\n +server: 10") as caught:
             remote.start()
         assert "observations" not in str(caught.value)
-        assert "look alike" not in str(caught.value)
+        assert "equal specs" not in str(caught.value)
         with pytest.raises(PolicyError, match="another policy"):
             remote.infer({"x": np.zeros(1)}, 1, deadline())
 
@@ -474,7 +474,7 @@ def test_policies_that_differ_in_their_files_alone_are_reported(monkeypatch: pyt
     with (
         served() as cloud,
         engine(cloud, other) as remote,
-        pytest.raises(ContractError, match=r"robot: 0ther\n +server: \w+\n +they look alike, but files or options"),
+        pytest.raises(ContractError, match=r"robot: 0ther\n +server: \w+\n +equal specs, but files or options"),
     ):
         remote.start()
 

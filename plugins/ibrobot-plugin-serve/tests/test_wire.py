@@ -177,7 +177,7 @@ TABLE = 80 + len("so101") + len("3f2a")
         (TABLE, "<Q", 0, "not where they belong"),
         (TABLE + 8, "<Q", 2**63, "not where they belong"),
         (TABLE + 16, "B", 77, "unknown dtype 77"),
-        (TABLE + 16, "B", 128, "JPEG, which is not spoken here|expected"),
+        (TABLE + 16, "B", 128, "JPEG, which this side does not support|expected"),
         (TABLE + 17, "B", 200, "over the limits"),
         (TABLE + 18, "<H", 0, "over the limits"),
         (TABLE + 20, "<I", 10 * 2**20, "in 8 bytes"),
@@ -278,7 +278,7 @@ def test_pictures_travel_as_their_codec_says_and_all_else_as_it_is():
 
 
 def test_who_speaks_no_jpeg_says_so():
-    with pytest.raises(WireError, match="'top': JPEG, which is not spoken here"):
+    with pytest.raises(WireError, match="'top': JPEG, which this side does not support"):
         decode(encode(PICTURES, codec=Halves()))
 
 

@@ -1,4 +1,4 @@
-"""The plugin's hooks: teleop `twist`, and section `tool_pose`, which robots with a model need not write."""
+"""The plugin's hooks: teleop `twist`, and section `tool_pose`, which is optional for robots with a model."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def _check_twist(options: TwistOptions, robot: Robot, joints: tuple[str, ...]) -
     if robot.description.mjcf is None:
         yield OptionFault(("topic",), "twists move a tool, which needs robot.description.mjcf: set it")
     if options.frame == robot.description.tip:
-        yield OptionFault(("frame",), f"{options.frame!r} is robot.description.tip, must be another frame, the base's")
+        yield OptionFault(("frame",), f"{options.frame!r} is robot.description.tip; give the name of the base frame")
 
 
 def _check_pose(options: ToolPoseOptions, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
@@ -42,7 +42,7 @@ def _has_model(config: RobotConfig) -> bool:
 
 @hookimpl
 def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
-    """What MoveIt Servo does in ROS."""
+    """The teleop `twist`, the counterpart of MoveIt Servo."""
     yield TeleopDescriptor(
         type="twist", options=TwistOptions, make=_twist, check_options=_check_twist,
         summary="moves the tool along a topic of twists, as MoveIt Servo does",
@@ -51,7 +51,7 @@ def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
 
 @hookimpl
 def ibrobot_sections() -> Iterable[SectionDescriptor]:
-    """Where the tool is."""
+    """The section `tool_pose`."""
     yield SectionDescriptor(
         type="tool_pose", options=ToolPoseOptions, make=_pose, check_options=_check_pose, without_section=_has_model,
         summary="the tool's pose in the base frame, on /robot_status/ee_pose",

@@ -1,4 +1,4 @@
-"""What the YAML may say under a `type: twist` of teleoperation, and in the section `tool_pose`."""
+"""Options of `type: twist` under `teleoperation`, and of the section `tool_pose`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ibrobot_core.api import documented, option
 
 def _check_topic(instance: Any, attribute: attrs.Attribute[Any], topic: str) -> None:
     if not topic.startswith("/") or topic.endswith("/") or " " in topic:
-        raise ValueError(f"{topic!r} is no topic: a topic begins with /, e.g. {attribute.default}")
+        raise ValueError(f"{topic!r} is not a topic: a topic begins with /, e.g. {attribute.default}")
 
 
 @documented
@@ -20,9 +20,9 @@ def _check_topic(instance: Any, attribute: attrs.Attribute[Any], topic: str) -> 
 class TwistOptions(ServoOptions):
     """Options of `type: twist`; the joints' own limits bound every speed."""
 
-    topic: str = option("/servo_node/delta_twist_cmds", validator=_check_topic, help="where twists come from")
+    topic: str = option("/servo_node/delta_twist_cmds", validator=_check_topic, help="topic of the twists")
     status_topic: str = option(
-        "/servo_node/status", validator=_check_topic, help="where the status goes, by MoveIt Servo's codes"
+        "/servo_node/status", validator=_check_topic, help="topic of the status, with MoveIt Servo's codes"
     )
     frame: str = option("base_link", help="name of the base frame in twists; the tool's is robot.description.tip")
     gripper: str = option("gripper", help="group of joints that do not belong to the arm")
@@ -33,6 +33,6 @@ class TwistOptions(ServoOptions):
 class ToolPoseOptions:
     """Keys of the section `tool_pose`."""
 
-    topic: str = option("/robot_status/ee_pose", validator=_check_topic, help="where the pose of the tool goes")
-    frame: str = option("base_link", help="name of the base frame, in which the pose is")
-    rate_hz: float = option(20.0, unit="Hz", gt=0, le=1000, help="poses a second, at most one per joint state")
+    topic: str = option("/robot_status/ee_pose", validator=_check_topic, help="topic of the tool's pose")
+    frame: str = option("base_link", help="name of the base frame, in which the pose is given")
+    rate_hz: float = option(20.0, unit="Hz", gt=0, le=1000, help="poses per second, at most one per joint state")

@@ -31,14 +31,14 @@ from ibrobot_servo.options import TwistOptions
 _STATUS_S = 0.1
 """The status is published when it changes, and at least that often [s]."""
 _FOLLOW_RAD = 0.1
-"""An arm at rest that is further from its setpoint was moved by other means: it begins where it is."""
+"""An arm at rest that is further from its setpoint was moved otherwise, so it starts from its measured position."""
 _DIAGNOSTICS = "/diagnostics"
 
 
 class TwistTeleop(Teleop):
     """The newest twist moves the tool until its timeout; then it slows down to a stop, and the robot holds.
 
-    Time is that of the measurements; the age of a twist is counted from its arrival.
+    Time is that of the measurements; the age of a twist counts from its arrival.
     """
 
     def __init__(self, options: TwistOptions, ctx: Context) -> None:
@@ -49,12 +49,12 @@ class TwistTeleop(Teleop):
         self._indices = ctx.robot.indices(self._arm)
         self._servo: Servo | None = None
         self._chain: tuple[int, ...] = ()
-        """Of the arm's joints, those that move the tool."""
+        """Indices of the arm's joints that move the tool."""
         self._twists: Subscription | None = None
         self._fresh = True
-        """Whether the setpoint is yet to be taken from the measurement."""
+        """Whether the next twist starts from the measured position."""
         self._published: tuple[ServoStatus, int] | None = None
-        """The status as it was last published, and when [ns]."""
+        """The last published status, and its time [ns]."""
 
     @override
     def connect(self) -> None:
@@ -77,7 +77,7 @@ class TwistTeleop(Teleop):
     def activate(self, measured: JointReading) -> None:
         if self._servo is not None and self._twists is not None:
             self._servo.reset(measured.position[self._indices])
-            self._twists.drain()  # sent for something else
+            self._twists.drain()  # discards earlier twists
         self._fresh = True
 
     @override
@@ -139,7 +139,7 @@ class TwistTeleop(Teleop):
         return None
 
     def _report(self, servo: Servo, fault: str, now_ns: int) -> None:
-        """Log the first twist that is refused for a reason, and publish how many were."""
+        """Log the first refused twist for each reason, and publish the counts."""
         if servo.refused[fault] == 1:
             self._ctx.log.warning("%s: refused a twist: %s", self._ctx.name, fault)
         counts = tuple(KeyValue(reason, str(count)) for reason, count in servo.refused.items())

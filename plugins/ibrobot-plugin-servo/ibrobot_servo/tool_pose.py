@@ -58,7 +58,7 @@ class ToolPose(SessionWorker):
         if self._next_ns is not None and self._next_ns - self._period_ns < stamp_ns < self._next_ns:
             return
         due_ns = self._next_ns if self._next_ns is not None else stamp_ns
-        # On the grid of the rate; a gap, or a clock that was set back, begins another one.
+        # Poses are on a grid of the rate; a gap, or a clock that was set back, starts a new grid.
         late = not 0 <= stamp_ns - due_ns < self._period_ns
         self._next_ns = (stamp_ns if late else due_ns) + self._period_ns
         tip = self._model.forward(state.position)

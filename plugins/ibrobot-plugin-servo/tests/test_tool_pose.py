@@ -124,7 +124,7 @@ def test_a_model_without_the_tip_is_reported(model, caplog):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"topic": "ee_pose"}, "'ee_pose' is no topic: a topic begins with /, e.g. /robot_status/ee_pose"),
+        ({"topic": "ee_pose"}, "'ee_pose' is not a topic: a topic begins with /, e.g. /robot_status/ee_pose"),
         ({"rate_hz": 0.0}, "0.0 is too small, must be above 0 Hz"),
         ({"rate_hz": float("nan")}, "nan is too small, must be above 0 Hz"),
     ],

@@ -263,9 +263,9 @@ def test_twists_that_waited_longer_than_the_timeout_are_refused(model):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"topic": "twists"}, "'twists' is no topic: a topic begins with /, e.g. /servo_node/delta_twist_cmds"),
-        ({"topic": "/a b"}, "'/a b' is no topic"),
-        ({"status_topic": "/status/"}, "'/status/' is no topic"),
+        ({"topic": "twists"}, "'twists' is not a topic: a topic begins with /, e.g. /servo_node/delta_twist_cmds"),
+        ({"topic": "/a b"}, "'/a b' is not a topic"),
+        ({"status_topic": "/status/"}, "'/status/' is not a topic"),
         ({"timeout": 5.0}, "5.0 is too large, must be at most 1 s"),
         ({"hard_stop_singularity_threshold": 10.0}, "lower_singularity_threshold is 30, must be below hard_stop"),
     ],
@@ -283,7 +283,7 @@ def faults(robot: Robot, options: TwistOptions = TwistOptions()) -> list[str]:  
 def test_options_are_checked_against_the_robot(model):
     assert faults(robot_of(model)) == []
     assert faults(make_robot()) == ["twists move a tool, which needs robot.description.mjcf: set it"]
-    same = "'tool' is robot.description.tip, must be another frame, the base's"
+    same = "'tool' is robot.description.tip; give the name of the base frame"
     assert faults(robot_of(model), TwistOptions(frame="tool")) == [same]
     (section,) = ibrobot_sections()
     (fault,) = section.check_options(section.options(), make_robot(), ())

@@ -49,7 +49,7 @@ class Codec:
             raise CodecError(f"{type_name}: cannot be encoded: {error}") from error
 
     def decode(self, type_name: str, data: bytes | memoryview) -> Message:
-        """The message in `data`. Arrays are views of it; bytes behind the message are passed over.
+        """The message in `data`. Arrays are views of it; bytes after the message are ignored.
 
         A type that core does not have becomes a class made from its definition, with stamps as `…_ns` [ns].
 
@@ -93,7 +93,7 @@ class Codec:
     def _define(self, type_name: str) -> None:
         if type_name in self._definitions:
             define(self._types, type_name, self._definitions.pop(type_name))
-        type_hash(type_name, self._types)  # finds types that nobody defined, also deep inside
+        type_hash(type_name, self._types)  # raises for undefined types, also nested ones
 
 
 _standard = Codec()

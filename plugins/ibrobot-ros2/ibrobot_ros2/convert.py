@@ -1,4 +1,4 @@
-"""Between core's messages and the objects of a type store; what differs is worked out once per type.
+"""Converts between core's messages and the objects of a type store; the differences are computed once per type.
 
 Core has a stamp or duration `x` as `x_ns`, leaves some fields out, and has the two parts of a transform without
 the transform; all else has equal names.

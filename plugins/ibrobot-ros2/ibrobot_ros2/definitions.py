@@ -51,7 +51,7 @@ def make_typestore() -> Typestore:
 
 
 def define(store: Typestore, type_name: str, text: str) -> None:
-    """Add a type and the types that its text defines to a store; they replace others of their names.
+    """Add a type and the types that its text defines to a store; they replace types of the same names.
 
     Raises:
         CodecError: for a definition that cannot be used.
@@ -94,10 +94,10 @@ def type_hash(type_name: str, types: Typestore | None = None) -> str:
     try:
         return _known(type_name, types).hash_rihs01(type_name)
     except KeyError as error:
-        raise CodecError(f"{type_name}: needs {error}, which nobody defined") from None
+        raise CodecError(f"{type_name}: needs {error}, which is not defined") from None
 
 
 def _known(type_name: str, types: Typestore) -> Typestore:
     if type_name not in types.fielddefs:
-        raise CodecError(f"{type_name}: nobody defined this message type")
+        raise CodecError(f"{type_name}: this message type is not defined")
     return types

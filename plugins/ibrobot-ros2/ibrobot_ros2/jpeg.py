@@ -29,13 +29,13 @@ def fits_jpeg(image: Image) -> bool:
 
 
 def to_jpeg(image: Image, quality: int) -> CompressedImage:
-    """The picture as JPEG, with its encoding in `format` as image_transport writes it.
+    """The image as JPEG, with its encoding in `format` as in image_transport.
 
     Raises:
         ContractError: for an encoding that JPEG has not, or data that is not such a picture.
     """
     if image.encoding not in _SPACES:
-        raise ContractError(f"a {image.encoding} picture cannot become JPEG, only {', '.join(_SPACES)} can")
+        raise ContractError(f"a {image.encoding} image cannot be encoded as JPEG, only {', '.join(_SPACES)}")
     space, channels = _SPACES[image.encoding]
     try:
         rows = image.data.reshape(image.height, image.step)[:, : image.width * channels]
@@ -69,7 +69,7 @@ def from_jpeg(image: CompressedImage) -> Image:
 
 
 def own_jpeg(data: NDArray[np.uint8], header: Header) -> tuple[CompressedImage, tuple[int, int]]:
-    """A camera's own JPEG as a message, with height and width [px]. What `from_jpeg` would refuse is refused here.
+    """A camera's own JPEG as a message, with height and width [px]. It refuses what `from_jpeg` would refuse.
 
     Args:
         data: the bytes, shape (N,).
@@ -88,7 +88,7 @@ def _header(data: bytes) -> tuple[int, int, str]:
     """Height, width [px] and colour space."""
     height, width, stored, _ = _read(simplejpeg.decode_jpeg_header, data)
     if height * width > _MOST_PIXELS:
-        raise ContractError(f"JPEG picture of {width}x{height}, at most {_MOST_PIXELS} pixels are decoded")
+        raise ContractError(f"JPEG image of {width}x{height}: at most {_MOST_PIXELS} pixels can be decoded")
     return height, width, stored
 
 

@@ -42,7 +42,7 @@ def from_png(image: CompressedImage) -> Image:
     file = data[_begin(image) :]
     encoding = _ENCODINGS.get(file[_KIND])
     if encoding is None:
-        raise ContractError(f"a PNG {_kind(file)} is not read; grey, RGB and RGBA of 8 bits, and grey of 16 are")
+        raise ContractError(f"a PNG {_kind(file)} cannot be read, only 8-bit grey, RGB and RGBA, and 16-bit grey")
     pixels = _decode(file, encoding)
     if _begin(image) and image.format.startswith("32FC1"):
         encoding, pixels = "32FC1", _depth(pixels, data)

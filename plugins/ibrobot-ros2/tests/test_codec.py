@@ -118,7 +118,7 @@ WRONG = {
     "too large": (Int32(2**31), "std_msgs/msg/Int32: cannot be encoded: .*format requires"),
     "covariance": (Imu(Header(), orientation_covariance=[1.0]), "sensor_msgs/msg/Imu: cannot be encoded: .*length"),
     "not text": (String(typing.cast(str, 5)), "std_msgs/msg/String: cannot be encoded"),
-    "no type": (attrs.make_class("Other", [], bases=(Message,))(), "nobody defined this message type"),
+    "no type": (attrs.make_class("Other", [], bases=(Message,))(), "this message type is not defined"),
 }
 
 

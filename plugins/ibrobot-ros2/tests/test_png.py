@@ -97,7 +97,7 @@ def test_cut_png_is_an_error(length):
 
 def test_16_bit_colours_are_refused_by_name_and_not_rounded():
     head = b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sIIBBBBB", 13, b"IHDR", 1, 1, 16, 2, 0, 0, 0)
-    with pytest.raises(ContractError, match="a PNG of 16 bits and RGB is not read; grey, RGB and RGBA of 8 bits"):
+    with pytest.raises(ContractError, match="a PNG of 16 bits and RGB cannot be read, only 8-bit grey, RGB and RGBA"):
         from_png(message(head))
 
 

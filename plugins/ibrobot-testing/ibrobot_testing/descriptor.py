@@ -20,7 +20,7 @@ def check_descriptor(descriptor: Descriptor[Any], options: Any) -> None:
     name = descriptor.type
     assert name, "type is empty"
     assert descriptor.summary, f"{name}: summary is empty"
-    assert isinstance(options, descriptor.options), f"{name}: {options!r} are no {descriptor.options.__name__}"
+    assert isinstance(options, descriptor.options), f"{name}: {options!r} is not a {descriptor.options.__name__}"
     devices = descriptor.devices(options)
     assert all(isinstance(text, str) for pair in devices.items() for text in pair), f"{name}: devices: {devices!r}"
     match descriptor:

@@ -133,7 +133,7 @@ class HardwareSuite(Suite[Hardware]):
                 hardware.write(goal)
                 self.elapse(hardware, ctx, self.settle_s)
                 left = np.abs(hardware.read().position - goal)
-                assert left[i] < 0.5 * abs(goal[i] - start[i]), f"{name} did not come half-way in {self.settle_s} s"
+                assert left[i] < 0.5 * abs(goal[i] - start[i]), f"{name} did not move half-way in {self.settle_s} s"
                 assert np.delete(left, i).max(initial=0.0) < 0.5 * self.move_rad, f"{name} moved another joint"
 
     def test_refuses_a_command_of_wrong_shape(self) -> None:
@@ -194,7 +194,7 @@ class HardwareSuite(Suite[Hardware]):
                 pytest.skip("has no torque control")
             assert isinstance(outcome, Torque), f"relax returned {outcome!r}, not a Torque"
             after = hardware.holding()
-            assert after is None or outcome is not Torque.OFF, f"torque is off, and holding says {after}"
+            assert after is None or outcome is not Torque.OFF, f"torque is off, but holding returns {after}"
             hardware.write(hardware.read().position)
             self.elapse(hardware, ctx, 0.0)
             for holding in (before, hardware.holding()):

@@ -72,7 +72,7 @@ class Terminal:
         with self._changed:
             come = self._changed.wait_for(lambda: self._ended or text in self.screen[self._seen :], _TIMEOUT_S)
             if not come or text not in self.screen[self._seen :]:
-                raise AssertionError(f"{text!r} did not come; the screen was:\n{self.screen}")
+                raise AssertionError(f"{text!r} did not appear; the screen was:\n{self.screen}")
             self._seen = self.screen.index(text, self._seen) + len(text)
 
     def type(self, text: str) -> None:

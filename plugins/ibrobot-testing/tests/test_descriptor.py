@@ -50,7 +50,7 @@ def test_right_descriptors_pass(descriptor: Descriptor[Any]) -> None:
     ("descriptor", "what"),
     [
         (wrong(ARM, summary=""), "summary is empty"),
-        (wrong(ARM, options=StreamOptions), "are no StreamOptions"),
+        (wrong(ARM, options=StreamOptions), "is not a StreamOptions"),
         (wrong(ARM, devices=lambda options: {"port": 1}), "devices: "),
         (wrong(ARM, calibration=lambda options: ""), "calibration must be a name"),
         (wrong(ARM, anchored=lambda options: "gripper"), "must be a tuple of joints, got 'gripper'"),

@@ -18,7 +18,7 @@ _POLL_S = 0.01
 
 
 def find_all(kinds: tuple[Kind, ...] = KINDS) -> list[tuple[Kind, Found]]:
-    """Every device that is plugged in, with its kind; a pad that both ways of reading know comes once."""
+    """All connected devices, with their kinds; a pad found by both hidapi and SDL appears once."""
     found: list[tuple[Kind, Found]] = []
     for kind in kinds:
         with closing(Finder(kind)) as finder:
@@ -47,7 +47,7 @@ def opened(wanted: str) -> Iterator[tuple[Kind, Found, Device]]:
 
 
 def watch(device: Device, seconds: float, see: Callable[[Controls], bool]) -> bool:
-    """Call `see` with each state until it returns True; False when the time is over first.
+    """Call `see` with each state until it returns True; returns False after the timeout.
 
     Raises:
         TeleopError: when the device is unplugged.

@@ -1,4 +1,4 @@
-"""`ibrobot gamepad list`: the gamepads and SpaceMice that are plugged in."""
+"""`ibrobot gamepad list`: the connected gamepads and SpaceMice."""
 
 from __future__ import annotations
 

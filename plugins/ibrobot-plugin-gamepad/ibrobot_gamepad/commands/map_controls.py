@@ -1,4 +1,4 @@
-"""`ibrobot gamepad map`: learns which control does what, and prints it for the robot YAML."""
+"""`ibrobot gamepad map`: learns the assignment of controls, and prints it for the robot YAML."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ibrobot_gamepad.devices import Device, Found
 from ibrobot_gamepad.options import FUNCTIONS, TOOL_AXES
 
 _MOVED = 0.6
-"""How far an axis goes from its rest before it is the one that is meant."""
+"""Deflection from rest beyond which an axis counts as chosen."""
 _WAYS = {
     "x": "forward", "y": "to the left", "z": "up", "roll": "turned about where it points", "pitch": "down",
     "yaw": "sideways",
@@ -29,7 +29,7 @@ _PRESSES = {
 
 
 _Find = Callable[[Controls, Controls], str | None]
-"""State and state at rest -> the control that is meant."""
+"""State and state at rest -> the chosen control."""
 
 
 @click.command("map")

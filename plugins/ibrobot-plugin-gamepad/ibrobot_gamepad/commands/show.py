@@ -1,4 +1,4 @@
-"""`ibrobot gamepad test`: shows what is pressed and deflected."""
+"""`ibrobot gamepad test`: shows deflected axes and pressed buttons."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from ibrobot_gamepad.commands.chosen import device_option, opened, watch
 from ibrobot_gamepad.controls import Controls
 
 _STEP = 0.05
-"""By how much an axis moves before it is shown again."""
+"""Change of an axis before it is shown again."""
 
 
 @click.command("test")
@@ -33,7 +33,7 @@ def show(device: str, seconds: float) -> None:
 
 
 def describe(controls: Controls) -> str:
-    """What is deflected and pressed, on one line."""
+    """Deflected axes and pressed buttons, on one line."""
     axes = {name: round(value / _STEP) * _STEP for name, value in controls.axes.items()}
     parts = [f"{name} {value:+.2f}" for name, value in axes.items() if value] + sorted(controls.buttons)
     return "  ".join(parts) or "at rest"

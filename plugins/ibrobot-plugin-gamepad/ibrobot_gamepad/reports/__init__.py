@@ -1,4 +1,4 @@
-"""The HID reports of the devices whose layout is public, and which device sends which."""
+"""The HID reports with a public layout, and the devices that send them."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ _USAGES: dict[Kind, tuple[int, ...]] = {"gamepad": (0x04, 0x05), "spacemouse": (
 """Joystick and gamepad; multi-axis controller."""
 THREEDCONNEXION = 0x256F
 _LOGITECH = 0x046D
-"""Who made the first ones."""
+"""Manufacturer of the first models."""
 
 
 @attrs.frozen
 class Model:
-    """A device whose reports are public."""
+    """A device with publicly documented reports."""
 
     name: str
     kind: Kind
     start: Callable[[], Parse]
-    """Makes the parser of one connection."""
+    """Creates the parser for one connection."""
     ids: tuple[tuple[int, int], ...] = ()
     """Vendor and product."""
     streams: bool = False
-    """Whether it sends reports all the time, so that its silence means that it is out of reach."""
+    """Whether it sends reports continuously, so that silence means that it is out of range."""
     opening: tuple[bytes, ...] = ()
     """Reports to write when it is opened."""
 
@@ -59,7 +59,7 @@ SPACE_MOUSE = Model("SpaceMouse", "spacemouse", SpaceMouse)
 
 
 def model_of(vendor: int, product: int, usage_page: int, usage: int) -> Model | None:
-    """The model of a HID interface, or None where its reports are not known.
+    """The model of a HID interface, or None if its reports are unknown.
 
     Args:
         vendor: USB or Bluetooth vendor.

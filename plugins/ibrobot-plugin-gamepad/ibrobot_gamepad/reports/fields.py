@@ -1,4 +1,4 @@
-"""Fields that reports of many makes have in common."""
+"""Fields common to reports of many makes."""
 
 from __future__ import annotations
 

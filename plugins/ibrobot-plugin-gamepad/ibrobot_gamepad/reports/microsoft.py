@@ -36,7 +36,7 @@ def parse_xbox(report: bytes) -> Controls | None:
 
 
 def parse_xbox_one_s(report: bytes) -> Controls | None:
-    """As `parse_xbox`, of pads without a Share button: what stands in its place is View."""
+    """As `parse_xbox`, for pads without a Share button: its bit is View."""
     controls = parse_xbox(report)
     if controls is None or "misc" not in controls.buttons:
         return controls

@@ -15,10 +15,10 @@ _HEAD = 12
 _RUMBLE_OFF = bytes.fromhex("00 01 40 40 00 01 40 40")
 _READ_FLASH, _SET_MODE = 0x10, 0x03
 _CALIBRATION = 0x603D
-"""Where the factory's calibration of both sticks lies."""
+"""Address of the factory calibration of both sticks."""
 _CALIBRATION_BYTES = 18
 _MOST, _LEAST_SPAN = 0xFFF, 0x100
-"""A stick that moves less by its calibration has none."""
+"""A calibration with a smaller range is invalid."""
 
 
 def _request(number: int, command: int, arguments: bytes) -> bytes:
@@ -29,7 +29,7 @@ OPENING = (
     _request(0, _READ_FLASH, _CALIBRATION.to_bytes(4, "little") + bytes([_CALIBRATION_BYTES])),
     _request(1, _SET_MODE, bytes([_FULL])),
 )
-"""What is written when the pad is opened: asks for its calibration, and for full reports."""
+"""Requests sent on opening: for the calibration, and for full reports."""
 
 
 def pairs(packed: bytes) -> tuple[tuple[int, int], ...]:
@@ -67,7 +67,7 @@ class SwitchPro:
         data = report[20 : 20 + _CALIBRATION_BYTES]
         if report[13:20] != begin or len(data) < _CALIBRATION_BYTES:
             return
-        # The left stick has its way up, its rest, its way down; the right one its rest, its way down, its way up.
+        # Order of the left stick: range up, rest, range down; of the right stick: rest, range down, range up.
         up, rest, down, right_rest, right_down, right_up = pairs(data)
         sticks = _Stick(rest, down, up), _Stick(right_rest, right_down, right_up)
         if all(stick.is_plausible() for stick in sticks):

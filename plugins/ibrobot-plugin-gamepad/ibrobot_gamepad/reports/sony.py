@@ -12,7 +12,7 @@ _FACE = ("west", "south", "east", "north")
 _SHOULDERS = ("left_shoulder", "right_shoulder", "", "", "back", "start", "left_stick", "right_stick")
 _EXTRAS = ("guide", "touchpad", "misc")
 _INPUT_HEADER = b"\xa1"
-"""What Bluetooth puts before an input report, and the checksum covers."""
+"""Byte before an input report over Bluetooth, which the checksum covers."""
 
 
 def parse_dualshock4(report: bytes) -> Controls | None:

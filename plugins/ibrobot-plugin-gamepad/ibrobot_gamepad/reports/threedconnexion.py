@@ -1,4 +1,4 @@
-"""SpaceMouse and its kin, as the drivers of spacenavd read them."""
+"""SpaceMouse and related devices, as the drivers of spacenavd read them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import struct
 from ibrobot_gamepad.controls import MOUSE_AXES, MOUSE_BUTTONS, Controls
 
 _FULL_SCALE = 350
-"""Counts at the end of the cap's way."""
+"""Counts at full deflection of the cap."""
 _THREE, _SIX = struct.Struct("<3h"), struct.Struct("<6h")
 _TRANSLATION, _ROTATION, _BUTTONS = 1, 2, 3
 

@@ -95,7 +95,7 @@ class FakeDataset(DatasetWriter):
         if self._root is None:
             raise DatasetError("create comes before add_frame")
         for key in sorted(self._features.keys() ^ values.keys()):
-            raise DatasetError(f"{key} is {'missing' if key in self._features else 'no feature of this dataset'}")
+            raise DatasetError(f"{key} is {'missing' if key in self._features else 'not a feature of this dataset'}")
         for key, feature in self._features.items():
             if values[key].shape != feature.shape:
                 raise DatasetError(f"{key} must have shape {feature.shape}, got {values[key].shape}")

@@ -78,7 +78,7 @@ class FakeTransport(Transport):
         def answer(request: _Request) -> None:
             try:
                 request.answer.put(handler(request.payload, None))
-            except Exception as error:  # noqa: BLE001 - it is the requester's to see
+            except Exception as error:  # noqa: BLE001 - the requester receives it
                 request.answer.put(error)
 
         server = _Threads(answer, f"the server of {name}", workers)
