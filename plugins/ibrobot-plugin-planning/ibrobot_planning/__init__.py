@@ -50,7 +50,7 @@ def _rrt_connect(options: Any, ctx: Context) -> Planner:
 
 @hookimpl
 def ibrobot_planners() -> Iterable[PlannerDescriptor]:
-    """Straight lines between joint positions, and ways around obstacles."""
+    """The planners `joint` and `rrt_connect`."""
     yield PlannerDescriptor(
         type="joint", options=JointPlannerOptions, make=_joint,
         summary="straight line in joint space, time-optimal within velocity, acceleration and jerk limits",
@@ -69,7 +69,7 @@ def _source(session: Session, mode: ControlMode) -> SourceWorker:
 
 @hookimpl
 def ibrobot_sources() -> Iterable[SourceDescriptor]:
-    """Goals."""
+    """The command source of modes with `planner:`."""
     yield SourceDescriptor(type="planner", make=_source, summary="moves to goals that a planner of any plugin plans")
 
 
@@ -87,7 +87,7 @@ def _gripper(options: Any, ctx: Context) -> Executor:
 
 @hookimpl
 def ibrobot_executors() -> Iterable[ExecutorDescriptor]:
-    """Trajectories, and the gripper."""
+    """The executors `trajectory` and `gripper`."""
     yield ExecutorDescriptor(
         type="trajectory", options=TrajectoryOptions, make=_trajectory,
         summary="follows joint trajectories, with path and goal tolerances",
@@ -115,7 +115,7 @@ def _check_world(options: WorldOptions, robot: Robot, joints: tuple[str, ...]) -
 
 @hookimpl
 def ibrobot_sections() -> Iterable[SectionDescriptor]:
-    """What is around the robot."""
+    """The section `world`."""
     yield SectionDescriptor(
         type="world", options=WorldOptions, make=_world, check=_find_engines, check_options=_check_world,
         summary="objects that planners avoid: boxes, spheres, cylinders, meshes, planes; services change them",

@@ -1,4 +1,4 @@
-"""The arm as collision checks see it: its links' shapes on its joints, from the MJCF.
+"""The collision model of the arm: joints and the shapes of its links, from the MJCF.
 
 MuJoCo reads the file. Pinocchio computes where links are and Coal what touches; ADR 31 has why.
 """
@@ -20,7 +20,7 @@ from ibrobot_planning.transforms import rotation
 from ibrobot_planning.world import Box, Capsule, Cylinder, Plane, Shape, Sphere
 
 ADJACENT, ALWAYS, NEVER, SRDF = "Adjacent", "Always", "Never", "SRDF"
-"""Why a pair of links is not checked; the first three as MoveIt's setup assistant writes them."""
+"""Reasons not to check a pair of links; the first three are those of MoveIt's setup assistant."""
 _PLANE, _SPHERE, _CAPSULE, _CYLINDER, _BOX, _MESH = 0, 2, 3, 5, 6, 7
 """Values of mujoco.mjtGeom."""
 _HINGE, _SLIDE = 3, 2
@@ -39,7 +39,7 @@ class LinkShape:
     placement: Vector
     """In the frame of the joint, shape (4, 4)."""
     geometry: Any
-    """The shape as Coal has it."""
+    """The shape in Coal."""
 
 
 @attrs.frozen(eq=False)
@@ -50,7 +50,7 @@ class Arm:
     model: Any
     """pinocchio.Model; its order of joints is that of the MJCF."""
     columns: np.ndarray[tuple[int], np.dtype[np.intp]]
-    """Where each joint is in Pinocchio's vector, shape (J,)."""
+    """Index of each joint in Pinocchio's vector, shape (J,)."""
     reference: Vector
     """Positions at which the joints move nothing [rad or m], shape (J,)."""
     lower: Vector
@@ -111,7 +111,7 @@ class Arm:
 
 
 def sorted_pair(a: str, b: str) -> Pair:
-    """The same for (a, b) and (b, a)."""
+    """A key that is equal for (a, b) and (b, a)."""
     return (a, b) if a < b else (b, a)
 
 
@@ -262,7 +262,7 @@ def _hull(source: Any, mesh: int) -> tuple[Vector, np.ndarray[tuple[int, ...], n
 
 
 def reach(arm: Arm, shapes: Sequence[LinkShape]) -> Vector:
-    """How far any point of the shapes is at most from each joint's axis [m], shape (J,); 1 for joints that slide.
+    """Maximum distance of any point of the shapes from each joint's axis [m], shape (J,); 1 for slide joints.
 
     An upper bound, from bounding spheres of the shapes on links that are stretched out in any direction.
     """

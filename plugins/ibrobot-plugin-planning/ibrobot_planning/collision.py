@@ -1,4 +1,4 @@
-"""What touches what: an arm in a world, with padding."""
+"""Collision checks of an arm in a world, with padding."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ibrobot_planning.transforms import matrix
 from ibrobot_planning.world import World
 
 _SAMPLES = 1000
-"""Configurations that tell which links always touch."""
+"""Number of configurations that determine which links always touch."""
 _ALWAYS_SHARE = 0.95
 """Links that touch in at least this share of configurations always touch, as in MoveIt's setup assistant."""
 
@@ -28,9 +28,9 @@ class Contact:
     first: str
     second: str
     distance: float
-    """[m]; below zero where they overlap."""
+    """[m]; negative if they overlap."""
     padding: float
-    """Least distance that they should have [m]."""
+    """Required distance [m]."""
 
     def __str__(self) -> str:
         if self.distance <= 0:
@@ -75,7 +75,7 @@ class Collisions:
         self._indices = np.array([arm.joint_names.index(name) for name in joints], dtype=np.intp)
         shapes = [*arm.shapes, *_objects(arm, world)]
         self.reach = reach(arm, shapes)[self._indices]
-        """How far any point moves at most with each joint [m/rad], shape (J,)."""
+        """Maximum motion of any point per joint [m/rad], shape (J,)."""
         self._names = [shape.link for shape in shapes]
         self.geometry = pinocchio.GeometryModel()
         for number, shape in enumerate(shapes):
@@ -96,11 +96,11 @@ class Collisions:
         self._manager = pinocchio.BroadPhaseManager_NaiveCollisionManager(arm.model, self.geometry, self.results)
 
     def free(self, q: Vector) -> bool:
-        """Whether nothing touches at `q`, shape (J,)."""
+        """Whether `q`, shape (J,), is free of contacts."""
         return self.first_hit(q[None]) == 1
 
     def first_hit(self, configurations: Vector) -> int:
-        """How many of the configurations, shape (N, J), are free before the first that is not."""
+        """Number of free configurations before the first in collision, of shape (N, J)."""
         model, data, manager, check = self.arm.model, self.data, self._manager, pinocchio.computeCollisions
         for number, q in enumerate(self.native(configurations)):
             if check(model, data, manager, q, True):
@@ -108,7 +108,7 @@ class Collisions:
         return len(configurations)
 
     def contacts(self, q: Vector) -> list[Contact]:
-        """What is closer than its padding at `q`, shape (J,): the closest of each pair of names, deepest first."""
+        """Contacts closer than their padding at `q`, shape (J,): the closest of each pair of names, deepest first."""
         pinocchio.computeCollisions(
             self.arm.model, self.data, self.geometry, self.results, self.native(q[None])[0], False
         )
@@ -125,7 +125,7 @@ class Collisions:
         return sorted(found.values(), key=lambda contact: contact.distance)
 
     def native(self, configurations: Vector) -> Vector:
-        """Configurations of the planned joints, shape (N, J), as Pinocchio takes them, with all other joints."""
+        """Configurations of the planned joints, shape (N, J), completed with all other joints for Pinocchio."""
         whole = np.repeat(self._base[None], len(configurations), axis=0)
         whole[:, self._indices] = configurations
         return self.arm.native(whole)
@@ -160,7 +160,7 @@ def unchecked_pairs(arm: Arm, *, samples: int = _SAMPLES, seed: int = 0, never: 
 
 
 def _objects(arm: Arm, world: World) -> list[LinkShape]:
-    """Objects as shapes of the links that carry them, or of none."""
+    """Objects as shapes, each with the link that carries it, if any."""
     shapes = []
     for name, thing in world.objects.items():
         if name in arm.frames:

@@ -28,26 +28,26 @@ from ibrobot_planning.transforms import from_rpy
 POLICIES: tuple[str, ...] = get_args(OrientationPolicy)
 _DIRECTIONS = {"down": Vector3(0.0, 0.0, -1.0), "up": Vector3(0.0, 0.0, 1.0)}
 _SIZES = {"xyz": 3, "axis": 3, "rpy": 3, "quat": 4}
-"""Keys with lists of numbers, and how many they take."""
+"""Keys with lists of numbers -> the number of values."""
 _KEYS = (*_SIZES, "beyond_reach")
 _NEARLY_ONE = 1e-3
-"""How far from 1 the length of a quaternion may be."""
+"""Allowed deviation of a quaternion's length from 1."""
 
 
 @attrs.frozen
 class Target:
-    """A goal, taken apart for the executors of a mode."""
+    """A goal, divided among the executors of a mode."""
 
     text: str
     tool: Goal | None = None
-    """What one executor of trajectories plans for."""
+    """The goal to plan for an executor of trajectories."""
     joints: dict[str, float] = attrs.field(factory=dict)
     """Joint -> position [rad]."""
     velocity_scaling: float = 1.0
 
 
 def target(goal: str | Goal, robot: Robot, velocity_scaling: float = 1.0) -> Target:
-    """Take a goal apart.
+    """Divide a goal among the executors.
 
     Args:
         goal: a goal, or its text: a pose's name; `joint=radians,joint=radians`; `xyz=X,Y,Z` [m], alone, with

@@ -34,7 +34,7 @@ _AT_GOAL = 1e-9
 
 
 class JointPlanner(Planner):
-    """Plans in joint space, past any obstacle: it knows limits, not shapes.
+    """Plans in joint space within limits, but ignores obstacles.
 
     All joints move along one straight line, so the motion has one degree of freedom, the way along that line; the joint
     with the tightest limit sets its pace.
@@ -58,7 +58,7 @@ class JointPlanner(Planner):
         distance = float(np.max(np.abs(delta), initial=0.0))
         if distance < _AT_GOAL:
             rest = np.zeros(len(joints))
-            # Two points and not one: an executor needs some time to be there.
+            # Two points, since an executor needs time to arrive.
             stay = tuple(JointTrajectoryPoint(stamp, request.start, rest, rest) for stamp in (0, self._period_ns))
             return PlanResult(JointTrajectory(header, request.joints, stay))
         # Limits along the line, measured on the joint that moves farthest: the others move by a fraction of its way.
@@ -82,18 +82,18 @@ class JointPlanner(Planner):
         return PlanResult(JointTrajectory(header, request.joints, points))
 
     def _check_start(self, request: PlanRequest) -> list[Joint]:
-        """The joints of the request, once they and its start make sense."""
+        """The joints of the request, after a check of the request."""
         joints = [self._joint(name) for name in request.joints]
         if np.shape(request.start) != (len(joints),):
             raise PlanningError(f"start has shape {np.shape(request.start)}, must be ({len(joints)},): one per joint")
-        # A start outside the limits is let pass: an arm at rest may sag beyond them, and the way in must stay open.
+        # A start outside the limits is allowed: an arm at rest may sag beyond them, and must be able to return.
         for joint, value in zip(joints, request.start, strict=True):
             if not math.isfinite(value):
                 raise PlanningError(f"start of joint {joint.name} is {value}, must be finite")
         return joints
 
     def _goal(self, request: PlanRequest, joints: list[Joint]) -> Vector:
-        """Where every joint of the request ends [rad], shape (J,)."""
+        """Goal position of every joint of the request [rad], shape (J,)."""
         goal = request.goal
         if not isinstance(goal, JointGoal):
             raise PlanningError(

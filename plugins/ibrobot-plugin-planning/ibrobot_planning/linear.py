@@ -13,19 +13,19 @@ from ibrobot_planning.goals import Tool, pose_matrix, turned
 
 _STEP_M = 0.004
 _STEP_RAD = 0.05
-"""Greatest distances between configurations on the path."""
+"""Maximum distances between configurations on the path."""
 _STEPS, _CONVERGED = 8, 1e-7
 _EXACT_M = 1e-4
-"""How far from the line the tool may be at a configuration."""
+"""Allowed distance of the tool from the line at a configuration."""
 _TURN_M = 0.1
-"""A turn by a radian counts as much as this distance."""
+"""Distance that corresponds to a rotation of one radian."""
 _LARGEST_JUMP = 0.35
 """A joint that moves further [rad] between two of them would leave the line between."""
 
 
 @attrs.frozen(eq=False)
 class LinearPath:
-    """Configurations along a path, as far as it is possible."""
+    """Configurations along the possible part of a path."""
 
     joints: Vector
     """All joints [rad], shape (N, J)."""
@@ -34,7 +34,7 @@ class LinearPath:
     errors: Vector
     """Angle between the tool and the asked orientation at each [rad], shape (N,)."""
     reason: str
-    """Why it ends; empty where it is complete."""
+    """Why it ends early; empty if it is complete."""
 
 
 def linear_path(tool: Tool, waypoints: Sequence[PositionGoal | PoseGoal], start: Vector) -> LinearPath:
@@ -203,7 +203,7 @@ def _towards(a: Vector, b: Vector, share: float) -> Vector:
 
 
 def _with_axis(rotation: Vector, axis: Vector) -> Vector:
-    """A rotation turned the short way so that its z axis is `axis`."""
+    """The rotation nearest to a given one whose z axis is `axis`."""
     normal = np.cross(rotation[:, 2], axis)
     sine = float(np.linalg.norm(normal))
     if sine < 1e-9:

@@ -1,4 +1,4 @@
-"""What the services of a planning mode take and answer: IB-Robot's requests and result as attrs classes."""
+"""Requests and result of the services of a planning mode: those of IB-Robot as attrs classes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class MoveToConfiguration:
     """Request of ibrobot_msgs/srv/MoveToConfiguration."""
 
     target_joint_state: JointState
-    """Names and positions [rad]; joints that it does not name stay."""
+    """Names and positions [rad]; all other joints stay."""
     velocity_scaling: float = 0.0
     """Fraction of the velocity limits, in (0, 1]; 0 means 1."""
 
@@ -37,12 +37,12 @@ class MoveResult:
 
     success: bool
     message: str
-    """Why not, in one sentence; empty after a success."""
+    """The error in one sentence; empty after a success."""
     execution_time_s: float
     outcome: Outcome
     code: PlanCode
     """`code.name` is MoveIt's, e.g. NO_IK_SOLUTION."""
     position_error_m: float = 0.0
-    """Distance of the planned tool position from the one asked for [m]."""
+    """Distance of the planned tool position from the requested one [m]."""
     orientation_error_rad: float = 0.0
-    """Angle between the planned orientation, or axis, and the one asked for [rad]."""
+    """Angle between the planned orientation, or axis, and the requested one [rad]."""

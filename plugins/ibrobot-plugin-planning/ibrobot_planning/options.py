@@ -1,4 +1,4 @@
-"""What the YAML may say under `planner: {type: joint}`."""
+"""Options of the planners."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The fastest way from rest to rest along a line, within limits on velocity, acceleration and jerk."""
+"""The fastest motion from rest to rest along a line, within limits on velocity, acceleration and jerk."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class RestToRest:
 
 
 def _peak_speed(distance: float, max_acceleration: float, max_jerk: float) -> float:
-    """The speed at which the motion must begin to slow down, were there no limit on it."""
+    """The peak speed without a velocity limit."""
     ramp = max_acceleration / max_jerk
     if distance <= 2 * max_acceleration * ramp**2:  # slows down before the acceleration reaches its limit
         return math.cbrt(distance**2 * max_jerk / 4)

@@ -44,23 +44,23 @@ from ibrobot_planning.world import World
 from ibrobot_planning.world_keeper import SNAPSHOT
 
 _RESOLUTIONS_M = (0.03, 0.01, 0.004)
-"""How far the arm moves at most between checks of the search; finer ones follow where the timed motion touches."""
+"""Maximum motion of the arm between checks of the search; finer ones follow if the timed motion touches."""
 _FINEST_M = 0.0015
 """The same for a whole path before it is timed."""
 _CHECK_S = 0.001
 """Time between checks of the timed motion."""
 _REPAIRS = 12
-"""Timings of one path, each with smaller blends where the one before touched."""
+"""Attempts to time one path, each with smaller blends where the previous motion touched."""
 _LEAST_BLEND = 0.01
 """Smaller blends [rad] become stops."""
 _WIDEST_WINDOW_S, _LINEAR_WINDOW_S = 0.1, 0.03
 """The moving average of free motions and of straight lines: the wider, the further they leave the path."""
 _ROUNDING = 1e-6
-"""By how much positions may exceed a limit [rad]."""
+"""Allowed excess of positions beyond a limit [rad]."""
 _WORSE_M = 1e-4
-"""How much closer something may come on the way out of a contact [m]."""
+"""Allowed decrease of a distance on the way out of a contact [m]."""
 _EXITS = 60
-"""Directions that are tried at each distance on the way out of a contact."""
+"""Number of directions tried at each distance on the way out of a contact."""
 
 
 class RrtConnectPlanner(Planner):
@@ -169,7 +169,7 @@ class _Goal:
 
 @attrs.define(eq=False)
 class _Plan:
-    """One request under way."""
+    """One request in progress."""
 
     ctx: Context
     options: RrtConnectOptions
@@ -190,7 +190,7 @@ class _Plan:
         failures: list[PlanningError] = []
         for number, alternative in enumerate(alternatives):
             try:
-                # What is left of the time is shared, so that a hard alternative leaves some for the next.
+                # The remaining time is divided, so that a hard alternative leaves some for the next.
                 share = (self.deadline - time.monotonic()) / (len(alternatives) - number)
                 return self._reach(tool, alternative, number, way_out, time.monotonic() + share)
             except PlanningError as failure:
@@ -231,7 +231,7 @@ class _Plan:
         raise PlanningError(self._stuck(way_out[-1], goals[0]), PlanCode.TIMED_OUT)
 
     def _paths(self, start: Vector, goals: list[Vector], deadline: float) -> Iterator[list[Vector]]:
-        """Short paths, ever more closely checked; the next is wanted where the timed motion of one touches."""
+        """Short paths with increasingly fine checks; the caller takes the next if the timed motion touches."""
         rng = np.random.default_rng(self.ctx.seed)
         for resolution in _RESOLUTIONS_M:
             space = Space(self.checks, *self._limits, resolution)
@@ -276,7 +276,7 @@ class _Plan:
             )
 
     def _free_goals(self, candidates: list[Candidate], goal: object) -> list[Candidate]:
-        """Those that touch nothing.
+        """The configurations without contacts.
 
         Raises:
             PlanningError: where all of them touch something.
@@ -294,7 +294,7 @@ class _Plan:
         raise PlanningError(f"the goal is in collision{at_all}: {_sentence(least)}", PlanCode.GOAL_IN_COLLISION)
 
     def _nearby(self, whole: Vector, goal: JointGoal) -> list[Candidate]:
-        """The nearest free of random configurations within the goal's tolerance."""
+        """The nearest free one of random configurations within the goal's tolerance."""
         rng = np.random.default_rng(self.ctx.seed)
         robot = self.ctx.robot
         found = []
@@ -386,7 +386,7 @@ class _Plan:
         return self._result(motion, end, 0, fraction)
 
     def _checked(self, path: Sequence[Vector], *, linear: bool = False) -> Motion | None:
-        """The fastest motion along a path that touches nothing; None where even one that stops at corners does."""
+        """The fastest motion along a path without contacts; None if even one that stops at corners touches."""
         robot, options, request = self.ctx.robot, self.options, self.request
         way = np.array(path)
         velocity = robot.max_velocity[self._order] * options.velocity_scaling * request.velocity_scaling
@@ -417,7 +417,7 @@ class _Plan:
         return all(finest.free(a, b) for a, b in pairwise(way[begin:]))
 
     def _blends(self, way: Vector) -> Vector:
-        """How far each corner may be cut, so that the cut touches nothing."""
+        """Maximum blend of each corner without contacts."""
         lengths = np.linalg.norm(np.diff(way, axis=0), axis=1)
         blends = np.minimum(np.minimum(lengths[:-1], lengths[1:]) / 2, self.options.blend)
         shares = np.linspace(0, 1, 9)[:, None]
@@ -438,7 +438,7 @@ class _Plan:
         """Where a motion touches or leaves the limits, shape (N, J)."""
         positions = motion.sampled(_CHECK_S)[0]
         lower, upper = self._limits
-        # From outside the limits only inwards.
+        # A joint outside its limits may only move inwards.
         lower, upper = np.minimum(lower, self.start), np.maximum(upper, self.start)
         outside = ((positions < lower - _ROUNDING) | (positions > upper + _ROUNDING)).any(axis=1)
         bad = [positions[outside]]

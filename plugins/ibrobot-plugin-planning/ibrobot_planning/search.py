@@ -31,19 +31,19 @@ type Random = np.random.Generator
 
 
 class Checks(Protocol):
-    """What the search needs of a collision checker."""
+    """The part of a collision checker that the search uses."""
 
     @property
     def reach(self) -> Vector:
-        """How far any point moves at most with each joint [m/rad], shape (J,)."""
+        """Maximum motion of any point per joint [m/rad], shape (J,)."""
 
     def first_hit(self, configurations: Vector) -> int:
-        """How many of the configurations, shape (N, J), are free before the first that is not."""
+        """Number of free configurations before the first in collision, of shape (N, J)."""
 
 
 @attrs.frozen(eq=False)
 class Space:
-    """Where to search: limits and checks."""
+    """The search space: limits and checks."""
 
     checks: Checks
     lower: Vector
@@ -51,7 +51,7 @@ class Space:
     upper: Vector
     """[rad], shape (J,)."""
     resolution: float
-    """How far any point of the arm moves at most between two checks on a line [m]."""
+    """Maximum motion of any point of the arm between two checks on a line [m]."""
 
     def line(self, a: Vector, b: Vector) -> Vector:
         """Configurations to check between `a` and `b`, shape (N, J): without `a`, with `b`."""
@@ -59,9 +59,9 @@ class Space:
         return np.asarray(a + (np.arange(1, number + 1) / number)[:, None] * (b - a))
 
     def free(self, a: Vector, b: Vector) -> bool:
-        """Whether the line is free, apart from `a`."""
+        """Whether the line is free; `a` is not checked."""
         line = self.line(a, b)
-        # From coarse to fine: what is in the way is mostly found early.
+        # From coarse to fine, which mostly finds obstacles early.
         spread = line[_spread(len(line))]
         return self.checks.first_hit(spread) == len(line)
 
@@ -104,7 +104,7 @@ class _Tree:
         return int(np.einsum("ij,ij->i", away, away).argmin())
 
     def way(self, index: int) -> list[Vector]:
-        """From a root to a node."""
+        """The path from a root to a node."""
         nodes = []
         while index >= 0:
             nodes.append(self._nodes[index].copy())
@@ -148,7 +148,7 @@ def _grown(
     for _ in range(iterations):
         if expired():
             return None
-        # The smaller tree grows, so that both get their share.
+        # The smaller tree grows, so that both grow equally.
         if here.size > there.size:
             here, there, forwards = there, here, not forwards
         sample = rng.uniform(space.lower, space.upper)
@@ -177,7 +177,7 @@ def _extend(space: Space, tree: _Tree, target: Vector, *, once: bool) -> int | N
     free = space.checks.first_hit(line)
     if free == 0:
         return None
-    # The last of the free configurations touches nearly: a node some way before it leads on more often.
+    # The last free configuration is close to contact: a node some way before it can be extended more often.
     if free < len(line):
         free = max(free // 2, 1) if once else free
     return tree.add(line[free - 1] if free < len(line) else end, parent)
@@ -209,7 +209,7 @@ def shortened(space: Space, path: Sequence[Vector], rng: Random) -> list[Vector]
 
 
 def _changed_free(space: Space, before: Sequence[Vector], after: Sequence[Vector], first: int) -> bool:
-    """Whether the segments of a polyline that another does not have are free."""
+    """Whether the segments of a polyline that differ from another are free."""
     known = {(id(a), id(b)) for a, b in pairwise(before)}
     segments = zip(after[max(first - 1, 0) :], after[max(first, 1) :], strict=False)
     return all(space.free(a, b) for a, b in segments if (id(a), id(b)) not in known)
@@ -232,7 +232,7 @@ def _cut(path: list[Vector], rng: Random) -> list[Vector]:
 
 
 def _cut_joint(path: list[Vector], rng: Random) -> list[Vector]:
-    """One joint goes evenly between two random points, the others as before."""
+    """One joint moves linearly between two random points, the others as before."""
     (i, a), (j, b) = (_at(path, share) for share in sorted(rng.random(2)))
     joint = int(rng.integers(len(a)))
     inner = [point.copy() for point in path[i + 1 : j + 1]]
@@ -247,7 +247,7 @@ def _cut_joint(path: list[Vector], rng: Random) -> list[Vector]:
 
 
 def _pruned(space: Space, path: list[Vector]) -> list[Vector]:
-    """Without waypoints that a straight line may pass by."""
+    """The polyline without waypoints that a straight line can bypass."""
     i = 0
     while i + 2 < len(path):
         if space.free(path[i], path[i + 2]):
@@ -259,7 +259,7 @@ def _pruned(space: Space, path: list[Vector]) -> list[Vector]:
 
 
 def _straightened(path: list[Vector]) -> list[Vector]:
-    """Without waypoints that repeat or lie on the line between their neighbours."""
+    """The polyline without waypoints that repeat or lie on the line between their neighbours."""
     kept = [path[0]]
     for point, after in pairwise(path[1:]):
         ahead, behind = after - point, point - kept[-1]

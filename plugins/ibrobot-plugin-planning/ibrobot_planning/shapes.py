@@ -1,4 +1,4 @@
-"""Shapes as Coal has them."""
+"""Shapes as objects of Coal."""
 
 from __future__ import annotations
 

@@ -41,9 +41,9 @@ from ibrobot_planning.goal_text import Target, target
 from ibrobot_planning.motion import MoveResult, MoveToConfiguration, MoveToPose, Outcome
 
 GO_TO = "/planning/go_to"
-"""Takes a goal, as text or as a goal of `ibrobot_core.api`, in place of the present one; answers with its number."""
+"""Takes a goal, as text or as a goal of `ibrobot_core.api`, which replaces the present one; answers with its number."""
 RESULT = "/planning/result"
-"""Number of a goal -> its `MoveResult`; None while it is under way."""
+"""Number of a goal -> its `MoveResult`; None while the robot moves."""
 CANCEL = "/planning/cancel"
 """Drops all goals: the robot slows down and holds."""
 MOVE_TO_POSE = "/moveit_gateway/move_to_pose"
@@ -60,33 +60,33 @@ _STATUS_NS = ns(0.1)
 _GLANCE_S = 0.5
 _ENDED = MoveResult(False, "the mode or the run ended", 0.0, "CANCELLED", PlanCode.PREEMPTED)
 _STILL_RAD = 1e-4
-"""Commands that change less from one look to the next stand still."""
+"""Commands that change less between two checks are at rest."""
 _KEPT = 100
-"""How many results are kept for `RESULT`."""
+"""Number of results kept for `RESULT`."""
 _POLICIES: tuple[OrientationPolicy, ...] = ("keep_axis", "arm_plane", "current", "free")
 
 
 @attrs.define(eq=False)
 class _Move:
-    """A goal on its way to the executors."""
+    """A goal in progress."""
 
     number: int
     target: Target
     asked: bool = False
-    """Whether the run ends when all such goals have."""
+    """Whether the run ends after all such goals."""
     waiting: set[str] = attrs.field(factory=set)
     """Executors that have not ended yet."""
     failures: list[str] = attrs.field(factory=list)
     begun_ns: int | None = None
     planned: PlanResult | None = None
     dropped: str = ""
-    """Why it stops before its end; empty while it does not."""
+    """Why it stops early; empty otherwise."""
     result: MoveResult | None = None
     ended: threading.Event = attrs.field(factory=threading.Event)
 
 
 class PlannerSource(SourceWorker):
-    """Moves to goals, planned from where the robot is.
+    """Moves to goals, planned from the robot's present position.
 
     The goals of the request are reached one after the other, in the mode in which the run begins. A goal of a service
     or of `/cmd_pose` takes the place of all others: the robot first slows down along its trajectory.
@@ -101,7 +101,7 @@ class PlannerSource(SourceWorker):
         self._component = mode.planner
         self._numbers = itertools.count(1)
         self._inbox: queue.SimpleQueue[Mapping[str, Any] | _Move | None] = queue.SimpleQueue()
-        """Events of executors; goals that take the place of others; None to cancel."""
+        """Events of executors; goals that replace others; None to cancel."""
         self._queue: deque[_Move] = deque()
         self._move: _Move | None = None
         self._moves: dict[int, _Move] = {}
@@ -182,7 +182,7 @@ class PlannerSource(SourceWorker):
         return _Move(next(self._numbers), parsed, asked)
 
     def _submit(self, goal: str | Goal, velocity_scaling: float = 1.0) -> _Move:
-        """Have a goal take the place of all others."""
+        """Replace all goals by this one."""
         move = self._known(self._new(goal, velocity_scaling))
         self._inbox.put(move)
         return move
@@ -211,7 +211,7 @@ class PlannerSource(SourceWorker):
         return self._wait(JointGoal(state.name, state.position), request.velocity_scaling)
 
     def _wait(self, goal: Goal, velocity_scaling: float) -> MoveResult:
-        """Submit a goal and wait for its end; one that makes no sense is REJECTED."""
+        """Submit a goal and wait for its end; an invalid goal is REJECTED."""
         if self.session.request.lockstep and threading.get_ident() == self._worker:
             raise NotSupported(
                 f"this service waits for the motion: in lockstep call it from another thread, or {GO_TO}"
@@ -243,7 +243,7 @@ class PlannerSource(SourceWorker):
             self._show("failed")
 
     def _replace(self, move: _Move | None) -> None:
-        """Drop all goals for `move`, or to hold where it is None."""
+        """Drop all goals in favour of `move`; None holds."""
         why = f"replaced by goal {move.target.text}" if move is not None else "cancelled"
         dropped = list(self._queue)
         self._queue.clear()
@@ -255,7 +255,7 @@ class PlannerSource(SourceWorker):
             self._stop(self._move, why)
 
     def _stop(self, move: _Move, why: str) -> None:
-        """Have the executors that move slow down; the goal ends when they have."""
+        """Let moving executors slow down; the goal ends when they stop."""
         session = self.session
         move.dropped = why
         for name in sorted(move.waiting):
@@ -271,7 +271,7 @@ class PlannerSource(SourceWorker):
                 return
 
     def _at_rest(self) -> bool:
-        """Whether the commands stand still: the safety layer may follow the executors with a delay."""
+        """Whether the commands are at rest: the safety layer may follow the executors with a delay."""
         state, seen = self.session.state, self._seen
         if state is None or (seen is not None and state.stamp_ns == seen.stamp_ns):
             return False
@@ -279,7 +279,7 @@ class PlannerSource(SourceWorker):
         return seen is not None and bool(np.abs(state.command - seen.command).max() < _STILL_RAD)
 
     def _commanded(self) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-        # From the commanded positions, not from where the joints sag to: the setpoint makes no step.
+        # From the commanded positions, not the sagging joints, so that the setpoint does not jump.
         state = self.session.state
         return state.command if state is not None else self.session.measured().position
 
@@ -301,7 +301,7 @@ class PlannerSource(SourceWorker):
             self._finish(move, "EXECUTION_FAILED", PlanCode.CONTROL_FAILED, str(error))
 
     def _executors(self, parsed: Target) -> dict[str, Goal | float]:
-        """Executor -> what it is to reach: planned for, or a position [rad].
+        """Executor -> its target: a goal to plan for, or a position [rad].
 
         Raises:
             PlanningError: where no executor of the mode can reach the goal.
@@ -361,7 +361,7 @@ class PlannerSource(SourceWorker):
         if not stopped and event["goal"] != f"{move.number}:{name}":
             return
         if not stopped and f"goal {move.number}:stop:{name}" in str(event["message"]):
-            return  # it still slows down
+            return  # it is still slowing down
         move.waiting.discard(name)
         if event["state"] != "succeeded" and not move.dropped:
             move.failures.append(f"{name} {event['state']}: {event['message']}")
@@ -401,7 +401,7 @@ class PlannerSource(SourceWorker):
         self.session.bus.publish(MOTION_STATUS, String(status), latched=True)
 
     def _drop_all(self) -> None:
-        """End all goals, so that nothing waits for them."""
+        """End all goals, so that no caller waits for them."""
         self.end()
         self._over = True
         for move in self._moves.values():

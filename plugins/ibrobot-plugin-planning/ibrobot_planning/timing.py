@@ -25,7 +25,7 @@ _SAMPLE_S = 0.001
 _STILL = 1e-9
 """Shorter segments [rad] are left out."""
 _EASED = 2e-3
-"""By how much limits are lowered, for the rounding of samples."""
+"""Reduction of the limits, for the rounding of samples."""
 
 
 @attrs.frozen(eq=False)
@@ -48,7 +48,7 @@ class Motion:
 
     @property
     def jerk(self) -> float:
-        """Greatest rate of change of any joint's acceleration between points [rad/s^3]."""
+        """Maximum rate of change of any joint's acceleration between points [rad/s^3]."""
         steps = np.diff(self.times)[:, None]
         return float(np.abs(np.diff(self.accelerations, axis=0) / steps).max(initial=0.0))
 
@@ -114,7 +114,7 @@ def timed(
         _fastest(path[first : last + 1], blends[first : last - 1], max_velocity, max_acceleration)
         for first, last in pairwise(stops)
     ]
-    # Rest for as long as the average is wide, so that it does not cut across a corner at which the motion stops.
+    # Rest for the width of the average, so that it does not cut a corner at which the motion stops.
     rested = [np.concatenate([part, np.repeat(part[-1:], samples, axis=0)]) for part in parts]
     motion = _averaged(np.concatenate([np.repeat(path[:1], samples, axis=0), *rested]), samples, step)
     _, velocities, accelerations = motion.sampled(_SAMPLE_S / 2)
@@ -141,7 +141,7 @@ def _fastest(path: Vector, blends: Vector, max_velocity: Vector, max_acceleratio
     squared = _speeds(s, slopes, bends, max_velocity, max_acceleration)
     speeds = np.sqrt(squared)
     stamps = np.concatenate([[0.0], np.cumsum(2 * np.diff(s) / (speeds[1:] + speeds[:-1]))])
-    # Slower by what the grid let slip.
+    # Slower by the excess between grid points.
     rates = np.diff(squared) / (2 * np.diff(s))
     begins, ends = (
         slopes[which] * rates[:, None] + bends * squared[which, None] for which in (slice(-1), slice(1, None))
@@ -187,7 +187,7 @@ def _grid(path: Vector, blends: Vector) -> tuple[Vector, Vector, Vector, Vector]
 
 
 def _speeds(s: Vector, slopes: Vector, bends: Vector, max_velocity: Vector, max_acceleration: Vector) -> Vector:
-    """Squares of the greatest speeds ds/dt at the grid points.
+    """Squares of the maximum speeds ds/dt at the grid points.
 
     With x = (ds/dt)^2 and u = d2s/dt2, each joint bounds |slope u + bend x| by its acceleration, and on an interval
     x changes by 2 u ds.

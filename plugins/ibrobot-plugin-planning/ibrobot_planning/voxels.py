@@ -1,4 +1,4 @@
-"""Voxels from what a depth camera sees."""
+"""Voxels from point clouds and depth images."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ibrobot_planning.world import Voxels
 
 
 def voxels(points: Vector, size: float, *, least_points: int = 1) -> Voxels | None:
-    """The cells that points lie in.
+    """The cells that contain points.
 
     Args:
         points: [m] in the frame of the voxels, shape (N, 3); rows that are not finite count as missing.
@@ -37,7 +37,7 @@ def voxels(points: Vector, size: float, *, least_points: int = 1) -> Voxels | No
 
 
 def depth_points(depth: Vector, intrinsics: Vector, camera: Pose, *, furthest: float = 2.0) -> Vector:
-    """Points that a depth image shows.
+    """The points of a depth image.
 
     Args:
         depth: distance along the optical axis of each pixel [m], shape (H, W); 0 and values that are not finite count

@@ -1,4 +1,4 @@
-"""What is around the arm: objects with shapes, at poses in the base frame or attached to a link. All of it immutable.
+"""The surroundings of the arm: objects with shapes, at poses in the base frame or attached to a link; all immutable.
 
 A plan takes one `World`; changes make a new one.
 """
@@ -86,7 +86,7 @@ class Plane:
 
 @attrs.frozen(eq=False)
 class Mesh:
-    """Triangles. What is inside a closed mesh touches nothing, unless the mesh is `convex`.
+    """Triangles. A body inside a closed mesh does not touch it, unless the mesh is `convex`.
 
     Raises:
         ValueError: for arrays of other shapes, vertices that are not finite, triangles of missing vertices, a mesh
@@ -178,7 +178,7 @@ class World:
     objects: Mapping[str, WorldObject] = attrs.field(factory=dict)
 
     def add(self, name: str, thing: WorldObject) -> World:
-        """With one object more.
+        """The world with another object.
 
         Raises:
             PlanningError: for a name that is taken.
@@ -190,7 +190,7 @@ class World:
         return World({**self.objects, name: thing})
 
     def remove(self, name: str) -> World:
-        """Without an object.
+        """The world without an object.
 
         Raises:
             PlanningError: for a name that no object has; so do the methods below.
@@ -199,11 +199,11 @@ class World:
         return World({key: value for key, value in self.objects.items() if key != name})
 
     def move(self, name: str, pose: Pose) -> World:
-        """With an object elsewhere, in the frame in which it stands."""
+        """The world with an object at another pose, in the same frame."""
         return World({**self.objects, name: attrs.evolve(self.named(name), pose=pose)})
 
     def attach(self, name: str, link: str, pose: Pose, may_touch: frozenset[str] = frozenset()) -> World:
-        """With an object carried by `link`, at `pose` in the link's frame, touching the link and `may_touch`.
+        """The world with an object carried by `link`, at `pose` in its frame; it may touch the link and `may_touch`.
 
         Raises:
             PlanningError: for a name that no object has, or an object that is attached already.
@@ -215,7 +215,7 @@ class World:
         return World({**self.objects, name: attrs.evolve(thing, link=link, pose=pose, may_touch=touching)})
 
     def detach(self, name: str, pose: Pose, may_touch: frozenset[str] = frozenset()) -> World:
-        """With an attached object put down at `pose` in the base frame, touching `may_touch` alone.
+        """The world with an attached object put down at `pose` in the base frame; it may touch only `may_touch`.
 
         Raises:
             PlanningError: for a name that no object has, or an object that is not attached.

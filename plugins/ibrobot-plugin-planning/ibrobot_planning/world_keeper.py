@@ -74,7 +74,7 @@ class WorldKeeper(Component):
         return world.detach(it.name, pose(placed), frozenset(it.may_touch))
 
     def _link(self, link: str) -> Vector:
-        """Where a link is now, shape (4, 4)."""
+        """Present pose of a link, shape (4, 4)."""
         if self._arm is None:
             self._arm = robot_arm(self._session.config.robot)
         return self._arm.link_pose(link, self._session.measured().position)

@@ -1,4 +1,4 @@
-"""What the YAML may say under `world:`."""
+"""Options of the section `world`."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ class ObjectOptions:
 @documented
 @attrs.frozen
 class WorldOptions:
-    """The section `world`: what stands around the robot, for planners."""
+    """The section `world`: the objects around the robot, for planners."""
 
     objects: Mapping[str, ObjectOptions] = option(factory=dict, help="objects by name")
 
@@ -113,7 +113,7 @@ class Moved:
 @documented
 @attrs.frozen
 class Attached:
-    """A request to `/world/attach`: the object stays where it is as seen from the link."""
+    """A request to `/world/attach`: the object keeps its pose relative to the link."""
 
     name: str = option(help="the object's name")
     link: str = option(help="the link of the MJCF that carries it from now on")

@@ -1,4 +1,4 @@
-"""The `gripper` executor: opens or closes to a position; what is in the way counts as grasped."""
+"""The `gripper` executor: opens or closes to a position; an object that stops it counts as grasped."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class _Running:
 
 
 class GripperExecutor(Executor):
-    """Moves one joint's setpoint to the goal at `velocity`, and keeps it there whatever comes of the goal.
+    """Moves one joint's setpoint to the goal at `velocity`, and keeps it there regardless of the result.
 
     Reached: the measured position is within `goal_tolerance` of the goal. Stalled: the measured speed has been below
     `stall_velocity` for `stall_time`; something is in the way. With `allow_stalling` that is a success (grasped) and
@@ -125,7 +125,7 @@ class GripperExecutor(Executor):
 
     def _judge(self, running: _Running, measured: JointReading) -> None:
         """End the goal if it is reached or the gripper has stalled."""
-        # Written so that a NaN speed counts as moving: a stall must be seen.
+        # Written so that a NaN speed counts as moving: a stall must be measured.
         if not abs(measured.velocity[0]) < self._options.stall_velocity:
             running.moved_ns = measured.stamp_ns
         if abs(measured.position[0] - self._target) <= self._options.goal_tolerance:
