@@ -1,4 +1,4 @@
-"""What must hold between sections: joints, groups, poses, hardware, executors, modes, start and stop behaviours."""
+"""Checks across sections: joints, groups, poses, hardware, executors, modes, start and stop behaviours."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from ibrobot_core.robot import Joint, Robot
 from ibrobot_core.units import radians
 
 _SLACK = 0.01
-"""How much wider than a model's a limit may be [rad]: models and people round."""
+"""Tolerance for limits wider than a model's [rad], since both may be rounded."""
 
 
 @attrs.frozen
 class Checks:
-    """Checks of one document; what does not hold is noted in it. Parts that failed are passed over."""
+    """Checks of one document. Faults are added to it; parts with earlier faults are skipped."""
 
     document: Document
     sections: ParsedSections
@@ -31,7 +31,7 @@ class Checks:
     """Whether the caller uses the transport itself."""
 
     def run(self) -> None:
-        """All checks."""
+        """Run all checks."""
         robot = self.sections.plain.get("robot")
         if robot is not None:
             self._robot(robot)
@@ -52,7 +52,7 @@ class Checks:
                 self.document.add((*key, i), f"{what} {name!r} is given twice")
 
     def _name(self, key: Key, name: str) -> None:
-        """Names become parts of topics, files and lines of a terminal."""
+        """Check a name, which may become part of topics, files and terminal output."""
         if not name or not name.isprintable() or "/" in name or name != name.strip():
             message = f"a name is not empty and has no slash, control character or space at its ends, got {name!r}"
             self.document.add(key, message)
@@ -82,7 +82,7 @@ class Checks:
         self._models(robot)
 
     def _models(self, robot: Robot) -> None:
-        """The models can be read, the tip is in them, and no joint may go where none of them lets it."""
+        """Check that the models can be read and contain the tip, and that joint limits are within those of a model."""
         known: list[DescriptionModel] = []
         described = robot.description
         for model, path in (("mjcf", described.mjcf), ("urdf", described.urdf), ("srdf", described.srdf)):
@@ -136,7 +136,7 @@ class Checks:
                 key: Key = (*part.key, "joints", i)
                 self.document.refer(key, joint, list(robot.joint_names), "joint")
                 if joint in owners:
-                    self.document.add(key, f"joint {joint!r} is owned by hardware {owners[joint]!r} already")
+                    self.document.add(key, f"joint {joint!r} is already owned by hardware {owners[joint]!r}")
                 owners.setdefault(joint, name)
         written = self.document.root.get("hardware")
         complete = isinstance(written, Mapping) and (len(self.sections.hardware) == len(written) or "type" in written)
@@ -145,7 +145,7 @@ class Checks:
             self.document.add(("hardware",), f"no hardware owns: {', '.join(missing)}")
 
     def _options(self, robot: Robot) -> None:
-        """What plugins say of their options for this robot."""
+        """Run the plugins' checks of their options for this robot."""
         for part in self.sections.all():
             joints: tuple[str, ...] = robot.joint_names
             if isinstance(part.component, HardwareConfig):
@@ -156,12 +156,12 @@ class Checks:
                 self.document.add((*part.key, *fault.option), fault.message)
 
     def _devices(self) -> None:
-        """No two components open one device. Of teleoperation one is open at a time."""
+        """Check that no two components open the same device; only one teleoperation device is open at a time."""
         users: dict[str, Key] = {}
         for part in (*self.sections.active(), *self.sections.teleoperation.values()):
             for option, device in part.descriptor.devices(part.component.options).items():
                 if (user := users.get(device, part.key)) != part.key:
-                    self.document.add((*part.key, option), f"{device} is used by {self.document.dotted(user)} already")
+                    self.document.add((*part.key, option), f"{device} is already used by {self.document.dotted(user)}")
                 elif part.key[0] != "teleoperation":
                     users[device] = part.key
 
@@ -201,14 +201,14 @@ class Checks:
             self._reaches(part)
         sources = [source for source in ("teleop", "inference", "planner") if getattr(mode, source) is not None]
         if len(sources) > 1:
-            self.document.add((*key, sources[1]), f"{sources[0]} drives this mode already; make a mode for each")
+            self.document.add((*key, sources[1]), f"{sources[0]} already drives this mode; make a mode for each")
         elif sources:
             self._drives(key, mode, sources[0])
         if mode.inference is None and self.document.get(*key, "dispatch") is not None:
-            self.document.add((*key, "dispatch"), "has a meaning only beside inference")
+            self.document.add((*key, "dispatch"), "applies only to a mode with inference")
 
     def _reaches(self, part: ParsedComponent[InferenceConfig]) -> None:
-        """An engine that uses the transport has one to other machines."""
+        """Check that an engine that uses the transport has one to other machines."""
         transport = self.document.root.get("transport")
         elsewhere = isinstance(transport, Mapping) and transport.get("type") != "local"
         if part.component.uses_transport and not elsewhere:
@@ -267,7 +267,7 @@ class Checks:
             self.document.add(("recording", "topics"), f"{topics!r} is not one of: contract, all, or a list of topics")
         elif not topics and self.sections.recording:
             self.document.add(
-                ("recording", "topics"), "names no topic; contract takes those of the contract, all every one"
+                ("recording", "topics"), "is empty; write contract for the contract's topics, or all for every topic"
             )
         for i, topic in enumerate(topics if isinstance(topics, tuple) else ()):
             if not topic.startswith("/"):
@@ -276,5 +276,5 @@ class Checks:
 
 
 def streams(part: ParsedComponent[Any]) -> bool:
-    """Whether an executor follows setpoints rather than goals."""
+    """Whether an executor follows setpoints, not goals."""
     return isinstance(part.descriptor, ExecutorDescriptor) and part.descriptor.streams

@@ -1,4 +1,4 @@
-"""The contract's rules: what it names must exist and fit together, and what it may leave out is filled in."""
+"""Checks of the contract: its references must exist and be consistent. Omitted values are filled in."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ JOINT_STATES = "/joint_states"
 PERIPHERAL_TOPICS: Mapping[str, tuple[str, type[messages.Message]]] = {
     "camera": ("/camera/{name}/image_raw", messages.Image)
 }
-"""Peripheral kind -> where its messages go, and their type."""
+"""Peripheral kind -> topic and type of its messages."""
 
 SIGNAL_TYPES: Mapping[str, str] = {
     TASK_KEY: messages.String.ros_type,
     "next.reward": "std_msgs/msg/Float32",
     "next.done": messages.Bool.ros_type,
 }
-"""Key of a signal -> type of its messages where the YAML does not say."""
+"""Key of a signal -> default type of its messages."""
 
 _IMAGES = (messages.Image.ros_type, messages.CompressedImage.ros_type)
 _IMAGE_KEYS = "observation.images."
@@ -37,7 +37,7 @@ _JOINT_FIELDS = ("position", "velocity", "effort")
 
 
 def completed(spec: ObservationSpec, kind: str = "") -> ObservationSpec:
-    """An observation with the topic and type that its peripheral, of this kind, or its topic implies."""
+    """Complete an observation with the topic and type implied by its peripheral, of this kind, or by its topic."""
     if spec.peripheral is not None and kind in PERIPHERAL_TOPICS:
         topic, message_type = PERIPHERAL_TOPICS[kind]
         return attrs.evolve(spec, topic=topic.format(name=spec.peripheral), type=message_type.ros_type)
@@ -48,15 +48,15 @@ def completed(spec: ObservationSpec, kind: str = "") -> ObservationSpec:
 
 @attrs.frozen
 class ContractChecks:
-    """Checks and completes the contract; what does not hold is noted in the document."""
+    """Checks and completes the contract; faults are added to the document."""
 
     document: Document
     sections: ParsedSections
     alone: bool = False
-    """Whether there is no robot: actions have no executor, and say themselves what their numbers are."""
+    """Whether the file has no robot; actions then have no executor, but their own `joints`."""
 
     def run(self) -> ContractConfig:
-        """The contract, complete."""
+        """Return the completed contract."""
         contract: ContractConfig = self.sections.plain.get("contract", ContractConfig())
         if "contract" in self.document.root and "contract" not in self.sections.plain:
             return contract
@@ -83,7 +83,7 @@ class ContractChecks:
         return attrs.evolve(contract, observations=observations, actions=actions, signals=signals)
 
     def observations(self, key: Key, specs: Sequence[ObservationSpec]) -> tuple[ObservationSpec, ...]:
-        """Observations with topic and type filled in."""
+        """Complete observations with topic and type."""
         return tuple(self._observation((*key, i), spec) for i, spec in enumerate(specs))
 
     def _observation(self, key: Key, spec: ObservationSpec) -> ObservationSpec:
@@ -96,12 +96,12 @@ class ContractChecks:
             self.document.add((*key, "topic"), f"a topic starts with /, got {spec.topic!r}")
         spec = completed(spec)
         if not spec.type:
-            self.document.add(key, f"needs a type, since that of {spec.topic} is not known by itself")
+            self.document.add(key, f"needs a type, which topic {spec.topic} does not determine")
         elif spec.foreign:
             self._foreign(key, spec)
         elif spec.type not in messages.MESSAGE_TYPES:
             remark = did_you_mean(spec.type, sorted(messages.MESSAGE_TYPES), "known")
-            hint = "(`foreign: true` takes one that only bags to convert have)"
+            hint = "(set `foreign: true` for a type that only bags define)"
             self.document.add((*key, "type"), f"unknown message type {spec.type!r}{remark} {hint}")
         elif spec.topic == JOINT_STATES and spec.type != messages.JointState.ros_type:
             self.document.add((*key, "type"), f"{JOINT_STATES} carries {messages.JointState.ros_type}, not {spec.type}")
@@ -110,15 +110,15 @@ class ContractChecks:
         return spec
 
     def _foreign(self, key: Key, spec: ObservationSpec) -> None:
-        """What can be known of a type whose definition only the bag to convert has."""
+        """Check an observation of a type that only the bag to convert defines."""
         if spec.type in messages.MESSAGE_TYPES:
-            self.document.add((*key, "foreign"), f"{spec.type} is known here; leave foreign out")
+            self.document.add((*key, "foreign"), f"{spec.type} is a known type; leave foreign out")
         elif not _TYPE_NAME.fullmatch(spec.type):
             self.document.add((*key, "type"), f"expected PACKAGE/msg/NAME, got {spec.type!r}")
         elif not spec.select:
             self.document.add(key, f"needs a select: paths to numbers of {spec.type}, e.g. wrench.force.x or data.0")
         elif spec.image is not None or spec.key.startswith(_IMAGE_KEYS):
-            self.document.add(key, f"no pictures are made of {spec.type}, only numbers; take a topic with pictures")
+            self.document.add(key, f"{spec.type} gives only numbers, no images; use a topic with images")
 
     def _of_peripheral(self, key: Key, spec: ObservationSpec) -> ObservationSpec:
         for other in ("topic", "type", "foreign"):
@@ -131,7 +131,7 @@ class ContractChecks:
             return spec
         kind = kinds[str(spec.peripheral)]
         if kind not in PERIPHERAL_TOPICS:
-            message = f"the topic of a peripheral of kind {kind!r} is not known by itself; give topic and type instead"
+            message = f"a peripheral of kind {kind!r} does not determine topic and type; give them instead"
             self.document.add((*key, "peripheral"), message)
             return spec
         spec = completed(spec, kind)
@@ -139,7 +139,7 @@ class ContractChecks:
         return spec
 
     def _fits(self, key: Key, spec: ObservationSpec) -> None:
-        """Whether `image` and `select` suit the message type."""
+        """Check that `image` and `select` fit the message type."""
         is_image = spec.type in _IMAGES
         if spec.image is not None and not is_image:
             self.document.add((*key, "image"), f"needs a camera; {spec.topic} carries {spec.type}")
@@ -152,7 +152,7 @@ class ContractChecks:
 
     def _select(self, key: Key, path: str, spec: ObservationSpec) -> None:
         if spec.type in _IMAGES:
-            self.document.add(key, "nothing can be selected from an image")
+            self.document.add(key, "images have no numbers to select")
             return
         if spec.type == messages.JointState.ros_type:
             field, _, joint = path.partition(".")
@@ -167,7 +167,7 @@ class ContractChecks:
         self._size(key, spec.type, (path,))
 
     def _size(self, key: Key, type_: str, select: Sequence[str]) -> int | None:
-        """How many numbers paths lead to in messages of a type; None with the fault noted where they lead to none."""
+        """The number of values selected from messages of a type; None, with a fault added, if a path is wrong."""
         try:
             return Selection(type_, select).size
         except ContractError as error:
@@ -175,12 +175,12 @@ class ContractChecks:
             return None
 
     def _same_kind(self, key: Key, specs: Sequence[ObservationSpec], others: Sequence[ObservationSpec]) -> None:
-        """Values under one key concatenate, which an image and a vector cannot."""
+        """Check that values under one key can concatenate: not an image and a vector."""
         kinds = {spec.key: spec.type in _IMAGES for spec in others if spec.type}
         pictures = {spec.key for spec in others if spec.type in _IMAGES}
         for i, spec in enumerate(specs):
             if spec.type in _IMAGES and spec.key in pictures:
-                message = f"a second picture under {spec.key}; only vectors concatenate, give it a key of its own"
+                message = f"a second image under {spec.key}; only vectors concatenate, so give it its own key"
                 self.document.add((*key, i, "key"), message)
             pictures |= {spec.key} if spec.type in _IMAGES else set()
             if spec.key.startswith(_IMAGE_KEYS) and spec.type not in _IMAGES:
@@ -198,39 +198,37 @@ class ContractChecks:
                 self.document.add(key, "needs joints: the names of its numbers, in order, e.g. [pan, lift, gripper]")
             return spec
         if spec.joints:
-            self.document.add((*key, "joints"), f"are those of executor {spec.executor!r}; leave them out")
+            self.document.add((*key, "joints"), f"are given by executor {spec.executor!r}; leave them out")
         known = self.document.names("executors")
         if not self.document.refer((*key, "executor"), spec.executor, known, "executor"):
             return spec
         self._commands(key, spec)
         if any(other.executor == spec.executor for other in earlier):
-            self.document.add((*key, "executor"), f"executor {spec.executor!r} has an action already")
+            self.document.add((*key, "executor"), f"executor {spec.executor!r} already has an action")
         for other in earlier:
             if other.topic == spec.topic and not (other.foreign or spec.foreign):
-                message = f"executor {other.executor!r} has its commands on {spec.topic}; give each a topic of its own"
+                message = f"executor {other.executor!r} has its commands on {spec.topic}; give each its own topic"
                 self.document.add((*key, "topic"), message)
                 break
         part = self.sections.executors.get(spec.executor)
         if part is None:
             return spec
         if not streams(part):
-            message = f"executor {spec.executor!r} takes goals; an action needs one that streams, such as type position"
+            message = f"executor {spec.executor!r} takes goals; an action needs one for setpoints, e.g. type position"
             self.document.add((*key, "executor"), message)
         return self._safety(key, spec, part)
 
     def _commands(self, key: Key, spec: ActionSpec) -> None:
-        """Whether the messages are a robot's own, or marked as foreign, and where their numbers are."""
+        """Check type and paths: of messages that this robot publishes, or of foreign ones."""
         own = messages.Float64MultiArray.ros_type
         if not spec.foreign:
             if spec.type != own:
                 message = (
-                    f"this robot publishes {own}, not {spec.type!r}; foreign: true takes the commands of foreign bags"
+                    f"this robot publishes {own}, not {spec.type!r}; set foreign: true for the commands of foreign bags"
                 )
                 self.document.add((*key, "type"), message)
             elif spec.select:
-                self.document.add(
-                    (*key, "select"), "has a meaning for the commands of foreign bags only, with foreign: true"
-                )
+                self.document.add((*key, "select"), "applies only to the commands of foreign bags; set foreign: true")
         elif not _TYPE_NAME.fullmatch(spec.type):
             self.document.add((*key, "type"), f"expected PACKAGE/msg/NAME, got {spec.type!r}")
         elif not spec.select and spec.type not in (own, messages.JointState.ros_type):
@@ -243,12 +241,12 @@ class ContractChecks:
     def _one_number_a_joint(self, key: Key, spec: ActionSpec) -> None:
         size, joints = self._size(key, spec.type, spec.select), self._joints(spec)
         if size is not None and joints and size != len(joints):
-            given = "a length that only messages know" if size < 0 else f"{size} numbers"
+            given = "a length that only messages determine" if size < 0 else f"{size} numbers"
             message = f"gives {given} for the {len(joints)} joints of {spec.executor!r}: {', '.join(joints)}"
             self.document.add(key, message)
 
     def _joints(self, spec: ActionSpec) -> tuple[str, ...]:
-        """The joints that an action's numbers are for; none where the faults of others keep them unknown."""
+        """The joints of an action's numbers; empty if other faults leave them unknown."""
         part, robot = self.sections.executors.get(spec.executor), self.sections.plain.get("robot")
         if part is None or robot is None:
             return spec.joints
@@ -260,7 +258,7 @@ class ContractChecks:
             joints = self._joints(spec)
             twice = next((each for n, each in enumerate(joints) if each in owners or each in joints[:n]), None)
             if twice is not None and owners.get(twice) != spec.executor:
-                self.document.add((*key, i), f"joint {twice!r} is in the action vector already; each is in it once")
+                self.document.add((*key, i), f"joint {twice!r} is already in the action vector; list each joint once")
             owners |= dict.fromkeys(joints, spec.executor)
 
     def _signal(self, key: Key, spec: SignalSpec, earlier: Sequence[SignalSpec]) -> SignalSpec:
@@ -270,7 +268,7 @@ class ContractChecks:
         if not _TYPE_NAME.fullmatch(spec.type):
             self.document.add((*key, "type"), f"expected PACKAGE/msg/NAME, got {spec.type!r}")
         if any(other.key == spec.key for other in earlier):
-            self.document.add((*key, "key"), f"{spec.key} is given twice; a row has one")
+            self.document.add((*key, "key"), f"{spec.key} is given twice; give it once")
         if len(spec.select) != 1:
             self.document.add((*key, "select"), f"{spec.key} takes one path, e.g. [data]")
         elif spec.key == TASK_KEY:
@@ -281,7 +279,7 @@ class ContractChecks:
         return spec
 
     def _text(self, key: Key, spec: SignalSpec) -> None:
-        """Check that a known type has the field that the path to its text begins with."""
+        """Check that a known type has the first field of the path to its text."""
         first = spec.select[0].partition(".")[0]
         known = messages.MESSAGE_TYPES.get(spec.type)
         names = [field.name for field in attrs.fields(known)] if known is not None else [first]
@@ -289,24 +287,24 @@ class ContractChecks:
             self.document.add(key, f"{spec.type} has no field {first!r}{did_you_mean(first, names, 'its fields')}")
 
     def _safety(self, key: Key, spec: ActionSpec, part: ParsedComponent[ExecutorConfig]) -> ActionSpec:
-        """One answer to what follows stale setpoints, in both, whether the action or the executor gives it."""
+        """Copy the behaviour for stale setpoints between action and executor, whichever states it."""
         executor = part.component.options
         if not isinstance(executor, StreamOptions):
             return spec
-        there = executor.safety_behavior
+        stated = executor.safety_behavior
         if self.document.get(*part.key, "safety_behavior") is None:
             options = attrs.evolve(executor, safety_behavior=spec.safety_behavior)
             component = attrs.evolve(part.component, options=options)
             self.sections.executors[spec.executor] = attrs.evolve(part, component=component)
         elif self.document.get(*key, "safety_behavior") is None:
-            spec = attrs.evolve(spec, safety_behavior=there)
-        elif there != spec.safety_behavior:
-            message = f"{spec.safety_behavior!r} contradicts {there!r}, which executor {spec.executor!r} says"
+            spec = attrs.evolve(spec, safety_behavior=stated)
+        elif stated != spec.safety_behavior:
+            message = f"{spec.safety_behavior!r} contradicts {stated!r} of executor {spec.executor!r}"
             self.document.add((*key, "safety_behavior"), message)
         return spec
 
     def _driven(self, key: Key, executors: Sequence[str], contract: ContractConfig) -> None:
-        """A policy's action vector and the executors of its mode must be the same thing."""
+        """Check that the action vector of a policy drives exactly the executors of its mode."""
         acted = [action.executor for action in contract.actions]
         for i, name in enumerate(executors):
             if name in self.sections.executors and name not in acted:

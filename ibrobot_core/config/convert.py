@@ -1,4 +1,4 @@
-"""Plain values -> attrs classes, strictly: every fault is collected with its key, and no scalar changes its type."""
+"""Plain values -> attrs classes, strictly: collects every fault with its key, and changes no scalar's type."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ibrobot_core.config.yaml_nodes import Key
 from ibrobot_core.options import did_you_mean, fields
 
 _SHOWN = 200
-"""Characters of a value that a message shows."""
+"""Maximum length of a value in a message, in characters."""
 _YAML_1_1_BOOLS = {"on", "off", "yes", "no", "y", "n", "true", "false"}
 _SCALARS: Mapping[Any, tuple[type | tuple[type, ...], str]] = {
     bool: (bool, "true or false"),
@@ -25,27 +25,27 @@ _SCALARS: Mapping[Any, tuple[type | tuple[type, ...], str]] = {
     float: ((int, float), "a number"),
     str: (str, "text"),
 }
-"""Type -> the Python types of the values that it takes, and what a message calls them."""
+"""Type -> accepted Python types, and their name in messages."""
 
 
 def error_message(error: Exception) -> str:
-    """An error's message; attrs' own validators put more than it into their errors."""
+    """The message of an error, without the further arguments in errors of attrs' validators."""
     return str(error.args[0]) if error.args else str(error)
 
 
 @attrs.define(slots=False)
 class Faults(ValueError):
-    """What is wrong with a value: keys below it, each with a message."""
+    """The faults of a value: keys below it, each with a message."""
 
     found: list[tuple[Key, str]] = attrs.field(factory=list)
 
     def add(self, key: Key, message: str) -> None:
-        """Note one fault."""
+        """Add a fault."""
         self.found.append((key, message))
 
     @contextmanager
     def at(self, part: str | int) -> Iterator[None]:
-        """Note the faults raised within as those of the item `part`."""
+        """Add the faults raised in the block as faults of the item `part`."""
         try:
             yield
         except Faults as inner:
@@ -54,18 +54,18 @@ class Faults(ValueError):
             self.found.append(((part,), error_message(error)))
 
     def raise_any(self) -> None:
-        """Raise this if anything was noted."""
+        """Raise this error if it has faults."""
         if self.found:
             raise self
 
 
 def unknown_key(word: str, known: Sequence[str]) -> str:
-    """The message for a key that is not there."""
+    """The message for an unknown key."""
     return f"unknown key{did_you_mean(word, known, 'known keys')}"
 
 
 def shown(value: Any) -> str:
-    """A value as a message shows it."""
+    """A value as text for messages."""
     if value is None:
         return "nothing"
     if isinstance(value, bool):
@@ -96,39 +96,39 @@ def _scalar(value: Any, kind: type) -> Any:
 
 
 def is_sequence(kind: Any) -> bool:
-    """Whether a type annotation says list, tuple or Sequence."""
+    """Whether a type annotation is list, tuple or Sequence."""
     return (get_origin(kind) or kind) in (tuple, list, Sequence)
 
 
 def is_mapping(kind: Any) -> bool:
-    """Whether a type annotation says dict or Mapping."""
+    """Whether a type annotation is dict or Mapping."""
     return (get_origin(kind) or kind) in (dict, Mapping)
 
 
 def is_union(kind: Any) -> bool:
-    """Whether a type annotation says `A | B`."""
+    """Whether a type annotation is `A | B`."""
     return get_origin(kind) in (Union, types.UnionType)
 
 
 def is_literal(kind: Any) -> bool:
-    """Whether a type annotation says `Literal[...]`."""
+    """Whether a type annotation is `Literal[...]`."""
     return get_origin(kind) is Literal
 
 
 @attrs.frozen
 class Converter:
-    """Makes what a type annotation asks for of plain values."""
+    """Converts plain values to the types of annotations."""
 
     base: Path
-    """Where relative paths start."""
+    """The folder of relative paths."""
 
     def structure(self, value: Any, kind: Any) -> Any:
-        """`value` as a `kind`.
+        """Convert `value` to a `kind`.
 
         Raises:
-            Faults: for what is wrong below it.
-            ValueError: for what is wrong with it as a whole.
-            TypeError: for a kind that is not supported, which is a mistake in an options class.
+            Faults: for faults below the value.
+            ValueError: for a fault of the value as a whole.
+            TypeError: for an unsupported kind, which is a bug in an options class.
         """
         if kind is Any or get_origin(kind) in (np.ndarray, NDArray):  # an array's class converts it
             return value
@@ -150,7 +150,7 @@ class Converter:
     def arguments(
         self, known: Mapping[str, attrs.Attribute[Any]], value: Mapping[str, Any], faults: Faults
     ) -> dict[str, Any]:
-        """The fields that `value` gives, each converted and validated; what is wrong or missing goes to `faults`."""
+        """The fields in `value`, converted and validated; faults and missing keys are added to `faults`."""
         arguments: dict[str, Any] = {}
         for name, field in known.items():
             if name in value:
@@ -164,7 +164,7 @@ class Converter:
         try:
             item = self.structure(value, field.type if field.type is not None else Any)
             if field.validator is not None:
-                # Ahead of the constructor, so that every field is checked and the fault is found at its own key.
+                # Validate before the constructor, so that every field is checked and each fault has its own key.
                 field.validator(None, field, item)
         except (ValueError, TypeError):
             if not field.metadata.get("secret"):
@@ -203,7 +203,7 @@ class Converter:
         return dict(zip(value, items, strict=True))
 
     def _items(self, items: Iterable[tuple[str | int, Any, Any]]) -> list[Any]:
-        """Key, value and kind of each -> what is made of it."""
+        """Convert items, given as key, value and kind."""
         faults, found = Faults(), []
         for key, item, kind in items:
             with faults.at(key):

@@ -1,4 +1,4 @@
-"""The keys of a section and the options of a plugin in words, for `ibrobot plugins show` and the reference pages."""
+"""Descriptions of a section's keys and a plugin's options, for `ibrobot plugins show` and the reference pages."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from ibrobot_core.options import default_of, fields
 
 @attrs.frozen
 class KeyDescription:
-    """One key in words."""
+    """The description of a key."""
 
     name: str
     type: str
     unit: str
     required: bool
     default: Any
-    """As YAML knows it; `(required)` where there is none."""
+    """The default as in YAML; `(required)` for a key without one."""
     allowed: str
     """Range or choices."""
     secret: bool
@@ -29,7 +29,7 @@ class KeyDescription:
 
 
 def described(kind: type[Any]) -> Iterator[KeyDescription]:
-    """The keys that a class takes, in order."""
+    """The descriptions of a class's keys, in order."""
     for name, field in fields(kind).items():
         default = default_of(field)
         required = default is attrs.NOTHING
@@ -46,7 +46,7 @@ def described(kind: type[Any]) -> Iterator[KeyDescription]:
 
 
 def type_name(kind: Any) -> str:
-    """A type annotation without the modules of its names."""
+    """A type annotation without module names."""
     text = kind.__name__ if isinstance(kind, type) and not get_args(kind) else str(kind)
     return re.sub(r"\w+\.(?=\w)", "", text)
 

@@ -1,4 +1,4 @@
-"""What stands for something else in a value: `${ENV:default}`, `~/` and `package://PACKAGE/path`."""
+"""Expansion of values: `${ENV:default}`, `~/` and `package://PACKAGE/path`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def expand(text: str) -> str:
     """`text` with `${ENV:default}` replaced by the environment's value and a leading `~/` by the home directory.
 
     Raises:
-        ValueError: for a variable that is not set and has no default, or an ill-formed `${`.
+        ValueError: for an unset variable without a default, or a malformed `${`.
     """
 
     def replace(match: re.Match[str]) -> str:
@@ -25,15 +25,15 @@ def expand(text: str) -> str:
         return value
 
     if "${" in _VARIABLE.sub("", text):
-        raise ValueError(f"ill-formed variable in {text!r}; write ${{NAME}} or ${{NAME:default}}")
+        raise ValueError(f"malformed variable in {text!r}; write ${{NAME}} or ${{NAME:default}}")
     expanded = _VARIABLE.sub(replace, text)
     return str(Path(expanded).expanduser()) if expanded.startswith("~/") else expanded
 
 
 def resolve_path(text: str, base: Path) -> Path:
-    """A path from a config: `package://PACKAGE/path` within an installed package, a relative one from `base`.
+    """Resolve a path from a config: `package://PACKAGE/path` in an installed package, a relative path from `base`.
 
-    Packages are found without importing them.
+    Packages are located without importing them.
 
     Raises:
         ValueError: if the package is not installed or has no such file.

@@ -44,7 +44,7 @@ class _Schemas:
     registry: Registry
 
     def of_type(self, kind: Any) -> Schema:
-        """The schema of a type annotation; `{}`, which allows everything, for `Any`."""
+        """The schema of a type annotation; for `Any`, `{}`, which allows everything."""
         if kind in _SCALARS:
             return dict(_SCALARS[kind])
         for fits, schema in (
@@ -70,7 +70,7 @@ class _Schemas:
 
     def _of_union(self, kind: Any) -> Schema:
         component = component_of(kind)
-        if component is not None:  # it may be null, but an editor marks what is wrong in it more closely without
+        if component is not None:  # without null, editors mark errors in it more precisely
             return self._of_component(component)
         return {"anyOf": [self.of_type(member) for member in get_args(kind)]}
 
@@ -90,7 +90,7 @@ class _Schemas:
         return several
 
     def _of_component(self, kind: type[ComponentConfig]) -> Schema:
-        """A section with a `type`: which further keys it takes follows from it."""
+        """The schema of a section with a `type`, which determines its further keys."""
         offered = [descriptor for descriptor in self.registry.of_kind(kind.plugin_kind) if kind.takes(descriptor)]
         own, key = self.of_fields(fields(kind)), kind.type_key()
         own["properties"][key]["enum"] = [descriptor.type for descriptor in offered]

@@ -1,4 +1,4 @@
-"""Robot YAML -> `RobotConfig`, with all faults reported at once."""
+"""Robot YAML -> `RobotConfig`; reports all faults at once."""
 
 from __future__ import annotations
 
@@ -41,13 +41,14 @@ def load_config(
     Args:
         path: the file.
         overrides: `path.to.key=value`, each checked like the file.
-        mode: in place of its `default_control_mode`, and of the simulation's.
-        sim: use the `simulation` section even where there is `hardware`.
-        registry: the plugins; the installed ones when None.
-        communicates: whether the caller uses the transport itself, as a server does; else the robot must.
+        mode: the first mode, in place of the file's `default_control_mode` and that of the simulation.
+        sim: use the `simulation` section even if there is `hardware`.
+        registry: the plugins; None for the installed ones.
+        communicates: whether the caller uses the transport itself, as a server does; otherwise a `transport` that the
+            robot does not use is a fault.
 
     Raises:
-        ConfigError: with everything that is wrong, in file order.
+        ConfigError: with all faults, in file order.
     """
     document = read_document(path)
     _override(document, overrides, mode)
@@ -57,17 +58,17 @@ def load_config(
 
 
 def contract_alone(document: Document, base: Path, registry: Registry | None = None) -> ContractConfig:
-    """The contract of a document that has no other section, for converting foreign bags.
+    """The contract of a document without other sections, for converting foreign bags.
 
-    Its actions have `joints`: no executor says what their numbers are.
+    Its actions have `joints`, since there are no executors to determine them.
 
     Args:
-        document: as `read_document` gives it.
-        base: where relative paths start.
-        registry: the plugins; the installed ones when None.
+        document: the document from `read_document`.
+        base: the folder of relative paths.
+        registry: the plugins; None for the installed ones.
 
     Raises:
-        ConfigError: with everything that is wrong, in file order.
+        ConfigError: with all faults, in file order.
     """
     sections = SectionParser(document, registry or installed_plugins(), base, sim=False).contract()
     contract = ContractChecks(document, sections, alone=True).run()
@@ -76,10 +77,10 @@ def contract_alone(document: Document, base: Path, registry: Registry | None = N
 
 
 def read_document(path: str | Path) -> Document:
-    """Read a YAML file that is a mapping of sections; what is in them is not checked yet.
+    """Read a YAML file that is a mapping of sections; does not check their content.
 
     Raises:
-        ConfigError: when it cannot be read, or is none.
+        ConfigError: if it cannot be read, or is not a mapping.
     """
     try:
         with Path(path).open(encoding="utf-8") as file:
@@ -103,10 +104,10 @@ def from_document(
     overrides: Sequence[str] = (),
     mode: str | None = None,
 ) -> RobotConfig:
-    """A config from the `document` of another, e.g. in another process, or of an earlier run; else as `load`.
+    """A config from the `document` of another config, e.g. of another process or an earlier run.
 
     Raises:
-        ConfigError: e.g. when the plugins installed are not those it was made with.
+        ConfigError: with all faults, e.g. if other plugins are installed than when the config was made.
     """
     copied = expanded_again(Document(copy.deepcopy(dict(document)), {}, [], str(source)))
     _override(copied, overrides, mode)
@@ -206,7 +207,7 @@ def _components[C: ComponentConfig](sections: Mapping[str, ParsedComponent[C]]) 
 
 
 def _not_installed(document: Document, sections: ParsedSections) -> dict[str, PeripheralConfig]:
-    """The peripherals whose plugin is missing, without options."""
+    """The peripherals without an installed plugin; they have no options."""
     items = [(each.error.type, document.get(*each.key)) for each in sections.missing if each.key[0] == "peripherals"]
     return {
         item["name"]: PeripheralConfig(type=type_, options=None, name=item["name"], kind=item["kind"])
@@ -215,7 +216,7 @@ def _not_installed(document: Document, sections: ParsedSections) -> dict[str, Pe
 
 
 def shipped_configs(registry: Registry) -> dict[str, Path]:
-    """Name -> file of the robot YAMLs that come with ibrobot and with plugins; ibrobot's own come first."""
+    """Name -> file of the robot YAMLs shipped with ibrobot and plugins; ibrobot's own first."""
     package = Path(ibrobot_core.__file__).parent
     in_wheel = package / "_configs"
     folder = in_wheel if in_wheel.is_dir() else package.parent / "configs"
@@ -226,10 +227,10 @@ def shipped_configs(registry: Registry) -> dict[str, Path]:
 
 
 def find_config(name: str | None, registry: Registry) -> Path:
-    """The file that a user means by `name`: a path, or the name of a shipped config with or without `.yaml`.
+    """Find a config by `name`: a path, or the name of a shipped config with or without `.yaml`.
 
     Raises:
-        ConfigError: when there is none; says which names there are.
+        ConfigError: if it does not exist; lists the known names.
     """
     name = name or DEFAULT_CONFIG
     if Path(name).is_file():

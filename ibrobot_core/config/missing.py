@@ -1,4 +1,4 @@
-"""Types whose plugins are not installed: what the entered mode needs is an error, other modes are unavailable."""
+"""Plugins that are not installed: an error if the entered mode needs them; other modes become unavailable."""
 
 from __future__ import annotations
 
@@ -13,33 +13,33 @@ from ibrobot_core.errors import PluginNotInstalled, plugin_type
 from ibrobot_core.plugins import install_command
 
 _OPTIONAL_SENSORS = ("camera",)
-"""Kinds of sensors without which a run goes on, where nothing in it needs them."""
+"""Kinds of sensors without which a run may continue, if nothing in it needs them."""
 
 
 @attrs.frozen
 class Missing:
-    """A component that cannot be made, since its plugin is not installed or is broken."""
+    """A component that cannot be created, since its plugin is not installed or is broken."""
 
     key: Key
     place: Key
-    """What in the file names the plugin."""
+    """The key in the file that names the plugin."""
     error: PluginNotInstalled
 
 
 def split(
     document: Document, plain: Mapping[str, Any], missing: Sequence[Missing], entered: str | None, *, everything: bool
 ) -> Mapping[str, str]:
-    """Note what the entered mode lacks as one problem of the document.
+    """Add the missing plugins of the entered mode as one problem of the document.
 
     Args:
         document: the robot YAML.
-        plain: its sections that need no plugin, structured.
-        missing: all that is missing.
-        entered: the mode in which the run begins.
-        everything: whether all of it is needed.
+        plain: its structured sections that need no plugin.
+        missing: all missing components.
+        entered: the first mode of the run.
+        everything: whether all components are needed.
 
     Returns:
-        Mode -> why it is unavailable, of the other modes.
+        For the other modes, mode -> why it is unavailable.
     """
     modes: Mapping[str, Any] = plain.get("control_modes") or {}
     contract = plain.get("contract") or ContractConfig()
@@ -57,7 +57,7 @@ def split(
 
 
 def unavailable_modes(unavailable: Mapping[str, str]) -> list[str]:
-    """A line for each reason why modes cannot be entered."""
+    """One line per reason for unavailable modes."""
     by_reason: dict[str, list[str]] = {}
     for name, reason in unavailable.items():
         by_reason.setdefault(reason, []).append(name)
@@ -68,7 +68,7 @@ def unavailable_modes(unavailable: Mapping[str, str]) -> list[str]:
 
 
 def describe(errors: Iterable[PluginNotInstalled]) -> str:
-    """What is missing, with one line that installs all of it; plugins that are broken are named with the reason."""
+    """The missing plugins with one command that installs them all, and broken plugins with the reason."""
     found = list(dict.fromkeys(errors))
     absent = list(dict.fromkeys((error.kind, error.type) for error in found if not error.reason))
     texts = [error.reason for error in found if error.reason]
@@ -81,7 +81,7 @@ def describe(errors: Iterable[PluginNotInstalled]) -> str:
 
 
 def _used(name: str, mode: Any, observed: set[Key]) -> set[Key]:
-    """What drives a mode, and moves its joints; with a model, what the contract observes too."""
+    """The components that drive a mode and move its joints; with a model, also those observed by the contract."""
     keys: set[Key] = {("control_modes", name, "planner"), ("control_modes", name, "inference")}
     keys |= {("executors", executor) for executor in mode.executors}
     if mode.teleop is not None:
@@ -92,7 +92,7 @@ def _used(name: str, mode: Any, observed: set[Key]) -> set[Key]:
 
 
 def _may_wait(document: Document, key: Key) -> bool:
-    """Whether only some modes need what is at `key`."""
+    """Whether only some modes need the component at `key`."""
     if key[0] == "peripherals":
         return str(document.get(*key, "kind")) in _OPTIONAL_SENSORS
     return key[0] in ("executors", "models", "teleoperation", "control_modes")

@@ -1,4 +1,4 @@
-"""What URDF and MJCF models say of joints and frames, read as plain XML: what uses them need not be installed."""
+"""Joints and frames of URDF and MJCF models, read as plain XML, without the libraries that use the models."""
 
 from __future__ import annotations
 
@@ -11,33 +11,33 @@ import attrs
 
 _MAX_BYTES = 16 << 20
 _PLACES = ("body", "frame", "replicate")
-"""Elements of an MJCF that joints are in."""
+"""Elements of an MJCF that contain joints."""
 
 
 class ModelError(ValueError):
-    """A model that cannot be read, e.g. a file that is not XML; names file and line."""
+    """A model cannot be read, e.g. since the file is not XML; the message names file and line."""
 
 
 @attrs.frozen
 class Limits:
-    """Position limits of a joint in a model [rad, or m for one that slides]."""
+    """Position limits of a joint in a model [rad, or m for a sliding joint]."""
 
     lower: float
     upper: float
     place: str
-    """File and line."""
+    """File and line of the joint."""
 
 
 @attrs.frozen
 class DescriptionModel:
-    """What a robot YAML refers to in a model."""
+    """The parts of a model that a robot YAML refers to."""
 
     limits: Mapping[str, Limits]
-    """Joint -> limits, of the joints that have some."""
+    """Joint -> limits, for joints with limits."""
     frames: tuple[str, ...]
-    """What can be the tip: sites of an MJCF, links of a URDF."""
+    """Candidates for the tip: sites of an MJCF, links of a URDF."""
     frame: str
-    """What such a frame is called."""
+    """The word for such a frame: site or link."""
 
 
 @attrs.frozen
@@ -51,14 +51,14 @@ class XmlElement:
     children: list[XmlElement] = attrs.field(factory=list)
 
     def error(self, message: str) -> ModelError:
-        """An error that names this place."""
+        """An error that names the place of this element."""
         return ModelError(f"{self.file}:{self.line}: {message}")
 
     def numbers(self, name: str, default: str, count: int) -> list[float]:
         """The numbers in an attribute.
 
         Raises:
-            ModelError: unless they are `count` finite numbers.
+            ModelError: if they are not `count` finite numbers.
         """
         text = self.attributes.get(name, default)
         try:
@@ -70,7 +70,7 @@ class XmlElement:
         return numbers
 
     def below(self) -> Iterator[XmlElement]:
-        """All elements within this one, in file order."""
+        """All descendants, in file order."""
         waiting = self.children[::-1]
         while waiting:
             element = waiting.pop()
@@ -79,14 +79,14 @@ class XmlElement:
 
 
 def read_xml(path: Path, root: str = "") -> XmlElement:
-    """The root element of an XML file. Document types, and with them entities, are refused.
+    """The root element of an XML file. Document types, and so entities, are refused.
 
     Args:
         path: the file.
-        root: the tag of its root element; any where it is empty.
+        root: the tag of its root element; empty for any.
 
     Raises:
-        ModelError: when it cannot be read, or is not such XML.
+        ModelError: if it cannot be read, is not valid XML or has another root.
     """
     parser = expat.ParserCreate()
     top = XmlElement("", {}, path, 0)
@@ -119,10 +119,10 @@ def read_xml(path: Path, root: str = "") -> XmlElement:
 
 
 def read_urdf(path: Path) -> DescriptionModel:
-    """What a URDF says.
+    """Read a URDF.
 
     Raises:
-        ModelError: when it is not a URDF.
+        ModelError: if it is not a URDF.
     """
     root = read_xml(path, "robot")
     found = {}
@@ -136,10 +136,10 @@ def read_urdf(path: Path) -> DescriptionModel:
 
 
 def read_mjcf(path: Path) -> DescriptionModel:
-    """What an MJCF says, with what it includes; a joint's limits are its own, or those of its default class.
+    """Read an MJCF with its includes; a joint without limits has those of its default class.
 
     Raises:
-        ModelError: when it is not an MJCF.
+        ModelError: if it is not an MJCF.
     """
     root = read_xml(path, "mujoco")
     _include(root, path.parent)
@@ -166,7 +166,7 @@ def read_mjcf(path: Path) -> DescriptionModel:
 
 
 READERS: Mapping[str, Callable[[Path], DescriptionModel]] = {"mjcf": read_mjcf, "urdf": read_urdf}
-"""Key under `robot.description` -> what reads that model."""
+"""Key under `robot.description` -> reader of that model."""
 
 
 def _names(elements: Iterable[XmlElement], tag: str) -> tuple[str, ...]:
@@ -174,7 +174,7 @@ def _names(elements: Iterable[XmlElement], tag: str) -> tuple[str, ...]:
 
 
 def _include(root: XmlElement, folder: Path) -> None:
-    """Put the content of included files, whose names are relative to the model's folder, in the place of includes."""
+    """Replace includes by the content of the files, whose names are relative to the model's folder."""
     seen: set[Path] = set()
     waiting = [root]
     while waiting:
@@ -196,7 +196,7 @@ def _include(root: XmlElement, folder: Path) -> None:
 
 
 def _default_classes(root: XmlElement) -> dict[str, dict[str, str]]:
-    """Default class -> attributes of its joints; `main` is that of joints without a class."""
+    """Default class -> attributes of its joints; joints without a class have class `main`."""
     classes: dict[str, dict[str, str]] = {"main": {}}
     waiting = [(element, "main") for element in reversed(root.children) if element.tag == "default"]
     while waiting:

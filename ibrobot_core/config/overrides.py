@@ -1,4 +1,4 @@
-"""`--set path.to.key=value`: a value put into the document, checked afterwards like the file."""
+"""Overrides `--set path.to.key=value`: set values in the document, which are then checked like the file."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ibrobot_core.options import did_you_mean
 
 
 def apply_overrides(document: Document, overrides: Sequence[str], flag: str = "--set") -> None:
-    """Put `overrides` into `document`, in order; faults in them are noted there, as of the command line's `flag`."""
+    """Apply `overrides` to `document` in order; their faults are added to it, as faults of the option `flag`."""
     for rank, text in enumerate(overrides, start=1):
         place = Place(rank, 0, 0, f"{flag} {text}")
         path, equals, value_text = text.partition("=")
@@ -33,7 +33,7 @@ def apply_overrides(document: Document, overrides: Sequence[str], flag: str = "-
 
 
 def put(document: Document, path: str, value: Document, place: Place) -> None:
-    """Set `path` of `document` to `value`, written at `place`; missing sections on the way are made."""
+    """Set `path` of `document` to `value`, written at `place`; create missing sections."""
     parts = path.split(".")
     holder: Any = document.root
     key: Key = ()
@@ -51,14 +51,14 @@ def put(document: Document, path: str, value: Document, place: Place) -> None:
             holder[part] = {}
             document.places[key] = place
         holder = holder[part]
-    # What lies below has no place of its own any more, so that its faults are reported as the override's.
+    # Remove the places of keys below, so that their faults are reported as faults of the override.
     document.places = {k: known for k, known in document.places.items() if k[: len(key)] != key} | {key: place}
     others = {k: text for k, text in document.references.items() if k[: len(key)] != key}
     document.references = others | {(*key, *inner): text for inner, text in value.references.items()}
 
 
 def _part(holder: Any, word: str) -> str | int:
-    """`word` as a key of `holder`: of a list, an index or an item's name."""
+    """`word` as a key of `holder`; for a list, an index or the name of an item."""
     if isinstance(holder, Mapping):
         return word
     if not isinstance(holder, list):
@@ -73,17 +73,17 @@ def _part(holder: Any, word: str) -> str | int:
 
 
 def single_options[T](kind: type[T], overrides: Sequence[str], name: str, flag: str = "--set", text: str = "{}") -> T:
-    """An options class, or another attrs class such as a message, checked as a section of a robot YAML.
+    """An options class, or another attrs class such as a message, checked like a section of a robot YAML.
 
     Args:
         kind: the class.
         overrides: `option=value` texts, e.g. `codec=h264`.
-        name: what errors call the component.
-        flag: which option of the command line the overrides were given by.
-        text: YAML to begin with, e.g. `{data: true}`.
+        name: name of the component in errors.
+        flag: the command line's option for overrides.
+        text: initial YAML, e.g. `{data: true}`.
 
     Raises:
-        ConfigError: with everything that is wrong.
+        ConfigError: with all faults.
     """
     document = parse_yaml(text, name)
     apply_overrides(document, overrides, flag)
@@ -93,7 +93,7 @@ def single_options[T](kind: type[T], overrides: Sequence[str], name: str, flag: 
     except Faults as faults:
         for key, message in faults.found:
             document.add(key, message)
-    except (ValueError, TypeError) as error:  # values that do not go together
+    except (ValueError, TypeError) as error:  # values that exclude each other
         document.add((), error_message(error))
     else:
         return found

@@ -1,4 +1,4 @@
-"""The robot YAML as frozen attrs classes: the keys of each section, their types, units, defaults, ranges and words.
+"""The robot YAML as frozen attrs classes: keys of each section with types, units, defaults, ranges and descriptions.
 
 Loading, `config show`, the JSON Schema and the reference pages derive from these classes, beginning with `RobotConfig`.
 """
@@ -29,20 +29,20 @@ from ibrobot_core.robot import Robot
 from ibrobot_core.units import NORM_MODES, ns
 
 _UNIT = 1e-3
-"""How far the length of a quaternion may be from 1: people round."""
+"""Tolerance for the length of a quaternion, which may be rounded."""
 
 
 @documented
 @attrs.frozen
 class ComponentConfig:
-    """A section with a `type`: which plugin, and that plugin's own options."""
+    """A section with a `type`, which selects a plugin, and the options of the plugin."""
 
     plugin_kind: ClassVar[str] = ""
-    """The kind of plugins whose types it takes."""
+    """The kind of plugins for its types."""
     may_be_alone: ClassVar[bool] = False
-    """Whether the section may be one component in place of several by name."""
+    """Whether the section may be a single component instead of named components."""
 
-    type: str = option(help="which plugin; `ibrobot plugins` lists them")
+    type: str = option(help="type of plugin; `ibrobot plugins` lists them")
     options: Any = not_a_key()
     """An instance of the plugin's options class."""
 
@@ -57,18 +57,18 @@ class ComponentConfig:
 
     @classmethod
     def takes(cls, descriptor: Descriptor[Any]) -> bool:
-        """Whether a plugin of the kind can stand in this section."""
+        """Whether a plugin of the kind may be used in this section."""
         return True
 
     @classmethod
     def described(cls, descriptor: Descriptor[Any], options: Any) -> Mapping[str, Any]:
-        """Fields that are no keys: what the plugin's descriptor says of the options."""
+        """Fields that are not keys, derived from the options by the plugin's descriptor."""
         return {}
 
 
 @attrs.frozen
 class NamedComponentConfig(ComponentConfig):
-    """One of several components that the file has by name."""
+    """One of several named components."""
 
     name: str = not_a_key()
 
@@ -86,11 +86,9 @@ class HardwareConfig(NamedComponentConfig):
     plugin_kind = "hardware"
     may_be_alone = True
 
-    joints: tuple[str, ...] = option(
-        (), help="the joints that it owns; the only component may leave them out and owns all"
-    )
+    joints: tuple[str, ...] = option((), help="its joints; a single component may omit them and owns all")
     calibration: str | None = not_a_key(None)
-    """Name or path of its calibration."""
+    """Name or path of the calibration."""
     anchored: tuple[str, ...] = not_a_key(())
     """Joints whose calibrated closed end is their lower limit."""
 
@@ -108,7 +106,7 @@ class HardwareConfig(NamedComponentConfig):
 
 @attrs.frozen
 class SimulationConfig(ComponentConfig):
-    """What stands for the hardware with `--sim`, or where there is none."""
+    """The simulation, used with `--sim` or without a hardware section."""
 
     plugin_kind = "hardware"
 
@@ -123,9 +121,9 @@ class SimulationConfig(ComponentConfig):
 @documented
 @attrs.frozen
 class Mount:
-    """Where a sensor is mounted: its frame in the frame of what carries it."""
+    """The mounting of a sensor: its frame relative to a parent frame."""
 
-    parent: str = option(help="the frame that it is fixed to: a link of the URDF, or the frame of another mount")
+    parent: str = option(help="parent frame: a link of the URDF, or the frame of another mount")
     xyz: tuple[float, float, float] = option((0.0, 0.0, 0.0), unit="m", help="its origin in the parent frame")
     rpy: tuple[float, float, float] | None = option(
         None, unit="rad", help="roll, pitch and yaw about the fixed axes of the parent frame, as in a URDF"
@@ -135,7 +133,7 @@ class Mount:
 
     def __attrs_post_init__(self) -> None:
         if self.rpy is not None and self.quaternion is not None:
-            raise ValueError("rpy and quaternion say the same; give one of them")
+            raise ValueError("rpy and quaternion exclude each other; give one of them")
         if not all(map(math.isfinite, (*self.xyz, *(self.rpy or ()), *(self.quaternion or ())))):
             raise ValueError("xyz, rpy and quaternion must be finite numbers")
         if self.quaternion is not None and abs(math.hypot(*self.quaternion) - 1) > _UNIT:
@@ -144,20 +142,20 @@ class Mount:
 
 @attrs.frozen
 class PeripheralConfig(ComponentConfig):
-    """A sensor. Under `--sim` the simulation's own sensor of the same kind stands for it."""
+    """A sensor. `--sim` replaces it by the simulation's sensor of the same kind."""
 
     plugin_kind = "sensor"
 
-    name: str = option(help="what the contract calls it")
+    name: str = option(help="name used in the contract")
     kind: str = option(help="camera, imu, …")
     transform: Mount | None = option(None, help="where it is mounted")
-    sim: Mapping[str, Any] = option(factory=dict, help="further options for the simulated sensor that stands for it")
+    sim: Mapping[str, Any] = option(factory=dict, help="further options for the simulated sensor")
     picture: tuple[int, int] | None = not_a_key(None)
-    """Height and width of its pictures [px], where its options say them."""
+    """Height and width of its images [px], if the options determine them."""
 
     @classmethod
     def described(cls, descriptor: Descriptor[Any], options: Any) -> Mapping[str, Any]:
-        """The size of its pictures."""
+        """The size of its images."""
         assert isinstance(descriptor, SensorDescriptor)
         return {"picture": descriptor.picture(options)}
 
@@ -168,15 +166,15 @@ class ExecutorConfig(NamedComponentConfig):
 
     plugin_kind = "executor"
 
-    group: str = option(help="the joint group that it owns")
+    group: str = option(help="joint group that it moves")
     joints: tuple[str, ...] = not_a_key(())
-    """Those of its group, in group order."""
+    """The joints of its group, in group order."""
     goals: str = not_a_key("trajectory")
-    """What a planner sends to it."""
+    """Kind of goals that a planner sends to it."""
 
     @classmethod
     def described(cls, descriptor: Descriptor[Any], options: Any) -> Mapping[str, Any]:
-        """The goals that it takes."""
+        """The kind of goals that it takes."""
         assert isinstance(descriptor, ExecutorDescriptor)
         return {"goals": descriptor.goals}
 
@@ -197,7 +195,7 @@ class PlannerConfig(ComponentConfig):
 
 @attrs.frozen
 class ViewerConfig(ComponentConfig):
-    """What shows the robot to a person."""
+    """A display of the robot."""
 
     plugin_kind = "viewer"
 
@@ -212,14 +210,14 @@ class Align:
         choices=("hold", "asof", "drop"),
         help="hold: the newest; asof: the newest if at most tol_ms old; drop: the newest if within the last step",
     )
-    stamp: str = option("header", choices=("header", "receive"), help="which stamp counts")
-    tol_ms: float | None = option(None, unit="ms", ge=0, help="greatest age, for asof")
+    stamp: str = option("header", choices=("header", "receive"), help="stamp to use: of the header, or of receipt")
+    tol_ms: float | None = option(None, unit="ms", ge=0, help="maximum age, for asof")
 
     def __attrs_post_init__(self) -> None:
         if self.strategy == "asof" and self.tol_ms is None:
             raise ValueError("strategy asof needs tol_ms, e.g. tol_ms: 100")
         if self.strategy != "asof" and self.tol_ms is not None:
-            raise ValueError(f"tol_ms has no meaning for strategy {self.strategy}; it belongs to asof")
+            raise ValueError(f"tol_ms applies only to strategy asof, not {self.strategy}")
 
 
 _LARGEST_PX = 8192
@@ -233,12 +231,12 @@ def _check_size(instance: Any, attribute: attrs.Attribute[Any], value: tuple[int
 @documented
 @attrs.frozen
 class ImageSpec:
-    """How an image becomes an array."""
+    """Conversion of an image to an array."""
 
     resize: tuple[int, int] | None = option(
         None, unit="px", validator=_check_size, help="[height, width]; None keeps the camera's size"
     )
-    encoding: str = option("rgb8", choices=("rgb8", "bgr8", "mono8", "16UC1", "32FC1"), help="of the array")
+    encoding: str = option("rgb8", choices=("rgb8", "bgr8", "mono8", "16UC1", "32FC1"), help="encoding of the array")
 
 
 @documented
@@ -247,12 +245,12 @@ class ObservationSpec:
     """One topic that feeds one key of the observations. Several under one key concatenate in file order."""
 
     key: str = option(help="e.g. observation.state, observation.images.top")
-    topic: str = option("", help="where the messages come from; a peripheral's own topic where it names one")
-    type: str = option("", help="ROS 2 message type; known by itself for /joint_states and peripherals")
-    foreign: bool = option(False, help="a type that only foreign bags have; each bag brings its definition")
-    peripheral: str | None = option(None, help="the peripheral that publishes it")
+    topic: str = option("", help="topic of the messages; by default that of the peripheral")
+    type: str = option("", help="ROS 2 message type; optional for /joint_states and peripherals")
+    foreign: bool = option(False, help="whether only foreign bags have this type; each bag contains its definition")
+    peripheral: str | None = option(None, help="peripheral that publishes the messages")
     select: tuple[str, ...] = option((), help="dotted paths into the message, e.g. position.shoulder_pan")
-    image: ImageSpec | None = option(None, help="for images")
+    image: ImageSpec | None = option(None, help="conversion of images")
     align: Align = option(factory=Align, help="how samples become a value at a tick")
 
 
@@ -261,36 +259,36 @@ class ObservationSpec:
 class ActionSpec:
     """One part of the action vector, for one executor. Several under one key split it in file order."""
 
-    executor: str = option(help="the executor that takes it")
-    topic: str = option(help="where the commands after the safety layer are published")
+    executor: str = option(help="executor that follows it")
+    topic: str = option(help="topic for the commands after the safety layer")
     key: str = option("action", choices=("action",), help="the key of the action vector, as in datasets")
-    type: str = option("std_msgs/msg/Float64MultiArray", help="message type; another one needs foreign")
-    foreign: bool = option(False, help="the commands come from foreign bags; this robot does not publish them")
-    select: tuple[str, ...] = option((), help="with foreign: where the numbers are, one for each joint")
-    safety_behavior: str = option("hold", choices=("hold", "relax"), help="what follows when the setpoints go stale")
+    type: str = option("std_msgs/msg/Float64MultiArray", help="message type; others need foreign")
+    foreign: bool = option(False, help="whether the commands come from foreign bags, not from this robot")
+    select: tuple[str, ...] = option((), help="with foreign: paths to the numbers, one per joint")
+    safety_behavior: str = option("hold", choices=("hold", "relax"), help="behaviour for stale setpoints")
     align: str = option(
         "hold",
         choices=("hold", "next"),
         help="the action of a row in a dataset: hold takes the command in effect at the tick, next the first after it",
     )
-    joints: tuple[str, ...] = option((), help="in a file with a contract alone: names of its numbers, in order")
+    joints: tuple[str, ...] = option((), help="in a file with only a contract: names of the numbers, in order")
 
 
 TASK_KEY = "task"
-"""Key of the signal that is text: what a policy is asked to do."""
+"""Key of the text signal: the task of a policy."""
 
 
 @documented
 @attrs.frozen
 class SignalSpec:
-    """One topic that says something of the rows of a dataset which no policy sees."""
+    """One topic that fills a column of a dataset that policies do not see."""
 
     key: str = option(
         choices=(TASK_KEY, "next.reward", "next.done"), help="task: text, in place of the prompt; the others: a number"
     )
-    topic: str = option(help="where the messages come from")
-    type: str = option("", help="ROS 2 message type; of std_msgs, and String, Float32 or Bool, where it is not given")
-    select: tuple[str, ...] = option(("data",), help="the path to the text or number in the message")
+    topic: str = option(help="topic of the messages")
+    type: str = option("", help="ROS 2 message type; by default String, Float32 or Bool of std_msgs")
+    select: tuple[str, ...] = option(("data",), help="path to the text or number in the message")
     align: str = option(
         "hold", choices=("hold", "next"), help="hold: the newest message received by the tick; next: the first after it"
     )
@@ -301,7 +299,7 @@ class SignalSpec:
 class ContractConfig:
     """The `contract:` section: rate, observations, actions and signals."""
 
-    rate_hz: float = option(30.0, unit="Hz", gt=0, help="ticks of observations and actions")
+    rate_hz: float = option(30.0, unit="Hz", gt=0, help="rate of observations and actions")
     max_duration_s: float = option(90.0, unit="s", gt=0, help="longest episode")
     observations: tuple[ObservationSpec, ...] = option((), help="topics -> observation keys")
     actions: tuple[ActionSpec, ...] = option((), help="the action vector -> executors")
@@ -310,19 +308,19 @@ class ContractConfig:
 
 @attrs.frozen
 class ModelConfig(NamedComponentConfig):
-    """A policy, the unit of its vectors, and what it sees beyond the contract."""
+    """A policy, the unit of its vectors, and its observations beyond the contract."""
 
     plugin_kind = "policy"
 
     norm_mode: str = option("radians", choices=NORM_MODES, help="unit of the joints in its vectors")
-    calibration: str | None = option(None, help="in place of the hardware's, for norm_mode: a name, or a path to one")
-    extra_observations: tuple[ObservationSpec, ...] = option((), help="what it sees beyond the contract")
+    calibration: str | None = option(None, help="for norm_mode, in place of the hardware's: a name or a path")
+    extra_observations: tuple[ObservationSpec, ...] = option((), help="observations beyond the contract")
 
 
 @documented
 @attrs.frozen
 class Smoothing:
-    """How an arriving chunk joins the plan."""
+    """Blending of a new chunk into the plan."""
 
     enabled: bool = option(True, help="blend where chunks overlap; otherwise the new chunk replaces the plan")
     temporal_ensemble_coeff: float = option(0.01, help="c in w_k = exp(-c k), k = 0 the oldest prediction")
@@ -336,14 +334,14 @@ def _check_watermark(_: object, __: object, value: int | str) -> None:
 @documented
 @attrs.frozen
 class DispatchConfig:
-    """How the plan is kept filled."""
+    """How the dispatcher keeps the plan filled."""
 
     watermark: int | Literal["auto"] = option(
         "auto",
         unit="actions",
         validator=_check_watermark,
-        help="ask for a chunk when no more than this remains of the plan; auto: half a chunk, or what the model's "
-        "measured latency takes where that is more",
+        help="remaining length of the plan at which the next chunk is requested; auto: half a chunk, or more if the "
+        "model's measured latency needs it",
     )
     strategy: str | None = option(
         None,
@@ -351,27 +349,27 @@ class DispatchConfig:
         help="how a chunk joins the plan: replace it; ensemble: blend with it; rtc (real-time chunking): the policy "
         "continues it, where it can. None: ensemble, or replace with smoothing off",
     )
-    smoothing: Smoothing = option(factory=Smoothing, help="how chunks blend")
+    smoothing: Smoothing = option(factory=Smoothing, help="blending of chunks")
 
     def __attrs_post_init__(self) -> None:
         if self.strategy == "ensemble" and not self.smoothing.enabled:
-            raise ValueError("strategy ensemble blends: it does not go with smoothing: {enabled: false}")
+            raise ValueError("strategy ensemble blends chunks, which smoothing: {enabled: false} excludes")
 
     @property
     def joins_by(self) -> str:
-        """The strategy that holds: replace, ensemble or rtc."""
+        """The effective strategy: replace, ensemble or rtc."""
         return self.strategy or ("ensemble" if self.smoothing.enabled else "replace")
 
 
 @attrs.frozen
 class InferenceConfig(ComponentConfig):
-    """Which model a mode runs, and where."""
+    """The model of a mode, and the engine that runs it."""
 
     plugin_kind = "engine"
 
     model: str = option(help="a name under models")
-    type: str = option("monolithic", key="execution_mode", help="where infer runs; `ibrobot plugins` lists the engines")
-    request_timeout: float = option(5.0, unit="s", gt=0, help="after it a request has failed and the arm holds")
+    type: str = option("monolithic", key="execution_mode", help="engine to run the model; `ibrobot plugins` lists them")
+    request_timeout: float = option(5.0, unit="s", gt=0, help="time after which a request fails and the arm holds")
     prompt: str = option("", help="task for language-conditioned policies")
     uses_transport: bool = not_a_key(False)
     """Whether it needs the transport."""
@@ -380,7 +378,7 @@ class InferenceConfig(ComponentConfig):
 
     @classmethod
     def described(cls, descriptor: Descriptor[Any], options: Any) -> Mapping[str, Any]:
-        """What the engine needs."""
+        """The engine's needs."""
         assert isinstance(descriptor, EngineDescriptor)
         return {"uses_transport": descriptor.uses_transport, "weights_here": descriptor.weights_here}
 
@@ -388,30 +386,30 @@ class InferenceConfig(ComponentConfig):
 @documented
 @attrs.frozen
 class ControlMode:
-    """A mode: the executors that are active in it, and what feeds them."""
+    """A mode: its active executors, and the source of their commands."""
 
-    executors: tuple[str, ...] = option(help="the executors that are active in it")
-    teleop: str | None = option(None, help="the device under teleoperation that drives it")
-    inference: InferenceConfig | None = option(None, help="the model that drives it")
+    executors: tuple[str, ...] = option(help="executors active in the mode")
+    teleop: str | None = option(None, help="device under teleoperation that drives the mode")
+    inference: InferenceConfig | None = option(None, help="model that drives the mode")
     dispatch: DispatchConfig = option(factory=DispatchConfig, help="how a model's plan is kept filled")
-    planner: PlannerConfig | None = option(None, help="the planner that drives it, with its options")
+    planner: PlannerConfig | None = option(None, help="planner that drives the mode, with its options")
     name: str = not_a_key("")
 
 
 def _check_dataset(_: object, __: object, value: str) -> None:
     folder = Path(value)
     if folder.is_absolute() or ".." in folder.parts or not folder.parts:
-        raise ValueError(f"{str(folder)!r} does not lie below recording.root; give a folder's name, e.g. pick_cube")
+        raise ValueError(f"{str(folder)!r} is not below recording.root; give a folder's name, e.g. pick_cube")
 
 
 @attrs.frozen
 class RecordingConfig(ComponentConfig):
-    """How episodes are recorded."""
+    """Recording of episodes."""
 
     plugin_kind = "recorder"
 
-    root: str = option("episodes", help="where episodes go; relative to the working directory")
-    dataset: str = option("default", validator=_check_dataset, help="folder of one task's episodes, below root")
+    root: str = option("episodes", help="folder of all datasets; relative to the working directory")
+    dataset: str = option("default", validator=_check_dataset, help="folder of the episodes of one task, below root")
     topics: str | tuple[str, ...] = option("contract", help="contract, all, or a list of topics")
 
     @property
@@ -422,7 +420,7 @@ class RecordingConfig(ComponentConfig):
 
 @attrs.frozen
 class TransportConfig(ComponentConfig):
-    """How processes and machines talk."""
+    """Communication between processes and machines."""
 
     plugin_kind = "transport"
 
@@ -430,21 +428,21 @@ class TransportConfig(ComponentConfig):
 @documented
 @attrs.frozen
 class Following:
-    """When a joint does not follow its setpoint, which is a fault."""
+    """Detection of joints that do not follow their setpoints, which is a fault."""
 
     distance: float = option(
-        0.25, unit="rad", gt=0, help="from its setpoint, beside what its lag explains; at most half of its max_lead"
+        0.25, unit="rad", gt=0, help="distance from the setpoint, beyond the joint's lag; at most half of max_lead"
     )
-    timeout: float = option(2.0, unit="s", gt=0, help="time that it may be so far away")
+    timeout: float = option(2.0, unit="s", gt=0, help="time at this distance before a fault")
 
 
 @documented
 @attrs.frozen
 class Shedding:
-    """What relieves joints that stay hot or overloaded: the arm goes to a pose, if one is given, and relaxes."""
+    """Relief of joints that stay hot or overloaded: the arm moves to a pose, if one is given, and relaxes."""
 
-    after: float = option(60.0, unit="s", gt=0, help="time for which such a condition lasts before")
-    pose: str = option("", help="named pose in which the arm can lie without torque; empty: it relaxes where it is")
+    after: float = option(60.0, unit="s", gt=0, help="duration of such a condition before the arm relaxes")
+    pose: str = option("", help="named pose in which the arm can rest without torque; empty: relax without moving")
 
 
 @documented
@@ -453,63 +451,61 @@ class ControlConfig:
     """The `control:` section."""
 
     rate_hz: float = option(100.0, unit="Hz", gt=0, le=1000, help="rate of the control loop")
-    startup: str = option("hold", help="what starting does before the mode begins: hold, or pose NAME")
-    stop: str = option("hold", help="what stopping does: hold, relax, or pose NAME")
-    priority: int = option(60, ge=1, le=99, help="SCHED_FIFO priority, where the machine permits it")
+    startup: str = option("hold", help="behaviour at the start, before the mode begins: hold, or pose NAME")
+    stop: str = option("hold", help="behaviour at the stop: hold, relax, or pose NAME")
+    priority: int = option(60, ge=1, le=99, help="SCHED_FIFO priority, if the machine permits it")
     state_timeout: float = option(0.1, unit="s", gt=0, help="time without a state from the hardware before a fault")
-    following_error: Following = option(factory=Following, help="when a joint does not follow its setpoint")
-    load_shedding: Shedding = option(factory=Shedding, help="what relieves joints that stay hot or overloaded")
+    following_error: Following = option(factory=Following, help="detection of joints that do not follow setpoints")
+    load_shedding: Shedding = option(factory=Shedding, help="relief of joints that stay hot or overloaded")
 
 
 @documented
 @attrs.frozen(slots=False, kw_only=True)
 class RobotConfig:
-    """A whole robot YAML, checked. `source` names the file; `document` is its plain data without secrets."""
+    """A checked robot YAML. `source` is the file; `document` contains its plain values without secrets."""
 
     robot: Robot = option(help="joints, groups, models and poses")
     hardware: Mapping[str, HardwareConfig] = option(
-        factory=dict, help="one component, or several by name, each with its joints"
+        factory=dict, help="one component, or several named ones, each with its joints"
     )
-    simulation: SimulationConfig | None = option(
-        None, help="stands for the hardware with --sim, or where there is none"
-    )
+    simulation: SimulationConfig | None = option(None, help="used with --sim, or without a hardware section")
     peripherals: Mapping[str, PeripheralConfig] = option(factory=dict, help="cameras and other sensors")
-    executors: Mapping[str, ExecutorConfig] = option(help="what moves the joints: name -> type, group, options")
+    executors: Mapping[str, ExecutorConfig] = option(help="name -> type, group and options of what moves joints")
     models: Mapping[str, ModelConfig] = option(factory=dict, help="policies by name")
-    control_modes: Mapping[str, ControlMode] = option(help="name -> the executors active in it, and what feeds them")
-    default_control_mode: str = option(help="the mode to start in")
-    teleoperation: Mapping[str, TeleopConfig] = option(factory=dict, help="devices by name")
+    control_modes: Mapping[str, ControlMode] = option(help="name -> active executors, and the source of their commands")
+    default_control_mode: str = option(help="first mode of a run")
+    teleoperation: Mapping[str, TeleopConfig] = option(factory=dict, help="teleoperation devices by name")
     contract: ContractConfig = option(factory=ContractConfig, help="how topics become observations and actions")
-    recording: RecordingConfig | None = option(None, help="how episodes are recorded")
-    transport: TransportConfig | None = option(None, help="how processes and machines talk")
-    viewer: ViewerConfig | None = option(None, help="what shows the robot to a person")
+    recording: RecordingConfig | None = option(None, help="recording of episodes")
+    transport: TransportConfig | None = option(None, help="communication between processes and machines")
+    viewer: ViewerConfig | None = option(None, help="display of the robot")
     control: ControlConfig = option(factory=ControlConfig, help="the control loop")
     plugin_sections: Mapping[str, ComponentConfig] = not_a_key(factory=dict)
-    """The sections of plugins that the file has, by name."""
+    """Name -> section defined by a plugin, for those in the file."""
     simulated: bool = not_a_key(False)
-    """Whether `simulation` stands for `hardware` in this run."""
+    """Whether this run uses `simulation` instead of `hardware`."""
     unavailable: Mapping[str, str] = not_a_key(factory=dict, repr=False, eq=False)
-    """Mode -> why it cannot be entered, and what to install for it."""
+    """Mode -> why it is unavailable, and what to install."""
     missing: tuple[PluginNotInstalled, ...] = not_a_key((), repr=False, eq=False)
-    """What the YAML names beside what the first mode needs, and no installed plugin offers."""
+    """Types in the YAML without an installed plugin, which the first mode does not need."""
     source: Path = not_a_key(Path("<memory>"))
     closed_ends: Mapping[str, float | None] = not_a_key(factory=dict, eq=False)
-    """Joint -> its lower limit [rad] where the hardware anchors it at its closed end, else None; without the joints of
-    hardware that is not installed. The hardware's, in a simulation too."""
+    """Joint -> its lower limit [rad] if the hardware anchors it at its closed end, else None. In a simulation, the
+    hardware determines this too. Joints of hardware without an installed plugin are left out."""
     document: Mapping[str, Any] = not_a_key(factory=dict, repr=False)
     complete: Mapping[str, Any] = not_a_key(factory=dict, repr=False, eq=False)
-    """`document` with its secrets, for other processes of the run only: never to be written or shown."""
+    """`document` with its secrets, only for other processes of the run; never write or show it."""
     secrets: Mapping[str, str] = not_a_key(factory=dict, repr=False, eq=False)
-    """Secret -> what is shown in its place."""
+    """Secret -> text shown in its place."""
 
     def context(self, name: str, clock: Clock, seed: int = 0, **more: Any) -> Context:
-        """What the `make` of a component's plugin is given.
+        """The context for the `make` of a component's plugin.
 
         Args:
-            name: of the component.
-            clock: the run's.
-            seed: the run's.
-            more: other fields of the context; `joints` are all of the robot's where left out.
+            name: name of the component.
+            clock: the clock of the run.
+            seed: the seed of the run.
+            more: other fields of the context; `joints` defaults to all joints of the robot.
         """
         simulation = self.simulation.options if self.simulation is not None else None
         given = {"joints": self.robot.joint_names, "simulation": simulation, **more}
@@ -518,7 +514,7 @@ class RobotConfig:
 
 
 def _as_written(field: attrs.Attribute[Any]) -> attrs.Attribute[Any]:
-    """A section's field with the type that it has in the file, where it is left out rather than null."""
+    """A section's field with its type in the file, where it may be missing but not null."""
     kind: Any = field.type
     component = component_of(kind)
     if get_origin(kind) is types.UnionType:
@@ -529,4 +525,4 @@ def _as_written(field: attrs.Attribute[Any]) -> attrs.Attribute[Any]:
 
 
 SECTIONS: Mapping[str, attrs.Attribute[Any]] = {name: _as_written(field) for name, field in fields(RobotConfig).items()}
-"""The sections of a robot YAML, with the types that they have in the file."""
+"""The sections of a robot YAML, with their types in the file."""

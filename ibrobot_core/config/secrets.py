@@ -1,4 +1,4 @@
-"""Secrets in a robot YAML: where they are, and the document without them, which may be recorded and shown."""
+"""Secrets in a robot YAML: their keys, and the document without them, for recordings and output."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from ibrobot_core.options import HIDDEN, fields
 from ibrobot_core.outside import redacted, remember_secret, without_credentials
 
 _NAMES = re.compile(r"(?i)(.*_)?(password|passwd|passphrase|secret|token|api_?key)")
-"""Keys of sections whose plugin is not installed, so that nothing says what is secret there."""
+"""Keys treated as secrets in sections without an installed plugin, which would state the secret options."""
 
 
 def note(document: Document, kind: type, value: Mapping[str, Any], key: Key) -> None:
-    """Note the secret options of a class among those that the section at `key` gives, so that no error shows them."""
+    """Register the secret options of a class in the section at `key`, so that no error shows them."""
     for name, field in fields(kind).items():
         item = value.get(name)
         if item is None:
@@ -35,7 +35,7 @@ def note(document: Document, kind: type, value: Mapping[str, Any], key: Key) -> 
 
 
 def expanded_again(document: Document) -> Document:
-    """A recorded document with its `${…}` replaced from the environment of now. Faults are noted in it."""
+    """A recorded document with its `${…}` expanded from the present environment. Faults are added to it."""
     for key, text in list(_texts(document.root)):
         if "${" in text:
             try:
@@ -47,7 +47,7 @@ def expanded_again(document: Document) -> Document:
 
 
 def public(document: Document) -> tuple[Any, dict[str, str]]:
-    """The document's values without secrets, and what stands there for each: its `${…}`, or `***`."""
+    """The document's values without secrets, and secret -> its replacement: `${…}` or `***`."""
     root, instead = copy.deepcopy(document.root), {}
     for key, text, hidden in _secrets(document):
         remember_secret(text)
@@ -57,17 +57,17 @@ def public(document: Document) -> tuple[Any, dict[str, str]]:
 
 
 def warn_of_literals(document: Document) -> None:
-    """Log where a secret is written out, which is safe from recordings but not from readers of the YAML."""
+    """Log a warning for each literal secret: recordings hide it, but readers of the YAML see it."""
     for key, _, _ in _secrets(document):
         if key not in document.references:
             place = document.place(key)
             where = f"{document.file}:{place.line}" if place.line else redacted(place.file)
-            told = "a secret is written out; take it from the environment, as ${NAME}"
-            logging.getLogger("ibrobot.config").warning("%s: %s: %s", where, document.dotted(key), told)
+            warning = "a literal secret; take it from the environment, as ${NAME}"
+            logging.getLogger("ibrobot.config").warning("%s: %s: %s", where, document.dotted(key), warning)
 
 
 def _secrets(document: Document) -> Iterator[tuple[Key, str, str]]:
-    """Key, value, and the value as it may be shown, of each text that holds a secret."""
+    """Key, value and safe text of each value with a secret."""
     for key, text in _texts(document.root):
         by_name = bool(key) and isinstance(key[-1], str) and _NAMES.fullmatch(key[-1])
         hidden = HIDDEN if by_name or key in document.secrets else without_credentials(text)
@@ -76,11 +76,11 @@ def _secrets(document: Document) -> Iterator[tuple[Key, str, str]]:
 
 
 def check_known(document: Document) -> None:
-    """Note a secret that a recording does not hold."""
+    """Add a fault for each secret that a recording does not contain."""
     for key in document.secrets:
         if document.get(*key) == HIDDEN:
             path = document.dotted(key)
-            document.add(key, f"the recording does not hold this secret; give it by --set '{path}=${{NAME}}'")
+            document.add(key, f"the recording does not contain this secret; give it by --set '{path}=${{NAME}}'")
 
 
 def _texts(value: Any, key: Key = ()) -> Iterator[tuple[Key, str]]:

@@ -1,4 +1,4 @@
-"""`RobotConfig` -> YAML with every default filled in, which loads again to the same config."""
+"""`RobotConfig` -> YAML with all defaults filled in, which loads to the same config."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from ibrobot_core.options import HIDDEN, fields
 from ibrobot_core.outside import without_credentials
 
 _RESOLVED: Mapping[type, str] = {schema.PeripheralConfig: "sim", schema.SimulationConfig: "default_control_mode"}
-"""Component -> a key that loading has resolved: a simulated sensor's options, the mode that a simulation begins in."""
+"""Component -> a key resolved by loading: a simulated sensor's options, or the first mode in simulation."""
 
 
 def plain(value: Any) -> Any:
-    """A config value as what YAML and JSON know: attrs classes as mappings, tuples as lists, paths as text."""
+    """A config value as plain YAML or JSON: attrs classes as mappings, tuples as lists, paths as text."""
     match value:
         case schema.ComponentConfig():
             return _fields(value, but=(_RESOLVED.get(type(value)),)) | plain(value.options)
@@ -31,7 +31,7 @@ def plain(value: Any) -> Any:
         case list() | tuple():
             return [plain(item) for item in value]
         case _ if attrs.has(type(value)):
-            # Topic and type of a peripheral were filled in; a file says either these or the peripheral.
+            # Loading filled in topic and type of the peripheral; a file states either these or the peripheral.
             filled = isinstance(value, schema.ObservationSpec) and value.peripheral is not None
             return _fields(value, but=("topic", "type") if filled else ())
         case _:
@@ -39,7 +39,7 @@ def plain(value: Any) -> Any:
 
 
 class _Secret(str):
-    """The value of a secret option, until it is replaced by what is shown of it."""
+    """The value of a secret option, until it is replaced by the text to show."""
 
 
 def _fields(value: Any, but: Collection[str | None] = ()) -> dict[str, Any]:
@@ -61,7 +61,7 @@ def _without_secrets(value: Any, shown: Mapping[str, str]) -> Any:
 
 
 def document(config: schema.RobotConfig) -> dict[str, Any]:
-    """What a YAML that says everything about this run would hold, with `${…}` or `***` for secrets."""
+    """The complete robot YAML of this run as plain values, with `${…}` or `***` for secrets."""
     sections = {name: plain(getattr(config, name)) for name in schema.SECTIONS}
     sections |= {name: plain(section.options) for name, section in config.plugin_sections.items()}
     sections["peripherals"] = list(sections["peripherals"].values())
@@ -75,17 +75,17 @@ def document(config: schema.RobotConfig) -> dict[str, Any]:
 
 
 class _Dumper(yaml.SafeDumper):
-    """Quotes text that YAML 1.2 would read as something else, e.g. `1e-3`."""
+    """Quotes text that YAML 1.2 would not read as text, e.g. `1e-3`."""
 
     def ignore_aliases(self, data: Any) -> bool:
-        """Write everything out."""
+        """Write values out instead of aliases."""
         return True
 
 
 def _text(dumper: yaml.SafeDumper, value: str) -> yaml.ScalarNode:
     style = None if is_text(value) else "'"
     if not value.isprintable():
-        style = '"'  # the only one with escapes: the others fold line breaks such as U+0085
+        style = '"'  # the only style with escapes; the others fold line breaks such as U+0085
     return dumper.represent_scalar("tag:yaml.org,2002:str", value, style=style)
 
 
@@ -93,7 +93,7 @@ _Dumper.add_representer(str, _text)
 
 
 def dump_yaml(value: Any) -> str:
-    """Plain values as YAML text that the config reader reads back as they are."""
+    """Plain values as YAML text, which the config reader reads back unchanged."""
     return yaml.dump(value, Dumper=_Dumper, sort_keys=False, width=120, allow_unicode=True)
 
 

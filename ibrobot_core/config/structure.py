@@ -1,4 +1,4 @@
-"""A document -> its sections as attrs classes: each component by the options class of its plugin."""
+"""Document -> sections as attrs classes, with the options of each component as its plugin's options class."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ class ParsedComponent[C: schema.ComponentConfig]:
 
 @attrs.define
 class ParsedSections:
-    """All sections; what could not be structured is None or left out, with its faults in the document."""
+    """All sections. Those with faults, which are in the document, are None or left out."""
 
     simulated: bool
     plain: dict[str, Any] = attrs.field(factory=dict)
-    """Sections that are attrs classes by themselves."""
+    """Sections without components."""
     hardware: dict[str, ParsedComponent[schema.HardwareConfig]] = attrs.field(factory=dict)
     simulation: ParsedComponent[schema.SimulationConfig] | None = None
     peripherals: dict[str, ParsedComponent[schema.PeripheralConfig]] = attrs.field(factory=dict)
@@ -55,10 +55,10 @@ class ParsedSections:
     plugin_sections: dict[str, ParsedComponent[schema.ComponentConfig]] = attrs.field(factory=dict)
     """The sections of plugins."""
     missing: list[Missing] = attrs.field(factory=list)
-    """What could not be made for want of a plugin."""
+    """Components without an installed plugin."""
 
     def active(self) -> Iterator[ParsedComponent[Any]]:
-        """The components that a run opens at its start."""
+        """The components that a run opens when it starts."""
         yield from () if self.simulated else self.hardware.values()
         yield from self.peripherals.values()
         yield from (part for part in (self.simulation, self.recording, self.transport, self.viewer) if part is not None)
@@ -73,7 +73,7 @@ class ParsedSections:
 
 
 class _Outline(Converter):
-    """Takes components as mappings: they are structured afterwards, by their plugins."""
+    """Keeps components as mappings, to be structured later by their plugins."""
 
     def structure(self, value: Any, kind: Any) -> Any:
         component = schema.component_of(kind)
@@ -84,7 +84,7 @@ class _Outline(Converter):
 
 @attrs.define
 class SectionParser:
-    """Structures one document. Faults are noted in it; nothing is raised."""
+    """Structures one document. Faults are added to it; nothing is raised."""
 
     document: Document
     registry: Registry
@@ -133,13 +133,13 @@ class SectionParser:
         return sections
 
     def contract(self) -> ParsedSections:
-        """The `contract` section of a file that has no other."""
+        """The `contract` section of a file without other sections."""
         sections = ParsedSections(simulated=False)
         self._sections(sections, ("contract",))
         return sections
 
     def _sections(self, sections: ParsedSections, names: Collection[str] = tuple(schema.SECTIONS)) -> None:
-        """The file's own level: unknown and missing sections, and those that need no plugin."""
+        """Parse the top level: sections without components; unknown and missing sections are faults."""
         known = {name: field for name, field in schema.SECTIONS.items() if name in names}
         faults = Faults()
         for name, value in self.document.root.items():
@@ -149,7 +149,7 @@ class SectionParser:
         self._report((), faults)
 
     def _plugin_section(self, sections: ParsedSections, name: str, value: Any, faults: Faults) -> None:
-        """A section that is not core's, where a plugin has one of this name."""
+        """Parse a section defined by a plugin."""
         if (found := self.registry.entries.get(("section", name))) is None:
             error = self.registry.not_found("section", name)
             if isinstance(error, PluginNotInstalled):
@@ -180,15 +180,15 @@ class SectionParser:
         needed: bool = True,
         below_sim: Collection[str] = (),
     ) -> ParsedComponent[C] | None:
-        """The component at `key` (or `value` in its place); None with its faults noted, or where there is none.
+        """Parse the component at `key`, or `value` in its place; None if it is missing or has faults.
 
         Args:
-            key: where it is in the document.
+            key: its key in the document.
             kind: its class.
-            value: what to structure, where it is not what the document says.
-            name: its name, where it is not one of its keys.
-            needed: whether a plugin that is not installed is a fault; where not, only core's own keys are checked.
-            below_sim: keys of `value` that the document has under `sim`.
+            value: the value to structure, if not the document's.
+            name: its name, if not one of its keys.
+            needed: whether a missing plugin is a fault; otherwise only core's own keys are checked then.
+            below_sim: keys of `value` that are under `sim` in the document.
         """
         value = self.document.get(*key) if value is None else value
         if not isinstance(value, Mapping):
@@ -260,7 +260,7 @@ class SectionParser:
 
     def _check_name(self, key: Key, name: str) -> None:
         if not _NAME.fullmatch(name):
-            self.document.add(key, f"a name has letters, digits, _ and - only, got {name!r}")
+            self.document.add(key, f"a name may contain only letters, digits, _ and -, got {name!r}")
 
     def _simulation(self, sections: ParsedSections) -> None:
         if "simulation" not in self.document.root:
@@ -276,7 +276,7 @@ class SectionParser:
 
     @property
     def _elsewhere(self) -> bool:
-        """Whether a simulation runs in another process: peripherals of kind `simulation` bring its state here."""
+        """Whether a simulation runs in another process; peripherals of kind `simulation` then provide its state."""
         return any(item.get("kind") == "simulation" for _, item in self.document.items("peripherals"))
 
     def _hardware(self, sections: ParsedSections) -> None:
@@ -316,7 +316,7 @@ class SectionParser:
     def _peripheral(
         self, key: Key, item: Mapping[str, Any], stand_in: str | None, *, needed: bool, simulated: bool
     ) -> ParsedComponent[schema.PeripheralConfig] | None:
-        """The sensor as it is, or the simulation's of its kind with the options that both have."""
+        """Parse a sensor, or in simulation the simulated sensor of its kind, with the options that both have."""
         before = len(self.document.problems)
         as_is = self._component(key, schema.PeripheralConfig, needed=needed)
         if as_is is not None and isinstance(as_is.descriptor, SensorDescriptor):

@@ -1,4 +1,4 @@
-"""YAML text -> plain values and the place of every key, with the scalars of YAML 1.2 and no repeated keys."""
+"""YAML text -> plain values and the place of every key, with YAML 1.2 scalars and without repeated keys."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ibrobot_core.options import did_you_mean
 from ibrobot_core.outside import redacted
 
 Key = tuple[str | int, ...]
-"""Where a value is in a document: mapping keys and list indices from the top."""
+"""The path of a value in a document: mapping keys and list indices from the root."""
 
 _DEFAULT_TAGS = (BaseResolver.DEFAULT_SCALAR_TAG, BaseResolver.DEFAULT_SEQUENCE_TAG, BaseResolver.DEFAULT_MAPPING_TAG)
 _BOOLS = {"true": True, "True": True, "TRUE": True, "false": False, "False": False, "FALSE": False}
@@ -33,13 +33,13 @@ MAX_BYTES = 256 * 1024
 _MAX_VALUES = 10_000
 _MAX_DEPTH = 50
 _MAX_DIGITS = 40
-_TOO_MANY = f"more than {_MAX_VALUES} values, those that aliases repeat included"
+_TOO_MANY = f"more than {_MAX_VALUES} values, including those repeated by aliases"
 _TOO_DEEP = f"nested more than {_MAX_DEPTH} levels deep"
 
 
 @attrs.frozen(order=True)
 class Place:
-    """Where something was written: line and column from 1 in a file, or an override, whose line is 0."""
+    """The place of a value: line and column from 1 in a file, or an override, whose line is 0."""
 
     rank: int
     line: int
@@ -49,34 +49,34 @@ class Place:
 
 @attrs.define
 class Document:
-    """Plain values with the places of their keys and items, and the faults found on the way."""
+    """Plain values with the places of their keys and items, and the faults found so far."""
 
     root: Any
     places: dict[Key, Place]
     problems: list[tuple[Place, Problem]]
     file: str
     unread: set[Key] = attrs.field(factory=set)
-    """Keys whose values could not be read; they have no value."""
+    """Keys without a value, since it could not be read."""
     references: dict[Key, str] = attrs.field(factory=dict)
-    """Text with `${…}` as it was written, where a value was made of it."""
+    """Key -> original text with `${…}`, for expanded values."""
     secrets: set[Key] = attrs.field(factory=set)
-    """Where the values are that nobody may see."""
+    """Keys of secret values."""
 
     def place(self, key: Key) -> Place:
-        """The place of `key`, or of what encloses it where it was not written."""
+        """The place of `key`, or of the enclosing key if it is not in the file."""
         while key and key not in self.places:
             key = key[:-1]
         return self.places.get(key, Place(0, 0, 0, self.file))
 
     def add(self, key: Key, message: str) -> None:
-        """Note a fault at `key`, unless its value could not even be read."""
+        """Add a fault at `key`, unless its value could not be read."""
         if key in self.unread:
             return
         place = self.place(key)
         self.problems.append((place, Problem(place.file, place.line, self.dotted(key), message)))
 
     def dotted(self, key: Key) -> str:
-        """`key` as `--set` takes it: list items by their name where they have one; fit for a terminal."""
+        """`key` in the syntax of `--set`, with list items by name if they have one; safe for a terminal."""
         words: list[str] = []
         value = self.root
         for part in key:
@@ -93,27 +93,27 @@ class Document:
         return value
 
     def items(self, section: str) -> list[tuple[Key, Mapping[str, Any]]]:
-        """Key and value of each mapping in a section that is a list, as far as it is one."""
+        """Key and value of each mapping in a section that should be a list."""
         value = self.root.get(section)
         items = value if isinstance(value, list) else ()
         return [((section, i), item) for i, item in enumerate(items) if isinstance(item, Mapping)]
 
     def names(self, section: str) -> list[str]:
-        """The names that a section gives, faulty or not, so that a fault is reported once."""
+        """The names in a section, including those of faulty items, so that each fault is reported once."""
         value = self.root.get(section)
         return list(value) if isinstance(value, Mapping) else []
 
     def refer(self, key: Key, name: str, known: Sequence[str], what: str) -> bool:
-        """Note where `name`, at `key`, is not among the known ones; whether it is."""
+        """Return whether `name`, at `key`, is among the known ones; add a fault if not."""
         if name not in known:
             self.add(key, f"unknown {what} {name!r}{did_you_mean(name, known, 'known')}")
         return name in known
 
     def raise_problems(self) -> None:
-        """Raise all that was noted, in file order.
+        """Raise all faults, in file order.
 
         Raises:
-            ConfigError: if anything was noted.
+            ConfigError: if there are any.
         """
         if self.problems:
             found = (problem for _, problem in sorted(self.problems, key=lambda item: item[0]))
@@ -132,7 +132,7 @@ def _child(value: Any, part: str | int) -> Any:
 
 
 class _Composer(yaml.SafeLoader):
-    """PyYAML's composer without its YAML 1.1 scalars: plain ones keep their text."""
+    """PyYAML's composer without YAML 1.1 scalars; plain scalars keep their text."""
 
     _values = 0
 
@@ -152,14 +152,14 @@ _Composer.yaml_implicit_resolvers = {}
 
 
 class _Excess(yaml.MarkedYAMLError):
-    """More of something than a robot YAML has, found before it takes time and memory."""
+    """A document beyond the size limits, detected before it takes time and memory."""
 
     def __init__(self, problem: str, mark: yaml.Mark) -> None:
         super().__init__(problem=problem, problem_mark=mark)
 
 
 def scalar(text: str) -> str | int | float | bool | None:
-    """The value of a plain scalar by the core schema of YAML 1.2: `1e-3` is a number, `on` is text.
+    """The value of a plain scalar in the core schema of YAML 1.2: `1e-3` is a number, `on` is text.
 
     Raises:
         ValueError: for a number that is too long or too large.
@@ -170,19 +170,19 @@ def scalar(text: str) -> str | int | float | bool | None:
         return _BOOLS[text]
     if _INT.fullmatch(text) or _BASED.fullmatch(text):
         if len(text) > _MAX_DIGITS:
-            raise ValueError(f"a number of {len(text)} characters; at most {_MAX_DIGITS} are read")
+            raise ValueError(f"a number of {len(text)} characters; the maximum is {_MAX_DIGITS}")
         return int(text, 0) if _BASED.fullmatch(text) else int(text)
     if _FLOAT.fullmatch(text):
         number = float(text)
         if math.isinf(number):
-            raise ValueError(f"{text[:_MAX_DIGITS]} is larger than any number that is read")
+            raise ValueError(f"{text[:_MAX_DIGITS]} is too large for a number")
         return number
     special = _SPECIAL.fullmatch(text)
     return float(text.replace(".", "")) if special else text
 
 
 def is_text(text: str) -> bool:
-    """Whether a plain scalar `text` is read as text."""
+    """Whether the plain scalar `text` is text."""
     try:
         return isinstance(scalar(text), str)
     except ValueError:
@@ -190,7 +190,7 @@ def is_text(text: str) -> bool:
 
 
 def parse_yaml(text: str, file: str) -> Document:
-    """Read one YAML document. Faults are noted in the result, but for text that is no YAML at all.
+    """Read one YAML document. The result contains faults, except for text that is not valid YAML.
 
     Raises:
         ConfigError: e.g. an unclosed bracket.
@@ -223,14 +223,14 @@ def _reason(error: yaml.MarkedYAMLError) -> str:
 class _Constructor:
     document: Document
     _open: set[int] = attrs.field(factory=set)
-    """Nodes under construction: one met again is an alias to what encloses it."""
+    """Constructs plain values from nodes; a node met again while under construction is an alias to its own block."""
     _values: int = 0
 
     def place(self, node: Node) -> Place:
         return Place(0, node.start_mark.line + 1, node.start_mark.column + 1, self.document.file)
 
     def count(self, node: Node) -> None:
-        """Refuse what aliases unfold to before memory and time are gone."""
+        """Count expanded nodes, and refuse too many, before aliases exhaust time and memory."""
         self._values += 1
         if self._values > _MAX_VALUES:
             raise _Excess(_TOO_MANY, node.start_mark)
@@ -262,7 +262,7 @@ class _Constructor:
     def refuse_tag(self, node: Node, key: Key) -> None:
         if node.tag not in _DEFAULT_TAGS:
             tag = node.tag.replace("tag:yaml.org,2002:", "!!")
-            self.fault(node, key, f"the tag {tag} is not known here; remove it")
+            self.fault(node, key, f"unknown tag {tag}; remove it")
 
     def scalar(self, node: ScalarNode, key: Key) -> Any:
         self.refuse_tag(node, key)

@@ -11,7 +11,7 @@ from ibrobot_core.config.show import to_yaml
 from ibrobot_core.config.yaml_nodes import parse_yaml
 from ibrobot_core.errors import ConfigError
 
-TOO_MANY = "more than 10000 values, those that aliases repeat included"
+TOO_MANY = "more than 10000 values, including those repeated by aliases"
 TOO_DEEP = "nested more than 50 levels deep"
 TOO_LONG = "too long: a robot YAML has at most 256 kB"
 
@@ -61,10 +61,10 @@ def test_endless_file_is_read_to_the_limit_only() -> None:
 @pytest.mark.parametrize(
     ("number", "message"),
     [
-        ("1" * 5_000, "a number of 5000 characters; at most 40 are read"),
-        ("-" + "1" * 5_000, "a number of 5001 characters; at most 40 are read"),
-        ("0x" + "f" * 5_000, "a number of 5002 characters; at most 40 are read"),
-        ("1e999", "1e999 is larger than any number that is read"),
+        ("1" * 5_000, "a number of 5000 characters; the maximum is 40"),
+        ("-" + "1" * 5_000, "a number of 5001 characters; the maximum is 40"),
+        ("0x" + "f" * 5_000, "a number of 5002 characters; the maximum is 40"),
+        ("1e999", "1e999 is too large for a number"),
     ],
     ids=["decimal", "negative", "hexadecimal", "exponent"],
 )

@@ -28,8 +28,8 @@ CASES = {
         "    - {key: observation.images.top",
         "    - {key: observation.images.top, peripheral: top}\n    - {key: observation.images.top",
         (
-            "robot.yaml:37: contract.observations.2.key: a second picture under observation.images.top; only vectors "
-            "concatenate, give it a key of its own"
+            "robot.yaml:37: contract.observations.2.key: a second image under observation.images.top; only vectors "
+            "concatenate, so give it its own key"
         ),
     ),
     "executors_share_a_topic": (
@@ -37,7 +37,7 @@ CASES = {
         "topic: /arm/commands",
         (
             "robot.yaml:39: contract.actions.1.topic: executor 'arm_position' has its commands on /arm/commands; give "
-            "each a topic of its own"
+            "each its own topic"
         ),
     ),
     "contract_unknown_peripheral": (
@@ -59,27 +59,27 @@ CASES = {
         "peripheral: top,",
         "peripheral: chest,",
         (
-            "robot.yaml:36: contract.observations.1.peripheral: the topic of a peripheral of kind 'imu' is not "
-            "known by itself; give topic and type instead"
+            "robot.yaml:36: contract.observations.1.peripheral: a peripheral of kind 'imu' does not "
+            "determine topic and type; give them instead"
         ),
     ),
     "contract_type_needed": (
         "peripheral: top,",
         "topic: /other,",
-        "robot.yaml:36: contract.observations.1: needs a type, since that of /other is not known by itself",
+        "robot.yaml:36: contract.observations.1: needs a type, which topic /other does not determine",
     ),
     "contract_unknown_message": (
         "peripheral: top,",
         "topic: /other, type: sensor_msgs/msg/Imag,",
         (
             "robot.yaml:36: contract.observations.1.type: unknown message type 'sensor_msgs/msg/Imag', did you "
-            "mean 'sensor_msgs/msg/Image'? (`foreign: true` takes one that only bags to convert have)"
+            "mean 'sensor_msgs/msg/Image'? (set `foreign: true` for a type that only bags define)"
         ),
     ),
     "contract_foreign_that_is_known": (
         "topic: /joint_states,",
         "topic: /imu, type: sensor_msgs/msg/Imu, foreign: true,",
-        "robot.yaml:35: contract.observations.0.foreign: sensor_msgs/msg/Imu is known here; leave foreign out",
+        "robot.yaml:35: contract.observations.0.foreign: sensor_msgs/msg/Imu is a known type; leave foreign out",
     ),
     "contract_foreign_name": (
         "topic: /joint_states,",
@@ -98,8 +98,8 @@ CASES = {
         "key: observation.state, topic: /joint_states,",
         "key: observation.images.x, topic: /touch, type: lamp_msgs/msg/Touch, foreign: true,",
         (
-            "robot.yaml:35: contract.observations.0: no pictures are made of lamp_msgs/msg/Touch, only numbers; "
-            "take a topic with pictures"
+            "robot.yaml:35: contract.observations.0: lamp_msgs/msg/Touch gives only numbers, no images; "
+            "use a topic with images"
         ),
     ),
     "contract_foreign_peripheral": (
@@ -136,7 +136,7 @@ CASES = {
     "contract_select_image": (
         "peripheral: top,",
         "peripheral: top, select: [data],",
-        "robot.yaml:36: contract.observations.1.select.0: nothing can be selected from an image",
+        "robot.yaml:36: contract.observations.1.select.0: images have no numbers to select",
     ),
     "contract_select_field": (
         "topic: /joint_states, select: [position.pan, position.lift, position.grip]",
@@ -175,7 +175,7 @@ CASES = {
             "joint 'pan'\n"
             "robot.yaml:27: control_modes.teleop.executors.1: executors 'arm_position' and 'grip_position' both claim "
             "joint 'pan'\n"
-            "robot.yaml:39: contract.actions.1: joint 'pan' is in the action vector already; each is in it once"
+            "robot.yaml:39: contract.actions.1: joint 'pan' is already in the action vector; list each joint once"
         ),
     ),
     "contract_signal_size": (
@@ -215,7 +215,7 @@ CASES = {
     "contract_tol": (
         "strategy: asof, ",
         "",
-        ("robot.yaml:36: contract.observations.1.align: tol_ms has no meaning for strategy hold; it belongs to asof"),
+        ("robot.yaml:36: contract.observations.1.align: tol_ms applies only to strategy asof, not hold"),
     ),
     "contract_align_strategy": (
         "strategy: asof",
@@ -232,7 +232,7 @@ CASES = {
         "executor: arm_trajectory, topic",
         (
             "robot.yaml:38: contract.actions.0.executor: executor 'arm_trajectory' takes goals; an action needs "
-            "one that streams, such as type position"
+            "one for setpoints, e.g. type position"
         ),
     ),
     "contract_action_type": (
@@ -240,16 +240,13 @@ CASES = {
         "executor: arm_position, type: sensor_msgs/msg/JointState, topic",
         (
             "robot.yaml:38: contract.actions.0.type: this robot publishes std_msgs/msg/Float64MultiArray, not "
-            "'sensor_msgs/msg/JointState'; foreign: true takes the commands of foreign bags"
+            "'sensor_msgs/msg/JointState'; set foreign: true for the commands of foreign bags"
         ),
     ),
     "contract_action_select": (
         "executor: arm_position, topic",
         "executor: arm_position, select: [data.1, data.0], topic",
-        (
-            "robot.yaml:38: contract.actions.0.select: has a meaning for the commands of foreign bags only, with "
-            "foreign: true"
-        ),
+        ("robot.yaml:38: contract.actions.0.select: applies only to the commands of foreign bags; set foreign: true"),
     ),
     "contract_foreign_action_whole": (
         "executor: arm_position, topic",
@@ -267,7 +264,7 @@ CASES = {
     "contract_action_twice": (
         "executor: grip_position, topic",
         "executor: arm_position, topic",
-        "robot.yaml:39: contract.actions.1.executor: executor 'arm_position' has an action already",
+        "robot.yaml:39: contract.actions.1.executor: executor 'arm_position' already has an action",
     ),
     "contract_topic": (
         "topic: /arm/commands",

@@ -163,12 +163,12 @@ CASES = {
     "mode_two_sources": (
         "teleop: stick}",
         "teleop: stick, planner: {type: straight}}",
-        "robot.yaml:27: control_modes.teleop.planner: teleop drives this mode already; make a mode for each",
+        "robot.yaml:27: control_modes.teleop.planner: teleop already drives this mode; make a mode for each",
     ),
     "mode_dispatch_alone": (
         "teleop: stick}",
         "teleop: stick, dispatch: {watermark: 5}}",
-        "robot.yaml:27: control_modes.teleop.dispatch: has a meaning only beside inference",
+        "robot.yaml:27: control_modes.teleop.dispatch: applies only to a mode with inference",
     ),
     "watermark_word": (
         "{model: net}",
@@ -189,8 +189,8 @@ CASES = {
         "{model: net}",
         "{model: net}\n    dispatch: {strategy: ensemble, smoothing: {enabled: false}}",
         (
-            "robot.yaml:27: control_modes.policy.dispatch: strategy ensemble blends: it does not go with "
-            "smoothing: {enabled: false}"
+            "robot.yaml:27: control_modes.policy.dispatch: strategy ensemble blends chunks, which "
+            "smoothing: {enabled: false} excludes"
         ),
     ),
     "mode_planner_missing": (
@@ -255,7 +255,7 @@ CASES = {
     "peripheral_name": (
         "name: chest",
         "name: my chest",
-        "robot.yaml:16: peripherals.my chest.name: a name has letters, digits, _ and - only, got 'my chest'",
+        "robot.yaml:16: peripherals.my chest.name: a name may contain only letters, digits, _ and -, got 'my chest'",
     ),
     "peripheral_kind": (
         "kind: imu, type: gyro",
@@ -291,7 +291,7 @@ CASES = {
             "hardware: {left: {type: bus, port: a, joints: [pan, lift]}, right: {type: bus, port: b, joints: "
             "[lift, grip]}}"
         ),
-        "robot.yaml:12: hardware.right.joints.0: joint 'lift' is owned by hardware 'left' already",
+        "robot.yaml:12: hardware.right.joints.0: joint 'lift' is already owned by hardware 'left'",
     ),
     "hardware_joints_needed": (
         "hardware: {type: bus, port: /dev/null}",
@@ -324,7 +324,7 @@ CASES = {
     "recording_no_topics": (
         "recording: {type: log}",
         "recording: {type: log, topics: []}",
-        "robot.yaml:40: recording.topics: names no topic; contract takes those of the contract, all every one",
+        "robot.yaml:40: recording.topics: is empty; write contract for the contract's topics, or all for every topic",
     ),
     "recording_topic_name": (
         "recording: {type: log}",
@@ -335,7 +335,7 @@ CASES = {
         "recording: {type: log}",
         "recording: {type: log, dataset: ../pick}",
         (
-            "robot.yaml:40: recording.dataset: '../pick' does not lie below recording.root; give a folder's name, "
+            "robot.yaml:40: recording.dataset: '../pick' is not below recording.root; give a folder's name, "
             "e.g. pick_cube"
         ),
     ),

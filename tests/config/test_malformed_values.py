@@ -191,7 +191,7 @@ CASES = {
     "tag": (
         "rate_hz: 30",
         "rate_hz: !!float 30",
-        "robot.yaml:33: contract.rate_hz: the tag !!float is not known here; remove it",
+        "robot.yaml:33: contract.rate_hz: unknown tag !!float; remove it",
     ),
     "two_documents": (
         "control: {rate_hz: 100, stop: hold}",
@@ -209,7 +209,7 @@ CASES = {
     "env_ill_formed": (
         "port: /dev/null}",
         'port: "${9}"}',
-        "robot.yaml:12: hardware.port: ill-formed variable in '${9}'; write ${NAME} or ${NAME:default}",
+        "robot.yaml:12: hardware.port: malformed variable in '${9}'; write ${NAME} or ${NAME:default}",
     ),
     "null_section": (
         "recording: {type: log}",

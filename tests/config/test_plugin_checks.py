@@ -71,7 +71,7 @@ def test_camera_used_twice_is_refused(load_text: Load, base: str) -> None:
     text = base.replace("  - {name: chest", "  - {name: side, kind: camera, type: webcam, device: 0}\n  - {name: chest")
 
     assert faults(load_text, text) == (
-        "robot.yaml:16: peripherals.side.device: /dev/video0 is used by peripherals.top already"
+        "robot.yaml:16: peripherals.side.device: /dev/video0 is already used by peripherals.top"
     )
     assert load_text(text, sim=True).simulated, "the simulation stands for both cameras"
 
@@ -79,7 +79,7 @@ def test_camera_used_twice_is_refused(load_text: Load, base: str) -> None:
 def test_port_of_hardware_and_leader_must_differ(load_text: Load, base: str) -> None:
     text = base.replace("stick: {type: stick}", "stick: {type: stick, port: /dev/null}")
 
-    assert faults(load_text, text) == ("robot.yaml:31: teleoperation.stick.port: /dev/null is used by hardware already")
+    assert faults(load_text, text) == ("robot.yaml:31: teleoperation.stick.port: /dev/null is already used by hardware")
     assert load_text(text, sim=True).simulated, "the leader has the port for itself"
 
 
@@ -90,7 +90,7 @@ def test_port_of_two_arms_must_differ(load_text: Load, base: str) -> None:
           b: {type: bus, port: /dev/null, joints: [grip]}""")
 
     assert faults(load_text, base.replace("hardware: {type: bus, port: /dev/null}", two)) == (
-        "robot.yaml:14: hardware.b.port: /dev/null is used by hardware.a already"
+        "robot.yaml:14: hardware.b.port: /dev/null is already used by hardware.a"
     )
 
 

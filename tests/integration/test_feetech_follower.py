@@ -162,7 +162,7 @@ def test_the_same_port_given_twice_is_refused_before_power_up(bench: Bench, tmp_
     leader = ["--set", f"teleoperation.leader={{type: so101_leader, {arm}}}"]
     ran = subprocess.run([*command, *leader], capture_output=True, text=True, timeout=PATIENCE_S, check=False)
     assert ran.returncode == 2
-    assert f"teleoperation.leader.port: {bench.emulator.port} is used by hardware already" in ran.stderr
+    assert f"teleoperation.leader.port: {bench.emulator.port} is already used by hardware" in ran.stderr
     assert bench.torque() == [False] * 6
 
 

@@ -86,7 +86,7 @@ def test_a_secret_that_is_written_out_is_hidden_and_warned_of(lab: Lab):
     shown = lab.run("config", "show", literal, "--sim")
     assert yaml.safe_load(shown)["transport"]["password"] == "***"
     (told,) = (text for command, text in lab.printed.items() if str(literal) in command)
-    assert "transport.password: a secret is written out" in told
+    assert "transport.password: a literal secret" in told
     assert lab.leaks() == []
 
 

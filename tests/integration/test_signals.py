@@ -154,7 +154,7 @@ def test_signal_that_the_bag_does_not_have_is_named(
     ("old", "new", "message"),
     [
         ("key: task", "key: next.success", "signals.0.key: 'next.success' is not one of: task, next.reward, next.done"),
-        ("key: next.done", "key: task", "signals.2.key: task is given twice; a row has one"),
+        ("key: next.done", "key: task", "signals.2.key: task is given twice; give it once"),
         ("topic: /done", "topic: done", "signals.2.topic: a topic starts with /, got 'done'"),
         ("topic: /done", "topic: /done, type: Bool", "signals.2.type: expected PACKAGE/msg/NAME, got 'Bool'"),
         ("topic: /done", "topic: /done, select: [a, b]", "signals.2.select: next.done takes one path, e.g. [data]"),

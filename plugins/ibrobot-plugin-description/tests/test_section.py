@@ -240,7 +240,7 @@ TOP, WRIST = "robot.yaml:9: peripherals.top.transform", "robot.yaml:10: peripher
         ("transform: {parent: tool, xyz: [0, 0]}", "", f"{TOP}.xyz: expected a list of 3 values, got 2"),
         ("transform: {parent: tool, xyz: [0, 0, .nan]}", "", f"{TOP}: xyz, rpy and quaternion must be finite numbers"),
         ("transform: {parent: tool, rpy: [0, 0, 0], quaternion: [0, 0, 0, 1]}", "",
-         f"{TOP}: rpy and quaternion say the same; give one of them"),
+         f"{TOP}: rpy and quaternion exclude each other; give one of them"),
         ("transform: {parent: tool, quaternion: [0, 0, 0, 2]}", "", f"{TOP}: quaternion has length 2, must have 1"),
         ("transform: {parent: tool, yaw: 1}", "",
          f"{TOP}.yaw: unknown key; known keys: parent, xyz, rpy, quaternion, frame"),
