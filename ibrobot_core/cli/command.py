@@ -1,6 +1,6 @@
-"""The entry point of `ibrobot`: while it starts, Ctrl-C ends it in one line, whatever it was about to import or read.
+"""The entry point of `ibrobot`. During the start, Ctrl-C ends it with one line, at any import or read.
 
-SIGTERM and SIGHUP do the same. This module imports next to nothing, so that it takes effect at once.
+SIGTERM and SIGHUP do the same. This module imports almost nothing, so that it takes effect at once.
 """
 
 import os
@@ -21,13 +21,13 @@ def main() -> None:
 
 
 def let_interrupts_raise() -> None:
-    """From here on Ctrl-C, SIGTERM and SIGHUP raise KeyboardInterrupt: for commands that put things in order then."""
+    """Let Ctrl-C, SIGTERM and SIGHUP raise KeyboardInterrupt from now on, for commands that clean up."""
     for number in _ENDING:
         if signal.getsignal(number) is _end:
             signal.signal(number, signal.default_int_handler)
 
 
 def _end(number: int, frame: FrameType | None) -> None:
-    """Nothing has begun that would have to be stopped; an exception could be swallowed, or printed in many lines."""
+    """Exit at once: nothing needs cleanup yet, and an exception could be swallowed or printed in many lines."""
     os.write(2, b"error: stopped\n")
     os._exit(130)

@@ -1,4 +1,4 @@
-"""`ibrobot config check|show|schema`: what a robot YAML says, and what is wrong with it."""
+"""`ibrobot config check|show|schema`: check and show robot YAMLs, and print their JSON Schema."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ config_options = run_options("config", "sim", "overrides", "mode")
 def config() -> None:
     """Check and show robot YAMLs.
 
-    CONFIG is a file, or the name of a config that comes with ibrobot or a plugin; so101 where it is left out.
+    CONFIG is a file, or the name of a config shipped with ibrobot or a plugin; so101 by default.
     """
 
 
 @config.command()
 @config_options
 @click.option("--json", "as_json", is_flag=True, help="Print a list of {file, line, path, message}.")
-@click.option("--deep", is_flag=True, help="Compare the models of all modes with the contract, too; loads no weights.")
+@click.option("--deep", is_flag=True, help="Also compare the models of all modes with the contract; loads no weights.")
 def check(
     config: str | None, sim: bool, overrides: tuple[str, ...], mode: str | None, as_json: bool, deep: bool
 ) -> None:
-    """Tell everything that is wrong with CONFIG; exit 2 if anything is."""
+    """Report all faults of CONFIG; exit with 2 if there are any."""
     from ibrobot_core.config import find_config, load_config
     from ibrobot_core.config.missing import unavailable_modes
     from ibrobot_core.launch.absence import absent_sensors, describe
@@ -58,7 +58,7 @@ def check(
     for line in unavailable_modes(found.unavailable):
         echo(f"note: {line}")
     if absent := describe(absent_sensors(found, installed_plugins())):
-        echo(f"note: a run is without {absent}")
+        echo(f"note: runs start without {absent}")
     for line in models:
         echo(line)
 
@@ -66,7 +66,7 @@ def check(
 @config.command()
 @config_options
 def show(config: str | None, sim: bool, overrides: tuple[str, ...], mode: str | None) -> None:
-    """Print what a run of CONFIG would use, every default filled in, as a YAML that loads again."""
+    """Print CONFIG as a run would use it, with all defaults filled in, as a YAML that loads again."""
     from ibrobot_core.config import find_config, load_config
     from ibrobot_core.config.missing import describe
     from ibrobot_core.config.show import to_yaml

@@ -18,11 +18,11 @@ from ibrobot_core.plugins import installed_plugins
 def launch(config: str | None, **options: Any) -> None:
     """Run a robot.
 
-    CONFIG is a robot YAML: a path, or the name of one that comes with ibrobot or a plugin; so101 when left out.
-    --episodes counts those of a policy in simulation.
+    CONFIG is a robot YAML: a path, or the name of one shipped with ibrobot or a plugin; so101 by default.
+    --episodes counts episodes of a policy in simulation.
 
-    Exits with 0 when the run ended well, 1 when a component failed or a fault was raised, 2 for a wrong command line
-    or YAML, 3 when not every episode or goal succeeded, 130 on a second Ctrl-C.
+    Exits with 0 if the run succeeded, 1 if a component failed or a fault was raised, 2 for a wrong command line
+    or YAML, 3 if an episode or goal did not succeed, 130 on a second Ctrl-C.
     """
     registry = installed_plugins()
     robot = load_config(

@@ -17,19 +17,19 @@ from ibrobot_core.errors import IbrobotError
 from ibrobot_core.outside import echo
 
 _FAILED, _WRONG, _INTERRUPTED = 1, 2, 130
-"""Exit codes of errors that bring none; docs/reference/exit-codes.md has all."""
+"""Exit codes of errors without their own; docs/reference/exit-codes.md lists all."""
 
 COMMANDS = {
     "launch": ("ibrobot_core.cli.launch:launch", "Run a robot, real or simulated."),
     "config": ("ibrobot_core.cli.config:config", "Check and show robot YAMLs."),
     "plugins": ("ibrobot_core.cli.plugins:plugins", "List what the installed plugins offer."),
-    "doctor": ("ibrobot_core.cli.doctor:doctor", "Check this machine, with the remedy for what it lacks."),
+    "doctor": ("ibrobot_core.cli.doctor:doctor", "Check this machine, and print a remedy for each fault."),
 }
-"""Name -> where the click command is, and its one line in the help."""
+"""Name -> place of the click command, and its line in the help."""
 
 
 class LazyGroup(click.Group):
-    """A group whose commands are imported when they are called; those of plugins come after core's own."""
+    """A group that imports commands when they are called; commands of plugins are listed after those of core."""
 
     @override
     def list_commands(self, ctx: click.Context) -> list[str]:
@@ -75,9 +75,9 @@ def cli(debug: bool) -> None:
 
 
 def main() -> None:
-    """Run the command line. Every error is one line and sets the exit code: docs/reference/exit-codes.md."""
+    """Run the command line. Every error is one line and sets the exit code; see docs/reference/exit-codes.md."""
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # an ASCII terminal shows \u2026, and does not end the run
+        if isinstance(stream, io.TextIOWrapper):  # an ASCII terminal shows \u2026 instead of raising an error
             stream.reconfigure(errors="backslashreplace")
     try:
         sys.exit(cli(prog_name="ibrobot", standalone_mode=False))
@@ -89,7 +89,7 @@ def main() -> None:
 
 
 def _error_lines(error: BaseException) -> tuple[list[str], int]:
-    """The lines that tell an error, and the exit code."""
+    """The message lines of an error, and the exit code."""
     if isinstance(error, IbrobotError):
         return str(error).splitlines(), error.exit_code
     if isinstance(error, click.Abort | KeyboardInterrupt):

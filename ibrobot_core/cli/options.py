@@ -1,4 +1,4 @@
-"""The options that commands share which read a robot YAML or run a robot."""
+"""Options shared by the commands that read a robot YAML or run a robot."""
 
 from __future__ import annotations
 
@@ -12,27 +12,29 @@ from ibrobot_core.plugins import installed_plugins
 
 _OPTIONS: dict[str, Callable[..., Any]] = {
     "config": argument("config", required=False),
-    "sim": option("--sim", is_flag=True, help="Use the simulation section in place of hardware."),
+    "sim": option("--sim", is_flag=True, help="Use the simulation section instead of hardware."),
     "lockstep": option(
-        "--lockstep", is_flag=True, help="Simulated time, as fast as the machine goes; equal seeds, equal runs."
+        "--lockstep", is_flag=True, help="Run in simulated time, as fast as possible; equal seeds give equal runs."
     ),
-    "seed": option("--seed", type=int, default=0, show_default=True, help="Of the first episode; later ones count up."),
-    "mode": option("--mode", metavar="MODE", help="Start in this control mode, not in default_control_mode."),
+    "seed": option(
+        "--seed", type=int, default=0, show_default=True, help="Seed of the first episode; later ones add 1."
+    ),
+    "mode": option("--mode", metavar="MODE", help="Start in this control mode, instead of default_control_mode."),
     "overrides": option(
         "--set", "overrides", multiple=True, metavar="PATH=VALUE", help="Override a key, e.g. control.rate_hz=50."
     ),
-    "duration": option("--duration", type=click.FloatRange(min=0), metavar="S", help="Stop after so many seconds."),
-    "episodes": option("--episodes", type=click.IntRange(min=1), metavar="N", help="Stop after so many episodes."),
+    "duration": option("--duration", type=click.FloatRange(min=0), metavar="S", help="Stop after S seconds."),
+    "episodes": option("--episodes", type=click.IntRange(min=1), metavar="N", help="Stop after N episodes."),
     "goals": option(
         "--goal", "goals", multiple=True, metavar="GOAL", help="For planning modes: a pose, or joint=rad,…"
     ),
     "window": option("--window", is_flag=True, help="Show the simulation in a desktop window."),
-    "headless": option("--headless", is_flag=True, help="No window, no viewer, no panel: plain lines."),
+    "headless": option("--headless", is_flag=True, help="Print plain lines, without window, viewer and panel."),
     "dry_run": option(
         "--dry-run", is_flag=True, help="Print the plan, compare the model with the contract, and start nothing."
     ),
     "as_json": option(
-        "--json", "as_json", is_flag=True, help="Print JSON alone on standard output: the summary, or the plan."
+        "--json", "as_json", is_flag=True, help="Print only JSON on standard output: the summary, or the plan."
     ),
 }
 
@@ -41,11 +43,11 @@ def run_options[C: Callable[..., Any]](*names: str) -> Callable[[C], C]:
     """The argument `config` and the options of commands that run a robot.
 
     Args:
-        names: which of them: `config`, `sim`, `lockstep`, `seed`, `mode`, `overrides`, `duration`, `episodes`, `goals`,
-            `window`, `headless`, `dry_run`, `as_json`. All when none is named.
+        names: any of `config`, `sim`, `lockstep`, `seed`, `mode`, `overrides`, `duration`, `episodes`, `goals`,
+            `window`, `headless`, `dry_run`, `as_json`. All by default.
 
     Returns:
-        A decorator of the function that becomes a click command.
+        A decorator for the function of a click command.
     """
 
     def add(command: C) -> C:
@@ -57,7 +59,7 @@ def run_options[C: Callable[..., Any]](*names: str) -> Callable[[C], C]:
 
 
 def run_overrides(options: Mapping[str, Any]) -> tuple[str, ...]:
-    """The overrides of a robot YAML that a command line asks for.
+    """The overrides of a robot YAML given by command-line options.
 
     Args:
         options: `overrides`, `window` and `headless` of `run_options`.

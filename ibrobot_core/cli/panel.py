@@ -1,4 +1,4 @@
-"""The live status panel in the terminal, and the same facts as plain lines where there is no terminal."""
+"""The live status panel, and plain status lines for output without a terminal."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ if TYPE_CHECKING:
 
 KEYS = {"Esc": "emergency stop", "F10": "reset", "Ctrl-C": "end"}
 LOOP = ""
-"""The control loop among the names of sensors."""
+"""Name of the control loop, beside the names of sensors."""
 _LOG_LINES = 6
 _RECENT_NS = 3 * NS_PER_S
-"""Rates are over so long [ns]."""
+"""Time over which rates are measured [ns]."""
 _SAMPLE_NS = NS_PER_S // 4
 _JOINT_WIDTH = 47
-"""Columns of a joint's name and numbers."""
+"""Width of a joint's name and numbers [columns]."""
 
 
 class RecentLog(logging.Handler):
@@ -47,13 +47,13 @@ class RecentLog(logging.Handler):
 
 
 class RecentRates:
-    """Rates of the loop and of the sensors over the last seconds, from how far their counts got meanwhile."""
+    """Rates of the control loop and the sensors over the last seconds, from their counts."""
 
     def __init__(self) -> None:
         self._samples: deque[tuple[int, dict[str, int]]] = deque()
 
     def sample(self, session: Session) -> None:
-        """Note the counts of now, a few times a second."""
+        """Store the present counts; call it a few times per second."""
         now_ns = session.clock.now_ns()
         if self._samples and now_ns - self._samples[-1][0] < _SAMPLE_NS:
             return
@@ -63,7 +63,7 @@ class RecentRates:
             self._samples.popleft()
 
     def __getitem__(self, name: str) -> str:
-        """A sensor's rate, or that of `LOOP`, as text; unknown before there are two samples."""
+        """The rate of a sensor, or of `LOOP`, as text; `- Hz` before the second sample."""
         if len(self._samples) < 2:
             return "- Hz"
         (first_ns, first), (last_ns, last) = self._samples[0], self._samples[-1]
@@ -87,7 +87,7 @@ def _sensor_texts(session: Session, rates: RecentRates) -> list[str]:
 
 
 def _model_text(session: Session) -> str | None:
-    """Where the model runs, unless it is in the host, and whether it answers."""
+    """Place and state of the model, unless it runs in the host."""
     if session.acting is None or session.acting.engine.mode == "monolithic":
         return None
     stats = session.acting.engine
@@ -115,7 +115,7 @@ def plain_line(session: Session, rates: RecentRates) -> str:
 def panel(
     session: Session, log: RecentLog, rates: RecentRates, help_text: str, more: Sequence[tuple[str, str]] = ()
 ) -> RenderableType:
-    """The whole panel, with `more` rows of heading and text; in a small terminal its end is left out."""
+    """The panel, with `more` rows of heading and text; a small terminal cuts off its end."""
     where = "in simulation" if session.config.simulated else "on hardware"
     modes = styled(f"{session.config.robot.name} {where}  ", "bold") + styled("  ").join(
         styled(f"{key} ")
@@ -124,7 +124,7 @@ def panel(
         )
         for key, name in session.mode_keys.items()
     )
-    return Group(  # what does not fit below, `Live` leaves out
+    return Group(  # `Live` cuts off what does not fit
         styled(" ").join(styled(key, "bold reverse") + styled(f" {does}", "bold") for key, does in KEYS.items()),
         *_faults(session),
         _Newest(log.lines),
@@ -136,7 +136,7 @@ def panel(
 
 
 def _faults(session: Session) -> list[Text]:
-    """What keeps the robot from going on, in full, the newest fault first."""
+    """The reasons why the robot holds, in full, the newest fault first."""
     if session.held and not session.faults:
         return [styled(f"holding after the reset: {session.to_go_on()}", "bold yellow")]
     estop = session.state is not None and session.state.estop
@@ -148,7 +148,7 @@ def _faults(session: Session) -> list[Text]:
 
 
 def _facts(session: Session, rates: RecentRates) -> Iterator[tuple[str, str]]:
-    """Heading and text, the most important first."""
+    """Rows of heading and text, the most important first."""
     outcome = session.outcome
     if session.sensors:
         yield "sensors", "  ".join(_sensor_texts(session, rates))
@@ -167,7 +167,7 @@ def _facts(session: Session, rates: RecentRates) -> Iterator[tuple[str, str]]:
 
 
 class _Newest:
-    """The newest of some messages, in full; so many as `_LOG_LINES` lines hold, and at least one."""
+    """The newest messages in full; as many as fit into `_LOG_LINES` lines, and at least one."""
 
     def __init__(self, messages: Sequence[RenderableType]) -> None:
         self._messages = messages
@@ -185,7 +185,7 @@ class _Newest:
 
 
 class _Joints:
-    """Position and command of each joint; where there is room, also within its limits."""
+    """Position and command of each joint; in wide terminals, also a bar between the limits."""
 
     def __init__(self, session: Session) -> None:
         self._session = session

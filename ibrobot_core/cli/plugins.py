@@ -1,4 +1,4 @@
-"""`ibrobot plugins` and `ibrobot plugins show TYPE`: what is installed, what is broken, what options there are."""
+"""`ibrobot plugins` and `ibrobot plugins show TYPE`: list installed and broken plugins, and options of types."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ibrobot_core.plugins import Entry, Registry, installed_plugins
 @click.option("--json", "as_json", is_flag=True, help="Print {plugins: […], broken: […]}.")
 @click.pass_context
 def plugins(ctx: click.Context, as_json: bool) -> None:
-    """List what the installed plugins offer, what this machine lacks for it, and the plugins that are broken."""
+    """List the types of the installed plugins, their missing dependencies, and broken plugins."""
     if ctx.invoked_subcommand is not None:
         return
     registry = installed_plugins()
@@ -41,7 +41,7 @@ def plugins(ctx: click.Context, as_json: bool) -> None:
 @click.argument("type_", metavar="TYPE")
 @click.option("--json", "as_json", is_flag=True, help="Print a list of {kind, type, …, options: […]}.")
 def show(type_: str, as_json: bool) -> None:
-    """Print the options of TYPE, of every kind that has a type of this name."""
+    """Print the options of TYPE, for every kind that has a type of this name."""
     from ibrobot_core.config.describe import described
 
     registry = installed_plugins()
@@ -89,7 +89,7 @@ def _text(value: Any) -> str:
 
 
 def _print_table(columns: tuple[str, ...], rows: list[list[str]]) -> None:
-    """A table as wide as the terminal; all of every cell where there is none to fit it into."""
+    """Print a table as wide as the terminal; without a terminal, print all cells in full."""
     from rich.table import Table
 
     from ibrobot_core.screen import Screen

@@ -1,4 +1,4 @@
-"""Runs of a robot by a command: its panel or plain lines, keys, signals, summary and exit status."""
+"""Runs of a robot from the command line: panel or plain lines, keys, signals, summary and exit status."""
 
 from __future__ import annotations
 
@@ -40,19 +40,19 @@ def run_robot(
     config: RobotConfig, request: LaunchRequest, *, headless: bool = False, dry_run: bool = False,
     as_json: bool = False, make_hooks: Callable[[Runtime], RunHooks] = lambda runtime: RunHooks(),
 ) -> None:  # fmt: skip
-    """Run a robot as `ibrobot launch` does, to the end of the process, with exit status and summary.
+    """Run a robot as `ibrobot launch` does, print the summary and exit.
 
     Args:
         config: the robot.
-        request: what is asked of the run.
-        headless: no window, no viewer, no panel: plain lines.
-        dry_run: print the plan of the run and compare models with the contract, but start nothing.
-        as_json: print JSON alone on standard output.
-        make_hooks: makes the hooks of the command, once the run is made and not started yet.
+        request: the user's request.
+        headless: whether to print plain lines, without window, viewer and panel.
+        dry_run: whether to only print the plan and compare models with the contract.
+        as_json: whether to print only JSON on standard output.
+        make_hooks: creates the hooks of the command, before the run starts.
 
     Raises:
-        IbrobotError: e.g. when a component fails.
-        SystemExit: at the end of a run in which no component failed; docs/reference/exit-codes.md has the codes.
+        IbrobotError: e.g. if a component fails.
+        SystemExit: at the end of a run without failed components; docs/reference/exit-codes.md lists the codes.
     """
     if request.lockstep and not config.simulated:
         raise click.UsageError("--lockstep is for simulation: add --sim")
@@ -70,22 +70,22 @@ def run_robot(
             return
         hooks = make_hooks(runtime)
         _stop_on_signals(runtime.session, keys)
-        if keys is not None:  # only now: until here Ctrl-C ends the process, and could not put the terminal back
+        if keys is not None:  # only now, since until here Ctrl-C ends the process without restoring the terminal
             stack.enter_context(keys)
         try:
             status = _run(runtime, hooks, live=not headless, as_json=as_json)
         finally:
             for line in runtime.session.outcome.holding:
                 echo(line, err=True)
-    _tell(runtime, hooks, as_json)
+    _print_summary(runtime, hooks, as_json)
     runtime.raise_failure()
     sys.exit(status)
 
 
 def _run(runtime: Runtime, hooks: RunHooks, *, live: bool, as_json: bool) -> int:
-    """Start, run and stop; returns the exit status of a run in which nothing failed.
+    """Start, run and stop; return the exit status of a run without failures.
 
-    What it shows meanwhile is on standard output, or on standard error where that is for JSON.
+    Status goes to standard output, or to standard error with `as_json`.
     """
     session = runtime.session
     where = "simulation" if session.config.simulated else "hardware"
@@ -106,7 +106,7 @@ def _run(runtime: Runtime, hooks: RunHooks, *, live: bool, as_json: bool) -> int
 
 
 def _stop_on_signals(session: Session, keys: KeyReader | None) -> None:
-    """The first of the `end_signals` stops in order; a second Ctrl-C ends the host, and control stops the robot."""
+    """Stop the run at the first of the `end_signals`; a second Ctrl-C ends the host, and control stops the robot."""
     terminals = [fd for fd in (1, 2) if os.isatty(fd)]
 
     def stop(number: int, frame: object) -> None:
@@ -114,7 +114,7 @@ def _stop_on_signals(session: Session, keys: KeyReader | None) -> None:
             if keys is not None:
                 keys.close()
             os._exit(_INTERRUPTED_TWICE)
-        if number == signal.SIGHUP:  # the terminal may be gone: what is written to it must not fail
+        if number == signal.SIGHUP:  # the terminal may be closed; writing to it must not fail
             _discard(terminals)
         if session.request.lockstep:  # does not block: the run ends at a tick
             finish()
@@ -130,7 +130,7 @@ def _stop_on_signals(session: Session, keys: KeyReader | None) -> None:
 
 
 def _discard(descriptors: list[int]) -> None:
-    """Have what is written to these go nowhere."""
+    """Redirect these descriptors to the null device."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     for descriptor in descriptors:
         os.dup2(nowhere, descriptor)
@@ -138,7 +138,7 @@ def _discard(descriptors: list[int]) -> None:
 
 
 class _Lines:
-    """Plain lines of status, where standard output is not a terminal."""
+    """Plain status lines, for output without a terminal."""
 
     def __init__(self, runtime: Runtime, hooks: RunHooks, stack: ExitStack, *, err: bool) -> None:
         self._session = runtime.session
@@ -151,10 +151,10 @@ class _Lines:
         _log_to(handler)
 
     def starting(self, component: str) -> None:
-        """Nothing is said of a component that starts."""
+        """Print nothing for components that start."""
 
     def show(self) -> None:
-        """Print a line, now and then."""
+        """Print a status line at intervals."""
         self._rates.sample(self._session)
         if time.monotonic() >= self._next_s:
             self._next_s += _PLAIN_PERIOD_S
@@ -163,7 +163,7 @@ class _Lines:
 
 
 class _Panel:
-    """The live panel, and the runtime's own keys: F1..F9 modes, Esc emergency stop, F10 reset."""
+    """The live panel, and the keys of the runtime: F1..F9 modes, Esc emergency stop, F10 reset."""
 
     def __init__(self, runtime: Runtime, hooks: RunHooks, stack: ExitStack, *, err: bool) -> None:
         from rich.live import Live
@@ -183,11 +183,11 @@ class _Panel:
             threading.Thread(target=self._listen, args=(keys(),), name="runtime keys", daemon=True).start()
 
     def starting(self, component: str) -> None:
-        """Show which component starts."""
+        """Show the component that starts."""
         self._display.update(f"starting {component} …", refresh=True)
 
     def show(self) -> None:
-        """Handle the keys pressed, and redraw the panel."""
+        """Handle pressed keys, and redraw the panel."""
         if time.monotonic() < self._next_s:
             return
         self._next_s = time.monotonic() + 1.0 / _PANEL_HZ
@@ -199,7 +199,7 @@ class _Panel:
         self._display.update(panel(session, self._log, self._rates, help_text, self._hooks.rows()), refresh=True)
 
     def _listen(self, keys: queue.SimpleQueue[str]) -> None:
-        """In a thread of its own, so that the emergency stop waits for nothing, e.g. not for a mode that loads."""
+        """Handle keys in a separate thread, so that the emergency stop does not wait, e.g. for a mode that loads."""
         while True:
             key = keys.get()
             if key == "esc":
@@ -223,13 +223,13 @@ class _Panel:
 
 
 def _log_to(handler: logging.Handler) -> None:
-    """Our own words from INFO on, those of libraries from WARNING on."""
+    """Log ibrobot's messages from INFO and those of libraries from WARNING to `handler`."""
     logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
     logging.getLogger("ibrobot").setLevel(logging.INFO)
 
 
-def _tell(runtime: Runtime, hooks: RunHooks, as_json: bool) -> None:
-    """The summary of a run."""
+def _print_summary(runtime: Runtime, hooks: RunHooks, as_json: bool) -> None:
+    """Print the summary of a run."""
     summary = runtime.summary()
     if as_json:
         echo(json.dumps(summary))

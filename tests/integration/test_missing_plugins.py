@@ -74,7 +74,7 @@ def test_config_check_notes_modes_that_cannot_be_entered(only: Only, ibrobot: Ru
     code, out, err = ibrobot("config", "check", "so101")
 
     assert (code, err) == (0, "")
-    assert out.splitlines()[2:] == [*(f"note: {line}" for line in NOTES), f"note: a run is without {CAMERAS}"]
+    assert out.splitlines()[2:] == [*(f"note: {line}" for line in NOTES), f"note: runs start without {CAMERAS}"]
     assert ibrobot("config", "check", "so101", "--json") == (0, "[]\n", "")
 
 
