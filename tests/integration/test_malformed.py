@@ -46,7 +46,7 @@ def test_there_are_many_and_the_file_without_them_is_good(
         assert (code or 0, err) == (0, "")
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case["told"][:60])
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case["message"][:60])
 def test_one_error_and_the_same_from_both(
     case: dict[str, Any], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -61,7 +61,7 @@ def test_one_error_and_the_same_from_both(
     code, err = checked
     assert code == 2
     [line] = err.splitlines()
-    assert line.startswith(f"error: robot.yaml:{case['told']}")
+    assert line.startswith(f"error: robot.yaml:{case['message']}")
 
 
 MODEL = """\
