@@ -8,7 +8,6 @@ from importlib.metadata import entry_points
 from typing import TYPE_CHECKING
 
 import pytest
-from ibrobot_metrics.component import MetricsPort
 from prometheus_client.parser import text_string_to_metric_families
 
 from ibrobot_core.errors import ComponentFailed, ConfigError, SensorError
@@ -32,6 +31,8 @@ def installed(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def url(runtime: Runtime) -> str:
+    from ibrobot_metrics.component import MetricsPort  # the plugin is installed where integration tests run
+
     (port,) = (component for component in runtime.plan.components if component.name == "metrics")
     assert isinstance(port, MetricsPort)
     return port.url
