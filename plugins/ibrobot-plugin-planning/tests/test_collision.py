@@ -124,6 +124,10 @@ WORLD = World({
 })  # fmt: skip
 
 
+@pytest.mark.skipif(
+    tuple(map(int, mujoco.__version__.split(".")[:2])) < (3, 12),
+    reason="mj_geomDistance of older versions misses deep contacts",
+)
 def test_free_is_what_mujoco_measures(arm, tmp_path):
     model = mujoco.MjModel.from_xml_path(str(write_arm(tmp_path, OBJECTS)))
     data = mujoco.MjData(model)

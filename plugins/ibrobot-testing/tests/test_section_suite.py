@@ -49,7 +49,9 @@ class Nameless(Counter):
 
 class NeedsMessages(Counter):
     def work(self, timeout_s):
-        assert self.states.get(timeout_s).message
+        received = self.states.get(timeout_s)
+        assert received is not None
+        assert received.message
 
 
 class ServesForEver(Counter):

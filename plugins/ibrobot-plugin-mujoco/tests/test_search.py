@@ -1,4 +1,4 @@
-"""Numerical searches: arms of six and seven joints, corners of the limits, nearest points of what is out of reach."""
+"""Numerical searches: arms of six and seven joints, corners of the limits, nearest points of targets out of reach."""
 
 from __future__ import annotations
 
@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 from ibrobot_kinematics import KinematicModel, Target, UnreachableError, robot_model, solve, solve_all
 from ibrobot_kinematics.rotations import log
+from ibrobot_mujoco.so101 import so101 as so101_robot
 from inverse_kinematics import packaged_arm
 
-from ibrobot_core.api import Vector, load_config
+from ibrobot_core.api import Vector
 
 
 @pytest.fixture(scope="module")
 def so101() -> KinematicModel:
-    return robot_model(load_config("configs/so101_blind.yaml").robot)
+    return robot_model(so101_robot())
 
 
 def anywhere(model: KinematicModel, number: int, seed: int) -> Vector:
