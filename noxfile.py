@@ -135,7 +135,7 @@ def integration(session: nox.Session) -> None:
     """What needs every plugin, or starts processes."""
     install(session, *PLUGINS)
     system_libraries(session)
-    session.run(*PYTEST, "-m", "integration", "tests", *session.posargs)
+    session.run(*PYTEST, "-m", "integration", "tests", "plugins", *session.posargs)
 
 
 @nox.session
