@@ -159,6 +159,7 @@ from ibrobot_core.component import (
     CONTROL as CONTROL,
     Component as Component,
     Worker as Worker,
+    error_line as error_line,
     error_text as error_text,
 )
 from ibrobot_core.launch.session import (
@@ -211,8 +212,11 @@ from ibrobot_core.contract.specs import (
 )
 from ibrobot_core.contract.image import pixels as pixels
 from ibrobot_core.contract.frames import FrameAssembler as FrameAssembler
-from ibrobot_core.contract.joint_units import JointUnits as JointUnits
-from ibrobot_core.contract.joint_units import with_closed_ends as with_closed_ends
+from ibrobot_core.contract.joint_units import (
+    JointUnits as JointUnits,
+    calibrations as calibrations,
+    with_closed_ends as with_closed_ends,
+)
 from ibrobot_core.selection import Leaf as Leaf, Selection as Selection, value_at as value_at
 from ibrobot_core.config import (
     RobotConfig as RobotConfig,
@@ -228,6 +232,7 @@ from ibrobot_core.config.schema import (
     ExecutorConfig as ExecutorConfig,
     ImageSpec as ImageSpec,
     Mount as Mount,
+    RecordingConfig as RecordingConfig,
     TransportConfig as TransportConfig,
 )
 from ibrobot_core.config.models import ModelError as ModelError, XmlElement as XmlElement, read_xml as read_xml
@@ -241,9 +246,8 @@ from ibrobot_core.plugins import (
     installed_plugins as installed_plugins,
 )
 from ibrobot_core.inference.build import build_policy as build_policy
-from ibrobot_core.recording.dataset import EpisodeDataset as EpisodeDataset
-from ibrobot_core.recording.service import EpisodeService as EpisodeService
-from ibrobot_core.recording.episode import episode_folder as episode_folder, robot_metadata as robot_metadata
+from ibrobot_core.contract.metadata import robot_metadata as robot_metadata
+from ibrobot_core.launch.episodes import Episodes as Episodes
 from ibrobot_core.control.realtime import go_real_time as go_real_time
 from ibrobot_core.memory import create_memory as create_memory, set_malloc as set_malloc
 from ibrobot_core.child import Channel as Channel, Child as Child, open_parent as open_parent

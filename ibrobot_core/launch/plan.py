@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
 from typing import Any
 
 import attrs
@@ -11,7 +10,6 @@ import attrs
 from ibrobot_core.component import CONTROL, Component
 from ibrobot_core.config.missing import unavailable_modes
 from ibrobot_core.config.schema import ActionSpec, ObservationSpec, PeripheralConfig
-from ibrobot_core.contract.specs import Contract
 from ibrobot_core.descriptors import SourceDescriptor, TransportDescriptor
 from ibrobot_core.errors import ComponentFailed, NotSupported
 from ibrobot_core.launch.absence import describe
@@ -26,10 +24,9 @@ from ibrobot_core.launch.sources.source_worker import SourceWorker
 from ibrobot_core.launch.sources.teleop import TeleopSource
 from ibrobot_core.launch.transport import TransportLink
 from ibrobot_core.messages import MESSAGE_TYPES
-from ibrobot_core.recording.episode import is_kept
-from ibrobot_core.recording.episodes import Episodes
-from ibrobot_core.recording.service import EpisodeService
-from ibrobot_core.recording.worker import RecordingWorker
+
+RECORDED = "episodes"
+"""The section of a plugin whose component records episodes in runs with a section `recording`."""
 
 
 @attrs.frozen
@@ -53,7 +50,6 @@ class LaunchPlan:
     """The transport to other machines; None if nothing in the run needs one."""
     mode: ModeComponents
     """The components of the first mode, which `components` contains too."""
-    episodes: Episodes
     episodes_worker: SimulatedEpisodes | None
     without: str
     """The sensors that this machine cannot run, and why; empty if it can run all."""
@@ -124,8 +120,7 @@ def build_plan(session: Session) -> LaunchPlan:
             f"known types: {', '.join(MESSAGE_TYPES)}"
         )
     if config.recording is not None:
-        kept = partial(is_kept, recording=config.recording, contract=Contract.from_config(config))
-        session.refuse_absent("the recording", kept)
+        session.registry.find("section", RECORDED)
     link = None
     if (transport := config.transport) is not None:
         descriptor = session.registry.find("transport", transport.type)
@@ -138,12 +133,6 @@ def build_plan(session: Session) -> LaunchPlan:
     components += added.models
     components.append(ControlComponent(session, tuple(model.name for model in added.models)))
     components += [SensorWorker(session, peripheral, (CONTROL,)) for peripheral in _sensors(session)]
-    policy = added.source if config.simulated and isinstance(added.source, PolicySource) else None
-    episodes = Episodes(session)
-    if config.recording is not None:
-        worker = RecordingWorker(session, config.recording)
-        components.append(worker)
-        episodes = EpisodeService(session, worker, by_mode=policy is not None or not session.request.by_operator)
     if isinstance(added.source, SourceWorker):
         components.append(added.source)
     components.append(Status(session, (CONTROL,)))
@@ -153,11 +142,11 @@ def build_plan(session: Session) -> LaunchPlan:
     if link is not None:
         components += shared
     simulated = None
-    if policy is not None:
-        simulated = SimulatedEpisodes(session, episodes, (policy.name,))
+    if session.simulates_episodes:
+        simulated = SimulatedEpisodes(session, (added.components()[-1].name,))
         components.append(simulated)
     without = describe(session.absent)
-    return LaunchPlan(tuple(_ordered(components)), link, added, episodes, simulated, without, config.unavailable)
+    return LaunchPlan(tuple(_ordered(components)), link, added, simulated, without, config.unavailable)
 
 
 def _ordered(components: list[Component]) -> list[Component]:

@@ -12,7 +12,6 @@ from ibrobot_core.errors import ComponentFailed, HardwareError, NotSupported, Pl
 from ibrobot_core.launch.control import ControlComponent
 from ibrobot_core.launch.plan import LaunchPlan, build_plan, mode_components
 from ibrobot_core.launch.session import Session
-from ibrobot_core.recording.service import EpisodeService
 from ibrobot_core.units import ns
 
 SET_MODE = "/set_mode"
@@ -41,9 +40,6 @@ class Runtime:
                 "--episodes counts a policy's episodes in simulation: it needs --sim and a mode with inference; "
                 f"mode {session.mode} ends with --duration, --goal or Ctrl-C"
             )
-        episodes = self.plan.episodes
-        self.episode_service = episodes if isinstance(episodes, EpisodeService) else None
-        """The service by which an operator begins and ends episodes; None in a run without recording."""
         self._mode_components = self.plan.mode
         session.command_source = self.plan.mode.source
         self._started: list[Component] = []
@@ -85,8 +81,6 @@ class Runtime:
         session.bus.serve(SET_MODE, self.switch_mode)
         session.bus.serve(RESET, lambda _: self.reset())
         session.bus.serve(ESTOP, lambda _: session.control.call("estop"))
-        if self.episode_service is not None:
-            self.episode_service.serve()
 
     def wait(self, timeout_s: float) -> bool:
         """Wait up to `timeout_s` [s] for the end of the run; return whether it has ended."""
@@ -134,7 +128,7 @@ class Runtime:
         except BaseException:
             self._stop_all(new)
             raise
-        self.plan.episodes.end("unknown")
+        session.episodes.end("unknown")
         previous = session.mode
         session.mode, session.command_source, session.held = name, added.source, False
         session.begin_source()
@@ -143,7 +137,7 @@ class Runtime:
         self._stop_all(old)
         session.emit("ibrobot_mode_changed", mode=name, previous=previous)
         if not session.request.by_operator:
-            self.plan.episodes.begin()
+            session.episodes.begin()
 
     def reset(self) -> str:
         """Clear faults and the emergency stop, and restart the mode at the measured positions.
@@ -171,7 +165,7 @@ class Runtime:
         session = self.session
         session.command("switch_mode", mode=session.mode)
         session.held = False
-        between_episodes = self.plan.episodes_worker in self._started and not self.plan.episodes.running
+        between_episodes = self.plan.episodes_worker in self._started and not session.episodes.running
         if not between_episodes:
             session.begin_source()
         session.log.info("mode %s goes on", session.mode)
@@ -182,13 +176,11 @@ class Runtime:
         session.finish()
         for service in (SET_MODE, RESET, ESTOP):
             session.bus.unserve(service)
-        if self.episode_service is not None:
-            self.episode_service.unserve()
         started, self._started = self._started, []
         if (worker := self.plan.episodes_worker) in started:
             started.remove(worker)
             self._stop_all([worker])
-        self.plan.episodes.end("unknown")
+        session.episodes.end("unknown")
         self._stop_all(started)
 
     def raise_failure(self) -> None:
@@ -290,4 +282,4 @@ class Runtime:
         session.generation = session.state.generation
         session.begin_source()
         if not session.request.by_operator:
-            self.plan.episodes.begin()
+            session.episodes.begin()

@@ -21,6 +21,7 @@ from ibrobot_core.control.link import ControlState, PlanRecord
 from ibrobot_core.errors import ComponentFailed, MissingDependency
 from ibrobot_core.interfaces import Context, EngineStats, JointReading, OperatorEvent
 from ibrobot_core.launch.absence import AbsentSensor, absent_sensors, by_cause
+from ibrobot_core.launch.episodes import Episodes
 from ibrobot_core.plugins import Registry
 from ibrobot_core.robot import Vector
 
@@ -146,6 +147,7 @@ class Session:
         operator_events: the operator's button presses on a teleoperation device, e.g. to begin and end episodes.
         log: the log of the run.
         command_source: the source that commands the active executors.
+        episodes: begins, ends and counts the episodes; replaced by what records them.
         held: whether the robot holds after the reset of a fault, until the operator enters the mode again.
         start_failed: whether the run ended before all components had started, so that nothing has moved the robot.
     """
@@ -161,6 +163,7 @@ class Session:
         self.mode = config.default_control_mode
         self.generation = 0
         self.command_source = CommandSource()
+        self.episodes = Episodes(self)
         self.held = False
         self.start_failed = False
         self.state: ControlState | None = None
@@ -195,6 +198,12 @@ class Session:
         """
         for missing, labels in by_cause(sensor for sensor in self.absent if needs(sensor.topic)):
             raise MissingDependency(f"{user} needs {labels}: {missing.missing}", apt=missing.apt, remedy=missing.remedy)
+
+    @property
+    def simulates_episodes(self) -> bool:
+        """Whether the mode begins and ends episodes itself: that of a policy in a simulation."""
+        by_policy = self.config.control_modes[self.mode].inference is not None and self.request.source is None
+        return self.config.simulated and by_policy
 
     @property
     def control(self) -> ControlHost:

@@ -5,18 +5,16 @@ from __future__ import annotations
 from typing import override
 
 from ibrobot_core.launch.session import Session, SessionWorker
-from ibrobot_core.recording.episodes import Episodes
 from ibrobot_core.units import NS_PER_S, ns
 
 
 class SimulatedEpisodes(SessionWorker):
     """Episodes of a policy in a simulated scene; seeds count up from the seed of the run."""
 
-    def __init__(self, session: Session, episodes: Episodes, needs: tuple[str, ...]) -> None:
+    def __init__(self, session: Session, needs: tuple[str, ...]) -> None:
         wanted = session.request.episodes
         summary = f"{wanted if wanted is not None else 'endless'} episodes from seed {session.request.seed}"
         super().__init__(session, "episodes", summary, needs)
-        self._episodes = episodes
         self._wanted = wanted
         self._longest_ns = ns(session.config.contract.max_duration_s)
         self._begun_ns: int | None = None
@@ -38,21 +36,21 @@ class SimulatedEpisodes(SessionWorker):
         elif state is not None and state.generation == session.generation and state.success:
             self._end_episode("success")
         elif (age_ns := session.clock.now_ns() - self._begun_ns) > self._longest_ns:
-            session.log.info("episode %d: no success within %.1f s", self._episodes.number, age_ns / NS_PER_S)
+            session.log.info("episode %d: no success within %.1f s", session.episodes.number, age_ns / NS_PER_S)
             self._end_episode("failure")
 
     def _begin_episode(self) -> None:
         session = self.session
-        seed = session.request.seed + self._episodes.number
+        seed = session.request.seed + session.episodes.number
         session.command("reset_episode", seed=seed)
         self._begun_ns = session.clock.now_ns()
-        self._episodes.begin()
+        session.episodes.begin()
         session.command_source.begin(seed)
 
     def _end_episode(self, outcome: str) -> None:
         session = self.session
         session.end_source()
         self._begun_ns = None
-        self._episodes.end(outcome)
-        if self._wanted is not None and self._episodes.number >= self._wanted:
+        session.episodes.end(outcome)
+        if self._wanted is not None and session.episodes.number >= self._wanted:
             session.finish()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import textwrap
 from collections.abc import Iterator
-from importlib.metadata import EntryPoint
+from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,7 +21,10 @@ from ibrobot_core.plugins import discover
 if TYPE_CHECKING:
     from ibrobot_testing.site import Site
 
-NEEDS = {"test_distributed.py": "ibrobot_serve", "test_sharing.py": "ibrobot_zenoh"}
+NEEDS = {
+    "test_distributed.py": "ibrobot_serve", "test_episode_service.py": "ibrobot_data",
+    "test_recording.py": "ibrobot_data", "test_sharing.py": "ibrobot_zenoh",
+}  # fmt: skip
 collect_ignore = [name for name, package in NEEDS.items() if find_spec(package) is None]
 
 ROBOT = textwrap.dedent("""\
@@ -90,6 +93,9 @@ class Runs:
         """A run in lockstep, unless `asked` says otherwise; not started."""
         path = self.folder / "mini.yaml"
         path.write_text(ROBOT)
+        if not self.installed and any(each.startswith("recording=") for each in overrides):
+            pytest.importorskip("ibrobot_data")
+            self.installed += entry_points(group="ibrobot", name="data")
         registry = discover([*self.site.entry_points(), *self.installed])
         config = load_config(path, overrides=overrides, mode=mode, sim=sim, registry=registry)
         runtime = Runtime(Session(config, registry, LaunchRequest(**{"lockstep": True, **asked})))

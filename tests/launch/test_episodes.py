@@ -136,7 +136,7 @@ def test_a_recording_has_its_episode_and_nothing_else(runs: Runs, tmp_path: Path
     states = runtime.session.bus.subscribe("/joint_states", 10_000)
     spans: list[list[int]] = []
     while not runtime.step():
-        episodes, now_ns = runtime.plan.episodes, runtime.session.clock.now_ns()
+        episodes, now_ns = runtime.session.episodes, runtime.session.clock.now_ns()
         if episodes.running and episodes.number > len(spans):
             spans.append([now_ns, now_ns])
         elif not episodes.running and spans:

@@ -7,12 +7,12 @@ from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from ibrobot_data import recording_worker as recording
 
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import RecorderError
 from ibrobot_core.interfaces import EpisodeEnd, EpisodeStart
 from ibrobot_core.messages import String
-from ibrobot_core.recording import worker as recording
 
 if TYPE_CHECKING:
     from ibrobot_core.launch.runtime import Runtime
@@ -57,7 +57,7 @@ def note(runs: Runs, monkeypatch: pytest.MonkeyPatch, topics: str = "contract") 
     """A run whose next episode is noted."""
     runtime = runs.start(f"recording={{type: lines, topics: {topics}}}", mode="teleop")
     ticks(runtime, 2)
-    runtime.plan.episodes.end("unknown")
+    runtime.session.episodes.end("unknown")
     ticks(runtime, 1)
     return runtime, Notes(runs.parts.MADE["recording"], monkeypatch)
 
@@ -67,7 +67,7 @@ def test_a_recorder_that_fails_costs_its_episode_and_the_robot_goes_on(
     runs: Runs, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, stuck: bool
 ):
     runtime, notes = note(runs, monkeypatch)
-    runtime.plan.episodes.begin()
+    runtime.session.episodes.begin()
     ticks(runtime, 3)
     notes.full, notes.stuck = True, stuck
     kept = len(notes.written)
@@ -78,75 +78,75 @@ def test_a_recorder_that_fails_costs_its_episode_and_the_robot_goes_on(
     assert runtime.session.outcome.faults == [fault]
     assert ("fault", fault) in runs.parts.EVENTS
     assert caplog.text.count(f"{fault}; the robot goes on") == 1
-    assert str(runtime.episode_service.failure) == "its disk has 1 MiB left"
+    assert str(runtime.session.episodes.failure) == "its disk has 1 MiB left"
     notes.full = notes.stuck = False
-    runtime.plan.episodes.end("success")
-    runtime.plan.episodes.begin()
+    runtime.session.episodes.end("success")
+    runtime.session.episodes.begin()
     ticks(runtime, 3)
     assert len(notes.begun) == 2
     assert len(notes.written) > kept
-    assert runtime.episode_service.failure is None
+    assert runtime.session.episodes.failure is None
 
 
 def test_an_episode_that_is_not_written_to_its_end_does_not_count(runs: Runs, monkeypatch: pytest.MonkeyPatch):
     runtime, notes = note(runs, monkeypatch)
-    saved = runtime.plan.episodes.saved
+    saved = runtime.session.episodes.saved
 
     def full(end: EpisodeEnd) -> None:
         raise RecorderError("its disk is full")
 
     monkeypatch.setattr(runs.parts.MADE["recording"], "end", full)
-    runtime.plan.episodes.begin()
+    runtime.session.episodes.begin()
     ticks(runtime, 3)
-    runtime.plan.episodes.end("success")
-    assert runtime.plan.episodes.saved == saved + 1, "nothing is known of it yet"
+    runtime.session.episodes.end("success")
+    assert runtime.session.episodes.saved == saved + 1, "nothing is known of it yet"
     ticks(runtime, 1)
-    assert runtime.plan.episodes.saved == saved
+    assert runtime.session.episodes.saved == saved
     monkeypatch.setattr(runs.parts.MADE["recording"], "end", notes.end)
-    runtime.plan.episodes.begin()
+    runtime.session.episodes.begin()
     ticks(runtime, 3)
-    runtime.plan.episodes.end("success")
+    runtime.session.episodes.end("success")
     ticks(runtime, 1)
-    assert runtime.plan.episodes.saved == saved + 1
+    assert runtime.session.episodes.saved == saved + 1
 
 
 def test_a_recorder_that_does_not_begin_costs_its_episode_and_the_robot_goes_on(
     runs: Runs, monkeypatch: pytest.MonkeyPatch
 ):
     runtime, notes = note(runs, monkeypatch)
-    saved = runtime.plan.episodes.saved
+    saved = runtime.session.episodes.saved
     notes.refuses = True
-    runtime.plan.episodes.begin()
+    runtime.session.episodes.begin()
     ticks(runtime, 5)
-    runtime.plan.episodes.end("success")
+    runtime.session.episodes.end("success")
     ticks(runtime, 1)
     assert (notes.written, notes.ended) == ([], [])
     assert runtime.session.outcome.faults == ["recording ended: its disk has 1 MiB left"]
-    assert runtime.plan.episodes.saved == saved, "nothing of it was kept"
+    assert runtime.session.episodes.saved == saved, "nothing of it was kept"
     notes.refuses = False
-    runtime.plan.episodes.begin()
+    runtime.session.episodes.begin()
     ticks(runtime, 3)
-    runtime.plan.episodes.end("success")
+    runtime.session.episodes.end("success")
     assert notes.written
-    assert runtime.plan.episodes.saved == saved + 1
+    assert runtime.session.episodes.saved == saved + 1
 
 
 @pytest.mark.parametrize("call", ["begin", "write", "end"])
 def test_whatever_a_recorder_raises_is_a_fault_of_the_episode(runs: Runs, monkeypatch: pytest.MonkeyPatch, call: str):
     runtime, _ = note(runs, monkeypatch)
-    saved = runtime.plan.episodes.saved
+    saved = runtime.session.episodes.saved
 
     def broken(*_: object) -> None:
         raise ValueError("not so")
 
     monkeypatch.setattr(runs.parts.MADE["recording"], call, broken)
-    runtime.plan.episodes.begin()
+    runtime.session.episodes.begin()
     ticks(runtime, 3)
-    runtime.plan.episodes.end("success")
+    runtime.session.episodes.end("success")
     runtime.stop()  # also where the end of the run comes first
     [fault] = runtime.session.outcome.faults
     assert fault.startswith("recording ended: the recorder 'lines' failed: ValueError: not so (a bug at ")
-    assert runtime.plan.episodes.saved == saved
+    assert runtime.session.episodes.saved == saved
 
 
 @pytest.mark.parametrize(("topics", "kept"), [("all", True), ("[/late]", True), ("contract", False)])
@@ -154,7 +154,7 @@ def test_a_topic_that_appears_during_the_episode_is_recorded(
     runs: Runs, monkeypatch: pytest.MonkeyPatch, topics: str, kept: bool
 ):
     runtime, notes = note(runs, monkeypatch, topics)
-    runtime.plan.episodes.begin()
+    runtime.session.episodes.begin()
     ticks(runtime, 3)
     runtime.session.bus.publish("/late", String("here"))
     ticks(runtime, 1)
@@ -169,7 +169,7 @@ def test_an_episode_begins_with_what_is_latched(runs: Runs, monkeypatch: pytest.
     runtime.session.bus.publish("/description", String("old"), latched=True)
     runtime.session.bus.publish("/description", String("arm"), latched=True)
     ticks(runtime, 3)
-    runtime.plan.episodes.begin()
+    runtime.session.episodes.begin()
     ticks(runtime, 3)
     stamp_ns = notes.begun[0].stamp_ns
     assert [item for item in notes.written if item[0] == "/description"] == [("/description", String("arm"), stamp_ns)]
@@ -178,7 +178,7 @@ def test_an_episode_begins_with_what_is_latched(runs: Runs, monkeypatch: pytest.
 
 def test_an_episode_knows_its_contract(runs: Runs, monkeypatch: pytest.MonkeyPatch):
     runtime, notes = note(runs, monkeypatch)
-    runtime.plan.episodes.begin()
+    runtime.session.episodes.begin()
     ticks(runtime, 2)
     contract = Contract.from_config(runtime.session.config)
     kept = notes.begun[0].metadata
@@ -194,13 +194,13 @@ def test_messages_that_were_lost_on_the_way_are_reported_by_topic(runs: Runs, mo
     for _ in range(80):
         bus.publish("/many", String("before"))
     ticks(runtime, 1)
-    runtime.plan.episodes.begin()
+    runtime.session.episodes.begin()
     ticks(runtime, 1)
     for _ in range(10):
         bus.publish("/few", String("y"))
     for _ in range(45):
         bus.publish("/many", String("x"))
-    runtime.plan.episodes.end("success")
+    runtime.session.episodes.end("success")
     ticks(runtime, 1)
     written = Counter(topic for topic, _, _ in notes.written)
     lost = notes.ended[-1].dropped
@@ -215,9 +215,9 @@ def test_a_listed_topic_that_nobody_publishes_is_reported_once(
 ):
     runtime, _ = note(runs, monkeypatch, "[/joint_states, /joint_stats]")
     for _ in range(2):
-        runtime.plan.episodes.begin()
+        runtime.session.episodes.begin()
         ticks(runtime, 3)
-        runtime.plan.episodes.end("success")
+        runtime.session.episodes.end("success")
         ticks(runtime, 1)
     warning = "recording.topics: no message on /joint_stats so far, so none was recorded; available: "
     assert caplog.text.count(warning) == 1
@@ -229,19 +229,19 @@ def test_recording_says_which_policy_acts_with_which_weights(runs: Runs, monkeyp
     monkeypatch.setattr(runs.parts.Net, "weights", lambda self: "a1")
     runtime = runs.start("recording={type: lines}")
     ticks(runtime, 2)
-    runtime.plan.episodes.end("unknown")
+    runtime.session.episodes.end("unknown")
     ticks(runtime, 1)
     notes = Notes(runs.parts.MADE["recording"], monkeypatch)
-    runtime.plan.episodes.begin()
+    runtime.session.episodes.begin()
     ticks(runtime, 2)
     policy = json.loads(notes.begun[0].metadata["policy"])
     fingerprint = runs.parts.MADE["net"].fingerprint()
     assert policy == {
         "model": "net", "type": "net", "fingerprint": fingerprint, "weights": "a1", "execution_mode": "monolithic"
     }  # fmt: skip
-    runtime.plan.episodes.end("unknown")
+    runtime.session.episodes.end("unknown")
     runtime.switch_mode("teleop")
     ticks(runtime, 2)
-    runtime.plan.episodes.begin()
+    runtime.session.episodes.begin()
     ticks(runtime, 2)
     assert "policy" not in notes.begun[1].metadata

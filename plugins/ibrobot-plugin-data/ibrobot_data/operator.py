@@ -8,7 +8,6 @@ from typing import override
 
 from ibrobot_core.api import (
     DiskFull,
-    EpisodeService,
     IbrobotError,
     NotSupported,
     OperatorEvent,
@@ -16,6 +15,7 @@ from ibrobot_core.api import (
     Session,
     seconds,
 )
+from ibrobot_data.episode_service import EpisodeService
 from ibrobot_data.words import plural
 
 _MIB = 1 << 20

@@ -19,6 +19,7 @@ from ibrobot_core.api import (
     run_overrides,
     run_robot,
 )
+from ibrobot_data.episode_service import EpisodeService
 from ibrobot_data.operator import Operator
 
 
@@ -50,9 +51,10 @@ def record(config: str | None, dataset: str | None, root: Path | None, **options
     live = sys.stdin.isatty() and sys.stdout.isatty() and not options["headless"]
 
     def operator(runtime: Runtime) -> Operator:
-        assert runtime.episode_service is not None
+        service = runtime.session.episodes
+        assert isinstance(service, EpisodeService)
         return Operator(
-            runtime.session, runtime.episode_service, options["episodes"], reset_time, prompt,
+            runtime.session, service, options["episodes"], reset_time, prompt,
             auto=auto, continuous=continuous, keys=live,
         )  # fmt: skip
 

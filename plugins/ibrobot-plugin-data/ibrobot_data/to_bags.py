@@ -18,7 +18,6 @@ from ibrobot_core.api import (
     Context,
     Contract,
     ContractError,
-    EpisodeDataset,
     EpisodeEnd,
     EpisodeReader,
     EpisodeStart,
@@ -28,9 +27,10 @@ from ibrobot_core.api import (
     RecorderError,
     Robot,
     SteppedClock,
-    episode_folder,
     installed_plugins,
 )
+from ibrobot_data.episode_dataset import EpisodeDataset
+from ibrobot_data.episode_start import episode_folder
 from ibrobot_data.request import EpisodeReport, Report
 
 _STAGING = ".staging"

@@ -9,12 +9,12 @@ from typing import Any
 
 import attrs
 import pytest
+from ibrobot_data.episode_service import EpisodeService
 from ibrobot_data.operator import Operator
 from ibrobot_testing.fakes import FakeRecorder
 from ibrobot_testing.site import made_up_site
 
 from ibrobot_core.api import (
-    EpisodeService,
     LaunchRequest,
     NotSupported,
     RecorderError,
@@ -68,8 +68,9 @@ class Recording:
 
     @property
     def service(self) -> EpisodeService:
-        assert self.runtime.episode_service is not None
-        return self.runtime.episode_service
+        service = self.runtime.session.episodes
+        assert isinstance(service, EpisodeService)
+        return service
 
     @property
     def finished(self) -> bool:
@@ -112,9 +113,8 @@ def record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Record]:
         config = load_config("mini.yaml", mode=mode, sim=True, registry=registry)
         runtime = Runtime(Session(config, registry, LaunchRequest(lockstep=True, by_operator=True)))
         made.append(runtime)
-        assert runtime.episode_service is not None
         flags = {"count": None, "reset_time_s": 0.0, "prompt": None, "auto": False, "keys": True, **asked}
-        operator = Operator(runtime.session, runtime.episode_service, **flags)
+        operator = Operator(runtime.session, runtime.session.episodes, **flags)
         runtime.start()
         for _ in range(5):
             assert not runtime.step()

@@ -5,17 +5,18 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 from uuid import NAMESPACE_OID, uuid4, uuid5
 
 import ibrobot_core
-from ibrobot_core.config import RobotConfig
-from ibrobot_core.config.schema import RecordingConfig
-from ibrobot_core.contract.joint_units import calibrations
-from ibrobot_core.contract.specs import Contract
-from ibrobot_core.errors import RecorderError
-from ibrobot_core.interfaces import EpisodeStart
-from ibrobot_core.recording.dataset import EpisodeDataset
+from ibrobot_core.api import (
+    Contract,
+    EpisodeStart,
+    RecorderError,
+    RecordingConfig,
+    RobotConfig,
+    calibrations,
+)
+from ibrobot_data.episode_dataset import EpisodeDataset
 
 _PREFIX = "episode_"
 
@@ -72,22 +73,6 @@ def episode_start(
         kept = {topic: type_ for topic, type_ in topics.items() if is_kept(topic, recording, contract)}
     directory = episode_folder(root.parent, _next_number(root))
     return EpisodeStart(directory, stamp_ns, kept, metadata, any_topic=recording.topics != "contract")
-
-
-def robot_metadata(contract: Contract, document: Mapping[str, Any], calibrations: Mapping[str, Any]) -> dict[str, str]:
-    """Metadata of an episode, with the keys used in recordings.
-
-    Args:
-        contract: the contract of the episode.
-        document: the robot YAML as plain values; empty if unknown.
-        calibrations: hardware -> joint -> fields of `JointCalibration`; empty if unknown.
-    """
-    robot = document.get("robot") or {}
-    found = {"contract": json.dumps(contract.canonical()), "fingerprint": contract.fingerprint()}
-    if document:
-        found |= {"config": json.dumps(document)}
-        found |= {"robot": str(robot.get("name", "")), "robot_type": str(robot.get("robot_type", ""))}
-    return found | ({"calibration": json.dumps(calibrations)} if calibrations else {})
 
 
 def is_kept(topic: str, recording: RecordingConfig, contract: Contract) -> bool:

@@ -8,8 +8,7 @@ from typing import Any
 
 import yaml
 
-from ibrobot_core.contract.specs import Contract
-from ibrobot_core.errors import RecorderError
+from ibrobot_core.api import Contract, RecorderError
 
 
 class EpisodeDataset:

@@ -7,16 +7,21 @@ import threading
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, override
 
-from ibrobot_core.contract.specs import Contract
-from ibrobot_core.errors import DiskFull, NotSupported, RecorderError, wrong_input
-from ibrobot_core.recording.dataset import EpisodeDataset
-from ibrobot_core.recording.episode import is_kept
-from ibrobot_core.recording.episodes import Episodes
-from ibrobot_core.recording.worker import RecordingWorker
-from ibrobot_core.units import seconds
+from ibrobot_core.api import (
+    Contract,
+    DiskFull,
+    Episodes,
+    NotSupported,
+    RecorderError,
+    Session,
+    seconds,
+    wrong_input,
+)
+from ibrobot_data.episode_dataset import EpisodeDataset
+from ibrobot_data.episode_start import is_kept
 
 if TYPE_CHECKING:
-    from ibrobot_core.launch.session import Session
+    from ibrobot_data.recording_worker import RecordingWorker
 
 START = "/record_episode/start"
 """Begins an episode. Request: a prompt, or None for the last prompt."""
@@ -36,20 +41,19 @@ class EpisodeService(Episodes):
     Args:
         session: the run.
         recording: the worker that records them.
-        by_mode: whether the mode begins and ends them, so that an operator can only watch.
 
     Attributes:
-        by_mode: whether the mode begins and ends episodes.
+        by_mode: whether the mode begins and ends episodes, so that an operator can only watch.
 
     Raises:
         RecorderError: if the dataset has another contract or cannot be written, or if `recording.topics` leaves out a
             topic of the contract in a run where an operator records.
     """
 
-    def __init__(self, session: Session, recording: RecordingWorker, *, by_mode: bool) -> None:
+    def __init__(self, session: Session, recording: RecordingWorker) -> None:
         super().__init__(session)
         self._recording = recording
-        self.by_mode = by_mode
+        self.by_mode = session.simulates_episodes or not session.request.by_operator
         self._lock = threading.Lock()
         config = session.config.recording
         assert config is not None

@@ -6,22 +6,27 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
-from typing import TYPE_CHECKING, override
+from typing import override
 
 import attrs
 
-from ibrobot_core.bus import Received
-from ibrobot_core.component import Worker, error_line
-from ibrobot_core.config.schema import RecordingConfig
-from ibrobot_core.contract.specs import Contract
-from ibrobot_core.errors import RecorderError
-from ibrobot_core.interfaces import EpisodeEnd, EpisodeStart, Recorder
-from ibrobot_core.messages import Message
-from ibrobot_core.recording.episode import episode_start, is_kept
-from ibrobot_core.units import NS_PER_S, seconds
-
-if TYPE_CHECKING:
-    from ibrobot_core.launch.session import Session
+from ibrobot_core.api import (
+    NS_PER_S,
+    Contract,
+    EpisodeEnd,
+    EpisodeStart,
+    Message,
+    Received,
+    Recorder,
+    RecorderError,
+    RecordingConfig,
+    Session,
+    SessionWorker,
+    error_line,
+    seconds,
+)
+from ibrobot_data.episode_service import EpisodeService
+from ibrobot_data.episode_start import episode_start, is_kept
 
 _DEPTH = 4096
 """Length of the queue to the recorder, in messages."""
@@ -31,20 +36,19 @@ _SILENT_NS = NS_PER_S
 """A topic without a message for this time is silent [ns]."""
 
 
-class RecordingWorker(Worker):
-    """Writes the bus's messages to a recorder during an episode.
+class RecordingWorker(SessionWorker):
+    """Writes the bus's messages to a recorder during an episode; its `service` begins and ends the run's episodes.
 
     If the recorder fails, e.g. on a full disk, the recording of the episode ends with a fault. The robot continues, and
     the next episode is recorded again.
     """
 
     def __init__(self, session: Session, config: RecordingConfig) -> None:
-        super().__init__(
-            "recording", f"{config.type} into {config.root}", on_failure=session.fail, lockstep=session.request.lockstep
-        )
-        self._session = session
+        super().__init__(session, "recording", f"{config.type} into {config.root}")
         self._config = config
         self._contract = Contract.from_config(session.config)
+        session.refuse_absent("the recording", self._keeps)
+        self.service = session.episodes = EpisodeService(session, self)
         self._pending: deque[tuple[int, Callable[[], None]]] = deque()
         """Pending begins and ends of episodes: stamp [ns] and action."""
         self._pending_lock = threading.Lock()
@@ -68,11 +72,12 @@ class RecordingWorker(Worker):
 
     @override
     def setup(self) -> None:
-        session = self._session
-        descriptor = session.registry.find("recorder", self._config.type)
-        self._recorder: Recorder = descriptor.make(self._config.options, session.context("recording"))
+        session = self.session
+        self._recorder: Recorder = session.make("recorder", self._config, "recording")
         self._incoming = session.bus.subscribe(None, _DEPTH)
         self.on_end.callback(self._incoming.close)
+        self.service.serve()
+        self.on_end.callback(self.service.unserve)
         self.on_end.callback(self._did, self._recorder.close)
         self.on_end.callback(self.work, 0.0)
 
@@ -82,7 +87,7 @@ class RecordingWorker(Worker):
         Raises:
             RecorderError: if the episode cannot be recorded in its dataset.
         """
-        session = self._session
+        session = self.session
         self.failure = None
         self._sizes = {}
         topics = {topic: type_ for topic, (type_, _) in session.bus.topics().items()}
@@ -102,7 +107,7 @@ class RecordingWorker(Worker):
         with self._pending_lock:
             provisional = outcome != "discarded" and self.failure is None
             self._provisional += provisional
-            end = EpisodeEnd(self._session.bus.snapshot_ns(), outcome)
+            end = EpisodeEnd(self.session.bus.snapshot_ns(), outcome)
             self._pending.append((end.stamp_ns, partial(self._end_episode, end, provisional)))
 
     @property
@@ -152,7 +157,7 @@ class RecordingWorker(Worker):
 
     def silent(self) -> dict[str, float | None]:
         """Silent topics of the contract: topic -> time since the last message [s], None if there was none."""
-        now_ns = self._session.clock.now_ns()
+        now_ns = self.session.clock.now_ns()
         found: dict[str, float | None] = {}
         for topic in self._contract.topics:
             stamps = self._seen.get(topic)
@@ -211,14 +216,14 @@ class RecordingWorker(Worker):
         except RecorderError as error:
             self._fail(error)
         except Exception as error:  # a plugin's bug must neither end the run nor go unreported
-            self._session.log.debug("the recorder failed", exc_info=error)
+            self.session.log.debug("the recorder failed", exc_info=error)
             self._fail(RecorderError(f"the recorder {self._config.type!r} failed: {error_line(error)}"))
         else:
             return True
         return False
 
     def _fail(self, error: RecorderError) -> None:
-        session = self._session
+        session = self.session
         if self.failure is not None:
             return  # report the first failure, not its consequences
         self.failure = error
@@ -233,8 +238,8 @@ class RecordingWorker(Worker):
         absent = [topic for topic in listed if topic not in self._seen]
         if absent and not self._reported_absent:
             self._reported_absent = True
-            available = ", ".join(self._session.bus.topics())
-            self._session.log.warning(
+            available = ", ".join(self.session.bus.topics())
+            self.session.log.warning(
                 "recording.topics: no message on %s so far, so none was recorded; available: %s",
                 ", ".join(absent),
                 available,

@@ -1,1 +1,0 @@
-"""Recording: datasets, episodes, their metadata, and the worker that writes them."""
