@@ -93,7 +93,7 @@ def lacking(session: nox.Session) -> list[dict[str, Any]]:
 
 
 def system_libraries(session: nox.Session) -> None:
-    """See to the system libraries that installed types lack: root installs them, anybody else is told how.
+    """Check for the system libraries that installed types lack: root installs them, anybody else gets the command.
 
     Tests that need what stays missing are skipped.
     """

@@ -154,7 +154,7 @@ def started(*arguments: str) -> Iterator[int]:
         process.stdout.close()
 
 
-def told(certificates: Path | None) -> tuple[str, ...]:
+def security_options(certificates: Path | None) -> tuple[str, ...]:
     """The arguments that tell a process of its certificates."""
     return ("--certificates", str(certificates)) if certificates else ()
 
@@ -212,7 +212,7 @@ def floor(pictures: np.ndarray, count: int, pause_s: float, certificates: Path |
     frame = bytes(encode(WireMessage(WireKind.REQUEST, 1, tensors)))
     buffer = memoryview(bytearray(1 << 20))
     port = free_port()
-    with started("--echo", str(port), *told(certificates)) as pid:
+    with started("--echo", str(port), *security_options(certificates)) as pid:
         plain = socket.create_connection(("127.0.0.1", port))
         plain.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         with secured(plain, certificates, "robot") as connection:
@@ -274,7 +274,7 @@ def over_zenoh(
 ) -> dict[str, Any]:
     """Execution mode distributed."""
     endpoint = f"{'tls/localhost' if certificates else 'tcp/127.0.0.1'}:{free_port()}"
-    with started("--serve", endpoint, *told(certificates)) as pid:
+    with started("--serve", endpoint, *security_options(certificates)) as pid:
         network = transport(connect=(endpoint,), shared_memory=shared, **tls(certificates, "robot"))
         try:
             null = installed_plugins().find("policy", "null").make(None, host_context())

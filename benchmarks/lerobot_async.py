@@ -163,8 +163,8 @@ def main() -> None:
         serve(given.serve, given.payload)
         return
     for number, payload in enumerate(PAYLOADS):
-        told = measure(given.port + number, payload, given.count, given.pause)
-        print(json.dumps({"payload": payload, **told}), flush=True)
+        measured = measure(given.port + number, payload, given.count, given.pause)
+        print(json.dumps({"payload": payload, **measured}), flush=True)
 
 
 if __name__ == "__main__":

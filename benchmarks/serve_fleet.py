@@ -259,19 +259,19 @@ def fleet(
         say(server, "stop")
         time.sleep(hiccup_s)
         say(server, "go")
-    told = [robot for process in asking for robot in json.loads(process.communicate()[0].splitlines()[-1])]
+    answers = [robot for process in asking for robot in json.loads(process.communicate()[0].splitlines()[-1])]
     busy = json.loads(server.communicate()[0].splitlines()[-1])["busy"]
     parts = {"before": (begun_s + SETTLED_S, stop_s), "after": (stop_s + hiccup_s + SETTLED_S, end_s)}
-    return {name: _measured(told, busy, *part) for name, part in parts.items()}
+    return {name: _measured(answers, busy, *part) for name, part in parts.items()}
 
 
-def _measured(told: list[Any], busy: list[tuple[float, float]], begin_s: float, end_s: float) -> dict[str, Any]:
+def _measured(answers: list[Any], busy: list[tuple[float, float]], begin_s: float, end_s: float) -> dict[str, Any]:
     worked = sum(max(0.0, min(done, end_s) - max(begun, begin_s)) for begun, done in busy)
-    latencies = [latency for robot in told for at, latency in robot["chunks"] if begin_s <= at < end_s]
+    latencies = [latency for robot in answers for at, latency in robot["chunks"] if begin_s <= at < end_s]
     p50, p99 = np.percentile(latencies, [50, 99])
     return {
         "load": round(worked / (end_s - begin_s), 3), "p50_ms": round(float(p50), 1), "p99_ms": round(float(p99), 1),
-        "holds": sum(begin_s <= at < end_s for robot in told for at in robot["holds"]), "chunks": len(latencies),
+        "holds": sum(begin_s <= at < end_s for robot in answers for at in robot["holds"]), "chunks": len(latencies),
     }  # fmt: skip
 
 

@@ -130,7 +130,7 @@ class Server:
 
 
 class Motion:
-    """What the arm was told, by time."""
+    """The arm's setpoints, by time."""
 
     def __init__(self, session: Session) -> None:
         self._commands = session.bus.subscribe("/arm/commands", 100_000)
@@ -229,18 +229,18 @@ def run(kills: int, slack_s: float, folder: Path) -> int:
         runtime.stop()
         server.kill()
     answered = made.answered
-    told = {
+    summary = {
         "kills": kills, "known_worst_ms": round(max(known) * 1e3, 1),
         "held_worst_s": round(max(held), 3), "held_limit_s": PLAN_S + STALE_S + SETTLE_S,
         "resumed_worst_s": round(max(resumed), 3), "requests": stats.requests, "chunks": stats.chunks,
         "failures": stats.failures, "timeouts": stats.timeouts, "answered_twice": len(answered) - len(set(answered)),
         "first": grown[:1], "last": grown[-1:],
     }  # fmt: skip
-    print(json.dumps(told))
+    print(json.dumps(summary))
     first, last = (grown[0], grown[-1]) if grown else (resources(), resources())
     good = (
         max(held) <= PLAN_S + STALE_S + SETTLE_S + slack_s and max(resumed) <= RESUMED_S + slack_s
-        and max(known) <= KNOWN_S + slack_s and told["answered_twice"] == 0
+        and max(known) <= KNOWN_S + slack_s and summary["answered_twice"] == 0
         and 0 <= stats.requests - stats.chunks - stats.failures - stats.timeouts <= 1
         and last["threads"] <= first["threads"] and last["files"] <= first["files"] + 2
         and last["memory_mib"] <= first["memory_mib"] + 20

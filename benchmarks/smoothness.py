@@ -141,7 +141,7 @@ class Arm:
                 self.holds[why] += self.dispatcher.stats.holds - holds
                 next_ns += self.contract.step_ns
             self.clock.advance(period_ns)
-        self.told = np.array(self.commands)
+        self.commanded = np.array(self.commands)
         self.control.stop()
 
     def _publish(self, state: ControlState) -> None:
@@ -161,9 +161,9 @@ def measure(
     arm.run(duration_s)
     stats, robot = arm.dispatcher.stats, config.robot
     period_s = 1 / config.control.rate_hz
-    speed = np.abs(np.diff(arm.told, axis=0)) / period_s / robot.max_velocity
-    acceleration = np.abs(np.diff(arm.told, 2, axis=0)) / period_s**2 / robot.max_acceleration
-    moving = arm.told[round(AWAY_S / period_s) :]
+    speed = np.abs(np.diff(arm.commanded, axis=0)) / period_s / robot.max_velocity
+    acceleration = np.abs(np.diff(arm.commanded, 2, axis=0)) / period_s**2 / robot.max_acceleration
+    moving = arm.commanded[round(AWAY_S / period_s) :]
     jerk = np.diff(moving, 3, axis=0) / period_s**3
     safety = arm.control.report["counters"]["safety"]
     return {

@@ -90,11 +90,11 @@ def main() -> int:
             times_s[name] = round(perf_counter() - begin)
     begin = perf_counter()
     model = f"models.act.path={trained}/checkpoints/last/pretrained_model"
-    told = run(
+    printed = run(
         "ibrobot", "launch", CONFIG, "--sim", "--lockstep", "--headless", "--mode", "learned", "--episodes",
         str(arguments.trials), "--json", "--set", model,
     )  # fmt: skip
-    summary = json.loads(told)
+    summary = json.loads(printed)
     times_s["run"] = round(perf_counter() - begin)
     rate = summary["successes"] / summary["episodes"]
     print(json.dumps({"successes": summary["successes"], "trials": summary["episodes"], "rate": rate, "s": times_s}))

@@ -86,16 +86,16 @@ def test_a_log_line_cannot_look_like_another(hostile: str):
 def test_echo(capsys: pytest.CaptureFixture[str]):
     echo("a\x1b[2Jb\tc")
     echo("rtsp://me:pw@cam/1", err=True)
-    told = capsys.readouterr()
-    assert told.out == "a\\u001b[2Jb\tc\n"
-    assert told.err == "rtsp://***@cam/1\n"
+    printed = capsys.readouterr()
+    assert printed.out == "a\\u001b[2Jb\tc\n"
+    assert printed.err == "rtsp://***@cam/1\n"
 
 
 def test_a_remembered_secret_is_hidden_in_every_form(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(outside, "_secrets", set())
     outside.remember_secret("p@ss'word")
-    for told in ("p@ss'word", "p%40ss%27word", repr("p@ss'word")):
-        assert "word" not in printable(f"it is {told}!"), told
+    for printed in ("p@ss'word", "p%40ss%27word", repr("p@ss'word")):
+        assert "word" not in printable(f"it is {printed}!"), printed
     outside.remember_secret("no")
     assert printable("nobody") == "nobody"
 

@@ -1,4 +1,4 @@
-"""Discovery: good plugins work beside broken ones, and every failure is told where it matters."""
+"""Discovery: good plugins work beside broken ones, and every failure is reported where it matters."""
 
 from __future__ import annotations
 
@@ -82,10 +82,10 @@ def test_a_missing_type_names_the_nearest_and_what_is_broken(registry: Registry)
 def test_a_known_type_of_a_broken_plugin_names_that_plugin(site: Site) -> None:
     site.add("ibrobot-plugin-keyboard", "fails_at_import.py")
 
-    with pytest.raises(PluginError) as told:
+    with pytest.raises(PluginError) as result:
         discover(site.entry_points()).find("teleop", "keyboard")
 
-    assert str(told.value) == (
+    assert str(result.value) == (
         "teleop type 'keyboard' is not available: plugin 'ibrobot_plugin_keyboard' (ibrobot-plugin-keyboard) "
         "failed to import: ImportError: no library"
     )
@@ -158,11 +158,11 @@ def test_config_check_names_the_broken_plugin(registry: Registry, site: Site) ->
     config = site.folder / "robot.yaml"
     config.write_text("hardware: {type: libarm}\n")
 
-    told = _ibrobot("config", "check", str(config))
+    result = _ibrobot("config", "check", str(config))
 
-    assert told.returncode == 2
-    assert f"{config}:1: hardware.type: unknown hardware type 'libarm'" in told.stderr
-    assert "plugin 'fake_import' (fake-import) failed to import: ImportError: no library" in told.stderr
+    assert result.returncode == 2
+    assert f"{config}:1: hardware.type: unknown hardware type 'libarm'" in result.stderr
+    assert "plugin 'fake_import' (fake-import) failed to import: ImportError: no library" in result.stderr
 
 
 def test_the_listing_imports_nothing_heavy() -> None:

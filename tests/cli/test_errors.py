@@ -30,7 +30,7 @@ def bugs(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "told"),
+    ("arguments", "code", "message"),
     [
         (("nothing",), 2, "No such command 'nothing'; see ibrobot --help"),
         (("config", "check", "a", "b"), 2, "Got unexpected extra argument (b); see ibrobot config check --help"),
@@ -43,30 +43,32 @@ def bugs(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         (("odd", "ask"), 130, "stopped"),
     ],
 )  # fmt: skip
-def test_errors_have_one_form(ibrobot: Ibrobot, bugs: None, arguments: tuple[str, ...], code: int, told: str) -> None:
+def test_errors_have_one_form(
+    ibrobot: Ibrobot, bugs: None, arguments: tuple[str, ...], code: int, message: str
+) -> None:
     ran = ibrobot(*arguments)
 
-    assert (ran.code, ran.out, ran.err) == (code, "", f"error: {told}\n")
+    assert (ran.code, ran.out, ran.err) == (code, "", f"error: {message}\n")
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "message"),
     [
         (("odd", "bug"), "ZeroDivisionError: integer division or modulo by zero"),
         (("broken",), "RuntimeError: cannot be loaded"),
     ],
 )
 def test_bug_is_one_line_that_names_the_file_with_the_traceback(
-    ibrobot: Ibrobot, bugs: None, arguments: tuple[str, ...], told: str
+    ibrobot: Ibrobot, bugs: None, arguments: tuple[str, ...], message: str
 ) -> None:
     ran = ibrobot(*arguments)
 
     assert ran.code == 1
     [line] = ran.err.splitlines()
-    assert line.startswith(f"error: {told} (a bug at site/fake_bugs.py:")
+    assert line.startswith(f"error: {message} (a bug at site/fake_bugs.py:")
     log = Path(line.rpartition(" is in ")[2].rstrip(")")).read_text()
     assert log.startswith("Traceback")
-    assert told in log
+    assert message in log
 
 
 def test_debug_prints_the_traceback(ibrobot: Ibrobot, bugs: None, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -69,8 +69,8 @@ def test_command_of_a_missing_plugin_names_the_package(
     monkeypatch.setattr("ibrobot_core.plugins.installed_plugins", Registry)
     ran = ibrobot(command, "so101")
 
-    told = f"error: ibrobot {command} needs a plugin that is not installed: pip install ibrobot-plugin-data\n"
-    assert (ran.code, ran.out, ran.err) == (2, "", told)
+    message = f"error: ibrobot {command} needs a plugin that is not installed: pip install ibrobot-plugin-data\n"
+    assert (ran.code, ran.out, ran.err) == (2, "", message)
 
 
 @pytest.mark.parametrize("command", ["config", "plugins", "doctor"])

@@ -277,7 +277,7 @@ def test_deep_check_wants_weights_only_where_they_are_loaded(
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "message"),
     [
         (("--sim", "--window", "--headless"), "--window and --headless exclude each other"),
         (("--lockstep",), "--lockstep is for simulation: add --sim"),
@@ -285,10 +285,10 @@ def test_deep_check_wants_weights_only_where_they_are_loaded(
         (("--sim", "--duration", "-1"), "'--duration'"),
     ],
 )
-def test_options_that_make_no_sense_are_refused(launch: Callable[..., Ran], arguments: tuple[str, ...], told: str):
+def test_options_that_make_no_sense_are_refused(launch: Callable[..., Ran], arguments: tuple[str, ...], message: str):
     ran = launch(*arguments)
     assert ran.code == 2
-    assert told in ran.err
+    assert message in ran.err
     assert ran.out == ""
 
 

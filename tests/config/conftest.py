@@ -132,13 +132,13 @@ def load_text(registry: Registry, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 @pytest.fixture
 def faults_of_edit(load_text: Callable[..., RobotConfig], tmp_path: Path) -> Callable[..., str]:
-    """All that is told of the base config with `old` replaced by `new`; its folder reads FOLDER."""
+    """The whole error for the base config with `old` replaced by `new`; its folder reads FOLDER."""
 
     def faults(old: str, new: str, **options: Any) -> str:
         assert BASE.count(old) == 1
-        with pytest.raises(ConfigError) as told:
+        with pytest.raises(ConfigError) as message:
             load_text(BASE.replace(old, new), **options)
-        return str(told.value).replace(str(tmp_path), "FOLDER")
+        return str(message.value).replace(str(tmp_path), "FOLDER")
 
     return faults
 

@@ -71,8 +71,8 @@ def test_a_simulation_may_begin_in_a_mode_of_its_own(
 
 
 def test_an_unknown_mode_of_the_simulation_is_reported(faults_of_edit: Faults) -> None:
-    told = faults_of_edit("{type: world}", "{type: world, default_control_mode: polcy}", sim=True)
-    assert "simulation.default_control_mode: unknown control mode 'polcy', did you mean 'policy'?" in told
+    message = faults_of_edit("{type: world}", "{type: world, default_control_mode: polcy}", sim=True)
+    assert "simulation.default_control_mode: unknown control mode 'polcy', did you mean 'policy'?" in message
 
 
 def test_simulation_needs_no_plugin_of_the_real_robot(load_text: Load, base: str, registry: Registry) -> None:
@@ -97,21 +97,21 @@ def test_a_file_without_hardware_is_simulated(load_text: Load, base: str) -> Non
 
 
 def test_sim_without_simulation_is_refused(faults_of_edit: Faults) -> None:
-    told = faults_of_edit("simulation: {type: world}\n", "", sim=True)
+    message = faults_of_edit("simulation: {type: world}\n", "", sim=True)
 
-    assert told == "robot.yaml: --sim needs a simulation section, e.g. simulation: {type: mujoco}"
+    assert message == "robot.yaml: --sim needs a simulation section, e.g. simulation: {type: mujoco}"
 
 
 def test_faults_of_real_sensors_are_reported_in_simulation_too(faults_of_edit: Faults) -> None:
-    told = faults_of_edit("type: webcam, fps: 30", "type: webcam, fsp: 30", sim=True)
+    message = faults_of_edit("type: webcam, fps: 30", "type: webcam, fsp: 30", sim=True)
 
-    assert told == "robot.yaml:15: peripherals.top.fsp: unknown key, did you mean 'fps'?"
+    assert message == "robot.yaml:15: peripherals.top.fsp: unknown key, did you mean 'fps'?"
 
 
 def test_faults_of_sim_options_are_reported_where_they_are(faults_of_edit: Faults) -> None:
-    told = faults_of_edit("type: webcam, fps: 30", "type: webcam, sim: {\n      fps: 300, shadow: true}", sim=True)
+    message = faults_of_edit("type: webcam, fps: 30", "type: webcam, sim: {\n      fps: 300, shadow: true}", sim=True)
 
-    assert told == (
+    assert message == (
         "robot.yaml:16: peripherals.top.sim.fps: 300.0 is too large, must be at most 120 Hz\n"
         "robot.yaml:16: peripherals.top.sim.shadow: unknown key, did you mean 'shadows'?"
     )
@@ -180,14 +180,14 @@ def test_either_the_action_or_its_executor_says_what_follows_stale_setpoints(
 
 
 def test_an_action_that_contradicts_its_executor_is_refused(faults_of_edit: Faults, base: str) -> None:
-    told = faults_of_edit(
+    message = faults_of_edit(
         base[base.index("  arm_position") :],
         base[base.index("  arm_position") :]
         .replace("arm_position: {type: position", "arm_position: {type: position, safety_behavior: relax")
         .replace("topic: /arm/commands", "topic: /arm/commands, safety_behavior: hold"),
     )
 
-    assert told == (
+    assert message == (
         "robot.yaml:38: contract.actions.0.safety_behavior: 'hold' contradicts 'relax' of executor 'arm_position'"
     )
 
@@ -274,13 +274,13 @@ def test_mode_with_a_planner_is_unavailable_without_the_source_of_goals(
     base: str, load_text: Load, registry: Registry
 ) -> None:
     del registry.entries["source", "planner"]
-    told = "a mode with planner needs a plugin that is not installed: pip install ibrobot-plugin-planning"
-    assert load_text(base).unavailable == {"plan": told}
-    with pytest.raises(ConfigError, match=rf"^robot.yaml:28: control_modes.plan.planner.type: {told}$"):
+    message = "a mode with planner needs a plugin that is not installed: pip install ibrobot-plugin-planning"
+    assert load_text(base).unavailable == {"plan": message}
+    with pytest.raises(ConfigError, match=rf"^robot.yaml:28: control_modes.plan.planner.type: {message}$"):
         load_text(base, mode="plan")
 
 
 @pytest.mark.parametrize("mode", ["teleop", "plan"])
 def test_executor_of_the_contract_must_be_installed(faults_of_edit: Faults, mode: str) -> None:
-    told = faults_of_edit("arm_position: {type: position", "arm_position: {type: trajectory", mode=mode)
-    assert told == f"robot.yaml:18: executors.arm_position.type: {NOT_INSTALLED}"
+    message = faults_of_edit("arm_position: {type: position", "arm_position: {type: trajectory", mode=mode)
+    assert message == f"robot.yaml:18: executors.arm_position.type: {NOT_INSTALLED}"

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
-# What is wrong, the text of the base YAML that is replaced, what stands there instead, and all that is told.
+# The fault, the replaced text of the base YAML, its replacement, and the whole error.
 CASES = {
     "resize_negative": (
         "peripheral: top, align",

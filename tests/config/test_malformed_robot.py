@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 
 NAME = "a name is not empty and has no slash, control character or space at its ends"
-# What is wrong, the text of the base YAML that is replaced, what stands there instead, and all that is told.
+# The fault, the replaced text of the base YAML, its replacement, and the whole error.
 CASES = {
     "package_missing": (
         "    poses:",

@@ -46,10 +46,10 @@ def test_the_last_override_of_a_key_counts(load_text: Load, base: str) -> None:
 
 
 def test_a_fault_below_an_override_is_reported_as_the_overrides(load_text: Load, base: str) -> None:
-    with pytest.raises(ConfigError) as told:
+    with pytest.raises(ConfigError) as message:
         load_text(base, overrides=["contract.observations.1.align={strategy: asof, tol_ms: soon}"])
 
-    assert str(told.value) == (
+    assert str(message.value) == (
         "--set contract.observations.1.align={strategy: asof, tol_ms: soon}: "
         "contract.observations.1.align.tol_ms: expected a number, got 'soon'"
     )
@@ -79,10 +79,10 @@ def test_mode_overrides_the_default(load_text: Load, base: str) -> None:
     ],
 )  # fmt: skip
 def test_an_override_is_checked_like_the_file(load_text: Load, base: str, override: str, expected: str) -> None:
-    with pytest.raises(ConfigError) as told:
+    with pytest.raises(ConfigError) as message:
         load_text(base, overrides=[override])
 
-    assert str(told.value).splitlines()[0] == f"--set {override}: {expected}"
+    assert str(message.value).splitlines()[0] == f"--set {override}: {expected}"
 
 
 @attrs.frozen
@@ -103,32 +103,32 @@ class _Pair:
     ],
 )
 def test_options_alone_are_checked_like_the_file(texts: list[str], said: str) -> None:
-    with pytest.raises(ConfigError) as told:
+    with pytest.raises(ConfigError) as message:
         single_options(_Pair, texts, "pair", "--pair")
-    assert str(told.value) == said
+    assert str(message.value) == said
     assert single_options(_Pair, ["high=5"], "pair") == _Pair(0, 5)
 
 
 @pytest.mark.parametrize("override", ["control.rate_hz", "=5", "control.=5", "a..b=5", ""])
 def test_an_ill_formed_override(load_text: Load, base: str, override: str) -> None:
-    with pytest.raises(ConfigError) as told:
+    with pytest.raises(ConfigError) as message:
         load_text(base, overrides=[override])
 
-    assert str(told.value) == f"--set {override}: expected PATH=VALUE, e.g. control.rate_hz=50"
+    assert str(message.value) == f"--set {override}: expected PATH=VALUE, e.g. control.rate_hz=50"
 
 
 def test_an_unknown_mode(load_text: Load, base: str) -> None:
-    with pytest.raises(ConfigError) as told:
+    with pytest.raises(ConfigError) as message:
         load_text(base, mode="plam")
 
-    assert str(told.value) == "--mode plam: default_control_mode: unknown control mode 'plam', did you mean 'plan'?"
+    assert str(message.value) == "--mode plam: default_control_mode: unknown control mode 'plam', did you mean 'plan'?"
 
 
 def test_faults_of_the_file_come_before_those_of_overrides(load_text: Load, base: str) -> None:
-    with pytest.raises(ConfigError) as told:
+    with pytest.raises(ConfigError) as message:
         load_text(base.replace("name: mini", "name: 5"), overrides=["control.rate_hz=x"])
 
-    assert [problem.line for problem in told.value.problems] == [2, 0]
+    assert [problem.line for problem in message.value.problems] == [2, 0]
 
 
 words = st.text(st.sampled_from("abcxyz_"), min_size=1, max_size=6)
@@ -170,7 +170,7 @@ def test_any_value_anywhere_is_taken_or_reported(
     try:
         config = load_text(base, overrides=[override], sim=sim)
     except ConfigError:
-        return  # told; any other exception fails this test
+        return  # reported; any other exception fails this test
     assert from_document(config.document, source=config.source, sim=sim, registry=registry) == config
 
 

@@ -54,9 +54,9 @@ def checking(registry: Registry) -> None:
 
 
 def faults(load_text: Load, text: str, **options: Any) -> str:
-    with pytest.raises(ConfigError) as told:
+    with pytest.raises(ConfigError) as message:
         load_text(text, **options)
-    return str(told.value)
+    return str(message.value)
 
 
 def test_joint_that_an_option_names_must_exist(load_text: Load, base: str) -> None:

@@ -61,9 +61,9 @@ def world(registry: Registry) -> None:
 
 
 def faults(load_text: Load, text: str, **options: Any) -> str:
-    with pytest.raises(ConfigError) as told:
+    with pytest.raises(ConfigError) as message:
         load_text(text, **options)
-    return str(told.value)
+    return str(message.value)
 
 
 def test_options_of_a_section_are_loaded(load_text: Load, base: str) -> None:
@@ -106,9 +106,9 @@ def test_a_section_that_no_plugin_has_is_an_unknown_key(load_text: Load, base: s
 
 def test_broken_plugins_are_named_beside_an_unknown_section(load_text: Load, base: str, registry: Registry) -> None:
     registry.failures.append(Failure("fake_maps", "fake-maps", "import", "ImportError: no maps"))
-    told = faults(load_text, base + "maps: {}\n")
-    assert "maps: unknown key" in told
-    assert "plugin 'fake_maps' (fake-maps) failed to import: ImportError: no maps" in told
+    message = faults(load_text, base + "maps: {}\n")
+    assert "maps: unknown key" in message
+    assert "plugin 'fake_maps' (fake-maps) failed to import: ImportError: no maps" in message
 
 
 def test_a_secret_of_a_section_is_not_shown(load_text: Load, base: str) -> None:

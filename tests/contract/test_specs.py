@@ -106,7 +106,7 @@ def test_a_foreign_type_is_read_back_as_it_was(make_config: Make) -> None:
 def test_foreign_commands_are_read_back_as_they_were(
     make_config: Make, type_: str, select: tuple[str, ...], expected: tuple[str, ...]
 ) -> None:
-    action = ActionSpec(executor="gripper_position", topic="/told", type=type_, foreign=True, select=select)
+    action = ActionSpec(executor="gripper_position", topic="/lamp/command", type=type_, foreign=True, select=select)
     contract = Contract.from_config(make_config((STATE,), (action,)))
     assert contract.action_parts[0].select == expected
     again = Contract.from_canonical(json.loads(json.dumps(contract.canonical())))

@@ -51,7 +51,7 @@ control: {rate_hz: 100, stop: hold, state_timeout: 0.05}
 
 
 class ScriptedHardware(FakeHardware):
-    """Fails as told, and keeps what it was written."""
+    """Fails on request, and keeps what was written to it."""
 
     def __init__(self, ctx: Context) -> None:
         super().__init__(ctx)
@@ -143,7 +143,7 @@ class Rig:
 
         registry = discover([])
         for descriptor in (
-            HardwareDescriptor("scripted", scripted, "fails as told"),
+            HardwareDescriptor("scripted", scripted, "fails on request"),
             HardwareDescriptor("scene", scripted, "fails as scripted, and can be set up again", simulated=True),
             HardwareDescriptor("stiff", lambda _, ctx: FakeRealHardware(ctx), "cannot relax"),
         ):
@@ -172,7 +172,7 @@ class Rig:
         return state
 
     def plan(self, end: list[float], seconds: float = 0.5, joints: tuple[bool, ...] = (True, True, True)) -> None:
-        """Send a straight plan from where the robot is told to be, to `end` [rad], shape (J,)."""
+        """Send a straight plan from the robot's setpoint to `end` [rad], shape (J,)."""
         assert self.core.state is not None
         rows = round(seconds * 100) + 1
         positions = np.linspace(self.core.state.command, end, rows)

@@ -198,21 +198,21 @@ class TestStop:
         assert len(rig.hardware.written) == count
 
     @pytest.mark.parametrize(
-        ("outcome", "told"),
+        ("outcome", "message"),
         [
             (Torque.UNKNOWN, "torque of hardware may still be on: nothing confirmed that it is off"),
             (HardwareError("servo 3 keeps it"), "torque of hardware cannot be taken off: servo 3 keeps it"),
         ],
         ids=["unknown", "failed"],
     )
-    def test_relax_that_is_not_confirmed_is_reported_beside_the_fault(self, make_rig, caplog, outcome, told):
+    def test_relax_that_is_not_confirmed_is_reported_beside_the_fault(self, make_rig, caplog, outcome, message):
         rig = make_rig({"control": {"stop": "relax"}}).start()
         rig.hardware.relax_outcome = outcome
         rig.hardware.silent = True
         rig.tick(3)
 
         assert rig.core.fault == "the bus is silent"
-        assert [event["fault"] for event in rig.events("fault")] == ["the bus is silent", told]
+        assert [event["fault"] for event in rig.events("fault")] == ["the bus is silent", message]
         assert "torque off" not in caplog.text
 
     def test_a_failed_relax_goes_on_braking_and_an_unconfirmed_one_writes_no_more(self, make_rig):

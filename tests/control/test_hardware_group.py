@@ -21,7 +21,7 @@ RIGHT = ("wrist_roll", "shoulder_lift", "wrist_flex")
 
 
 class Part(Hardware):
-    """Measures the place of each joint in the robot's order, and keeps what it is told."""
+    """Measures the place of each joint in the robot's order, and keeps what was written to it."""
 
     signals = (Signal("/part", 2),)
 
@@ -145,9 +145,9 @@ def test_a_failing_part_does_not_leave_another_at_work(two) -> None:
     failures: list[Exception] = []
 
     def read() -> None:
-        with pytest.raises(HardwareError) as told:
+        with pytest.raises(HardwareError) as message:
             parts.read()
-        failures.append(told.value)
+        failures.append(message.value)
 
     reading = threading.Thread(target=read)
     reading.start()

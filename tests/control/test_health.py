@@ -45,10 +45,10 @@ class TestWarnings:
         rig.hardware.conditions = (HOT,)
         rig.tick()
 
-        (told,) = json.loads(json.dumps(rig.core.counters()))["conditions"]
-        assert told["joint"] == "lift"
-        assert told["severity"] == "warning"
-        assert told["value"] == 58.0
+        (reported,) = json.loads(json.dumps(rig.core.counters()))["conditions"]
+        assert reported["joint"] == "lift"
+        assert reported["severity"] == "warning"
+        assert reported["value"] == 58.0
         rig.hardware.conditions = ()
         rig.tick()
         assert rig.core.counters()["conditions"] == []

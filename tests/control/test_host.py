@@ -47,8 +47,8 @@ default_control_mode: stream
 
 
 @attrs.define
-class Told:
-    """What control told its host."""
+class Reports:
+    """What control reported to its host."""
 
     states: queue.SimpleQueue[ControlState] = attrs.field(factory=queue.SimpleQueue)
     events: queue.SimpleQueue[Mapping[str, Any]] = attrs.field(factory=queue.SimpleQueue)
@@ -68,12 +68,12 @@ def kind(request: pytest.FixtureRequest) -> str:
 
 
 @pytest.fixture
-def told() -> Told:
-    return Told()
+def reports() -> Reports:
+    return Reports()
 
 
 @pytest.fixture
-def make(site: Site, told: Told) -> Iterator[Callable[..., ControlHost]]:
+def make(site: Site, reports: Reports) -> Iterator[Callable[..., ControlHost]]:
     site.add("ibrobot-plugin-arm", "control_arm.py")
     made: list[ControlHost] = []
 
@@ -87,10 +87,10 @@ def make(site: Site, told: Told) -> Iterator[Callable[..., ControlHost]]:
         host: ControlHost
         if kind == "process":
             host = ControlClient(
-                config, RealClock(), 0, told.states.put, told.events.put, told.deaths.put, given_up=given_up
+                config, RealClock(), 0, reports.states.put, reports.events.put, reports.deaths.put, given_up=given_up
             )
         else:
-            host = InlineControl(config, installed_plugins(), SteppedClock(), 0, told.states.put, told.events.put)
+            host = InlineControl(config, installed_plugins(), SteppedClock(), 0, reports.states.put, reports.events.put)
         made.append(host)
         return host
 
@@ -132,14 +132,14 @@ class TestBoth:
 
         assert (tmp_path / "closed").exists()
 
-    def test_the_mode_begins_at_the_startup_pose(self, make, kind, told):
+    def test_the_mode_begins_at_the_startup_pose(self, make, kind, reports):
         host = make(kind, startup="pose out")
         host.start()
         generation = host.call("counters")["generation"]
         if isinstance(host, InlineControl):
             host.step()
         np.testing.assert_allclose(
-            told.state(lambda state: state.generation == generation).command, [0.4, 0.8], atol=0.01
+            reports.state(lambda state: state.generation == generation).command, [0.4, 0.8], atol=0.01
         )
 
     def test_commands_are_answered_with_the_generation_and_refused_with_the_reason(self, make, kind):
@@ -154,10 +154,10 @@ class TestBoth:
 
 @pytest.mark.integration
 class TestProcess:
-    def test_states_come_in_order_and_plans_are_followed(self, make, told):
+    def test_states_come_in_order_and_plans_are_followed(self, make, reports):
         host = make()
         host.start()
-        first = told.state(lambda state: True)
+        first = reports.state(lambda state: True)
         end = np.array([0.3, 0.9])
         # It ends with seconds at rest, so that it is no matter when it comes.
         positions = np.vstack([np.linspace(first.command, end, 50), np.full((1500, 2), end)])
@@ -169,7 +169,7 @@ class TestProcess:
             ticks.append(state.tick)
             return np.allclose(state.command, end)
 
-        told.state(arrived)
+        reports.state(arrived)
         assert ticks == sorted(set(ticks))
         # A host that was stopped for seconds comes too late for some, and says so.
         assert ticks[-1] - first.tick + 1 - len(ticks) <= host.lost_states
@@ -183,40 +183,40 @@ class TestProcess:
 
         assert (tmp_path / "closed").exists()
 
-    def test_a_fault_is_reported_and_reset(self, make, told):
+    def test_a_fault_is_reported_and_reset(self, make, reports):
         host = make()
         host.start()
         host.call("estop")
-        assert told.events.get(timeout=PATIENCE_S)["fault"] == "emergency stop"
-        assert told.state(lambda state: state.estop)
+        assert reports.events.get(timeout=PATIENCE_S)["fault"] == "emergency stop"
+        assert reports.state(lambda state: state.estop)
 
-        resting = told.state(lambda state: state.estop)
+        resting = reports.state(lambda state: state.estop)
         assert host.call("reset")["generation"] > resting.generation
-        assert told.state(lambda state: not state.estop)
+        assert reports.state(lambda state: not state.estop)
 
-    def test_its_report_has_the_whole_run_at_the_end(self, make, told):
+    def test_its_report_has_the_whole_run_at_the_end(self, make, reports):
         host = make()
         host.start()
-        told.state(lambda state: state.tick >= 5)
+        reports.state(lambda state: state.tick >= 5)
         host.stop()
 
         assert host.report["loop"]["ticks"] >= 5
         assert host.report["counters"]["loop"]["read_errors"] == 0
 
-    def test_its_death_is_reported_and_commands_fail_from_then_on(self, make, told):
+    def test_its_death_is_reported_and_commands_fail_from_then_on(self, make, reports):
         host = make()
         host.start()
         os.kill(host.pid, signal.SIGKILL)
 
-        assert str(told.deaths.get(timeout=PATIENCE_S)) == "the control process died (killed by SIGKILL)"
+        assert str(reports.deaths.get(timeout=PATIENCE_S)) == "the control process died (killed by SIGKILL)"
         with pytest.raises(ComponentFailed, match="control process is gone"):
             host.call("estop")
 
-    def test_one_that_ignores_its_end_is_killed_and_reported(self, make, told, monkeypatch, caplog):
+    def test_one_that_ignores_its_end_is_killed_and_reported(self, make, reports, monkeypatch, caplog):
         monkeypatch.setattr("ibrobot_core.control.host._STOP_TIMEOUT_S", 0.2)
         host = make()
         host.start()
-        told.state(lambda state: state.tick >= 1)
+        reports.state(lambda state: state.tick >= 1)
         pid = host.pid
         os.kill(pid, signal.SIGSTOP)
         host.stop()
@@ -224,39 +224,39 @@ class TestProcess:
         assert "the control process did not end within 0.2 s: killed" in caplog.text
         assert not Path(f"/proc/{pid}").exists()
 
-    def test_sigterm_stops_it_in_order(self, make, told, tmp_path):
+    def test_sigterm_stops_it_in_order(self, make, reports, tmp_path):
         host = make(closed=str(tmp_path / "closed"))
         host.start()
         os.kill(host.pid, signal.SIGTERM)
 
-        assert str(told.deaths.get(timeout=PATIENCE_S)) == "the control process died (exit status 0)"
+        assert str(reports.deaths.get(timeout=PATIENCE_S)) == "the control process died (exit status 0)"
         assert (tmp_path / "closed").exists()
 
-    def test_a_host_that_cannot_take_states_is_reported(self, make, told):
+    def test_a_host_that_cannot_take_states_is_reported(self, make, reports):
         host = make()
         host._on_state = lambda state: 1 / 0
         host.start()
 
-        assert "division by zero" in str(told.deaths.get(timeout=PATIENCE_S))
+        assert "division by zero" in str(reports.deaths.get(timeout=PATIENCE_S))
 
 
 class TestInline:
-    def test_a_step_is_a_tick_at_the_clocks_time(self, make, told):
+    def test_a_step_is_a_tick_at_the_clocks_time(self, make, reports):
         host = make("inline")
         host.start()
         for _ in range(3):
             host._clock.advance(10_000_000)
             host.step()
 
-        states = [told.states.get_nowait() for _ in range(3)]
+        states = [reports.states.get_nowait() for _ in range(3)]
         assert [state.tick for state in states] == [1, 2, 3]
         assert [state.stamp_ns for state in states] == [10_000_000, 20_000_000, 30_000_000]
 
-    def test_stopping_takes_as_many_ticks_as_braking(self, make, told):
+    def test_stopping_takes_as_many_ticks_as_braking(self, make, reports):
         host = make("inline")
         host.start()
         host.step()
-        state = told.states.get_nowait()
+        state = reports.states.get_nowait()
         far = np.linspace(state.command, state.command + 0.5, 20)
         host.write_plan(PlanRecord(state.generation, 0, 10_000_000, np.ones(2, dtype=bool), far))
         for _ in range(10):
@@ -265,7 +265,7 @@ class TestInline:
         host.stop()
 
         commands = []
-        while not told.states.empty():
-            commands.append(told.states.get_nowait().command)
+        while not reports.states.empty():
+            commands.append(reports.states.get_nowait().command)
         assert len(commands) > 12
         np.testing.assert_array_equal(commands[-1], commands[-2])

@@ -77,9 +77,9 @@ def test_setpoints_at_a_limit_are_not_passed_and_those_beyond_are_reached() -> N
     executor.activate(reading(0, 2.0, 2.0))
     rows = ((2.0, 2.0), (3.0, 2.5), (3.0, 3.0), (2.0, 3.2), (1.0, 1.0))
     executor.set_plan(plan(0, 10, *rows))
-    told = follow(executor, 10, 40)
-    assert told.max(axis=0).tolist() == [3.0, 3.2]
-    assert told[20].tolist() == pytest.approx([2.0, 3.2])
+    commanded = follow(executor, 10, 40)
+    assert commanded.max(axis=0).tolist() == [3.0, 3.2]
+    assert commanded[20].tolist() == pytest.approx([2.0, 3.2])
 
 
 def follow(executor: PositionExecutor, begin_ms: int, end_ms: int) -> np.ndarray:
@@ -100,9 +100,9 @@ def test_a_smooth_plan_is_followed_smoothly() -> None:
     executor = make()
     executor.activate(reading(0, *wave(0, 1)[0]))
     executor.set_plan(Plan(0, 30 * MS, wave(0, 60)))
-    told = follow(executor, 30, 1500)
-    np.testing.assert_allclose(told, wave_at(np.arange(30, 1500)), atol=1e-4)
-    accelerations = np.diff(told[200:], 2, axis=0) * 1e6
+    commanded = follow(executor, 30, 1500)
+    np.testing.assert_allclose(commanded, wave_at(np.arange(30, 1500)), atol=1e-4)
+    accelerations = np.diff(commanded[200:], 2, axis=0) * 1e6
     assert np.abs(accelerations).max() < 1.01 * (np.pi / 2) ** 2, "linearly it would be 33 times that"
 
 

@@ -32,8 +32,9 @@ ZERO = np.zeros(1)
 
 
 class Watched:
-    """A real layer, whose every output is checked against the limits. The joints are where they were sent, if not told.
+    """A real layer, whose every output is checked against the limits.
 
+    The joints reach every setpoint unless a position is given.
     Velocity and acceleration limits may yield only where the measured position leaves no room to brake within the lead.
     """
 

@@ -33,8 +33,8 @@ def continued(request: DispatchInfer, honoured: int, rng: np.random.Generator) -
 
 
 def setpoints(rig: Rig, ticks: int) -> np.ndarray:
-    """What the arm was told at each tick from the first plan on: the newest plan's action, the last one when dry."""
-    told, newest = [], None
+    """The arm's setpoint at each tick from the first plan on: the newest plan's action, its last one once it ended."""
+    commanded, newest = [], None
     plans = iter(rig.sent)
     coming = next(plans, None)
     for tick in range(1, ticks + 1):
@@ -42,8 +42,8 @@ def setpoints(rig: Rig, ticks: int) -> np.ndarray:
             newest, coming = coming, next(plans, None)
         if newest is not None:
             _, (start_ns, step_ns, positions) = newest
-            told.append(positions[min((START_NS + tick * STEP - start_ns) // step_ns, len(positions) - 1)])
-    return np.array(told)
+            commanded.append(positions[min((START_NS + tick * STEP - start_ns) // step_ns, len(positions) - 1)])
+    return np.array(commanded)
 
 
 def run(rig: Rig, latencies: list[int], ticks: int, honoured: int | None, seed: int) -> None:

@@ -271,7 +271,7 @@ def fuzz(name: str, mutants: int, seed: int, only: int | None = None) -> Counter
         name: of the container.
         mutants: how many.
         seed: of all that is by chance.
-        only: the number of one, of which everything is told; the others are passed over.
+        only: the number of one mutant to report in full; the others are skipped.
     """
     container, chance = CONTAINERS[name], random.Random(f"{name} {seed}")
     ended: Counter[str] = Counter()
@@ -288,13 +288,13 @@ def fuzz(name: str, mutants: int, seed: int, only: int | None = None) -> Counter
                 continue
             for file, content in contents.items():
                 (mutant / file).write_bytes(content)
-            how, broken, told = _judge(container, mutant, intact)
+            how, broken, details = _judge(container, mutant, intact)
             ended[how] += 1
             if only is not None or (broken and sum(ended[key] for key in ended if key.startswith("wrong")) <= SHOWN):
                 kept = Path(tempfile.gettempdir()) / f"ibrobot-fuzz-{name}-{seed}-{number}"
                 shutil.rmtree(kept, ignore_errors=True)
                 shutil.copytree(mutant, kept)
-                print(f"{name} {seed}:{number}: {how}; kept at {kept}\n{told}", file=sys.stderr)
+                print(f"{name} {seed}:{number}: {how}; kept at {kept}\n{details}", file=sys.stderr)
     return ended
 
 

@@ -275,7 +275,7 @@ def test_signal_while_a_command_starts_is_one_line(line: str, at: str, number: s
 
     ran = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
 
-    told = ran.stderr.strip()  # after the ^C of a terminal, an empty line
+    printed = ran.stderr.strip()  # after the ^C of a terminal, an empty line
     assert (ran.returncode, ran.stdout) == (130, ""), ran.stderr
-    assert told == "error: stopped" or told.startswith("interrupted; finished episodes are kept"), told
-    assert len(told.splitlines()) == 1
+    assert printed == "error: stopped" or printed.startswith("interrupted; finished episodes are kept"), printed
+    assert len(printed.splitlines()) == 1

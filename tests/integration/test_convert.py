@@ -168,11 +168,11 @@ def test_interrupted_by_the_keyboard_it_says_what_is_kept(bags: Path, tmp_path: 
         assert process.stderr is not None
         first = process.stderr.readline()
         os.killpg(process.pid, signal.SIGINT)  # as a terminal does
-        told = process.stderr.read()
-    assert process.returncode == 130, told
+        printed = process.stderr.read()
+    assert process.returncode == 130, printed
     assert "frames (1 of 4" in first
-    assert "interrupted; finished episodes are kept: run the same command again to continue" in told
-    assert "Traceback" not in told
+    assert "interrupted; finished episodes are kept: run the same command again to continue" in printed
+    assert "Traceback" not in printed
     result = run(*arguments, "--json")
     assert result.report["resumed"] >= 1, result.err
     assert digest(out) == digest(whole)
@@ -182,9 +182,9 @@ def test_many_with_the_same_fault_are_reported_together(tmp_path: Path) -> None:
     for number in (1, 2, 3):
         record(tmp_path / f"bags/episode_{number:06d}", number, 0.2, contract=None)
     result = run(tmp_path / "bags", "--out", tmp_path / "set")
-    (told,) = [line for line in result.err.splitlines() if line.startswith("left out")]
-    assert told.count("episode_00000") == 3
-    assert told.count("has no contract") == 1
+    (printed,) = [line for line in result.err.splitlines() if line.startswith("left out")]
+    assert printed.count("episode_00000") == 3
+    assert printed.count("has no contract") == 1
 
 
 def test_a_bad_episode_is_reported_and_left_out(bags: Path, tmp_path: Path) -> None:
@@ -261,9 +261,9 @@ def test_a_gap_is_refused_skipped_or_held(tmp_path: Path) -> None:
     assert f"left out where something was missing: 1 time, at most {ticks} ticks in a row\n" in default.out
     kept = json.loads((tmp_path / "default/meta/ibrobot.json").read_bytes())["episodes"][0]
     assert kept["cuts"] == [[row, ticks]]
-    told = run(tmp_path / "bag", "--out", tmp_path / "told", "--missing", "hold").out
-    assert "missing for a time: observation.images.wrist 1\n" in told
-    assert "without a prompt, so with an empty task: 1; --prompt TEXT gives them one" in told
+    printed = run(tmp_path / "bag", "--out", tmp_path / "printed", "--missing", "hold").out
+    assert "missing for a time: observation.images.wrist 1\n" in printed
+    assert "without a prompt, so with an empty task: 1; --prompt TEXT gives them one" in printed
     asked = run(tmp_path / "bag", "--out", tmp_path / "asked", "--missing", "hold", "--prompt", "stack").out
     assert "without a prompt" not in asked
 
@@ -387,7 +387,7 @@ def test_foreign_bags_by_the_contract_alone(
 
 
 @pytest.mark.parametrize(
-    ("told", "more"),
+    ("printed", "more"),
     [
         (lambda i: JointState(Header(0), JOINTS[::-1], [2.0, 1.0, i + 0.5]), ""),
         (
@@ -397,8 +397,8 @@ def test_foreign_bags_by_the_contract_alone(
     ],
     ids=["leader", "trajectory"],
 )
-def test_foreign_commands_come_as_what_they_are(tmp_path: Path, told: Callable[[int], Message], more: str) -> None:
-    type_ = told(0).ros_type
+def test_foreign_commands_come_as_what_they_are(tmp_path: Path, printed: Callable[[int], Message], more: str) -> None:
+    type_ = printed(0).ros_type
     store = get_typestore(Stores.ROS2_JAZZY)
     with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         states = writer.add_connection("/joint_states", JointState.ros_type, typestore=store)
@@ -406,7 +406,7 @@ def test_foreign_commands_come_as_what_they_are(tmp_path: Path, told: Callable[[
         for i in range(30):
             t_ns = START_NS + i * 33_333_333
             writer.write(states, t_ns, bytes(encode(JointState(Header(t_ns), JOINTS, [i, 1.0, 2.0]))))
-            writer.write(commands, t_ns, bytes(encode(told(i))))
+            writer.write(commands, t_ns, bytes(encode(printed(i))))
     robot, _, _ = ROBOT.partition("    - key: observation.images.top")
     action = f"{{key: action, executor: arm, topic: /commands, type: {type_}, foreign: true{more}}}"
     (tmp_path / "robot.yaml").write_text(f"{robot}  actions:\n    - {action}\n")

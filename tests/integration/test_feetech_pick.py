@@ -56,9 +56,9 @@ def test_cube_lies_in_the_bin_and_only_the_emulator_says_so(ibrobot: tuple[str, 
         finally:
             emulator.terminate()
             reading.join()
-    told = (tmp_path / "out").read_text()
-    assert run.returncode == 0, told + (tmp_path / "err").read_text()
-    summary = json.loads(told.splitlines()[-1])
+    printed = (tmp_path / "out").read_text()
+    assert run.returncode == 0, printed + (tmp_path / "err").read_text()
+    summary = json.loads(printed.splitlines()[-1])
     assert not summary["simulated"]
     assert summary["faults"] == []
     assert said.get(timeout=PATIENCE_S) == "success: the task of the scene is done\n"

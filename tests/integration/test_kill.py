@@ -98,7 +98,7 @@ class Run:
 
     @property
     def log(self) -> list[list[str]]:
-        """What the arm was told so far: word, monotonic time [ns], positions [rad]; whole lines only."""
+        """The arm's setpoints so far: word, monotonic time [ns], positions [rad]; whole lines only."""
         path = self.folder / "commands.log"
         text = path.read_text() if path.exists() else ""
         return [line.split() for line in text.rpartition("\n")[0].splitlines()]
@@ -114,13 +114,13 @@ class Run:
         return times[1:][np.abs(np.diff(positions, axis=0)).max(axis=1) > 0]
 
     def is_swinging(self) -> bool:
-        """Whether the arm is told to move fast now."""
+        """Whether the arm's setpoints move fast now."""
         _, positions = self.commands()
         return len(positions) > 20 and bool(np.abs(np.diff(positions[-3:], axis=0)).min() > 0.02)
 
     def find_control(self) -> None:
         """Learn the process ids of the host's children."""
-        wait_for(lambda: len(self.log) > 10, "the arm is told something")
+        wait_for(lambda: len(self.log) > 10, "the arm has setpoints")
         tasks = Path(f"/proc/{self.host.pid}/task")
         self.children = [int(pid) for each in tasks.glob("*/children") for pid in each.read_text().split()]
         (self.control,) = (
@@ -169,7 +169,7 @@ def launch(site: Site, tmp_path: Path) -> Iterator[Callable[..., Run]]:
         run.host.wait()
 
 
-def told(error: str) -> list[str]:
+def errors_in(error: str) -> list[str]:
     return [line for line in error.splitlines() if line.startswith("error: ")]
 
 
@@ -240,7 +240,7 @@ class TestInterrupt:
         status, error = run.end()
 
         assert status == 0
-        assert told(error) == []
+        assert errors_in(error) == []
 
     def test_the_first_stops_in_order(self, launch):
         run = launch("control.stop=pose rest")
@@ -248,7 +248,7 @@ class TestInterrupt:
         status, error = run.end()
 
         assert status == 0
-        assert told(error) == []
+        assert errors_in(error) == []
         np.testing.assert_allclose(run.commands()[1][-1], REST, atol=1e-4)
 
     def test_the_second_ends_the_host_at_once_and_the_arm_stops_all_the_same(self, launch):
@@ -271,7 +271,7 @@ class TestDeath:
         status, error = run.end()
 
         assert status == 1
-        assert told(error) == ["error: control: the control process died (killed by SIGKILL)"]
+        assert errors_in(error) == ["error: control: the control process died (killed by SIGKILL)"]
 
     def test_of_the_control_process_while_a_sensor_is_awaited_is_reported(self, launch):
         run = launch(DARK, awaited=False)
@@ -280,14 +280,14 @@ class TestDeath:
         status, error = run.end()
 
         assert status == 1
-        assert told(error) == ["error: control: the control process died (killed by SIGKILL)"]
+        assert errors_in(error) == ["error: control: the control process died (killed by SIGKILL)"]
 
     def test_of_the_control_loop_by_a_bug_is_reported_on_one_line(self, launch):
         run = launch("hardware.trouble=true", awaited=False)
         status, error = run.end()
 
         assert status == 1
-        [line] = told(error)
+        [line] = errors_in(error)
         assert line.startswith(
             "error: control: the control process died (ZeroDivisionError: division by zero (a bug at "
         )
@@ -297,7 +297,7 @@ class TestDeath:
         status, error = run.end()
 
         assert status == 1
-        assert told(error) == ["error: sensor:top: the camera was unplugged"]
+        assert errors_in(error) == ["error: sensor:top: the camera was unplugged"]
         np.testing.assert_allclose(run.commands()[1][-1], REST, atol=1e-4)
 
     def test_of_a_policy_that_does_not_load_comes_before_anything_is_powered(self, launch):
@@ -305,5 +305,7 @@ class TestDeath:
         status, error = run.end()
 
         assert status == 1
-        assert [re.sub(r"^error: (model:lost: )?", "", line) for line in told(error)] == ["no such checkpoint: lost.pt"]
+        assert [re.sub(r"^error: (model:lost: )?", "", line) for line in errors_in(error)] == [
+            "no such checkpoint: lost.pt"
+        ]
         assert run.log == []

@@ -70,7 +70,7 @@ def test_a_fault_in_real_time(launch: Callable[..., Ran]):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "message"),
     [
         (("--mode", "moveit_planning", "--goal", "hom"), "goal 'hom': no pose 'hom'; the poses are: home, rest"),
         (("--mode", "moveit_planning", "--goal", "wrist=1"), "goal 'wrist=1': no joint 'wrist'; the joints are: "),
@@ -81,10 +81,10 @@ def test_a_fault_in_real_time(launch: Callable[..., Ran]):
     ],
     ids=["pose", "joint", "no planner", "mode", "key", "options"],
 )
-def test_a_wrong_command_line_is_exit_code_2(launch: Callable[..., Ran], arguments: tuple[str, ...], told: str):
+def test_a_wrong_command_line_is_exit_code_2(launch: Callable[..., Ran], arguments: tuple[str, ...], message: str):
     ran = launch(*arguments)
     assert ran.code == 2
-    assert told in ran.err
+    assert message in ran.err
     assert "Traceback" not in ran.err
     assert ran.out == ""
 

@@ -86,7 +86,7 @@ default_control_mode: idle
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "told"),
+    ("old", "new", "message"),
     [
         ("", "", ""),
         ('<position joint="pan" kp="1"/>', '<motor joint="pan"/>', "has no position actuator for joint 'pan'"),
@@ -96,7 +96,7 @@ default_control_mode: idle
     ],
 )
 def test_model_that_mujoco_refuses(
-    old: str, new: str, told: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    old: str, new: str, message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     Path("robot.yaml").write_text(SIMULATED)
     Path("model.xml").write_text(MODEL.replace(old, new) if old else MODEL)
@@ -106,7 +106,7 @@ def test_model_that_mujoco_refuses(
 
     assert checked == launched
     code, err = checked
-    assert (code or 0) == (2 if told else 0), err
-    assert told in err
-    assert len(err.splitlines()) == bool(told)
-    assert err.startswith("error: robot.yaml:6: simulation: ") or not told
+    assert (code or 0) == (2 if message else 0), err
+    assert message in err
+    assert len(err.splitlines()) == bool(message)
+    assert err.startswith("error: robot.yaml:6: simulation: ") or not message

@@ -90,7 +90,7 @@ def test_plan_says_what_is_not_there(only: Only, ibrobot: Run) -> None:
 
 
 @pytest.mark.parametrize(
-    ("kept", "arguments", "told"),
+    ("kept", "arguments", "message"),
     [
         ((), (), "hardware.type: hardware type 'feetech_so101', teleop type 'so101_leader' need plugins that are not "
          "installed: pip install ibrobot-plugin-feetech"),
@@ -114,7 +114,7 @@ def test_plan_says_what_is_not_there(only: Only, ibrobot: Run) -> None:
     ],
 )  # fmt: skip
 def test_entered_mode_is_one_error_with_one_command(
-    only: Only, ibrobot: Run, kept: tuple[str, ...], arguments: tuple[str, ...], told: str
+    only: Only, ibrobot: Run, kept: tuple[str, ...], arguments: tuple[str, ...], message: str
 ) -> None:
     only(*kept)
 
@@ -126,7 +126,7 @@ def test_entered_mode_is_one_error_with_one_command(
     assert (code, out) == (2, "")
     [line] = err.splitlines()
     assert line.startswith("error: ")
-    assert line.endswith(told)
+    assert line.endswith(message)
 
 
 FAR = ("--set", "transport={type: zenoh, connect: [tcp/127.0.0.1:7447]}")

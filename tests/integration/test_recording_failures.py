@@ -302,7 +302,7 @@ class TestTruncatedChunk:
         (report,) = json.loads(done.out)["reports"]
         assert report["finished"] is False
         assert 10 < report["frames"] < 40
-        again = run("convert", cut, "--out", tmp_path / "told", "--no-videos", "--missing", "hold")
+        again = run("convert", cut, "--out", tmp_path / "message", "--no-videos", "--missing", "hold")
         assert f"unfinished cut/episode_000001: it has the {report['frames']} frames that could be read" in again.err
 
     def test_repair_makes_it_whole(self, run: Run, cut: Path):

@@ -85,8 +85,8 @@ def test_a_secret_that_is_written_out_is_hidden_and_warned_of(lab: Lab):
     literal.write_text(lab.yaml.read_text(encoding="utf-8").replace("${IBROBOT_PASSWORD}", LITERAL), encoding="utf-8")
     shown = lab.run("config", "show", literal, "--sim")
     assert yaml.safe_load(shown)["transport"]["password"] == "***"
-    (told,) = (text for command, text in lab.printed.items() if str(literal) in command)
-    assert "transport.password: a literal secret" in told
+    (output,) = (text for command, text in lab.printed.items() if str(literal) in command)
+    assert "transport.password: a literal secret" in output
     assert lab.leaks() == []
 
 
@@ -94,7 +94,7 @@ def test_errors_hold_no_secret(lab: Lab):
     lab.run("config", "check", lab.camera, ok=False)
     lab.run("config", "check", lab.yaml, "--sim", "--set", "transport.mode=wrong", ok=False)
     lab.run("config", "check", lab.yaml, "--sim", "--set", "transport.password=1234567", ok=False)
-    told = lab.printed.popitem()[1]
-    assert "transport.password" in told
-    assert "1234567" not in told
+    output = lab.printed.popitem()[1]
+    assert "transport.password" in output
+    assert "1234567" not in output
     assert lab.leaks() == []

@@ -122,8 +122,8 @@ def test_a_server_that_is_killed_in_the_middle_of_requests_harms_nothing():
     command = [sys.executable, str(ROOT / "benchmarks/server_kill.py"), "--kills", "2", "--slack", "5"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
-    told: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
-    assert told["answered_twice"] == 0
+    result: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    assert result["answered_twice"] == 0
 
 
 def test_a_server_whose_model_hangs_starts_again(

@@ -1,4 +1,4 @@
-"""Workers: ready before `start` returns, told when they die, stopped in time; in lockstep a step at a time."""
+"""Workers: ready before `start` returns, their deaths reported, stopped in time; in lockstep one step at a time."""
 
 from __future__ import annotations
 

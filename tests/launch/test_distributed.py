@@ -72,19 +72,19 @@ def test_every_execution_mode_moves_alike(mode: str, runs: Runs, cloud: Inferenc
 
 @pytest.mark.parametrize("mode", ["process", "distributed"])
 def test_the_plan_to_be_continued_travels_with_the_request(mode: str, runs: Runs, site: Site):
-    def told(*overrides: str, strategy: str) -> np.ndarray:
+    def commanded(*overrides: str, strategy: str) -> np.ndarray:
         dispatch = f"control_modes.policy.dispatch={{watermark: 7, strategy: {strategy}}}"
         return motion(runs.start("models.net.type=continuing", dispatch, *overrides, episodes=2, seed=5))
 
     site.add("shared-network", "shared_network.py")
-    here = told(strategy="rtc")
-    assert not np.array_equal(told(strategy="replace"), here)
+    here = commanded(strategy="rtc")
+    assert not np.array_equal(commanded(strategy="replace"), here)
     robot, network = runs.made[-1].session.config.robot, sys.modules["shared_network"].NETWORK
     service = InferenceService(runs.parts.Continuing(host_context(robot=robot)), network, "net")
     service.start()
     try:
         transport = NETWORK if mode == "distributed" else "transport={type: local}"
-        np.testing.assert_array_equal(told(MODE.format(mode), transport, strategy="rtc"), here)
+        np.testing.assert_array_equal(commanded(MODE.format(mode), transport, strategy="rtc"), here)
     finally:
         service.close()
         FakeTransport.close(network)

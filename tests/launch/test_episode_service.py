@@ -116,10 +116,10 @@ def test_a_disk_too_small_for_an_episode_is_refused_with_the_figures(
     service, kept = run.session.episodes, runs.parts.MADE["recording"]
     monkeypatch.setattr(kept, "min_free", 3 << 20)
     monkeypatch.setattr(service, "free_bytes", lambda: (3 << 20) + flow - 2)
-    told = (
+    message = (
         r"has 3 MiB left; an episode of 1 s \(contract.max_duration_s\) takes 0 MiB at 0.\d MiB/s, and 3 MiB stay free"
     )
-    with pytest.raises(DiskFull, match=told):
+    with pytest.raises(DiskFull, match=message):
         service.start("")
     assert folders(runs) == []
     monkeypatch.setattr(service, "free_bytes", lambda: (3 << 20) + flow + 2)

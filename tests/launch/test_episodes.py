@@ -1,4 +1,4 @@
-"""Episodes: counted, judged, told to plugins, and recorded each in a folder of its own."""
+"""Episodes: counted, judged, reported to plugins, and recorded each in its own folder."""
 
 from __future__ import annotations
 

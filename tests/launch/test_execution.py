@@ -1,4 +1,4 @@
-"""A policy in a run: its prompt, what is told of its plan, and what its execution mode needs."""
+"""A policy in a run: its prompt, what is published of its plan, and what its execution mode needs."""
 
 from __future__ import annotations
 
@@ -56,11 +56,11 @@ def test_the_status_and_the_diagnostics_tell_how_the_plan_is_kept_filled(runs: R
         subscription.close()
     (dispatch,) = (each for each in diagnostics.status if each.name == "dispatch")
     values = {pair.key: pair.value for pair in dispatch.values}
-    told = {
+    expected = {
         "plan_length", "latency_ms", "strategy", "smoothing", "latency_p50_ms", "latency_p99_ms", "requests", "holds",
         "failures", "timeouts", "late_chunks",
     }  # fmt: skip
-    assert {name: str(getattr(status, name)) for name in told} == {name: values[name] for name in told}
+    assert {name: str(getattr(status, name)) for name in expected} == {name: values[name] for name in expected}
     assert (status.strategy, status.smoothing, values["watermark"]) == ("ensemble", True, "5")
     assert status.requests > 1
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class Notes:
-    """What a recorder was told; `full` makes every write fail."""
+    """What a recorder received; `full` makes every write fail."""
 
     def __init__(self, recorder: object, monkeypatch: pytest.MonkeyPatch) -> None:
         self.begun: list[EpisodeStart] = []

@@ -91,7 +91,7 @@ def test_all_start_in_order_and_stop_in_reverse(runs: Runs, monkeypatch: pytest.
 
 
 @pytest.mark.parametrize(
-    ("trouble", "told"),
+    ("trouble", "expected"),
     [
         ("missing", "sensor:side: no such device"),
         ("bug", "sensor:side: ZeroDivisionError: one over nothing"),
@@ -99,14 +99,14 @@ def test_all_start_in_order_and_stop_in_reverse(runs: Runs, monkeypatch: pytest.
 )
 @pytest.mark.parametrize("lockstep", [True, False], ids=["lockstep", "real"])
 def test_one_that_cannot_start_is_named_and_those_before_it_stop(
-    runs: Runs, trouble: str, told: str, lockstep: bool, monkeypatch: pytest.MonkeyPatch
+    runs: Runs, trouble: str, expected: str, lockstep: bool, monkeypatch: pytest.MonkeyPatch
 ):
     runtime = runs.make(lockstep=lockstep, sim=lockstep, mode="teleop")
     runs.parts.TROUBLE["side"] = trouble
     happened = watch(runtime, monkeypatch)
     with pytest.raises(ComponentFailed) as failure:
         runtime.start()
-    assert str(failure.value).partition(" (a bug at ")[0] == told
+    assert str(failure.value).partition(" (a bug at ")[0] == expected
     assert failure.value.exit_code == 1
     assert happened == [
         "start control", "start sensor:top", "start sensor:side",

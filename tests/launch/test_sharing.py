@@ -107,7 +107,7 @@ def test_nothing_comes_in_in_lockstep(runs: Runs, network: None):
 
 
 @pytest.mark.parametrize(
-    ("transport", "told"),
+    ("transport", "expected"),
     [
         ("{type: local, share: {publish: [/a]}}", "unknown key"),
         ("{type: network, share: {publish: [a]}}", "'a' is not a full topic name, did you mean '/a'?"),
@@ -116,6 +116,6 @@ def test_nothing_comes_in_in_lockstep(runs: Runs, network: None):
         ("{type: network, share: {publishes: [/a]}}", "did you mean 'publish'?"),
     ],
 )
-def test_mistakes_in_the_yaml(transport: str, told: str, runs: Runs, network: None):
-    with pytest.raises(ConfigError, match=told.replace("?", r"\?")):
+def test_mistakes_in_the_yaml(transport: str, expected: str, runs: Runs, network: None):
+    with pytest.raises(ConfigError, match=expected.replace("?", r"\?")):
         runs.make(f"transport={transport}")

@@ -109,9 +109,9 @@ def test_an_invalid_plan_is_reported(policy: LeRobotPolicy, prefix: Any, delay: 
     tensors = {**policy.preprocess(frame()), "prefix": prefix}
     if delay is not None:
         tensors["delay_steps"] = np.array([delay])
-    with pytest.raises(PolicyError) as told:
+    with pytest.raises(PolicyError) as message:
         policy.infer(tensors)
-    assert said in str(told.value)
+    assert said in str(message.value)
 
 
 @pytest.mark.parametrize("name", ["pi0", "pi05"])

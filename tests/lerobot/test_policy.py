@@ -264,9 +264,9 @@ def test_a_request_that_another_client_got_wrong_is_reported(
     policy = loaded(folders["act"])
     [frame] = frames(policy, 1)
     tensors = {**policy.preprocess(frame), **changes}
-    with pytest.raises(PolicyError) as told:
+    with pytest.raises(PolicyError) as message:
         policy.infer({name: value for name, value in tensors.items() if value is not None})
-    assert str(told.value) == f"the request's tensors: {said}"
+    assert str(message.value) == f"the request's tensors: {said}"
 
 
 def test_threads_are_set(folders: dict[str, Path]) -> None:

@@ -1,4 +1,4 @@
-"""An emulated servo that remembers where it was told to go."""
+"""An emulated servo that keeps its goal positions."""
 
 from __future__ import annotations
 

@@ -171,10 +171,12 @@ def _tree(path: Path, links: Mapping[str, int], joints: tuple[UrdfJoint, ...]) -
             seen.append(parent)
             if parent == link:
                 loop = " -> ".join(reversed(seen))
-                raise ModelError(f"{path}:{joint.line}: link {link!r} hangs on itself: {loop}; links must make a tree")
+                raise ModelError(
+                    f"{path}:{joint.line}: link {link!r} is its own ancestor: {loop}; links must make a tree"
+                )
             if len(seen) > len(links):
                 break  # a loop further in, which its own links find
     if len(roots) > 1:
         place = f"{path}:{links[roots[1]]}"
-        raise ModelError(f"{place}: link {roots[1]!r} hangs loose: no joint connects it to {roots[0]!r}")
+        raise ModelError(f"{place}: link {roots[1]!r} is not connected: no joint leads to it from {roots[0]!r}")
     return roots[0]

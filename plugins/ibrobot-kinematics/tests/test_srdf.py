@@ -59,9 +59,9 @@ def read(urdf: Urdf, tmp_path: Path) -> Read:
 @pytest.fixture
 def fault(read: Read, tmp_path: Path) -> Callable[[str], str]:
     def run(text: str) -> str:
-        with pytest.raises(KinematicsError) as told:
+        with pytest.raises(KinematicsError) as message:
             read(text)
-        return str(told.value).replace(f"{tmp_path}/", "")
+        return str(message.value).replace(f"{tmp_path}/", "")
 
     return run
 
@@ -110,7 +110,7 @@ def test_pose_of_a_mobile_base_is_passed_over(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "told"),
+    ("old", "new", "message"),
     [
         ("</robot>", "", "robot.srdf:12: not valid XML: no element found"),
         ('<group name="arm">', "<group>", "robot.srdf:2: <group> has no name"),
@@ -142,9 +142,9 @@ def test_pose_of_a_mobile_base_is_passed_over(tmp_path: Path) -> None:
         ('link1="wrist"', 'link1="wirst"', "robot.srdf:8: unknown link 'wirst', did you mean 'wrist'?"),
     ],
 )  # fmt: skip
-def test_wrong_files_are_named_with_their_line(fault: Callable[[str], str], old: str, new: str, told: str) -> None:
+def test_wrong_files_are_named_with_their_line(fault: Callable[[str], str], old: str, new: str, message: str) -> None:
     assert SRDF.count(old) >= 1
-    assert fault(SRDF.replace(old, new, 1)) == told
+    assert fault(SRDF.replace(old, new, 1)) == message
 
 
 def test_groups_that_contain_one_another_are_refused(fault: Callable[[str], str]) -> None:

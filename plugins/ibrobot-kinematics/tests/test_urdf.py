@@ -41,9 +41,9 @@ def read(tmp_path: Path) -> Read:
 @pytest.fixture
 def fault(read: Read, tmp_path: Path) -> Callable[[str], str]:
     def run(text: str) -> str:
-        with pytest.raises(KinematicsError) as told:
+        with pytest.raises(KinematicsError) as message:
             read(text)
-        return str(told.value).replace(f"{tmp_path}/", "")
+        return str(message.value).replace(f"{tmp_path}/", "")
 
     return run
 
@@ -73,7 +73,7 @@ def robot(*joints: tuple[str, str, str], links: str = "abcd") -> str:
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("<robot><joint", "robot.urdf:1: not valid XML: unclosed token"),
         ("<!DOCTYPE r [<!ENTITY a 'b'>]><robot/>", "robot.urdf:1: has a document type (<!DOCTYPE …>): remove it"),
@@ -96,14 +96,15 @@ def robot(*joints: tuple[str, str, str], links: str = "abcd") -> str:
         (robot(("1", "a", "b"), ("2", "c", "b"), ("3", "a", "d")),
          "robot.urdf:7: joints '1' (line 6) and '2' both carry link 'b'; links must make a tree"),
         (robot(("1", "a", "b"), ("2", "b", "d")),
-         "robot.urdf:4: link 'c' hangs loose: no joint connects it to 'a'"),
+         "robot.urdf:4: link 'c' is not connected: no joint leads to it from 'a'"),
         (robot(("1", "b", "c"), ("2", "c", "d"), ("3", "d", "b")),
-         "robot.urdf:6: link 'c' hangs on itself: c -> d -> b -> c; links must make a tree"),
-        (robot(("1", "a", "a"), links="a"), "robot.urdf:3: link 'a' hangs on itself: a -> a; links must make a tree"),
+         "robot.urdf:6: link 'c' is its own ancestor: c -> d -> b -> c; links must make a tree"),
+        (robot(("1", "a", "a"), links="a"),
+         "robot.urdf:3: link 'a' is its own ancestor: a -> a; links must make a tree"),
     ],
 )  # fmt: skip
-def test_wrong_files_are_named_with_their_line(fault: Callable[[str], str], text: str, told: str) -> None:
-    assert fault(text) == told
+def test_wrong_files_are_named_with_their_line(fault: Callable[[str], str], text: str, message: str) -> None:
+    assert fault(text) == message
 
 
 def test_missing_file_is_named(tmp_path: Path) -> None:

@@ -35,7 +35,7 @@ SMALL = RealSenseOptions(width=WIDTH, height=HEIGHT)
 
 
 @pytest.mark.parametrize(
-    ("reason", "told"),
+    ("reason", "message"),
     [
         (
             "ModuleNotFoundError(\"No module named 'pyrealsense2'\")",
@@ -54,15 +54,15 @@ SMALL = RealSenseOptions(width=WIDTH, height=HEIGHT)
     ],
 )
 def test_what_the_library_lacks_is_named_with_its_remedy(
-    reason: str, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    reason: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "pyrealsense2.py").write_text(f"raise {reason}")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "pyrealsense2", raising=False)
     with pytest.raises(MissingDependency) as missing:
         RealSenseCamera(SMALL, host_context("top"))
-    assert str(missing.value) == told
-    assert str(installed_plugins().missing("sensor", "realsense")) == told
+    assert str(missing.value) == message
+    assert str(installed_plugins().missing("sensor", "realsense")) == message
 
 
 class SoftwareCamera:

@@ -1,4 +1,4 @@
-"""The converting processes end when they are told to, or are killed."""
+"""The converting processes end on request, or are killed."""
 
 from __future__ import annotations
 

@@ -70,7 +70,7 @@ def source_of(runtime: Runtime) -> ReplaySource:
 
 
 def commands(runtime: Runtime) -> np.ndarray:
-    """What the joints were told at every tick of the run, shape (ticks, 2)."""
+    """The setpoints of the joints at every tick of the run, shape (ticks, 2)."""
     runtime.start()
     found: list[Vector] = []
     ended = False
@@ -88,26 +88,30 @@ def report(runtime: Runtime) -> dict[str, Any]:
 
 
 def test_the_commands_are_those_of_the_episode_after_a_slow_way_to_the_first(replay: Make):
-    told = commands(replay())
-    first = next(i for i, command in enumerate(told) if np.allclose(command, WAVE.commands.positions[0], atol=1e-9))
-    np.testing.assert_allclose(told[first : first + 51], WAVE.commands.positions, atol=1e-9)
-    assert np.abs(np.diff(told[: first + 1], axis=0)).max() < 0.5 / 50 + 1e-9
-    assert len(told) - first <= 52, "it ends by itself"
+    commanded = commands(replay())
+    first = next(
+        i for i, command in enumerate(commanded) if np.allclose(command, WAVE.commands.positions[0], atol=1e-9)
+    )
+    np.testing.assert_allclose(commanded[first : first + 51], WAVE.commands.positions, atol=1e-9)
+    assert np.abs(np.diff(commanded[: first + 1], axis=0)).max() < 0.5 / 50 + 1e-9
+    assert len(commanded) - first <= 52, "it ends by itself"
 
 
 @pytest.mark.parametrize("speed", [0.5, 2.0])
 def test_speed_scales_the_times(replay: Make, speed: float):
-    told = commands(replay(speed=speed))
-    first = next(i for i, command in enumerate(told) if np.allclose(command, WAVE.commands.positions[0], atol=1e-9))
-    assert len(told) - first == pytest.approx(50 / speed, abs=2)
-    np.testing.assert_allclose(told[-1], WAVE.commands.positions[-1], atol=0.01)
+    commanded = commands(replay(speed=speed))
+    first = next(
+        i for i, command in enumerate(commanded) if np.allclose(command, WAVE.commands.positions[0], atol=1e-9)
+    )
+    assert len(commanded) - first == pytest.approx(50 / speed, abs=2)
+    np.testing.assert_allclose(commanded[-1], WAVE.commands.positions[-1], atol=0.01)
 
 
 def test_the_safety_layer_bounds_it(replay: Make):
     far = attrs.evolve(WAVE, commands=Track(TIMES, np.stack([0.4 + 3 * TIMES, 0 * TIMES], axis=1)))
-    told = commands(replay(far))
-    assert told.max() <= 1.0
-    assert np.abs(np.diff(told, axis=0)).max() <= 2.0 / 50 + 1e-9
+    commanded = commands(replay(far))
+    assert commanded.max() <= 1.0
+    assert np.abs(np.diff(commanded, axis=0)).max() <= 2.0 / 50 + 1e-9
 
 
 def test_the_scene_is_set_up_by_the_recorded_seed_and_judged(replay: Make):
@@ -161,13 +165,17 @@ def test_a_host_that_is_held_up_cuts_nothing_out(replay: Make, monkeypatch: pyte
             work(timeout_s)
 
     monkeypatch.setattr(source, "work", held_up)
-    told = commands(runtime)
-    first = next(i for i, command in enumerate(told) if np.allclose(command, WAVE.commands.positions[0], atol=1e-9))
+    commanded = commands(runtime)
+    first = next(
+        i for i, command in enumerate(commanded) if np.allclose(command, WAVE.commands.positions[0], atol=1e-9)
+    )
     assert first < 100
     way = np.abs(np.diff(WAVE.commands.positions, axis=0)).max(axis=0) / 4
-    assert (np.abs(np.diff(told[first:], axis=0)) <= 1.5 * way).all(), "it goes on from where it stood, with no jump"
-    assert 200 + 80 < len(told) - first < 200 + 150
-    np.testing.assert_allclose(told[-1], WAVE.commands.positions[-1], atol=1e-9)
+    assert (np.abs(np.diff(commanded[first:], axis=0)) <= 1.5 * way).all(), (
+        "it goes on from where it stood, with no jump"
+    )
+    assert 200 + 80 < len(commanded) - first < 200 + 150
+    np.testing.assert_allclose(commanded[-1], WAVE.commands.positions[-1], atol=1e-9)
 
 
 def test_in_real_time_a_motion_longer_than_what_control_is_given_at_once_is_played_whole(replay: Make):

@@ -187,9 +187,9 @@ def load(tmp_path: Path, registry: Registry) -> Callable[..., RobotConfig]:
 @pytest.fixture
 def faults(load: Callable[..., RobotConfig], tmp_path: Path) -> Faults:
     def run(**changes: str) -> str:
-        with pytest.raises(ConfigError) as told:
+        with pytest.raises(ConfigError) as error:
             load(**changes)
-        return str(told.value).replace(f"{tmp_path}/", "")
+        return str(error.value).replace(f"{tmp_path}/", "")
 
     return run
 
@@ -221,7 +221,7 @@ TOP, WRIST = "robot.yaml:9: peripherals.top.transform", "robot.yaml:10: peripher
 
 
 @pytest.mark.parametrize(
-    ("top", "wrist", "told"),
+    ("top", "wrist", "error"),
     [
         ("transform: {}", "", f"{TOP}.parent: required key is missing"),
         ("transform: {parent: tol}", "", f"{TOP_PARENT} has an unknown parent 'tol', did you mean 'tool'?"),
@@ -246,8 +246,8 @@ TOP, WRIST = "robot.yaml:9: peripherals.top.transform", "robot.yaml:10: peripher
          f"{TOP}.yaw: unknown key; known keys: parent, xyz, rpy, quaternion, frame"),
     ],
 )  # fmt: skip
-def test_wrong_mounts_are_named_with_line_and_frame(faults: Faults, top: str, wrist: str, told: str) -> None:
-    assert faults(top=top, wrist=wrist) == told
+def test_wrong_mounts_are_named_with_line_and_frame(faults: Faults, top: str, wrist: str, error: str) -> None:
+    assert faults(top=top, wrist=wrist) == error
 
 
 def test_wrong_models_are_named_with_their_own_line(faults: Faults) -> None:
@@ -273,5 +273,5 @@ def test_srdf_needs_a_urdf(load: Callable[..., RobotConfig], tmp_path: Path, reg
 
 
 def test_empty_srdf_is_named(faults: Faults) -> None:
-    told = faults(top="transform: {parent: tool}", srdf="")
-    assert "robot.srdf:1: not valid XML" in told
+    error = faults(top="transform: {parent: tool}", srdf="")
+    assert "robot.srdf:1: not valid XML" in error

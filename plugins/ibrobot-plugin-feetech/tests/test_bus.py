@@ -205,7 +205,7 @@ class TestLateReplies(OnALine):
                     found = [bus.read(2, "present_position")]
                 except FeetechError:
                     found = []
-            # What is older is of an earlier request; on a busy machine the servos may have been told of more since.
+            # Older values answer an earlier request; on a busy machine the servos may have had more requests since.
             assert all(before <= value <= counting.truth() for value in found)  # type: ignore[attr-defined]
 
     def test_a_servo_that_was_late_is_heard_again(self, bus: FeetechBus, counting: Emulator) -> None:

@@ -185,7 +185,7 @@ def test_an_existing_file_is_not_overwritten_against_the_answer(emulator, home):
 
 
 @pytest.mark.parametrize(
-    ("ends", "told"),
+    ("ends", "message"),
     [
         (ENDS | {3: (2048, 4400)}, "elbow_flex: its range 2048 to 4400 crosses the encoder's end (0/4095)"),
         ({servo: both for servo, both in ENDS.items() if servo != 4}, "wrist_flex: it moved by only 0 ticks"),
@@ -193,13 +193,13 @@ def test_an_existing_file_is_not_overwritten_against_the_answer(emulator, home):
         (ENDS | {1: (1247, 3747)}, "shoulder_pan: the middle of its range is 39 deg from the middle pose"),
     ],
 )
-def test_ranges_that_cannot_be_true_are_explained_and_not_kept(emulator, person, home, ends, told):
+def test_ranges_that_cannot_be_true_are_explained_and_not_kept(emulator, person, home, ends, message):
     before = eprom(emulator)
     with Terminal("feetech", "calibrate", emulator.port, "--middle-now") as terminal:
         terminal.wait_for("(Enter ends it)")
         person.sweep(ends)
         terminal.type("\r")
-        terminal.wait_for(told)
+        terminal.wait_for(message)
         terminal.interrupt()
         assert terminal.end() != 0
     assert eprom(emulator) == before

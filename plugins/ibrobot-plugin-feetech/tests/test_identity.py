@@ -144,7 +144,7 @@ class TestSupply:
 
 class TestPort:
     @pytest.mark.parametrize(
-        ("number", "kind", "told"),
+        ("number", "kind", "message"),
         [
             (2, PortError, "there is no such port; check the USB cable"),
             (13, PortForbidden, "no permission; add yourself to the group"),
@@ -152,13 +152,13 @@ class TestPort:
         ],
     )
     def test_the_remedy_is_that_of_what_happened(
-        self, monkeypatch: pytest.MonkeyPatch, number: int, kind: type[PortError], told: str
+        self, monkeypatch: pytest.MonkeyPatch, number: int, kind: type[PortError], message: str
     ):
         def refuse(*arguments: object, **options: object) -> None:
             raise OSError(number, "refused")
 
         monkeypatch.setattr("serial.Serial", refuse)
-        with pytest.raises(kind, match=told) as refused:
+        with pytest.raises(kind, match=message) as refused:
             SerialPort("/dev/ttyACM0", 1_000_000).open()
         assert ("cable" in str(refused.value)) == (kind is PortError)
 

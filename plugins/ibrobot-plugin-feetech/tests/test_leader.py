@@ -113,7 +113,7 @@ class TestHold(LeaderSuite):
 
 
 class TeleopRig:
-    """A leader and a robot that is where it was told to be."""
+    """A leader and a robot that reaches every setpoint at once."""
 
     def __init__(self, emulator: Emulator, file: Path, link: Path | None = None, **options: Any) -> None:
         self.emulator, self.clock = emulator, SteppedClock(START_NS)
@@ -199,15 +199,15 @@ class TestMapping:
         assert rig.follow()[3] == -1.5
 
     @pytest.mark.parametrize(
-        ("given", "told"),
+        ("given", "message"),
         [
             ({"joints": {"shoulder_pan": "sholder"}}, "joints: no joint 'sholder'; the joints are: shoulder_pan"),
             ({"inverted": ("roll",)}, "inverted: no joint 'roll'; the joints are: shoulder_pan, shoulder_lift"),
             ({"scaled": ("grip",)}, "scaled: no joint 'grip'; the joints are: shoulder_pan, shoulder_lift"),
         ],
     )
-    def test_unknown_joints_are_reported(self, emulator: Emulator, calibration_file: Path, given: Any, told: str):
-        with pytest.raises(TeleopError, match=told):
+    def test_unknown_joints_are_reported(self, emulator: Emulator, calibration_file: Path, given: Any, message: str):
+        with pytest.raises(TeleopError, match=message):
             TeleopRig(emulator, calibration_file, **given)
 
 

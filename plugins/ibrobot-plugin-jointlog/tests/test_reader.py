@@ -1,4 +1,4 @@
-"""Joint logs as episodes: states, commands where a contract is told, and logs that cannot be read."""
+"""Joint logs as episodes: states, commands where a contract is given, and unreadable logs."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ def contract(*joints: tuple[str, ...]) -> Contract:
 def read(path: Path, known: Contract | None = None) -> EpisodeReader:
     (descriptor,) = ibrobot_readers()
     assert descriptor.reads(path)
-    told = {"contract": json.dumps(known.canonical())} if known is not None else {}
-    return descriptor.make(EpisodeAddress.of(path, told))
+    provenance = {"contract": json.dumps(known.canonical())} if known is not None else {}
+    return descriptor.make(EpisodeAddress.of(path, provenance))
 
 
 @pytest.mark.parametrize("joints", [JOINTS, JOINTS[::-1]])

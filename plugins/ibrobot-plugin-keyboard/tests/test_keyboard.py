@@ -34,7 +34,7 @@ TICK_S = 0.01
 
 @attrs.define
 class TeleopRig:
-    """An operator at a keyboard, and a robot that goes where it is told."""
+    """An operator at a keyboard, and a robot that reaches every setpoint at once."""
 
     robot: Robot = attrs.field(factory=make_robot)
     options: KeyboardOptions = KeyboardOptions(cartesian=False)

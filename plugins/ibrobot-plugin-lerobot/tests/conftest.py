@@ -80,7 +80,7 @@ def shown(root: Path, key: str, episode: int) -> list[NDArray[Any]]:
 
 
 def check(root: Path, features: dict[str, Feature], lengths: tuple[int, ...]) -> None:
-    """Check that a dataset has what `write` was told."""
+    """Check that a dataset has what `write` was given."""
     found, number = rows(root), 0
     assert [row["length"] for row in episodes(root)] == list(lengths)
     assert [row["index"] for row in found] == list(range(sum(lengths)))

@@ -162,6 +162,8 @@ def test_foreign_messages_are_refused():
     touch = ObservationPart("touch", "/touch", "lamp_msgs/msg/Touch", ("x",), None, Align(), Feature("float32", (1,)))
     with pytest.raises(ContractError, match="touch: cannot make a lamp_msgs/msg/Touch"):
         Composer(Contract(30.0, (touch,), ()))
-    command = ActionPart("arm", "/told", "lamp_msgs/msg/Command", "hold", ("a",), ("joints.0.target",))
-    with pytest.raises(ContractError, match=r"action: cannot make a .* for /told, because the action is foreign"):
+    command = ActionPart("arm", "/lamp/command", "lamp_msgs/msg/Command", "hold", ("a",), ("joints.0.target",))
+    with pytest.raises(
+        ContractError, match=r"action: cannot make a .* for /lamp/command, because the action is foreign"
+    ):
         Composer(Contract(30.0, (), (command,)))

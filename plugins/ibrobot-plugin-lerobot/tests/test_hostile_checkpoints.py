@@ -33,9 +33,9 @@ def test_harmless_checkpoint_is_accepted(tmp_path: Path, kind: str) -> None:
 def test_hostile_checkpoint_is_refused(tmp_path: Path, attack: str, kind: str) -> None:
     path, canary = write(tmp_path / "model", type=kind, **TYPES[kind]), tmp_path / "canary"
     ATTACKS[attack].spoil(path, canary)
-    with pytest.raises(PolicyError, match=ATTACKS[attack].refusal) as told:
+    with pytest.raises(PolicyError, match=ATTACKS[attack].refusal) as message:
         make(path)
-    assert str(path) in str(told.value), "the message names the file"
+    assert str(path) in str(message.value), "the message names the file"
     assert not canary.exists()
 
 

@@ -1,4 +1,4 @@
-"""JPEG of pictures on their way to a model: near what was sent, and damage is told."""
+"""JPEG of images on their way to a model: close to what was sent, and damage is reported."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ def contract(names: tuple[str, ...] = ("a", "b", "c"), *, camera: bool = True) -
     return Contract(FPS, tuple(parts), (ActionPart("arm", "/arm", Float64MultiArray.ros_type, "hold", names),))
 
 
-def told(described: Contract | None = None, norm_mode: str = "radians", **more: str) -> dict[str, str]:
+def provenance(described: Contract | None = None, norm_mode: str = "radians", **more: str) -> dict[str, str]:
     text = json.dumps((described or contract()).canonical())
     return {"contract": text, "norm_mode": norm_mode, **more}
 
@@ -70,7 +70,7 @@ def foreign(root: Path, **options: Any) -> Path:
 
 
 def read(root: Path, number: int, **more: Any) -> list[Any]:
-    return list(LeRobotReader(EpisodeAddress(root, number, more or told())).messages())
+    return list(LeRobotReader(EpisodeAddress(root, number, more or provenance())).messages())
 
 
 @pytest.mark.parametrize(("options", "exact"), [({"videos": False}, True), ({"codec": "h264", "crf": 20}, False)])
@@ -93,7 +93,7 @@ def test_rows_and_pictures_of_an_episode_in_the_middle_come_in_step(
 
 def test_the_summary_tells_topics_times_and_task_without_decoding(tmp_path: Path):
     root = foreign(tmp_path / "set", videos=False)
-    reader = installed_plugins().open_episode(tmp_path / "set:2", told())
+    reader = installed_plugins().open_episode(tmp_path / "set:2", provenance())
     summary = reader.summary()
     reader.close()
     assert summary.path == tmp_path / "set:2"
@@ -108,7 +108,7 @@ def test_only_what_is_asked_for_is_read(tmp_path: Path):
     root = foreign(tmp_path / "set", codec="h264")
     for video in root.rglob("*.mp4"):
         video.write_bytes(b"no video")
-    reader = LeRobotReader(EpisodeAddress(root, 0, told()))
+    reader = LeRobotReader(EpisodeAddress(root, 0, provenance()))
     assert len(list(reader.messages({"/arm"}))) == 3
     with pytest.raises(RecorderError, match=r"set:0: .*file-000.mp4: cannot be read"):
         list(reader.messages())
@@ -117,7 +117,7 @@ def test_only_what_is_asked_for_is_read(tmp_path: Path):
 def test_joints_come_in_radians(tmp_path: Path):
     joints = {n: {"id": i, "drive_mode": 0, "homing_offset": 0, "range_min": 1000, "range_max": 3100} for i, n in
               enumerate("abc")}  # fmt: skip
-    more = told(norm_mode="degrees", calibration=json.dumps({"arm": joints}))
+    more = provenance(norm_mode="degrees", calibration=json.dumps({"arm": joints}))
     items = read(foreign(tmp_path / "set", videos=False), 0, **more)
     degrees = values(FEATURES, 0)["action"].astype(float)
     expected = lerobot_to_radians(degrees, "degrees", range_min=1000, range_max=3100, zero=2048.0)
@@ -132,10 +132,10 @@ def test_joints_come_in_radians(tmp_path: Path):
             ContractError,
             "was not made by ibrobot, .*give a robot YAML with a matching contract",
         ),
-        ({"contract": told()["contract"]}, CalibrationError, "does not state the unit .*; set it by --norm-mode"),
-        (told(norm_mode="degrees"), CalibrationError, "degrees needs the calibration of joint 'a'"),
+        ({"contract": provenance()["contract"]}, CalibrationError, "does not state the unit .*; set it by --norm-mode"),
+        (provenance(norm_mode="degrees"), CalibrationError, "degrees needs the calibration of joint 'a'"),
         (
-            told(contract(("a", "c", "b"))),
+            provenance(contract(("a", "c", "b"))),
             ContractError,
             r"dataset: \(3,\) a.pos, b.pos, c.pos\n *contract: .*a.pos, c",
         ),
@@ -156,11 +156,11 @@ def test_an_episode_goes_by_its_number(tmp_path: Path):
     foreign(tmp_path / "set", videos=False)
     registry = installed_plugins()
     with pytest.raises(RecorderError, match=r"set: is a dataset of 3 episodes; choose one, e.g. .*set:0"):
-        registry.open_episode(tmp_path / "set", told())
+        registry.open_episode(tmp_path / "set", provenance())
     with pytest.raises(RecorderError, match=r"set: has no episode 3; available: 0 to 2"):
-        registry.open_episode(tmp_path / "set:3", told())
+        registry.open_episode(tmp_path / "set:3", provenance())
     with pytest.raises(RecorderError, match=r"sat:0: there is no such episode"):
-        registry.open_episode(tmp_path / "sat:0", told())
+        registry.open_episode(tmp_path / "sat:0", provenance())
 
 
 def test_a_table_without_some_of_the_rows_is_reported(tmp_path: Path):

@@ -1,4 +1,4 @@
-"""`ibrobot episodes …` on episodes that the recorder wrote: what is told, what is mended, cut, exported, deleted."""
+"""`ibrobot episodes …` on episodes that the recorder wrote: what they print, repair, cut, export and delete."""
 
 from __future__ import annotations
 
@@ -142,15 +142,15 @@ def test_a_cut_episode_does_not_count_as_success_and_keeps_what_is_missing_until
     after, again = contents(path)
     assert again == messages
     assert (after.outcome, after.finished, after.topics[JOINTS].missing) == ("unknown", True, missing)
-    told = f"{JOINTS}: {missing} messages that the recorder wrote are missing"
-    assert told in run("verify", path, code=1)
+    gap = f"{JOINTS}: {missing} messages that the recorder wrote are missing"
+    assert gap in run("verify", path, code=1)
     run("trim", path, "--to", "1", "-o", tmp_path / "cut")
-    assert told in run("info", tmp_path / "cut")
+    assert gap in run("info", tmp_path / "cut")
     run("mark", path, "success")
     marked, again = contents(path)
     assert again == messages
     assert (marked.outcome, marked.metadata["marked"]) == ("success", "true")
-    assert told in run("verify", path, code=1)
+    assert gap in run("verify", path, code=1)
 
 
 def test_messages_that_are_missing_from_within_keep_an_episode_from_being_read(tmp_path):
@@ -319,10 +319,10 @@ def test_plot_shows_the_first_and_the_last_picture_and_bears_states_without_posi
 
 
 def test_plot_takes_the_actions_and_their_joints_from_the_contract(tmp_path):
-    action = {"topic": "/told", "type": "std_msgs/msg/Float64MultiArray", "joints": ["pan", "tilt"]}
+    action = {"topic": "/head/setpoint", "type": "std_msgs/msg/Float64MultiArray", "joints": ["pan", "tilt"]}
     contract = {"version": 1, "units": "SI", "rate_hz": 30.0, "observations": {}, "action": [action]}
-    topics = ["/told", "/arm/commands"]
-    assert actions_of({"contract": json.dumps(contract)}, topics) == {"/told": ("pan", "tilt")}
+    topics = ["/head/setpoint", "/arm/commands"]
+    assert actions_of({"contract": json.dumps(contract)}, topics) == {"/head/setpoint": ("pan", "tilt")}
     assert actions_of({"contract": "of sale"}, topics) == {"/arm/commands": ()}
     assert actions_of({}, topics) == {"/arm/commands": ()}
 

@@ -44,7 +44,7 @@ class Outcome:
     success_s: float | None = None
     """When it first succeeded."""
     commands: list[Vector] = attrs.field(factory=list)
-    """What the hardware was told each tick [rad], shape (J,)."""
+    """The hardware's command of each tick [rad], shape (J,)."""
     chunks: list[tuple[float, Vector]] = attrs.field(factory=list)
     """When each chunk was asked for, and its actions, shape (N, J)."""
     infer_s: list[float] = attrs.field(factory=list)

@@ -67,7 +67,7 @@ def test_options_refuse_what_makes_no_sense(make: object, message: str) -> None:
 
 
 def test_egl_that_finds_no_driver_is_not_usable(tmp_path: Path) -> None:
-    """As with the package libegl1 alone. Real libraries, told of an empty folder of drivers."""
+    """As with the package libegl1 alone. Real libraries with an empty folder of drivers."""
     code = "from ibrobot_mujoco import gl; print(gl.usable())"
     environment = {"__EGL_VENDOR_LIBRARY_DIRS": str(tmp_path), "PATH": ""}
     ran = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
@@ -128,9 +128,9 @@ class TestOpenGl:
     ) -> None:
         self.have(monkeypatch, "libEGL.so.1", "libGL.so.1")
         monkeypatch.setenv("MUJOCO_GL", "osmesa")
-        told = r"MUJOCO_GL=osmesa does not work on this machine \(or unset it\); sudo apt-get install libosmesa6"
+        remedy = r"MUJOCO_GL=osmesa does not work on this machine \(or unset it\); sudo apt-get install libosmesa6"
         policy = installed_plugins().find("policy", "scripted_pick")
-        with pytest.raises(MissingDependency, match=told):
+        with pytest.raises(MissingDependency, match=remedy):
             policy.make(ScriptedPickOptions(), control_context("pick"))
 
     def test_an_unknown_backend_is_refused(self, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -68,7 +68,7 @@ NAMES = ", ".join(JOINTS)
 
 
 @pytest.mark.parametrize(
-    ("goal", "told"),
+    ("goal", "message"),
     [
         ("", "a goal is a pose's name, joints, e.g. wrist_flex=0.5, or a position, e.g. xyz=0.2,0.0,0.1"),
         ("lft", f"no pose 'lft'; {POSES}"),
@@ -101,15 +101,15 @@ NAMES = ", ".join(JOINTS)
         ),
     ],
 )
-def test_text_that_makes_no_sense(robot, goal: str, told: str):
+def test_text_that_makes_no_sense(robot, goal: str, message: str):
     with pytest.raises(PlanningError) as failure:
         target(goal, robot)
-    assert str(failure.value) == f"goal {goal!r}: {told}"
+    assert str(failure.value) == f"goal {goal!r}: {message}"
     assert failure.value.code is PlanCode.INVALID_GOAL_CONSTRAINTS
 
 
 @pytest.mark.parametrize(
-    ("goal", "scaling", "told"),
+    ("goal", "scaling", "message"),
     [
         (5, 1.0, "a goal is a text such as 'home' or 'xyz=0.2,0.0,0.1', or a goal of ibrobot_core.api; got int"),
         (JointGoal(("pan",), np.zeros(2)), 1.0, "goal has 1 joints and 2 positions, each joint once"),
@@ -122,7 +122,7 @@ def test_text_that_makes_no_sense(robot, goal: str, told: str):
         ("up", math.nan, "velocity_scaling is nan, must be above 0 and at most 1"),
     ],
 )  # fmt: skip
-def test_value_that_makes_no_sense(robot, goal, scaling: float, told: str):
+def test_value_that_makes_no_sense(robot, goal, scaling: float, message: str):
     with pytest.raises(PlanningError) as failure:
         target(goal, robot, scaling)
-    assert str(failure.value) == told
+    assert str(failure.value) == message

@@ -150,19 +150,19 @@ def test_cmd_pose_is_a_goal(run, stamped: bool):
 
 
 @pytest.mark.parametrize(
-    ("message", "told"),
+    ("message", "expected"),
     [
         (PoseStamped(Header(0, "camera"), Pose()), "frame 'camera' is not the base; it is called base, base_link"),
         (String("up"), "takes geometry_msgs/msg/PoseStamped or Pose, got std_msgs/msg/String"),
     ],
 )
-def test_wrong_cmd_pose_moves_nothing(run, message, told: str, caplog: pytest.LogCaptureFixture):
+def test_wrong_cmd_pose_moves_nothing(run, message, expected: str, caplog: pytest.LogCaptureFixture):
     runtime = run()
     before = command(runtime)
     runtime.session.bus.publish(CMD_POSE, message)
     for _ in range(20):
         runtime.step()
-    assert f"/cmd_pose: {told}" in caplog.text
+    assert f"/cmd_pose: {expected}" in caplog.text
     np.testing.assert_array_equal(command(runtime), before)
 
 
@@ -215,7 +215,7 @@ def test_end_of_the_run_ends_a_service_that_waits(run):
 
 
 @pytest.mark.parametrize(
-    ("service", "request_", "error", "told"),
+    ("service", "request_", "error", "expected"),
     [
         (GO_TO, "xyz=1", PlanningError, "goal 'xyz=1': xyz takes 3 numbers, got 1"),
         (
@@ -231,12 +231,12 @@ def test_end_of_the_run_ends_a_service_that_waits(run):
         (MOVE_TO_POSE, MoveToPose(Pose()), NotSupported, "this service waits for the motion: "),
     ],
 )  # fmt: skip
-def test_wrong_request_is_an_error(run, service: str, request_: object, error: type[Exception], told: str):
+def test_wrong_request_is_an_error(run, service: str, request_: object, error: type[Exception], expected: str):
     runtime = run()
     runtime.step()
     with pytest.raises(error) as failure:
         runtime.session.bus.call(service, request_)
-    assert str(failure.value).startswith(told)
+    assert str(failure.value).startswith(expected)
 
 
 def assert_within_limits(runtime: Runtime, commands: list[Vector]) -> None:

@@ -113,7 +113,7 @@ def test_reset_fails_the_goal_under_way_and_the_next_is_tried(start: Make):
 
 
 @pytest.mark.parametrize(
-    ("goal", "told"),
+    ("goal", "message"),
     [
         (
             "hom",
@@ -125,8 +125,8 @@ def test_reset_fails_the_goal_under_way_and_the_next_is_tried(start: Make):
         ("pan=nan", "goal 'pan=nan': 'nan' is not an angle in radians"),
     ],
 )
-def test_goal_that_makes_no_sense_is_refused_before_anything_starts(make: Make, goal: str, told: str):
+def test_goal_that_makes_no_sense_is_refused_before_anything_starts(make: Make, goal: str, message: str):
     with pytest.raises(PlanningError) as failure:
         make(mode="plan", goals=(goal,))
-    assert str(failure.value) == told
+    assert str(failure.value) == message
     assert failure.value.exit_code == 2

@@ -48,7 +48,7 @@ def goal(*points: dict[str, Any], joint_names: Any = ("pan", "roll"), **more: An
 
 
 class Arm:
-    """Two joints that stand, at each tick, where the last setpoint told them to be, plus `off`."""
+    """Two joints that stand, at each tick, at the last setpoint plus `off`."""
 
     def __init__(self, start: tuple[float, float] = (0.0, 0.0), **options: Any) -> None:
         context = Context(

@@ -91,7 +91,7 @@ class Robot(threading.Thread):
                 )
                 if not np.array_equal(outputs["sum"], state + 1):
                     raise ValueError(f"got {outputs['sum']} for {state}")
-            except Exception as error:  # noqa: BLE001 - told at the end
+            except Exception as error:  # noqa: BLE001 - reported at the end
                 self.wrong.append(f"{type(error).__name__}: {error}")
             self.slowest_s = max(self.slowest_s, time.monotonic() - begun_s)
             self.served += 1
@@ -218,21 +218,21 @@ def main() -> int:
     np.seterr(all="ignore")  # sums of damaged numbers
     begun_s = time.monotonic()
     ended, robot, grown = fuzz_frames(arguments.mutants, arguments.seed)
-    told = {
+    summary = {
         "mutants": arguments.mutants, **ended, "growth_mib": round(grown, 1), "robot_served": robot.served,
         "robot_slowest_ms": round(robot.slowest_s * 1e3, 1), "robot_wrong": robot.wrong[:3],
         "seconds": round(time.monotonic() - begun_s),
     }  # fmt: skip
     wrong = bool(robot.wrong) or grown > GROWTH_MIB or not robot.served
-    print(json.dumps(told), flush=True)
+    print(json.dumps(summary), flush=True)
     if arguments.connections:
         robot, grown = fuzz_connections(arguments.connections, arguments.seed)
-        told = {
+        summary = {
             "garbage_connections": arguments.connections, "growth_mib": round(grown, 1), "robot_served": robot.served,
             "robot_slowest_ms": round(robot.slowest_s * 1e3, 1), "robot_wrong": robot.wrong[:3],
         }  # fmt: skip
         wrong = wrong or bool(robot.wrong) or grown > GROWTH_MIB
-        print(json.dumps(told))
+        print(json.dumps(summary))
     return int(wrong)
 
 

@@ -1,4 +1,4 @@
-"""The model in a process of its own: the same outputs, its death told and mended, nothing left behind."""
+"""The model in a process of its own: the same outputs, recovery after its death, nothing left behind."""
 
 from __future__ import annotations
 
@@ -62,8 +62,8 @@ def ask(engine: ProcessEngine) -> Callable[..., Any]:
     def infer(do: str = "", patience_ns: int = PATIENCE_NS, **tensors: np.ndarray) -> Any:
         nonlocal count
         count += 1
-        told = {"do": np.frombuffer(do.encode(), np.uint8)} if do else {}
-        return engine.infer({"x": np.arange(3), **tensors, **told}, count, time.monotonic_ns() + patience_ns)
+        request = {"do": np.frombuffer(do.encode(), np.uint8)} if do else {}
+        return engine.infer({"x": np.arange(3), **tensors, **request}, count, time.monotonic_ns() + patience_ns)
 
     return infer
 

@@ -97,7 +97,7 @@ class TestTwist(TeleopSuite):
 
 
 class Rig:
-    """A program that sends twists, and a robot that goes where it is told."""
+    """A program that sends twists, and a robot that reaches every setpoint at once."""
 
     def __init__(self, path: Path, options: TwistOptions = TwistOptions()) -> None:  # noqa: B008 - it is frozen
         self.robot = robot_of(path)

@@ -144,15 +144,15 @@ class SubscribedTopics(Component):
             self._ends.append(transport.subscribe_messages(topic, self._to_bus(topic)))
 
     def _to_bus(self, topic: str) -> Callable[[Message], None]:
-        told = False
+        reported = False
 
         def take(message: Message) -> None:
-            nonlocal told
+            nonlocal reported
             try:
                 self._session.bus.publish(topic, message)
             except IbrobotError as error:
-                if not told:
-                    told = True
+                if not reported:
+                    reported = True
                     self._session.log.warning("from another machine: %s", error)
 
         return take

@@ -157,7 +157,7 @@ def test_large_messages_are_refused_both_ways():
 
 
 def test_a_flood_is_turned_away(monkeypatch: pytest.MonkeyPatch):
-    """What waits for a server is bounded; who is turned away is told, and the others are answered."""
+    """The queue of a server is bounded; a refused client gets an answer, and so do the others."""
     monkeypatch.setattr(transport_module, "REQUESTS_WAITING", 2)
     endpoint = free_endpoint()
     server, robot = router(endpoint), client(endpoint)

@@ -150,7 +150,7 @@ def test_a_server_needs_a_list_of_robots(lab: Path, tmp_path: Path):
 
 
 def test_a_robot_that_is_not_listed_gets_nothing(lab: Path, tmp_path: Path):
-    """Its certificate is good; striking its name is how it is locked out. It is told what may be wrong."""
+    """Its certificate is valid, but its name was removed from the access list. The error names both possible causes."""
     robots = tmp_path / "robots.txt"
     robots.write_text("# robot1 is in repair\nrobot2\n")
     endpoint = free_endpoint("tls")

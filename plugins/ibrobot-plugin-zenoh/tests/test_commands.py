@@ -1,4 +1,4 @@
-"""`ibrobot topic …` beside a router on this machine: what is shown, counted and sent, and what is told when wrong."""
+"""`ibrobot topic …` beside a router on this machine: what they show, count and send, and their errors."""
 
 from __future__ import annotations
 
@@ -98,8 +98,8 @@ def run(*arguments: str) -> str:
 def test_list(robot: ZenohTransport, endpoint: str):
     wait_for(lambda: robot.shared_topics(WAIT_S))
     assert run("list", "--endpoint", endpoint) == "/joint_states\n"
-    told = run("list", "--endpoint", endpoint, "--types").split("  ")
-    assert told[:2] == ["/joint_states", "sensor_msgs/msg/JointState"]
+    message = run("list", "--endpoint", endpoint, "--types").split("  ")
+    assert message[:2] == ["/joint_states", "sensor_msgs/msg/JointState"]
     assert run("list", "--endpoint", endpoint, "--domain", "3") == "no topics are shared\n"
 
 
@@ -117,8 +117,8 @@ def test_hz(robot: ZenohTransport, endpoint: str):
     assert unit.startswith("Hz")
     assert 1 < float(rate) <= 400  # 200 at most, and more where some had waited for a busy machine
     silent = run("hz", "/silence", "--endpoint", endpoint, "-n", "1", "--period", "0.02")
-    told = "/silence has no publisher yet; available: /joint_states\n"
-    assert silent == f"{told}fewer than two messages on /silence in 0.02 s\n"
+    message = "/silence has no publisher yet; available: /joint_states\n"
+    assert silent == f"{message}fewer than two messages on /silence in 0.02 s\n"
 
 
 def test_pub(robot: ZenohTransport, endpoint: str):
@@ -155,8 +155,8 @@ def test_ctrl_c_ends_it_cleanly(command: list[str], robot: ZenohTransport, endpo
         assert process.stdout is not None
         assert process.stdout.readline()
         process.send_signal(signal.SIGINT)
-        _, told = process.communicate(timeout=WAIT_S)
-    assert (process.returncode, told) == (0, "")
+        _, message = process.communicate(timeout=WAIT_S)
+    assert (process.returncode, message) == (0, "")
 
 
 def test_which_network(monkeypatch: pytest.MonkeyPatch):
@@ -209,13 +209,13 @@ def test_messages_from_text():
     )
     with pytest.raises(NotSupported, match="did you mean 'std_msgs/msg/Bool'"):
         message_from("std_msgs/Bool", "data: true")
-    for text, told in (
+    for text, message in (
         ("data: x", "data: expected true or false, got 'x'"),
         ("dat: true", "did you mean 'data'"),
         ("[1", "MESSAGE"),
         ("5", "expected a mapping"),
     ):
-        with pytest.raises(ConfigError, match=told):
+        with pytest.raises(ConfigError, match=message):
             message_from("std_msgs/msg/Bool", text)
     with pytest.raises(ConfigError, match="could not convert"):
         message_from("std_msgs/msg/Float64MultiArray", "data: [a]")
