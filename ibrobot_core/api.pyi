@@ -73,6 +73,7 @@ from ibrobot_core.interfaces import (
     PositionGoal as PositionGoal,
     Recorded as Recorded,
     Recorder as Recorder,
+    SceneObject as SceneObject,
     Sensor as Sensor,
     Severity as Severity,
     Signal as Signal,
@@ -171,8 +172,9 @@ from ibrobot_core.launch.session import (
 from ibrobot_core.launch.sources.source_worker import SourceWorker as SourceWorker
 from ibrobot_core.control.link import ControlState as ControlState
 from ibrobot_core.control.spline import Spline as Spline
-from ibrobot_core.launch.runtime import Runtime as Runtime
+from ibrobot_core.launch.runtime import SET_MODE as SET_MODE, Runtime as Runtime
 from ibrobot_core.cli.run import run_robot as run_robot
+from ibrobot_core.launch.models import check_models as check_models
 from ibrobot_core.cli.options import run_options as run_options, run_overrides as run_overrides
 from ibrobot_core.run_hooks import RunHooks as RunHooks
 from ibrobot_core.launch.transport import TransportLink as TransportLink
@@ -239,7 +241,7 @@ from ibrobot_core.config.models import ModelError as ModelError, XmlElement as X
 from ibrobot_core.config.expand import resolve_path as resolve_path
 from ibrobot_core.config.overrides import apply_overrides as apply_overrides, single_options as single_options
 from ibrobot_core.config.show import dump_yaml as dump_yaml
-from ibrobot_core.config.yaml_nodes import parse_yaml as parse_yaml
+from ibrobot_core.config.yaml_nodes import Document as Document, parse_yaml as parse_yaml
 from ibrobot_core.plugins import (
     Registry as Registry,
     example_type as example_type,

@@ -70,6 +70,8 @@ class HardwareDescriptor(Descriptor["interfaces.Hardware"]):
     anchored: Callable[[Any], tuple[str, ...]] = attrs.field(default=lambda options: (), kw_only=True)
     """The joints whose calibrated closed end is at their lower limit, such as a gripper. In LeRobot's units they range
     from 0 to 100."""
+    scene: Callable[[Any, Robot], Sequence[interfaces.SceneObject]] = attrs.field(default=lambda o, r: (), kw_only=True)
+    """For simulated hardware: the objects around the robot, for planners."""
 
 
 @attrs.frozen

@@ -10,6 +10,7 @@ from ibrobot_core.interfaces.hardware import (
     Hardware,
     Holding,
     JointReading,
+    SceneObject,
     Severity,
     Signal,
     SimulatedHardware,

@@ -6,11 +6,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from enum import Enum, StrEnum
+from typing import Literal
 
 import attrs
 import numpy as np
 
 from ibrobot_core.errors import NotSupported
+from ibrobot_core.messages import Pose
 from ibrobot_core.robot import Vector
 
 
@@ -36,6 +38,24 @@ class Signal:
     topic: str
     size: int
     help: str = ""
+
+
+@attrs.frozen
+class SceneObject:
+    """A rigid object of a simulated scene, as a shape."""
+
+    name: str
+    shape: Literal["box", "sphere", "cylinder", "capsule", "plane"]
+    """A box, or a cylinder or capsule along z, about its centre; a plane is solid below z = 0."""
+    size: tuple[float, ...]
+    """Lengths of a box along x, y and z; radius of a sphere; radius and height of a cylinder or capsule (without the
+    half spheres); nothing for a plane [m]."""
+    pose: Pose
+    """At the beginning, in the base frame."""
+    topic: str = ""
+    """The `Signal` that has its pose during a run; empty for an object that stands still."""
+    first: int = 0
+    """Index of the pose in that signal: position [m] (3), quaternion wxyz (4)."""
 
 
 class Torque(Enum):

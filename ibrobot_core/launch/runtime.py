@@ -95,7 +95,8 @@ class Runtime:
         clock = session.clock
         assert isinstance(clock, SteppedClock)
         now_ns = clock.advance(ns(1.0 / session.config.control.rate_hz))
-        for component in self._started:
+        # A step may switch the mode, which removes components.
+        for component in (each for each in self._started if each in self._started):
             try:
                 component.step(now_ns)
             except Exception as error:  # noqa: BLE001 - a component that dies ends the run, with its cause

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from ibrobot_core.api import (
@@ -18,7 +18,17 @@ from ibrobot_mujoco.options import CameraOptions, MujocoOptions, check_world, pi
 from ibrobot_mujoco.policy_options import ScriptedPickOptions, check_pick
 
 if TYPE_CHECKING:
-    from ibrobot_core.api import CompressedImage, Context, Hardware, Image, Policy, Sensor, Viewer
+    from ibrobot_core.api import (
+        CompressedImage,
+        Context,
+        Hardware,
+        Image,
+        Policy,
+        Robot,
+        SceneObject,
+        Sensor,
+        Viewer,
+    )
 
 
 def _hardware(options: Any, ctx: Context) -> Hardware:
@@ -26,6 +36,13 @@ def _hardware(options: Any, ctx: Context) -> Hardware:
     from ibrobot_mujoco.hardware import MujocoHardware
 
     return MujocoHardware(options, ctx)
+
+
+def _scene(options: Any, robot: Robot) -> Sequence[SceneObject]:
+    check_asked()
+    from ibrobot_mujoco.scene import scene_objects
+
+    return scene_objects(options, robot)
 
 
 def _camera(options: Any, ctx: Context) -> Sensor:
@@ -58,7 +75,7 @@ def ibrobot_hardware() -> Iterable[HardwareDescriptor]:
     """Physics."""
     yield HardwareDescriptor(
         type="mujoco", options=MujocoOptions, make=_hardware, default=True, simulated=True,
-        sensors={"camera": "mujoco"}, check_options=check_world,
+        sensors={"camera": "mujoco"}, check_options=check_world, scene=_scene,
         summary="the robot's MJCF in MuJoCo, on an empty table or with a cube and a bin",
     )  # fmt: skip
 

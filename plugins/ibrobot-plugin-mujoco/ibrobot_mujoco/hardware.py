@@ -25,7 +25,15 @@ from ibrobot_mujoco.faults import Faults
 from ibrobot_mujoco.model import build_model
 from ibrobot_mujoco.options import MujocoOptions
 from ibrobot_mujoco.pick_cube import PickCube
-from ibrobot_mujoco.state import PHYSICS_TOPIC, SCENE_SIZE, SCENE_TOPIC, physics_size, write_physics
+from ibrobot_mujoco.state import (
+    OBJECTS_TOPIC,
+    PHYSICS_TOPIC,
+    POSE_SIZE,
+    SCENE_SIZE,
+    SCENE_TOPIC,
+    physics_size,
+    write_physics,
+)
 
 _RELAXED = int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
 
@@ -64,7 +72,10 @@ class MujocoHardware(SimulatedHardware):
         self._stride = options.velocity_limit * options.timestep
         physics = Signal(PHYSICS_TOPIC, physics_size(model), "stamp and state, for cameras and viewers")
         scene = Signal(SCENE_TOPIC, SCENE_SIZE, "cube position, cube quaternion wxyz, bin centre [m, base frame]")
-        self.signals = (physics, scene) if self._task is not None else (physics,)
+        free = [name for name, thing in options.objects.items() if thing.mass is not None]
+        self._objects = [int(model.joint(name).qposadr[0]) for name in free]
+        objects = Signal(OBJECTS_TOPIC, POSE_SIZE * len(free), f"pose of each of {', '.join(free)}: position, wxyz")
+        self.signals = (physics, *([scene] if self._task is not None else ()), *([objects] if free else ()))
 
     @override
     def connect(self) -> None:
@@ -186,12 +197,17 @@ class MujocoHardware(SimulatedHardware):
     @override
     def read_signal(self, index: int, out: Vector) -> None:
         physics = self._connected()
-        if index == 0:
+        if index >= len(self.signals):
+            raise HardwareError(f"no signal {index}, there are {len(self.signals)}")
+        topic = self.signals[index].topic
+        if topic == PHYSICS_TOPIC:
             write_physics(self._model, physics, self._stamp_ns, out)
-        elif index == 1 and self._task is not None:
+        elif topic == SCENE_TOPIC and self._task is not None:
             self._task.observe(physics, out)
         else:
-            raise HardwareError(f"no signal {index}, there are {len(self.signals)}")
+            for number, address in enumerate(self._objects):
+                first = POSE_SIZE * number
+                out[first : first + POSE_SIZE] = physics.qpos[address : address + POSE_SIZE]
 
     def _connected(self) -> mujoco.MjData:
         if self._physics is None:

@@ -1,4 +1,4 @@
-"""The scene as a MuJoCo model: the robot's MJCF, a table, and for `pick_cube` a cube and a bin.
+"""The scene as a MuJoCo model: the robot's MJCF, a table, added objects, and for `pick_cube` a cube and a bin.
 
 The physics model has no visual meshes, the visual model has low-poly ones; both have the same layout of qpos and qvel.
 """
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ibrobot_core.api import NS_PER_S, HardwareError, Robot, ns
 from ibrobot_mujoco.lowpoly import GRID_M, low_poly
-from ibrobot_mujoco.options import MujocoOptions, SceneCamera
+from ibrobot_mujoco.options import MujocoOptions, SceneCamera, SceneThing
 
 CUBE = "cube"
 """Name of the cube's body, free joint and geom."""
@@ -35,6 +35,7 @@ CAMERAS = (
 
 _Mesh = mujoco.mjtGeom.mjGEOM_MESH
 _Box = mujoco.mjtGeom.mjGEOM_BOX
+_SHAPES = {"box": _Box, "sphere": mujoco.mjtGeom.mjGEOM_SPHERE, "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER}
 
 
 def build_model(options: MujocoOptions, robot: Robot, *, visual: bool) -> mujoco.MjModel:
@@ -79,6 +80,8 @@ def build_spec(options: MujocoOptions, robot: Robot) -> mujoco.MjSpec:
     if options.scene == "pick_cube":
         _add_cube(spec, options.cube_size)
         _add_bin(spec, options.bin_position)
+    for name, thing in options.objects.items():
+        _add_thing(spec, name, thing)
     present = {camera.name for camera in spec.cameras}
     for camera in CAMERAS:
         if camera.name not in present:
@@ -162,6 +165,20 @@ def _add_bin(spec: mujoco.MjSpec, position: tuple[float, float]) -> None:
     }
     for name, (pos, size) in boxes.items():
         body.add_geom(name=f"{BIN}_{name}", type=_Box, pos=pos, size=size, rgba=[0.16, 0.36, 0.62, 1])
+
+
+def _add_thing(spec: mujoco.MjSpec, name: str, thing: SceneThing) -> None:
+    if spec.body(name) is not None or spec.geom(name) is not None:
+        raise HardwareError(f"simulation.objects: the scene has {name!r} already; give the object another name")
+    turn = [np.cos(thing.yaw / 2), 0, 0, np.sin(thing.yaw / 2)]
+    body = spec.worldbody.add_body(name=name, pos=thing.position, quat=turn)
+    if thing.mass is not None:
+        body.add_freejoint(name=name)
+    sizes = [each / 2 for each in thing.size or ()] or [thing.radius, (thing.height or 0) / 2, 0]
+    body.add_geom(
+        name=name, type=_SHAPES[thing.shape], size=sizes, mass=thing.mass or 1.0, friction=[1, 0.005, 0.0001],
+        rgba=[0.35, 0.55, 0.35, 1],
+    )  # fmt: skip
 
 
 def _add_camera(spec: mujoco.MjSpec, camera: SceneCamera) -> None:

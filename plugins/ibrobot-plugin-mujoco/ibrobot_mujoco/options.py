@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any, Literal
 
 import attrs
 
@@ -59,6 +59,29 @@ class Fault:
 
 @documented
 @attrs.frozen
+class SceneThing:
+    """An object added to the scene."""
+
+    shape: Literal["box", "sphere", "cylinder"] = option(help="a box, a sphere, or a cylinder along z")
+    position: Vec3 = option(unit="m", help="its centre at the beginning of each episode, in the base frame")
+    size: Vec3 | None = option(None, unit="m", help="lengths of a box along x, y and z")
+    radius: float | None = option(None, unit="m", gt=0, le=1, help="of a sphere or cylinder")
+    height: float | None = option(None, unit="m", gt=0, le=1, help="of a cylinder")
+    yaw: float = option(0.0, unit="rad", help="its turn about z")
+    mass: float | None = option(None, unit="kg", gt=0, help="None: it stands still, whatever pushes it")
+
+    def __attrs_post_init__(self) -> None:
+        needed = {"box": ("size",), "sphere": ("radius",), "cylinder": ("radius", "height")}[self.shape]
+        for key, value in (("size", self.size), ("radius", self.radius), ("height", self.height)):
+            if (value is None) == (key in needed):
+                found = "missing" if value is None else "given"
+                raise ValueError(f"a {self.shape} takes {' and '.join(needed)}; {key} is {found}")
+        if self.size is not None and min(self.size) <= 0:
+            raise ValueError(f"size is {list(self.size)}, must be three lengths above 0")
+
+
+@documented
+@attrs.frozen
 class MujocoOptions:
     """Options of the simulation. Servo values of None use those of the MJCF."""
 
@@ -85,6 +108,7 @@ class MujocoOptions:
     cube_bearing: Range = option((-0.7, 0.5), unit="rad", validator=_ordered, help="direction of the cube; 0 is ahead")
     cube_yaw: Range = option((-3.14159, 3.14159), unit="rad", validator=_ordered, help="cube's rotation")
     bin_position: Range = option((0.10, 0.24), unit="m", help="x and y of the bin's centre")
+    objects: Mapping[str, SceneThing] = option(factory=dict, help="further objects, e.g. obstacles, by name")
     cameras: tuple[SceneCamera, ...] = option((), help="cameras in addition to `top`, `front` and those of the MJCF")
 
 

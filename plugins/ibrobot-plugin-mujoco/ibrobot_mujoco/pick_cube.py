@@ -28,7 +28,7 @@ class PickCube:
         self._qpos = int(model.joint(CUBE).qposadr[0])
         self._dof = int(model.joint(CUBE).dofadr[0])
         self._bin: Vector = np.add(model.body(BIN).pos, (0, 0, BIN_HEIGHT / 2))
-        scenery = [model.body(name).id for name in ("world", CUBE, BIN)]
+        scenery = [model.body(name).id for name in ("world", CUBE, BIN, *options.objects)]
         self._of_robot = ~np.isin(model.geom_bodyid, scenery)
         solid = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
         solid[[self._cube, model.geom(TABLE).id]] = False

@@ -12,6 +12,9 @@ PHYSICS_TOPIC = "/simulation/physics"
 SCENE_TOPIC = "/simulation/scene"
 """Cube position [m] (3), cube orientation as a quaternion wxyz (4), centre of the bin [m] (3); base frame."""
 SCENE_SIZE = 10
+OBJECTS_TOPIC = "/simulation/objects"
+"""Of each object of `simulation.objects` that has a mass, in file order: position [m] (3), quaternion wxyz (4)."""
+POSE_SIZE = 7
 _STAMP_SIZE = 2
 # Positions are sufficient for rendering.
 _STATE = mujoco.mjtState.mjSTATE_QPOS

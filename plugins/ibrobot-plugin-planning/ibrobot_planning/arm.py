@@ -96,6 +96,17 @@ class Arm:
             )
         return self.frames[link]
 
+    def hand(self, joint: str) -> tuple[str, ...]:
+        """Links that a joint and the joints behind it carry; the link next to the joint first.
+
+        For the last joint that moves the tool, these are the links of the gripper.
+        """
+        carried = {int(self.numbers[self.joint_names.index(joint)])}
+        for number in range(min(carried) + 1, self.model.njoints):
+            if self.model.parents[number] in carried:
+                carried.add(number)
+        return tuple(link for link, (number, _) in self.frames.items() if number in carried)
+
     def pairs(self) -> list[tuple[int, int]]:
         """Shapes of different links that can move towards one another, as indices of `shapes`."""
         return [(i, j) for (i, a), (j, b) in combinations(enumerate(self.shapes), 2) if a.joint != b.joint]

@@ -465,10 +465,13 @@ class _Plan:
         return f"{message}; on the straight way {_sentence(self.checks.contacts(line[hit]))}"
 
     def _result(self, motion: Motion, end: Candidate, number: int, fraction: float = 1.0) -> PlanResult:
+        # Rounding may leave the limits, which executors refuse.
+        lower, upper = self._limits
+        positions = np.clip(motion.positions, np.minimum(lower, self.start), np.maximum(upper, self.start))
         points = tuple(
             JointTrajectoryPoint(ns(stamp), position, velocity, acceleration)
             for stamp, position, velocity, acceleration in zip(
-                motion.times.tolist(), motion.positions, motion.velocities, motion.accelerations, strict=True
+                motion.times.tolist(), positions, motion.velocities, motion.accelerations, strict=True
             )
         )
         trajectory = JointTrajectory(Header(stamp_ns=self.ctx.clock.now_ns()), self.request.joints, points)

@@ -3,44 +3,115 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
-from typing import Any, override
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, override
 
+import attrs
 import numpy as np
 
-from ibrobot_core.api import Component, PlanningError, Pose, Session, Vector, Vector3, single_options
-from ibrobot_planning.arm import Arm, robot_arm
+from ibrobot_core.api import (
+    Component,
+    Float64MultiArray,
+    HardwareDescriptor,
+    PlanningError,
+    Pose,
+    Quaternion,
+    Registry,
+    RobotConfig,
+    SceneObject,
+    Session,
+    Subscription,
+    Vector,
+    Vector3,
+    single_options,
+)
 from ibrobot_planning.transforms import from_rpy, matrix, pose
-from ibrobot_planning.world import World
-from ibrobot_planning.world_options import Added, Attached, Detached, Moved, Named, WorldOptions
+from ibrobot_planning.world import Box, Capsule, Cylinder, Plane, Shape, Sphere, World, WorldObject
+from ibrobot_planning.world_options import Added, Attached, Detached, Moved, Named, Touched, WorldOptions
+
+if TYPE_CHECKING:
+    from ibrobot_planning.arm import Arm
 
 SNAPSHOT = "/world/snapshot"
 """Service that answers with the `World` of the run."""
+ATTACH, DETACH, TOUCH = "/world/attach", "/world/detach", "/world/touch"
+"""Services that take `Attached`, `Detached` and `Touched` as YAML."""
+SECTION = "world"
+
+
+def scene_objects(config: RobotConfig, registry: Registry) -> tuple[SceneObject, ...]:
+    """The objects of the simulated scene that the world of a robot has: none without `scene: true`, or on hardware."""
+    section = config.plugin_sections.get(SECTION)
+    if section is None or not section.options.scene or not config.simulated or config.simulation is None:
+        return ()
+    descriptor = registry.find("hardware", config.simulation.type)
+    assert isinstance(descriptor, HardwareDescriptor)
+    return tuple(descriptor.scene(config.simulation.options, config.robot))
+
+
+def first_world(options: WorldOptions, scene: Sequence[SceneObject]) -> World:
+    """The world at the beginning of a run.
+
+    Raises:
+        PlanningError: for a name that is in the YAML and in the scene.
+        ValueError: as `ObjectOptions.made`.
+    """
+    world = World({name: thing.made() for name, thing in options.objects.items()})
+    for thing in scene:
+        if thing.name in world.objects:
+            raise PlanningError(
+                f"the simulated scene has an object {thing.name!r}; leave world.objects.{thing.name} out"
+            )
+        world = world.add(thing.name, WorldObject(_shape(thing), thing.pose))
+    return world
+
+
+def _shape(thing: SceneObject) -> Shape:
+    match thing.shape:
+        case "box":
+            return Box(thing.size)
+        case "sphere":
+            return Sphere(*thing.size)
+        case "cylinder":
+            return Cylinder(*thing.size)
+        case "capsule":
+            return Capsule(*thing.size)
+        case "plane":
+            return Plane()
 
 
 class WorldKeeper(Component):
-    """Serves `/world/snapshot`, and `/world/add`, `remove`, `move`, `attach` and `detach`, which take YAML texts.
+    """Serves `/world/snapshot`, and `/world/add`, `remove`, `move`, `attach`, `detach` and `touch`, which take YAML.
 
-    A change answers with the names of all objects. Planners see a whole world: each change makes a new one.
+    A change answers with the names of all objects. Planners see a whole world: each change makes a new one. Objects of
+    the simulated scene are where the simulation has them now, unless they are attached.
     """
 
     def __init__(self, options: WorldOptions, session: Session) -> None:
-        super().__init__("world", f"{len(options.objects)} objects for planners", ())
+        scene = scene_objects(session.config, session.registry)
+        self._world = first_world(options, scene)
+        super().__init__("world", f"{len(self._world.objects)} objects for planners", ())
         self._session = session
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
         self._arm: Arm | None = None
-        self._world = World({name: thing.made() for name, thing in options.objects.items()})
+        self._moving = {thing.name: thing for thing in scene if thing.topic}
+        """Objects of the scene that may move."""
+        self._poses: dict[str, Subscription] = {}
+        self._touched: tuple[str, ...] = ()
         self._services: dict[str, Callable[[Any], Any]] = {
-            SNAPSHOT: lambda request: self._world,
+            SNAPSHOT: lambda request: self._snapshot(),
             "/world/add": self._changing(Added, lambda world, it: world.add(it.name, it.object.made())),
             "/world/remove": self._changing(Named, lambda world, it: world.remove(it.name)),
             "/world/move": self._changing(Moved, self._move),
-            "/world/attach": self._changing(Attached, self._attach),
-            "/world/detach": self._changing(Detached, self._detach),
+            ATTACH: self._changing(Attached, self._attach),
+            DETACH: self._changing(Detached, self._detach),
+            TOUCH: self._changing(Touched, self._touch),
         }
 
     @override
     def start(self) -> None:
+        for topic in {thing.topic for thing in self._moving.values()}:
+            self._poses[topic] = self._session.bus.subscribe(topic, 1)
         for name, handler in self._services.items():
             self._session.bus.serve(name, handler)
 
@@ -48,13 +119,45 @@ class WorldKeeper(Component):
     def stop(self) -> None:
         for name in self._services:
             self._session.bus.unserve(name)
+        for subscription in self._poses.values():
+            subscription.close()
+        self._poses.clear()
+
+    def _snapshot(self) -> World:
+        with self._lock:
+            self._world = self._observed()
+            world = self._world
+            if not self._touched:
+                return world
+            hand = frozenset(self._hand())
+            carried = {name for name, thing in world.objects.items() if thing.link in hand}
+            objects = dict(world.objects)
+            for name in (name for name in self._touched if name in objects):
+                touching = objects[name].may_touch | hand | carried - {name}
+                objects[name] = attrs.evolve(objects[name], may_touch=touching)
+            return World(objects)
+
+    def _observed(self) -> World:
+        """The world with the objects of the scene at their present poses."""
+        world = self._world
+        for topic, subscription in self._poses.items():
+            received = subscription.get()
+            if received is None:
+                continue
+            message = received.message
+            assert isinstance(message, Float64MultiArray)
+            for name, thing in self._moving.items():
+                if thing.topic == topic and name in world.objects and world.objects[name].link is None:
+                    x, y, z, qw, qx, qy, qz = message.data[thing.first : thing.first + 7].tolist()
+                    world = world.move(name, Pose(Vector3(x, y, z), Quaternion(qx, qy, qz, qw)))
+        return world
 
     def _changing[T](self, kind: type[T], change: Callable[[World, T], World]) -> Callable[[str], list[str]]:
         def handler(text: str) -> list[str]:
             request = single_options(kind, (), "the request", text=text)
             with self._lock:
                 try:
-                    self._world = change(self._world, request)
+                    self._world = change(self._observed(), request)
                 except ValueError as error:
                     raise PlanningError(str(error)) from error
                 return list(self._world.objects)
@@ -65,16 +168,36 @@ class WorldKeeper(Component):
         return world.move(it.name, Pose(Vector3(*it.position), from_rpy(*it.rpy)))
 
     def _attach(self, world: World, it: Attached) -> World:
-        placed = np.linalg.inv(self._link(it.link)) @ matrix(world.named(it.name).pose)
-        return world.attach(it.name, it.link, pose(placed), frozenset(it.may_touch))
+        hand = self._hand() if it.link is None else ()
+        link = it.link or hand[0]
+        placed = np.linalg.inv(self._link(link)) @ matrix(world.named(it.name).pose)
+        return world.attach(it.name, link, pose(placed), frozenset((*hand, *it.may_touch)))
 
     def _detach(self, world: World, it: Detached) -> World:
         thing = world.named(it.name)
         placed = matrix(thing.pose) if thing.link is None else self._link(thing.link) @ matrix(thing.pose)
         return world.detach(it.name, pose(placed), frozenset(it.may_touch))
 
-    def _link(self, link: str) -> Vector:
-        """Present pose of a link, shape (4, 4)."""
+    def _touch(self, world: World, it: Touched) -> World:
+        for name in it.objects:
+            world.named(name)
+        self._touched = it.objects
+        return world
+
+    def _robot(self) -> Arm:
+        from ibrobot_planning.arm import robot_arm
+
         if self._arm is None:
             self._arm = robot_arm(self._session.config.robot)
-        return self._arm.link_pose(link, self._session.measured().position)
+        return self._arm
+
+    def _hand(self) -> tuple[str, ...]:
+        """The links that the last joint of the tool carries."""
+        from ibrobot_kinematics import robot_model
+
+        model = robot_model(self._session.config.robot)
+        return self._robot().hand(model.joint_names[model.chain[-1].index])
+
+    def _link(self, link: str) -> Vector:
+        """Present pose of a link, shape (4, 4)."""
+        return self._robot().link_pose(link, self._session.measured().position)

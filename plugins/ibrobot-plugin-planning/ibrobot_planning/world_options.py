@@ -81,6 +81,7 @@ class WorldOptions:
     """The section `world`: the objects around the robot, for planners."""
 
     objects: Mapping[str, ObjectOptions] = option(factory=dict, help="objects by name")
+    scene: bool = option(False, help="whether a simulation adds the objects of its scene, at their present poses")
 
 
 @documented
@@ -116,7 +117,9 @@ class Attached:
     """A request to `/world/attach`: the object keeps its pose relative to the link."""
 
     name: str = option(help="the object's name")
-    link: str = option(help="the link of the MJCF that carries it from now on")
+    link: str | None = option(
+        None, help="the link of the MJCF that carries it from now on; None: the hand, whose links it may touch"
+    )
     may_touch: tuple[str, ...] = option((), help="further links that it may touch, e.g. the other finger")
 
 
@@ -127,3 +130,11 @@ class Detached:
 
     name: str = option(help="the object's name")
     may_touch: tuple[str, ...] = option((), help="what it may touch from now on, e.g. the table")
+
+
+@documented
+@attrs.frozen
+class Touched:
+    """A request to `/world/touch`, in place of the previous one."""
+
+    objects: tuple[str, ...] = option((), help="objects that the hand, and what it carries, may touch")

@@ -6,12 +6,31 @@ from collections.abc import Iterator
 
 from ibrobot_testing.fakes import FakeHardware, FakePlanner, FakeRealHardware, FakeTrajectoryExecutor
 
-from ibrobot_core.api import ExecutorDescriptor, HardwareDescriptor, PlannerDescriptor, hookimpl
+from ibrobot_core.api import (
+    ExecutorDescriptor,
+    HardwareDescriptor,
+    PlannerDescriptor,
+    Pose,
+    SceneObject,
+    Vector3,
+    hookimpl,
+)
+
+POSES = "/scene/poses"
+SCENE = (
+    SceneObject("floor", "plane", (), Pose(Vector3(0.0, 0.0, -0.1))),
+    SceneObject("post", "capsule", (0.02, 0.1), Pose(Vector3(0.4, 0.3, 0.1))),
+    SceneObject("cube", "box", (0.02, 0.02, 0.02), Pose(Vector3(0.2, 0.05, 0.06)), POSES, 0),
+    SceneObject("ball", "sphere", (0.02,), Pose(Vector3(0.0, 0.3, 0.3)), POSES, 7),
+    SceneObject("can", "cylinder", (0.02, 0.1), Pose(Vector3(0.3, -0.3, 0.05))),
+)
 
 
 @hookimpl
 def ibrobot_hardware() -> Iterator[HardwareDescriptor]:
-    yield HardwareDescriptor("scene", lambda options, ctx: FakeHardware(ctx), "a scene", simulated=True)
+    yield HardwareDescriptor(
+        "scene", lambda options, ctx: FakeHardware(ctx), "a scene", simulated=True, scene=lambda options, robot: SCENE
+    )
     yield HardwareDescriptor("arm", lambda options, ctx: FakeRealHardware(ctx), "an arm")
 
 

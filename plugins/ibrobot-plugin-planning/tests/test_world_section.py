@@ -12,13 +12,24 @@ from ibrobot_planning.options import RrtConnectOptions
 from ibrobot_planning.rrt import RrtConnectPlanner
 from ibrobot_planning.transforms import matrix
 from ibrobot_planning.world import Box, Capsule, Cylinder, Mesh, Plane, Sphere
-from ibrobot_planning.world_keeper import SNAPSHOT, WorldKeeper
+from ibrobot_planning.world_keeper import ATTACH, DETACH, SNAPSHOT, TOUCH, WorldKeeper
 from ibrobot_planning.world_options import WorldOptions
 from ibrobot_testing import SectionSuite, make_session
 
-from ibrobot_core.api import ConfigError, Context, JointGoal, PlanningError, PlanRequest, SteppedClock, single_options
+from ibrobot_core.api import (
+    ConfigError,
+    Context,
+    Float64MultiArray,
+    JointGoal,
+    PlanningError,
+    PlanRequest,
+    SteppedClock,
+    single_options,
+)
 
+from .parts import POSES
 from .table_arm import ARM, make_robot
+from .test_motion import robot_yaml
 from .test_world import STL
 
 YAML = """
@@ -121,7 +132,7 @@ def test_malformed_worlds_are_refused(text, message):
 
 
 def test_meshes_and_sizes_are_checked_before_a_run(tmp_path):
-    (descriptor,) = ibrobot_sections()
+    descriptor = next(each for each in ibrobot_sections() if each.type == "world")
     path = tmp_path / "part.stl"
     path.write_text(STL)
     good = options(f"objects: {{part: {{shape: mesh, file: {path}, scale: 0.001}}}}")
@@ -136,6 +147,72 @@ def test_meshes_and_sizes_are_checked_before_a_run(tmp_path):
         assert fault.option == ("objects", "part")
         with pytest.raises(ValueError, match=message):
             raise ValueError(fault.message)
+
+
+def scene_run(make, tmp_path):
+    """A run in which the world has the objects of the simulated scene, besides those of the YAML."""
+    world = "world: {scene: true, objects: {table: {shape: plane, position: [0, 0, -0.2]}}}"
+    runtime = make(text=robot_yaml(tmp_path) + world)
+    runtime.start()
+    return runtime
+
+
+def at(world, name):
+    p = world.objects[name].pose.position
+    return p.x, p.y, p.z
+
+
+def test_objects_of_the_simulated_scene_are_where_the_simulation_has_them(make, tmp_path):
+    bus = scene_run(make, tmp_path).session.bus
+    world = bus.call(SNAPSHOT, None)
+    assert {name: type(thing.shape) for name, thing in world.objects.items()} == {
+        "table": Plane, "floor": Plane, "post": Capsule, "cube": Box, "ball": Sphere, "can": Cylinder,
+    }  # fmt: skip
+    assert at(world, "cube") == (0.2, 0.05, 0.06)
+    poses = np.array([0.1, 0.2, 0.3, 1, 0, 0, 0, 0.4, 0.5, 0.6, 0, 0, 0, 1])
+    bus.publish(POSES, Float64MultiArray(poses))
+    world = bus.call(SNAPSHOT, None)
+    assert (at(world, "cube"), at(world, "ball")) == ((0.1, 0.2, 0.3), (0.4, 0.5, 0.6))
+    assert world.objects["ball"].pose.orientation.z == 1.0
+    assert at(world, "can") == (0.3, -0.3, 0.05)
+
+
+def test_attached_object_of_the_scene_moves_with_the_hand(make, tmp_path):
+    runtime = scene_run(make, tmp_path)
+    bus = runtime.session.bus
+    bus.call(ATTACH, "{name: cube}")
+    held = bus.call(SNAPSHOT, None).objects["cube"]
+    assert (held.link, held.may_touch) == ("hand", {"hand", "finger"}), "the hand is what the tool's last joint carries"
+    bus.publish(POSES, Float64MultiArray(np.array([0.1, 0.2, 0.3, 1, 0, 0, 0] * 2)))
+    assert bus.call(SNAPSHOT, None).objects["cube"] == held
+    bus.call(DETACH, "{name: cube}")
+    bus.publish(POSES, Float64MultiArray(np.array([0.1, 0.2, 0.3, 1, 0, 0, 0] * 2)))
+    assert at(bus.call(SNAPSHOT, None), "cube") == (0.1, 0.2, 0.3)
+
+
+def test_hand_and_what_it_carries_may_touch_named_objects(make, tmp_path):
+    bus = scene_run(make, tmp_path).session.bus
+    bus.call(ATTACH, "{name: cube}")
+    bus.call(TOUCH, "{objects: [can]}")
+    objects = bus.call(SNAPSHOT, None).objects
+    assert objects["can"].may_touch == {"hand", "finger", "cube"}
+    assert objects["table"].may_touch == frozenset()
+    bus.call(TOUCH, "{}")
+    assert bus.call(SNAPSHOT, None).objects["can"].may_touch == frozenset()
+    with pytest.raises(PlanningError, match="no object 'cup'"):
+        bus.call(TOUCH, "{objects: [cup]}")
+
+
+def test_name_in_the_yaml_and_in_the_scene_is_refused(make, tmp_path):
+    world = "world: {scene: true, objects: {can: {shape: plane}}}"
+    with pytest.raises(PlanningError, match=r"has an object 'can'; leave world.objects.can out"):
+        make(text=robot_yaml(tmp_path) + world)
+
+
+def test_scene_is_left_out_unless_asked_for(make, tmp_path):
+    runtime = make(text=robot_yaml(tmp_path) + "world: {objects: {can: {shape: plane}}}")
+    runtime.start()
+    assert set(runtime.session.bus.call(SNAPSHOT, None).objects) == {"can"}
 
 
 def test_impossible_requests_are_refused(run):

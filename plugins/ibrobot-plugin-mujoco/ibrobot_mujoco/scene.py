@@ -1,0 +1,49 @@
+"""The objects around the robot, as shapes for planners."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from ibrobot_core.api import Pose, Quaternion, Robot, SceneObject, Vector3
+from ibrobot_mujoco.model import BIN, CUBE, TABLE, build_model
+from ibrobot_mujoco.options import MujocoOptions
+from ibrobot_mujoco.state import OBJECTS_TOPIC, POSE_SIZE, SCENE_TOPIC
+
+
+def scene_objects(options: MujocoOptions, robot: Robot) -> tuple[SceneObject, ...]:
+    """The table, with `pick_cube` the cube and the parts of the bin, and `objects`, with the names of their geoms.
+
+    Raises:
+        HardwareError: as `build_model`.
+    """
+    model = build_model(options, robot, visual=False)
+    physics = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, physics)
+    free = [name for name, thing in options.objects.items() if thing.mass is not None]
+    signals = {CUBE: (SCENE_TOPIC, 0)} | {name: (OBJECTS_TOPIC, POSE_SIZE * i) for i, name in enumerate(free)}
+    bodies = {*options.objects, *((CUBE, BIN) if options.scene == "pick_cube" else ())}
+    found = []
+    for geom in range(model.ngeom):
+        name, body = model.geom(geom).name, model.body(int(model.geom_bodyid[geom])).name
+        if name == TABLE or body in bodies:
+            topic, first = signals.get(name, ("", 0))
+            found.append(_object(model, physics, geom, topic, first))
+    return tuple(found)
+
+
+def _object(model: mujoco.MjModel, physics: mujoco.MjData, geom: int, topic: str, first: int) -> SceneObject:
+    quaternion = np.empty(4)
+    mujoco.mju_mat2Quat(quaternion, physics.geom_xmat[geom])
+    w, x, y, z = quaternion.tolist()
+    pose = Pose(Vector3(*physics.geom_xpos[geom].tolist()), Quaternion(x, y, z, w))
+    name, size = model.geom(geom).name, model.geom_size[geom].tolist()
+    match int(model.geom_type[geom]):
+        case mujoco.mjtGeom.mjGEOM_PLANE:
+            return SceneObject(name, "plane", (), pose, topic, first)
+        case mujoco.mjtGeom.mjGEOM_SPHERE:
+            return SceneObject(name, "sphere", (size[0],), pose, topic, first)
+        case mujoco.mjtGeom.mjGEOM_CYLINDER:
+            return SceneObject(name, "cylinder", (size[0], 2 * size[1]), pose, topic, first)
+        case _:
+            return SceneObject(name, "box", tuple(2 * each for each in size), pose, topic, first)
