@@ -78,9 +78,7 @@ def test_speed_slows_it_down(yaml: Path):
 
 def test_text_and_picture(yaml: Path, tmp_path: Path):
     picture = tmp_path / "plan.png"
-    result = run(
-        yaml, "--from", "pan=0.9,lift=0.3", "--goal", "xyz=0.2,0.05,0.1", "--set", WORLD, "--plot", str(picture)
-    )
+    result = run(yaml, "--from", "left", "--goal", "pan=0.6,lift=0.5", "--set", WORLD, "--plot", str(picture))
     if result.exception is not None:
         raise result.exception
     headings = [line.split("  ")[0] for line in result.stdout.splitlines()]
@@ -112,7 +110,7 @@ def test_no_plan_exits_with_3(yaml: Path):
         (
             ("--from", "up", "--goal", "left", "--mode", "idle"),
             NotSupported,
-            "mode idle has no planner: --mode plan or",
+            "mode idle has no planner: --mode plan",
         ),
         (("--from", "up", "--goal", "left", "--mode", "no"), ConfigError, "default_control_mode"),
         (("--from", "up", "--goal", "left", "--plot", "a.gif"), NotSupported, r"the format is .png, .svg or .pdf"),
