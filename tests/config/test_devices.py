@@ -36,14 +36,15 @@ CASES = {
         f"{MODE}.teleop.gripper: unknown teleoperation device 'rigt', did you mean 'right'?"),
     "device twice": ([("gripper: right", "gripper: left"), (", joint: lift", "")],
         f"{MODE}.teleop.gripper: device 'left' is given twice"),
-    "joint of two groups": ([("gripper: right", "hand: right"), ("gripper: [grip]", "gripper: [grip]\n    hand: [lift]")],
-        f"{SHIFTED}.executors.0: executor 'arm_position' follows only one device that moves all of its joints: pan by left, "
-        "lift by right\n"
+    "joint of two groups": (
+        [("gripper: right", "hand: right"), ("gripper: [grip]", "gripper: [grip]\n    hand: [lift]")],
+        f"{SHIFTED}.executors.0: executor 'arm_position' follows only one device that moves all of its joints: "
+        "pan by left, lift by right\n"
         f"{SHIFTED}.teleop.hand: groups 'arm' and 'hand' both have joint 'lift'"),
     "part of an executor": (
         [("{arm: left, gripper: right}", "{hand: left}"), ("gripper: [grip]", "gripper: [grip]\n    hand: [lift]")],
-        f"{SHIFTED}.executors.0: executor 'arm_position' follows only one device that moves all of its joints: pan by none, "
-        "lift by left"),
+        f"{SHIFTED}.executors.0: executor 'arm_position' follows only one device that moves all of its joints: "
+        "pan by none, lift by left"),
     "no executor": ([("[arm_position, grip_position], teleop", "[arm_position], teleop")],
         f"{MODE}.teleop.gripper: no executor of this mode moves grip"),
     "wrong joint": ([("joint: lift", "joint: grip")],
