@@ -197,7 +197,7 @@ def _add_thing(spec: mujoco.MjSpec, name: str, thing: SceneThing) -> None:
     body = spec.worldbody.add_body(name=name, pos=thing.position, quat=turn)
     if thing.mass is not None:
         body.add_freejoint(name=name)
-    sizes = [each / 2 for each in thing.size or ()] or [thing.radius, (thing.height or 0) / 2, 0]
+    sizes = [each / 2 for each in thing.size or ()] or [thing.radius or 0.0, (thing.height or 0.0) / 2, 0.0]
     body.add_geom(
         name=name, type=_SHAPES[thing.shape], size=sizes, mass=thing.mass or 1.0, friction=[1, 0.005, 0.0001],
         rgba=[0.35, 0.55, 0.35, 1],
