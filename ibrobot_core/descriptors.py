@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import builtins
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -86,6 +86,11 @@ class SensorDescriptor(Descriptor["interfaces.Sensor"]):
 @attrs.frozen
 class TeleopDescriptor(Descriptor["interfaces.Teleop"]):
     """A teleoperation device."""
+
+    events: Callable[[Any], Collection[interfaces.OperatorEvent]] = attrs.field(
+        default=lambda options: (), kw_only=True
+    )
+    """The events for which the device has a button, by its options, e.g. `start` to begin an episode."""
 
 
 @attrs.frozen

@@ -13,6 +13,7 @@ from ibrobot_core.api import (
     OperatorEvent,
     RunHooks,
     Session,
+    TeleopDescriptor,
     seconds,
 )
 from ibrobot_data.episode_service import EpisodeService
@@ -47,8 +48,11 @@ class Operator(RunHooks):
     ) -> None:  # fmt: skip
         if service.by_mode and continuous:
             raise NotSupported(f"--continuous: mode {run.mode} begins and ends its episodes itself")
-        if not (service.by_mode or auto or continuous or keys):
-            raise NotSupported("without a terminal no key can begin an episode: add --auto")
+        if not (service.by_mode or auto or continuous or keys or _has_start_button(run)):
+            raise NotSupported(
+                "without a terminal no key can begin an episode, and no device of mode "
+                f"{run.mode} has a button start: add --auto"
+            )
         self._run = run
         self._service = service
         self._count = count
@@ -222,3 +226,14 @@ class Operator(RunHooks):
     def _end(self, act: Callable[[], None]) -> None:
         act()
         self._not_before_s = self._clock_s() + self._reset_time_s
+
+
+def _has_start_button(run: Session) -> bool:
+    """Whether a teleoperation device of the mode can begin episodes."""
+    for name in run.config.control_modes[run.mode].devices.values():
+        device = run.config.teleoperation[name]
+        descriptor = run.registry.find("teleop", device.type)
+        assert isinstance(descriptor, TeleopDescriptor)
+        if "start" in descriptor.events(device.options):
+            return True
+    return False

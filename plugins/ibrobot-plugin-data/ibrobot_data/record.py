@@ -38,8 +38,9 @@ def record(config: str | None, dataset: str | None, root: Path | None, **options
 
     CONFIG is a robot YAML as for `ibrobot launch`. If it has no `recording` section, episodes go to episodes/default.
     In simulation a policy's episodes begin and end by themselves, and the scene decides on success. In all other modes
-    keys begin and end them. Without a terminal, use --auto, or --continuous for one episode without a break;
-    recording.split_size and recording.split_duration divide it into files.
+    keys begin and end them, and so do the buttons of a teleoperation device. Without a terminal, use such a device,
+    --auto, or --continuous for one episode without a break; recording.split_size and recording.split_duration divide
+    it into files.
 
     Exits as `ibrobot launch` does.
     """

@@ -65,6 +65,8 @@ def ibrobot_hardware() -> Iterator[HardwareDescriptor]:
 @hookimpl
 def ibrobot_teleop() -> Iterator[TeleopDescriptor]:
     yield TeleopDescriptor("stick", lambda options, ctx: Stick(ctx), "a stick")
+    pad = lambda options, ctx: Stick(ctx)  # noqa: E731
+    yield TeleopDescriptor("pad", pad, "a stick with buttons", events=lambda options: ("start", "success"))
 
 
 @hookimpl

@@ -43,9 +43,11 @@ control_modes:
   teleop: {executors: [arm_position, grip_position], teleop: stick}
   policy: {executors: [arm_position, grip_position], inference: {model: net}, dispatch: {watermark: 5}}
   idle: {executors: [arm_position]}
+  pad: {executors: [arm_position, grip_position], teleop: {arm: stick, gripper: pad}}
 default_control_mode: teleop
 teleoperation:
   stick: {type: stick}
+  pad: {type: pad}
 contract:
   rate_hz: 25
   max_duration_s: 1
@@ -263,7 +265,16 @@ def test_continuous_means_nothing_where_the_mode_has_episodes(record: Record):
     assert caught.value.exit_code == 2
 
 
-def test_nobody_can_begin_an_episode_without_keys_and_auto(record: Record):
-    with pytest.raises(NotSupported, match="add --auto") as caught:
+def test_without_a_terminal_the_buttons_of_a_device_begin_and_end_episodes(record: Record):
+    run = record("pad", keys=False, prompt="pick")
+    for event in ("start", "success"):
+        run.press(event)
+        run.step(3)
+    assert run.ended == [(1, "success")]
+
+
+def test_nobody_can_begin_an_episode_without_keys_buttons_and_auto(record: Record):
+    message = "without a terminal no key can begin an episode, and no device of mode teleop has a button start"
+    with pytest.raises(NotSupported, match=f"{message}: add --auto") as caught:
         record(keys=False)
     assert caught.value.exit_code == 2

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from typing import TYPE_CHECKING, Any
 
 from ibrobot_core.api import Check, Command, TeleopDescriptor, hookimpl
@@ -11,7 +11,7 @@ from ibrobot_gamepad.options import GamepadOptions, SpaceMouseOptions
 if TYPE_CHECKING:
     import click
 
-    from ibrobot_core.api import Context, OptionFault, Robot, Teleop
+    from ibrobot_core.api import Context, OperatorEvent, OptionFault, Robot, Teleop
 
 
 def _jog(options: Any, ctx: Context) -> Teleop:
@@ -26,15 +26,21 @@ def _check(options: Any, robot: Robot, joints: tuple[str, ...]) -> Iterable[Opti
     return check_mapping(options, robot)
 
 
+def _events(options: Any) -> Collection[OperatorEvent]:
+    from ibrobot_gamepad.mapping import events
+
+    return events(options)
+
+
 @hookimpl
 def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
     """Jog with the hands on a device."""
     yield TeleopDescriptor(
-        type="gamepad", options=GamepadOptions, make=_jog, check_options=_check,
+        type="gamepad", options=GamepadOptions, make=_jog, check_options=_check, events=_events,
         summary="joint and tool jog with an Xbox, PlayStation, Switch, 8BitDo or other pad",
     )  # fmt: skip
     yield TeleopDescriptor(
-        type="spacemouse", options=SpaceMouseOptions, make=_jog, check_options=_check,
+        type="spacemouse", options=SpaceMouseOptions, make=_jog, check_options=_check, events=_events,
         summary="joint and tool jog with a SpaceMouse",
     )  # fmt: skip
 

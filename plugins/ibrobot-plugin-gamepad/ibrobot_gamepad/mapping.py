@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from typing import get_args
 
 import attrs
 
-from ibrobot_core.api import OptionFault, Robot, TeleopError, did_you_mean
+from ibrobot_core.api import OperatorEvent, OptionFault, Robot, TeleopError, did_you_mean
 from ibrobot_gamepad.controls import Controls
 from ibrobot_gamepad.options import NONE, GamepadOptions, SpaceMouseOptions
 
@@ -65,6 +66,15 @@ class ControlMap:
             for heading, pairs in rows.items()
             if pairs
         )
+
+
+EVENTS: tuple[OperatorEvent, ...] = get_args(OperatorEvent)
+
+
+def events(options: GamepadOptions | SpaceMouseOptions) -> tuple[OperatorEvent, ...]:
+    """The events that have a button."""
+    buttons = _chosen(_PAD_BUTTONS if isinstance(options, GamepadOptions) else _MOUSE_BUTTONS, options.buttons)
+    return tuple(event for event in EVENTS if event in buttons)
 
 
 def control_map(options: GamepadOptions | SpaceMouseOptions, robot: Robot) -> ControlMap:

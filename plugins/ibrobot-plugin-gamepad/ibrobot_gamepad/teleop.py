@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import get_args, override
+from typing import override
 
 import numpy as np
 from ibrobot_kinematics import JogArm, JogMotion, VelocityJog
@@ -20,7 +20,7 @@ from ibrobot_core.api import (
 )
 from ibrobot_gamepad.controls import Controls
 from ibrobot_gamepad.devices import Device, DeviceGone, Finder, open_first
-from ibrobot_gamepad.mapping import control_map
+from ibrobot_gamepad.mapping import EVENTS, control_map
 from ibrobot_gamepad.options import GamepadOptions, SpaceMouseOptions
 from ibrobot_gamepad.reports import Kind
 
@@ -28,7 +28,6 @@ _LOOK_NS = ns(0.5)
 """Period of the search while no device is connected."""
 _LONGEST_STEP_S = 0.1
 """Maximum motion of one command [s]: after a pause of the host the robot does not jump."""
-_EVENTS: tuple[OperatorEvent, ...] = get_args(OperatorEvent)
 _GRIPPER = ("gripper_open", "gripper_close", "gripper")
 _POSE = "pose "
 """Prefix of the function of a button that drives to a pose."""
@@ -185,7 +184,7 @@ class JogTeleop(Teleop):
                     self._opens = not self._opens
                 elif function == "estop":
                     self._estop = True
-                elif function in _EVENTS:
+                elif function in EVENTS:
                     events.append(function)
             if "deadman" not in self._pressed:
                 self._engaged = False

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import attrs
 import pytest
+from ibrobot_gamepad import ibrobot_teleop
 from ibrobot_gamepad.mapping import check_mapping, control_map
 from ibrobot_gamepad.options import GamepadOptions, SpaceMouseOptions
 from ibrobot_testing import make_robot
@@ -152,3 +153,13 @@ def test_the_defaults_fit_an_arm_with_a_model(options: GamepadOptions | SpaceMou
     robot = attrs.evolve(make_robot(), description=Description(mjcf=Path("arm.xml"), poses=poses))
     assert list(check_mapping(options, robot)) == []
     assert list(control_map(options, robot).tool) == ["x", "y", "z", "roll", "pitch", "yaw"]
+
+
+def test_the_descriptor_has_the_events_with_a_button():
+    pad, mouse = ibrobot_teleop()
+    assert pad.events(GamepadOptions()) == ("start", "success", "failure", "discard", "intervention")
+    assert pad.events(GamepadOptions(buttons={"start": "none", "discard": "none"})) == (
+        "success", "failure", "intervention",
+    )  # fmt: skip
+    assert mouse.events(SpaceMouseOptions()) == ()
+    assert mouse.events(SpaceMouseOptions(buttons={"start": "button3"})) == ("start",)
