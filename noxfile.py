@@ -45,7 +45,7 @@ LOCAL = {
 EXTRAS = {
     "ibrobot-plugin-camera": "[realsense]",
     "ibrobot-plugin-mcap": "[plot]",
-    "ibrobot-plugin-planning": "[client,obstacles,plot]",
+    "ibrobot-plugin-planning": "[obstacles]",
     "ibrobot-plugin-zenoh": "[interop]",
 }
 """Distribution -> extras that its tests use."""
@@ -92,6 +92,30 @@ def lacking(session: nox.Session) -> list[dict[str, Any]]:
     return [row for row in json.loads(str(listed))["plugins"] if row["missing"] is not None]
 
 
+def apt_install(session: nox.Session, *wanted: str) -> bool:
+    """Install Debian packages, where root runs this; returns whether it could."""
+    if os.geteuid() != 0 or not shutil.which("apt-get"):
+        return False
+    session.run("apt-get", "update", "-qq", external=True)
+    session.run("apt-get", "install", "-qq", "-y", *wanted, external=True)
+    return True
+
+
+def note_untested(session: nox.Session, line: str) -> None:
+    """Report what a session does not test, now and after all sessions."""
+    session.warn(line)
+    with NOT_TESTED.open("a", encoding="utf-8") as file:
+        file.write(f"{session.name}: {line}\n")
+
+
+def chromium(session: nox.Session) -> None:
+    """Check for Chromium, which tests of web pages need: root installs it; they are skipped without it."""
+    with Path(".nox/apt.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not shutil.which("chromium") and not apt_install(session, "chromium"):
+            note_untested(session, "web pages are not tested: needs Chromium; apt-get install chromium")
+
+
 def system_libraries(session: nox.Session) -> None:
     """Check for the system libraries that installed types lack: root installs them, anybody else gets the command.
 
@@ -101,15 +125,11 @@ def system_libraries(session: nox.Session) -> None:
         fcntl.flock(lock, fcntl.LOCK_EX)
         found = lacking(session)
         wanted = sorted({package for row in found for package in row["missing"]["apt"]})
-        if wanted and os.geteuid() == 0 and shutil.which("apt-get"):
-            session.run("apt-get", "update", "-qq", external=True)
-            session.run("apt-get", "install", "-qq", "-y", *wanted, external=True)
+        if wanted and apt_install(session, *wanted):
             found = lacking(session)
     for row in found:
-        line = f"{row['kind']} {row['type']} is not tested: {row['missing']['what']}; {row['missing']['remedy']}"
-        session.warn(line)
-        with NOT_TESTED.open("a", encoding="utf-8") as file:
-            file.write(f"{session.name}: {line}\n")
+        missing = row["missing"]
+        note_untested(session, f"{row['kind']} {row['type']} is not tested: {missing['what']}; {missing['remedy']}")
 
 
 @atexit.register
@@ -133,8 +153,9 @@ def installation(page: str) -> list[str]:
 @nox.session
 def integration(session: nox.Session) -> None:
     """What needs every plugin, or starts processes."""
-    install(session, *PLUGINS)
+    install(session, *PLUGINS, groups=("test", "browser"))
     system_libraries(session)
+    chromium(session)
     session.run(*PYTEST, "-m", "integration", "tests", "plugins", *session.posargs)
 
 
@@ -176,7 +197,7 @@ def docs(session: nox.Session) -> None:
 @nox.session
 def types(session: nox.Session) -> None:
     """Types of core and of every plugin, strictly, and of all tests, benchmarks and scripts of the documentation."""
-    install(session, *PLUGINS, groups=("docs", "lint", "test"))
+    install(session, *PLUGINS, groups=("docs", "lint", "test", "browser"))
     session.run("mypy", "--strict", "ibrobot_core", *(str(FOLDERS[name] / f"ibrobot_{name}") for name in PLUGINS))
     modules = (
         "tests/shared",
@@ -197,7 +218,7 @@ def types(session: nox.Session) -> None:
 @nox.session
 @nox.parametrize("name", PLUGINS, ids=PLUGINS)
 def plugin(session: nox.Session, name: str) -> None:
-    """A plugin's tests with that plugin and core alone."""
+    """A plugin's tests with that plugin and core alone; those in a browser run in `integration`."""
     install(session, name)
     system_libraries(session)
     session.run(*PYTEST, str(FOLDERS[name] / "tests"), *session.posargs)

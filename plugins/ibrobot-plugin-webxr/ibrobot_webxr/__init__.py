@@ -1,0 +1,39 @@
+"""The plugin's hooks: teleop `webxr`, and checks for `ibrobot doctor`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+from ibrobot_core.api import Check, TeleopDescriptor, hookimpl
+from ibrobot_webxr.options import WebxrOptions, check_robot
+
+if TYPE_CHECKING:
+    from ibrobot_core.api import Context, OptionFault, Robot, Teleop
+
+
+def _make(options: WebxrOptions, ctx: Context) -> Teleop:
+    from ibrobot_webxr.teleop import WebxrTeleop
+
+    return WebxrTeleop(options, ctx)
+
+
+def _check(options: WebxrOptions, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
+    return check_robot(options, robot)
+
+
+@hookimpl
+def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
+    """Drive the tool with a hand in space."""
+    yield TeleopDescriptor(
+        type="webxr", options=WebxrOptions, make=_make, check_options=_check,
+        summary="moves the tool with a phone, a VR controller or a hand, through a web page",
+    )  # fmt: skip
+
+
+@hookimpl
+def ibrobot_doctor() -> Iterable[Check]:
+    """Check the page's own certificate."""
+    from ibrobot_webxr.doctor import checks
+
+    return checks()

@@ -1,0 +1,106 @@
+"""Options of `type: webxr` under `teleoperation`. Nothing here imports NumPy."""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import attrs
+
+from ibrobot_core.api import OptionFault, Robot, documented, option
+
+HANDS = ("left", "right")
+"""The hands of an operator, as WebXR calls them; on a phone the page asks which arm it drives."""
+_HOST = re.compile(r"[A-Za-z0-9]([A-Za-z0-9-]*[A-Za-z0-9])?(\.[A-Za-z0-9]([A-Za-z0-9-]*[A-Za-z0-9])?)*")
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine reaches an address."""
+    return host == "localhost" or ipaddress.ip_address(host).is_loopback
+
+
+def _check_host(instance: Any, attribute: attrs.Attribute[Any], value: str) -> None:
+    if value == "localhost":
+        return
+    try:
+        ipaddress.ip_address(value)
+    except ValueError:
+        raise ValueError(
+            f"{value!r} is not an address of this machine: 127.0.0.1 serves this machine alone, 0.0.0.0 the network"
+        ) from None
+
+
+def _check_names(instance: Any, attribute: attrs.Attribute[Any], value: tuple[str, ...]) -> None:
+    for name in value:
+        try:
+            ipaddress.ip_address(name)
+        except ValueError:
+            if not _HOST.fullmatch(name) or re.fullmatch(r"[\d.]+", name):
+                raise ValueError(f"{name!r} is not a host name or an address, e.g. robot.lab or 192.168.1.5") from None
+
+
+@documented
+@attrs.frozen
+class WebxrOptions:
+    """Options of `type: webxr`; the joints' own limits bound every speed."""
+
+    host: str = option(
+        "127.0.0.1", validator=_check_host,
+        help="address to listen on: 127.0.0.1 for this machine alone, 0.0.0.0 for the network",
+    )  # fmt: skip
+    port: int = option(8443, ge=0, le=65535, help="port of the page; 0: any free one")
+    names: tuple[str, ...] = option(
+        (), validator=_check_names,
+        help="names and addresses under which browsers reach this machine; empty: its host name and address",
+    )  # fmt: skip
+    certificate: Path | None = option(
+        None, help="certificate of this machine, made by `ibrobot certs`; without one, the page makes its own"
+    )
+    key: Path | None = option(None, help="private key of the certificate")
+    cameras: tuple[str, ...] = option((), help="cameras whose images the page shows; empty: all")
+    image_rate: float = option(15.0, unit="Hz", gt=0, le=60, help="images per second of each camera, at most")
+    hand: str = option("any", choices=("any", *HANDS), help="the controller that moves this arm")
+    gripper: str = option("gripper", help="group of joints that the trigger moves; all others move the tool")
+    scale: float = option(1.0, gt=0, le=10, help="distance of the tool for each metre of the hand")
+    facing: float = option(
+        0.0, unit="rad", ge=-7, le=7,
+        help="direction in which the operator looks, from the robot's x axis to the left; 3.14: towards the robot",
+    )  # fmt: skip
+    turn: bool = option(True, help="whether the tool turns with the hand")
+    tool_speed: float = option(0.5, unit="m/s", gt=0, le=1, help="highest speed of the tool")
+    turn_speed: float = option(2.0, unit="rad/s", gt=0, le=6, help="highest speed of turning the tool")
+    stick_speed: float = option(0.1, unit="m/s", gt=0, le=1, help="speed of the tool with an on-screen stick pushed")
+    gripper_speed: float = option(2.0, unit="rad/s", gt=0, help="speed of the gripper")
+    cutoff: float = option(
+        4.0, unit="Hz", gt=0, le=100, help="cutoff of the One Euro filter at rest; it delays poses by 1/(2 pi cutoff)"
+    )
+    cutoff_slope: float = option(
+        20.0, unit="Hz s/m", ge=0, help="increase of the cutoff with the speed of the hand; a turn of 1 rad is 0.2 m"
+    )
+    follow_time: float = option(
+        0.04, unit="s", ge=0.02, le=1, help="time constant with which the tool approaches the pose of the hand"
+    )
+    dead_zone: float = option(0.001, unit="m", ge=0, lt=0.05, help="movement of a hand that counts as rest")
+    dead_angle: float = option(0.005, unit="rad", ge=0, lt=0.2, help="turn of a hand that counts as rest")
+    timeout: float = option(0.06, unit="s", ge=0.03, le=0.09, help="silence of the page after which the robot holds")
+    follow: float = option(
+        0.1, unit="rad", ge=0, help="how far the robot may be from its last setpoint for the clutch to start there"
+    )
+
+    def __attrs_post_init__(self) -> None:
+        if (self.certificate is None) != (self.key is None):
+            raise ValueError("certificate and key belong together: give both, or neither")
+        if self.names and self.port == 0:
+            raise ValueError("port 0, any free port, is for tests on this machine: names needs a fixed port")
+
+
+def check_robot(options: WebxrOptions, robot: Robot) -> Iterator[OptionFault]:
+    """The robot has a model, and the certificate exists."""
+    if robot.description.mjcf is None:
+        yield OptionFault((), "a hand moves the tool, which needs robot.description.mjcf: set it")
+    for name, path in (("certificate", options.certificate), ("key", options.key)):
+        if path is not None and not path.is_file():
+            yield OptionFault((name,), f"{path}: no such file; `ibrobot certs` makes certificates and keys")

@@ -1,0 +1,121 @@
+// The page: connects its parts.
+
+import { Connection } from "/connection.js";
+import { Controls } from "/controls.js";
+import { Headset, supportedMode } from "/headset.js";
+import { Phone } from "/phone.js";
+
+const IDLE_MS = 200;
+const $ = (id) => document.getElementById(id);
+const figures = [];
+let state = null;
+let failure = "";
+
+const controls = new Controls(document);
+const connection = new Connection({ onState, onImage, onLink });
+const arm = () => $("arm").value || Object.keys(state?.hands ?? {})[0] || "right";
+const phone = new Phone(controls, connection, arm);
+const headset = new Headset(controls, connection, arm, $("overlay"));
+
+function onState(next) {
+  state = next;
+  $("robot").textContent = next.robot?.name ?? "ibrobot";
+  $("mode").textContent = next.robot ? `mode ${next.robot.mode}` : "";
+  const arms = Object.entries(next.hands);
+  const devices = new Set(arms.map(([, { device }]) => device));
+  if (devices.size > 1 && $("arm").options.length !== arms.length) {
+    $("arm").replaceChildren(...arms.map(([hand, { device }]) => new Option(device, hand)));
+  }
+  $("arms").hidden = devices.size < 2;
+  $("claim").hidden = next.control !== "free";
+  const moves = arms.some(([, { engaged }]) => engaged);
+  $("clutch").classList.toggle("moves", moves);
+  $("message").textContent = failure || reason(next, arms);
+  for (const button of document.querySelectorAll("[data-event], #clutch, #stick, #open, #close")) button.disabled = next.control !== "you";
+}
+
+function reason({ control, robot, error }, arms) {
+  if (robot?.estop) return "EMERGENCY STOP. Reset it at the robot.";
+  if (robot?.faults.length) return robot.faults.join("; ");
+  if (control === "other") return "Another page has control. This one watches.";
+  if (control === "free") return "No page has control.";
+  if (!arms.length) return `The mode ${robot?.mode ?? ""} is not driven from here.`;
+  const running = phone.running || headset.session;
+  return (running && arms.map(([, { text }]) => text).find(Boolean)) || error || "";
+}
+
+function onLink({ open, silent, rate, roundTrip }) {
+  $("link").textContent = !open ? "not connected" : silent ? "the network is slow" : roundTrip === undefined ? "connected" : `${rate} Hz, ${roundTrip.toFixed(0)} ms`;
+  if (!open || silent) controls.release();
+}
+
+function onImage(camera, blob, shown) {
+  if (!figures[camera]) {
+    const figure = document.createElement("figure");
+    figure.append(document.createElement("img"), document.createElement("figcaption"));
+    figures[camera] = figure;
+    $("cameras").replaceChildren(...figures.filter(Boolean));
+  }
+  const name = state?.cameras[camera] ?? "";
+  const [image, caption] = figures[camera].children;
+  caption.textContent = image.alt = name;
+  if (headset.session && !headset.isPhone) {
+    createImageBitmap(blob).then((bitmap) => headset.screens.show(camera, bitmap)).finally(shown);
+    return;
+  }
+  const address = URL.createObjectURL(blob);
+  image.onload = image.onerror = () => {
+    URL.revokeObjectURL(address);
+    shown();
+  };
+  image.src = address;
+}
+
+async function run(start) {
+  failure = "";
+  try {
+    await start();
+    $("controls").hidden = Boolean(headset.session) && !headset.isPhone;
+    await navigator.wakeLock?.request("screen").catch(() => {});
+  } catch (error) {
+    failure = error.message;
+  }
+}
+
+$("stop").addEventListener("pointerdown", () => connection.send({ type: "stop" }));
+$("stop").addEventListener("click", () => connection.send({ type: "stop" }));
+$("claim").addEventListener("click", () => connection.send({ type: "claim" }));
+$("sensors").addEventListener("click", () => run(async () => {
+  await phone.start();
+  $("sensors").hidden = $("xr").hidden = true;
+}));
+for (const button of document.querySelectorAll("[data-event]")) {
+  button.addEventListener("click", () => connection.send({ type: "press", event: button.dataset.event }));
+}
+
+supportedMode().then((mode) => {
+  if (!mode) return;
+  $("xr").hidden = false;
+  $("xr").textContent = mode === "immersive-ar" ? "Start AR" : "Start VR";
+  $("xr").addEventListener("click", () => run(async () => {
+    phone.stop();
+    await headset.start(mode, () => {
+      controls.release();
+      $("controls").hidden = true;
+      $("xr").hidden = $("sensors").hidden = false;
+    });
+    $("xr").hidden = $("sensors").hidden = true;
+  }));
+});
+
+// Without poses to send, the page still says that it is there; and that it holds nothing when it is left.
+setInterval(() => {
+  if (!headset.session && !phone.running && document.visibilityState === "visible") connection.sendHands({}, 0);
+}, IDLE_MS);
+const leave = () => connection.sendHands({}, 0);
+window.addEventListener("blur", leave);
+window.addEventListener("pagehide", leave);
+document.addEventListener("visibilitychange", () => {
+  if (document.visibilityState === "visible" && state?.control === "free") connection.send({ type: "claim" });
+  leave();
+});

@@ -1,0 +1,68 @@
+"""One page for all devices of a run with the same address, e.g. of two arms, or of several modes."""
+
+from __future__ import annotations
+
+import threading
+
+import attrs
+
+from ibrobot_core.api import Context, TeleopError, echo
+from ibrobot_webxr.options import WebxrOptions
+from ibrobot_webxr.qr import qr_code
+from ibrobot_webxr.server import PageServer
+
+_SHARED = ("names", "certificate", "key", "cameras", "image_rate")
+"""Options of the page, which its devices must agree on."""
+
+
+@attrs.define
+class _Shared:
+    server: PageServer
+    options: WebxrOptions
+    device: str
+    """The device that opened it."""
+    users: int = 0
+
+
+_lock = threading.Lock()
+_open: dict[tuple[int, str, int], _Shared] = {}
+"""Bus of the run, host and port -> the page."""
+
+
+def _key(options: WebxrOptions, ctx: Context) -> tuple[int, str, int]:
+    return id(ctx.bus), options.host, options.port
+
+
+def open_page(options: WebxrOptions, ctx: Context) -> PageServer:
+    """The page of a device, which is served from its first device on; prints its address and QR code then.
+
+    Raises:
+        TeleopError: if it cannot be served, or another device with this address has other options of the page.
+    """
+    with _lock:
+        shared = _open.get(_key(options, ctx))
+        if shared is None:
+            server = PageServer(options, ctx.clock, ctx.bus, ctx.log)
+            shared = _open[_key(options, ctx)] = _Shared(server, options, ctx.name)
+            # Not to the log: the address has the token.
+            echo(f"{ctx.name}: open this page on the phone or headset:\n{qr_code(server.address)}", err=True)
+            echo(server.address, err=True)
+        for name in _SHARED:
+            if attrs.asdict(options)[name] != attrs.asdict(shared.options)[name]:
+                raise TeleopError(
+                    f"{ctx.name}: shares the page on port {options.port} with {shared.device}, so that both need the "
+                    f"same {name}; or give it another port"
+                )
+        shared.users += 1
+        return shared.server
+
+
+def close_page(options: WebxrOptions, ctx: Context) -> None:
+    """Leave the page of a device; the last device closes it."""
+    with _lock:
+        shared = _open[_key(options, ctx)]
+        shared.users -= 1
+        if shared.users:
+            return
+        del _open[_key(options, ctx)]
+    shared.server.close()

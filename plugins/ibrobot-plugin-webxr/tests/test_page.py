@@ -1,0 +1,191 @@
+"""The page in a browser: an emulated headset and an emulated phone move an arm through it."""
+
+from __future__ import annotations
+
+import shutil
+import threading
+import time
+from collections.abc import Iterator
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from ibrobot_testing import host_context
+from ibrobot_webxr.server import PageServer
+from ibrobot_webxr.teleop import WebxrTeleop
+
+from ibrobot_core.api import Header, Image, JointReading, RealClock, RobotStatus, Vector
+
+from .rig import ANY_PORT, BENT, page_of, robot_of
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+pytestmark = [
+    pytest.mark.integration,
+    pytest.mark.skipif(find_spec("playwright") is None, reason="needs playwright: pip install playwright"),
+    pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium"),
+]
+HEADSET = Path(__file__).parent / "emulated_headset.js"
+
+
+class Arm:
+    """An arm at the end of the teleop, followed at 100 Hz in a thread."""
+
+    def __init__(self, mjcf: Path) -> None:
+        self.ctx = host_context("phone", robot=robot_of(mjcf), clock=RealClock())
+        self.teleop = WebxrTeleop(ANY_PORT, self.ctx)
+        self.position = BENT.copy()
+        self.moves = False
+        self.stopped = False
+        self.events: list[str] = []
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+
+    def start(self) -> None:
+        self.teleop.connect()
+        self.teleop.activate(self.measured())
+        self._thread.start()
+
+    def end(self) -> None:
+        self._end.set()
+        self._thread.join()
+        self.teleop.disconnect()
+
+    def measured(self) -> JointReading:
+        return JointReading(self.ctx.clock.now_ns(), self.position.copy(), np.zeros(6), np.zeros(6))
+
+    def _run(self) -> None:
+        while not self._end.wait(0.01):
+            command = self.teleop.read(self.measured())
+            self.moves = command.positions is not None
+            self.stopped |= command.estop
+            self.events += command.events
+            if command.positions is not None:
+                self.position = np.array([command.positions[name] for name in self.ctx.robot.joint_names])
+
+    def wait(self, until) -> None:
+        deadline = time.monotonic() + 10
+        while not until():
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+
+
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Any]:
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(
+            executable_path=CHROMIUM, args=["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+        )
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def arm(mjcf: Path) -> Iterator[Arm]:
+    arm = Arm(mjcf)
+    arm.start()
+    yield arm
+    arm.end()
+
+
+@pytest.fixture
+def server(arm: Arm) -> Iterator[PageServer]:
+    with page_of(ANY_PORT, arm.ctx) as server:
+        yield server
+
+
+@pytest.fixture
+def tab(chromium, server: PageServer) -> Iterator[Any]:
+    """A phone's browser with the page open."""
+    context = chromium.new_context(
+        ignore_https_errors=True, viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True
+    )
+    asked: list[str] = []
+    context.on("request", lambda request: asked.append(request.url))
+    faults: list[str] = []
+    tab = context.new_page()
+    tab.on("pageerror", lambda error: faults.append(str(error)))
+    tab.on("console", lambda message: faults.append(message.text) if message.type == "error" else None)
+    yield tab
+    origin = server.address.partition("/?")[0]
+    assert [url for url in asked if not url.startswith((f"{origin}/", f"blob:{origin}"))] == []
+    assert faults == []
+    context.close()
+
+
+def far(arm: Arm, start: Vector) -> bool:
+    return bool(np.abs(arm.position - start).max() > 0.02)
+
+
+def test_controllers_of_a_headset_move_the_arm(arm: Arm, server: PageServer, tab):
+    tab.add_init_script(HEADSET.read_text())
+    tab.goto(server.address)
+    tab.get_by_role("button", name="Start VR").click()
+    tab.wait_for_function("document.getElementById('link').textContent.includes('Hz')")
+    tab.evaluate("emulated.right.position.z = -0.5")
+    tab.wait_for_timeout(300)
+    np.testing.assert_array_equal(arm.position, BENT)
+    tab.evaluate("emulated.right.squeeze = 1")
+    arm.wait(lambda: arm.moves)
+    np.testing.assert_allclose(arm.position, BENT, atol=1e-3)
+    tab.evaluate("emulated.right.position.z -= 0.05; emulated.right.trigger = 1")
+    arm.wait(lambda: far(arm, BENT))
+    arm.wait(lambda: arm.position[5] < 0)
+    tab.evaluate("emulated.right.tracked = false")
+    arm.wait(lambda: not arm.moves)
+    tab.evaluate("emulated.right.pressed = [4]; emulated.left.pressed = [5]")
+    arm.wait(lambda: sorted(arm.events) == ["intervention", "start"])
+    tab.evaluate("emulated.left.pressed = [3]")
+    arm.wait(lambda: arm.stopped)
+
+
+def test_a_phone_without_webxr_moves_the_arm_by_its_sensors_and_sticks(arm: Arm, server: PageServer, tab):
+    tab.goto(server.address)
+    sensors = tab.context.new_cdp_session(tab)
+    turned = {"alpha": 10, "beta": 60, "gamma": 5}
+    sensors.send("DeviceOrientation.setDeviceOrientationOverride", turned)
+    tab.get_by_role("button", name="Use this phone").click()
+    clutch, stick = (tab.locator(name).bounding_box() for name in ("#clutch", "#stick"))
+    boxes = enumerate((clutch, stick))
+    at = [{"id": i, "x": box["x"] + box["width"] / 2, "y": box["y"] + box["height"] / 2} for i, box in boxes]
+    sensors.send("Input.dispatchTouchEvent", {"type": "touchStart", "touchPoints": [at[0]]})
+    arm.wait(lambda: arm.moves)
+    np.testing.assert_allclose(arm.position, BENT, atol=1e-3)
+    sensors.send("DeviceOrientation.setDeviceOrientationOverride", {**turned, "gamma": 25})
+    arm.wait(lambda: far(arm, BENT))  # it rolls
+    before = arm.position
+    moved = list(at)
+    sensors.send("Input.dispatchTouchEvent", {"type": "touchStart", "touchPoints": moved})
+    moved[1] = {**moved[1], "y": moved[1]["y"] - 80}
+    sensors.send("Input.dispatchTouchEvent", {"type": "touchMove", "touchPoints": moved})
+    arm.wait(lambda: far(arm, before))
+    tab.evaluate("window.dispatchEvent(new Event('blur'))")  # e.g. a call comes in
+    arm.wait(lambda: not arm.moves)
+    held = arm.position
+    tab.wait_for_timeout(200)
+    np.testing.assert_array_equal(arm.position, held)
+
+
+def test_the_page_shows_cameras_and_who_has_control(arm: Arm, server: PageServer, tab):
+    bus = arm.ctx.bus
+    assert bus is not None
+    tab.goto(server.address)
+    second = tab.context.new_page()
+    second.goto(server.address)
+    second.get_by_text("Another page has control").wait_for()
+    pixels = np.full(48 * 64 * 3, 200, np.uint8)
+    for _ in range(20):
+        bus.publish("/camera/wrist/image_raw", Image(Header(0), 48, 64, "rgb8", 192, pixels))
+        tab.wait_for_timeout(50)
+    tab.locator("figure img[src^=blob]").wait_for()
+    assert tab.locator("figcaption").text_content() == "wrist"
+    bus.publish("/robot_status", RobotStatus(Header(0), "so101", "phone", faults=("<b>a fault</b>",)))
+    tab.get_by_text("<b>a fault</b>").wait_for()
+    tab.close()
+    second.get_by_role("button", name="Take control").click()
+    second.get_by_text("Another page has control").wait_for(state="detached")
+    second.get_by_role("button", name="STOP").click()
+    arm.wait(lambda: arm.stopped)
