@@ -45,7 +45,7 @@ LOCAL = {
 EXTRAS = {
     "ibrobot-plugin-camera": "[realsense]",
     "ibrobot-plugin-mcap": "[plot]",
-    "ibrobot-plugin-planning": "[obstacles]",
+    "ibrobot-plugin-planning": "[client,obstacles,plot]",
     "ibrobot-plugin-zenoh": "[interop]",
 }
 """Distribution -> extras that its tests use."""

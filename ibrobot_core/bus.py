@@ -163,6 +163,11 @@ class Bus:
         with self._lock:
             return name in self._services
 
+    def services(self) -> list[str]:
+        """Names of the served services, sorted."""
+        with self._lock:
+            return sorted(self._services)
+
     def call(self, name: str, request: Any) -> Any:
         """Call service `name`.
 
@@ -172,5 +177,5 @@ class Bus:
         with self._lock:
             handler = self._services.get(name)
         if handler is None:
-            raise TransportError(f"nobody serves {name}; served: {', '.join(sorted(self._services)) or 'nothing'}")
+            raise TransportError(f"nobody serves {name}; served: {', '.join(self.services()) or 'nothing'}")
         return handler(request)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from itertools import compress
 from pathlib import Path
 
 import attrs
@@ -59,6 +60,14 @@ class Description:
     srdf: Path | None = option(None, help="SRDF with groups, poses and pairs of links that may touch: a path as above")
     tip: str = option("gripperframe", help="site (MJCF) or link (URDF) of the tool centre point")
     poses: Mapping[str, tuple[float, ...]] = option(factory=dict, unit="rad", help="joint positions in joint order")
+    arms: Mapping[str, tuple[float, float, float, float]] = option(
+        factory=dict,
+        help="of several equal arms: prefix of its names, as left_ -> x, y, z [m] and yaw [rad] of its base",
+    )
+
+    def arm_of(self, joint: str) -> str:
+        """The prefix of the arm of a joint; empty for a joint that is named as in the models."""
+        return next((prefix for prefix in self.arms if joint.startswith(prefix)), "")
 
 
 @documented
@@ -122,6 +131,15 @@ class Robot:
         if missing:
             raise KeyError(f"no joint {missing[0]!r}; the joints are: {', '.join(self.joint_names)}")
         return np.array([order[n] for n in names], dtype=np.intp)
+
+    def part(self, group: str) -> Robot:
+        """The robot reduced to the joints of a group, in joint order, with the groups within it."""
+        members = set(self.groups[group])
+        kept = [joint.name in members for joint in self.joints]
+        groups = {name: each for name, each in self.groups.items() if members.issuperset(each)}
+        poses = {name: tuple(compress(pose, kept)) for name, pose in self.description.poses.items()}
+        description = attrs.evolve(self.description, poses=poses)
+        return attrs.evolve(self, joints=tuple(compress(self.joints, kept)), groups=groups, description=description)
 
     def pose(self, name: str) -> Vector:
         """A named pose [rad], shape (J,).

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import attrs
@@ -76,6 +76,9 @@ class Checks:
             for i, joint in enumerate(members):
                 self.document.refer((*at, "groups", group, i), joint, names, "joint")
             self._unique((*at, "groups", group), members, "joint")
+        for prefix in robot.description.arms:
+            if not prefix or not any(name.startswith(prefix) for name in names):
+                self.document.add((*at, "description", "arms", prefix), f"no joint's name begins with {prefix!r}")
         for pose, positions in robot.description.poses.items():
             self._name((*at, "description", "poses", pose), pose)
             self._pose((*at, "description", "poses", pose), robot, positions)
@@ -95,7 +98,8 @@ class Checks:
                 except ModelError as error:
                     self.document.add(key, str(error))
         for i, joint in enumerate(robot.joints):
-            limits = [each.limits[joint.name] for each in known if joint.name in each.limits]
+            name = joint.name.removeprefix(robot.description.arm_of(joint.name))
+            limits = [each.limits[name] for each in known if name in each.limits]
             if limits and not joint.beyond_model:
                 self._within(("robot", "joints", i), joint, limits)
         at: Key = ("robot", "description", "tip")
@@ -147,23 +151,41 @@ class Checks:
     def _options(self, robot: Robot) -> None:
         """Run the plugins' checks of their options for this robot."""
         for part in self.sections.all():
-            joints: tuple[str, ...] = robot.joint_names
-            if isinstance(part.component, HardwareConfig):
-                joints = part.component.joints or joints
-            elif isinstance(part.component, ExecutorConfig):
-                joints = robot.groups.get(part.component.group, ())
-            for fault in part.descriptor.check_options(part.component.options, robot, joints):
-                self.document.add((*part.key, *fault.option), fault.message)
+            for seen, joints in self._seen_by(part, robot):
+                for fault in part.descriptor.check_options(part.component.options, seen, joints):
+                    self.document.add((*part.key, *fault.option), fault.message)
+
+    def _seen_by(self, part: ParsedComponent[Any], robot: Robot) -> list[tuple[Robot, tuple[str, ...]]]:
+        """The robot as a component sees it, with its joints; a device sees the groups that it moves in the modes."""
+        if isinstance(part.component, HardwareConfig):
+            return [(robot, part.component.joints or robot.joint_names)]
+        if isinstance(part.component, ExecutorConfig):
+            return [(robot, robot.groups.get(part.component.group, ()))]
+        moved = {group for mode in self._modes for group, name in mode.devices.items() if part.key[1:] == (name,)}
+        parts = [robot.part(group) for group in robot.groups if group in moved]
+        if part.key[0] != "teleoperation" or not parts or "" in moved:
+            parts.append(robot)
+        return [(seen, seen.joint_names) for seen in parts]
+
+    @property
+    def _modes(self) -> Collection[ControlMode]:
+        return (self.sections.plain.get("control_modes") or {}).values()
 
     def _devices(self) -> None:
-        """Check that no two components open the same device; only one teleoperation device is open at a time."""
-        users: dict[str, Key] = {}
+        """Check that no two components that are open at the same time open the same device."""
+        users: dict[str, list[Key]] = {}
         for part in (*self.sections.active(), *self.sections.teleoperation.values()):
             for option, device in part.descriptor.devices(part.component.options).items():
-                if (user := users.get(device, part.key)) != part.key:
-                    self.document.add((*part.key, option), f"{device} is already used by {self.document.dotted(user)}")
-                elif part.key[0] != "teleoperation":
-                    users[device] = part.key
+                for user in users.setdefault(device, []):
+                    if user != part.key and self._open_together(user, part.key):
+                        message = f"{device} is already used by {self.document.dotted(user)}"
+                        self.document.add((*part.key, option), message)
+                users[device].append(part.key)
+
+    def _open_together(self, a: Key, b: Key) -> bool:
+        """Whether a run opens both components at the same time: of the teleoperation devices, those of one mode."""
+        alone = a[0] == b[0] == "teleoperation"
+        return not alone or any({a[1], b[1]} <= set(mode.devices.values()) for mode in self._modes)
 
     def _executors(self, robot: Robot) -> None:
         for part in self.sections.executors.values():
@@ -194,8 +216,7 @@ class Checks:
             self.document.add((*key, "executors"), "a mode needs at least one executor")
         if robot is not None:
             self._claims(key, mode, robot)
-        if mode.teleop is not None:
-            self.document.refer((*key, "teleop"), mode.teleop, names("teleoperation"), "teleoperation device")
+        self._teleop(key, mode, robot)
         if (part := self.sections.inference.get(name)) is not None:
             self.document.refer((*part.key, "model"), part.component.model, names("models"), "model")
             self._reaches(part)
@@ -206,6 +227,41 @@ class Checks:
             self._drives(key, mode, sources[0])
         if mode.inference is None and self.document.get(*key, "dispatch") is not None:
             self.document.add((*key, "dispatch"), "applies only to a mode with inference")
+
+    def _teleop(self, key: Key, mode: ControlMode, robot: Robot | None) -> None:
+        """Check the devices of a mode; where they move groups, each its own joints, by executors of its own."""
+        at: Key = (*key, "teleop")
+        devices = list(mode.devices.items())
+        for i, (group, device) in enumerate(devices):
+            place = at if isinstance(mode.teleop, str) else (*at, group)
+            self.document.refer(place, device, self.document.names("teleoperation"), "teleoperation device")
+            if device in (other for _, other in devices[:i]):
+                self.document.add(place, f"device {device!r} is given twice")
+        if robot is None or not isinstance(mode.teleop, Mapping):
+            return
+        if not devices:
+            self.document.add(at, "a joint group and its device are missing, e.g. left: leader_left")
+        mover: dict[str, str] = {}
+        for group in mode.devices:
+            if not self.document.refer((*at, group), group, list(robot.groups), "group"):
+                continue
+            if shared := [joint for joint in robot.groups[group] if joint in mover]:
+                message = f"groups {mover[shared[0]]!r} and {group!r} both have joint {shared[0]!r}"
+                self.document.add((*at, group), message)
+            mover |= dict.fromkeys(robot.groups[group], group)
+        unmoved = set(mover)
+        for i, name in enumerate(mode.executors):
+            if (part := self.sections.executors.get(name)) is None:
+                return
+            joints = robot.groups.get(part.component.group, ())
+            unmoved -= set(joints)
+            if len({mover.get(joint) for joint in joints}) > 1:
+                each = ", ".join(f"{joint} by {mode.devices.get(mover.get(joint, ''), 'none')}" for joint in joints)
+                message = f"executor {name!r} follows only one device that moves all of its joints: {each}"
+                self.document.add((*key, "executors", i), message)
+        for group in mode.devices:
+            if left := [joint for joint in robot.groups.get(group, ()) if joint in unmoved]:
+                self.document.add((*at, group), f"no executor of this mode moves {', '.join(left)}")
 
     def _reaches(self, part: ParsedComponent[InferenceConfig]) -> None:
         """Check that an engine that uses the transport has one to other machines."""

@@ -84,8 +84,7 @@ def _used(name: str, mode: Any, observed: set[Key]) -> set[Key]:
     """The components that drive a mode and move its joints; with a model, also those observed by the contract."""
     keys: set[Key] = {("control_modes", name, "planner"), ("control_modes", name, "inference")}
     keys |= {("executors", executor) for executor in mode.executors}
-    if mode.teleop is not None:
-        keys.add(("teleoperation", mode.teleop))
+    keys |= {("teleoperation", device) for device in mode.devices.values()}
     if mode.inference is not None:
         keys |= {("models", str(mode.inference.get("model"))), *observed}
     return keys

@@ -389,11 +389,18 @@ class ControlMode:
     """A mode: its active executors, and the source of their commands."""
 
     executors: tuple[str, ...] = option(help="executors active in the mode")
-    teleop: str | None = option(None, help="device under teleoperation that drives the mode")
+    teleop: str | Mapping[str, str] | None = option(
+        None, help="device under teleoperation that drives the mode, or joint group -> the device that moves it"
+    )
     inference: InferenceConfig | None = option(None, help="model that drives the mode")
     dispatch: DispatchConfig = option(factory=DispatchConfig, help="how a model's plan is kept filled")
     planner: PlannerConfig | None = option(None, help="planner that drives the mode, with its options")
     name: str = not_a_key("")
+
+    @property
+    def devices(self) -> Mapping[str, str]:
+        """Joint group -> the teleoperation device that moves it; empty group: a device that may move all joints."""
+        return {"": self.teleop} if isinstance(self.teleop, str) else self.teleop or {}
 
 
 def _check_dataset(_: object, __: object, value: str) -> None:
@@ -508,9 +515,10 @@ class RobotConfig:
             more: other fields of the context; `joints` defaults to all joints of the robot.
         """
         simulation = self.simulation.options if self.simulation is not None else None
-        given = {"joints": self.robot.joint_names, "simulation": simulation, **more}
+        robot: Robot = more.get("robot", self.robot)
+        given = {"robot": robot, "joints": robot.joint_names, "simulation": simulation, **more}
         log, period_ns = logging.getLogger(f"ibrobot.{name}"), ns(1.0 / self.control.rate_hz)
-        return Context(name=name, clock=clock, log=log, robot=self.robot, period_ns=period_ns, seed=seed, **given)
+        return Context(name=name, clock=clock, log=log, period_ns=period_ns, seed=seed, **given)
 
 
 def _as_written(field: attrs.Attribute[Any]) -> attrs.Attribute[Any]:

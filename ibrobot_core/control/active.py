@@ -24,11 +24,8 @@ class _Owned:
     columns: NDArray[np.intp]
 
     def reading(self, measured: JointReading, now_ns: int | None = None) -> JointReading:
-        columns = self.columns
-        return JointReading(
-            measured.stamp_ns if now_ns is None else now_ns, measured.position[columns],
-            measured.velocity[columns], measured.effort[columns], measured.stale,
-        )  # fmt: skip
+        reading = measured.of(self.columns)
+        return reading if now_ns is None else attrs.evolve(reading, stamp_ns=now_ns)
 
 
 class ActiveExecutors:

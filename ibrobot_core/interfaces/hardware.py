@@ -10,6 +10,7 @@ from typing import Literal
 
 import attrs
 import numpy as np
+from numpy.typing import NDArray
 
 from ibrobot_core.errors import NotSupported
 from ibrobot_core.messages import Pose
@@ -29,6 +30,11 @@ class JointReading:
     """[Nm], shape (J,); NaN if the hardware does not measure it."""
     stale: bool = False
     """True if this repeats the last reading because a single reply was lost."""
+
+    def of(self, columns: NDArray[np.intp]) -> JointReading:
+        """The reading of some joints, by their indices."""
+        values = self.position[columns], self.velocity[columns], self.effort[columns]
+        return JointReading(self.stamp_ns, *values, self.stale)
 
 
 @attrs.frozen

@@ -82,7 +82,7 @@ def mode_components(session: Session, name: str, link: TransportLink | None) -> 
         needs = (CONTROL, *(f"sensor:{sensor.name}" for sensor in _sensors(session)))
         return ModeComponents((model,), PolicySource(session, mode, mode.inference, model, needs))
     if mode.teleop is not None:
-        return ModeComponents((), TeleopSource(session, mode, mode.teleop))
+        return ModeComponents((), TeleopSource(session, mode))
     if mode.planner is not None:
         descriptor = session.registry.find("source", "planner")
         assert isinstance(descriptor, SourceDescriptor)

@@ -11,7 +11,7 @@ import pytest
 from ibrobot_core.plugins import EXTRAS, KINDS, OFFICIAL, example_type, official_plugins
 
 CORE = OFFICIAL.parent
-ORDINARY = {"gripper", "joint", "keyboard", "process", "trajectory", "twist"}
+ORDINARY = {"gripper", "imu", "joint", "keyboard", "process", "trajectory", "twist"}
 """Types that are words of the language too: they count where a YAML would name them, as in `type: WORD`."""
 ALLOWED = {("config/models.py", 'read_xml(path, "mujoco")')}
 """File and text: the root element of MJCF files."""

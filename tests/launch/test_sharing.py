@@ -6,8 +6,9 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from ibrobot_ros2.services import SERVICES, Answer, Call, decode_answer, encode_call
 
-from ibrobot_core.errors import ConfigError, MissingDependency, NotSupported
+from ibrobot_core.errors import ConfigError, MissingDependency, NotSupported, TransportError
 from ibrobot_core.messages import Bool, String
 from ibrobot_core.units import NS_PER_S
 
@@ -106,6 +107,63 @@ def test_nothing_comes_in_in_lockstep(runs: Runs, network: None):
         runs.make("transport={type: network, share: {subscribe: [/lamp]}}", lockstep=True)
 
 
+def ask(service: str, request: Any = None, raw: bytes | None = None) -> Answer:
+    return decode_answer(made().request("services", raw or encode_call(Call(service, request)), 5.0))
+
+
+def test_services_answer_other_machines(runs: Runs, network: None):
+    runtime = runs.start("transport={type: network, share: {services: [/double, /planning/]}}", lockstep=False)
+    runtime.session.bus.serve("/double", lambda request: [request, request])
+    runtime.session.bus.serve("/secret", lambda request: "not shared")
+    assert ask("/double", {"a": 1}) == Answer([{"a": 1}, {"a": 1}])
+    assert ask(SERVICES) == Answer(["/double"])
+    runtime.session.bus.serve("/planning/go_to", lambda request: 7)
+    assert ask("/planning/go_to", "home") == Answer(7)
+    assert ask(SERVICES) == Answer(["/double", "/planning/go_to"])
+    assert ask("/secret") == Answer(
+        "/secret is not shared; shared: /double, /planning/go_to; transport.share.services of the robot lists what is",
+        False,
+    )
+    assert ask("/doubel").values.startswith("/doubel is not shared, did you mean '/double'?")
+    refused = ask("/planning/cancel")
+    assert not refused.result
+    assert refused.values.startswith("nobody serves /planning/cancel; served: ")
+    runtime.stop()
+    with pytest.raises(TransportError):
+        ask("/double")
+
+
+@pytest.mark.parametrize(
+    ("raw", "told"),
+    [
+        (b"{", "not JSON: "),
+        (b"[]", "expected a JSON object, got list"),
+        (b'{"op": "publish"}', "not a service call: it needs op: call_service and the name of a service"),
+        (b"[" * 100_000, "not JSON: "),
+        (b'{"op":"call_service","service":"/double","args":"${HOME}"}', "${…} cannot stand in a call: it would read"),
+    ],
+)
+def test_bytes_that_are_no_call_are_refused(runs: Runs, network: None, raw: bytes, told: str):
+    runtime = runs.start("transport={type: network, share: {services: [/double]}}", lockstep=False)
+    runtime.session.bus.serve("/double", lambda request: request)
+    refused = ask("", raw=raw)
+    assert not refused.result
+    assert refused.values.startswith(told)
+    runtime.stop()
+
+
+def test_answer_that_is_no_data_is_refused(runs: Runs, network: None):
+    runtime = runs.start("transport={type: network, share: {services: [/runtime]}}", lockstep=False)
+    runtime.session.bus.serve("/runtime", lambda request: runtime)
+    assert ask("/runtime") == Answer("a Runtime cannot be sent to another process", False)
+    runtime.stop()
+
+
+def test_nothing_is_answered_in_lockstep(runs: Runs, network: None):
+    with pytest.raises(NotSupported, match=r"transport\.share\.services: a lockstep run cannot answer"):
+        runs.make("transport={type: network, share: {services: [/lamp]}}", lockstep=True)
+
+
 @pytest.mark.parametrize(
     ("transport", "expected"),
     [
@@ -113,6 +171,8 @@ def test_nothing_comes_in_in_lockstep(runs: Runs, network: None):
         ("{type: network, share: {publish: [a]}}", "'a' is not a full topic name, did you mean '/a'?"),
         ("{type: network, share: {publish: [/a, /a]}}", "/a is listed twice"),
         ("{type: network, share: {publish: [/a], subscribe: [/a]}}", "/a is both published and subscribed"),
+        ("{type: network, share: {services: [a]}}", "'a' is not a full name of a service, did you mean '/a'?"),
+        ("{type: network, share: {services: [/a, /a]}}", "/a is listed twice"),
         ("{type: network, share: {publishes: [/a]}}", "did you mean 'publish'?"),
     ],
 )

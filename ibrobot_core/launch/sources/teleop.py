@@ -1,50 +1,75 @@
-"""Teleop: reads the device at every joint state, and sends control plans of one setpoint."""
+"""Teleop: reads the devices at every joint state, and sends control plans of one setpoint."""
 
 from __future__ import annotations
 
 from typing import override
 
+import attrs
 import numpy as np
+from numpy.typing import NDArray
 
 from ibrobot_core.config.schema import ControlMode
 from ibrobot_core.errors import TeleopError
-from ibrobot_core.interfaces import OperatorEvent, Teleop
+from ibrobot_core.interfaces import OperatorEvent, Teleop, TeleopCommand
 from ibrobot_core.launch.session import Session
 from ibrobot_core.launch.sources.source_worker import SourceWorker
 
 
-class TeleopSource(SourceWorker):
-    """A teleoperation device, which commands the robot by plans as all command sources do.
+@attrs.define(eq=False)
+class _Connected:
+    """A device, and the indices of the joints that it sees and moves."""
 
-    A failure of the device while the robot follows it is a fault; a reset connects the device again.
+    name: str
+    device: Teleop
+    columns: NDArray[np.intp]
+    joints: frozenset[str]
+    lost: bool = False
+
+
+class TeleopSource(SourceWorker):
+    """The teleoperation devices of a mode, which command the robot by plans as all command sources do.
+
+    Each device sees its group of joints as the whole robot. A failure of one while the robot follows it is a fault, so
+    that all joints stop together; a reset connects the device again.
     """
 
-    def __init__(self, session: Session, mode: ControlMode, device: str) -> None:
-        component = session.config.teleoperation[device]
-        super().__init__(session, mode, f"teleop {device} ({component.type})")
-        self._device_name = device
-        self._component = component
-        self._lost = False
+    def __init__(self, session: Session, mode: ControlMode) -> None:
+        types = session.config.teleoperation
+        texts = [
+            f"{name} ({types[name].type})" + (f" moves {group}" if group else "")
+            for group, name in mode.devices.items()
+        ]
+        super().__init__(session, mode, f"teleop {', '.join(texts)}")
+        self._connected: list[_Connected] = []
 
     @override
     def setup(self) -> None:
-        self._device: Teleop = self.session.make("teleop", self._component, self._device_name)
-        self.on_end.callback(self._device.disconnect)
-        self._device.connect()
+        robot = self.session.config.robot
+        for group, name in self.mode.devices.items():
+            part = robot.part(group) if group else robot
+            device = self.session.make("teleop", self.session.config.teleoperation[name], name, robot=part)
+            self.on_end.callback(device.disconnect)
+            device.connect()
+            self._connected.append(
+                _Connected(name, device, robot.indices(part.joint_names), frozenset(part.joint_names))
+            )
         self._states = self.session.bus.subscribe("/joint_states", 1)
         self.on_end.callback(self._states.close)
 
     @override
     def recover(self) -> None:
         with self.lock:
-            if self._lost:
-                self._device.disconnect()
-                self._device.connect()
-                self._lost = False
+            for each in self._connected:
+                if each.lost:
+                    each.device.disconnect()
+                    each.device.connect()
+                    each.lost = False
 
     @override
     def begin_mode(self, seed: int) -> None:
-        self._device.activate(self.session.measured())
+        measured = self.session.measured()
+        for each in self._connected:
+            each.device.activate(measured.of(each.columns))
 
     @override
     def work(self, timeout_s: float) -> None:
@@ -56,23 +81,37 @@ class TeleopSource(SourceWorker):
 
     def _follow(self) -> None:
         session = self.session
-        try:
-            command = self._device.read(session.measured())
-        except TeleopError as error:
-            self._lost = True
-            self.end()
-            session.control.call("fault", fault=str(error))
-            return
-        if command.estop:
+        commands = self._read()
+        if any(command.estop for command in commands):
             session.control.call("estop")
-        elif command.positions:
-            joints = tuple(command.positions)
-            setpoint = np.array([list(command.positions.values())])
-            session.send_plan(session.clock.now_ns(), 1, joints, setpoint)
-        for event in command.events:
+        elif positions := {joint: at for command in commands for joint, at in (command.positions or {}).items()}:
+            setpoint = np.array([list(positions.values())])
+            session.send_plan(session.clock.now_ns(), 1, tuple(positions), setpoint)
+        for event in (event for command in commands for event in command.events):
             self._pass_on(event)
-        if command.finished:
+        if commands and all(command.finished for command in commands):
             session.finish()
+
+    def _read(self) -> list[TeleopCommand]:
+        """The command of each device; none, and a fault, if a device has failed."""
+        measured = self.session.measured()
+        commands, faults = [], []
+        for each in self._connected:
+            try:
+                command = each.device.read(measured.of(each.columns))
+                if strange := set(command.positions or ()) - each.joints:
+                    raise TeleopError(
+                        f"{each.name}: commands joints that are not its own: {', '.join(sorted(strange))}"
+                    )
+                commands.append(command)
+            except TeleopError as error:
+                each.lost = True
+                faults.append(str(error))
+        if not faults:
+            return commands
+        self.end()
+        self.session.control.call("fault", fault="; ".join(faults))
+        return []
 
     def _pass_on(self, event: OperatorEvent) -> None:
         session = self.session
@@ -85,4 +124,4 @@ class TeleopSource(SourceWorker):
 
     @override
     def help(self) -> str:
-        return self._device.help()
+        return "\n".join(filter(None, (each.device.help() for each in self._connected)))

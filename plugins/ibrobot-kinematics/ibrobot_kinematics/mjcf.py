@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import attrs
 import numpy as np
 
 from ibrobot_core.api import Robot, Vector
@@ -25,21 +26,30 @@ def robot_model(robot: Robot, joints: Sequence[str] | None = None) -> KinematicM
 
     Args:
         robot: its description names the MJCF and the tip, a site of it.
-        joints: the joints that may move, in the order of vectors; None: all of the robot's. Others stay at zero.
+        joints: the joints that may move, in the order of vectors; None: all of the robot's. Others stay at zero. Of a
+            robot with several arms, the joints of one of them; the base frame is then that of the arm.
 
     Raises:
-        KinematicsError: when there is no MJCF, or it cannot be read, or it lacks the tip or one of the joints.
+        KinematicsError: when there is no MJCF, or it cannot be read, or it lacks the tip or one of the joints, or the
+            joints belong to several arms.
         KeyError: for a name in `joints` that is not a joint of the robot.
     """
-    if robot.description.mjcf is None:
+    description = robot.description
+    if description.mjcf is None:
         raise KinematicsError(f"robot {robot.name!r} has no robot.description.mjcf; kinematics needs a MuJoCo model")
     names = robot.joint_names if joints is None else tuple(joints)
     order = robot.indices(names)
     lower, upper = robot.lower[order], robot.upper[order]
+    arms = list(dict.fromkeys(map(description.arm_of, names)))
+    if len(arms) > 1:
+        known = ", ".join(map(repr, arms))
+        raise KinematicsError(f"robot {robot.name!r} has several arms ({known}), each with a tool: choose one of them")
+    own = [name.removeprefix(arm) for arm in arms for name in names]
     try:
-        return read_mjcf(robot.description.mjcf, robot.description.tip, names, lower=lower, upper=upper)
+        model = read_mjcf(description.mjcf, description.tip, own, lower=lower, upper=upper)
     except KinematicsError as error:
         raise KinematicsError(f"robot.description: {error}") from error
+    return attrs.evolve(model, joint_names=names)
 
 
 def read_mjcf(

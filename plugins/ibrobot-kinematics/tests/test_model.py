@@ -111,3 +111,26 @@ def test_robot_without_an_mjcf_is_refused():
     robot = Robot("arm", (Joint("pan", -1.0, 1.0, max_velocity=3.0, max_acceleration=20.0),))
     with pytest.raises(KinematicsError, match=r"robot 'arm' has no robot\.description\.mjcf"):
         robot_model(robot)
+
+
+def two_arms(path: Path) -> Robot:
+    names = [f"{arm}_{name}" for arm in ("left", "right") for name in FIVE]
+    joints = tuple(Joint(name, -1.5, 1.5, max_velocity=1.0, max_acceleration=1.0) for name in names)
+    arms = {"left_": (0.0, 0.2, 0.0, 0.0), "right_": (0.0, -0.2, 0.0, 0.0)}
+    groups = {arm: tuple(f"{arm}_{name}" for name in FIVE) for arm in ("left", "right")}
+    return Robot("two", joints, groups=groups, description=Description(mjcf=path, tip="tool", arms=arms))
+
+
+def test_each_of_several_arms_has_the_model_in_the_frame_of_its_base(tmp_path: Path):
+    robot = two_arms(write_arm(tmp_path, *FIVE))
+    alone = read_mjcf(robot.description.mjcf or Path(), "tool", FIVE)
+    q = np.array([0.3, -0.6, 1.1, 0.2, 0.2, 0.4])[: len(FIVE)]
+    for arm in ("left", "right"):
+        model = robot_model(robot.part(arm))
+        assert model.joint_names == robot.groups[arm]
+        np.testing.assert_array_equal(model.forward(q).position, alone.forward(q).position)
+
+
+def test_several_arms_have_no_common_tool(tmp_path: Path):
+    with pytest.raises(KinematicsError, match=r"robot 'two' has several arms \('left_', 'right_'\), each with a tool"):
+        robot_model(two_arms(write_arm(tmp_path, *FIVE)))

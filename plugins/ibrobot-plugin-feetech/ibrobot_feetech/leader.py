@@ -51,7 +51,7 @@ class LeaderTeleop(Teleop):
         self._options = options
         self._ctx = ctx
         robot = ctx.robot
-        pairs = dict(options.joints) or {joint: joint for joint in robot.joint_names}
+        pairs = options.pairs(robot)
         self._leader_joints = tuple(pairs)
         self._joints = tuple(pairs.values())
         self._check_names("joints", self._joints, robot.joint_names)
@@ -124,7 +124,7 @@ class LeaderTeleop(Teleop):
         if self._options.estop_key in (typed := self._typed()):
             self._release()
             return TeleopCommand(None, estop=True)
-        self._handle_presses(typed.count("space"), now_ns)
+        self._handle_presses(typed.count(self._options.deadman_key), now_ns)
         self._receive(self._reader, now_ns)
         if not self._engaged(now_ns):
             self._setpoint = None
@@ -140,12 +140,13 @@ class LeaderTeleop(Teleop):
 
     @override
     def help(self) -> str:
+        key = self._options.deadman_key
         start = {
             "none": "move the leader arm to start",
-            "toggle": "press space to follow the leader arm",
-            "hold": "hold space to follow the leader arm",
+            "toggle": f"press {key} to follow the leader arm",
+            "hold": f"hold {key} to follow the leader arm",
         }
-        pause = {"none": "", "toggle": ": space pauses", "hold": ": release space to pause"}
+        pause = {"none": "", "toggle": f": {key} pauses", "hold": f": release {key} to pause"}
         deadman = self._options.deadman
         state = f"PAUSED: {start[deadman]}" if self._setpoint is None else f"following the leader arm{pause[deadman]}"
         return f"{state}   {self._options.estop_key}  emergency stop"

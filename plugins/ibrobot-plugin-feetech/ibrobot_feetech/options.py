@@ -86,6 +86,9 @@ class LeaderOptions:
     joints: Mapping[str, str] = option(
         factory=dict, help="joint of the leader -> joint of the robot; by default, joints with equal names"
     )
+    prefix: str = option(
+        "", help="in place of joints: prefix of the robot's joints that those of the leader lack, e.g. left_"
+    )
     inverted: tuple[str, ...] = option((), help="joints of the leader whose direction is reversed")
     scaled: tuple[str, ...] = option(
         _GRIPPER, help="joints of the leader whose calibrated range maps to the robot's limits; others map by angle"
@@ -108,8 +111,19 @@ class LeaderOptions:
     release: float = option(
         0.2, unit="s", gt=0, le=1, help="deadman hold: a key that is not repeated for this long counts as released"
     )
+    deadman_key: str = option("space", help="key of the deadman; two leaders may have the same or different ones")
     estop_key: str = option("esc", help="key of the emergency stop")
     lost_replies: int = option(3, unit="reads", ge=0, help="consecutive replies of a servo that may be missing")
+
+    def __attrs_post_init__(self) -> None:
+        if self.prefix and self.joints:
+            raise ValueError("joints and prefix exclude each other; give one of them")
+        if self.deadman_key == self.estop_key:
+            raise ValueError(f"deadman_key and estop_key are both {self.estop_key!r}; give two different keys")
+
+    def pairs(self, robot: Robot) -> Mapping[str, str]:
+        """Joint of the leader -> joint of the robot."""
+        return self.joints or {joint.removeprefix(self.prefix): joint for joint in robot.joint_names}
 
 
 @documented
@@ -135,7 +149,13 @@ def check_leader(options: LeaderOptions, robot: Robot, joints: tuple[str, ...]) 
             yield OptionFault(
                 ("joints", ours), f"unknown joint {theirs!r}{did_you_mean(theirs, robot.joint_names, 'known')}"
             )
-    known = tuple(options.joints) or robot.joint_names
+    if strange := [joint for joint in robot.joint_names if not joint.startswith(options.prefix)]:
+        yield OptionFault(
+            ("prefix",),
+            f"joint {strange[0]!r} does not begin with {options.prefix!r}; give the device its arm in the mode, "
+            "e.g. teleop: {left: DEVICE}, where left is a joint group",
+        )
+    known = tuple(options.pairs(robot))
     for key, names in (("inverted", options.inverted), ("scaled", options.scaled)):
         if names != _GRIPPER:
             yield from _unknown(key, names, known, "joint of the leader")

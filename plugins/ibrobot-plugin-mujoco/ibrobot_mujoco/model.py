@@ -5,6 +5,8 @@ The physics model has no visual meshes, the visual model has low-poly ones; both
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from pathlib import Path
 
 import mujoco
@@ -67,10 +69,8 @@ def build_spec(options: MujocoOptions, robot: Robot) -> mujoco.MjSpec:
     path = robot.description.mjcf
     if path is None:
         raise HardwareError(f"robot {robot.name!r} has no MJCF to simulate: set robot.description.mjcf")
-    try:
-        spec = mujoco.MjSpec.from_file(str(path))
-    except ValueError as error:
-        raise HardwareError(f"{path} cannot be loaded: {error}") from error
+    arms = robot.description.arms
+    spec = _several(path, arms) if arms else _load(path)
     spec.option.timestep = ns(options.timestep) / NS_PER_S
     # Grasping needs both: with a pyramidal cone, or an impedance ratio of 1, the cube slips out.
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
@@ -88,6 +88,29 @@ def build_spec(options: MujocoOptions, robot: Robot) -> mujoco.MjSpec:
             _add_camera(spec, camera)
     for camera in options.cameras:
         _add_camera(spec, camera)
+    return spec
+
+
+def _load(path: Path) -> mujoco.MjSpec:
+    try:
+        return mujoco.MjSpec.from_file(str(path))
+    except ValueError as error:
+        raise HardwareError(f"{path} cannot be loaded: {error}") from error
+
+
+def _several(path: Path, arms: Mapping[str, tuple[float, float, float, float]]) -> mujoco.MjSpec:
+    """An MJCF once for each arm: prefix of its names -> x, y, z [m] and yaw [rad] of its base."""
+    spec = mujoco.MjSpec()
+    for prefix, (x, y, z, yaw) in arms.items():
+        arm = _load(path)
+        folder = Path(arm.modelfiledir) / arm.meshdir
+        for mesh in arm.meshes:
+            mesh.name, mesh.file = _mesh_name(mesh), str(folder / mesh.file)
+        arm.meshdir = ""
+        for option in ("integrator", "iterations", "ls_iterations", "timestep", "cone", "impratio"):
+            setattr(spec.option, option, getattr(arm.option, option))
+        base = spec.worldbody.add_frame(pos=[x, y, z], quat=[math.cos(yaw / 2), 0, 0, math.sin(yaw / 2)])
+        spec.attach(arm, prefix=prefix, frame=base)
     return spec
 
 
@@ -174,7 +197,7 @@ def _add_thing(spec: mujoco.MjSpec, name: str, thing: SceneThing) -> None:
     body = spec.worldbody.add_body(name=name, pos=thing.position, quat=turn)
     if thing.mass is not None:
         body.add_freejoint(name=name)
-    sizes = [each / 2 for each in thing.size or ()] or [thing.radius, (thing.height or 0) / 2, 0]
+    sizes = [each / 2 for each in thing.size or ()] or [thing.radius or 0.0, (thing.height or 0.0) / 2, 0.0]
     body.add_geom(
         name=name, type=_SHAPES[thing.shape], size=sizes, mass=thing.mass or 1.0, friction=[1, 0.005, 0.0001],
         rgba=[0.35, 0.55, 0.35, 1],

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 from ibrobot_core.api import (
     Command,
     ExecutorDescriptor,
-    MissingDependency,
     OptionFault,
     PlannerDescriptor,
     SectionDescriptor,
     SourceDescriptor,
     hookimpl,
 )
+from ibrobot_planning.engines import find_engines
 from ibrobot_planning.executors.options import GripperOptions, TrajectoryOptions
 from ibrobot_planning.options import JointPlannerOptions, RrtConnectOptions
 from ibrobot_planning.world_options import WorldOptions
@@ -31,17 +31,6 @@ def _joint(options: Any, ctx: Context) -> Planner:
     return JointPlanner(options, ctx)
 
 
-def _find_engines() -> None:
-    from importlib.util import find_spec
-
-    missing = [name for name in ("pinocchio", "coal", "mujoco", "ibrobot_kinematics") if find_spec(name) is None]
-    if missing:
-        raise MissingDependency(
-            f"planning around obstacles needs the Python package {missing[0]}, which is not installed",
-            remedy="pip install 'ibrobot-plugin-planning[obstacles]'",
-        )
-
-
 def _rrt_connect(options: Any, ctx: Context) -> Planner:
     from ibrobot_planning.rrt import RrtConnectPlanner
 
@@ -56,7 +45,7 @@ def ibrobot_planners() -> Iterable[PlannerDescriptor]:
         summary="straight line in joint space, time-optimal within velocity, acceleration and jerk limits",
     )  # fmt: skip
     yield PlannerDescriptor(
-        type="rrt_connect", options=RrtConnectOptions, make=_rrt_connect, check=_find_engines,
+        type="rrt_connect", options=RrtConnectOptions, make=_rrt_connect, check=find_engines,
         summary="around obstacles, to joint positions or poses of the tool, checked against padding after timing",
     )  # fmt: skip
 
@@ -117,19 +106,26 @@ def _check_world(options: WorldOptions, robot: Robot, joints: tuple[str, ...]) -
 def ibrobot_sections() -> Iterable[SectionDescriptor]:
     """The section `world`."""
     yield SectionDescriptor(
-        type="world", options=WorldOptions, make=_world, check=_find_engines, check_options=_check_world,
+        type="world", options=WorldOptions, make=_world, check=find_engines, check_options=_check_world,
         summary="objects that planners avoid: boxes, spheres, cylinders, meshes, planes; services change them",
     )  # fmt: skip
 
 
 def _description() -> click.Command:
-    _find_engines()
+    find_engines()
     from ibrobot_planning.commands import description
 
     return description
 
 
+def _plan() -> click.Command:
+    from ibrobot_planning.plan_command import plan
+
+    return plan
+
+
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
-    """`ibrobot description …`."""
+    """`ibrobot plan` and `ibrobot description …`."""
+    yield Command("plan", "Plan a motion without moving, and print or plot it.", _plan)
     yield Command("description", "Make files that describe a robot, e.g. an SRDF.", _description)

@@ -124,6 +124,15 @@ class Collisions:
                 found[first, second] = contact
         return sorted(found.values(), key=lambda contact: contact.distance)
 
+    def distances(self, q: Vector) -> dict[Pair, float]:
+        """Distance [m] of each checked pair of names at `q`, shape (J,); negative where they overlap."""
+        pinocchio.computeDistances(self.arm.model, self.data, self.geometry, self.results, self.native(q[None])[0])
+        found: dict[Pair, float] = {}
+        for pair, result in zip(self.geometry.collisionPairs, self.results.distanceResults, strict=True):
+            names = self._names[pair.first], self._names[pair.second]
+            found[names] = min(float(result.min_distance), found.get(names, np.inf))
+        return found
+
     def native(self, configurations: Vector) -> Vector:
         """Configurations of the planned joints, shape (N, J), completed with all other joints for Pinocchio."""
         whole = np.repeat(self._base[None], len(configurations), axis=0)

@@ -11,6 +11,7 @@ from ibrobot_core.api import (
     AnyGoal,
     Goal,
     JointGoal,
+    JointTrajectory,
     LinearGoal,
     NamedGoal,
     OrientationPolicy,
@@ -44,6 +45,9 @@ class Target:
     joints: dict[str, float] = attrs.field(factory=dict)
     """Joint -> position [rad]."""
     velocity_scaling: float = 1.0
+    acceleration_scaling: float = 1.0
+    trajectory: JointTrajectory | None = None
+    """A trajectory to follow as it is, in place of a goal."""
 
 
 def target(goal: str | Goal, robot: Robot, velocity_scaling: float = 1.0) -> Target:
@@ -81,6 +85,8 @@ def target(goal: str | Goal, robot: Robot, velocity_scaling: float = 1.0) -> Tar
         return Target(
             ", ".join(f"{joint}={value:g}" for joint, value in positions.items()), None, positions, velocity_scaling
         )
+    for joint in goal.joints if isinstance(goal, JointGoal) else ():
+        _check_joint(joint, robot)
     if isinstance(goal, JointGoal | PositionGoal | PoseGoal | AnyGoal | LinearGoal):
         return Target(_described(goal), goal, velocity_scaling=velocity_scaling)
     raise _invalid(

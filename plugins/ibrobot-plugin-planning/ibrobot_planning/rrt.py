@@ -10,8 +10,7 @@ from typing import override
 import attrs
 import numpy as np
 from ibrobot_kinematics import KinematicModel, KinematicsError, robot_model
-from ibrobot_kinematics.srdf import Srdf, read_srdf
-from ibrobot_kinematics.urdf import read_urdf
+from ibrobot_kinematics.srdf import Srdf
 
 from ibrobot_core.api import (
     AnyGoal,
@@ -32,16 +31,15 @@ from ibrobot_core.api import (
     Vector,
     ns,
 )
-from ibrobot_planning.arm import SRDF, Arm, Pair, robot_arm, sorted_pair
-from ibrobot_planning.collision import Collisions, Contact, unchecked_pairs
+from ibrobot_planning.arm import Arm, Pair
+from ibrobot_planning.checked_arm import checked_arm
+from ibrobot_planning.collision import Collisions, Contact
 from ibrobot_planning.goals import Candidate, Tool, joint_target
 from ibrobot_planning.linear import linear_path
 from ibrobot_planning.options import RrtConnectOptions
 from ibrobot_planning.search import Space, connect, shortened
-from ibrobot_planning.semantics import urdf_names
 from ibrobot_planning.timing import Motion, timed
-from ibrobot_planning.world import World
-from ibrobot_planning.world_keeper import SNAPSHOT
+from ibrobot_planning.world import SNAPSHOT, World
 
 _RESOLUTIONS_M = (0.03, 0.01, 0.004)
 """Maximum motion of the arm between checks of the search; finer ones follow if the timed motion touches."""
@@ -76,29 +74,14 @@ class RrtConnectPlanner(Planner):
         self._ctx = ctx
         self._arm: Arm | None = None
         self._tool: Tool | None = None
-        self._unchecked: dict[Pair, str] = {}
+        self._unchecked: Mapping[Pair, str] = {}
         self._srdf: Srdf | None = None
 
     @override
     def load(self) -> None:
-        robot = self._ctx.robot
-        self._arm = robot_arm(robot)
-        self._tool = Tool(robot_model(robot))
-        self._unchecked = unchecked_pairs(self._arm)
-        if robot.description.srdf is not None and robot.description.urdf is not None:
-            urdf = read_urdf(robot.description.urdf)
-            self._srdf = read_srdf(robot.description.srdf, urdf)
-            self._leave_out(self._srdf, {name: link for link, name in urdf_names(self._arm, urdf).items()})
-
-    def _leave_out(self, srdf: Srdf, links: Mapping[str, str]) -> None:
-        """Do not check pairs of the SRDF; `links` has the MJCF's links under the names of the URDF, which it uses."""
-        for pair in srdf.may_touch:
-            unknown = [name for name in pair if name not in links]
-            if unknown:
-                message = "%s: %s and %s are checked nevertheless: no joint of the MJCF carries %s"
-                self._ctx.log.warning(message, srdf.path, *pair, unknown[0])
-            else:
-                self._unchecked[sorted_pair(links[pair[0]], links[pair[1]])] = SRDF
+        checked = checked_arm(self._ctx.robot, self._ctx.log)
+        self._arm, self._unchecked, self._srdf = checked.arm, checked.unchecked, checked.srdf
+        self._tool = Tool(robot_model(self._ctx.robot))
 
     @property
     def arm(self) -> Arm:

@@ -20,6 +20,7 @@ from ibrobot_core.api import (
     HardwareError,
     JointGoal,
     JointState,
+    JointTrajectory,
     NotSupported,
     OrientationPolicy,
     PlanCode,
@@ -33,12 +34,15 @@ from ibrobot_core.api import (
     Session,
     SourceWorker,
     String,
+    Vector,
     ns,
     seconds,
     trajectory_goal,
 )
 from ibrobot_planning.goal_text import Target, target
 from ibrobot_planning.motion import MoveResult, MoveToConfiguration, MoveToPose, Outcome
+from ibrobot_planning.planning_services import PlanningServices
+from ibrobot_planning.requests import MoveRequest, requested, trajectory_from
 
 GO_TO = "/planning/go_to"
 """Takes a goal, as text or as a goal of `ibrobot_core.api`, which replaces the present one; answers with its number."""
@@ -46,6 +50,10 @@ RESULT = "/planning/result"
 """Number of a goal -> its `MoveResult`; None while the robot moves."""
 CANCEL = "/planning/cancel"
 """Drops all goals: the robot slows down and holds."""
+MOVE_ACTION = "/move_action"
+"""Takes a `MoveRequest`, and answers like `GO_TO`; named like MoveIt's action."""
+EXECUTE = "/execute_trajectory"
+"""Takes a trajectory that begins where the robot is, and answers like `GO_TO`; named like MoveIt's action."""
 MOVE_TO_POSE = "/moveit_gateway/move_to_pose"
 """Takes a `MoveToPose`, and answers with a `MoveResult` when the motion has ended."""
 MOVE_TO_CONFIGURATION = "/moveit_gateway/move_to_configuration"
@@ -61,6 +69,8 @@ _GLANCE_S = 0.5
 _ENDED = MoveResult(False, "the mode or the run ended", 0.0, "CANCELLED", PlanCode.PREEMPTED)
 _STILL_RAD = 1e-4
 """Commands that change less between two checks are at rest."""
+_START_RAD = 0.01
+"""Allowed distance between the start of a trajectory and the robot, that of MoveIt."""
 _KEPT = 100
 """Number of results kept for `RESULT`."""
 _POLICIES: tuple[OrientationPolicy, ...] = ("keep_axis", "arm_plane", "current", "free")
@@ -118,12 +128,16 @@ class PlannerSource(SourceWorker):
         self._asked = len(self._queue)
         self._ends = bool(self._queue)
         self._over = False
+        self._planning = threading.Lock()
         self._services: dict[str, Callable[[Any], Any]] = {
             GO_TO: lambda goal: self._submit(goal).number,
             RESULT: self._result,
             CANCEL: lambda request: self._inbox.put(None),
+            MOVE_ACTION: self._move_action,
+            EXECUTE: self._execute,
             MOVE_TO_POSE: self._move_to_pose,
             MOVE_TO_CONFIGURATION: self._move_to_configuration,
+            **PlanningServices(session, mode, self._planned).handlers,
         }
 
     @override
@@ -183,9 +197,23 @@ class PlannerSource(SourceWorker):
 
     def _submit(self, goal: str | Goal, velocity_scaling: float = 1.0) -> _Move:
         """Replace all goals by this one."""
-        move = self._known(self._new(goal, velocity_scaling))
-        self._inbox.put(move)
+        return self._submitted(self._new(goal, velocity_scaling))
+
+    def _submitted(self, move: _Move) -> _Move:
+        self._inbox.put(self._known(move))
         return move
+
+    def _move_action(self, request: object) -> int:
+        wanted = requested(MoveRequest, request)
+        move = self._new(wanted.goal(), wanted.velocity_scaling)
+        move.target = attrs.evolve(move.target, acceleration_scaling=wanted.acceleration_scaling)
+        return self._submitted(move).number
+
+    def _execute(self, request: object) -> int:
+        trajectory = trajectory_from(request)
+        parsed = Target("trajectory", trajectory=trajectory)
+        self._executors(parsed)
+        return self._submitted(_Move(next(self._numbers), parsed)).number
 
     def _known(self, move: _Move) -> _Move:
         """Keep a goal for `RESULT`."""
@@ -199,16 +227,14 @@ class PlannerSource(SourceWorker):
             raise PlanningError(f"no goal {number!r}; {GO_TO} answers with the number of a goal")
         return self._moves[number].result
 
-    def _move_to_pose(self, request: MoveToPose) -> MoveResult:
-        if not isinstance(request, MoveToPose):
-            raise PlanningError(f"{MOVE_TO_POSE} takes a MoveToPose, got {type(request).__name__}")
-        return self._wait(_nearest(request.target_pose), request.velocity_scaling)
+    def _move_to_pose(self, request: object) -> MoveResult:
+        wanted = requested(MoveToPose, request)
+        return self._wait(_nearest(wanted.target_pose), wanted.velocity_scaling)
 
-    def _move_to_configuration(self, request: MoveToConfiguration) -> MoveResult:
-        if not isinstance(request, MoveToConfiguration):
-            raise PlanningError(f"{MOVE_TO_CONFIGURATION} takes a MoveToConfiguration, got {type(request).__name__}")
-        state: JointState = request.target_joint_state
-        return self._wait(JointGoal(state.name, state.position), request.velocity_scaling)
+    def _move_to_configuration(self, request: object) -> MoveResult:
+        wanted = requested(MoveToConfiguration, request)
+        state: JointState = wanted.target_joint_state
+        return self._wait(JointGoal(state.name, state.position), wanted.velocity_scaling)
 
     def _wait(self, goal: Goal, velocity_scaling: float) -> MoveResult:
         """Submit a goal and wait for its end; an invalid goal is REJECTED."""
@@ -278,7 +304,7 @@ class PlannerSource(SourceWorker):
         self._seen = state
         return seen is not None and bool(np.abs(state.command - seen.command).max() < _STILL_RAD)
 
-    def _commanded(self) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    def _commanded(self) -> Vector:
         # From the commanded positions, not the sagging joints, so that the setpoint does not jump.
         state = self.session.state
         return state.command if state is not None else self.session.measured().position
@@ -300,14 +326,25 @@ class PlannerSource(SourceWorker):
             session.control.call("cancel")  # those that took their goal already
             self._finish(move, "EXECUTION_FAILED", PlanCode.CONTROL_FAILED, str(error))
 
-    def _executors(self, parsed: Target) -> dict[str, Goal | float]:
-        """Executor -> its target: a goal to plan for, or a position [rad].
+    def _executors(self, parsed: Target) -> dict[str, Goal | float | JointTrajectory]:
+        """Executor -> its target: a goal to plan for, a position [rad], or a trajectory to follow.
 
         Raises:
             PlanningError: where no executor of the mode can reach the goal.
         """
         executors = {name: self.session.config.executors[name] for name in self.mode.executors}
-        found: dict[str, Goal | float] = {}
+        found: dict[str, Goal | float | JointTrajectory] = {}
+        if (trajectory := parsed.trajectory) is not None:
+            wanted = set(trajectory.joint_names)
+            arms = [
+                name for name, each in executors.items() if each.goals == "trajectory" and set(each.joints) == wanted
+            ]
+            if not arms:
+                raise PlanningError(
+                    f"no executor of mode {self.mode.name} follows trajectories of {', '.join(trajectory.joint_names)}",
+                    PlanCode.INVALID_GROUP_NAME,
+                )
+            return {arms[0]: trajectory}
         for name, executor in executors.items():
             mine = [joint for joint in executor.joints if joint in parsed.joints]
             if mine and executor.goals == "position":
@@ -342,16 +379,48 @@ class PlannerSource(SourceWorker):
             if isinstance(goal, float):
                 goals[name] = {"position": goal}
                 continue
+            if isinstance(goal, JointTrajectory):
+                self._check_begin(goal, start)
+                goals[name] = trajectory_goal(goal)
+                continue
             joints = self.session.config.executors[name].joints
             others = dict(zip(robot.joint_names, start.tolist(), strict=True))
             request = PlanRequest(
-                joints, start[robot.indices(joints)], goal, velocity_scaling=move.target.velocity_scaling, others=others
-            )
-            planned = self._planner.plan(request)
+                joints, start[robot.indices(joints)], goal,
+                move.target.velocity_scaling, move.target.acceleration_scaling, others,
+            )  # fmt: skip
+            planned = self._planned(request)
             goals[name] = trajectory_goal(planned.trajectory)
             if goal is move.target.tool:
                 move.planned = planned
         return goals
+
+    def _planned(self, request: PlanRequest) -> PlanResult:
+        with self._planning:
+            return self._planner.plan(request)
+
+    def _check_begin(self, trajectory: JointTrajectory, start: Vector) -> None:
+        """Check that a trajectory begins where the robot is.
+
+        Raises:
+            PlanningError: if it does not.
+        """
+        first = trajectory.points[0].positions
+        present = start[self.session.config.robot.indices(trajectory.joint_names)]
+        if first.shape != present.shape:
+            raise PlanningError(
+                f"point 0 of the trajectory has {first.size} positions for {present.size} joints",
+                PlanCode.INVALID_MOTION_PLAN,
+            )
+        away = np.abs(first - present)
+        # Written so that NaN fails it.
+        if not away.max() <= _START_RAD:
+            joint = int(away.argmax())
+            raise PlanningError(
+                f"the trajectory begins with {trajectory.joint_names[joint]} at {first[joint]:.4f} rad, the robot is at"
+                f" {present[joint]:.4f} rad; at most {_START_RAD} rad may lie between them",
+                PlanCode.START_STATE_INVALID,
+            )
 
     def _advance(self, event: Mapping[str, Any]) -> None:
         move, name = self._move, str(event["executor"])

@@ -52,3 +52,13 @@ def from_rpy(roll: float, pitch: float, yaw: float) -> Quaternion:
         float(sr * cp * cy - cr * sp * sy), float(cr * sp * cy + sr * cp * sy),
         float(cr * cp * sy - sr * sp * cy), float(cr * cp * cy + sr * sp * sy),
     )  # fmt: skip
+
+
+def to_rpy(q: Quaternion) -> tuple[float, float, float]:
+    """Turns [rad] about the fixed x, then y, then z axis of a quaternion; the inverse of `from_rpy`."""
+    r = rotation(q.w, q.x, q.y, q.z)
+    across = float(np.hypot(r[0, 0], r[1, 0]))
+    pitch = float(np.arctan2(-r[2, 0], across))
+    if across < 1e-9:  # x and z axis coincide: one turn does for both
+        return float(np.arctan2(-r[1, 2], r[1, 1])), pitch, 0.0
+    return float(np.arctan2(r[2, 1], r[2, 2])), pitch, float(np.arctan2(r[1, 0], r[0, 0]))

@@ -14,6 +14,8 @@ from numpy.typing import ArrayLike
 
 from ibrobot_core.api import PlanCode, PlanningError, Pose, Vector
 
+SNAPSHOT = "/world/snapshot"
+"""Service that answers with the `World` of the run."""
 _LARGEST_M = 100.0
 """Sizes above this are most likely millimetres."""
 
@@ -224,6 +226,12 @@ class World:
         if thing.link is None:
             raise PlanningError(f"object {name!r} is not attached", PlanCode.INVALID_OBJECT_NAME)
         return World({**self.objects, name: attrs.evolve(thing, link=None, pose=pose, may_touch=may_touch)})
+
+    def allow(self, name: str, may_touch: frozenset[str]) -> World:
+        """The world with an object that may touch `may_touch` and the link that carries it, and nothing else."""
+        thing = self.named(name)
+        carrier = frozenset() if thing.link is None else frozenset({thing.link})
+        return World({**self.objects, name: attrs.evolve(thing, may_touch=may_touch | carrier)})
 
     def named(self, name: str) -> WorldObject:
         """An object.

@@ -23,19 +23,17 @@ from ibrobot_core.api import (
     Subscription,
     Vector,
     Vector3,
-    single_options,
 )
+from ibrobot_planning.requests import requested
 from ibrobot_planning.transforms import from_rpy, matrix, pose
-from ibrobot_planning.world import Box, Capsule, Cylinder, Plane, Shape, Sphere, World, WorldObject
-from ibrobot_planning.world_options import Added, Attached, Detached, Moved, Named, Touched, WorldOptions
+from ibrobot_planning.world import SNAPSHOT, Box, Capsule, Cylinder, Plane, Shape, Sphere, World, WorldObject
+from ibrobot_planning.world_options import Added, Allowed, Attached, Detached, Moved, Named, Touched, WorldOptions
 
 if TYPE_CHECKING:
     from ibrobot_planning.arm import Arm
 
-SNAPSHOT = "/world/snapshot"
-"""Service that answers with the `World` of the run."""
 ATTACH, DETACH, TOUCH = "/world/attach", "/world/detach", "/world/touch"
-"""Services that take `Attached`, `Detached` and `Touched` as YAML."""
+"""Services that take `Attached`, `Detached` and `Touched`."""
 SECTION = "world"
 
 
@@ -81,7 +79,9 @@ def _shape(thing: SceneObject) -> Shape:
 
 
 class WorldKeeper(Component):
-    """Serves `/world/snapshot`, and `/world/add`, `remove`, `move`, `attach`, `detach` and `touch`, which take YAML.
+    """Serves `/world/snapshot`, and `/world/add`, `remove`, `move`, `attach`, `detach`, `allow` and `touch`.
+
+    Requests are mappings, or the same as YAML.
 
     A change answers with the names of all objects. Planners see a whole world: each change makes a new one. Objects of
     the simulated scene are where the simulation has them now, unless they are attached.
@@ -100,12 +100,13 @@ class WorldKeeper(Component):
         self._touched: tuple[str, ...] = ()
         self._services: dict[str, Callable[[Any], Any]] = {
             SNAPSHOT: lambda request: self._snapshot(),
-            "/world/add": self._changing(Added, lambda world, it: world.add(it.name, it.object.made())),
+            "/world/add": self._changing(Added, self._add),
             "/world/remove": self._changing(Named, lambda world, it: world.remove(it.name)),
             "/world/move": self._changing(Moved, self._move),
             ATTACH: self._changing(Attached, self._attach),
             DETACH: self._changing(Detached, self._detach),
             TOUCH: self._changing(Touched, self._touch),
+            "/world/allow": self._changing(Allowed, lambda world, it: world.allow(it.name, frozenset(it.may_touch))),
         }
 
     @override
@@ -152,17 +153,22 @@ class WorldKeeper(Component):
                     world = world.move(name, Pose(Vector3(x, y, z), Quaternion(qx, qy, qz, qw)))
         return world
 
-    def _changing[T](self, kind: type[T], change: Callable[[World, T], World]) -> Callable[[str], list[str]]:
-        def handler(text: str) -> list[str]:
-            request = single_options(kind, (), "the request", text=text)
+    def _changing[T](self, kind: type[T], change: Callable[[World, T], World]) -> Callable[[object], list[str]]:
+        def handler(request: object) -> list[str]:
+            wanted = requested(kind, request)
             with self._lock:
                 try:
-                    self._world = change(self._observed(), request)
+                    self._world = change(self._observed(), wanted)
                 except ValueError as error:
                     raise PlanningError(str(error)) from error
                 return list(self._world.objects)
 
         return handler
+
+    def _add(self, world: World, it: Added) -> World:
+        if it.replace and it.name in world.objects:
+            world = world.remove(it.name)
+        return world.add(it.name, it.object.made())
 
     def _move(self, world: World, it: Moved) -> World:
         return world.move(it.name, Pose(Vector3(*it.position), from_rpy(*it.rpy)))

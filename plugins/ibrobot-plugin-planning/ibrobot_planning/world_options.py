@@ -91,6 +91,7 @@ class Added:
 
     name: str = option(help="a name that no object has")
     object: ObjectOptions = option(help="the object, as in the YAML")
+    replace: bool = option(False, help="whether to replace an object of this name")
 
 
 @documented
@@ -138,3 +139,12 @@ class Touched:
     """A request to `/world/touch`, in place of the previous one."""
 
     objects: tuple[str, ...] = option((), help="objects that the hand, and what it carries, may touch")
+
+
+@documented
+@attrs.frozen
+class Allowed:
+    """A request to `/world/allow`."""
+
+    name: str = option(help="the object's name")
+    may_touch: tuple[str, ...] = option((), help="all links and objects that it may touch from now on")

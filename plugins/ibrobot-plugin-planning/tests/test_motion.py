@@ -21,6 +21,7 @@ from ibrobot_planning.source import (
 )
 
 from ibrobot_core.api import (
+    ConfigError,
     Header,
     JointState,
     NotSupported,
@@ -223,11 +224,8 @@ def test_end_of_the_run_ends_a_service_that_waits(run):
             "goal 'xyz=0.2,0,0.1 pan=1': pan moves the tool, and cannot be given beside its position",
         ),
         (RESULT, 99, PlanningError, "no goal 99; /planning/go_to answers with the number of a goal"),
-        (MOVE_TO_POSE, Pose(), PlanningError, "/moveit_gateway/move_to_pose takes a MoveToPose, got Pose"),
-        (
-            MOVE_TO_CONFIGURATION, "up", PlanningError,
-            "/moveit_gateway/move_to_configuration takes a MoveToConfiguration, got str",
-        ),
+        (MOVE_TO_POSE, Pose(), PlanningError, "the request must be a MoveToPose, or a mapping or YAML with"),
+        (MOVE_TO_CONFIGURATION, "up", ConfigError, "the request: expected a mapping, got 'up'"),
         (MOVE_TO_POSE, MoveToPose(Pose()), NotSupported, "this service waits for the motion: "),
     ],
 )  # fmt: skip

@@ -1,4 +1,4 @@
-"""The plugin's hooks: transport `zenoh`, the commands `ibrobot topic …` and `ibrobot certs`."""
+"""The plugin's hooks: transport `zenoh`, the commands `ibrobot topic …`, `ibrobot service …` and `ibrobot certs`."""
 
 from __future__ import annotations
 
@@ -60,8 +60,15 @@ def _topic() -> click.Command:
     return topic
 
 
+def _service() -> click.Command:
+    from ibrobot_zenoh.commands.service import service
+
+    return service
+
+
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
-    """Commands for topics and certificates."""
+    """Commands for topics, services and certificates."""
     yield Command("topic", "List, show, measure and publish topics shared over the network.", _topic)
+    yield Command("service", "List and call services shared over the network.", _service)
     yield Command("certs", "Make certificates for a server and its robots.", _certs)

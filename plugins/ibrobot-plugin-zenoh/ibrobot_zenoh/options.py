@@ -82,16 +82,29 @@ def _check_topics(instance: Any, attribute: attrs.Attribute[tuple[str, ...]], va
             raise ValueError(f"{topic} is listed twice")
 
 
+def _check_services(instance: Any, attribute: attrs.Attribute[tuple[str, ...]], value: tuple[str, ...]) -> None:
+    for service in value:
+        if not service.startswith("/"):
+            raise ValueError(f"{service!r} is not a full name of a service, did you mean '/{service}'?")
+        if value.count(service) > 1:
+            raise ValueError(f"{service} is listed twice")
+
+
 @documented
 @attrs.frozen
 class Share:
-    """Topics shared with other machines."""
+    """Topics and services shared with other machines."""
 
     publish: tuple[str, ...] = option(
         (), validator=_check_topics, help="topics of this robot for others, e.g. /joint_states"
     )
     subscribe: tuple[str, ...] = option(
         (), validator=_check_topics, help="topics of other machines for this robot's bus, e.g. /force_torque"
+    )
+    services: tuple[str, ...] = option(
+        (),
+        validator=_check_services,
+        help="services of this robot that others may call, e.g. /planning/go_to; /world/ stands for all that begin so",
     )
 
     def __attrs_post_init__(self) -> None:
@@ -104,7 +117,7 @@ class Share:
 class ZenohOptions:
     """Options of `type: zenoh`."""
 
-    share: Share = option(factory=Share, help="topics shared with other machines")
+    share: Share = option(factory=Share, help="topics and services shared with other machines")
     connect: tuple[str, ...] = option(
         (), validator=_check_endpoints, help="endpoints to connect to, in order of preference, e.g. tls/gpu.lab:7447"
     )

@@ -1,4 +1,4 @@
-"""Shares topics between a run and other machines, over the transport. The bus never waits for it."""
+"""Shares topics and services between a run and other machines. The bus never waits for the transport."""
 
 from __future__ import annotations
 
@@ -6,12 +6,15 @@ from abc import abstractmethod
 from collections.abc import Callable
 from typing import override
 
+from ibrobot_ros2.services import SERVICES, Answer, decode_call, encode_answer, endpoint
+
 from ibrobot_core.api import (
     NS_PER_S,
     Component,
     IbrobotError,
     Message,
     NotSupported,
+    Payload,
     Session,
     SessionWorker,
     Subscription,
@@ -53,6 +56,11 @@ class TopicTransport(Transport):
             TransportError: if closed.
         """
 
+    @property
+    def namespace(self) -> str:
+        """Prefix of this robot's names on the network."""
+        return ""
+
     @abstractmethod
     def shared_topics(self, timeout_s: float) -> list[SharedTopic]:
         """All shared topics, by name; waits up to `timeout_s` [s] for the answer.
@@ -63,17 +71,20 @@ class TopicTransport(Transport):
 
 
 def components(share: Share, session: Session, link: TransportLink) -> list[Component]:
-    """The components that share the topics in a YAML.
+    """The components that share the topics and services in a YAML.
 
     Raises:
-        NotSupported: if it subscribes to topics of other machines in lockstep.
+        NotSupported: if it subscribes to topics of other machines, or serves them, in lockstep.
         MissingDependency: if it publishes topics of a sensor that cannot run on this machine.
     """
     if session.request.lockstep and share.subscribe:
         raise NotSupported("transport.share.subscribe: a lockstep run cannot receive topics of other machines")
+    if session.request.lockstep and share.services:
+        raise NotSupported("transport.share.services: a lockstep run cannot answer other machines")
     session.refuse_absent("transport.share.publish", share.publish.__contains__)
     subscribed: list[Component] = [SubscribedTopics(session, link, share.subscribe)] if share.subscribe else []
-    return [*(PublishedTopic(session, link, topic) for topic in share.publish), *subscribed]
+    served: list[Component] = [SharedServices(session, link, share.services)] if share.services else []
+    return [*(PublishedTopic(session, link, topic) for topic in share.publish), *subscribed, *served]
 
 
 def _topics(link: TransportLink) -> TopicTransport:
@@ -162,3 +173,51 @@ class SubscribedTopics(Component):
         ends, self._ends = self._ends, []
         for end in ends:
             end()
+
+
+class SharedServices(Component):
+    """Answers calls of the bus's services from other machines.
+
+    A name that ends with / stands for all services whose names begin with it. `/rosapi/services` lists the services.
+    """
+
+    def __init__(self, session: Session, link: TransportLink, names: tuple[str, ...]) -> None:
+        super().__init__("share:services", f"{', '.join(names)} for other machines", (link.name,))
+        self._session = session
+        self._link = link
+        self._names = names
+        self._end: Callable[[], None] | None = None
+
+    @override
+    def start(self) -> None:
+        transport = _topics(self._link)
+        self._end = transport.serve(endpoint(transport.namespace), self._answer)
+
+    @override
+    def stop(self) -> None:
+        end, self._end = self._end, None
+        if end is not None:
+            end()
+
+    def _answer(self, payload: Payload, sender: str | None) -> bytes:
+        try:
+            if b"${" in bytes(payload):
+                raise NotSupported("${…} cannot stand in a call: it would read the environment of the robot's machine")
+            call = decode_call(payload)
+            if call.service == SERVICES:
+                return encode_answer(Answer(self._shared()))
+            if not self._is_shared(call.service):
+                raise NotSupported(
+                    f"{call.service} is not shared{did_you_mean(call.service, self._shared(), 'shared')};"
+                    " transport.share.services of the robot lists what is"
+                )
+            return encode_answer(Answer(self._session.bus.call(call.service, call.request)))
+        except IbrobotError as error:
+            return encode_answer(Answer(str(error), result=False))
+
+    def _is_shared(self, service: str) -> bool:
+        return any(service == name or (name.endswith("/") and service.startswith(name)) for name in self._names)
+
+    def _shared(self) -> list[str]:
+        """The shared services that something serves at present."""
+        return [name for name in self._session.bus.services() if self._is_shared(name)]

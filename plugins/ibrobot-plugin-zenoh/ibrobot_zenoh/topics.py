@@ -109,6 +109,9 @@ class Topics:
         options: domain, namespace, and whether types have hashes.
         own: identity of this machine.
         ctx: its robot's name becomes the node's name.
+
+    Attributes:
+        namespace: prefix of the names of topics; empty for none.
     """
 
     def __init__(self, connection: Connection, options: ZenohOptions, own: Identity | None, ctx: Context) -> None:
@@ -116,7 +119,7 @@ class Topics:
         self.options = options
         self._own = own
         default = own.name if own is not None and own.role is Role.ROBOT else ""
-        self._namespace = default if options.namespace is None else options.namespace
+        self.namespace = default if options.namespace is None else options.namespace
         self._log = ctx.log
         self._name = "ibrobot_" + re.sub(r"\W", "_", ctx.robot.name)
         self._lock = threading.Lock()
@@ -126,7 +129,7 @@ class Topics:
     def publish(self, topic: str, message: Message, *, latched: bool) -> None:
         """See `TopicTransport.publish_message`."""
         self.connection.check_open()
-        name = absolute(topic, self._namespace)
+        name = absolute(topic, self.namespace)
         if self._own is not None:
             self._own.check_may_publish(name)
         payload = encode(message).tobytes()
@@ -140,7 +143,7 @@ class Topics:
 
     def is_heard(self, topic: str, type_name: str, timeout_s: float) -> bool:
         """See `ZenohTransport.is_heard`."""
-        publisher = self._publisher(absolute(topic, self._namespace), type_name, latched=False)
+        publisher = self._publisher(absolute(topic, self.namespace), type_name, latched=False)
         deadline = time.monotonic() + timeout_s
         while not publisher.is_heard and time.monotonic() + _AGAIN_S < deadline:
             time.sleep(_AGAIN_S)
@@ -159,7 +162,7 @@ class Topics:
 
     def subscribe(self, topic: str, callback: Callable[[Message], object]) -> tuple[Callable[[], None], Workers[Any]]:
         """Returns a function that unsubscribes, and the thread that calls `callback`; see `TopicTransport`."""
-        name = absolute(topic, self._namespace)
+        name = absolute(topic, self.namespace)
         warn_once = _Once(self._log)
 
         def deliver(sample: zenoh.Sample) -> None:

@@ -181,6 +181,11 @@ class ZenohTransport(TopicTransport):
     def subscribe_messages(self, topic: str, callback: Callable[[Message], object]) -> Callable[[], None]:
         return self._keep(*self._topics.subscribe(topic, callback))
 
+    @property
+    @override
+    def namespace(self) -> str:
+        return self._topics.namespace
+
     def await_connection(self, timeout_s: float) -> bool:
         """Wait up to `timeout_s` [s] for the other side; returns whether it has answered."""
         return self._connection.answered.wait(timeout_s)

@@ -46,6 +46,7 @@ from ibrobot_feetech.usb import usb_port
     show_default=True,
     help="0 rad: the middle pose, set by hand, or the middle of each range, as in LeRobot.",
 )
+@click.option("--prefix", default="", help="Prefix of the joints' names, e.g. left_ for one of two arms.")
 @click.option("--check-signs", is_flag=True, help="Ask to turn each joint in its positive direction.")
 @click.option("--middle-now", is_flag=True, help="The arm is in its middle pose: do not ask.")
 @click.option("--range-seconds", type=click.FloatRange(0.1), help="Measure the ranges for this long, not until Enter.")
@@ -53,24 +54,28 @@ from ibrobot_feetech.usb import usb_port
 @click.option("--yes", is_flag=True, help="Switch torque off and overwrite without asking; the old file is kept.")
 def calibrate(
     port: str | None, name: str | None, leader: bool, robot: str | None, arm: str | None, full_turn: tuple[str, ...],
-    zero_at: str, check_signs: bool, middle_now: bool, range_seconds: float | None, accept_ranges: bool, yes: bool,
+    zero_at: str, prefix: str, check_signs: bool, middle_now: bool, range_seconds: float | None, accept_ranges: bool,
+    yes: bool,
 ) -> None:  # fmt: skip
     """Calibrate an arm: its middle pose, then the range of each joint, moved by hand.
 
     Nothing is written to the servos or to disk before everything is measured.
     """
     name = name or ("so101_leader" if leader else "so101_follower")
-    joints = joints_of(robot, name)
+    joints = joints_of(robot, name, prefix)
     path = calibration_path(name)
     if path.exists() and not yes and not agree(f"{path} exists already. Calibrate again?", flag="--yes"):
         raise Declined
-    compared = [joint.name for joint in joints if not (leader and joint.name == "gripper")]
+    compared = [joint.name for joint in joints if not (leader and joint.anchored)]
+    turning = [
+        joint.name for joint in joints if joint.name in full_turn or joint.name.removeprefix(prefix) in full_turn
+    ]
     answers = Answers(middle_now, range_seconds, accept_ranges, check_signs)
     with opened(port, joints=by_servo(joints)) as bus:
         _prepare(bus, yes)
         try:
             measurement = Measurement(
-                bus, joints, full_turn=full_turn, compared=compared, zero_at=zero_at, answers=answers
+                bus, joints, full_turn=turning, compared=compared, zero_at=zero_at, answers=answers
             )
             found = measurement.run()
         except BaseException:

@@ -48,6 +48,7 @@ _SWITCH_S = 2e-4
 @click.option("--throttle", is_flag=True, help="Delay bytes by their time on a real wire.")
 @click.option("--link", type=click.Path(path_type=Path), help="Path of a symbolic link to the port.")
 @click.option("--calibration", metavar="NAME", help="Calibration of the servos; created if it does not exist.")
+@click.option("--prefix", default="", help="Prefix of the joints' names, e.g. left_ for one of two arms.")
 @click.option("--physics", metavar="CONFIG", help="Move the joints with the simulation of this robot YAML.")
 @click.option("--seed", type=int, default=0, show_default=True, help="Seed of random faults and of the scene.")
 @click.option("--drop", type=click.FloatRange(0, 1), default=0.0, help="Probability that a reply is lost.")
@@ -62,9 +63,9 @@ _SWITCH_S = 2e-4
 @click.option("--disconnected", type=int, multiple=True, metavar="ID", help="A servo without its cable.")
 @click.option("--error", "errors", type=(int, int), multiple=True, metavar="ID BITS", help="Error bits of a servo.")
 def emulate(
-    servos: int, baud: int, throttle: bool, link: Path | None, calibration: str | None, physics: str | None, seed: int,
-    silent: tuple[int, ...], blocked: tuple[int, ...], overloaded: tuple[int, ...], disconnected: tuple[int, ...],
-    errors: tuple[tuple[int, int], ...], **chances: float,
+    servos: int, baud: int, throttle: bool, link: Path | None, calibration: str | None, prefix: str,
+    physics: str | None, seed: int, silent: tuple[int, ...], blocked: tuple[int, ...], overloaded: tuple[int, ...],
+    disconnected: tuple[int, ...], errors: tuple[tuple[int, int], ...], **chances: float,
 ) -> None:  # fmt: skip
     """Emulate a bus of STS3215 servos on a pseudo-terminal.
 
@@ -78,7 +79,7 @@ def emulate(
     ended = threading.Event()
     on_signals(ended.set)
     config = _config(physics) if physics is not None else None
-    joints = config.robot.joint_names if config is not None else _JOINTS[:servos]
+    joints = config.robot.joint_names if config is not None else [f"{prefix}{joint}" for joint in _JOINTS[:servos]]
     count = len(joints) if config is not None else servos
     with ExitStack() as stack:
         emulator = stack.enter_context(Emulator(count, baud_rate=baud, throttle=throttle, seed=seed, link=link))
@@ -168,12 +169,12 @@ def _calibrate(emulator: Emulator, name: str | None, joints: Sequence[str], robo
 
 def _ranges(joints: Sequence[str], robot: Robot | None) -> dict[str, JointCalibration]:
     """Ranges that match the joints' limits, centred on the turn; those of an SO-101 if no robot is given."""
-    limits = {joint.name: (joint.lower, joint.upper) for joint in robot.joints} if robot is not None else SO101
+    limits = {joint.name: (joint.lower, joint.upper) for joint in robot.joints} if robot is not None else {}
     found = {}
     for number, joint in enumerate(joints, 1):
-        lower, upper = limits[joint]
+        lower, upper = limits.get(joint) or next(ends for name, ends in SO101.items() if joint.endswith(name))
         per_radian = TICKS_PER_TURN / (2 * math.pi)
-        if joint == _GRIPPER:  # anchored at its closed end, but centred on the turn as well
+        if joint.endswith(_GRIPPER):  # anchored at its closed end, but centred on the turn as well
             half = (upper - lower) / 2
             lower, upper = -half, half
         low, high = math.floor(MIDDLE_TICK + lower * per_radian), math.ceil(MIDDLE_TICK + upper * per_radian)

@@ -25,17 +25,20 @@ from ibrobot_feetech.usb import usb_port
 @click.option("--port", help="Port of the arm, to store the serial number of its adapter.")
 @click.option("--arm", help="Name of the arm, for the records.")
 @click.option("--robot", metavar="CONFIG", help="Robot YAML with the joints; by default an SO-101.")
+@click.option("--prefix", default="", help="Prefix of the joints' names, e.g. left_ for one of two arms.")
 @click.option("--yes", is_flag=True, help="Overwrite without asking; the old file is kept.")
 def import_calibration(
-    file: str, name: str | None, zero_at: str | None, port: str | None, arm: str | None, robot: str | None, yes: bool
-) -> None:
+    file: str, name: str | None, zero_at: str | None, port: str | None, arm: str | None, robot: str | None,
+    prefix: str, yes: bool,
+) -> None:  # fmt: skip
     """Import the calibration FILE, a path or a name, and set where its 0 rad is. Does not access any servo."""
     path = calibration_path(name or file)
     found = load_calibration(file, [joint.name for joint in joints_of(robot, name)], zero_at=zero_at)
     if path.exists() and not yes and not agree(f"{path} exists already. Overwrite it?", flag="--yes"):
         raise Declined
     adapter = found.adapter if port is None else _adapter(port)
-    made = attrs.evolve(found, robot=arm or found.robot, adapter=adapter)
+    joints = {f"{prefix}{joint}": numbers for joint, numbers in found.joints.items()}
+    made = attrs.evolve(found, joints=joints, robot=arm or found.robot, adapter=adapter)
     backup(path)
     save_calibration(made, path, overwrite=True)
     echo(f"saved: {path}")

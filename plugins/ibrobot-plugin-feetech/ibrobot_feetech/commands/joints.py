@@ -34,18 +34,19 @@ class Joint:
     """Whether its angle is measured from its calibrated closed end rather than from its middle pose."""
 
 
-def joints_of(robot: str | None = None, calibration: str | None = None) -> list[Joint]:
+def joints_of(robot: str | None = None, calibration: str | None = None, prefix: str = "") -> list[Joint]:
     """The joints of a robot YAML, or of an SO-101; servos have ids from 1 in that order.
 
     Args:
         robot: a path, or the name of a shipped config.
         calibration: selects the arm whose options name this calibration, if the robot has several arms.
+        prefix: of the names of an SO-101's joints.
 
     Raises:
         ConfigError: if the config is invalid.
     """
-    limits: Mapping[str, tuple[float, float]] = SO101
-    anchored: tuple[str, ...] = ("gripper",)
+    limits: Mapping[str, tuple[float, float]] = {f"{prefix}{joint}": ends for joint, ends in SO101.items()}
+    anchored: tuple[str, ...] = (f"{prefix}gripper",)
     if robot is not None:
         from ibrobot_core.api import find_config, installed_plugins, load_config
 

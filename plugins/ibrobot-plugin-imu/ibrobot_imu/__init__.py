@@ -1,0 +1,35 @@
+"""The plugin's hooks: teleop `imu`, and the serial ports for doctor."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+from ibrobot_core.api import Check, TeleopDescriptor, hookimpl
+from ibrobot_imu.options import ImuOptions, check_imu, serial_port
+
+if TYPE_CHECKING:
+    from ibrobot_core.api import Context, Teleop
+
+
+def _imu(options: ImuOptions, ctx: Context) -> Teleop:
+    from ibrobot_imu.teleop import ImuTeleop
+
+    return ImuTeleop(options, ctx)
+
+
+@hookimpl
+def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
+    """The teleop `imu`."""
+    yield TeleopDescriptor(
+        type="imu", options=ImuOptions, make=_imu, check_options=check_imu, devices=serial_port,
+        summary="moves the tool by the tilt of an orientation sensor (BNO08x, WitMotion)",
+    )  # fmt: skip
+
+
+@hookimpl
+def ibrobot_doctor() -> Iterable[Check]:
+    """Check which serial ports the user may open."""
+    from ibrobot_imu.permissions import checks
+
+    yield from checks()

@@ -1,0 +1,322 @@
+"""`ibrobot plan`: plan a motion without a run, and print or plot it."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import attrs
+import click
+import numpy as np
+
+from ibrobot_core.api import (
+    ControlMode,
+    Goal,
+    JointGoal,
+    JointTrajectory,
+    LaunchRequest,
+    MissingDependency,
+    NotSupported,
+    PlanCode,
+    Planner,
+    PlanningError,
+    PlanRequest,
+    PoseGoal,
+    PositionGoal,
+    Robot,
+    RobotConfig,
+    Session,
+    Spline,
+    Vector,
+    echo,
+    find_config,
+    installed_plugins,
+    load_config,
+    ns,
+    run_options,
+    run_overrides,
+    seconds,
+    wrong_input,
+)
+from ibrobot_planning.goal_text import Target, target
+from ibrobot_planning.world import SNAPSHOT, World
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_STEP_S = 0.01
+"""Time between the samples of a plan."""
+_NO_PLAN = 3
+"""Exit code if there is no plan."""
+
+
+@attrs.frozen(eq=False)
+class Plan:
+    """A plan, sampled."""
+
+    trajectory: JointTrajectory
+    times: Vector
+    """[s], shape (N,)."""
+    positions: Vector
+    """[rad], shape (N, J)."""
+    velocities: Vector
+    """[rad/s], shape (N, J)."""
+    tool: Vector | None
+    """Positions of the tool [m], shape (N, 3); None without a model of the arm."""
+
+
+@click.command()
+@click.option("--from", "start", required=True, metavar="START", help="A pose, or joint=rad,… (others at 0).")
+@click.option("--goal", required=True, metavar="GOAL", help="A pose, joint=rad,…, or xyz=X,Y,Z with axis, rpy or quat.")
+@click.option(
+    "--speed", type=click.FloatRange(0, 1, min_open=True), default=1.0, show_default=True,
+    help="Fraction of the velocity limits.",
+)  # fmt: skip
+@click.option("--plot", type=click.Path(dir_okay=False, path_type=Path), help="Also draw the plan: .png, .svg or .pdf.")
+@run_options("config", "sim", "seed", "mode", "overrides", "as_json")
+def plan(start: str, goal: str, speed: float, plot: Path | None, config: str | None, **options: Any) -> None:
+    """Plan a motion of the robot in CONFIG, without moving it.
+
+    The planner and the world are those of the robot YAML. Prints what was planned: joints at the goal, path length,
+    duration, clearance, and the peak velocity of each joint.
+
+    Exits with 0 if there is a plan, 3 if there is none, 2 for a wrong command line, YAML or goal.
+    """
+    with wrong_input():
+        if plot is not None:
+            _check_plot(plot)
+        loaded, mode = _loaded(config, options)
+        robot = loaded.robot
+        joints = _arm(loaded, mode)
+        from_ = _positions(start, robot)
+        wanted = target(goal, robot, speed)
+    facts: dict[str, Any] = {
+        "robot": robot.name, "mode": mode.name, "planner": mode.planner.type if mode.planner else "",
+        "from": start, "goal": goal, "kind": _kind(wanted, robot),
+    }  # fmt: skip
+    try:
+        found = _planned(loaded, mode, options["seed"], joints, from_, wanted, facts)
+    except PlanningError as error:
+        facts |= {"success": False, "code": error.code.name, "message": str(error)}
+        if options["as_json"]:
+            echo(json.dumps(facts, indent=2))
+        else:
+            echo(f"error: no plan: {error.code.name}: {error}", err=True)
+        sys.exit(_NO_PLAN)
+    if plot is not None:
+        _figure(found, robot, goal).savefig(plot)
+    echo(json.dumps(facts, indent=2) if options["as_json"] else _text(facts))
+
+
+def _loaded(config: str | None, options: dict[str, Any]) -> tuple[RobotConfig, ControlMode]:
+    """The robot, and its mode with a planner.
+
+    Raises:
+        NotSupported: where the mode has no planner, or none is named and there are several.
+    """
+    registry = installed_plugins()
+    overrides = run_overrides({**options, "window": False, "headless": False})
+    loaded = load_config(
+        find_config(config, registry), overrides=overrides, mode=options["mode"], sim=options["sim"], registry=registry
+    )
+    planning = [name for name, mode in loaded.control_modes.items() if mode.planner is not None]
+    name = loaded.default_control_mode
+    if name not in planning:
+        if options["mode"] is not None or not planning:
+            there = f"--mode {' or --mode '.join(planning)}" if planning else "this robot has none"
+            raise NotSupported(f"mode {name} has no planner: {there}")
+        if len(planning) > 1:
+            raise NotSupported(f"several modes have a planner: --mode {' or --mode '.join(planning)}")
+        name = planning[0]
+    return loaded, loaded.control_modes[name]
+
+
+def _arm(config: RobotConfig, mode: ControlMode) -> tuple[str, ...]:
+    executors = [config.executors[name] for name in mode.executors]
+    arms = [executor.joints for executor in executors if executor.goals == "trajectory"]
+    if len(arms) != 1:
+        raise NotSupported(f"mode {mode.name} has {len(arms)} executors of trajectories, a plan needs one")
+    return arms[0]
+
+
+def _positions(text: str, robot: Robot) -> Vector:
+    """Positions of all joints [rad], shape (J,)."""
+    parsed = target(text, robot)
+    if parsed.tool is not None:
+        raise PlanningError(f"--from {text!r}: a start is a pose or joints, not a position of the tool")
+    return np.array([parsed.joints.get(name, 0.0) for name in robot.joint_names])
+
+
+def _kind(wanted: Target, robot: Robot) -> str:
+    if isinstance(wanted.tool, PositionGoal):
+        return "position" if wanted.tool.axis is None else "position with axis"
+    if isinstance(wanted.tool, PoseGoal):
+        return "pose"
+    return "named pose" if wanted.text in robot.description.poses else "joints"
+
+
+def _planned(
+    config: RobotConfig, mode: ControlMode, seed: int, joints: tuple[str, ...], start: Vector, wanted: Target,
+    facts: dict[str, Any],
+) -> Plan:  # fmt: skip
+    """The plan; adds what is printed to `facts`.
+
+    Raises:
+        PlanningError: if there is none.
+    """
+    robot = config.robot
+    # A run that never starts: its bus gives the planner the world.
+    session = Session(config, installed_plugins(), LaunchRequest(seed=seed))
+    for descriptor, section in session.registry.sections(config):
+        if descriptor.type == "world":
+            descriptor.make(section, session).start()
+    goal: Goal | None = wanted.tool
+    mine = {name: value for name, value in wanted.joints.items() if name in joints}
+    if goal is None:
+        if not mine:
+            raise PlanningError(f"goal {wanted.text!r} moves no joint of the arm: {', '.join(joints)}")
+        goal = JointGoal(tuple(mine), np.array(list(mine.values())))
+    assert mode.planner is not None
+    planner: Planner = session.make("planner", mode.planner, mode.planner.type)
+    try:
+        planner.load()
+        begun = time.monotonic()
+        others = dict(zip(robot.joint_names, start.tolist(), strict=True))
+        result = planner.plan(
+            PlanRequest(joints, start[robot.indices(joints)], goal, wanted.velocity_scaling, others=others)
+        )
+        elapsed_s = time.monotonic() - begun
+    finally:
+        planner.close()
+    found = _sampled(result.trajectory, robot, start)
+    limits = robot.max_velocity[robot.indices(joints)]
+    peaks = np.abs(found.velocities).max(axis=0)
+    facts |= {
+        "success": True, "code": PlanCode.SUCCESS.name, "message": "",
+        "goal_joints": dict(zip(joints, found.positions[-1].tolist(), strict=True)),
+        "position_error_m": result.position_error, "orientation_error_rad": result.orientation_error,
+        "length_rad": float(np.linalg.norm(np.diff(found.positions, axis=0), axis=1).sum()),
+        "tool_path_m": None if found.tool is None else float(np.linalg.norm(np.diff(found.tool, axis=0), axis=1).sum()),
+        "duration_s": float(found.times[-1]),
+        "clearance": _clearance(session, joints, others, found),
+        "peak_velocity": {
+            name: {"rad_s": float(peak), "share_of_limit": float(peak / limit)}
+            for name, peak, limit in zip(joints, peaks, limits, strict=True)
+        },
+        "planning_time_s": elapsed_s,
+    }  # fmt: skip
+    return found
+
+
+def _sampled(trajectory: JointTrajectory, robot: Robot, start: Vector) -> Plan:
+    points = trajectory.points
+    fields = [
+        np.array([point.positions for point in points]), np.array([point.velocities for point in points]),
+        np.array([point.accelerations for point in points]),
+    ]  # fmt: skip
+    stamps = np.array([point.time_from_start_ns for point in points], dtype=np.int64)
+    spline = Spline(stamps, *(each if each.size else None for each in fields))  # type: ignore[arg-type]
+    times = np.append(np.arange(0.0, seconds(spline.end_ns), _STEP_S), seconds(spline.end_ns))
+    samples = [spline.at(ns(float(moment))) for moment in times]
+    positions = np.array([sample[0] for sample in samples])
+    tool = None
+    if robot.description.mjcf is not None and find_spec("ibrobot_kinematics") is not None:
+        from ibrobot_kinematics import robot_model
+
+        whole = np.repeat(start[None], len(times), axis=0)
+        whole[:, robot.indices(trajectory.joint_names)] = positions
+        tool = robot_model(robot).forward(whole).position
+    return Plan(trajectory, times, positions, np.array([sample[1] for sample in samples]), tool)
+
+
+def _clearance(
+    session: Session, joints: tuple[str, ...], others: dict[str, float], found: Plan
+) -> dict[str, Any] | None:
+    """The least distance of the arm, and of what it carries, from objects; None without objects or collision checks."""
+    bus = session.bus
+    world = bus.call(SNAPSHOT, None) if bus.serves(SNAPSHOT) else World()
+    assert isinstance(world, World)
+    if not world.objects:
+        return None
+    from ibrobot_planning.checked_arm import checked_arm
+    from ibrobot_planning.collision import Collisions
+
+    checked = checked_arm(session.config.robot, session.log)
+    checks = Collisions(checked.arm, world, joints, others, unchecked=checked.unchecked)
+    nearest: dict[str, Any] | None = None
+    for moment, q in zip(found.times.tolist(), found.positions, strict=True):
+        for (first, second), distance in checks.distances(q).items():
+            standing = any(name in world.objects and world.objects[name].link is None for name in (first, second))
+            if standing and (nearest is None or distance < nearest["distance_m"]):
+                nearest = {"distance_m": distance, "between": [first, second], "at_s": moment}
+    return nearest
+
+
+def _text(facts: dict[str, Any]) -> str:
+    rows = [
+        ("planner", f"{facts['planner']}, mode {facts['mode']}"),
+        ("goal", f"{facts['goal']} ({facts['kind']})"),
+        ("joints at the goal", ", ".join(f"{name} {value:.3f}" for name, value in facts["goal_joints"].items())),
+        ("off the goal", f"{1e3 * facts['position_error_m']:.2f} mm, {facts['orientation_error_rad']:.4f} rad"),
+        ("path", f"{facts['length_rad']:.3f} rad"),
+        ("duration", f"{facts['duration_s']:.3f} s"),
+    ]
+    if facts["tool_path_m"] is not None:
+        rows.append(("path of the tool", f"{facts['tool_path_m']:.3f} m"))
+    if (nearest := facts["clearance"]) is not None:
+        between = " and ".join(nearest["between"])
+        rows.append(
+            ("clearance", f"{1e3 * nearest['distance_m']:.1f} mm between {between}, at {nearest['at_s']:.2f} s")
+        )
+    peaks = (
+        f"{name} {peak['rad_s']:.2f} rad/s ({100 * peak['share_of_limit']:.0f} %)"
+        for name, peak in facts["peak_velocity"].items()
+    )
+    rows += [("peak velocities", ", ".join(peaks)), ("planned in", f"{1e3 * facts['planning_time_s']:.0f} ms")]
+    return "\n".join(f"{name:18}  {value}" for name, value in rows)
+
+
+def _check_plot(path: Path) -> None:
+    """Check that a plot can be written.
+
+    Raises:
+        MissingDependency: without matplotlib.
+        NotSupported: for an unknown format, or a folder that does not exist.
+    """
+    if find_spec("matplotlib") is None:
+        raise MissingDependency("--plot needs matplotlib", remedy="pip install 'ibrobot-plugin-planning[plot]'")
+    if path.suffix not in (".png", ".svg", ".pdf"):
+        raise NotSupported(f"--plot {path}: the format is .png, .svg or .pdf, got {path.suffix or 'no suffix'}")
+    if not path.absolute().parent.is_dir():
+        raise NotSupported(f"--plot {path}: no folder {path.parent}")
+
+
+def _figure(found: Plan, robot: Robot, title: str) -> Figure:
+    """Positions and velocities over time, and the path of the tool from above and from the side."""
+    from matplotlib.figure import Figure
+
+    columns = 1 if found.tool is None else 2
+    figure = Figure(figsize=(5.5 * columns, 6), layout="constrained")
+    axes = figure.subplots(2, columns, squeeze=False)
+    limits = robot.max_velocity[robot.indices(found.trajectory.joint_names)]
+    for number, name in enumerate(found.trajectory.joint_names):
+        axes[0][0].plot(found.times, found.positions[:, number], label=name)
+        axes[1][0].plot(found.times, 100 * found.velocities[:, number] / limits[number], label=name)
+    axes[0][0].set(title=title, ylabel="position [rad]")
+    axes[0][0].legend(fontsize="small")
+    axes[1][0].set(xlabel="time [s]", ylabel="velocity [% of the limit]")
+    if found.tool is not None:
+        for row, (across, up, view) in enumerate(((0, 1, "from above"), (0, 2, "from the side"))):
+            path = axes[row][1]
+            path.plot(found.tool[:, across], found.tool[:, up])
+            path.plot(*found.tool[0, [across, up]], "o", label="start")
+            path.plot(*found.tool[-1, [across, up]], "s", label="goal")
+            path.set(
+                title=f"tool, {view}", xlabel="x [m]", ylabel=f"{'xyz'[up]} [m]", aspect="equal", adjustable="datalim"
+            )
+            path.legend(fontsize="small")
+    return figure

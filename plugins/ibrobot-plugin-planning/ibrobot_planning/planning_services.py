@@ -1,0 +1,241 @@
+"""Services that plan and compute without moving, under MoveIt's names."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ibrobot_core.api import (
+    ControlMode,
+    Goal,
+    Header,
+    IbrobotError,
+    JointState,
+    PlanCode,
+    PlanningError,
+    PlanRequest,
+    PlanResult,
+    PoseGoal,
+    PoseStamped,
+    PositionGoal,
+    Session,
+    Vector,
+)
+from ibrobot_planning.engines import find_engines
+from ibrobot_planning.options import RrtConnectOptions
+from ibrobot_planning.requests import (
+    CartesianQuery,
+    FkAnswer,
+    FkQuery,
+    IkAnswer,
+    IkQuery,
+    ObjectSummary,
+    PlanAnswer,
+    PlanningScene,
+    PlanQuery,
+    any_goal,
+    requested,
+)
+from ibrobot_planning.world import SNAPSHOT, World
+
+if TYPE_CHECKING:
+    from ibrobot_planning.checked_arm import CheckedArm
+    from ibrobot_planning.goals import Tool
+
+COMPUTE_IK = "/compute_ik"
+"""Takes an `IkQuery`, and answers with an `IkAnswer`."""
+COMPUTE_FK = "/compute_fk"
+"""Takes an `FkQuery`, and answers with an `FkAnswer`."""
+PLAN = "/plan_kinematic_path"
+"""Takes a `PlanQuery`, and answers with a `PlanAnswer`."""
+CARTESIAN = "/compute_cartesian_path"
+"""Takes a `CartesianQuery`, and answers with a `PlanAnswer`."""
+SCENE = "/get_planning_scene"
+"""Takes nothing, and answers with a `PlanningScene`."""
+BASE_FRAME = "base_link"
+"""Frame of poses in answers."""
+
+
+class PlanningServices:
+    """The services of a planning mode that do not move the robot.
+
+    Args:
+        session: the run.
+        mode: the mode.
+        plan: plans a request by the mode's planner.
+
+    Attributes:
+        handlers: service -> its handler.
+    """
+
+    def __init__(self, session: Session, mode: ControlMode, plan: Callable[[PlanRequest], PlanResult]) -> None:
+        self._session = session
+        self._robot = session.config.robot
+        self._mode = mode
+        self._plan_request = plan
+        self.handlers: dict[str, Callable[[Any], Any]] = {
+            COMPUTE_IK: self._ik,
+            COMPUTE_FK: self._fk,
+            PLAN: self._plan,
+            CARTESIAN: self._cartesian,
+            SCENE: self._scene,
+        }
+
+    @cached_property
+    def _tool(self) -> Tool:
+        find_engines()
+        from ibrobot_kinematics import robot_model
+
+        from ibrobot_planning.goals import Tool
+
+        return Tool(robot_model(self._robot))
+
+    @cached_property
+    def _checked(self) -> CheckedArm:
+        find_engines()
+        from ibrobot_planning.checked_arm import checked_arm
+
+        return checked_arm(self._robot, self._session.log)
+
+    def _plan(self, request: object) -> PlanAnswer:
+        query = requested(PlanQuery, request)
+        scaling = query.velocity_scaling, query.acceleration_scaling
+        return self._planned(lambda: any_goal(query.goals), query.start, *scaling)
+
+    def _cartesian(self, request: object) -> PlanAnswer:
+        query = requested(CartesianQuery, request)
+        return self._planned(query.goal, query.start, query.velocity_scaling, query.acceleration_scaling)
+
+    def _planned(
+        self, goal: Callable[[], Goal], start: Mapping[str, float], velocity: float, acceleration: float
+    ) -> PlanAnswer:
+        begun = time.monotonic()
+        try:
+            joints, whole = self._joints(), self._start(start)
+            others = dict(zip(self._robot.joint_names, whole.tolist(), strict=True))
+            planned = self._plan_request(
+                PlanRequest(joints, whole[self._robot.indices(joints)], goal(), velocity, acceleration, others)
+            )
+        except PlanningError as error:
+            return PlanAnswer(error.code, str(error), planning_time_s=time.monotonic() - begun)
+        return PlanAnswer(
+            PlanCode.SUCCESS, "", planned.trajectory, planned.fraction, planned.alternative,
+            planned.position_error, planned.orientation_error, time.monotonic() - begun,
+        )  # fmt: skip
+
+    def _joints(self) -> tuple[str, ...]:
+        """The joints of the arm.
+
+        Raises:
+            PlanningError: where the mode has not exactly one executor of trajectories.
+        """
+        executors = [self._session.config.executors[name] for name in self._mode.executors]
+        arms = [executor.joints for executor in executors if executor.goals == "trajectory"]
+        if len(arms) != 1:
+            raise PlanningError(
+                f"mode {self._mode.name} has {len(arms)} executors of trajectories, planning needs one",
+                PlanCode.INVALID_GROUP_NAME,
+            )
+        return arms[0]
+
+    def _start(self, given: Mapping[str, float]) -> Vector:
+        """Present or given positions of all joints [rad], shape (J,)."""
+        state = self._session.state
+        # From the commanded positions, as motions begin there.
+        start = (state.command if state is not None else self._session.measured().position).copy()
+        for name, value in given.items():
+            if name not in self._robot.joint_names:
+                raise PlanningError(
+                    f"start: no joint {name!r}; the joints are: {', '.join(self._robot.joint_names)}",
+                    PlanCode.INVALID_ROBOT_STATE,
+                )
+            if not np.isfinite(value):
+                raise PlanningError(f"start of joint {name} is {value}, must be finite", PlanCode.INVALID_ROBOT_STATE)
+            start[self._robot.joint_names.index(name)] = value
+        return np.asarray(start)
+
+    def _ik(self, request: object) -> IkAnswer:
+        query = requested(IkQuery, request)
+        try:
+            goal = query.goal.goal()
+            if not isinstance(goal, PositionGoal | PoseGoal):
+                raise PlanningError(
+                    "the goal is not a position of the tool: give xyz", PlanCode.INVALID_GOAL_CONSTRAINTS
+                )
+            found = self._tool.candidates(goal, self._start(query.start))
+            if query.avoid_collisions:
+                found = self._free(found)
+        except PlanningError as error:
+            return IkAnswer(error.code, str(error))
+        best = found[0]
+        state = JointState(Header(self._session.clock.now_ns()), self._robot.joint_names, best.joints)
+        return IkAnswer(PlanCode.SUCCESS, "", state, best.position_error, best.orientation_error)
+
+    def _free(self, candidates: list[Any]) -> list[Any]:
+        """The candidates without contacts.
+
+        Raises:
+            PlanningError: where all of them touch something.
+        """
+        from ibrobot_planning.collision import Collisions
+
+        planner, padding, self_padding = self._mode.planner, 0.0, 0.0
+        if planner is not None and isinstance(planner.options, RrtConnectOptions):
+            padding, self_padding = planner.options.padding, planner.options.self_padding
+        checked = self._checked
+        checks = Collisions(
+            checked.arm, self._world(), self._robot.joint_names,
+            padding=padding, self_padding=self_padding, unchecked=checked.unchecked,
+        )  # fmt: skip
+        free = [each for each in candidates if checks.free(each.joints)]
+        if not free:
+            contacts = checks.contacts(candidates[0].joints)
+            raise PlanningError(
+                f"all {len(candidates)} configurations touch something: {'; '.join(map(str, contacts[:3]))}",
+                PlanCode.NO_IK_SOLUTION,
+            )
+        return free
+
+    def _fk(self, request: object) -> FkAnswer:
+        query = requested(FkQuery, request)
+        try:
+            q = self._start(query.joints) if query.joints else self._session.measured().position
+            header = Header(self._session.clock.now_ns(), BASE_FRAME)
+            links = query.links or (self._tool.model.tip,)
+            return FkAnswer(PlanCode.SUCCESS, "", tuple(PoseStamped(header, self._pose(link, q)) for link in links))
+        except PlanningError as error:
+            return FkAnswer(error.code, str(error))
+
+    def _pose(self, link: str, q: Vector) -> Any:
+        from ibrobot_planning.transforms import pose
+
+        if link == self._tool.model.tip:
+            tip = self._tool.model.forward(q)
+            placed = np.eye(4)
+            placed[:3, :3], placed[:3, 3] = tip.rotation, tip.position
+            return pose(placed)
+        checked = self._checked
+        return pose(checked.arm.link_pose(checked.names.get(link, link), q))
+
+    def _world(self) -> World:
+        bus = self._session.bus
+        world = bus.call(SNAPSHOT, None) if bus.serves(SNAPSHOT) else World()
+        assert isinstance(world, World)
+        return world
+
+    def _scene(self, request: object) -> PlanningScene:
+        robot, reading = self._robot, self._session.measured()
+        objects = {
+            name: ObjectSummary(type(each.shape).__name__.lower(), each.pose, each.link, tuple(sorted(each.may_touch)))
+            for name, each in self._world().objects.items()
+        }
+        try:
+            tip, links = self._tool.model.tip, tuple(self._checked.arm.frames)
+        except IbrobotError:  # a robot without a model can still move its joints
+            tip, links = "", ()
+        state = JointState(Header(reading.stamp_ns), robot.joint_names, reading.position, reading.velocity)
+        return PlanningScene(robot.name, state, robot.groups, tuple(robot.description.poses), tip, links, objects)

@@ -1,0 +1,65 @@
+"""`ibrobot service list|call`: services that a robot shares over the network."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import click
+from ibrobot_ros2.services import SERVICES, Call, decode_answer, encode_call, endpoint
+
+from ibrobot_core.api import NotSupported, dump_yaml, echo, parse_yaml
+from ibrobot_zenoh.commands.network import connected, network_options
+from ibrobot_zenoh.transport import ZenohTransport
+
+
+@click.group()
+def service() -> None:
+    """List and call services that a robot shares over the network."""
+
+
+def _command(function: Callable[..., None]) -> click.Command:
+    """Make a command of `service` whose function receives a connected transport and the robot's namespace."""
+
+    @functools.wraps(function)
+    def run(config: str | None, endpoints: tuple[str, ...], domain: int | None, **arguments: Any) -> None:
+        with connected(config, endpoints, domain) as transport:
+            function(transport, **arguments)
+
+    named = click.option("--namespace", default="", metavar="NAME", help="The robot's namespace, e.g. arm1.")(run)
+    return service.command(function.__name__.rstrip("_"))(network_options(named))
+
+
+def _ask(transport: ZenohTransport, namespace: str, call: Call, timeout_s: float) -> Any:
+    answer = decode_answer(transport.request(endpoint(namespace), encode_call(call), timeout_s))
+    if not answer.result:
+        raise NotSupported(str(answer.values))
+    return answer.values
+
+
+@_command
+def list_(transport: ZenohTransport, namespace: str) -> None:
+    """List the shared services."""
+    for name in _ask(transport, namespace, Call(SERVICES), 5.0):
+        echo(name)
+
+
+@_command
+@click.argument("name", metavar="SERVICE")
+@click.argument("request", default="null")
+@click.option("--timeout", default=60.0, show_default=True, type=click.FloatRange(0.01), help="For the answer [s].")
+@click.option("--text", is_flag=True, help="Send REQUEST as it is, as text.")
+def call(transport: ZenohTransport, namespace: str, name: str, request: str, timeout: float, text: bool) -> None:
+    """Call SERVICE with REQUEST, as YAML, and print the answer.
+
+    E.g. `ibrobot service call /planning/go_to home` or `… /world/remove '{name: can}'`.
+    """
+    value = request
+    if not text:
+        document = parse_yaml(request, "REQUEST")
+        document.raise_problems()
+        value = document.root
+    answer = _ask(transport, namespace, Call(name, value), timeout)
+    if answer is not None:
+        echo(dump_yaml(answer).removesuffix("\n") if isinstance(answer, dict | list) else str(answer))

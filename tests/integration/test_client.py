@@ -1,0 +1,107 @@
+"""A script for pymoveit2 moves a simulated SO-101 over the network: only its imports differ."""
+
+from __future__ import annotations
+
+import logging
+import socket
+from collections.abc import Iterator
+from threading import Thread
+
+import pytest
+from ibrobot_planning.client import GripperInterface, MoveIt2, rclpy
+from ibrobot_planning.client import robots as ibrobot_robots
+from ibrobot_planning.client.rclpy import Node, ReentrantCallbackGroup
+
+from ibrobot_core.api import (
+    LaunchRequest,
+    Runtime,
+    Session,
+    TransportError,
+    find_config,
+    installed_plugins,
+    load_config,
+)
+
+pytestmark = pytest.mark.integration
+robot = ibrobot_robots.so101
+
+
+@pytest.fixture
+def endpoint() -> str:
+    with socket.socket() as found:
+        found.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{found.getsockname()[1]}"
+
+
+@pytest.fixture
+def arm(endpoint: str) -> Iterator[Runtime]:
+    """A simulated SO-101 with a table, which shares its services."""
+    registry = installed_plugins()
+    config = load_config(
+        find_config("so101_blind", registry), sim=True, mode="moveit_planning", registry=registry,
+        overrides=(
+            "simulation.scene=empty", "simulation.start_pose=home",
+            "control_modes.moveit_planning.planner={type: rrt_connect}",
+            "world={objects: {table: {shape: box, size: [0.8, 0.8, 0.02], position: [0.2, 0, -0.05]}}}",
+            f"transport={{type: zenoh, mode: router, listen: [{endpoint}], shared_memory: false, namespace: arm1, "
+            "share: {services: [/planning/, /world/, /get_planning_scene, /compute_ik, /compute_fk, /move_action, "
+            "/plan_kinematic_path, /compute_cartesian_path, /execute_trajectory]}}",
+        ),
+    )  # fmt: skip
+    runtime = Runtime(Session(config, registry, LaunchRequest()))
+    try:
+        runtime.start()
+        yield runtime
+    finally:
+        runtime.stop()
+
+
+def test_script_moves_a_robot_over_the_network(arm: Runtime, endpoint: str):
+    rclpy.init()
+    node = Node("ex_pose_goal", f"connect=[{endpoint}]", "shared_memory=false", namespace="arm1")
+    moveit2 = MoveIt2(
+        node=node,
+        joint_names=robot.joint_names(),
+        base_link_name=robot.base_link_name(),
+        end_effector_name=robot.end_effector_name(),
+        group_name=robot.MOVE_GROUP_ARM,
+        callback_group=ReentrantCallbackGroup(),
+    )
+    executor = rclpy.executors.MultiThreadedExecutor(2)
+    executor.add_node(node)
+    executor_thread = Thread(target=executor.spin, daemon=True, args=())
+    executor_thread.start()
+    node.create_rate(20.0).sleep()
+
+    moveit2.max_velocity = 0.5
+    moveit2.add_collision_box("post", (0.02, 0.02, 0.1), position=(0.25, 0.15, 0.05), quat_xyzw=(0, 0, 0, 1))
+    moveit2.move_to_pose(position=[0.25, 0.0, 0.12], quat_xyzw=None)
+    assert moveit2.wait_until_executed()
+    pose = moveit2.compute_fk()
+    assert (pose.pose.position.x, pose.pose.position.z) == pytest.approx((0.25, 0.12), abs=0.02)
+    trajectory = moveit2.plan(joint_positions=[0.3, 0.0, 0.0, 0.0, 0.0])
+    moveit2.execute(trajectory)
+    assert moveit2.wait_until_executed()
+    assert moveit2.joint_state.position[0] == pytest.approx(0.3, abs=0.05)
+    gripper = GripperInterface(
+        node=node,
+        gripper_joint_names=robot.gripper_joint_names(),
+        open_gripper_joint_positions=robot.OPEN_GRIPPER_JOINT_POSITIONS,
+        closed_gripper_joint_positions=robot.CLOSED_GRIPPER_JOINT_POSITIONS,
+        gripper_group_name=robot.MOVE_GROUP_GRIPPER,
+    )
+    gripper.open()
+    assert gripper.wait_until_executed()
+    assert gripper.is_open
+
+    node.destroy_node()
+    rclpy.shutdown()
+    executor_thread.join(30)
+    assert not executor_thread.is_alive()
+
+
+def test_missing_robot_is_an_error(endpoint: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture):
+    monkeypatch.setattr("ibrobot_planning.client.node._CONNECT_S", 0.2)
+    caplog.set_level(logging.CRITICAL)
+    with pytest.raises(TransportError, match="nobody listens there"):
+        Node("script", f"connect=[{endpoint}]", "shared_memory=false")
