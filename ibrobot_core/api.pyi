@@ -169,6 +169,8 @@ from ibrobot_core.launch.session import (
     Session as Session,
     SessionWorker as SessionWorker,
 )
+from ibrobot_core.launch.sources.operator_devices import OperatorDevices as OperatorDevices
+from ibrobot_core.launch.sources.policy import PolicySource as PolicySource
 from ibrobot_core.launch.sources.source_worker import SourceWorker as SourceWorker
 from ibrobot_core.control.link import ControlState as ControlState
 from ibrobot_core.control.spline import Spline as Spline

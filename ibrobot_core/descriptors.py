@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from ibrobot_core import interfaces
     from ibrobot_core.component import Component
-    from ibrobot_core.config.schema import ControlMode, RobotConfig
+    from ibrobot_core.config.schema import RobotConfig
     from ibrobot_core.launch.session import Session
     from ibrobot_core.launch.sources.source_worker import SourceWorker
     from ibrobot_core.launch.transport import TransportLink
@@ -131,11 +131,12 @@ class PlannerDescriptor(Descriptor["interfaces.Planner"]):
 
 @attrs.frozen
 class SourceDescriptor(Descriptor["SourceWorker"]):
-    """The command source of all control modes that have a key, e.g. `planner`; `type` is that key."""
+    """The command source of the control modes that have a key, its `type`: `planner`, or `intervene` of `inference`."""
 
-    make: Callable[[Session, ControlMode], SourceWorker] = attrs.field(kw_only=True)  # type: ignore[assignment]
-    """Run and mode -> the source. Called before anything starts: what it raises stops a wrong run, e.g. for goals that
-    make no sense. Imports what it needs when it is called, and opens nothing."""
+    make: Callable[..., SourceWorker] = attrs.field(kw_only=True)
+    """Session and mode -> the source; for `intervene` with a third argument, the `PolicySource` that runs the policy.
+    Called before anything starts: what it raises stops a wrong run, e.g. for goals that make no sense. Imports what it
+    needs when it is called, and opens nothing."""
 
 
 @attrs.frozen

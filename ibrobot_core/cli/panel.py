@@ -33,6 +33,11 @@ _JOINT_WIDTH = 47
 """Width of a joint's name and numbers [columns]."""
 
 
+_COMMANDS = {
+    "policy": "the policy commands", "operator": "THE OPERATOR COMMANDS", "handover": "holding for the handover",
+}  # fmt: skip
+
+
 class RecentLog(logging.Handler):
     """Keeps the last log lines for the panel."""
 
@@ -98,7 +103,8 @@ def _model_text(session: Session) -> str | None:
 def plain_line(session: Session, rates: RecentRates) -> str:
     """One line of status."""
     outcome = session.outcome
-    pieces = [f"mode {session.mode}", f"loop {_loop_text(session, rates)}"]
+    commander = f", {_COMMANDS[session.commander]}" if session.commander else ""
+    pieces = [f"mode {session.mode}{commander}", f"loop {_loop_text(session, rates)}"]
     if session.acting is not None:
         stats = session.acting.dispatch
         pieces.append(f"plan {stats.plan_length}, latency {stats.latency_ms:.0f} ms")
@@ -150,6 +156,8 @@ def _faults(session: Session) -> list[Text]:
 def _facts(session: Session, rates: RecentRates) -> Iterator[tuple[str, str]]:
     """Rows of heading and text, the most important first."""
     outcome = session.outcome
+    if session.commander:
+        yield "robot", _COMMANDS[session.commander]
     if session.sensors:
         yield "sensors", "  ".join(_sensor_texts(session, rates))
     if session.acting is not None:

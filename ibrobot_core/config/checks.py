@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import attrs
 
 from ibrobot_core.config.models import READERS, DescriptionModel, Limits, ModelError
-from ibrobot_core.config.schema import ControlConfig, ControlMode, ExecutorConfig, HardwareConfig, InferenceConfig
+from ibrobot_core.config.schema import (
+    ControlConfig,
+    ControlMode,
+    ExecutorConfig,
+    HardwareConfig,
+    InferenceConfig,
+    devices_of,
+)
 from ibrobot_core.config.structure import ParsedComponent, ParsedSections
 from ibrobot_core.config.yaml_nodes import Document, Key
 from ibrobot_core.descriptors import ExecutorDescriptor, TransportDescriptor
@@ -161,15 +168,18 @@ class Checks:
             return [(robot, part.component.joints or robot.joint_names)]
         if isinstance(part.component, ExecutorConfig):
             return [(robot, robot.groups.get(part.component.group, ()))]
-        moved = {group for mode in self._modes for group, name in mode.devices.items() if part.key[1:] == (name,)}
+        moved = {group for devices in self._used for group, name in devices.items() if part.key[1:] == (name,)}
         parts = [robot.part(group) for group in robot.groups if group in moved]
         if part.key[0] != "teleoperation" or not parts or "" in moved:
             parts.append(robot)
         return [(seen, seen.joint_names) for seen in parts]
 
     @property
-    def _modes(self) -> Collection[ControlMode]:
-        return (self.sections.plain.get("control_modes") or {}).values()
+    def _used(self) -> list[Mapping[str, str]]:
+        """Joint group -> device, for the devices that drive a mode and for those that intervene in one."""
+        modes: Mapping[str, ControlMode] = self.sections.plain.get("control_modes") or {}
+        driving = [mode.devices for mode in modes.values()]
+        return driving + [part.component.devices for part in self.sections.inference.values()]
 
     def _devices(self) -> None:
         """Check that no two components that are open at the same time open the same device."""
@@ -185,7 +195,7 @@ class Checks:
     def _open_together(self, a: Key, b: Key) -> bool:
         """Whether a run opens both components at the same time: of the teleoperation devices, those of one mode."""
         alone = a[0] == b[0] == "teleoperation"
-        return not alone or any({a[1], b[1]} <= set(mode.devices.values()) for mode in self._modes)
+        return not alone or any({a[1], b[1]} <= set(devices.values()) for devices in self._used)
 
     def _executors(self, robot: Robot) -> None:
         for part in self.sections.executors.values():
@@ -216,8 +226,9 @@ class Checks:
             self.document.add((*key, "executors"), "a mode needs at least one executor")
         if robot is not None:
             self._claims(key, mode, robot)
-        self._teleop(key, mode, robot)
+        self._operated((*key, "teleop"), mode.teleop, mode, robot)
         if (part := self.sections.inference.get(name)) is not None:
+            self._operated((*part.key, "intervene"), part.component.intervene, mode, robot)
             self.document.refer((*part.key, "model"), part.component.model, names("models"), "model")
             self._reaches(part)
         sources = [source for source in ("teleop", "inference", "planner") if getattr(mode, source) is not None]
@@ -228,21 +239,21 @@ class Checks:
         if mode.inference is None and self.document.get(*key, "dispatch") is not None:
             self.document.add((*key, "dispatch"), "applies only to a mode with inference")
 
-    def _teleop(self, key: Key, mode: ControlMode, robot: Robot | None) -> None:
+    def _operated(self, at: Key, given: str | Mapping[str, str] | None, mode: ControlMode, robot: Robot | None) -> None:
         """Check the devices of a mode; where they move groups, each its own joints, by executors of its own."""
-        at: Key = (*key, "teleop")
-        devices = list(mode.devices.items())
+        groups = devices_of(given)
+        devices = list(groups.items())
         for i, (group, device) in enumerate(devices):
-            place = at if isinstance(mode.teleop, str) else (*at, group)
+            place = at if isinstance(given, str) else (*at, group)
             self.document.refer(place, device, self.document.names("teleoperation"), "teleoperation device")
             if device in (other for _, other in devices[:i]):
                 self.document.add(place, f"device {device!r} is given twice")
-        if robot is None or not isinstance(mode.teleop, Mapping):
+        if robot is None or not isinstance(given, Mapping):
             return
         if not devices:
             self.document.add(at, "a joint group and its device are missing, e.g. left: leader_left")
         mover: dict[str, str] = {}
-        for group in mode.devices:
+        for group in groups:
             if not self.document.refer((*at, group), group, list(robot.groups), "group"):
                 continue
             if shared := [joint for joint in robot.groups[group] if joint in mover]:
@@ -256,10 +267,10 @@ class Checks:
             joints = robot.groups.get(part.component.group, ())
             unmoved -= set(joints)
             if len({mover.get(joint) for joint in joints}) > 1:
-                each = ", ".join(f"{joint} by {mode.devices.get(mover.get(joint, ''), 'none')}" for joint in joints)
+                each = ", ".join(f"{joint} by {groups.get(mover.get(joint, ''), 'none')}" for joint in joints)
                 message = f"executor {name!r} follows only one device that moves all of its joints: {each}"
-                self.document.add((*key, "executors", i), message)
-        for group in mode.devices:
+                self.document.add(("control_modes", at[1], "executors", i), message)
+        for group in groups:
             if left := [joint for joint in robot.groups.get(group, ()) if joint in unmoved]:
                 self.document.add((*at, group), f"no executor of this mode moves {', '.join(left)}")
 

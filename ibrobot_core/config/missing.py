@@ -86,7 +86,11 @@ def _used(name: str, mode: Any, observed: set[Key]) -> set[Key]:
     keys |= {("executors", executor) for executor in mode.executors}
     keys |= {("teleoperation", device) for device in mode.devices.values()}
     if mode.inference is not None:
+        given = mode.inference.get("intervene")
         keys |= {("models", str(mode.inference.get("model"))), *observed}
+        keys |= {
+            ("teleoperation", str(device)) for device in (given.values() if isinstance(given, Mapping) else (given,))
+        }
     return keys
 
 

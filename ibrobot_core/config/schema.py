@@ -361,6 +361,11 @@ class DispatchConfig:
         return self.strategy or ("ensemble" if self.smoothing.enabled else "replace")
 
 
+def devices_of(given: str | Mapping[str, str] | None) -> Mapping[str, str]:
+    """Joint group -> the teleoperation device that moves it; empty group: a device that may move all joints."""
+    return {"": given} if isinstance(given, str) else given or {}
+
+
 @attrs.frozen
 class InferenceConfig(ComponentConfig):
     """The model of a mode, and the engine that runs it."""
@@ -371,6 +376,10 @@ class InferenceConfig(ComponentConfig):
     type: str = option("monolithic", key="execution_mode", help="engine to run the model; `ibrobot plugins` lists them")
     request_timeout: float = option(5.0, unit="s", gt=0, help="time after which a request fails and the arm holds")
     prompt: str = option("", help="task for language-conditioned policies")
+    intervene: str | Mapping[str, str] | None = option(
+        None,
+        help="device with which an operator takes the robot from the model and gives it back; groups as for teleop",
+    )
     uses_transport: bool = not_a_key(False)
     """Whether it needs the transport."""
     weights_here: bool = not_a_key(True)
@@ -381,6 +390,11 @@ class InferenceConfig(ComponentConfig):
         """The engine's needs."""
         assert isinstance(descriptor, EngineDescriptor)
         return {"uses_transport": descriptor.uses_transport, "weights_here": descriptor.weights_here}
+
+    @property
+    def devices(self) -> Mapping[str, str]:
+        """The devices of `intervene`, as `devices_of`."""
+        return devices_of(self.intervene)
 
 
 @documented
@@ -399,8 +413,8 @@ class ControlMode:
 
     @property
     def devices(self) -> Mapping[str, str]:
-        """Joint group -> the teleoperation device that moves it; empty group: a device that may move all joints."""
-        return {"": self.teleop} if isinstance(self.teleop, str) else self.teleop or {}
+        """The devices that drive the mode, as `devices_of`."""
+        return devices_of(self.teleop)
 
 
 def _check_dataset(_: object, __: object, value: str) -> None:

@@ -119,18 +119,25 @@ class SectionParser:
             if mode.planner is not None:
                 key: Key = ("control_modes", name, "planner")
                 planner = self._component(key, schema.PlannerConfig)
-                if ("source", "planner") not in self.registry.entries:
-                    error = self.registry.not_found("source", "planner")
-                    assert isinstance(error, PluginNotInstalled)
-                    self._missing.append(Missing(key, (*key, "type"), error))
+                self._need_source(key, "planner", "type")
                 sections.planners |= {name: planner} if planner is not None else {}
             if mode.inference is not None:
-                inference = self._component(("control_modes", name, "inference"), schema.InferenceConfig)
+                key = ("control_modes", name, "inference")
+                inference = self._component(key, schema.InferenceConfig)
+                if inference is not None and inference.component.intervene is not None:
+                    self._need_source(key, "intervene", "intervene")
                 sections.inference |= {name: inference} if inference is not None else {}
         sections.transport = self._component(("transport",), schema.TransportConfig)
         sections.viewer = self._component(("viewer",), schema.ViewerConfig)
         sections.recording = self._component(("recording",), schema.RecordingConfig)
         return sections
+
+    def _need_source(self, key: Key, type_: str, place: str) -> None:
+        """Note that the component at `key` needs a command source of a plugin."""
+        if ("source", type_) not in self.registry.entries:
+            error = self.registry.not_found("source", type_)
+            assert isinstance(error, PluginNotInstalled)
+            self._missing.append(Missing(key, (*key, place), error))
 
     def contract(self) -> ParsedSections:
         """The `contract` section of a file without other sections."""

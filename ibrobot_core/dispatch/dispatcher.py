@@ -160,14 +160,26 @@ class Dispatcher:
         if self._sampler is not None:
             self._sampler.close()
         self._sampler = FrameSampler(self._contract, self._bus, tuple(self._spec.observations), self._spec.history)
+        self._seed = seed
+        self.resume()
+
+    def suspend(self) -> None:
+        """Discard plan and requests, and request none until `resume`; observations are still sampled."""
+        self._suspended = True
         self._smoother.reset()
-        self._client.reset(seed)
         self._open = {}
+        self._dry = True
+        self.stats.plan_length = 0
+
+    def resume(self, held: Vector | None = None) -> None:
+        """Request a new plan, which begins at `held` [rad], shape (A,), if the arm is held there."""
+        self.suspend()
+        self._smoother.reset(held)
+        self._client.reset(self._seed)
         self._settle()
         self._ask_after_ns = 0
         self._waiting_since_ns: int | None = None
-        self._dry = True
-        self.stats.plan_length = 0
+        self._suspended = False
 
     def end(self) -> None:
         """Stop requesting; later answers are dropped."""
@@ -186,6 +198,8 @@ class Dispatcher:
             return
         self._smoother.trim(t_ns)
         self._sampler.advance(t_ns)
+        if self._suspended:
+            return
         remaining = self.stats.plan_length = self._smoother.remaining(t_ns)
         if not remaining and not self._dry:
             self.stats.holds += 1

@@ -68,11 +68,11 @@ class TemporalSmoother:
         self._gains = _gains(self._ratio, _FIRST_GAINS)
         self.reset()
 
-    def reset(self) -> None:
-        """Discard the plan and the time for a new episode."""
+    def reset(self, held: Vector | None = None) -> None:
+        """Discard the plan and the time; the next one begins at `held`, shape (A,), if the arm is held there."""
         self._set(0, np.empty((0, self.action_size)), np.empty(0, dtype=np.intp))
         self._now_ns: int | None = None
-        self._held: Vector | None = None
+        self._held: Vector | None = None if held is None else held[None]
 
     def plan(self) -> tuple[int, Vector]:
         """The time of the first action [ns] and the actions, shape (M, A), read-only; `(0, empty)` without a plan."""

@@ -61,6 +61,17 @@ class Teleop(ABC):
         Nothing moves until the operator acts again: a deadman that was pressed before counts as released.
         """
 
+    def approach(self, measured: JointReading) -> bool:
+        """Drive the device itself to the robot's pose, if it has motors, and release it there.
+
+        Called at the control rate before `activate` when an operator takes the robot from a policy, until it returns
+        True; the robot holds meanwhile. Never blocks.
+
+        Raises:
+            TeleopError: as `read`.
+        """
+        return True
+
     def help(self) -> str:
         """Instructions for the operator, in a few lines: keys, buttons."""
         return ""

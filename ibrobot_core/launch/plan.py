@@ -35,10 +35,16 @@ class ModeComponents:
 
     models: tuple[LoadedModel, ...]
     source: CommandSource
+    policy: PolicySource | None = None
+    """The source that runs the policy, if `source` is another one, which lets an operator intervene."""
+
+    def sources(self) -> list[Component]:
+        """The workers that command the robot, in starting order."""
+        return [each for each in (self.policy, self.source) if isinstance(each, SourceWorker)]
 
     def components(self) -> list[Component]:
         """The components in starting order."""
-        return [*self.models, *([self.source] if isinstance(self.source, SourceWorker) else [])]
+        return [*self.models, *self.sources()]
 
 
 @attrs.frozen
@@ -80,14 +86,22 @@ def mode_components(session: Session, name: str, link: TransportLink | None) -> 
     if mode.inference is not None:
         model = LoadedModel(session, mode.inference, link)
         needs = (CONTROL, *(f"sensor:{sensor.name}" for sensor in _sensors(session)))
-        return ModeComponents((model,), PolicySource(session, mode, mode.inference, model, needs))
+        policy = PolicySource(session, mode, mode.inference, model, needs)
+        if mode.inference.intervene is None:
+            return ModeComponents((model,), policy)
+        return ModeComponents((model,), _source("intervene", session, mode, policy), policy)
     if mode.teleop is not None:
         return ModeComponents((), TeleopSource(session, mode))
     if mode.planner is not None:
-        descriptor = session.registry.find("source", "planner")
-        assert isinstance(descriptor, SourceDescriptor)
-        return ModeComponents((), descriptor.make(session, mode))
+        return ModeComponents((), _source("planner", session, mode))
     return ModeComponents((), CommandSource())
+
+
+def _source(type_: str, *arguments: Any) -> SourceWorker:
+    session: Session = arguments[0]
+    descriptor = session.registry.find("source", type_)
+    assert isinstance(descriptor, SourceDescriptor)
+    return descriptor.make(*arguments)
 
 
 def _sensors(session: Session) -> list[PeripheralConfig]:
@@ -133,8 +147,7 @@ def build_plan(session: Session) -> LaunchPlan:
     components += added.models
     components.append(ControlComponent(session, tuple(model.name for model in added.models)))
     components += [SensorWorker(session, peripheral, (CONTROL,)) for peripheral in _sensors(session)]
-    if isinstance(added.source, SourceWorker):
-        components.append(added.source)
+    components += added.sources()
     components.append(Status(session, (CONTROL,)))
     components += [section.make(options, session) for section, options in session.registry.sections(config)]
     if config.viewer is not None:

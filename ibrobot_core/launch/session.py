@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import queue
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +19,7 @@ from ibrobot_core.config import RobotConfig
 from ibrobot_core.config.schema import ComponentConfig, ControlMode
 from ibrobot_core.control.link import ControlState, PlanRecord
 from ibrobot_core.errors import ComponentFailed, MissingDependency
-from ibrobot_core.interfaces import Context, EngineStats, JointReading, OperatorEvent
+from ibrobot_core.interfaces import Context, EngineStats, JointReading, OperatorEvent, Teleop
 from ibrobot_core.launch.absence import AbsentSensor, absent_sensors, by_cause
 from ibrobot_core.launch.episodes import Episodes
 from ibrobot_core.plugins import Registry
@@ -88,6 +88,29 @@ class SensorFigures:
     """Age of the newest message at publication, by its stamp [s]; None for messages without a stamp."""
 
 
+class SharedDevices:
+    """The open teleoperation devices of a run, with the number of their users. Thread-safe."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._open: dict[Hashable, tuple[Teleop, int]] = {}
+
+    def take(self, key: Hashable, opened: Callable[[], Teleop]) -> Teleop:
+        """The device with this key, made by `opened` unless it is open already."""
+        with self._lock:
+            device, users = self._open.get(key) or (opened(), 0)
+            self._open[key] = device, users + 1
+            return device
+
+    def give_back(self, key: Hashable) -> bool:
+        """End a use of a device; return whether it was the last one."""
+        with self._lock:
+            device, users = self._open.pop(key)
+            if users > 1:
+                self._open[key] = device, users - 1
+            return users == 1
+
+
 class CommandSource:
     """Commands the active executors of a mode, from `begin` to `end`. The base class sends nothing.
 
@@ -148,6 +171,9 @@ class Session:
         log: the log of the run.
         command_source: the source that commands the active executors.
         episodes: begins, ends and counts the episodes; replaced by what records them.
+        devices: the open teleoperation devices, which modes share.
+        commander: who commands the robot in a mode in which an operator may take it from the policy: `policy`,
+            `operator`, or `handover` while neither does; empty in other modes.
         held: whether the robot holds after the reset of a fault, until the operator enters the mode again.
         start_failed: whether the run ended before all components had started, so that nothing has moved the robot.
     """
@@ -164,6 +190,8 @@ class Session:
         self.generation = 0
         self.command_source = CommandSource()
         self.episodes = Episodes(self)
+        self.devices = SharedDevices()
+        self.commander = ""
         self.held = False
         self.start_failed = False
         self.state: ControlState | None = None
@@ -275,6 +303,13 @@ class Session:
     def mode_keys(self) -> dict[str, str]:
         """Key -> the mode it enters: `F1` to `F9`, in file order."""
         return {f"F{i}": name for i, name in enumerate(tuple(self.config.control_modes)[:9], 1)}
+
+    def pass_on(self, event: OperatorEvent) -> None:
+        """Pass a button press that concerns episodes to the command that records them."""
+        if self.request.by_operator:
+            self.operator_events.put(event)
+        else:
+            self.log.warning("%s: this run records no episodes by hand", event)
 
     def to_go_on(self) -> str:
         """Instruction for entering the present mode again."""

@@ -93,7 +93,7 @@ class Runs:
         """A run in lockstep, unless `asked` says otherwise; not started."""
         path = self.folder / "mini.yaml"
         path.write_text(ROBOT)
-        if not self.installed and any(each.startswith("recording=") for each in overrides):
+        if not self.installed and any("recording=" in each or "intervene" in each for each in overrides):
             pytest.importorskip("ibrobot_data")
             self.installed += entry_points(group="ibrobot", name="data")
         registry = discover([*self.site.entry_points(), *self.installed])

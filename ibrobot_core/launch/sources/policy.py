@@ -127,6 +127,17 @@ class PolicySource(SourceWorker):
         self._dispatcher.begin(seed)
         self.session.bus.serve(TOGGLE_SMOOTHING, self.toggle_smoothing)
 
+    def suspend(self) -> None:
+        """Drop the plan and request none, e.g. while an operator commands the robot; observations are still sampled."""
+        with self.lock:
+            self._dispatcher.suspend()
+
+    def resume(self, position: Vector) -> None:
+        """Request a plan again, which begins at `position` [rad], shape (J,), where the robot is held."""
+        columns = self.session.config.robot.indices(self._model.contract.action_joints)
+        with self.lock:
+            self._dispatcher.resume(position[columns])
+
     @override
     def end_mode(self) -> None:
         self.session.bus.unserve(TOGGLE_SMOOTHING)

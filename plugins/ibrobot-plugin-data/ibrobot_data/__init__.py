@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from ibrobot_core.api import Command, NoOptions, SectionDescriptor, hookimpl
+from ibrobot_core.api import Command, SectionDescriptor, SourceDescriptor, hookimpl
+from ibrobot_data.options import EpisodesOptions
 
 if TYPE_CHECKING:
     import click
 
-    from ibrobot_core.api import Component, RobotConfig, Session
+    from ibrobot_core.api import Component, ControlMode, PolicySource, RobotConfig, Session, SourceWorker
 
 
 def _convert() -> click.Command:
@@ -39,11 +40,25 @@ def ibrobot_commands() -> Iterable[Command]:
     yield Command("replay", "Play a recorded episode on a robot, and compare.", _replay)
 
 
-def _recording(options: NoOptions | None, session: Session) -> Component:
-    from ibrobot_data.recording_worker import RecordingWorker
+def _corrections(session: Session, mode: ControlMode, policy: PolicySource) -> SourceWorker:
+    from ibrobot_data.corrections import Corrections
 
-    assert session.config.recording is not None
-    return RecordingWorker(session, session.config.recording)
+    return Corrections(session, mode, policy)
+
+
+@hookimpl
+def ibrobot_sources() -> Iterable[SourceDescriptor]:
+    """The command source of modes with `inference: {intervene: …}`."""
+    yield SourceDescriptor(
+        type="intervene", make=_corrections, summary="lets an operator take the robot from a policy, and give it back"
+    )
+
+
+def _recording(options: EpisodesOptions | None, session: Session) -> Component:
+    from ibrobot_data.recording_worker import NoRecording, RecordingWorker
+
+    config = session.config.recording
+    return RecordingWorker(session, config) if config is not None else NoRecording("recording", "of nothing")
 
 
 def _records(config: RobotConfig) -> bool:
@@ -54,5 +69,6 @@ def _records(config: RobotConfig) -> bool:
 def ibrobot_sections() -> Iterable[SectionDescriptor]:
     """What records the episodes of a run with a section `recording`."""
     yield SectionDescriptor(
-        type="episodes", make=_recording, without_section=_records, summary="records the episodes of a run"
-    )
+        type="episodes", options=EpisodesOptions, make=_recording, without_section=_records,
+        summary="how an operator corrects a policy, and which parts of a run are kept",
+    )  # fmt: skip

@@ -28,7 +28,7 @@ from ibrobot_core.api import (
     with_closed_ends,
     wrong_input,
 )
-from ibrobot_data.request import MISSING, OUTCOMES, ConversionRequest, EpisodeReport, Report
+from ibrobot_data.request import MISSING, ONLY, OUTCOMES, ConversionRequest, EpisodeReport, Report
 from ibrobot_data.words import plural
 
 if TYPE_CHECKING:
@@ -36,10 +36,11 @@ if TYPE_CHECKING:
 
 _MIB = 1 << 20
 _ONLY_TO_BAG = ("numbers",)
-_ONLY_TO_DATASET = ("append", "type_", "force_contract", "missing", "outcomes", "success", "jobs")
+_ONLY_TO_DATASET = ("append", "type_", "force_contract", "missing", "outcomes", "success", "jobs", "only", "context")
 _MUCH = 0.1
 """The report names episodes that lost a larger share of their ticks."""
 _MISSING = attrs.fields(ConversionRequest).missing.default
+_CONTEXT = attrs.fields(ConversionRequest).context.default
 
 
 def _flags() -> dict[str, Flag]:
@@ -75,6 +76,14 @@ def _flags_of_writers(command: Callable[..., Any]) -> Callable[..., Any]:
 )  # fmt: skip
 @click.option("--outcome", "outcomes", multiple=True, type=click.Choice(OUTCOMES), help="Only these; repeatable.")
 @click.option("--prompt", default="", metavar="TEXT", help="Task of episodes recorded without one.")
+@click.option(
+    "--only", type=click.Choice(ONLY), default="all", show_default=True,
+    help="Keep only what the operator commanded, or only what the policy commanded; each stretch is an episode.",
+)  # fmt: skip
+@click.option(
+    "--context", type=click.FloatRange(min=0), default=_CONTEXT, show_default=True, metavar="S",
+    help="Seconds to keep before and after an intervention, for --only interventions.",
+)  # fmt: skip
 @click.option("--success", is_flag=True, help="Add next.success: true in the last row of a success.")
 @click.option(
     "--jobs",
@@ -280,8 +289,10 @@ def _print_report(report: Report) -> None:
         echo(f"nothing was added to {report.out}")
         return
     resumed = f", {report.resumed} of them by an earlier run" if report.resumed else ""
-    episodes, frames = plural(len(done), "episode"), plural(summary["frames"], "frame")
-    echo(f"{len(done)} {episodes}, {summary['frames']} {frames}{resumed} -> {report.out}")
+    made = summary["episodes"]
+    source = f" from {len(done)} {plural(len(done), 'recording')}" if made != len(done) else ""
+    episodes, frames = plural(made, "episode"), plural(summary["frames"], "frame")
+    echo(f"{made} {episodes}{source}, {summary['frames']} {frames}{resumed} -> {report.out}")
     echo(
         f"gaps {summary['gaps']} (ticks skipped {summary['skipped_ticks']}, held {summary['held_ticks']}), "
         f"messages lost in recording {summary['lost_messages']}"

@@ -8,7 +8,7 @@ import logging
 import os
 import shutil
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,18 +36,35 @@ from ibrobot_core.api import (
     Robot,
     installed_plugins,
 )
+from ibrobot_data.commanders import Commanders, stretches
 from ibrobot_data.identity import identity
+from ibrobot_data.options import OPERATOR, POLICY
 from ibrobot_data.request import ConversionRequest, EpisodeReport
 from ibrobot_data.ticks import Ticks
 
 SUCCESS = "next.success"
+INTERVENTION, REWARD, DONE = "intervention", "next.reward", "next.done"
 DATASET = "dataset"
 """The dataset within a unit."""
 _RECORD = "episode.json"
-type _Row = tuple[dict[str, NDArray[Any]], str]
-"""Key -> value, and the task."""
-_VERSION = 3
+_VERSION = 4
 """Version of the unit format; units of an older one are converted again."""
+
+
+@attrs.frozen(eq=False)
+class _Row:
+    """A row of the episode: key -> value, the task, and who commanded if it matters."""
+
+    values: dict[str, NDArray[Any]]
+    task: str
+    commander: str
+
+
+_KEEPS: Mapping[str, Callable[[_Row], bool]] = {
+    "all": lambda row: True,
+    "interventions": lambda row: row.commander == OPERATOR,
+    "policy": lambda row: row.commander == POLICY,
+}
 
 
 @attrs.frozen
@@ -103,6 +120,7 @@ def unit_key(job: Job) -> str:
     shaping = [
         _VERSION, request.type, attrs.asdict(request.options), contract, request.force_contract,
         request.document, request.calibration, request.norm_mode, request.missing, request.prompt, request.success,
+        request.labels, request.only, request.context,
     ]  # fmt: skip
     address = EpisodeAddress.of(job.episode)
     root = address.path
@@ -142,6 +160,8 @@ def convert_episode(job: Job, progress: Callable[[int], None]) -> EpisodeReport:
         summary = reader.summary()
         report = attrs.evolve(_described(report, summary, job.request), identity=identity(reader, summary))
         unit = _write(job, key, reader, summary, report, making, progress)
+        if unit is None:
+            return attrs.evolve(report, passed_over=_NOTHING[job.request.only])
         shutil.rmtree(job.unit, ignore_errors=True)
         _sync(making)
         making.rename(job.unit)
@@ -155,6 +175,10 @@ def convert_episode(job: Job, progress: Callable[[int], None]) -> EpisodeReport:
         if reader is not None:
             reader.close()
     return unit.report
+
+
+_NOTHING = {"interventions": "no operator commands in it", "policy": "no policy commands in it"}
+"""Rows to keep -> why an episode without any is passed over."""
 
 
 def unexpected(error: Exception) -> str:
@@ -176,8 +200,8 @@ def _described(report: EpisodeReport, summary: EpisodeSummary, request: Conversi
 def _write(
     job: Job, key: str, reader: EpisodeReader, summary: EpisodeSummary, report: EpisodeReport, folder: Path,
     progress: Callable[[int], None],
-) -> Unit:  # fmt: skip
-    """Write the dataset of one episode, and the record that describes the unit."""
+) -> Unit | None:  # fmt: skip
+    """Write the dataset of one episode, and the record that describes the unit; None if no row is wanted."""
     request = job.request
     contract = _contract(request, summary)
     document = request.document or _recorded(summary, "config")
@@ -188,30 +212,46 @@ def _write(
     if request.success and report.outcome == "unknown":
         raise DatasetError(f"{SUCCESS} cannot be determined: the episode's outcome is unknown")
     ticks = Ticks(reader, contract, request.missing)
+    commanders = Commanders(reader, summary) if request.labels or request.only != "all" else None
     writer = make_writer(request)
     features: dict[str, Feature] = {}
     waiting: _Row | None = None
-    frames, tasks = 0, dict[str, None]()
-    try:
+    pieces: list[tuple[int, int]] = []
+    tasks = dict[str, None]()
+
+    def rows() -> Iterator[_Row]:
         for row in ticks:
             values, task = _labelled(units(row), contract, ticks.tasks, report.prompt)
+            commander = commanders.at(ticks.stamp_ns) if commanders is not None else ""
+            yield _Row(values, task, commander)
+            progress(1)
+
+    try:
+        number = -1
+        for row, number, begins in stretches(rows(), _KEEPS[request.only], _context(request, contract)):
             if waiting is None:
-                features = _features(contract, values, request.success)
+                features = _features(contract, row.values, request)
                 folder.mkdir(parents=True)
                 writer.create(folder / DATASET, contract.rate_hz, features, {"robot_type": robot_type})
             else:
-                _add(writer, waiting, request, report, last=False)
-            waiting, frames = (values, task), frames + 1
-            tasks.setdefault(task)
-            progress(1)
-        assert waiting is not None
-        _add(writer, waiting, request, report, last=True)
+                _add(writer, waiting, request, features, last=begins)
+            if begins:
+                if pieces:
+                    writer.save_episode()
+                pieces.append((number, 0))
+            pieces[-1] = (pieces[-1][0], pieces[-1][1] + 1)
+            waiting = row
+            tasks.setdefault(row.task)
+        if waiting is None:
+            return None
+        succeeds = report.outcome == "success" and number == ticks.rows - 1
+        _add(writer, waiting, request, features, last=True, succeeds=succeeds)
         writer.save_episode()
     finally:
         writer.finalize()
     report = attrs.evolve(
-        report, frames=frames, skipped=ticks.skipped, cuts=tuple(ticks.cuts), held=ticks.held, gaps=ticks.gaps,
-        resets=dict(ticks.resets), prompt="; ".join(tasks),
+        report, frames=sum(count for _, count in pieces), stretches=pieces, skipped=ticks.skipped,
+        cuts=tuple(ticks.cuts), held=ticks.held, gaps=ticks.gaps, resets=dict(ticks.resets), prompt="; ".join(tasks),
     )  # fmt: skip
     unit = Unit(
         job.unit, key, report, contract.rate_hz, features, contract.canonical(), robot_type, calibration, document,
@@ -222,7 +262,9 @@ def _write(
     return unit
 
 
-def _labelled(values: dict[str, NDArray[Any]], contract: Contract, tasks: Sequence[str], prompt: str) -> _Row:
+def _labelled(
+    values: dict[str, NDArray[Any]], contract: Contract, tasks: Sequence[str], prompt: str
+) -> tuple[dict[str, NDArray[Any]], str]:
     """A row with its signals as the dataset has them, and its task: the prompt where no topic gives one."""
     signals = {part.key: values[part.key].astype(part.feature.dtype) for part in contract.signal_parts}
     number = signals.pop(TASK_KEY, None)
@@ -230,18 +272,31 @@ def _labelled(values: dict[str, NDArray[Any]], contract: Contract, tasks: Sequen
     return rest | signals, prompt if number is None else tasks[int(number[0])]
 
 
-def _add(writer: DatasetWriter, row: _Row, request: ConversionRequest, report: EpisodeReport, *, last: bool) -> None:
-    values, task = row
-    if request.success:
-        values = values | {SUCCESS: np.array([last and report.outcome == "success"])}
-    writer.add_frame(values, task)
+def _context(request: ConversionRequest, contract: Contract) -> int:
+    """Rows to keep before and after each stretch of wanted rows."""
+    return round(request.context * contract.rate_hz) if request.only == "interventions" else 0
 
 
-def _features(contract: Contract, values: Mapping[str, NDArray[Any]], success: bool) -> dict[str, Feature]:
-    """The contract's features, with the sizes found in the messages, and its signals."""
+def _add(
+    writer: DatasetWriter, row: _Row, request: ConversionRequest, features: Mapping[str, Feature], *,
+    last: bool, succeeds: bool = False,
+) -> None:  # fmt: skip
+    """Write a row: `last` of an episode of the dataset, with which the recorded one `succeeds`."""
+    added: dict[str, NDArray[Any]] = {SUCCESS: np.array([succeeds])} if request.success else {}
+    if request.labels:
+        added[INTERVENTION] = np.array([row.commander == OPERATOR])
+        added[REWARD], added[DONE] = np.array([succeeds], np.float32), np.array([last])
+    writer.add_frame(added | {key: value for key, value in row.values.items() if key in features}, row.task)
+
+
+def _features(contract: Contract, values: Mapping[str, NDArray[Any]], request: ConversionRequest) -> dict[str, Feature]:
+    """The contract's features, with the sizes found in the messages, its signals, and those that the request adds."""
     features = {key: attrs.evolve(each, shape=values[key].shape) for key, each in contract.features().items()}
+    if request.labels:
+        flag = Feature("bool", (1,))
+        features |= {INTERVENTION: flag, REWARD: Feature("float32", (1,)), DONE: flag}
     features |= {part.key: part.feature for part in contract.signal_parts if part.key != TASK_KEY}
-    return features | ({SUCCESS: Feature("bool", (1,))} if success else {})
+    return features | ({SUCCESS: Feature("bool", (1,))} if request.success else {})
 
 
 def _contract(request: ConversionRequest, summary: EpisodeSummary) -> Contract:

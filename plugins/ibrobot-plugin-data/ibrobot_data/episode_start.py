@@ -14,9 +14,11 @@ from ibrobot_core.api import (
     RecorderError,
     RecordingConfig,
     RobotConfig,
+    String,
     calibrations,
 )
 from ibrobot_data.episode_dataset import EpisodeDataset
+from ibrobot_data.options import COMMANDER
 
 _PREFIX = "episode_"
 
@@ -37,8 +39,8 @@ def episode_start(
         config: the robot.
         recording: its `recording` section.
         topics: topic -> message type for every topic on the bus. For `topics: contract` the episode has all topics of
-            the contract, including those not published yet; otherwise it has the requested ones of these topics, and
-            more may follow (`any_topic`).
+            the contract, including those not published yet, and who commands; otherwise it has the requested ones of
+            these topics, and more may follow (`any_topic`).
         mode: the control mode.
         seed: the seed of the scene.
         stamp_ns: start of the episode [ns].
@@ -68,7 +70,7 @@ def episode_start(
         metadata["policy"] = json.dumps(dict(policy))
     metadata["uuid"] = str(uuid5(NAMESPACE_OID, json.dumps(metadata)) if lockstep else uuid4())
     if recording.topics == "contract":
-        kept = contract.topics
+        kept = {**contract.topics, **({COMMANDER: String.ros_type} if COMMANDER in topics else {})}
     else:
         kept = {topic: type_ for topic, type_ in topics.items() if is_kept(topic, recording, contract)}
     directory = episode_folder(root.parent, _next_number(root))
@@ -78,7 +80,7 @@ def episode_start(
 def is_kept(topic: str, recording: RecordingConfig, contract: Contract) -> bool:
     """Whether the `recording` section selects `topic`."""
     if recording.topics == "contract":
-        return topic in contract.topics
+        return topic in contract.topics or topic == COMMANDER
     return recording.topics == "all" or topic in recording.topics
 
 

@@ -20,7 +20,10 @@ _KEPT_ONCE = ("contract", "fingerprint", "config", "calibration", "prompt")
 def conversion(request: ConversionRequest) -> dict[str, Any]:
     """The settings that must be equal for all episodes of a dataset."""
     options = attrs.asdict(request.options)
-    return {"writer": request.type, "options": options, "norm_mode": request.norm_mode, "success": request.success}
+    chosen = {"only": request.only, "context": request.context} if request.only != "all" else {}
+    labels = {"labels": True} if request.labels else {}
+    settings = {"writer": request.type, "options": options, "norm_mode": request.norm_mode, "success": request.success}
+    return settings | labels | chosen
 
 
 def provenance(request: ConversionRequest, old: DatasetSummary | None, units: Sequence[Unit]) -> dict[str, Any]:
@@ -34,7 +37,7 @@ def provenance(request: ConversionRequest, old: DatasetSummary | None, units: Se
         kept["recorded"] = {name: value for name, value in unit.recorded.items() if name not in _KEPT_ONCE}
         kept["calibration"] = _file(calibrations, unit.calibration)
         kept["config"] = _file(configs, unit.document)
-        episodes.append(kept)
+        episodes += [kept | {"stretch": list(each)} for each in kept.pop("stretches")]
     contract = before.get("contract", units[0].contract)
     return {
         "robot_type": before.get("robot_type", units[0].robot_type), "contract": contract,

@@ -12,6 +12,7 @@ import attrs
 
 from ibrobot_core.api import (
     NS_PER_S,
+    Component,
     Contract,
     EpisodeEnd,
     EpisodeStart,
@@ -34,6 +35,18 @@ _RATE_WINDOW = 31
 """Number of messages over which a rate is measured."""
 _SILENT_NS = NS_PER_S
 """A topic without a message for this time is silent [ns]."""
+
+
+class NoRecording(Component):
+    """Stands for the recording in a run that records nothing."""
+
+    @override
+    def start(self) -> None:
+        pass
+
+    @override
+    def stop(self) -> None:
+        pass
 
 
 class RecordingWorker(SessionWorker):

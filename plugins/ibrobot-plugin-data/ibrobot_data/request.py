@@ -12,6 +12,7 @@ from ibrobot_core.api import NORM_MODES, Contract, documented, option
 
 MISSING = ("refuse", "skip", "hold")
 OUTCOMES = ("success", "failure", "unknown")
+ONLY = ("all", "interventions", "policy")
 
 
 @documented
@@ -42,6 +43,12 @@ class ConversionRequest:
     """Task of the episodes that were recorded without one."""
     success: bool = False
     """Whether to add `next.success`: true at the last row of a successful episode."""
+    labels: bool = False
+    """Whether to add `intervention`, `next.reward` and `next.done`."""
+    only: str = option("all", choices=ONLY)
+    """Which rows to keep, by who commanded. Each stretch of them is an episode of the dataset."""
+    context: float = option(2.0, ge=0)
+    """Time to keep before and after each intervention, for `only: interventions` [s]."""
     append: bool = False
     """Whether to add to a dataset in `out`."""
     jobs: int = option(1, ge=1)
@@ -64,6 +71,8 @@ class EpisodeReport:
     """Ticks left out because something was missing."""
     cuts: tuple[tuple[int, int], ...] = attrs.field(default=(), converter=_pairs)
     """Where ticks were left out: the number of the row that follows, from 0, and how many ticks."""
+    stretches: tuple[tuple[int, int], ...] = attrs.field(default=(), converter=_pairs)
+    """The episodes that it gives in the dataset: number of the first row, from 0, and number of rows."""
     held: int = 0
     """Ticks with a missing observation, at which its last value was held."""
     gaps: Mapping[str, int] = attrs.field(factory=dict)
@@ -119,8 +128,9 @@ class Report:
     def summary(self) -> dict[str, Any]:
         """As JSON values."""
         done = self.converted
+        episodes = sum(len(each.stretches) or 1 for each in done)
         return {
-            "out": str(self.out), "episodes": len(done), "frames": sum(each.frames for each in done),
+            "out": str(self.out), "episodes": episodes, "frames": sum(each.frames for each in done),
             "failed": len(self.failed), "passed_over": len(self.episodes) - len(done) - len(self.failed),
             "resumed": self.resumed, "skipped_ticks": sum(each.skipped for each in done),
             "held_ticks": sum(each.held for each in done), "gaps": sum(sum(each.gaps.values()) for each in done),

@@ -34,7 +34,9 @@ from ibrobot_core.api import (
     seconds,
     set_malloc,
 )
+from ibrobot_data.commanders import is_labelled
 from ibrobot_data.episode import (
+    INTERVENTION,
     Job,
     Unit,
     convert_episode,
@@ -100,6 +102,9 @@ def convert(
     """
     begin = time.monotonic()
     with _staging(request) as (staging, old):
+        request = _with_labels(request, episodes, old)
+        if old is not None:
+            _check_old(request, old)
         plan = _Plan(request, staging, old, episodes)
         reports = plan.run(watch)
         units = [unit for unit in plan.units() if not reports[unit.report.source].error]
@@ -125,8 +130,8 @@ def _staging(request: ConversionRequest) -> Iterator[tuple[Path, DatasetSummary 
                 raise DatasetError(f"{out} is not empty and has no dataset of writer {request.type!r}")
         else:
             old = make_writer(request).summary(out)
-        if old is not None:
-            _check_old(request, old)
+        if old is not None and not request.append:
+            raise DatasetError(f"{out}: already has a dataset; --append adds to it")
         (out / STAGING).mkdir(parents=True, exist_ok=True)
         with (out / STAGING / "lock").open("w") as lock:
             try:
@@ -150,9 +155,25 @@ def _tidy(out: Path) -> None:
         out.rmdir()
 
 
+def _with_labels(request: ConversionRequest, episodes: Sequence[Path], old: DatasetSummary | None) -> ConversionRequest:
+    """The request, which adds labels if the dataset has them, or if there is none and an episode says who commanded."""
+    if old is not None:
+        return attrs.evolve(request, labels=INTERVENTION in old.features)
+    return attrs.evolve(request, labels=request.labels or any(map(_says_who_commanded, episodes)))
+
+
+def _says_who_commanded(episode: Path) -> bool:
+    try:
+        reader = installed_plugins().open_episode(episode)
+        try:
+            return is_labelled(reader.summary())
+        finally:
+            reader.close()
+    except Exception:  # noqa: BLE001 - the conversion reports it
+        return False
+
+
 def _check_old(request: ConversionRequest, old: DatasetSummary) -> None:
-    if not request.append:
-        raise DatasetError(f"{request.out}: already has a dataset; --append adds to it")
     known = old.metadata.get("conversion")
     if known is None:
         raise DatasetError(f"{request.out}: not made by ibrobot convert; convert into another folder")

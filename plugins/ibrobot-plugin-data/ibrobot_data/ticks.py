@@ -222,6 +222,10 @@ class Ticks:
         self.held = 0
         self.gaps: dict[str, int] = {}
         """Key -> how often it went missing."""
+        self.rows = 0
+        """Number of rows so far."""
+        self.stamp_ns = 0
+        """Time of the last row [ns]."""
 
     @property
     def skipped(self) -> int:
@@ -240,7 +244,7 @@ class Ticks:
             RecorderError: when an observation is missing at every tick, or with `refuse` at one.
             ContractError: for a message that does not fit the contract.
         """
-        source, before, rows = self._source, frozenset[str](), 0
+        source, before = self._source, frozenset[str]()
         last: dict[str, NDArray[Any]] = {}
         absent = frozenset(self._contract.observations)
         for frame in frames(self._assembler, source, source.ticks(self._contract.step_ns)):
@@ -253,10 +257,11 @@ class Ticks:
             for key in frame.missing - before:
                 self.gaps[key] = self.gaps.get(key, 0) + 1
             before = frame.missing
-            if frame.missing and not self._take(frame.missing, frame.stamp_ns, rows):
+            if frame.missing and not self._take(frame.missing, frame.stamp_ns, self.rows):
                 continue
             last = {**last, **frame.values}
-            rows += 1
+            self.rows += 1
+            self.stamp_ns = frame.stamp_ns
             yield last
         if not last:
             what = f"{', '.join(sorted(absent))} is missing at every one" if absent else "each time another was missing"

@@ -1,0 +1,135 @@
+"""The devices with which an operator moves the robot in a mode."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+
+import attrs
+import numpy as np
+from numpy.typing import NDArray
+
+from ibrobot_core.errors import TeleopError
+from ibrobot_core.interfaces import JointReading, Teleop, TeleopCommand
+from ibrobot_core.launch.session import Session
+from ibrobot_core.robot import Robot
+
+
+@attrs.define(eq=False)
+class _Connected:
+    """A device, and the indices of the joints that it sees and moves."""
+
+    name: str
+    device: Teleop
+    columns: NDArray[np.intp]
+    joints: frozenset[str]
+    lost: bool = False
+
+
+class OperatorDevices:
+    """Teleoperation devices, each of which sees its group of joints as the whole robot.
+
+    Modes that have a device in common share it, so that the robot can switch between them.
+
+    Args:
+        session: the run.
+        devices: joint group -> name of the device that moves it; empty group: a device that may move all joints.
+    """
+
+    def __init__(self, session: Session, devices: Mapping[str, str]) -> None:
+        self._session = session
+        self._devices = devices
+        self._connected: list[_Connected] = []
+
+    def __str__(self) -> str:
+        types = self._session.config.teleoperation
+        return ", ".join(
+            f"{name} ({types[name].type})" + (f" moves {group}" if group else "")
+            for group, name in self._devices.items()
+        )
+
+    def connect(self) -> None:
+        """Open the devices.
+
+        Raises:
+            TeleopError: if one cannot be opened.
+        """
+        robot = self._session.config.robot
+        for group, name in self._devices.items():
+            part = robot.part(group) if group else robot
+            device = self._session.devices.take((group, name), partial(self._opened, name, part))
+            self._connected.append(
+                _Connected(name, device, robot.indices(part.joint_names), frozenset(part.joint_names))
+            )
+
+    def disconnect(self) -> None:
+        """Release the devices. Safe to call twice."""
+        connected, self._connected = self._connected, []
+        for (group, name), each in zip(self._devices.items(), connected, strict=False):
+            if self._session.devices.give_back((group, name)):
+                each.device.disconnect()
+
+    def recover(self) -> None:
+        """Connect lost devices again.
+
+        Raises:
+            TeleopError: if one cannot be opened yet.
+        """
+        for each in self._connected:
+            if each.lost:
+                each.device.disconnect()
+                each.device.connect()
+                each.lost = False
+
+    def activate(self, measured: JointReading) -> None:
+        """Let all devices start from the measured position; see `Teleop.activate`."""
+        for each in self._connected:
+            each.device.activate(measured.of(each.columns))
+
+    def approach(self, measured: JointReading) -> bool:
+        """Drive devices with motors to the robot's pose; return whether all have arrived. See `Teleop.approach`.
+
+        Raises:
+            TeleopError: if a device has failed.
+        """
+        return all([each.device.approach(measured.of(each.columns)) for each in self._connected])
+
+    def read(self, measured: JointReading) -> TeleopCommand:
+        """The commands of all devices as one, which is finished when all are.
+
+        Raises:
+            TeleopError: if a device has failed; names all that have.
+        """
+        commands, faults = [], []
+        for each in self._connected:
+            try:
+                command = each.device.read(measured.of(each.columns))
+                if strange := set(command.positions or ()) - each.joints:
+                    raise TeleopError(
+                        f"{each.name}: commands joints that are not its own: {', '.join(sorted(strange))}"
+                    )
+                commands.append(command)
+            except TeleopError as error:
+                each.lost = True
+                faults.append(str(error))
+        if faults:
+            raise TeleopError("; ".join(faults))
+        return TeleopCommand(
+            {joint: at for command in commands for joint, at in (command.positions or {}).items()} or None,
+            estop=any(command.estop for command in commands),
+            finished=all(command.finished for command in commands),
+            events=tuple(event for command in commands for event in command.events),
+        )
+
+    def help(self) -> str:
+        """The instructions of all devices."""
+        return "\n".join(filter(None, (each.device.help() for each in self._connected)))
+
+    def _opened(self, name: str, part: Robot) -> Teleop:
+        device: Teleop = self._session.make("teleop", self._session.config.teleoperation[name], name, robot=part)
+        try:
+            device.connect()
+        except BaseException:
+            device.disconnect()
+            raise
+        return device

@@ -1,0 +1,76 @@
+"""Who commanded the robot at each row of an episode, and which rows a conversion keeps."""
+
+from __future__ import annotations
+
+import json
+from bisect import bisect_right
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+
+from ibrobot_core.api import EpisodeReader, EpisodeSummary, RecorderError, String
+from ibrobot_data.options import COMMANDER, OPERATOR, POLICY
+
+
+def is_labelled(summary: EpisodeSummary) -> bool:
+    """Whether the episode says at each state who commanded."""
+    topic = summary.topics.get(COMMANDER)
+    return topic is not None and topic.count > 0
+
+
+class Commanders:
+    """Who commands an episode's robot, by time.
+
+    An episode of a mode without takeovers has one commander: the operator of its devices, or its policy.
+
+    Raises:
+        RecorderError: if neither the messages nor the mode in the metadata say who commands.
+    """
+
+    def __init__(self, reader: EpisodeReader, summary: EpisodeSummary) -> None:
+        self._times: list[int] = []
+        self._names: list[str] = []
+        if is_labelled(summary):
+            for item in reader.messages({COMMANDER}):
+                assert isinstance(item.message, String)
+                if not self._names or item.message.data != self._names[-1]:
+                    self._times.append(item.received_ns)
+                    self._names.append(item.message.data)
+        else:
+            self._times, self._names = [0], [_of_mode(summary)]
+
+    def at(self, t_ns: int) -> str:
+        """Who commanded at `t_ns` [ns]: the newest message by then."""
+        return self._names[max(0, bisect_right(self._times, t_ns) - 1)]
+
+
+def _of_mode(summary: EpisodeSummary) -> str:
+    try:
+        mode = json.loads(summary.metadata["config"])["control_modes"][summary.metadata["mode"]]
+        return OPERATOR if mode.get("teleop") is not None else POLICY
+    except (KeyError, TypeError, ValueError, AttributeError):
+        raise RecorderError(
+            f"nothing says who commanded: it has no {COMMANDER}, and its metadata name no mode of a robot YAML"
+        ) from None
+
+
+def stretches[T](rows: Iterable[T], wanted: Callable[[T], bool], context: int) -> Iterator[tuple[T, int, bool]]:
+    """The wanted rows, and up to `context` rows before and after each stretch of them.
+
+    Yields:
+        A row, its number, and whether it begins a stretch.
+    """
+    before: deque[tuple[int, T]] = deque(maxlen=context)
+    after, last = 0, -2
+    for number, row in enumerate(rows):
+        if wanted(row):
+            after = context + 1
+            for earlier, kept in before:
+                yield kept, earlier, earlier != last + 1
+                last = earlier
+            before.clear()
+        if after > 0:
+            after -= 1
+            yield row, number, number != last + 1
+            last = number
+        else:
+            before.append((number, row))

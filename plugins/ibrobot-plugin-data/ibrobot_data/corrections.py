@@ -1,0 +1,244 @@
+"""Corrections: in the middle of an episode an operator takes the robot from a policy, and gives it back."""
+
+from __future__ import annotations
+
+import queue
+from typing import override
+
+from ibrobot_core.api import (
+    CONTROL,
+    ControlMode,
+    NotSupported,
+    OperatorDevices,
+    PolicySource,
+    Session,
+    SourceWorker,
+    String,
+    TeleopCommand,
+    TeleopError,
+    seconds,
+)
+from ibrobot_data.handover import Handover
+from ibrobot_data.options import COMMANDER, HANDOVER, OPERATOR, POLICY, EpisodesOptions, options_of
+
+INTERVENE = "/intervene"
+"""Takes the robot from the policy (True), gives it back (False), or toggles (None); returns who commands then."""
+_ANSWER_S = 60.0
+"""How long the arm holds while the policy does not answer, before its setpoints count as stale [s]."""
+
+
+class Corrections(SourceWorker):
+    """Lets an operator take the robot from a policy and give it back, as often as wanted.
+
+    At a takeover the policy's plan is dropped, the arm brakes and holds, and devices with motors are driven to its
+    pose. The operator's first command ends the handover; from then on the robot follows the devices, from where it is.
+    When the operator gives it back, it brakes again, and a new plan is requested, which begins where it holds. The
+    policy's observations are sampled all the time.
+
+    `/commander` has who commands at each state of control: `policy`, `operator`, or `handover` while neither does.
+
+    Args:
+        session: the run.
+        mode: the mode, with `inference.intervene`.
+        policy: runs the policy.
+    """
+
+    autonomous = True
+
+    def __init__(self, session: Session, mode: ControlMode, policy: PolicySource) -> None:
+        assert mode.inference is not None
+        config = session.config
+        self._devices = OperatorDevices(session, mode.inference.devices)
+        super().__init__(session, mode, f"takeovers by {self._devices}", (CONTROL, policy.name))
+        self.name = f"operator:{mode.name}"
+        self._policy = policy
+        self._options: EpisodesOptions = options_of(config)
+        moved = {joint for name in mode.executors for joint in config.executors[name].joints}
+        self._arm = Handover(session, tuple(joint for joint in config.robot.joint_names if joint in moved))
+        self._keys: queue.SimpleQueue[str] | None = None
+        self._commander = POLICY
+        self._taken = False
+        """Whether the operator has the robot, or is about to have it."""
+        self._aligned = True
+        """Whether the devices may command: those with motors are at the robot's pose."""
+        self._waiting = False
+        """Whether the policy was requested to go on and has not commanded yet."""
+        self._engaged = False
+        """Whether the devices commanded positions at the last state."""
+        self._takeovers = 0
+        self._commanded_ns = 0
+        """How long the operator commanded [ns]."""
+        self._changed_ns = 0
+
+    @override
+    def setup(self) -> None:
+        session = self.session
+        self.on_end.callback(self._devices.disconnect)
+        self._devices.connect()
+        self._states = session.bus.subscribe("/joint_states", 1)
+        self.on_end.callback(self._states.close)
+        self._keys = session.request.keys() if session.request.keys is not None else None
+        self._publish()
+
+    @override
+    def recover(self) -> None:
+        with self.lock:
+            self._devices.recover()
+            self._policy.recover()
+
+    @override
+    def begin_mode(self, seed: int) -> None:
+        self._arm.begin()
+        self._devices.activate(self.session.measured())
+        self._taken = self._waiting = self._engaged = False
+        self._set(POLICY)
+        self._typed()
+        self._policy.begin(seed)
+        self.session.bus.serve(INTERVENE, self.intervene)
+
+    @override
+    def end_mode(self) -> None:
+        self.session.bus.unserve(INTERVENE)
+        self._policy.end()
+        self._set(POLICY)
+        self.session.commander = ""
+
+    def intervene(self, take: bool | None = None) -> str:
+        """Service: take the robot from the policy, give it back, or toggle; returns who commands then.
+
+        Raises:
+            NotSupported: if the mode has ended, or for another request.
+        """
+        if take not in (True, False, None):
+            raise NotSupported(f"{INTERVENE} takes True, False or None, got {take!r}")
+        with self.lock:
+            if not self.active:
+                raise NotSupported(f"mode {self.mode.name} does not run: nobody can take the robot from its policy")
+            self._change(not self._taken if take is None else take)
+            return self._commander
+
+    @override
+    def work(self, timeout_s: float) -> None:
+        if self._states.get(timeout_s) is None:
+            return
+        with self.lock:
+            typed = self._typed()
+            if self.active:
+                self._tick(typed.count(self._options.takeover_key))
+
+    @override
+    def help(self) -> str:
+        does = "give the robot back to the policy" if self._taken else "take the robot from the policy"
+        return f"{self._options.takeover_key}  {does}\n{self._devices.help()}"
+
+    @override
+    def summary_rows(self) -> list[tuple[str, str]]:
+        return [("takeovers", f"{self._takeovers}; the operator commanded for {seconds(self._commanded_ns):.1f} s")]
+
+    @override
+    def facts(self) -> dict[str, object]:
+        return {"takeovers": self._takeovers, "operator_s": round(seconds(self._commanded_ns), 3)}
+
+    def _tick(self, presses: int) -> None:
+        session = self.session
+        state = session.state
+        assert state is not None
+        self._arm.see(state)
+        self._publish()  # of the command in this state, which precedes what follows here
+        try:
+            command = self._devices.read(session.measured())
+            self._press(command, presses)
+            self._command(command)
+        except TeleopError as error:
+            self.end()
+            session.control.call("fault", fault=str(error))
+
+    def _press(self, command: TeleopCommand, presses: int) -> None:
+        """Act on keys and buttons."""
+        session = self.session
+        if command.estop:
+            session.control.call("estop")
+        for event in command.events:
+            if event == "intervention":
+                presses += 1
+            else:
+                session.pass_on(event)
+        if presses % 2:
+            self._change(not self._taken)
+        elif self._options.takeover == "deadman" and bool(command.positions) != self._engaged:
+            self._change(bool(command.positions), engaged=True)
+        self._engaged = bool(command.positions)
+
+    def _change(self, take: bool, *, engaged: bool = False) -> None:
+        """Take the robot, or give it back; `engaged` if the operator's deadman is pressed already."""
+        if take == self._taken:
+            return
+        self._taken = take
+        if take:
+            self._policy.suspend()  # from here on it sends no plan that could replace the braking
+            self._takeovers += 1
+            self._aligned = engaged
+        self._arm.brake()
+        self._waiting = False
+        self._set(HANDOVER)
+        self.session.log.info("the operator takes the robot" if take else "the policy gets the robot back")
+
+    def _command(self, command: TeleopCommand) -> None:
+        """Send what the operator commands, or hold for the handover."""
+        if self._taken:
+            if self._commander == HANDOVER and not self._may_command():
+                self._arm.hold()
+            elif command.positions and (self._arm.at_rest or not self._arm.holds):
+                self._set(OPERATOR)
+                self._arm.follow(command.positions)
+            else:
+                self._release()
+        elif self._commander == HANDOVER:
+            self._give_back()
+
+    def _may_command(self) -> bool:
+        """Whether the arm holds, and the devices may command it."""
+        if not self._arm.at_rest:
+            return False
+        if not self._aligned and self._devices.approach(self.session.measured()):
+            self._aligned = True
+            self._devices.activate(self.session.measured())
+            return False
+        return self._aligned
+
+    def _release(self) -> None:
+        """Hold while the deadman is released."""
+        if self._arm.holds:
+            self._arm.hold()
+        else:
+            self._arm.brake()
+
+    def _give_back(self) -> None:
+        """Request a plan of the policy once the arm holds; it commands when the plan has arrived."""
+        acting = self.session.acting
+        if not self._waiting and self._arm.at_rest:
+            self._arm.hold(_ANSWER_S)
+            self._waiting = True
+            self._devices.activate(self.session.measured())
+            self._policy.resume(self._arm.position)
+        elif self._waiting and acting is not None and acting.dispatch.plan_length:
+            self._set(POLICY)
+
+    def _set(self, commander: str) -> None:
+        now_ns = self.session.clock.now_ns()
+        if self._commander == OPERATOR:
+            self._commanded_ns += now_ns - self._changed_ns
+        self._commander, self._changed_ns = commander, now_ns
+        self.session.commander = commander
+        if not self.active:  # before the first state of an episode
+            self._publish()
+
+    def _publish(self) -> None:
+        self.session.bus.publish(COMMANDER, String(self._commander), latched=True)
+
+    def _typed(self) -> list[str]:
+        """The keys typed since the last call."""
+        typed: list[str] = []
+        while self._keys is not None and not self._keys.empty():
+            typed.append(self._keys.get_nowait())
+        return typed
