@@ -9,6 +9,7 @@ from typing import override
 import mujoco
 import numpy as np
 from ibrobot_ros2.jpeg import to_jpeg
+from numpy.typing import NDArray
 
 from ibrobot_core.api import (
     CameraInfo,
@@ -29,13 +30,16 @@ from ibrobot_mujoco.state import PHYSICS_TOPIC, newest, pose_scene, stamp_of
 
 # One second of states at 100 Hz; states that arrive during rendering are skipped, not lost from the queue.
 _QUEUE = 100
+_FURTHEST_M = 10.0
+"""Depth beyond this counts as missing, as with real cameras."""
 
 
 class MujocoCamera(Sensor):
     """Renders in the thread of `open` and `read`; images for which there is no time are counted, not queued."""
 
     def __init__(self, options: CameraOptions, ctx: Context) -> None:
-        self.message_type = CompressedImage if options.encoding == "jpeg" else Image
+        self._is_depth = options.stream == "depth"
+        self.message_type = CompressedImage if options.encoding == "jpeg" and not self._is_depth else Image
         self.topic = f"/camera/{ctx.name}/image_raw"
         self.skipped = 0
         """Number of images that were due but not rendered."""
@@ -84,6 +88,8 @@ class MujocoCamera(Sensor):
             stamp_ns = stamp_of(state)
             if self._is_due(stamp_ns):
                 pose_scene(self._model, self._drawn, state)
+                if self._is_depth:
+                    return self._depth_image(stamp_ns, self._renderer.render_depth(self._drawn))
                 return self._image(stamp_ns, self._renderer.render(self._drawn))
             if timeout_s <= 0:
                 return None
@@ -101,6 +107,11 @@ class MujocoCamera(Sensor):
         height, width, _ = pixels.shape
         image = Image(self._header(stamp_ns), height, width, "rgb8", 3 * width, pixels.reshape(-1))
         return to_jpeg(image, self._options.jpeg_quality) if self.message_type is CompressedImage else image
+
+    def _depth_image(self, stamp_ns: int, depth: NDArray[np.float32]) -> Image:
+        height, width = depth.shape
+        millimetres = np.where(depth < _FURTHEST_M, depth * 1000.0 + 0.5, 0.0).astype("<u2")
+        return Image(self._header(stamp_ns), height, width, "16UC1", 2 * width, millimetres.reshape(-1).view(np.uint8))
 
     def _header(self, stamp_ns: int) -> Header:
         return Header(stamp_ns, f"{self._ctx.name}_optical_frame")

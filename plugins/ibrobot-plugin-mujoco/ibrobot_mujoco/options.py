@@ -123,8 +123,9 @@ class CameraOptions:
     width: int = option(640, unit="px", ge=1, le=8192, help="width of the image")
     height: int = option(480, unit="px", ge=1, le=8192, help="height of the image")
     fps: float = option(30.0, unit="Hz", gt=0, le=1000, help="images per second of simulated time")
+    stream: str = option("color", choices=("color", "depth"), help="depth: 16UC1 [mm], 0 where nothing is near")
     encoding: str = option(
-        "jpeg", choices=("jpeg", "raw"), help="encoding of messages; raw is 15 times the size of jpeg"
+        "jpeg", choices=("jpeg", "raw"), help="encoding of colour messages; raw is 15 times the size of jpeg"
     )
     jpeg_quality: int = option(90, ge=1, le=100, help="JPEG quality")
     shadows: bool = option(False, help="whether to render shadows (three times the cost)")

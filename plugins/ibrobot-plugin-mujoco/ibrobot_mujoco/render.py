@@ -45,13 +45,31 @@ class Renderer:
 
     def render(self, drawn: mujoco.MjData) -> NDArray[np.uint8]:
         """The camera's image of `drawn`, shape (height, width, 3), RGB, top row first."""
+        self._draw(drawn)
+        pixels = np.empty((self._rect.height, self._rect.width, 3), np.uint8)
+        mujoco.mjr_readPixels(pixels, None, self._rect, self._mjr)
+        return np.ascontiguousarray(pixels[::-1])
+
+    def render_depth(self, drawn: mujoco.MjData) -> NDArray[np.float32]:
+        """Distance along the optical axis of the camera's pixels [m], shape (height, width), top row first.
+
+        The background is at the far clipping plane.
+        """
+        self._draw(drawn)
+        self._mjr.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
+        buffer = np.empty((self._rect.height, self._rect.width), np.float32)
+        mujoco.mjr_readPixels(None, buffer, self._rect, self._mjr)
+        # The buffer is n (f - z) / (z (f - n)) for clipping planes at n and f.
+        extent, planes = self._model.stat.extent, self._model.vis.map
+        near, far = planes.znear * extent, planes.zfar * extent
+        depth = far * near / (buffer.astype(float) * (far - near) + near)
+        return np.ascontiguousarray(depth[::-1].astype(np.float32))
+
+    def _draw(self, drawn: mujoco.MjData) -> None:
         self._context.make_current()
         everything = mujoco.mjtCatBit.mjCAT_ALL
         mujoco.mjv_updateScene(self._model, drawn, self._option, None, self._view, everything, self._scene)
         mujoco.mjr_render(self._rect, self._scene, self._mjr)
-        pixels = np.empty((self._rect.height, self._rect.width, 3), np.uint8)
-        mujoco.mjr_readPixels(pixels, None, self._rect, self._mjr)
-        return np.ascontiguousarray(pixels[::-1])
 
     def close(self) -> None:
         """Release the context. Safe to call twice."""

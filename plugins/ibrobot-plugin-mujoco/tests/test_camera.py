@@ -246,3 +246,25 @@ def test_low_poly_looks_like_the_full_meshes(ctx: Context) -> None:
     overlap = (yellow[0] & yellow[1]).sum() / (yellow[0] | yellow[1]).sum()
     assert overlap > 0.9
     assert np.abs(low_poly - expected).mean() < 4
+
+
+def test_depth_is_the_distance_along_the_optical_axis() -> None:
+    ctx = host_context("top", robot=ROBOT, simulation=OPTIONS)
+    camera = MujocoCamera(CameraOptions(stream="depth"), ctx)
+    camera.open()
+    try:
+        assert ctx.bus is not None
+        x, y = 0.2, -0.1
+        ctx.bus.publish(PHYSICS_TOPIC, Float64MultiArray(scene_state(SLOT_NS, cube=(x, y))))
+        image = camera.read(0)
+        ((_, info),) = camera.latched()
+    finally:
+        camera.close()
+    assert isinstance(image, Image)
+    assert isinstance(info, CameraInfo)
+    assert (image.encoding, image.height, image.width, image.step) == ("16UC1", 480, 640, 1280)
+    depth = image.data.view("<u2").reshape(480, 640)
+    # The camera hangs 0.80 m above the table; the cube is 25 mm high.
+    row, column = round(239.5 - info.k[0] * (x - 0.16) / 0.775), round(319.5 - info.k[0] * (y - 0.04) / 0.775)
+    assert depth[row, column] == pytest.approx(775, abs=2)
+    assert depth[row - 60, column] == pytest.approx(800, abs=2)

@@ -88,6 +88,10 @@ def ibrobot_executors() -> Iterable[ExecutorDescriptor]:
 
 
 def _world(options: WorldOptions, session: Session) -> Component:
+    if options.clouds:
+        from ibrobot_planning.clouds import CloudKeeper
+
+        return CloudKeeper(options, session)
     from ibrobot_planning.world_keeper import WorldKeeper
 
     return WorldKeeper(options, session)
@@ -100,6 +104,9 @@ def _check_world(options: WorldOptions, robot: Robot, joints: tuple[str, ...]) -
             thing.made()
         except ValueError as error:
             yield OptionFault(("objects", name), str(error))
+    for name in options.clouds:
+        if name in options.objects:
+            yield OptionFault(("clouds", name), f"there is an object {name!r} already; clouds need names of their own")
 
 
 @hookimpl
@@ -107,7 +114,7 @@ def ibrobot_sections() -> Iterable[SectionDescriptor]:
     """The section `world`."""
     yield SectionDescriptor(
         type="world", options=WorldOptions, make=_world, check=find_engines, check_options=_check_world,
-        summary="objects that planners avoid: boxes, spheres, cylinders, meshes, planes; services change them",
+        summary="what planners avoid: boxes, spheres, cylinders, meshes, planes, point clouds; services change it",
     )  # fmt: skip
 
 

@@ -84,6 +84,14 @@ class Arm:
         pinocchio.forwardKinematics(self.model, data, self.native(np.asarray(q, dtype=float)))
         return np.asarray(data.oMi[joint].homogeneous @ frame)
 
+    def placed_shapes(self, q: Vector) -> list[tuple[Any, Vector]]:
+        """The shapes of all links with their poses in the base frame, shape (4, 4), at joint positions, shape (J,)."""
+        import pinocchio
+
+        data = self.model.createData()
+        pinocchio.forwardKinematics(self.model, data, self.native(np.asarray(q, dtype=float)))
+        return [(each.geometry, data.oMi[each.joint].homogeneous @ each.placement) for each in self.shapes]
+
     def frame(self, link: str) -> tuple[int, Vector]:
         """The joint that moves a link, and the link's frame in that of the joint.
 

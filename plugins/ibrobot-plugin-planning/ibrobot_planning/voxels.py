@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from typing import Any
+
 import numpy as np
 
-from ibrobot_core.api import Pose, Vector
+from ibrobot_core.api import PointCloud2, Pose, Vector
 from ibrobot_planning.transforms import matrix
 from ibrobot_planning.world import Voxels
+
+_FLOATS = {7: np.float32, 8: np.float64}
+"""Datatype of sensor_msgs/msg/PointField -> type of its values."""
 
 
 def voxels(points: Vector, size: float, *, least_points: int = 1) -> Voxels | None:
@@ -63,3 +69,64 @@ def depth_points(depth: Vector, intrinsics: Vector, camera: Pose, *, furthest: f
     y = (row - intrinsics[1, 2]) / intrinsics[1, 1] * z
     placed = matrix(camera)
     return np.asarray(np.stack([x, y, z], axis=1) @ placed[:3, :3].T + placed[:3, 3])
+
+
+def cloud_points(message: PointCloud2) -> Vector:
+    """The points of a point cloud, in its frame.
+
+    Returns:
+        [m], shape (N, 3).
+
+    Raises:
+        ValueError: for a cloud without x, y and z as floats, or with too few bytes for its size.
+    """
+    fields = {field.name: field for field in message.fields}
+    needed = message.width * message.point_step
+    if message.row_step < needed or message.data.size < message.height * message.row_step:
+        raise ValueError(
+            f"a cloud of {message.height}x{message.width} points of {message.point_step} bytes needs rows of at least"
+            f" {needed} bytes; this one has rows of {message.row_step} and {message.data.size} bytes"
+        )
+    rows = message.data[: message.height * message.row_step].reshape(message.height, message.row_step)
+    points = rows[:, :needed].reshape(-1, message.point_step)
+    columns = []
+    for axis in "xyz":
+        if axis not in fields:
+            raise ValueError(f"the cloud has no field {axis}; it has: {', '.join(fields) or 'none'}")
+        field = fields[axis]
+        if field.datatype not in _FLOATS:
+            raise ValueError(f"field {axis} of the cloud has datatype {field.datatype}, must be FLOAT32 or FLOAT64")
+        kind = np.dtype(_FLOATS[field.datatype]).newbyteorder(">" if message.is_bigendian else "<")
+        if field.offset + kind.itemsize > message.point_step:
+            raise ValueError(f"field {axis} of the cloud ends beyond its points of {message.point_step} bytes")
+        values = np.ascontiguousarray(points[:, field.offset : field.offset + kind.itemsize]).view(kind)
+        columns.append(values[:, 0].astype(float))
+    return np.stack(columns, axis=1)
+
+
+def outside(cells: Voxels, shapes: Iterable[tuple[Any, Vector]], margin: float) -> Voxels | None:
+    """The cells whose centres are further than `margin` and half a cell from all shapes; None where there are none.
+
+    Args:
+        cells: the cells.
+        shapes: shapes of `ibrobot_planning.shapes`, each with its pose in the frame of the cells, shape (4, 4).
+        margin: [m].
+    """
+    import coal
+
+    reach = margin + cells.size / 2
+    ball, nowhere = coal.Sphere(reach), coal.Transform3s()
+    centres = cells.centres
+    kept = np.ones(len(centres), dtype=bool)
+    for shape, placed in shapes:
+        local = (centres - placed[:3, 3]) @ placed[:3, :3]
+        shape.computeLocalAABB()
+        box = shape.aabb_local
+        # The box of a half space is unbounded; only what is near the box is checked against the shape itself.
+        near = kept & (local > box.min_ - reach).all(axis=1) & (local < box.max_ + reach).all(axis=1)
+        for number in np.flatnonzero(near):
+            there = coal.Transform3s(np.eye(3), local[number])
+            kept[number] = not coal.collide(
+                shape, nowhere, ball, there, coal.CollisionRequest(), coal.CollisionResult()
+            )
+    return Voxels(cells.size, cells.cells[kept]) if kept.any() else None

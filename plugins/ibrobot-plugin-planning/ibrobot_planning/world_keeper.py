@@ -153,6 +153,12 @@ class WorldKeeper(Component):
                     world = world.move(name, Pose(Vector3(x, y, z), Quaternion(qx, qy, qz, qw)))
         return world
 
+    def put(self, name: str, thing: WorldObject | None) -> None:
+        """Replace an object, or remove it."""
+        with self._lock:
+            others = {key: value for key, value in self._world.objects.items() if key != name}
+            self._world = World(others if thing is None else {**others, name: thing})
+
     def _changing[T](self, kind: type[T], change: Callable[[World, T], World]) -> Callable[[object], list[str]]:
         def handler(request: object) -> list[str]:
             wanted = requested(kind, request)

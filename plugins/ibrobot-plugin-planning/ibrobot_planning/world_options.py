@@ -75,12 +75,43 @@ class ObjectOptions:
         return WorldObject(shape, Pose(Vector3(*self.position), from_rpy(*self.rpy)), self.link, self.may_touch)
 
 
+def _check_topic(instance: object, attribute: attrs.Attribute[str], value: str) -> None:
+    if not value.startswith("/"):
+        raise ValueError(f"{value!r} is not a topic: a topic begins with /, e.g. /camera/top/image_raw")
+
+
+@documented
+@attrs.frozen
+class CloudOptions:
+    """A point cloud or a depth image that becomes occupied cells of the world."""
+
+    topic: str = option(
+        validator=_check_topic, help="sensor_msgs/msg/PointCloud2, or Image with encoding 16UC1 [mm] or 32FC1 [m]"
+    )
+    info: str = option("", help="topic of the depth camera's CameraInfo; camera_info beside the topic if empty")
+    frame: str = option("", help="frame of the sensor; that of the messages if empty")
+    cell: float = option(0.02, unit="m", ge=0.002, le=0.2, help="edge of a cell")
+    furthest: float = option(1.5, unit="m", gt=0, help="points beyond this distance from the camera are left out")
+    reach: float = option(1.0, unit="m", gt=0, help="points beyond this distance from the base are left out")
+    least_points: int = option(3, ge=1, help="points that make a cell occupied; more drop outliers")
+    margin: float = option(
+        0.02,
+        unit="m",
+        ge=0,
+        help="cells this near to the arm, or to what it carries, are left out",
+    )
+    rate: float = option(2.0, unit="Hz", gt=0, le=30, help="updates per second, at most")
+    keep: float = option(0.0, unit="s", ge=0, help="how long cells stay after they were last seen; 0: until the next")
+    most_cells: int = option(20_000, ge=1, help="occupied cells, at most; those nearest to the base are kept")
+
+
 @documented
 @attrs.frozen
 class WorldOptions:
     """The section `world`: the objects around the robot, for planners."""
 
     objects: Mapping[str, ObjectOptions] = option(factory=dict, help="objects by name")
+    clouds: Mapping[str, CloudOptions] = option(factory=dict, help="point clouds and depth images by name")
     scene: bool = option(False, help="whether a simulation adds the objects of its scene, at their present poses")
 
 

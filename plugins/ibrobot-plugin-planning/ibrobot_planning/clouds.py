@@ -1,0 +1,201 @@
+"""Point clouds and depth images as occupied cells of the world."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any, override
+
+import numpy as np
+
+from ibrobot_core.api import (
+    CONTROL,
+    CameraInfo,
+    ContractError,
+    Image,
+    Message,
+    PointCloud2,
+    Received,
+    Session,
+    SessionWorker,
+    Vector,
+    ns,
+    pixels,
+)
+from ibrobot_planning.arm import Arm, robot_arm
+from ibrobot_planning.frames import Frames
+from ibrobot_planning.shapes import geometry
+from ibrobot_planning.transforms import matrix, pose
+from ibrobot_planning.voxels import cloud_points, depth_points, outside, voxels
+from ibrobot_planning.world import SNAPSHOT, Voxels, World, WorldObject
+from ibrobot_planning.world_keeper import WorldKeeper
+from ibrobot_planning.world_options import CloudOptions, WorldOptions
+
+CLEAR = "/clear_octomap"
+"""Service that removes the cells of all clouds until the next message; MoveIt's name."""
+_PIXELS = 3
+"""Least pixels along the edge of a cell at the furthest distance; images are thinned to about this."""
+
+
+class CloudKeeper(SessionWorker):
+    """Keeps the world of a run, with the cells that clouds occupy as objects of the clouds' names.
+
+    Cells of the arm, of what it carries and of other objects are left out.
+    """
+
+    def __init__(self, options: WorldOptions, session: Session) -> None:
+        self._keeper = WorldKeeper(options, session)
+        topics = ", ".join(cloud.topic for cloud in options.clouds.values())
+        super().__init__(session, "world", f"{self._keeper.summary}, and cells from {topics}", (CONTROL,))
+        self._clouds = {name: _Cloud(name, cloud, session) for name, cloud in options.clouds.items()}
+        self._arm: Arm | None = None
+
+    @override
+    def setup(self) -> None:
+        self._arm = robot_arm(self.session.config.robot)
+        self._keeper.start()
+        self.on_end.callback(self._keeper.stop)
+        self._frames = Frames(self.session.bus)
+        self.on_end.callback(self._frames.close)
+        for cloud in self._clouds.values():
+            cloud.open()
+            self.on_end.callback(cloud.close)
+        self.session.bus.serve(CLEAR, self._clear)
+        self.on_end.callback(self.session.bus.unserve, CLEAR)
+
+    @override
+    def work(self, timeout_s: float) -> None:
+        for name, cloud in self._clouds.items():
+            received = cloud.due(timeout_s / len(self._clouds))
+            if received is None:
+                continue
+            try:
+                cells = cloud.cells(received, self._frames)
+                if cells is not None:
+                    cells = self._unknown(cells, cloud.options.margin)
+                cells = cloud.kept(cells, received.received_ns)
+            except (ValueError, ContractError) as error:
+                cloud.report(str(error))
+                continue
+            self._keeper.put(name, None if cells is None else WorldObject(cells))
+
+    def _unknown(self, cells: Voxels, margin: float) -> Voxels | None:
+        """The cells that neither the arm nor an object occupies."""
+        arm = self._arm
+        assert arm is not None
+        world = self.session.bus.call(SNAPSHOT, None)
+        assert isinstance(world, World)
+        q = self.session.measured().position
+        arm_shapes = arm.placed_shapes(q)
+        others: list[tuple[Any, Vector]] = []
+        for thing in world.objects.values():
+            frame = np.eye(4) if thing.link is None else arm.link_pose(thing.link, q)
+            if not isinstance(thing.shape, Voxels):
+                shapes = others if thing.link is None else arm_shapes
+                shapes.append((geometry(thing.shape), frame @ matrix(thing.pose)))
+        left = outside(cells, arm_shapes, margin)
+        # What stands on an object must stay, however flat.
+        return None if left is None else outside(left, others, cells.size / 2)
+
+    def _clear(self, request: object) -> None:
+        for name, cloud in self._clouds.items():
+            cloud.forget()
+            self._keeper.put(name, None)
+
+
+class _Cloud:
+    """One source of points."""
+
+    def __init__(self, name: str, options: CloudOptions, session: Session) -> None:
+        self.options = options
+        self._name = name
+        self._session = session
+        self._info: CameraInfo | None = None
+        self._due_ns: int | None = None
+        self._seen: deque[tuple[int, Voxels]] = deque()
+        """Time of receipt [ns] and cells of updates, oldest first."""
+        self._reported = ""
+
+    def open(self) -> None:
+        bus, options = self._session.bus, self.options
+        self._messages = bus.subscribe(options.topic, 1)
+        self._infos = bus.subscribe(options.info or f"{options.topic.rpartition('/')[0]}/camera_info", 1)
+
+    def close(self) -> None:
+        self._messages.close()
+        self._infos.close()
+
+    def due(self, timeout_s: float) -> Received | None:
+        """The newest message, if an update is due."""
+        received = self._messages.get(timeout_s)
+        if received is None or (self._due_ns is not None and received.received_ns < self._due_ns):
+            return None
+        self._due_ns = received.received_ns + ns(1.0 / self.options.rate)
+        return received
+
+    def cells(self, received: Received, frames: Frames) -> Voxels | None:
+        """The cells that a message occupies in the base frame.
+
+        Raises:
+            ValueError: for a message that cannot be used, or an unknown frame.
+        """
+        options, message = self.options, received.message
+        points = self._points(message)
+        assert isinstance(message, PointCloud2 | Image)
+        placed = frames.pose(options.frame or message.header.frame_id)
+        points = points[np.isfinite(points).all(axis=1)]
+        points = points[np.linalg.norm(points, axis=1) <= options.furthest]
+        points = points @ placed[:3, :3].T + placed[:3, 3]
+        points = points[np.linalg.norm(points, axis=1) <= options.reach]
+        return voxels(points, options.cell, least_points=options.least_points)
+
+    def _points(self, message: Message) -> Vector:
+        """Points in the frame of the sensor."""
+        options = self.options
+        if isinstance(message, PointCloud2):
+            return cloud_points(message)
+        if not isinstance(message, Image) or message.encoding not in ("16UC1", "32FC1"):
+            kind = f"{message.ros_type} {message.encoding}" if isinstance(message, Image) else message.ros_type
+            raise ValueError(f"needs a PointCloud2, or an Image of 16UC1 or 32FC1; got {kind}")
+        received = self._infos.get()
+        if received is not None:
+            assert isinstance(received.message, CameraInfo)
+            self._info = received.message
+        if self._info is None:
+            raise ValueError(f"a depth image needs the CameraInfo of its camera on {self._infos.topic}")
+        if (self._info.height, self._info.width) != (message.height, message.width):
+            raise ValueError(
+                f"the image has {message.height}x{message.width} pixels, but CameraInfo says"
+                f" {self._info.height}x{self._info.width}"
+            )
+        k = self._info.k.reshape(3, 3).copy()
+        depth = pixels(message)[:, :, 0].astype(float) / (1000.0 if message.encoding == "16UC1" else 1.0)
+        step = max(1, int(options.cell * k[0, 0] / (_PIXELS * options.furthest)))
+        k[:2] /= step
+        return depth_points(depth[::step, ::step], k, pose(np.eye(4)), furthest=options.furthest)
+
+    def kept(self, cells: Voxels | None, now_ns: int) -> Voxels | None:
+        """These cells with those seen before that are still kept, at most as many as allowed."""
+        options = self.options
+        if options.keep == 0:
+            self._seen.clear()
+        while self._seen and now_ns - self._seen[0][0] > ns(options.keep):
+            self._seen.popleft()
+        if cells is not None:
+            self._seen.append((now_ns, cells))
+        if not self._seen:
+            return None
+        found = np.unique(np.concatenate([each.cells for _, each in self._seen]), axis=0)
+        if len(found) > options.most_cells:
+            self.report(f"{len(found)} occupied cells, only the nearest {options.most_cells} are kept (most_cells)")
+            found = found[np.argsort(np.linalg.norm(found, axis=1), kind="stable")[: options.most_cells]]
+        return Voxels(options.cell, found)
+
+    def forget(self) -> None:
+        """Forget what was seen."""
+        self._seen.clear()
+
+    def report(self, message: str) -> None:
+        """Log a warning, unless it is the same as before."""
+        if message != self._reported:
+            self._reported = message
+            self._session.log.warning("world.clouds.%s: %s: %s", self._name, self.options.topic, message)
