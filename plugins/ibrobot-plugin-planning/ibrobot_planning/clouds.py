@@ -174,7 +174,7 @@ class _Cloud:
         return depth_points(depth[::step, ::step], k, pose(np.eye(4)), furthest=options.furthest)
 
     def kept(self, cells: Voxels | None, now_ns: int) -> Voxels | None:
-        """These cells with those seen before that are still kept, at most as many as allowed."""
+        """These cells and earlier ones that are still kept, at most as many as allowed."""
         options = self.options
         if options.keep == 0:
             self._seen.clear()
