@@ -11,6 +11,7 @@ import pytest
 from ibrobot_planning.client import GripperInterface, MoveIt2, rclpy
 from ibrobot_planning.client import robots as ibrobot_robots
 from ibrobot_planning.client.rclpy import Node, ReentrantCallbackGroup
+from ibrobot_testing import host_context
 
 from ibrobot_core.api import (
     LaunchRequest,
@@ -26,11 +27,25 @@ pytestmark = pytest.mark.integration
 robot = ibrobot_robots.so101
 
 
-@pytest.fixture
-def endpoint() -> str:
+def free_endpoint() -> str:
     with socket.socket() as found:
         found.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{found.getsockname()[1]}"
+
+
+@pytest.fixture(scope="module")
+def _zenoh_runs() -> None:
+    """Zenoh's own threads run, with the files that they keep."""
+    zenoh = installed_plugins().find("transport", "zenoh")
+    first = free_endpoint()
+    router = zenoh.make(zenoh.options(mode="router", listen=(first,), shared_memory=False), host_context())
+    zenoh.make(zenoh.options(connect=(first,), shared_memory=False), host_context()).close()
+    router.close()
+
+
+@pytest.fixture
+def endpoint(_zenoh_runs: None) -> str:
+    return free_endpoint()
 
 
 @pytest.fixture
