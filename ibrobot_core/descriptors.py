@@ -184,6 +184,9 @@ class DatasetDescriptor(Descriptor["interfaces.DatasetWriter"]):
 class ViewerDescriptor(Descriptor["interfaces.Viewer"]):
     """A viewer."""
 
+    flag: str = ""
+    """Flag of the command line that shows a run with this viewer, e.g. `--window`; its help is the summary."""
+
 
 @attrs.frozen
 class SectionDescriptor(Descriptor["Component"]):

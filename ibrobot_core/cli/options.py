@@ -3,12 +3,39 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, override
 
 import click
 from click import argument, option
 
+from ibrobot_core.descriptors import ViewerDescriptor
 from ibrobot_core.plugins import installed_plugins
+
+
+def _viewer_flags() -> dict[str, str]:
+    """Type of an installed viewer -> its flag."""
+    found = (installed_plugins().find("viewer", name) for name in installed_plugins().types("viewer"))
+    return {each.type: each.flag for each in found if isinstance(each, ViewerDescriptor) and each.flag}
+
+
+class _ViewerOption(click.Option):
+    """`--viewer TYPE`, and the flags of the installed viewers."""
+
+    def __init__(self, *args: Any, **more: Any) -> None:
+        super().__init__(*args, **more)
+        self.secondary_opts = list(_viewer_flags().values())
+
+    @override
+    def add_to_parser(self, parser: Any, ctx: click.Context) -> None:
+        super().add_to_parser(parser, ctx)
+        for type_, flag in _viewer_flags().items():
+            parser.add_option(obj=self, opts=[flag], dest=self.name, action="store_const", const=type_)
+
+    @override
+    def get_help_record(self, ctx: click.Context) -> tuple[str, str]:
+        flags = ", ".join(f"{flag} ({type_})" for type_, flag in _viewer_flags().items())
+        return "--viewer TYPE", f"{self.help} Short: {flags}." if flags else str(self.help)
+
 
 _OPTIONS: dict[str, Callable[..., Any]] = {
     "config": argument("config", required=False),
@@ -28,7 +55,7 @@ _OPTIONS: dict[str, Callable[..., Any]] = {
     "goals": option(
         "--goal", "goals", multiple=True, metavar="GOAL", help="For planning modes: a pose, or joint=rad,…"
     ),
-    "window": option("--window", is_flag=True, help="Show the simulation in a desktop window."),
+    "viewer": option("--viewer", metavar="TYPE", cls=_ViewerOption, help="Show the robot in this viewer."),
     "headless": option("--headless", is_flag=True, help="Print plain lines, without window, viewer and panel."),
     "dry_run": option(
         "--dry-run", is_flag=True, help="Print the plan, compare the model with the contract, and start nothing."
@@ -44,7 +71,7 @@ def run_options[C: Callable[..., Any]](*names: str) -> Callable[[C], C]:
 
     Args:
         names: any of `config`, `sim`, `lockstep`, `seed`, `mode`, `overrides`, `duration`, `episodes`, `goals`,
-            `window`, `headless`, `dry_run`, `as_json`. All by default.
+            `viewer`, `headless`, `dry_run`, `as_json`. All by default.
 
     Returns:
         A decorator for the function of a click command.
@@ -62,12 +89,13 @@ def run_overrides(options: Mapping[str, Any]) -> tuple[str, ...]:
     """The overrides of a robot YAML given by command-line options.
 
     Args:
-        options: `overrides`, `window` and `headless` of `run_options`.
+        options: `overrides`, `viewer` and `headless` of `run_options`.
 
     Raises:
         click.UsageError: for options that exclude each other.
     """
-    if options["window"] and options["headless"]:
-        raise click.UsageError("--window and --headless exclude each other")
-    window = [f"viewer={{type: {installed_plugins().default('viewer')}}}"] if options["window"] else []
-    return (*options["overrides"], *window)
+    viewer = options["viewer"]
+    if viewer and options["headless"]:
+        flag = _viewer_flags().get(viewer, "--viewer")
+        raise click.UsageError(f"{flag} and --headless exclude each other")
+    return (*([f"viewer.type={viewer}"] if viewer else []), *options["overrides"])

@@ -162,6 +162,7 @@ class Session:
         state: the newest state of the joints and of control; None before the first.
         mode: name of the active control mode.
         generation: counts mode switches and resets; plans of an earlier generation are ignored.
+        plan: the newest plan that control was sent; None before the first.
         acting: the policy that moves the robot; None in a mode without inference.
         sensors: sensor -> its measurements, for sensors that have published messages.
         outcome: the outcome of the run so far.
@@ -195,6 +196,7 @@ class Session:
         self.held = False
         self.start_failed = False
         self.state: ControlState | None = None
+        self.plan: PlanRecord | None = None
         self.acting: ActingPolicy | None = None
         self.sensors: dict[str, SensorFigures] = {}
         self.failure: tuple[str, Exception] | None = None
@@ -281,7 +283,8 @@ class Session:
         mask[columns] = True
         full = np.zeros((len(positions), len(robot.joints)))
         full[:, columns] = positions
-        self.control.write_plan(PlanRecord(self.generation, start_ns, step_ns, mask, full))
+        self.plan = PlanRecord(self.generation, start_ns, step_ns, mask, full)
+        self.control.write_plan(self.plan)
 
     def command(self, do: str, **arguments: Any) -> Mapping[str, Any]:
         """Execute a command that begins a new generation, e.g. a mode switch, and return control's answer."""

@@ -279,7 +279,7 @@ def test_deep_check_wants_weights_only_where_they_are_loaded(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--sim", "--window", "--headless"), "--window and --headless exclude each other"),
+        (("--sim", "--viewer", "any", "--headless"), "--viewer and --headless exclude each other"),
         (("--lockstep",), "--lockstep is for simulation: add --sim"),
         (("--sim", "--episodes", "0"), "'--episodes'"),
         (("--sim", "--duration", "-1"), "'--duration'"),

@@ -150,7 +150,7 @@ class Excerpt(Snippet):
     def load(self) -> Any:
         """Its values, below the keys that the note names."""
         document = parse_yaml(
-            re.sub(r"\$\{\w+(?::([^}]*))?\}", lambda match: match[1] or "value", self.text), str(self)
+            re.sub(r"\$\{\w+(?::([^}]*))?\}", lambda match: match[1] or "value-of-a-variable", self.text), str(self)
         )
         document.raise_problems()
         values = document.root
@@ -202,6 +202,8 @@ def _check_excerpt(values: Any, folder: Path, *, sim: bool) -> None:
     (folder / "logs").mkdir(exist_ok=True)
     for name in ("wave.csv", "logs/wave.csv"):
         (folder / name).write_text(LOG)
+    for name in ("robot.pem", "robot.key"):
+        (folder / name).touch()
     if "transport" in values:
         served = {"control_modes": {"model_inference": {"inference": {"execution_mode": "distributed"}}}}
         values = _merged(values, served)

@@ -59,6 +59,7 @@ NOTES = [
     "pip install ibrobot-plugin-keyboard",
     "mode servo is unavailable: teleop type 'twist' needs a plugin that is not installed: "
     "pip install ibrobot-plugin-servo",
+    "mode web is unavailable: teleop type 'web' needs a plugin that is not installed: pip install ibrobot-plugin-web",
     "mode moveit_planning is unavailable: executor type 'trajectory', executor type 'gripper', planner type 'joint', "
     "a mode with planner need plugins that are not installed: pip install ibrobot-plugin-planning",
 ]
@@ -84,9 +85,9 @@ def test_plan_says_what_is_not_there(only: Only, ibrobot: Run) -> None:
     code, out, err = ibrobot("launch", "so101", "--dry-run")
 
     assert (code, err) == (0, "")
-    assert out.splitlines()[-6:-1] == [f"without {CAMERAS}", *NOTES]
+    assert out.splitlines()[-len(NOTES) - 2 : -1] == [f"without {CAMERAS}", *NOTES]
     plan = json.loads(ibrobot("launch", "so101", "--dry-run", "--json")[1])
-    assert list(plan["unavailable"]) == ["model_inference", "jog", "servo", "moveit_planning"]
+    assert list(plan["unavailable"]) == ["model_inference", "jog", "servo", "web", "moveit_planning"]
 
 
 @pytest.mark.parametrize(

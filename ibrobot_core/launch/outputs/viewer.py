@@ -1,4 +1,4 @@
-"""Viewer: a window or web page that shows the robot; runs in the host."""
+"""Viewer: shows the robot in a window or browser; runs in the host."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class ViewerWorker(SessionWorker):
 
     @override
     def setup(self) -> None:
-        self._viewer: Viewer = self.session.make("viewer", self._component, "viewer")
+        self._viewer: Viewer = self.session.make("viewer", self._component, "viewer", session=self.session)
         self.on_end.callback(self._viewer.close)
         self._viewer.open()
         if where := self._viewer.where():

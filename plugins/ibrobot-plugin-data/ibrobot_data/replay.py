@@ -48,7 +48,7 @@ _MODE = "replay"
 @click.option("--force-contract", is_flag=True, help="Replay even if the observations of CONFIG differ.")
 @click.option("--norm-mode", type=click.Choice(NORM_MODES), help="Unit of joints in a dataset that does not state it.")
 @click.option("--calibration", metavar="NAME", help="Of such a dataset, if its unit needs one.")
-@run_options("overrides", "window", "headless", "dry_run", "as_json")
+@run_options("overrides", "viewer", "headless", "dry_run", "as_json")
 def replay(
     episode: Path, config: str | None, speed: float, force_contract: bool, norm_mode: str | None,
     calibration: str | None, **options: Any,

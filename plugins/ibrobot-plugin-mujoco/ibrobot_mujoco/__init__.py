@@ -113,4 +113,6 @@ def ibrobot_decoders() -> Iterable[DecoderDescriptor]:
 @hookimpl
 def ibrobot_viewers() -> Iterable[ViewerDescriptor]:
     """A window on a desktop."""
-    yield ViewerDescriptor(type="mujoco", make=_viewer, default=True, summary="a desktop window on the simulated scene")
+    yield ViewerDescriptor(
+        type="mujoco", make=_viewer, default=True, flag="--window", summary="a desktop window on the simulated scene"
+    )

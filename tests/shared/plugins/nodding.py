@@ -60,7 +60,7 @@ class Nod(SourceWorker):
 
 
 @click.command()
-@run_options("config", "sim", "lockstep", "mode", "overrides", "window", "headless", "dry_run", "as_json")
+@run_options("config", "sim", "lockstep", "mode", "overrides", "viewer", "headless", "dry_run", "as_json")
 @click.option("--joint", required=True)
 def nod(config: str | None, joint: str, **options: Any) -> None:
     """Nod."""

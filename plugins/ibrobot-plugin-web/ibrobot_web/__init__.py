@@ -1,0 +1,48 @@
+"""The plugin's hooks: viewer and teleop `web`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+from ibrobot_core.api import OptionFault, TeleopDescriptor, ViewerDescriptor, hookimpl
+from ibrobot_web.options import WebOptions, WebTeleopOptions
+
+if TYPE_CHECKING:
+    from ibrobot_core.api import Context, Robot, Teleop, Viewer
+
+
+def _viewer(options: WebOptions, ctx: Context) -> Viewer:
+    from ibrobot_web.viewer import WebViewer
+
+    return WebViewer(options, ctx)
+
+
+def _teleop(options: WebTeleopOptions, ctx: Context) -> Teleop:
+    from ibrobot_web.teleop import WebTeleop
+
+    return WebTeleop(options, ctx)
+
+
+def _check_viewer(options: WebOptions, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
+    for name, path in (("certificate", options.certificate), ("key", options.key)):
+        if path is not None and not path.is_file():
+            yield OptionFault((name,), f"{path}: no such file")
+
+
+@hookimpl
+def ibrobot_viewers() -> Iterable[ViewerDescriptor]:
+    """A page in the browser."""
+    yield ViewerDescriptor(
+        type="web", options=WebOptions, make=_viewer, check_options=_check_viewer, flag="--web",
+        summary="a page in the browser, which shows and drives the robot",
+    )  # fmt: skip
+
+
+@hookimpl
+def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
+    """Jog from the page."""
+    yield TeleopDescriptor(
+        type="web", options=WebTeleopOptions, make=_teleop,
+        summary="joint and tool jog from the page of the viewer web, while a button is held",
+    )  # fmt: skip

@@ -1,0 +1,123 @@
+"""The robot's shapes for the page: bodies, joints, primitives and low-poly meshes, from its MJCF or URDF.
+
+MuJoCo reads the file, in the server's process. The page computes where the bodies are, so that states need only contain
+the positions of joints.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from ibrobot_kinematics.meshes import cluster
+from numpy.typing import NDArray
+
+_GRID_M = 0.0025
+"""Grid on which the vertices of meshes are merged, for robots of up to 1 m; larger ones have a larger one."""
+_SHOWN_GROUPS = 3
+"""MuJoCo's viewers show geoms of the groups 0 to 2; files have collision shapes in group 3."""
+_SHAPES = {
+    int(mujoco.mjtGeom.mjGEOM_PLANE): "plane",
+    int(mujoco.mjtGeom.mjGEOM_SPHERE): "sphere",
+    int(mujoco.mjtGeom.mjGEOM_CAPSULE): "capsule",
+    int(mujoco.mjtGeom.mjGEOM_ELLIPSOID): "ellipsoid",
+    int(mujoco.mjtGeom.mjGEOM_CYLINDER): "cylinder",
+    int(mujoco.mjtGeom.mjGEOM_BOX): "box",
+    int(mujoco.mjtGeom.mjGEOM_MESH): "mesh",
+}
+_JOINTS = {int(mujoco.mjtJoint.mjJNT_HINGE): "hinge", int(mujoco.mjtJoint.mjJNT_SLIDE): "slide"}
+_MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
+
+
+def make_scene(description: Mapping[str, Any]) -> dict[str, Any]:
+    """The shapes of a robot, as JSON.
+
+    Args:
+        description: `mjcf`, `urdf` and `xml` (paths, or the text of a scene), `tip`, and `cameras`.
+
+    Returns:
+        `bodies` (parents first), `meshes` (base64 of float32 vertices and uint32 faces), `tip`, and `problem`: why
+        there are no shapes.
+    """
+    try:
+        model = _compiled(description)
+    except ValueError as error:
+        return {"bodies": [], "meshes": [], "tip": None, "problem": " ".join(str(error).split())}
+    if model is None:
+        problem = "the robot has no model: set robot.description.mjcf or robot.description.urdf"
+        return {"bodies": [], "meshes": [], "tip": None, "problem": problem}
+    known = [i for i in range(model.ngeom) if int(model.geom_type[i]) in _SHAPES]
+    shown = [i for i in known if model.geom_group[i] < _SHOWN_GROUPS] or known
+    meshes = sorted({int(model.geom_dataid[i]) for i in shown if model.geom_type[i] == _MESH})
+    grid = _GRID_M * max(1.0, float(model.stat.extent))
+    return {
+        "bodies": [_body(model, body, [i for i in shown if model.geom_bodyid[i] == body], meshes)
+                   for body in range(model.nbody)],
+        "meshes": [_mesh(model, mesh, grid) for mesh in meshes],
+        "tip": _tip(model, str(description["tip"])),
+        "extent": float(model.stat.extent),
+        "centre": model.stat.center.tolist(),
+        "problem": "",
+    }  # fmt: skip
+
+
+def _compiled(description: Mapping[str, Any]) -> Any:
+    if description.get("xml"):
+        return mujoco.MjModel.from_xml_string(description["xml"])
+    path = description.get("mjcf") or description.get("urdf")
+    return mujoco.MjSpec.from_file(str(Path(path))).compile() if path else None
+
+
+def _body(model: Any, body: int, geoms: list[int], meshes: list[int]) -> dict[str, Any]:
+    first = int(model.body_jntadr[body])
+    joints = []
+    for joint in range(first, first + int(model.body_jntnum[body])):
+        kind = _JOINTS.get(int(model.jnt_type[joint]))
+        if kind is not None:
+            joints.append({
+                "name": model.joint(joint).name, "type": kind, "axis": model.jnt_axis[joint].tolist(),
+                "pos": model.jnt_pos[joint].tolist(), "ref": float(model.qpos0[model.jnt_qposadr[joint]]),
+            })  # fmt: skip
+    return {
+        "name": model.body(body).name, "parent": int(model.body_parentid[body]) if body else -1,
+        "pos": model.body_pos[body].tolist(), "quat": model.body_quat[body].tolist(), "joints": joints,
+        "geoms": [_geom(model, geom, meshes) for geom in geoms],
+    }  # fmt: skip
+
+
+def _geom(model: Any, geom: int, meshes: list[int]) -> dict[str, Any]:
+    kind = int(model.geom_type[geom])
+    material = int(model.geom_matid[geom])
+    rgba = model.mat_rgba[material] if material >= 0 else model.geom_rgba[geom]
+    found: dict[str, Any] = {
+        "type": _SHAPES[kind], "size": model.geom_size[geom].tolist(), "pos": model.geom_pos[geom].tolist(),
+        "quat": model.geom_quat[geom].tolist(), "rgba": [round(float(value), 4) for value in rgba],
+    }  # fmt: skip
+    if kind == _MESH:
+        found["mesh"] = meshes.index(int(model.geom_dataid[geom]))
+    return found
+
+
+def _mesh(model: Any, mesh: int, grid: float) -> dict[str, str]:
+    start, size = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
+    first, count = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
+    corners = model.mesh_vert[start : start + size].astype(np.float64)
+    vertices, faces = cluster(corners[model.mesh_face[first : first + count]], grid)
+    return {"vertices": _packed(vertices.astype("<f4")), "faces": _packed(faces.astype("<u4"))}
+
+
+def _packed(values: NDArray[Any]) -> str:
+    return base64.b64encode(np.ascontiguousarray(values).tobytes()).decode()
+
+
+def _tip(model: Any, name: str) -> dict[str, Any] | None:
+    site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, name)
+    if site >= 0:
+        body, pos, quat = int(model.site_bodyid[site]), model.site_pos[site], model.site_quat[site]
+        return {"body": body, "pos": pos.tolist(), "quat": quat.tolist()}
+    body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
+    return {"body": body, "pos": [0, 0, 0], "quat": [1, 0, 0, 0]} if body >= 0 else None

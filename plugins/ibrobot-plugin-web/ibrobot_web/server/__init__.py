@@ -1,0 +1,1 @@
+"""The server of the page, in a process of its own."""

@@ -1,0 +1,196 @@
+"""The process of the page's server: `python -m ibrobot_web.server.process CHANNEL STREAM`, started by the viewer.
+
+Its order has the options of the viewer; it answers `{"event": "ready", "url": …}`. Later messages:
+
+- to the run: `{"event": "pages", "count": N, "wanted": [CHANNEL, …] | null}`, and commands `{"id": N, "do": …}`;
+- to the server: `{"reply": N, "ok": … | "error": …}`.
+
+States and pictures arrive on STREAM, as `ibrobot_web.link` defines. It ends when the run closes the channel.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import itertools
+import json
+import logging
+import socket
+import ssl
+import sys
+import threading
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from aiohttp import web
+
+from ibrobot_core.api import Channel, IbrobotError, open_parent
+from ibrobot_web.link import FIRST_PICTURE, STATUS, receive_frame
+from ibrobot_web.options import is_loopback
+from ibrobot_web.pictures import as_jpeg
+from ibrobot_web.server.app import make_app
+from ibrobot_web.server.broadcast import Broadcast
+from ibrobot_web.server.drive import Drive
+from ibrobot_web.server.guard import Guard
+
+_STREAM_BYTES = 4 << 20
+"""Frames that wait to be broadcast [bytes]."""
+_CLOSE_S = 1.0
+_log = logging.getLogger("ibrobot.web")
+
+
+class RunLink:
+    """The server's side of the run.
+
+    Args:
+        channel: to the run.
+        order: the order of the run.
+    """
+
+    def __init__(self, channel: Channel, order: Mapping[str, Any]) -> None:
+        self._channel = channel
+        self._order = order
+        self._numbers = itertools.count(1)
+        self._answers: dict[int, Callable[[Mapping[str, Any]], None]] = {}
+        self._scene: asyncio.Future[bytes] | None = None
+        self.ended = asyncio.Event()
+        self.broadcast = Broadcast(self._pages_changed, frozenset({STATUS}))
+        self.drive = Drive(self._execute, lambda: self._send({"do": "release"}))
+
+    async def scene(self) -> bytes:
+        """The robot's shapes, made once, in a thread that does not delay the end."""
+        if self._scene is None:
+            self._scene = asyncio.get_running_loop().create_future()
+            threading.Thread(target=self._make_scene, args=(self._scene,), name="scene", daemon=True).start()
+        return await asyncio.shield(self._scene)
+
+    def _make_scene(self, made: asyncio.Future[bytes]) -> None:
+        from ibrobot_web.scene import make_scene
+
+        content = json.dumps(make_scene(self._order["description"]), separators=(",", ":")).encode()
+        with contextlib.suppress(RuntimeError):  # the server has ended meanwhile
+            made.get_loop().call_soon_threadsafe(made.set_result, content)
+
+    def receive(self) -> None:
+        """Handle the messages of the run."""
+        for message in self._channel.receive():
+            answer = self._answers.pop(message.get("reply", 0), None)
+            if answer is not None:
+                answer({name: message[name] for name in ("ok", "error") if name in message})
+        if self._channel.closed:
+            self.ended.set()
+
+    async def relay(self, connection: socket.socket) -> None:
+        """Broadcast the states and pictures of the run."""
+        reader, writer = await asyncio.open_connection(sock=connection, limit=_STREAM_BYTES)
+        try:
+            while True:
+                channel, payload = await receive_frame(reader)
+                if channel >= FIRST_PICTURE:
+                    payload = await as_jpeg(payload)
+                self.broadcast.publish(channel, payload)
+        except asyncio.IncompleteReadError:
+            self.ended.set()
+        finally:
+            writer.close()
+
+    def _execute(self, message: Mapping[str, Any], answer: Callable[[Mapping[str, Any]], None]) -> None:
+        number = next(self._numbers)
+        if "id" in message and message["id"] is not None:
+            self._answers[number] = answer
+        self._send({**message, "id": number})
+
+    def _pages_changed(self) -> None:
+        wanted = self.broadcast.wanted
+        count = len(self.broadcast.pages)
+        self._send({"event": "pages", "count": count, "wanted": None if wanted is None else sorted(wanted)})
+
+    def _send(self, message: Mapping[str, Any]) -> None:
+        self._channel.send(message)
+
+
+def _tls(order: Mapping[str, Any]) -> ssl.SSLContext | None:
+    if order["certificate"] is None:
+        return None
+    context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    try:
+        context.load_cert_chain(order["certificate"], order["key"])
+    except (OSError, ssl.SSLError) as error:
+        raise IbrobotError(f"viewer: certificate {order['certificate']} and its key cannot be used: {error}") from None
+    return context
+
+
+def _names(order: Mapping[str, Any]) -> tuple[str, ...]:
+    """Host names under which browsers reach this server."""
+    host = order["address"]
+    given = tuple(order["names"])
+    if is_loopback(host):
+        return ("127.0.0.1", "localhost", "[::1]", *given)
+    own = socket.gethostname()
+    names = (own, f"{own}.local", *given)
+    return names if host in ("0.0.0.0", "::") else (f"[{host}]" if ":" in host else host, *names)
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    try:
+        return socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
+    except OSError as error:
+        raise IbrobotError(
+            f"viewer: port {port} of {host} is not available: {error.strerror}; choose another, or any free one: "
+            "--set viewer.port=0"
+        ) from None
+
+
+async def serve(channel: Channel, stream: socket.socket, order: Mapping[str, Any]) -> None:
+    """Serve until the run closes the channel.
+
+    Raises:
+        IbrobotError: if the port or the certificate cannot be used.
+    """
+    loop = asyncio.get_running_loop()
+    link = RunLink(channel, order)
+    tls = _tls(order)
+    guard = Guard(_names(order), secure=tls is not None, password=order["password"])
+    listening = _listen(order["address"], order["port"])
+    port = listening.getsockname()[1]
+    guard.listen_on(port)
+    runner = web.AppRunner(
+        make_app(guard, link.broadcast, link.drive, link.scene), access_log=None, shutdown_timeout=_CLOSE_S
+    )
+    await runner.setup()
+    try:
+        site = web.SockSite(runner, listening, ssl_context=tls)
+        await site.start()
+        loop.add_reader(channel.fileno(), link.receive)
+        relaying = asyncio.create_task(link.relay(stream))
+        scene = asyncio.create_task(link.scene())  # so that the first page does not wait for it
+        base = f"{'https' if tls else 'http'}://{_names(order)[0]}:{port}"
+        links = {"url": base + guard.path("drive"), "watch_url": base + guard.path("watch")}
+        channel.send({"event": "ready", **links})
+        await link.ended.wait()
+        loop.remove_reader(channel.fileno())
+        for task in (relaying, scene):
+            task.cancel()
+        await asyncio.gather(relaying, scene, return_exceptions=True)
+    finally:
+        await runner.cleanup()
+
+
+def main() -> None:
+    """Run the process."""
+    channel = open_parent(int(sys.argv[1]))
+    stream = socket.socket(fileno=int(sys.argv[2]))
+    stream.setblocking(False)
+    order = channel.wait(None)[0]
+    sys.path[:] = [path for path in sys.path if Path(path) != Path()]
+    try:
+        asyncio.run(serve(channel, stream, order))
+    except IbrobotError as error:
+        channel.send({"event": "failed", "error": str(error)})
+        channel.flush()
+
+
+if __name__ == "__main__":
+    main()

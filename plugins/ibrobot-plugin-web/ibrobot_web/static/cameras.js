@@ -1,0 +1,57 @@
+// Camera pictures, each drawn when it arrives. Hidden cameras are not sent.
+
+import { h, refresh } from "./dom.js";
+
+export class Cameras {
+  constructor(section, page) {
+    this.section = section;
+    this.page = page;
+    this.views = new Map();
+    this.frames = {};
+    page.stream.addEventListener("picture", ({ detail }) => this.draw(detail));
+  }
+
+  update({ cameras, sensors }) {
+    refresh(this.section, cameras, () => {
+      this.views.clear();
+      return cameras.length ? cameras.map((camera) => this.add(camera)) : [h("p", { class: "note" }, "No cameras.")];
+    });
+    for (const camera of cameras) {
+      const sensor = sensors[nameOf(camera.topic)];
+      const view = this.views.get(camera.channel);
+      if (view && sensor) view.rate = `${sensor.rate_hz.toFixed(0)} Hz`;
+    }
+  }
+
+  add({ channel, topic }) {
+    const canvas = h("canvas", { width: "4", height: "3", role: "img", "aria-label": `Camera ${nameOf(topic)}` });
+    const caption = h("figcaption", {}, nameOf(topic));
+    this.views.set(channel, { canvas, caption, context: canvas.getContext("2d"), name: nameOf(topic), rate: "" });
+    this.page.stream.show(channel, true);
+    return h("figure", {}, canvas, caption);
+  }
+
+  draw({ channel, bitmap, stamp }) {
+    const view = this.views.get(channel);
+    if (!view) return;
+    if (!bitmap) { view.caption.textContent = `${view.name}: damaged picture`; return; }
+    if (view.canvas.width !== bitmap.width || view.canvas.height !== bitmap.height) {
+      view.canvas.width = bitmap.width;
+      view.canvas.height = bitmap.height;
+    }
+    view.context.drawImage(bitmap, 0, 0);
+    bitmap.close();
+    const age = Date.now() - stamp;
+    const counted = this.frames[view.name] ??= { count: 0, ages: [] };
+    counted.count += 1;
+    counted.ages.push(age);
+    if (counted.ages.length > 500) counted.ages.shift();
+    view.caption.textContent = `${view.name} · ${view.rate}${age < 60000 ? ` · ${Math.max(0, age).toFixed(0)} ms` : ""}`;
+  }
+}
+
+// "/camera/top/image_raw" is the camera top.
+export function nameOf(topic) {
+  const parts = topic.split("/").filter(Boolean);
+  return parts[1] ?? parts[0];
+}

@@ -1,0 +1,118 @@
+// The two connections to the server: states and pictures, newest only; and commands with their replies.
+
+const CHANNELS = { 0: "state", 1: "status", 2: "samples", 3: "plan" };
+const FIRST_PICTURE = 16;
+const HEAD = 1;
+const PICTURE_HEAD = 13;
+const TYPES = ["image/jpeg", "", "image/png"];
+
+function address(path) {
+  return `${location.protocol === "https:" ? "wss" : "ws"}://${location.host}${path}`;
+}
+
+// Emits state, status, samples, plan, picture and connection. Each frame is acknowledged once it is handled, and so the
+// server never sends more than the page can show.
+export class Stream extends EventTarget {
+  constructor() {
+    super();
+    this.wanted = new Set([0, 1, 3]);
+    this.connect();
+  }
+
+  connect() {
+    this.socket = new WebSocket(address("/stream"));
+    this.socket.binaryType = "arraybuffer";
+    this.socket.onopen = () => { this.report(true); this.want(); };
+    this.socket.onclose = () => { this.report(false); setTimeout(() => this.connect(), 1000); };
+    this.socket.onmessage = ({ data }) => this.take(data);
+  }
+
+  show(channel, shown) {
+    if (this.wanted.has(channel) === shown) return;
+    this.wanted[shown ? "add" : "delete"](channel);
+    this.want();
+  }
+
+  want() {
+    if (this.socket.readyState === WebSocket.OPEN) this.socket.send(new Uint8Array([255, ...this.wanted, 255]));
+  }
+
+  async take(data) {
+    const channel = new Uint8Array(data, 0, 1)[0];
+    try {
+      if (channel >= FIRST_PICTURE) await this.picture(channel, data);
+      else this.emit(CHANNELS[channel], JSON.parse(new TextDecoder().decode(new Uint8Array(data, HEAD))));
+    } finally {
+      if (this.socket.readyState === WebSocket.OPEN) this.socket.send(new Uint8Array([channel]));
+    }
+  }
+
+  async picture(channel, data) {
+    const head = new DataView(data, HEAD, PICTURE_HEAD);
+    const type = TYPES[head.getUint8(12)];
+    try {
+      const bitmap = await createImageBitmap(new Blob([new Uint8Array(data, HEAD + PICTURE_HEAD)], { type }));
+      this.emit("picture", { channel, bitmap, stamp: Number(head.getBigInt64(0, true)) / 1e6 });
+    } catch {
+      this.emit("picture", { channel, bitmap: null });
+    }
+  }
+
+  report(open) { this.emit("connection", { open }); }
+  emit(name, detail) { this.dispatchEvent(new CustomEvent(name, { detail })); }
+}
+
+// Emits operator and connection. `call` resolves with the run's answer and rejects with its error.
+export class Drive extends EventTarget {
+  constructor() {
+    super();
+    this.number = 0;
+    this.waiting = new Map();
+    this.facts = { operating: false, operator: "", role: "watch", pages: 0 };
+    this.connect();
+  }
+
+  get open() { return this.socket.readyState === WebSocket.OPEN; }
+
+  connect() {
+    this.socket = new WebSocket(address("/drive"));
+    this.socket.onmessage = ({ data }) => this.take(JSON.parse(data));
+    this.socket.onopen = () => this.emit("connection", { open: true });
+    this.socket.onclose = () => {
+      this.facts = { ...this.facts, operating: false };
+      for (const { reject } of this.waiting.values()) reject(new Error("the connection to the robot was lost"));
+      this.waiting.clear();
+      this.emit("operator", this.facts);
+      this.emit("connection", { open: false });
+      setTimeout(() => this.connect(), 1000);
+    };
+  }
+
+  take(message) {
+    if (message.event === "operator") {
+      this.facts = message;
+      this.emit("operator", message);
+    } else if (this.waiting.has(message.id)) {
+      const { resolve, reject } = this.waiting.get(message.id);
+      this.waiting.delete(message.id);
+      if ("error" in message) reject(new Error(message.error));
+      else resolve(message.ok);
+    } else if ("error" in message) {
+      this.emit("refused", message.error);
+    }
+  }
+
+  call(command, facts = {}) {
+    if (!this.open) return Promise.reject(new Error("there is no connection to the robot"));
+    const id = ++this.number;
+    this.socket.send(JSON.stringify({ id, do: command, ...facts }));
+    return new Promise((resolve, reject) => this.waiting.set(id, { resolve, reject }));
+  }
+
+  // Without a reply, for messages that repeat.
+  tell(command, facts = {}) {
+    if (this.open) this.socket.send(JSON.stringify({ do: command, ...facts }));
+  }
+
+  emit(name, detail) { this.dispatchEvent(new CustomEvent(name, { detail })); }
+}

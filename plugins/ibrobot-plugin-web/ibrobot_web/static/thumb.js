@@ -1,0 +1,32 @@
+// On phones: a bar at the thumb with one motion to choose and two buttons to hold.
+
+import { h, refresh } from "./dom.js";
+
+const TOOL = {
+  "tool forward and back": [0, 1], "tool left and right": [1, 1], "tool up and down": [2, 1],
+};
+
+export class Thumb {
+  constructor(bar, page) {
+    this.bar = bar;
+    this.page = page;
+  }
+
+  update({ robot }) {
+    refresh(this.bar, [robot.joints, robot.tool], () => {
+      const motions = [...(robot.tool ? Object.keys(TOOL) : []), ...robot.joints.map((joint) => joint.name)];
+      const choice = h("select", { "aria-label": "Motion" }, motions.map((name) => h("option", {}, name)));
+      const button = (label, speed) => this.page.deadman.button(h("button", { "aria-label": `${label}, hold to move` },
+        speed < 0 ? "−" : "+"), () => request(choice.value, speed));
+      return [button("less", -1), choice, button("more", 1)];
+    });
+    this.bar.hidden = !this.page.jogs;
+  }
+}
+
+function request(motion, speed) {
+  if (!(motion in TOOL)) return { joints: { [motion]: speed } };
+  const linear = [0, 0, 0];
+  linear[TOOL[motion][0]] = speed;
+  return { linear };
+}

@@ -1,0 +1,177 @@
+"""What a page shows of a run, as JSON: joint states, the status, the plan, and samples of topics."""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+from collections import deque
+from collections.abc import Iterator, Mapping
+from typing import Any, override
+
+import attrs
+import numpy as np
+
+from ibrobot_core.api import NS_PER_S, ControlMode, ControlState, Message, Session, Vector
+
+_LOG_LINES = 100
+_PLAN_ROWS = 24
+"""Setpoints of the plan that a page gets, evenly spaced."""
+_LEAVES = 64
+"""Most numbers of a message in plots."""
+_DIGITS = 5
+_NO_VALUES = ("header", "layout")
+"""Fields of messages that are not plotted."""
+SERVICES = {
+    "goal": "/planning/go_to",
+    "smoothing": "/action_dispatcher/toggle_smoothing",
+    "record": "/record_episode/start",
+    "jog": "/web_teleop/jog",
+}
+"""What a page offers only while its service is served."""
+EPISODE_STATUS = "/record_episode/status"
+
+
+class LogLines(logging.Handler):
+    """Keeps the last lines of the log, for pages that open later. Thread-safe."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.INFO)
+        self._lines: deque[dict[str, Any]] = deque(maxlen=_LOG_LINES)
+        self._number = 0
+        self._adding = threading.Lock()
+
+    @override
+    def emit(self, record: logging.LogRecord) -> None:
+        with self._adding:
+            self._number += 1
+            line = {"n": self._number, "level": record.levelname.lower(), "time": round(record.created, 3)}
+            self._lines.append({**line, "text": record.getMessage()})
+
+    def lines(self) -> list[dict[str, Any]]:
+        """The last lines, oldest first."""
+        with self._adding:
+            return list(self._lines)
+
+
+def state_json(state: ControlState) -> dict[str, Any]:
+    """A joint state."""
+    return {
+        "stamp": state.stamp_ns, "tick": state.tick, "late_us": round(state.late_ns / 1e3, 1), "estop": state.estop,
+        "stale": state.stale, "position": _numbers(state.position), "command": _numbers(state.command),
+    }  # fmt: skip
+
+
+def robot_json(session: Session) -> dict[str, Any]:
+    """What does not change during a run."""
+    config, robot = session.config, session.config.robot
+    return {
+        "name": robot.name, "simulated": config.simulated, "lockstep": session.request.lockstep,
+        "source": config.source.name, "rate_hz": config.control.rate_hz,
+        "joints": [{"name": joint.name, "lower": joint.lower, "upper": joint.upper} for joint in robot.joints],
+        "groups": {name: list(joints) for name, joints in robot.groups.items()},
+        "poses": {name: list(pose) for name, pose in robot.description.poses.items()},
+        "tool": robot.description.mjcf is not None,
+        "modes": [
+            {"name": name, "about": _about(session, mode), "planner": bool(mode.planner),
+             "policy": mode.inference is not None, "web": "web" in _devices(session, mode).values()}
+            for name, mode in config.control_modes.items()
+        ],
+    }  # fmt: skip
+
+
+def _devices(session: Session, mode: ControlMode) -> dict[str, str]:
+    """The teleoperation devices of a mode: name -> type."""
+    return {name: session.config.teleoperation[name].type for name in mode.devices.values()}
+
+
+def _about(session: Session, mode: ControlMode) -> str:
+    if mode.inference is not None:
+        return f"policy {mode.inference.model}"
+    if devices := _devices(session, mode):
+        return "teleoperation by " + " and ".join(f"{name} ({kind})" for name, kind in devices.items())
+    return f"planner {mode.planner.type}" if mode.planner is not None else "no source of commands"
+
+
+def status_json(session: Session, log: LogLines, pages: int) -> dict[str, Any]:
+    """Everything about a run that changes, except joint states."""
+    counts = session.counts()
+    conditions = session.control.report["counters"].get("conditions", ())
+    held = session.held and not session.faults
+    return {
+        "robot": robot_json(session),
+        "mode": session.mode, "unavailable": dict(session.config.unavailable),
+        "held": session.to_go_on() if held else "",
+        "faults": [{"text": fault, "remedy": "Remove the cause, then reset."} for fault in session.faults],
+        "all_faults": len(session.outcome.faults), "failure": session.failure_text,
+        "conditions": [{name: str(value) for name, value in each.items()} for each in conditions],
+        "absent": [{"name": each.label, "why": str(each.missing)} for each in session.absent],
+        "services": [name for name, service in SERVICES.items() if session.bus.serves(service)],
+        "help": session.command_source.help(), "autonomous": session.command_source.autonomous,
+        "sensors": {
+            name: {"rate_hz": round(each.rate_hz, 1),
+                   "age_ms": None if each.age_s is None else round(each.age_s * 1e3, 1)}
+            for name, each in session.sensors.items()
+        },
+        "counts": {group: {key: _plain(value) for key, value in values.items()} for group, values in counts.items()},
+        "episode": _plain(session.bus.call(EPISODE_STATUS, None)) if session.bus.serves(EPISODE_STATUS) else None,
+        "episodes": session.outcome.episodes, "successes": session.outcome.successes,
+        "pages": pages, "log": log.lines(),
+    }  # fmt: skip
+
+
+def plan_json(session: Session, now_ns: int) -> dict[str, Any]:
+    """The part of the plan still to come; without rows if there is none."""
+    plan = session.plan
+    if plan is None or plan.generation != session.generation or len(plan.positions) < 2:
+        return {"joints": [], "rows": []}
+    begin = max(0, math.ceil((now_ns - plan.start_ns) / plan.step_ns))
+    rows = plan.positions[begin:]
+    chosen = np.unique(np.linspace(0, max(0, len(rows) - 1), min(len(rows), _PLAN_ROWS)).astype(int))
+    return {
+        "joints": np.flatnonzero(plan.mask).tolist(),
+        "rows": [_numbers(row[plan.mask]) for row in rows[chosen]],
+        "ends_s": round(max(0.0, (plan.start_ns + len(plan.positions) * plan.step_ns - now_ns) / NS_PER_S), 3),
+    }
+
+
+def numbers_of(message: Message) -> dict[str, float]:
+    """The numbers of a message for plots: path -> value; at most `_LEAVES`."""
+    found: dict[str, float] = {}
+    for path, value in _leaves(message, ""):
+        if len(found) >= _LEAVES:
+            break
+        found[path] = value
+    return found
+
+
+def _leaves(value: Any, path: str) -> Iterator[tuple[str, float]]:
+    if isinstance(value, bool | int | float | np.number):
+        if math.isfinite(value):
+            yield path, round(float(value), _DIGITS)
+    elif isinstance(value, np.ndarray):
+        if value.dtype.kind in "fiu" and value.size <= _LEAVES:
+            for i, each in enumerate(value.ravel().tolist()):
+                yield from _leaves(each, f"{path}[{i}]")
+    elif attrs.has(type(value)):
+        for field in attrs.fields(type(value)):
+            if field.name not in _NO_VALUES:
+                yield from _leaves(getattr(value, field.name), f"{path}.{field.name}" if path else field.name)
+
+
+def _numbers(vector: Vector) -> list[float | None]:
+    """Rounded numbers; None for those that are not finite, which JSON lacks."""
+    return [round(value, _DIGITS) if math.isfinite(value) else None for value in vector.tolist()]
+
+
+def _plain(value: Any) -> Any:
+    """A value in JSON."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(each) for each in value]
+    if isinstance(value, bool | int | str) or value is None:
+        return value
+    if isinstance(value, float | np.floating):
+        return round(float(value), 4) if math.isfinite(value) else None
+    return str(value)

@@ -1,0 +1,274 @@
+"""Viewer `web`: starts the page's server, sends it states and pictures, and carries out the commands of pages."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import socket
+import sys
+import threading
+import time
+import webbrowser
+from collections.abc import Mapping
+from typing import Any, override
+
+from ibrobot_core.api import (
+    Child,
+    ComponentFailed,
+    CompressedImage,
+    Context,
+    ContractError,
+    IbrobotError,
+    Image,
+    JointState,
+    Session,
+    Subscription,
+    Viewer,
+)
+from ibrobot_web.commands import Commands
+from ibrobot_web.link import FIRST_PICTURE, PLAN, SAMPLES, STATE, STATUS, FrameSender
+from ibrobot_web.options import WebOptions
+from ibrobot_web.pictures import to_payload
+from ibrobot_web.status import LogLines, numbers_of, plan_json, state_json, status_json
+
+_MODULE = "ibrobot_web.server.process"
+_START_S = 30.0
+_END_S = 3.0
+_POLL_S = 0.1
+_STATUS_S, _SAMPLES_S, _TOPICS_S = 0.25, 0.1, 1.0
+"""Periods of the status, of samples of topics, and of looking for new topics with pictures."""
+_PICTURES = (Image.ros_type, CompressedImage.ros_type)
+_CAMERAS = 32
+"""Most topics with pictures."""
+_SAMPLED = 40
+"""Most topics in plots."""
+_PRIVATE_TOPICS = frozenset({"/robot_description", "/robot_description_semantic"})
+
+
+class WebViewer(Viewer):
+    """The run's side of the page. Without pages it sends nothing.
+
+    Attributes:
+        url: address of the page with its token, once open.
+        watch_url: address of the page for watching only.
+    """
+
+    def __init__(self, options: WebOptions, ctx: Context) -> None:
+        self._options = options
+        self._ctx = ctx
+        self.url = self.watch_url = ""
+        self.pages = 0
+        self.newest: dict[str, Any] | None = None
+        """The newest joint state that pages were sent."""
+        self._wanted: frozenset[int] | None = frozenset()
+        self._child: Child | None = None
+        self._finish = threading.Event()
+        self._dead: str = ""
+
+    @override
+    def open(self) -> None:
+        if self._child is not None:
+            return
+        session, bus = self._ctx.session, self._ctx.bus
+        if session is None or bus is None:
+            raise IbrobotError("viewer type web shows a run: use it in `viewer:` or with --web")
+        self._session: Session = session
+        self._finish.clear()
+        self._dead = ""
+        own, far = socket.socketpair()
+        with far:
+            self._child = Child(_MODULE, self._order(session), far.fileno())
+        self._frames = FrameSender(own)
+        try:
+            ready = self._await_ready(self._child)
+        except BaseException:
+            self.close()
+            raise
+        self.url, self.watch_url = str(ready["url"]), str(ready["watch_url"])
+        self._log = LogLines()
+        self._ctx.log.parent.addHandler(self._log) if self._ctx.log.parent else None
+        self._states = bus.subscribe("/joint_states", 1)
+        self._pictures: dict[str, Subscription] = {}
+        self._samples: dict[str, Subscription] = {}
+        self._due: dict[int, float] = {}
+        self._next_s = 0.0
+        self._commands = Commands(session, self._child.channel.send)
+        self._thread = threading.Thread(target=self._receive, args=(self._child,), name="web commands", daemon=True)
+        self._thread.start()
+        if self._options.browser and _has_desktop():
+            threading.Thread(target=webbrowser.open, args=(self.url,), name="browser", daemon=True).start()
+
+    @override
+    def update(self) -> bool:
+        if self._child is None or self._finish.is_set():
+            return False
+        if self._dead:
+            raise ComponentFailed(f"the page's server died: {self._dead}")
+        now_s = time.monotonic()
+        if now_s < self._next_s:
+            self._frames.flush()
+            return True
+        self._next_s = now_s + 0.8 / self._options.rate_hz
+        self._send_state()
+        if self.pages:
+            self._send_pictures(now_s)
+            self._send_slower(now_s)
+        self._frames.flush()
+        return True
+
+    def finish(self) -> None:
+        """End the run, at the next `update`."""
+        self._finish.set()
+
+    @override
+    def close(self) -> None:
+        child, self._child = self._child, None
+        if child is None:
+            return
+        if self.url:
+            if self._ctx.log.parent is not None:
+                self._ctx.log.parent.removeHandler(self._log)
+            for subscription in (self._states, *self._pictures.values(), *self._samples.values()):
+                subscription.close()
+            self._commands.close(_END_S)
+        self._frames.close()
+        child.channel.close()
+        child.end(_END_S)
+        if self.url:
+            self._thread.join()
+        self.url = self.watch_url = ""
+        self.pages = 0
+
+    @override
+    def where(self) -> str:
+        return f"{self.url}  (to watch only: {self.watch_url})" if self.url else ""
+
+    def _order(self, session: Session) -> dict[str, Any]:
+        """The order of the server's process."""
+        options, robot = self._options, session.config.robot
+        paths = {"mjcf": robot.description.mjcf, "urdf": robot.description.urdf}
+        return {
+            "address": options.host, "port": options.port, "names": options.names, "password": options.password,
+            "certificate": str(options.certificate) if options.certificate is not None else None,
+            "key": str(options.key) if options.key is not None else None,
+            "description": {
+                "tip": robot.description.tip,
+                **{name: str(path) if path is not None else None for name, path in paths.items()},
+            },
+        }  # fmt: skip
+
+    @staticmethod
+    def _await_ready(child: Child) -> Mapping[str, Any]:
+        deadline_s = time.monotonic() + _START_S
+        while time.monotonic() < deadline_s:
+            try:
+                message = child.wait(_POLL_S)
+            except ComponentFailed:
+                raise IbrobotError(child.cause(_END_S)) from None
+            if child.failed is not None:
+                raise IbrobotError(str(child.failed["error"]))
+            if message is not None and message["event"] == "ready":
+                return message
+        raise ComponentFailed(f"the page's server was not ready after {_START_S:g} s")
+
+    def _receive(self, child: Child) -> None:
+        """Pass on commands until the server or the viewer ends."""
+        while not child.channel.closed:
+            try:
+                if not select.select([child.channel.fileno()], [], [], _POLL_S)[0]:
+                    continue
+                messages = child.receive()
+            except (OSError, ValueError):  # closed meanwhile
+                return
+            for message in messages:
+                if message.get("event") == "pages":
+                    self._set_pages(message)
+                elif message.get("do") == "finish":
+                    self.finish()
+                    child.channel.send({"reply": message["id"], "ok": None})
+                else:
+                    self._commands.take(message)
+        if self._child is child:
+            self._commands.take({"do": "release"})
+            self._dead = child.cause(_END_S)
+
+    def _set_pages(self, message: Mapping[str, Any]) -> None:
+        wanted = message["wanted"]
+        self._wanted = None if wanted is None else frozenset(wanted)
+        self.pages = int(message["count"])
+        self._due = {}
+
+    def _shows(self, channel: int) -> bool:
+        return self.pages > 0 and (self._wanted is None or channel in self._wanted)
+
+    def _send(self, channel: int, value: Mapping[str, Any]) -> None:
+        self._frames.send(channel, json.dumps(value, separators=(",", ":"), allow_nan=False).encode())
+
+    def _is_due(self, channel: int, period_s: float, now_s: float) -> bool:
+        if not self._shows(channel) or now_s < self._due.get(channel, 0.0):
+            return False
+        self._due[channel] = now_s + period_s
+        return True
+
+    def _send_state(self) -> None:
+        arrived = self._states.drain()
+        if not arrived or self._session.state is None:
+            return
+        newest = arrived[-1].message
+        assert isinstance(newest, JointState)
+        self.newest = state_json(self._session.state)
+        if self._shows(STATE):
+            self._send(STATE, self.newest)
+
+    def _send_pictures(self, now_s: float) -> None:
+        if now_s >= self._due.get(-1, 0.0):
+            self._due[-1] = now_s + _TOPICS_S
+            bus = self._session.bus
+            for topic, (kind, _) in bus.topics().items():
+                if kind in _PICTURES and topic not in self._pictures and len(self._pictures) < _CAMERAS:
+                    self._pictures[topic] = bus.subscribe(topic, 1)
+        for i, subscription in enumerate(self._pictures.values()):
+            arrived = subscription.drain()
+            if not arrived or not self._shows(FIRST_PICTURE + i):
+                continue
+            try:
+                payload = to_payload(arrived[-1].message)
+            except ContractError as error:
+                self._ctx.log.debug("%s: %s", subscription.topic, error)
+                continue
+            if payload is not None:
+                self._frames.send(FIRST_PICTURE + i, payload)
+
+    def _send_slower(self, now_s: float) -> None:
+        session = self._session
+        if self._is_due(STATUS, _STATUS_S, now_s):
+            cameras = [{"channel": FIRST_PICTURE + i, "topic": topic} for i, topic in enumerate(self._pictures)]
+            self._send(STATUS, {**status_json(session, self._log, self.pages), "cameras": cameras})
+        if self._is_due(PLAN, _STATUS_S, now_s):
+            self._send(PLAN, plan_json(session, session.clock.now_ns()))
+        if self._wanted is not None and self._is_due(SAMPLES, _SAMPLES_S, now_s):
+            self._send(SAMPLES, {"stamp": session.clock.now_ns(), "topics": self._sampled()})
+
+    def _sampled(self) -> dict[str, dict[str, float]]:
+        """The newest numbers of every topic that has any."""
+        bus = self._session.bus
+        for topic, (kind, _) in bus.topics().items():
+            if kind not in _PICTURES and topic not in _PRIVATE_TOPICS | set(self._samples):
+                if len(self._samples) >= _SAMPLED:
+                    break
+                self._samples[topic] = bus.subscribe(topic, 1)
+        found = {}
+        for topic, subscription in self._samples.items():
+            arrived = subscription.drain()
+            numbers = numbers_of(arrived[-1].message) if arrived else {}
+            if numbers:
+                found[topic] = numbers
+        return found
+
+
+def _has_desktop() -> bool:
+    """Whether a browser can be opened on this machine for the person who launched the run."""
+    if "SSH_CONNECTION" in os.environ or "CI" in os.environ:
+        return False
+    return sys.platform == "darwin" or bool({"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ))

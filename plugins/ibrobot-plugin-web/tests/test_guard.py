@@ -1,0 +1,308 @@
+"""Attacks on the guard and on the commands of pages, with the application in this process."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+from collections.abc import Awaitable, Callable, Mapping
+from typing import Any
+
+import aiohttp
+import pytest
+from aiohttp import web
+from ibrobot_web.server.app import make_app
+from ibrobot_web.server.broadcast import Broadcast
+from ibrobot_web.server.drive import LARGEST_MESSAGE, Drive
+from ibrobot_web.server.guard import Guard
+
+Reply = Callable[[Mapping[str, Any]], None]
+
+
+class Server:
+    """A server whose run answers every command with the command."""
+
+    def __init__(self, password: str | None = None) -> None:
+        self.guard = Guard(("127.0.0.1", "localhost"), secure=False, password=password)
+        self.executed: list[Mapping[str, Any]] = []
+        self.released = 0
+        self.broadcast = Broadcast(lambda: None, frozenset({1}))
+        self.drive = Drive(self._execute, self._release)
+        self.base = ""
+
+    def _execute(self, message: Mapping[str, Any], answer: Reply) -> None:
+        self.executed.append(message)
+        answer({"ok": message["do"]})
+
+    def _release(self) -> None:
+        self.released += 1
+
+    async def __aenter__(self) -> Server:
+        async def scene() -> bytes:
+            return b"{}"
+
+        self._runner = web.AppRunner(make_app(self.guard, self.broadcast, self.drive, scene), shutdown_timeout=0.1)
+        await self._runner.setup()
+        site = web.TCPSite(self._runner, "127.0.0.1", 0)
+        await site.start()
+        port = self._runner.addresses[0][1]
+        self.guard.listen_on(port)
+        self.base = f"http://127.0.0.1:{port}"
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self._runner.cleanup()
+
+    def browser(self) -> aiohttp.ClientSession:
+        return aiohttp.ClientSession(self.base, cookie_jar=aiohttp.CookieJar(unsafe=True))
+
+    async def signed_in(self, browser: aiohttp.ClientSession, role: Any = "drive") -> None:
+        async with browser.get(self.guard.path(role)) as answer:
+            assert answer.status == 200
+            assert "token" not in str(answer.url)
+
+
+def run(test: Callable[[Server], Awaitable[None]], **options: Any) -> None:
+    async def inside() -> None:
+        async with Server(**options) as server:
+            await test(server)
+
+    asyncio.run(asyncio.wait_for(inside(), 30))
+
+
+async def call(socket: aiohttp.ClientWebSocketResponse, **message: Any) -> dict[str, Any]:
+    """Send a command and wait for its answer."""
+    await socket.send_json({"id": 1, **message})
+    while True:
+        answer: dict[str, Any] = await socket.receive_json(timeout=5)
+        if answer.get("id") == 1:
+            return answer
+
+
+MALFORMED = 10_000
+PATHS = ("/", "/api/session", "/api/scene", "/stream", "/drive", "/static/app.js", "/login", "/nothing")
+
+
+def test_nothing_is_served_without_a_session() -> None:
+    async def test(server: Server) -> None:
+        async with server.browser() as browser:
+            for path in PATHS:
+                async with browser.get(path) as answer:
+                    assert answer.status == 401, path
+            for wrong in ("", "x" * 32, server.guard.path("drive")[8:-1], "ä", "%00"):
+                async with browser.get("/", params={"token": wrong}) as answer:
+                    assert answer.status == 401
+                    assert "Set-Cookie" not in answer.headers
+
+    run(test)
+
+
+def test_a_token_gives_a_session_that_scripts_and_other_sites_cannot_use() -> None:
+    async def test(server: Server) -> None:
+        async with (
+            server.browser() as browser,
+            browser.get(server.guard.path("drive"), allow_redirects=False) as answer,
+        ):
+            assert (answer.status, answer.headers["Location"]) == (303, "/")
+            cookie = answer.headers["Set-Cookie"]
+            assert all(each in cookie for each in ("HttpOnly", "SameSite=Strict", server.base.rsplit(":")[-1]))
+            async with browser.get("/") as page:
+                policy = page.headers["Content-Security-Policy"]
+                assert "default-src 'none'" in policy
+                assert "unsafe" not in policy
+                assert "frame-ancestors 'none'" in policy
+
+    run(test)
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"Host": "evil.example"},
+        {"Host": "127.0.0.1"},
+        {"Host": "127.0.0.1.evil.example:80"},
+        {"Origin": "http://evil.example"},
+        {"Origin": "null"},
+        {"Origin": "http://127.0.0.1:1"},
+        {"Sec-Fetch-Site": "cross-site"},
+        {"Sec-Fetch-Site": "same-site"},
+    ],
+    ids=lambda headers: " ".join(f"{name}={value}" for name, value in headers.items()),
+)
+def test_requests_of_other_sites_are_refused(headers: dict[str, str]) -> None:
+    async def test(server: Server) -> None:
+        async with server.browser() as browser:
+            await server.signed_in(browser)
+            for path in ("/", "/api/session", "/drive", "/stream", server.guard.path("drive")):
+                async with browser.get(path, headers=headers) as answer:
+                    assert answer.status == 403
+            with pytest.raises(aiohttp.WSServerHandshakeError):
+                await browser.ws_connect("/drive", headers=headers)
+        assert not server.executed
+
+    run(test)
+
+
+def test_no_path_leads_out_of_the_page_s_files() -> None:
+    async def test(server: Server) -> None:
+        async with server.browser() as browser:
+            await server.signed_in(browser)
+            for path in (
+                "../app.py",
+                "..%2f..%2foptions.py",
+                "%2e%2e/options.py",
+                "/etc/passwd",
+                "....//app.py",
+                "%00",
+            ):
+                async with browser.get(f"/static/{path}") as answer:
+                    assert answer.status == 404
+
+    run(test)
+
+
+def test_a_large_upload_is_refused_without_reading_it() -> None:
+    async def test(server: Server) -> None:
+        sent = 0
+
+        async def body() -> Any:
+            nonlocal sent
+            for _ in range(100):
+                yield bytes(1 << 20)
+                sent += 1
+
+        async with server.browser() as browser:
+            await server.signed_in(browser)
+            for path in ("/", "/login", "/static/app.js"):
+                try:
+                    async with browser.post(path, data=body()) as answer:
+                        assert answer.status in (404, 405, 413)
+                except aiohttp.ClientConnectionError:
+                    pass
+            socket = await browser.ws_connect("/drive", max_msg_size=0)
+            with contextlib.suppress(aiohttp.ClientError, ConnectionError):
+                await socket.send_bytes(bytes(100 << 20))
+            with contextlib.suppress(aiohttp.ClientError, ConnectionError):
+                while (await socket.receive(timeout=5)).type is aiohttp.WSMsgType.TEXT:
+                    pass
+            assert socket.closed
+            await socket.close()
+        assert sent < 100
+        assert not server.executed
+
+    run(test)
+
+
+def test_malformed_messages_are_refused_and_harm_nobody() -> None:
+    wrong = [
+        "", "null", "[]", "{}", '{"do": 1}', '{"do": "jog", "id": "x"}', '{"do": NaN}', "[" * 20000, "\x00", '{"do":',
+        json.dumps({"do": "x" * (LARGEST_MESSAGE + 1)}),
+    ]  # fmt: skip
+
+    async def test(server: Server) -> None:
+        async with server.browser() as browser, server.browser() as other:
+            await server.signed_in(browser)
+            await server.signed_in(other)
+            operator = await other.ws_connect("/drive")
+            await operator.receive_json(timeout=5)
+            sent = 0
+            while sent < MALFORMED:
+                text = wrong[sent // 20 % len(wrong)]
+                socket = await browser.ws_connect("/drive")
+                for _ in range(20):
+                    await socket.send_str(text)
+                    sent += 1
+                    if len(text) > LARGEST_MESSAGE:
+                        break
+                with contextlib.suppress(ConnectionError):
+                    while (await socket.receive(timeout=5)).type is aiohttp.WSMsgType.TEXT:
+                        pass
+                await socket.close()
+                if sent % 1000 < 20:  # it also answers the server's pings
+                    assert (await call(operator, do="mode"))["ok"] == "mode"
+        assert {each["do"] for each in server.executed} == {"mode"}
+        assert server.drive.refused > 50
+
+    run(test)
+
+
+def test_only_the_operator_commands_and_taking_over_is_explicit() -> None:
+    async def test(server: Server) -> None:
+        async with server.browser() as first, server.browser() as second, server.browser() as watcher:
+            for browser in (first, second):
+                await server.signed_in(browser)
+            await server.signed_in(watcher, "watch")
+            one, two = await first.ws_connect("/drive"), await second.ws_connect("/drive")
+            three = await watcher.ws_connect("/drive")
+            assert (await call(one, do="mode", mode="a"))["ok"] == "mode"
+            assert "take over first" in (await call(two, do="mode", mode="b"))["error"]
+            assert (await call(two, do="estop"))["ok"] == "estop"
+            assert "take over explicitly" in (await call(two, do="operate"))["error"]
+            for command in ("estop", "jog", "operate", "mode"):
+                assert "watching only" in (await call(three, do=command, take_over=True))["error"]
+            released = server.released
+            assert "ok" in await call(two, do="operate", take_over=True)
+            assert server.released == released + 1
+            assert "take over first" in (await call(one, do="jog"))["error"]
+            assert (await call(two, do="jog"))["ok"] == "jog"
+            released = server.released
+            await two.close()
+            await asyncio.sleep(0.05)
+            assert server.released == released + 1
+            assert server.drive.operator is None
+            assert "ok" in await call(one, do="operate")
+
+    run(test)
+
+
+def test_presses_of_pages_with_other_clocks_count_up() -> None:
+    async def test(server: Server) -> None:
+        async with server.browser() as first, server.browser() as second:
+            for browser in (first, second):
+                await server.signed_in(browser)
+            one, two = await first.ws_connect("/drive"), await second.ws_connect("/drive")
+            for press in (9000, 9000, 9001):
+                await call(one, do="jog", press=press)
+            await call(two, do="operate", take_over=True)
+            await call(two, do="jog", press=5)
+        assert [each["press"] for each in server.executed] == [1, 1, 2, 3]
+
+    run(test)
+
+
+def test_a_password_takes_the_place_of_the_token_and_cannot_be_tried_quickly() -> None:
+    async def test(server: Server) -> None:
+        async with server.browser() as browser:
+            async with browser.get("/") as answer:
+                assert "Password" in await answer.text()
+            statuses = []
+            for password in ("wrong", "correct horse battery"):
+                async with browser.post("/login", data={"password": password}, allow_redirects=False) as answer:
+                    statuses.append(answer.status)
+            assert statuses == [401, 429]
+            await asyncio.sleep(1.1)
+            async with browser.post("/login", data={"password": "correct horse battery"}) as answer:
+                assert answer.status == 200
+            async with browser.get("/api/session") as answer:
+                assert (await answer.json())["role"] == "drive"
+
+    run(test, password="correct horse battery")
+
+
+def test_slow_pages_skip_frames_and_delay_nobody() -> None:
+    async def test(server: Server) -> None:
+        async with server.browser() as browser:
+            await server.signed_in(browser)
+            fast, slow = await browser.ws_connect("/stream"), await browser.ws_connect("/stream")
+            got = []
+            for i in range(200):
+                server.broadcast.publish(0, i.to_bytes(2, "big"))
+                got.append(int.from_bytes((await fast.receive_bytes(timeout=5))[1:], "big"))
+                await fast.send_bytes(b"\x00")
+            assert got == list(range(200))
+            late = [int.from_bytes((await slow.receive_bytes(timeout=5))[1:], "big") for _ in range(2)]
+            assert late == [0, 1], "without acknowledgements only the credits arrive"
+            await slow.send_bytes(b"\x00")
+            assert int.from_bytes((await slow.receive_bytes(timeout=5))[1:], "big") == 199
+
+    run(test)

@@ -1,0 +1,115 @@
+"""Payloads between the run and pages: pictures, frames, and JSON of anything that messages contain."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+
+import numpy as np
+import pytest
+import simplejpeg
+from hypothesis import given
+from hypothesis import strategies as st
+from ibrobot_ros2.jpeg import to_jpeg
+from ibrobot_testing import make_session
+from ibrobot_web.link import JPEG, PICTURE_HEAD, FrameSender, receive_frame
+from ibrobot_web.pictures import as_jpeg, to_payload
+from ibrobot_web.status import LogLines, numbers_of, plan_json, status_json
+
+from ibrobot_core.api import Float64MultiArray, Header, Image, Imu, JointState, String, Vector3
+
+
+def gradient(encoding: str) -> Image:
+    """A picture that is red on the left and blue on the right, or bright on the left."""
+    ramp = np.linspace(1.0, 0.0, 32)[None, :].repeat(16, axis=0)
+    rgb = np.stack([ramp, 0 * ramp, 1 - ramp], axis=2)
+    data: np.ndarray = {
+        "rgb8": (255 * rgb).astype(np.uint8),
+        "bgr8": (255 * rgb[..., ::-1]).astype(np.uint8),
+        "mono8": (255 * ramp).astype(np.uint8),
+        "mono16": (65535 * ramp).astype(np.uint16),
+        "16UC1": (4000 * (1.01 - ramp)).astype(np.uint16),
+        "32FC1": (4 * (1.01 - ramp)).astype(np.float32),
+    }[encoding]
+    raw = np.ascontiguousarray(data).view(np.uint8).reshape(-1)
+    return Image(Header(123), 16, 32, encoding, raw.size // 16, raw)
+
+
+@pytest.mark.parametrize("encoding", ["rgb8", "bgr8", "mono8", "mono16", "16UC1", "32FC1"])
+def test_pixels_reach_pages_as_jpeg(encoding: str) -> None:
+    payload = to_payload(gradient(encoding))
+    assert payload is not None
+    sent = asyncio.run(as_jpeg(payload))
+    stamp_ns, _, _, kind = PICTURE_HEAD.unpack_from(sent)
+    assert (stamp_ns, kind) == (123, JPEG)
+    shown = simplejpeg.decode_jpeg(sent[PICTURE_HEAD.size :])
+    assert shown.shape == (16, 32, 3)
+    assert int(shown[8, 2, 0]) > int(shown[8, 29, 0]) + 150
+
+
+def test_a_jpeg_stays_as_the_camera_made_it() -> None:
+    picture = to_jpeg(gradient("rgb8"), 90)
+    payload = to_payload(picture)
+    assert payload is not None
+    assert asyncio.run(as_jpeg(payload)) == payload
+    assert payload[PICTURE_HEAD.size :] == picture.data.tobytes()
+
+
+def test_messages_without_pictures_have_none() -> None:
+    assert to_payload(String("hello")) is None
+
+
+@given(st.lists(st.tuples(st.integers(0, 3), st.binary(max_size=40)), min_size=1, max_size=20))
+def test_frames_arrive_in_order_and_the_newest_of_each_channel_arrives(frames: list[tuple[int, bytes]]) -> None:
+    async def received(near: socket.socket, far: socket.socket) -> list[tuple[int, bytes]]:
+        sender = FrameSender(near)
+        for channel, payload in frames:
+            sender.send(channel, payload)
+        near.shutdown(socket.SHUT_WR)
+        reader, writer = await asyncio.open_connection(sock=far)
+        found = []
+        try:
+            while True:
+                found.append(await receive_frame(reader))
+        except asyncio.IncompleteReadError:
+            writer.close()
+            sender.close()
+            return found
+
+    assert asyncio.run(received(*socket.socketpair())) == frames
+
+
+def test_a_reader_that_is_behind_gets_the_newest() -> None:
+    near, far = socket.socketpair()
+    with far:
+        sender = FrameSender(near)
+        for i in range(100):
+            sender.send(16, bytes([i]) * 100_000)
+        assert sender.replaced > 90
+        far.settimeout(5)
+        received = bytearray()
+        for _ in range(1000):
+            received += far.recv(1 << 16)
+            sender.flush()
+            if received[-1] == 99:
+                break
+        assert received[-1] == 99
+        sender.close()
+
+
+def test_numbers_of_messages_are_paths() -> None:
+    assert numbers_of(Float64MultiArray(np.array([1.5, np.nan]))) == {"data[0]": 1.5}
+    assert numbers_of(String("5")) == {}
+    names = numbers_of(JointState(Header(1), ("a", "b"), np.array([1.0, 2.0])))
+    assert names == {"position[0]": 1.0, "position[1]": 2.0}
+    assert numbers_of(Imu(Header(1), linear_acceleration=Vector3(0, 0, 9.81)))["linear_acceleration.z"] == 9.81
+
+
+def test_the_status_of_a_run_is_json_without_nan() -> None:
+    session = make_session()
+    log = LogLines()
+    status = status_json(session, log, 2)
+    text = json.dumps(status, allow_nan=False)
+    assert json.loads(text)["robot"]["joints"][0]["name"] == "shoulder_pan"
+    assert plan_json(session, 0) == {"joints": [], "rows": []}

@@ -1,0 +1,119 @@
+"""The viewer: conformance with the server's process behind it, and its errors."""
+
+from __future__ import annotations
+
+import re
+import socket
+import urllib.error
+import urllib.request
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, override
+
+import attrs
+import numpy as np
+import pytest
+from ibrobot_testing import ViewerSuite, check_descriptor, host_context, make_session
+from ibrobot_web import ibrobot_viewers
+from ibrobot_web.options import WebOptions
+from ibrobot_web.viewer import WebViewer
+
+from ibrobot_core.api import Context, ControlState, Header, IbrobotError, JointState, Message, Viewer
+
+OPTIONS = WebOptions(port=0, browser=False, rate_hz=60)
+
+
+def state(i: int, stamp_ns: int) -> ControlState:
+    zeros = np.zeros(6)
+    position = np.full(6, 0.01 * i)
+    return ControlState(i, stamp_ns, 0, 0, False, False, None, position, zeros, zeros, position, np.empty(0))
+
+
+def make_context() -> Context:
+    session = make_session()
+    return attrs.evolve(host_context("viewer", bus=session.bus, clock=session.clock), session=session)
+
+
+class TestConformance(ViewerSuite):
+    @override
+    def context(self) -> Context:
+        return make_context()
+
+    @override
+    def make(self, ctx: Context) -> WebViewer:
+        return WebViewer(OPTIONS, ctx)
+
+    @override
+    def message(self, ctx: Context, i: int) -> Message:
+        session = ctx.session
+        assert session is not None
+        session.state = state(i, ctx.clock.now_ns())
+        return JointState(Header(session.state.stamp_ns), ctx.robot.joint_names, session.state.position)
+
+    @override
+    def shut(self, viewer: Viewer) -> None:
+        assert isinstance(viewer, WebViewer)
+        viewer.finish()
+
+    @override
+    def shown(self, viewer: Viewer) -> Message:
+        assert isinstance(viewer, WebViewer)
+        assert viewer.newest is not None
+        newest: Mapping[str, Any] = viewer.newest
+        names = make_session().config.robot.joint_names
+        return JointState(Header(newest["stamp"]), names, np.array(newest["position"]))
+
+
+def test_descriptor() -> None:
+    (descriptor,) = ibrobot_viewers()
+    check_descriptor(descriptor, OPTIONS)
+    assert descriptor.flag == "--web"
+
+
+def test_the_address_has_a_token_and_the_page_is_gone_after_close() -> None:
+    viewer = WebViewer(OPTIONS, make_context())
+    viewer.open()
+    try:
+        found = re.fullmatch(r"(http://127\.0\.0\.1:\d+/)\?token=\S+  \(to watch only: http://\S+\)", viewer.where())
+        assert found is not None
+        with pytest.raises(urllib.error.HTTPError, match="401"):
+            urllib.request.urlopen(found[1])
+    finally:
+        viewer.close()
+    with pytest.raises(urllib.error.URLError, match="refused"):
+        urllib.request.urlopen(found[1])
+
+
+def test_a_port_in_use_is_an_error_with_a_remedy() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        viewer = WebViewer(attrs.evolve(OPTIONS, port=port), make_context())
+        with pytest.raises(IbrobotError, match=f"port {port} of 127.0.0.1 is not available: .*viewer.port=0"):
+            viewer.open()
+        viewer.close()
+
+
+def test_a_certificate_that_cannot_be_used_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "a.pem").write_text("no certificate")
+    viewer = WebViewer(attrs.evolve(OPTIONS, certificate=tmp_path / "a.pem", key=tmp_path / "a.pem"), make_context())
+    with pytest.raises(IbrobotError, match=r"a\.pem and its key cannot be used"):
+        viewer.open()
+    viewer.close()
+
+
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [
+        ({"host": "0.0.0.0"}, "needs TLS: give certificate and key"),
+        ({"host": "192.168.1.5", "key": Path("key.pem")}, "certificate and key belong together"),
+        ({"password": "short"}, "password must have at least 12 characters"),
+    ],
+)
+def test_options_that_would_open_the_robot_to_the_network_are_refused(options: dict[str, Any], why: str) -> None:
+    with pytest.raises(ValueError, match=why):
+        WebOptions(**options)
+
+
+def test_the_page_needs_a_run() -> None:
+    with pytest.raises(IbrobotError, match="viewer type web shows a run"):
+        WebViewer(OPTIONS, host_context("viewer")).open()
