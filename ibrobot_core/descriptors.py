@@ -185,7 +185,7 @@ class ViewerDescriptor(Descriptor["interfaces.Viewer"]):
     """A viewer."""
 
     flag: str = ""
-    """Flag of the command line that shows a run with this viewer, e.g. `--window`; its help is the summary."""
+    """Flag of the command line that that runs the robot with this viewer, e.g. `--window`."""
 
 
 @attrs.frozen
