@@ -128,6 +128,9 @@ class ExecutorDescriptor(Descriptor["interfaces.Executor"]):
 class PlannerDescriptor(Descriptor["interfaces.Planner"]):
     """A motion planner."""
 
+    tool_goals: bool = True
+    """Whether it takes every goal; otherwise only `JointGoal`."""
+
 
 @attrs.frozen
 class SourceDescriptor(Descriptor["SourceWorker"]):

@@ -23,9 +23,8 @@ class _Owned:
     executor: Executor
     columns: NDArray[np.intp]
 
-    def reading(self, measured: JointReading, now_ns: int | None = None) -> JointReading:
-        reading = measured.of(self.columns)
-        return reading if now_ns is None else attrs.evolve(reading, stamp_ns=now_ns)
+    def reading(self, measured: JointReading) -> JointReading:
+        return measured.of(self.columns)
 
 
 class ActiveExecutors:
@@ -71,17 +70,12 @@ class ActiveExecutors:
             if owned.executor.accepts_plans and plan.mask[owned.columns].all():
                 owned.executor.set_plan(Plan(plan.start_ns, plan.step_ns, plan.positions[:, owned.columns]))
 
-    def update(self, measured: JointReading, now_ns: int | None) -> list[tuple[NDArray[np.intp], Vector]]:
-        """Return the joint indices of each active executor and its setpoints for them [rad].
-
-        Args:
-            measured: all joints.
-            now_ns: the current time [ns], if the reading's stamp is too old.
-        """
+    def update(self, measured: JointReading) -> list[tuple[NDArray[np.intp], Vector]]:
+        """Return the joint indices of each active executor and its setpoints for them [rad]."""
         setpoints = []
         self.want_relax = False
         for owned in self._active:
-            setpoints.append((owned.columns, owned.executor.update(owned.reading(measured, now_ns))))
+            setpoints.append((owned.columns, owned.executor.update(owned.reading(measured))))
             self.want_relax = self.want_relax or owned.executor.wants_relax
             self._report_goals(owned)
         return setpoints

@@ -69,6 +69,7 @@ class ControlCore:
         """The fault, if a joint's condition caused it; otherwise empty."""
         self._arriving = False
         self._tick = 0
+        self._due_ns = clock.now_ns()
         self._commands: dict[str, Callable[..., Mapping[str, Any] | None]] = {
             "switch_mode": self._switch_mode,
             "reset_episode": self._reset_episode,
@@ -138,13 +139,15 @@ class ControlCore:
             )
         return False
 
-    def tick(self, late_ns: int = 0, periods: int = 1) -> ControlState:
+    def tick(self, due_ns: int | None = None, late_ns: int = 0, periods: int = 1) -> ControlState:
         """Run one cycle.
 
         Args:
+            due_ns: the time of the cycle, by which executors compute their setpoints; None for the present time.
             late_ns: delay of the cycle's start [ns], stored in the state.
             periods: periods since the last tick; more than one after missed ticks, to keep simulated time in step.
         """
+        self._due_ns = self._clock.now_ns() if due_ns is None else due_ns
         self._read()
         signals = self._read_signals()
         success = self._hardware.success()
@@ -267,6 +270,11 @@ class ControlCore:
     def _late_to_pose(self) -> bool:
         return self._clock.now_ns() >= self._pose_deadline
 
+    @property
+    def _at_tick(self) -> JointReading:
+        """The reading at the time of the cycle: executors see equal periods even if cycles are late."""
+        return attrs.evolve(self._measured, stamp_ns=self._due_ns)
+
     def _read(self) -> None:
         try:
             measured = self._hardware.read()
@@ -359,9 +367,7 @@ class ControlCore:
             return None if self._late_to_pose else self._safety.towards(self._target, _POSE_SPEED)
         if not self._executors:
             return self._yield()
-        # Where a single reply was lost, a plan continues by the clock.
-        now_ns = self._clock.now_ns() if self._measured.stale else None
-        setpoints = self._executors.update(self._measured, now_ns)
+        setpoints = self._executors.update(self._at_tick)
         relax = self._executors.want_relax
         if relax and not self._relaxed:
             self._relax("the setpoints are stale")
@@ -416,23 +422,24 @@ class ControlCore:
 
     def _announce(self, fault: str, then: str) -> None:
         """Report a fault to the host, even if another is set; `then` states what the robot does."""
-        stamp_ns = self._clock.now_ns()
+        # The generation lets the host know which faults a later reset cleared. The first fault begins a new one. Its
+        # event comes before those of the goals that it cancels, so that the host knows their cause.
+        generation, stamp_ns = self.generation + (not self.fault), self._clock.now_ns()
+        self.events.append(
+            {"event": "fault", "fault": fault, "then": then, "stamp_ns": stamp_ns, "generation": generation}
+        )
         if not self.fault:
             self.fault = fault
             self._leave()
             self._target = None
-        # The generation lets the host know which faults a later reset cleared.
-        self.events.append(
-            {"event": "fault", "fault": fault, "then": then, "stamp_ns": stamp_ns, "generation": self.generation}
-        )
 
     def _leave(self) -> None:
         """Deactivate all executors; without one, every joint brakes and holds."""
-        self._executors.leave(self._measured)
+        self._executors.leave(self._at_tick)
         self.generation += 1
 
     def _enter(self) -> None:
-        self._executors.enter(self._config.control_modes[self.mode].executors, self._measured)
+        self._executors.enter(self._config.control_modes[self.mode].executors, self._at_tick)
         self.generation += 1
 
     def _switch_mode(self, mode: str) -> None:
@@ -479,7 +486,7 @@ class ControlCore:
         self._enter()
 
     def _goal(self, executor: str, goal_id: str, goal: Mapping[str, Any]) -> None:
-        self._executors.set_goal(executor, goal_id, goal, self._measured)
+        self._executors.set_goal(executor, goal_id, goal, self._at_tick)
 
     def _cancel(self) -> None:
-        self._executors.cancel(self._measured)
+        self._executors.cancel(self._at_tick)

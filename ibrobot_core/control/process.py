@@ -74,7 +74,7 @@ class ControlProcess:
         plan = self._memory.read_plan()
         if plan is not None:
             self._core.set_plan(plan)
-        self._memory.write_state(self._core.tick(late, periods))
+        self._memory.write_state(self._core.tick(deadline, late, periods))
         self._punctuality.tick(deadline, late, periods - 1)
         self._report_to_host()
         # A process forked by the host keeps the socket open after the host's death.

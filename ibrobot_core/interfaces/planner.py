@@ -125,6 +125,18 @@ class Planner(ABC):
                 code for the reason.
         """
 
+    def blocked(self, trajectory: JointTrajectory, others: Mapping[str, float], from_ns: int = 0) -> str:
+        """What a trajectory touches in the present world, in words; empty if nothing, or if the planner knows no world.
+
+        It is called during a motion, every 20 ms and from another thread than `plan`.
+
+        Args:
+            trajectory: with velocities and accelerations.
+            others: positions [rad] of joints that it does not move.
+            from_ns: where it begins [ns]; what lies before is past.
+        """
+        return ""
+
     def load(self) -> None:
         """Prepare the planner, e.g. load the collision model."""
 

@@ -100,6 +100,28 @@ class TestModes:
         np.testing.assert_allclose(rig.tick(70).command, [0.4, 0.4, before[2]], atol=1e-9)
 
 
+class TestLateTicks:
+    def test_setpoints_are_those_of_the_time_at_which_the_tick_was_due(self, make_rig):
+        """Otherwise a smooth plan would exceed the limits after every late tick."""
+        rng, commands = np.random.default_rng(0), []
+        for most_late in (0.0, 0.9):
+            rig = make_rig({}).start()
+            rig.tick(5)
+            rig.plan([0.6, 0.5, 0.4])
+            first_ns = rig.clock.now_ns()
+            found = []
+            for number in range(1, 40):
+                due_ns = first_ns + number * rig.core.period_ns
+                late_ns = round(most_late * rng.random() * rig.core.period_ns)
+                rig.clock.sleep_until(due_ns + late_ns)
+                state = rig.core.tick(due_ns, late_ns)
+                assert (state.late_ns, state.stamp_ns) == (late_ns, due_ns + late_ns)
+                found.append(state.command)
+            commands.append(found)
+
+        np.testing.assert_array_equal(*commands)
+
+
 class TestGoals:
     def test_reach_their_executor_and_report(self, make_rig):
         rig = make_rig({}).start("plan")

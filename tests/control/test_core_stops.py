@@ -302,6 +302,6 @@ class TestSimulation:
             rig.hardware.write_error = ""
             rig.hardware.write = lambda position: None
         one.tick(4)
-        other.core.tick(0, 4)
+        other.core.tick(periods=4)
 
         np.testing.assert_allclose(one.hardware._position, other.hardware._position)

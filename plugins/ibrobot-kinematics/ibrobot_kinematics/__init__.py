@@ -7,6 +7,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from ibrobot_kinematics.clearance import world_clearance
     from ibrobot_kinematics.errors import KinematicsError, UnreachableError
     from ibrobot_kinematics.inverse import solve, solve_all
     from ibrobot_kinematics.jog_arm import JogArm, JogMotion, VelocityJog
@@ -19,9 +20,11 @@ if TYPE_CHECKING:
 __all__ = [
     "ChainJoint", "JogArm", "JogMotion", "KinematicModel", "KinematicsError", "Servo", "ServoOptions", "ServoStatus",
     "Target", "TipPose", "UnreachableError", "VelocityJog", "read_mjcf", "robot_model", "solve", "solve_all",
+    "world_clearance",
 ]  # fmt: skip
 
 _HOMES = {
+    "clearance": ("world_clearance",),
     "errors": ("KinematicsError", "UnreachableError"),
     "inverse": ("solve", "solve_all"),
     "jog_arm": ("JogArm", "JogMotion", "VelocityJog"),

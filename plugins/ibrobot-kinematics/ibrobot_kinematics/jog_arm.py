@@ -5,7 +5,8 @@ from __future__ import annotations
 import attrs
 import numpy as np
 
-from ibrobot_core.api import Robot, TeleopError, Vector, ns
+from ibrobot_core.api import Bus, Robot, TeleopError, Vector, ns
+from ibrobot_kinematics.clearance import world_clearance
 from ibrobot_kinematics.errors import KinematicsError
 from ibrobot_kinematics.mjcf import robot_model
 from ibrobot_kinematics.servo import Servo
@@ -37,11 +38,12 @@ class JogArm:
         self._now_ns = 0
         """The sum of the steps in which the tool moved [ns]."""
 
-    def load_model(self, remedy: str) -> None:
+    def load_model(self, remedy: str, bus: Bus | None = None) -> None:
         """Load the model that `move_tool` needs.
 
         Args:
             remedy: how to do without the model, for the error, e.g. `cartesian: false`.
+            bus: of the run, whose world has the obstacles before which the tool slows down.
 
         Raises:
             TeleopError: when the robot has no model of its arm, or one that does not fit.
@@ -53,7 +55,10 @@ class JogArm:
         except KinematicsError as error:
             raise TeleopError(f"Cartesian jog: {error}; set {remedy} to do without it") from error
         arm = self.robot.indices(self.arm)
-        self._servo = Servo(model, self.robot.max_velocity[arm], self.robot.max_acceleration[arm])
+        self._servo = Servo(
+            model, self.robot.max_velocity[arm], self.robot.max_acceleration[arm],
+            clearance=world_clearance(bus, self.arm),
+        )  # fmt: skip
 
     @property
     def tool_moves(self) -> bool:

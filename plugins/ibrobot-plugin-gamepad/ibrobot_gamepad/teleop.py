@@ -83,7 +83,7 @@ class JogTeleop(Teleop):
     @override
     def connect(self) -> None:
         if self._options.cartesian:
-            self._arm.load_model("cartesian: false")
+            self._arm.load_model("cartesian: false", self._ctx.bus)
         self._finder = Finder(self._kind, self._via)
         self._look(self._finder)
         if self._device is None:

@@ -51,7 +51,7 @@ class KeyboardTeleop(Teleop):
                 "or choose another teleop"
             )
         if self._options.cartesian:
-            self._arm.load_model("cartesian: false")
+            self._arm.load_model("cartesian: false", self._ctx.bus)
         self._keys = self._ctx.keys()
 
     @override

@@ -41,7 +41,7 @@ def _rrt_connect(options: Any, ctx: Context) -> Planner:
 def ibrobot_planners() -> Iterable[PlannerDescriptor]:
     """The planners `joint` and `rrt_connect`."""
     yield PlannerDescriptor(
-        type="joint", options=JointPlannerOptions, make=_joint,
+        type="joint", options=JointPlannerOptions, make=_joint, tool_goals=False,
         summary="straight line in joint space, time-optimal within velocity, acceleration and jerk limits",
     )  # fmt: skip
     yield PlannerDescriptor(

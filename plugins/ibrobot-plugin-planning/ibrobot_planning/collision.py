@@ -95,6 +95,11 @@ class Collisions:
         # It widens them by the margins, which must therefore be set before.
         self._manager = pinocchio.BroadPhaseManager_NaiveCollisionManager(arm.model, self.geometry, self.results)
 
+    @property
+    def pairs(self) -> list[Pair]:
+        """Names of what each pair of `geometry.collisionPairs` has, links and objects."""
+        return [(self._names[pair.first], self._names[pair.second]) for pair in self.geometry.collisionPairs]
+
     def free(self, q: Vector) -> bool:
         """Whether `q`, shape (J,), is free of contacts."""
         return self.first_hit(q[None]) == 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import override
@@ -30,8 +31,10 @@ from ibrobot_core.api import (
     PositionGoal,
     Vector,
     ns,
+    seconds,
 )
 from ibrobot_planning.arm import Arm, Pair
+from ibrobot_planning.blend import motion_of
 from ibrobot_planning.checked_arm import checked_arm
 from ibrobot_planning.collision import Collisions, Contact
 from ibrobot_planning.goals import Candidate, Tool, joint_target
@@ -47,6 +50,8 @@ _FINEST_M = 0.0015
 """The same for a whole path before it is timed."""
 _CHECK_S = 0.001
 """Time between checks of the timed motion."""
+_WATCH_STRIDE = 2
+"""Of these times, every second is checked again when the world has changed."""
 _REPAIRS = 12
 """Attempts to time one path, each with smaller blends where the previous motion touched."""
 _LEAST_BLEND = 0.01
@@ -76,6 +81,8 @@ class RrtConnectPlanner(Planner):
         self._tool: Tool | None = None
         self._unchecked: Mapping[Pair, str] = {}
         self._srdf: Srdf | None = None
+        self._checked: deque[tuple[JointTrajectory, World]] = deque(maxlen=8)
+        """Trajectories found free, each with the world in which it is."""
 
     @override
     def load(self) -> None:
@@ -92,16 +99,42 @@ class RrtConnectPlanner(Planner):
 
     @override
     def plan(self, request: PlanRequest) -> PlanResult:
-        arm, options = self.arm, self._options
         begun = time.monotonic()
         start = self._check_start(request)
-        checks = Collisions(
-            arm, self._snapshot(), request.joints, request.others,
+        world = self._snapshot()
+        checks = self._collisions(world, request.joints, request.others)
+        deadline = begun + self._options.planning_time
+        plan = _Plan(self._ctx, self._options, request, start, checks, self._srdf, deadline)
+        assert self._tool is not None
+        result = plan.solve(self._tool)
+        self._checked.append((result.trajectory, world))
+        return result
+
+    @override
+    def blocked(self, trajectory: JointTrajectory, others: Mapping[str, float], from_ns: int = 0) -> str:
+        world = self._snapshot()
+        # A trajectory needs a new check when the world has changed.
+        if any(known is trajectory and in_world == world for known, in_world in tuple(self._checked)):
+            return ""
+        checks = self._collisions(world, trajectory.joint_names, others)
+        made = motion_of(trajectory)
+        if made is None:
+            return ""
+        positions = made.sampled(_CHECK_S)[0][round(seconds(from_ns) / _CHECK_S) :: _WATCH_STRIDE]
+        # What touches already may get away.
+        leaving = _outwards(checks, positions) or 0 if len(positions) else 0
+        hit = leaving + checks.first_hit(positions[leaving:])
+        if hit < len(positions):
+            return _sentence(checks.contacts(positions[hit]))
+        self._checked.append((trajectory, world))
+        return ""
+
+    def _collisions(self, world: World, joints: Sequence[str], others: Mapping[str, float]) -> Collisions:
+        options = self._options
+        return Collisions(
+            self.arm, world, joints, others,
             padding=options.padding, self_padding=options.self_padding, unchecked=self._unchecked,
         )  # fmt: skip
-        plan = _Plan(self._ctx, options, request, start, checks, self._srdf, begun + options.planning_time)
-        assert self._tool is not None
-        return plan.solve(self._tool)
 
     def _snapshot(self) -> World:
         bus = self._ctx.bus
@@ -319,19 +352,7 @@ class _Plan:
     def _leaves(self, start: Vector, end: Vector) -> bool:
         """Whether what touches at the start only gets away on the line to a free end, and nothing else touches."""
         line = Space(self.checks, *self._limits, _FINEST_M).line(start, end)
-        return self._outwards(np.concatenate([start[None], line])) is not None
-
-    def _outwards(self, configurations: Vector) -> int | None:
-        """How many configurations from the start on touch, getting away; None where something comes closer."""
-        before = {(each.first, each.second): each.distance for each in self.checks.contacts(configurations[0])}
-        for number, q in enumerate(configurations):
-            if self.checks.free(q):
-                return number
-            now = {(each.first, each.second): each.distance for each in self.checks.contacts(q)}
-            if any(pair not in before or distance < before[pair] - _WORSE_M for pair, distance in now.items()):
-                return None
-            before = {pair: max(distance, before[pair]) for pair, distance in now.items()}
-        return None
+        return _outwards(self.checks, np.concatenate([start[None], line])) is not None
 
     def _linear(self, tool: Tool, goal: LinearGoal) -> PlanResult:
         self._check_chain(tool.model)
@@ -427,7 +448,7 @@ class _Plan:
         bad = [positions[outside]]
         checked = 0
         if not self.checks.free(self.start):
-            out = self._outwards(positions)
+            out = _outwards(self.checks, positions)
             if out is None:
                 return np.asarray(positions[:1])
             checked = out
@@ -459,6 +480,19 @@ class _Plan:
         )
         trajectory = JointTrajectory(Header(stamp_ns=self.ctx.clock.now_ns()), self.request.joints, points)
         return PlanResult(trajectory, fraction, number, end.position_error, end.orientation_error)
+
+
+def _outwards(checks: Collisions, configurations: Vector) -> int | None:
+    """How many configurations from the start on touch, getting away; None where something comes closer."""
+    before = {(each.first, each.second): each.distance for each in checks.contacts(configurations[0])}
+    for number, q in enumerate(configurations):
+        if checks.free(q):
+            return number
+        now = {(each.first, each.second): each.distance for each in checks.contacts(q)}
+        if any(pair not in before or distance < before[pair] - _WORSE_M for pair, distance in now.items()):
+            return None
+        before = {pair: max(distance, before[pair]) for pair, distance in now.items()}
+    return None
 
 
 def _still(q: Vector, step: float) -> tuple[Vector, Vector, Vector, Vector]:

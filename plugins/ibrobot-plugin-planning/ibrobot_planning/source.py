@@ -25,6 +25,7 @@ from ibrobot_core.api import (
     OrientationPolicy,
     PlanCode,
     Planner,
+    PlannerDescriptor,
     PlanningError,
     PlanRequest,
     PlanResult,
@@ -37,8 +38,8 @@ from ibrobot_core.api import (
     Vector,
     ns,
     seconds,
-    trajectory_goal,
 )
+from ibrobot_planning.execution import Execution, ExecutorGoal
 from ibrobot_planning.goal_text import Target, target
 from ibrobot_planning.motion import MoveResult, MoveToConfiguration, MoveToPose, Outcome
 from ibrobot_planning.planning_services import PlanningServices
@@ -66,6 +67,10 @@ FRAMES = ("", "base", "base_link")
 """Names of the base frame in `/cmd_pose`."""
 _STATUS_NS = ns(0.1)
 _GLANCE_S = 0.5
+_BUSY_S = 0.01
+"""Longest wait of a unit of work while the robot moves [s]."""
+_WATCH_S = 0.02
+"""Interval at which a motion is checked against the present world [s]."""
 _ENDED = MoveResult(False, "the mode or the run ended", 0.0, "CANCELLED", PlanCode.PREEMPTED)
 _STILL_RAD = 1e-4
 """Commands that change less between two checks are at rest."""
@@ -84,13 +89,13 @@ class _Move:
     target: Target
     asked: bool = False
     """Whether the run ends after all such goals."""
-    waiting: set[str] = attrs.field(factory=set)
-    """Executors that have not ended yet."""
     failures: list[str] = attrs.field(factory=list)
     begun_ns: int | None = None
     planned: PlanResult | None = None
     dropped: str = ""
     """Why it stops early; empty otherwise."""
+    blocked: str = ""
+    """What is in its way; empty otherwise."""
     result: MoveResult | None = None
     ended: threading.Event = attrs.field(factory=threading.Event)
 
@@ -99,7 +104,8 @@ class PlannerSource(SourceWorker):
     """Moves to goals, planned from the robot's present position.
 
     The goals of the request are reached one after the other, in the mode in which the run begins. A goal of a service
-    or of `/cmd_pose` takes the place of all others: the robot first slows down along its trajectory.
+    or of `/cmd_pose` takes the place of all others; its motion blends with the one under way. A motion that something
+    blocks stops.
 
     Raises:
         PlanningError: for a goal of the request that makes no sense for this robot.
@@ -118,6 +124,10 @@ class PlannerSource(SourceWorker):
         self._status = ""
         self._status_ns = 0
         self._worker = 0
+        self._choosing = threading.Lock()
+        """Held while the move under way changes."""
+        self._watched = threading.Event()
+        """Set when nothing more is to be watched."""
         self._seen: ControlState | None = None
         for goal in () if session.has_control else session.request.goals:
             try:
@@ -144,10 +154,17 @@ class PlannerSource(SourceWorker):
     def setup(self) -> None:
         self._planner: Planner = self.session.make("planner", self._component, self._component.type)
         self.on_end.callback(self._planner.close)
+        self._execution = Execution(self.session, self._planner)
         self._poses = self.session.bus.subscribe(CMD_POSE, 1)
         self.on_end.callback(self._poses.close)
         self.on_end.callback(self._drop_all)
         self._planner.load()
+        if not self.session.request.lockstep:
+            self._watched.clear()
+            watcher = threading.Thread(target=self._watch_on, name=f"{self.name} watch", daemon=True)
+            watcher.start()
+            self.on_end.callback(watcher.join)
+            self.on_end.callback(self._watched.set)
 
     @override
     def begin_mode(self, seed: int) -> None:
@@ -171,6 +188,7 @@ class PlannerSource(SourceWorker):
     def work(self, timeout_s: float) -> None:
         self._worker = threading.get_ident()
         try:
+            timeout_s = timeout_s if self._move is None else min(timeout_s, _BUSY_S)
             items = [self._inbox.get(timeout_s > 0, timeout_s or None)]
             while not self._inbox.empty():
                 items.append(self._inbox.get())
@@ -185,6 +203,10 @@ class PlannerSource(SourceWorker):
             if not self.active:
                 return
             self._take_pose()
+            if self.session.request.lockstep:
+                self._watch()
+            if self._move is not None:
+                self._go_on(self._move)
             if self._move is None and self._queue and self._at_rest():
                 self._begin(self._queue.popleft())
             if self._move is not None and self.session.clock.now_ns() - self._status_ns >= _STATUS_NS:
@@ -192,8 +214,21 @@ class PlannerSource(SourceWorker):
 
     def _new(self, goal: str | Goal, velocity_scaling: float = 1.0, *, asked: bool = False) -> _Move:
         parsed = target(goal, self.session.config.robot, velocity_scaling)
+        if parsed.tool is not None and not isinstance(parsed.tool, JointGoal):
+            self._check_planner(parsed)
         self._executors(parsed)
         return _Move(next(self._numbers), parsed, asked)
+
+    def _check_planner(self, parsed: Target) -> None:
+        """Refuse a goal of the tool, or alternatives, where the planner takes joint positions only."""
+        planners = self.session.registry.of_kind("planner")
+        takes = [each.type for each in planners if isinstance(each, PlannerDescriptor) and each.tool_goals]
+        if self._component.type not in takes:
+            raise PlanningError(
+                f"goal {parsed.text!r}: planner type {self._component.type!r} of mode {self.mode.name} takes joint"
+                f" positions only; types that take other goals: {', '.join(takes) or 'none is installed'}",
+                PlanCode.UNRECOGNIZED_GOAL_TYPE,
+            )
 
     def _submit(self, goal: str | Goal, velocity_scaling: float = 1.0) -> _Move:
         """Replace all goals by this one."""
@@ -277,24 +312,62 @@ class PlannerSource(SourceWorker):
             self._queue.append(move)
         for other in dropped:
             self._finish(other, "CANCELLED", PlanCode.PREEMPTED, why)
-        if self._move is not None and not self._move.dropped:
-            self._stop(self._move, why)
+        old = self._move
+        if old is None or old.dropped or old.blocked:
+            return
+        # A given trajectory begins where the robot stands.
+        if move is None or move.target.trajectory is not None or not self._hand_over(old, move):
+            old.dropped = why
+            self._execution.stop(old.number)
 
-    def _stop(self, move: _Move, why: str) -> None:
-        """Let moving executors slow down; the goal ends when they stop."""
-        session = self.session
-        move.dropped = why
-        for name in sorted(move.waiting):
-            stop: Mapping[str, Any] = {"stop": True}
-            if session.config.executors[name].goals == "position":
-                joint = session.config.robot.indices(session.config.executors[name].joints)[0]
-                stop = {"position": float(self._commanded()[joint])}
-            try:
-                session.control.call("goal", executor=name, goal_id=f"{move.number}:stop:{name}", goal=stop)
-            except HardwareError as error:
-                session.log.warning("%s does not slow down, and is cancelled: %s", name, error)
-                session.control.call("cancel")
-                return
+    def _hand_over(self, old: _Move, new: _Move) -> bool:
+        """Plan to the next goal while the robot moves; return False if it must stop first."""
+        rest = self._execution.brake(new.number)
+        if rest is None:
+            return False
+        self._queue.remove(new)
+        with self._choosing:
+            self._move = new
+        self._finish(old, "CANCELLED", PlanCode.PREEMPTED, f"replaced by goal {new.target.text}")
+        new.begun_ns = self.session.clock.now_ns()
+        self._show("executing")
+        try:
+            goals = self._plan(new, rest)
+        except PlanningError as error:
+            self._execution.stop(new.number)
+            self._finish(new, "PLANNING_FAILED", error.code, str(error))
+            return True
+        if not new.blocked:
+            self._execution.follow(goals)
+        return True
+
+    def _go_on(self, move: _Move) -> None:
+        try:
+            self._execution.step()
+        except HardwareError as error:
+            move.failures.append(str(error))
+            self._execution.stop(move.number)
+        if not self._execution.under_way:
+            self._end_move(move)
+
+    def _watch(self) -> None:
+        """Stop a motion that is blocked in the world as it is now."""
+        move = self._move
+        if move is None or move.dropped or move.blocked:
+            return
+        blocked = self._execution.blocked()
+        if blocked:
+            with self._choosing:
+                if move is self._move:
+                    move.blocked = blocked
+                    self._execution.stop(move.number)
+
+    def _watch_on(self) -> None:
+        try:
+            while not self._watched.wait(_WATCH_S):
+                self._watch()
+        except Exception as error:  # noqa: BLE001 - a motion that nobody watches must not go on
+            self.session.fail(self.name, error)
 
     def _at_rest(self) -> bool:
         """Whether the commands are at rest: the safety layer may follow the executors with a delay."""
@@ -304,26 +377,17 @@ class PlannerSource(SourceWorker):
         self._seen = state
         return seen is not None and bool(np.abs(state.command - seen.command).max() < _STILL_RAD)
 
-    def _commanded(self) -> Vector:
-        # From the commanded positions, not the sagging joints, so that the setpoint does not jump.
-        state = self.session.state
-        return state.command if state is not None else self.session.measured().position
-
     def _begin(self, move: _Move) -> None:
-        session = self.session
-        move.begun_ns = session.clock.now_ns()
+        move.begun_ns = self.session.clock.now_ns()
         self._show("executing")
         try:
-            goals = self._plan(move)
+            goals = self._plan(move, self._execution.commanded())
+            with self._choosing:
+                self._move = move
+            self._execution.begin(move.number, goals)
         except PlanningError as error:
             self._finish(move, "PLANNING_FAILED", error.code, str(error))
-            return
-        self._move, move.waiting = move, set(goals)
-        try:
-            for executor, goal in goals.items():
-                session.control.call("goal", executor=executor, goal_id=f"{move.number}:{executor}", goal=goal)
         except HardwareError as error:
-            session.control.call("cancel")  # those that took their goal already
             self._finish(move, "EXECUTION_FAILED", PlanCode.CONTROL_FAILED, str(error))
 
     def _executors(self, parsed: Target) -> dict[str, Goal | float | JointTrajectory]:
@@ -368,20 +432,20 @@ class PlannerSource(SourceWorker):
             )
         return {arms[0]: parsed.tool, **found}
 
-    def _plan(self, move: _Move) -> dict[str, Mapping[str, Any]]:
-        """Executor -> its goal."""
-        robot, start = self.session.config.robot, self._commanded()
+    def _plan(self, move: _Move, start: Vector) -> dict[str, ExecutorGoal]:
+        """Executor -> its goal; `start` has the commanded positions of all joints [rad], shape (J,)."""
+        robot = self.session.config.robot
         wanted = self._executors(move.target)
         if not wanted:
             raise PlanningError(f"goal {move.target.text!r}: no executor of mode {self.mode.name} has these joints")
-        goals: dict[str, Mapping[str, Any]] = {}
+        goals: dict[str, ExecutorGoal] = {}
         for name, goal in wanted.items():
             if isinstance(goal, float):
-                goals[name] = {"position": goal}
+                goals[name] = goal
                 continue
             if isinstance(goal, JointTrajectory):
                 self._check_begin(goal, start)
-                goals[name] = trajectory_goal(goal)
+                goals[name] = goal
                 continue
             joints = self.session.config.executors[name].joints
             others = dict(zip(robot.joint_names, start.tolist(), strict=True))
@@ -390,7 +454,7 @@ class PlannerSource(SourceWorker):
                 move.target.velocity_scaling, move.target.acceleration_scaling, others,
             )  # fmt: skip
             planned = self._planned(request)
-            goals[name] = trajectory_goal(planned.trajectory)
+            goals[name] = planned.trajectory
             if goal is move.target.tool:
                 move.planned = planned
         return goals
@@ -423,30 +487,35 @@ class PlannerSource(SourceWorker):
             )
 
     def _advance(self, event: Mapping[str, Any]) -> None:
-        move, name = self._move, str(event["executor"])
-        if move is None or event["state"] == "executing":
+        move = self._move
+        failed = self._execution.take(event)
+        if move is None or failed is None:
             return
-        stopped = event["goal"] == f"{move.number}:stop:{name}"
-        if not stopped and event["goal"] != f"{move.number}:{name}":
-            return
-        if not stopped and f"goal {move.number}:stop:{name}" in str(event["message"]):
-            return  # it is still slowing down
-        move.waiting.discard(name)
-        if event["state"] != "succeeded" and not move.dropped:
-            move.failures.append(f"{name} {event['state']}: {event['message']}")
-        if move.waiting:
-            return
-        if move.dropped:
+        if failed and not move.dropped:
+            move.failures.append(failed)
+            self._execution.stop(move.number)
+        if not self._execution.under_way:
+            self._end_move(move)
+
+    def _end_move(self, move: _Move) -> None:
+        """Report the outcome of a move whose executors have ended."""
+        if move.blocked:
+            code = PlanCode.MOTION_PLAN_INVALIDATED_BY_ENVIRONMENT_CHANGE
+            self._finish(move, "EXECUTION_FAILED", code, f"stopped before an obstacle: {move.blocked}")
+        elif move.dropped:
             self._finish(move, "CANCELLED", PlanCode.PREEMPTED, move.dropped)
         elif move.failures:
-            self._finish(move, "EXECUTION_FAILED", PlanCode.CONTROL_FAILED, "; ".join(move.failures))
+            # A fault of the robot cancels all goals: the fault is the cause.
+            why = "; ".join(self.session.faults or move.failures)
+            self._finish(move, "EXECUTION_FAILED", PlanCode.CONTROL_FAILED, why)
         else:
             self._finish(move, "SUCCEEDED", PlanCode.SUCCESS, "")
 
     def _finish(self, move: _Move, outcome: Outcome, code: PlanCode, message: str) -> None:
         session, success = self.session, outcome == "SUCCEEDED"
-        if move is self._move:
-            self._move = None
+        with self._choosing:
+            if move is self._move:
+                self._move = None
         duration = seconds(session.clock.now_ns() - move.begun_ns) if move.begun_ns is not None else 0.0
         errors = (move.planned.position_error, move.planned.orientation_error) if move.planned is not None else ()
         move.result = MoveResult(success, message, duration, outcome, code, *errors)
@@ -456,7 +525,7 @@ class PlannerSource(SourceWorker):
         elif outcome == "CANCELLED":
             session.log.info("goal %s dropped: %s", move.target.text, message)
         else:
-            session.log.error("goal %s failed: %s", move.target.text, message)
+            session.log.error("goal %s failed: %s: %s", move.target.text, code.name, message)
         if not success and (move.asked or outcome != "CANCELLED"):
             session.outcome.goals_failed += 1
         self._show("succeeded" if success else "failed")

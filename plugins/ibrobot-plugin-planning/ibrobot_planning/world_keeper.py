@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, override
 
 import attrs
 import numpy as np
+from ibrobot_kinematics.clearance import CLEARANCE
 
 from ibrobot_core.api import (
     Component,
@@ -31,10 +32,13 @@ from ibrobot_planning.world_options import Added, Allowed, Attached, Detached, M
 
 if TYPE_CHECKING:
     from ibrobot_planning.arm import Arm
+    from ibrobot_planning.clearance import Clearance
 
 ATTACH, DETACH, TOUCH = "/world/attach", "/world/detach", "/world/touch"
 """Services that take `Attached`, `Detached` and `Touched`."""
 SECTION = "world"
+_STILL = 1e-4
+"""Smaller changes of an object's position [m] and axes are no motion."""
 
 
 def scene_objects(config: RobotConfig, registry: Registry) -> tuple[SceneObject, ...]:
@@ -79,7 +83,7 @@ def _shape(thing: SceneObject) -> Shape:
 
 
 class WorldKeeper(Component):
-    """Serves `/world/snapshot`, and `/world/add`, `remove`, `move`, `attach`, `detach`, `allow` and `touch`.
+    """Serves `/world/add`, `remove`, `move`, `attach`, `detach`, `allow` and `touch`; snapshots and clearances.
 
     Requests are mappings, or the same as YAML.
 
@@ -107,12 +111,16 @@ class WorldKeeper(Component):
             DETACH: self._changing(Detached, self._detach),
             TOUCH: self._changing(Touched, self._touch),
             "/world/allow": self._changing(Allowed, lambda world, it: world.allow(it.name, frozenset(it.may_touch))),
+            CLEARANCE: self._distance,
         }
+        self._near: tuple[World, Clearance] | None = None
 
     @override
     def start(self) -> None:
         for topic in {thing.topic for thing in self._moving.values()}:
             self._poses[topic] = self._session.bus.subscribe(topic, 1)
+        if self._session.config.robot.description.mjcf is not None:
+            self._robot()  # reading it takes a moment, which the first service call should not wait for
         for name, handler in self._services.items():
             self._session.bus.serve(name, handler)
 
@@ -150,7 +158,10 @@ class WorldKeeper(Component):
             for name, thing in self._moving.items():
                 if thing.topic == topic and name in world.objects and world.objects[name].link is None:
                     x, y, z, qw, qx, qy, qz = message.data[thing.first : thing.first + 7].tolist()
-                    world = world.move(name, Pose(Vector3(x, y, z), Quaternion(qx, qy, qz, qw)))
+                    now = Pose(Vector3(x, y, z), Quaternion(qx, qy, qz, qw))
+                    # Physics trembles: the world stays the same until an object has really moved.
+                    if np.abs(matrix(now) - matrix(world.objects[name].pose)).max() > _STILL:
+                        world = world.move(name, now)
         return world
 
     def put(self, name: str, thing: WorldObject | None) -> None:
@@ -213,3 +224,15 @@ class WorldKeeper(Component):
     def _link(self, link: str) -> Vector:
         """Present pose of a link, shape (4, 4)."""
         return self._robot().link_pose(link, self._session.measured().position)
+
+    def _distance(self, positions: Mapping[str, float]) -> float:
+        """Distance of the arm from the nearest object [m], where joints not given are where they are measured."""
+        from ibrobot_planning.clearance import Clearance
+
+        q = self._session.measured().position.copy()
+        q[self._session.config.robot.indices(tuple(positions))] = list(positions.values())
+        with self._lock:
+            world = self._snapshot()
+            if self._near is None or self._near[0] != world:
+                self._near = world, Clearance(self._robot(), world)
+            return self._near[1](q)

@@ -129,10 +129,29 @@ def test_result_has_the_code_and_the_sentence_of_the_planner(run):
     assert runtime.summary()["goals_failed"] == 1
 
 
-def test_planner_of_joints_refuses_goals_of_the_tool(run):
-    result = go(run(mode="joint"), "xyz=0.2,0.05,0.1")
-    assert result.code is PlanCode.UNRECOGNIZED_GOAL_TYPE
-    assert result.message.startswith("planner type 'joint' knows joint goals only")
+NO_TOOL = (
+    "goal 'xyz=0.2,0.05,0.1': planner type 'joint' of mode joint takes joint positions only; types that take other"
+    " goals: cubic, rrt_connect"
+)
+
+
+def test_goal_that_the_planner_does_not_take_is_refused_before_anything_starts(make: Make, tmp_path: Path):
+    with pytest.raises(PlanningError) as failure:
+        make(text=robot_yaml(tmp_path), mode="joint", goals=("up", "xyz=0.2,0.05,0.1"))
+    assert (str(failure.value), failure.value.code) == (NO_TOOL, PlanCode.UNRECOGNIZED_GOAL_TYPE)
+    assert failure.value.exit_code == 2
+
+
+def test_goal_of_a_service_that_the_planner_does_not_take_is_refused(run):
+    runtime = run(mode="joint")
+    with pytest.raises(PlanningError) as failure:
+        runtime.session.bus.call(GO_TO, "xyz=0.2,0.05,0.1")
+    assert str(failure.value) == NO_TOOL
+
+
+def test_log_has_the_code_of_the_planner(run, caplog: pytest.LogCaptureFixture):
+    go(run(), PositionGoal(Vector3(2.0, 0.0, 0.1)))
+    assert "goal position 2, 0, 0.1 failed: NO_IK_SOLUTION: " in caplog.text
 
 
 @pytest.mark.parametrize("stamped", [True, False], ids=["PoseStamped", "Pose"])

@@ -80,7 +80,7 @@ def test_goal_that_cannot_be_reached_is_counted_and_the_next_one_tried(
     runtime = start(mode="plan", goals=(goal, "up"))
     to_the_end(runtime)
     assert runtime.summary()["goals_failed"] == 1
-    assert f"goal {goal} failed: " in caplog.text
+    assert f"goal {goal} failed: PLANNING_FAILED: " in caplog.text
     assert position(runtime)[0] == pytest.approx(0.4, abs=0.03)
 
 

@@ -7,6 +7,7 @@ import logging
 from collections.abc import Callable
 from typing import Any
 
+import attrs
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -65,14 +66,15 @@ class Arm:
         self.executor.set_goal(goal_id, wanted, self.reading())
 
     def at(self, time_s: float) -> list[float]:
-        """Tick at `time_s`."""
-        self.now_ns = ns(time_s)
-        before = self.reading()
-        self.setpoint = self.executor.update(before)
-        return self.setpoint.tolist()
+        """Tick until `time_s`."""
+        while True:
+            self.now_ns = min(ns(time_s), self.now_ns + 10 * MS)
+            self.setpoint = self.executor.update(self.reading())
+            if self.now_ns == ns(time_s):
+                return self.setpoint.tolist()
 
     def statuses(self) -> list[GoalStatus]:
-        return list(iter(self.executor.pop_status, None))
+        return [attrs.evolve(each, result={}) for each in iter(self.executor.pop_status, None)]
 
 
 def test_it_holds_the_measured_position_after_activation() -> None:
@@ -234,7 +236,7 @@ def test_path_tolerances_of_options_and_goal(options: Any, more: Any, off: float
         ({}, 1.0, GoalState.ABORTED),
         ({"goal_time": 0}, 1.0, GoalState.ABORTED),
         ({"goal_time": 2.0}, 1.0, GoalState.EXECUTING),
-        ({"goal_time": -1}, 3600.0, GoalState.EXECUTING),
+        ({"goal_time": -1}, 36.0, GoalState.EXECUTING),
         ({"goal_tolerance": -1}, 0.0, GoalState.SUCCEEDED),
         ({"goal_tolerance": 0.3}, 0.0, GoalState.SUCCEEDED),
         ({"goal_tolerance": 0}, 1.0, GoalState.ABORTED),
@@ -268,6 +270,100 @@ def test_cancelling_holds_the_measured_position() -> None:
     assert arm.statuses()[-1] == GoalStatus("goal", GoalState.CANCELED, "cancelled")
     arm.executor.cancel(arm.reading())
     assert arm.statuses() == []
+
+
+def quintic(time_s: float, positions: Any) -> dict[str, Any]:
+    return point(time_s, positions, (0.0, 0.0), (0.0, 0.0))
+
+
+def test_missed_ticks_delay_a_trajectory_and_skip_nothing() -> None:
+    punctual, late = Arm(), Arm()
+    for arm in (punctual, late):
+        arm.go(goal(quintic(0.5, (0.1, -0.05))))
+        arm.at(0.2)
+    before = late.setpoint.copy()
+    late.now_ns += 70 * MS
+    late.setpoint = late.executor.update(late.reading())
+    assert late.setpoint.tolist() == punctual.at(0.21), "one period further, not seven"
+    assert (late.setpoint != before).all()
+    late.at(1.0)
+    assert [each.state for each in late.statuses()] == [GoalState.EXECUTING, GoalState.SUCCEEDED]
+
+
+def test_trajectory_takes_over_at_a_time_of_the_running_one() -> None:
+    alone, arm = Arm(), Arm()
+    for each in (alone, arm):
+        each.go(goal(quintic(1.0, (0.2, 0.1))), "first")
+        each.at(0.2)
+    # The same motion from 0.345 s on, between two ticks.
+    position, velocity, acceleration = (np.array((0.2, 0.1)) * value for value in _rest_to_rest(0.345))
+    rest = [point(0.0, position, velocity, acceleration), quintic(0.655, (0.2, 0.1))]
+    arm.go(goal(*rest, takes_over={"goal": "first", "time_ns": 345 * MS}), "second")
+    assert [each.goal_id for each in arm.statuses()] == ["first"]
+    for time_s in (0.3, 0.34, 0.36, 0.5, 0.9, 1.0):
+        assert arm.at(time_s) == pytest.approx(alone.at(time_s), abs=1e-9)
+    arm.at(1.02)
+    assert [(each.goal_id, each.state) for each in arm.statuses()] == [
+        ("first", GoalState.CANCELED), ("second", GoalState.EXECUTING), ("second", GoalState.SUCCEEDED),
+    ]  # fmt: skip
+
+
+def _rest_to_rest(s: float) -> tuple[float, float, float]:
+    """The quintic from 0 to 1, with its derivatives."""
+    return 10 * s**3 - 15 * s**4 + 6 * s**5, 30 * s**2 - 60 * s**3 + 30 * s**4, 60 * s - 180 * s**2 + 120 * s**3
+
+
+def test_executing_says_when_the_trajectory_began() -> None:
+    arm = Arm()
+    arm.at(0.1)
+    arm.go(goal(quintic(1.0, (0.2, 0.1))), "first")
+    arm.at(0.2)
+    arm.go(goal(quintic(1.0, (0.0, 0.0)), takes_over={"goal": "first", "time_ns": 115 * MS}), "second")
+    arm.at(0.3)
+    begun = {s.goal_id: s.result["begin_ns"] for s in iter(arm.executor.pop_status, None) if s.result}
+    assert begun == {"first": 100 * MS, "second": 215 * MS}
+
+
+def test_stop_drops_a_trajectory_that_waits_to_take_over() -> None:
+    arm = Arm()
+    arm.go(goal(quintic(1.0, (0.2, 0.1))), "first")
+    arm.at(0.2)
+    arm.go(goal(quintic(1.0, (0.0, 0.0)), takes_over={"goal": "first", "time_ns": 300 * MS}), "second")
+    arm.go({"stop": True}, "stop")
+    arm.at(1.5)
+    assert [(each.goal_id, each.state) for each in arm.statuses()] == [
+        ("first", GoalState.EXECUTING), ("second", GoalState.CANCELED), ("first", GoalState.CANCELED),
+        ("stop", GoalState.EXECUTING), ("stop", GoalState.SUCCEEDED),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("takes_over", "message"),
+    [
+        ({"goal": "other", "time_ns": 0}, "goal other does not run, so no trajectory can take over from it"),
+        (
+            {"goal": "goal", "time_ns": 100 * MS},
+            "takes_over is at 100000000 ns of goal goal, which is at 500000000 ns and ends at 1000000000 ns",
+        ),
+        (
+            {"goal": "goal", "time_ns": 2000 * MS},
+            "takes_over is at 2000000000 ns of goal goal, which is at 500000000 ns and ends at 1000000000 ns",
+        ),
+        ({"goal": "goal"}, "takes_over has no time_ns"),
+        ({"goal": "goal", "time_ns": 0.5}, "takes_over has time_ns 0.5; it must be an integer from 0 on"),
+        ({"goal": 1, "time_ns": 0}, "takes_over has goal 1; it must be the name of the running goal"),
+        ("goal", "takes_over must be a mapping with goal, time_ns, got 'goal'"),
+    ],
+)
+def test_impossible_takeover_is_rejected_and_the_running_goal_goes_on(takes_over: Any, message: str) -> None:
+    arm = Arm()
+    arm.go(goal(quintic(1.0, (0.2, 0.1))))
+    arm.at(0.5)
+    with pytest.raises(GoalRejected) as caught:
+        arm.go(goal(quintic(1.0, (0.0, 0.0)), takes_over=takes_over), "second")
+    assert str(caught.value) == message
+    arm.at(1.01)
+    assert [each.state for each in arm.statuses()] == [GoalState.EXECUTING, GoalState.SUCCEEDED]
 
 
 def test_stop_slows_down_along_the_trajectory() -> None:
@@ -312,9 +408,8 @@ BAD: dict[str, Any] = {
     "the goal has no trajectory": {},
     "the trajectory has no joint_names": {"trajectory": {"points": []}},
     "the goal must be a mapping with trajectory, got 'up'": "up",
-    "the goal has an unknown key 'tolerance'; known: trajectory, path_tolerance, goal_tolerance, goal_time": goal(
-        point(1, AT_REST), tolerance=1
-    ),
+    "the goal has an unknown key 'tolerance'; known: trajectory, path_tolerance, goal_tolerance, goal_time, "
+    "takes_over": goal(point(1, AT_REST), tolerance=1),
     "point 0 has an unknown key 'effort'; known: time_from_start_ns, positions, velocities, accelerations": goal(
         point(1, AT_REST) | {"effort": [1.0, 1.0]}
     ),

@@ -7,6 +7,7 @@ from typing import override
 
 import numpy as np
 import pytest
+from ibrobot_kinematics.clearance import CLEARANCE
 from ibrobot_planning import ibrobot_sections
 from ibrobot_planning.options import RrtConnectOptions
 from ibrobot_planning.rrt import RrtConnectPlanner
@@ -105,6 +106,25 @@ def test_planners_use_the_world_of_the_run(run, tmp_path):
     run.call("/world/add", "{name: block, object: {shape: box, size: [0.4, 0.4, 0.1], position: [0.3, 0.1, 0.1]}}")
     with pytest.raises(PlanningError, match=r"the goal is in collision: \w+ overlaps block"):
         planner.plan(PlanRequest(ARM, np.zeros(5), goal))
+
+
+def test_clearance_is_the_distance_from_the_nearest_object(run):
+    upright = run.call(CLEARANCE, {"pan": 0.0})
+    assert run.call(CLEARANCE, {}) == pytest.approx(upright)
+    run.call("/world/add", "{name: above, object: {shape: box, size: [0.1, 0.1, 0.02], position: [0, 0, 0.5]}}")
+    near = run.call(CLEARANCE, {})
+    assert 0.02 < near < upright
+    run.call("/world/move", "{name: above, position: [0, 0, 0.49]}")
+    assert run.call(CLEARANCE, {}) == pytest.approx(near - 0.01, abs=1e-6)
+    run.call("/world/move", "{name: above, position: [0, 0, 0.4]}")
+    assert run.call(CLEARANCE, {}) < 0
+    assert run.call(CLEARANCE, {"lift": 1.5}) > 0
+
+
+def test_carried_objects_count_as_the_arm(run):
+    run.call("/world/attach", "{name: ball, link: hand, may_touch: [hand, finger]}")
+    run.call("/world/add", "{name: beside, object: {shape: box, size: [0.02, 0.1, 0.1], position: [0.14, 0, 0.6]}}")
+    assert run.call(CLEARANCE, {}) == pytest.approx(0.01)
 
 
 MALFORMED = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import override
 
 import numpy as np
-from ibrobot_kinematics import KinematicsError, Servo, ServoStatus, robot_model
+from ibrobot_kinematics import KinematicsError, Servo, ServoStatus, robot_model, world_clearance
 
 from ibrobot_core.api import (
     Context,
@@ -69,7 +69,7 @@ class TwistTeleop(Teleop):
             raise TeleopError(f"{ctx.name}: {error}") from error
         self._chain = tuple(model.moving.tolist())
         limits = robot.max_velocity[self._indices], robot.max_acceleration[self._indices]
-        self._servo = Servo(model, *limits, self._options)
+        self._servo = Servo(model, *limits, self._options, clearance=world_clearance(ctx.bus, self._arm))
         self._twists = ctx.bus.subscribe(self._options.topic)
         self._fresh = True
 

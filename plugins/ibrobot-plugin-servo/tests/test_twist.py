@@ -8,7 +8,8 @@ from typing import ClassVar, override
 import attrs
 import numpy as np
 import pytest
-from ibrobot_kinematics import KinematicModel, robot_model
+from ibrobot_kinematics import KinematicModel, ServoStatus, robot_model
+from ibrobot_kinematics.clearance import CLEARANCE
 from ibrobot_servo import ibrobot_sections, ibrobot_teleop
 from ibrobot_servo.options import TwistOptions
 from ibrobot_servo.teleop import TwistTeleop
@@ -307,3 +308,17 @@ def test_help_names_topic_type_and_frames(model):
     assert help_text == (
         "publish geometry_msgs/msg/TwistStamped on /servo_node/delta_twist_cmds, its frame_id base_link or tool"
     )
+
+
+def test_tool_slows_down_and_stands_before_obstacles(model: Path):
+    rig = Rig(model)
+    ceiling = rig.tool()[2] + 0.04
+
+    def distance(positions: dict[str, float]) -> float:
+        return float(ceiling - rig.kinematics.forward(np.array([*positions.values(), 0.0])).position[2])
+
+    rig.bus.serve(CLEARANCE, distance)
+    up = rig.follow(twist((0.0, 0.0, 0.2)), seconds=2.0)
+    assert 0.02 < up[2] <= 0.04 - TwistOptions().stop_distance + 1e-4
+    assert rig.status.drain()[-1].message == Int8(ServoStatus.DECELERATE_FOR_COLLISION)
+    assert rig.follow(twist((0.0, 0.0, -0.1)), seconds=0.3)[2] < -0.02, "it may leave"

@@ -53,6 +53,13 @@ class PlannerSuite(Suite[Planner]):
                 np.testing.assert_allclose(points[-1].positions, request.goal.positions, atol=self.tolerance_rad)
                 assert (np.diff([p.time_from_start_ns for p in points]) > 0).all(), "times must increase"
 
+    def test_nothing_blocks_its_own_trajectory(self) -> None:
+        """`blocked` finds nothing in the way of a trajectory just planned."""
+        with self.loaded() as (planner, ctx):
+            trajectory = planner.plan(self.request(ctx, 0)).trajectory
+            for from_ns in (0, trajectory.points[-1].time_from_start_ns // 2):
+                assert planner.blocked(trajectory, {}, from_ns) == ""
+
     def test_names_the_joints_asked_for(self) -> None:
         """The trajectory has exactly the request's joints, in its order, and a value for each in every point."""
         with self.loaded() as (planner, ctx):

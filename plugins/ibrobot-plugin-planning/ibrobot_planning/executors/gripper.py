@@ -24,22 +24,29 @@ from ibrobot_core.api import (
 )
 from ibrobot_planning.executors.options import GripperOptions
 
+_SHARE = 0.99
+"""Of the acceleration limit, what is used: rounding must not exceed it."""
+
 
 @attrs.define
 class _Running:
     goal_id: str
     moved_ns: int
     """When the gripper last moved [ns]."""
+    stops: bool = False
+    """Whether it only slows down."""
 
 
 class GripperExecutor(Executor):
     """Moves one joint's setpoint to the goal at `velocity`, and keeps it there regardless of the result.
 
+    It speeds up and slows down within the joint's acceleration limit, also from one goal to the next.
+
     Reached: the measured position is within `goal_tolerance` of the goal. Stalled: the measured speed has been below
     `stall_velocity` for `stall_time`; something is in the way. With `allow_stalling` that is a success (grasped) and
     the setpoint goes on to the goal, so that the gripper keeps squeezing; without, the goal is aborted and the measured
-    position held, as it is by `cancel`. With `max_effort` the setpoint goes no further while the measured effort is at
-    or above it, also after the goal has ended.
+    position held, as it is by `cancel`. The goal `{"stop": True}` slows down and holds. With `max_effort` the setpoint
+    goes no further while the measured effort is at or above it, also after the goal has ended.
     """
 
     def __init__(self, options: GripperOptions, ctx: Context) -> None:
@@ -52,8 +59,13 @@ class GripperExecutor(Executor):
         self._options = options
         joint = ctx.robot.joints[int(ctx.robot.indices(ctx.joints)[0])]
         self._lower, self._upper = joint.lower, joint.upper
+        period_s = seconds(ctx.period_ns)
+        self._fastest = min(options.velocity, joint.max_velocity) * period_s
+        self._change = _SHARE * joint.max_acceleration * period_s**2
         self._stall_ns = ns(options.stall_time)
         self._setpoint = self._target = math.nan
+        self._step = 0.0
+        """The last step of the setpoint [rad]."""
         self._max_effort = 0.0
         self._stamp_ns = 0
         self._running: _Running | None = None
@@ -63,6 +75,7 @@ class GripperExecutor(Executor):
     def activate(self, measured: JointReading) -> None:
         self.deactivate()
         self._setpoint = self._target = float(measured.position[0])
+        self._step = 0.0
         self._stamp_ns = measured.stamp_ns
 
     @override
@@ -76,7 +89,7 @@ class GripperExecutor(Executor):
 
         Args:
             goal_id: names it in `pop_status`.
-            goal: `position` [rad]; optionally `max_effort` [Nm], 0 for no limit.
+            goal: `position` [rad]; optionally `max_effort` [Nm], 0 for no limit. Or `{"stop": True}`.
             measured: the joint now, shape (1,).
 
         Raises:
@@ -84,6 +97,9 @@ class GripperExecutor(Executor):
         """
         if math.isnan(self._setpoint):
             raise GoalRejected("the executor is not active")
+        if goal == {"stop": True}:
+            self._begin(_Running(goal_id, measured.stamp_ns, stops=True), self._setpoint + self._braking_distance())
+            return
         unknown = [key for key in goal if key not in {"position", "max_effort"}]
         if unknown:
             raise GoalRejected(f"the goal has an unknown key {unknown[0]!r}; known: position, max_effort")
@@ -97,18 +113,26 @@ class GripperExecutor(Executor):
             raise GoalRejected(f"max_effort is {max_effort:.6g} Nm; it must be at least 0")
         if max_effort > 0 and not np.isfinite(measured.effort[0]):
             raise GoalRejected(f"max_effort cannot be kept: {self.joints[0]} has no measured effort; leave it out")
-        self._end(GoalState.CANCELED, f"replaced by goal {goal_id}")
-        self._target = position
-        self._running = _Running(goal_id, moved_ns=measured.stamp_ns)
+        self._begin(_Running(goal_id, measured.stamp_ns), position)
         self._max_effort = max_effort
-        self._statuses.append(GoalStatus(goal_id, GoalState.EXECUTING))
+
+    def _begin(self, goal: _Running, target: float) -> None:
+        self._end(GoalState.CANCELED, f"replaced by goal {goal.goal_id}")
+        self._running, self._target = goal, target
+        self._statuses.append(GoalStatus(goal.goal_id, GoalState.EXECUTING))
+
+    def _braking_distance(self) -> float:
+        """How far the setpoint goes until it has come to rest [rad]."""
+        ticks = math.floor(abs(self._step) / self._change)
+        return math.copysign(ticks * (abs(self._step) - (ticks + 1) * self._change / 2), self._step)
 
     @override
     def update(self, measured: JointReading) -> Vector:
-        step = self._options.velocity * seconds(measured.stamp_ns - self._stamp_ns)
+        if measured.stamp_ns > self._stamp_ns:
+            squeezes = self._max_effort > 0 and abs(measured.effort[0]) >= self._max_effort
+            self._step = 0.0 if squeezes else self._next_step()
+            self._setpoint += self._step
         self._stamp_ns = measured.stamp_ns
-        if not (self._max_effort > 0 and abs(measured.effort[0]) >= self._max_effort):
-            self._setpoint = min(max(self._target, self._setpoint - step), self._setpoint + step)
         if self._running is not None:
             self._judge(self._running, measured)
         return np.array([self._setpoint])
@@ -123,8 +147,20 @@ class GripperExecutor(Executor):
     def pop_status(self) -> GoalStatus | None:
         return self._statuses.popleft() if self._statuses else None
 
+    def _next_step(self) -> float:
+        """The step of this tick towards the target [rad], within velocity and acceleration."""
+        gap = self._target - self._setpoint
+        # From a step u, then u - D, u - 2 D, …, the setpoint comes to rest within the gap.
+        ticks = math.floor((math.sqrt(1 + 8 * abs(gap) / self._change) - 1) / 2)
+        most = min(abs(gap) / (ticks + 1) + ticks * self._change / 2, self._fastest)
+        return min(max(math.copysign(most, gap), self._step - self._change), self._step + self._change)
+
     def _judge(self, running: _Running, measured: JointReading) -> None:
         """End the goal if it is reached or the gripper has stalled."""
+        if running.stops:
+            if self._setpoint == self._target or self._step == 0:
+                self._end(GoalState.SUCCEEDED, "", self._result(measured))
+            return
         # Written so that a NaN speed counts as moving: a stall must be measured.
         if not abs(measured.velocity[0]) < self._options.stall_velocity:
             running.moved_ns = measured.stamp_ns
@@ -142,7 +178,7 @@ class GripperExecutor(Executor):
     def _hold(self, measured: JointReading) -> None:
         if np.isfinite(measured.position[0]):
             self._setpoint = float(measured.position[0])
-        self._target = self._setpoint
+        self._target, self._step = self._setpoint, 0.0
 
     def _result(self, measured: JointReading, *, stalled: bool = False, reached_goal: bool = False) -> dict[str, Any]:
         return {"position": float(measured.position[0]), "stalled": stalled, "reached_goal": reached_goal}

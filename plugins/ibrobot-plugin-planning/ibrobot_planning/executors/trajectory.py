@@ -22,7 +22,7 @@ from ibrobot_core.api import (
     seconds,
 )
 from ibrobot_planning.executors.options import TrajectoryOptions
-from ibrobot_planning.executors.trajectory_goal import TrajectoryGoal, parse_goal
+from ibrobot_planning.executors.trajectory_goal import Takeover, TrajectoryGoal, parse_goal
 
 START_TOLERANCE_RAD = 0.1
 """How far from the present setpoint a trajectory's point at time zero may lie."""
@@ -47,6 +47,7 @@ class _Stop:
 class _Running:
     goal_id: str
     goal: TrajectoryGoal
+    begin_ns: int
     spline: Spline
     stop: _Stop | None = None
 
@@ -60,8 +61,11 @@ class TrajectoryExecutor(Executor):
     position comes within the goal tolerance, at the end or up to `goal_time` after it. A joint further off its path
     than the path tolerance, or late, aborts the goal. Aborting and cancelling hold the measured position.
 
-    The goal `{"stop": True}` slows down along the trajectory under way, within the acceleration limits, and holds where
-    it comes to rest.
+    A trajectory with `takes_over` waits until the running one has come to a given time, and begins at that time's
+    setpoint, velocity and acceleration. The goal `{"stop": True}` slows down along the trajectory under way, within the
+    acceleration limits, and holds where it comes to rest.
+
+    Trajectories advance by one control period per tick: ticks that are missed delay them, and skip nothing.
     """
 
     def __init__(self, options: TrajectoryOptions, ctx: Context) -> None:
@@ -70,14 +74,20 @@ class TrajectoryExecutor(Executor):
         indices = ctx.robot.indices(ctx.joints)
         self._lower, self._upper = ctx.robot.lower[indices], ctx.robot.upper[indices]
         self._acceleration = ctx.robot.max_acceleration[indices]
+        self._period_ns = ctx.period_ns
         self._held: Vector | None = None
         self._running: _Running | None = None
+        self._next: _Running | None = None
+        """Takes over from the running trajectory when it begins."""
+        self._now_ns = self._stamp_ns = 0
+        """Time that passes by at most a period per tick, and the time of the last tick."""
         self._statuses: deque[GoalStatus] = deque()
 
     @override
     def activate(self, measured: JointReading) -> None:
         self.deactivate()
         self._held = measured.position.copy()
+        self._now_ns = self._stamp_ns = measured.stamp_ns
 
     @override
     def deactivate(self) -> None:
@@ -92,17 +102,19 @@ class TrajectoryExecutor(Executor):
             goal_id: names it in `pop_status`.
             goal: `trajectory`: `joint_names` and `points`, each of `time_from_start_ns`, `positions` and, in all
                 points or in none, `velocities`, `accelerations`; optionally `path_tolerance` and `goal_tolerance`
-                [rad], a number or one by joint name, and `goal_time` [s]: 0 means the options' value, -1 none. Or
-                `{"stop": True}`.
-            measured: the joints now; its stamp is when the trajectory starts.
+                [rad], a number or one by joint name, and `goal_time` [s]: 0 means the options' value, -1 none;
+                and `takes_over`: `goal`, the running one, and `time_ns`, the time of its trajectory at which this one
+                begins. Or `{"stop": True}`.
+            measured: the joints now.
 
         Raises:
-            GoalRejected: e.g. times that do not increase, or a velocity at the end; the old goal goes on.
+            GoalRejected: e.g. times that do not increase, a velocity at the end, or a time to take over that has
+                passed; the old goal goes on.
         """
         if self._held is None:
             raise GoalRejected("the executor is not active")
         if "stop" in goal:
-            self._begin_stop(goal_id, goal, measured.stamp_ns)
+            self._begin_stop(goal_id, goal)
             return
         parsed = parse_goal(goal, self.joints, self._options)
         outside = (parsed.positions[-1] < self._lower) | (parsed.positions[-1] > self._upper)
@@ -112,12 +124,36 @@ class TrajectoryExecutor(Executor):
                 f"the last point has {self.joints[joint]} at {parsed.positions[-1, joint]:.6g} rad, outside its limits "
                 f"{self._lower[joint]:.6g} to {self._upper[joint]:.6g}"
             )
-        spline = self._spline(parsed, measured.stamp_ns)
-        self._end(GoalState.CANCELED, f"replaced by goal {goal_id}")
-        self._running = _Running(goal_id, parsed, spline)
-        self._statuses.append(GoalStatus(goal_id, GoalState.EXECUTING))
+        begin_ns = self._now_ns if parsed.takes_over is None else self._takeover_ns(parsed.takes_over)
+        following = _Running(goal_id, parsed, begin_ns, self._spline(parsed, begin_ns))
+        if self._next is not None:
+            self._statuses.append(GoalStatus(self._next.goal_id, GoalState.CANCELED, f"replaced by goal {goal_id}"))
+        self._next = following
+        if parsed.takes_over is None:
+            self._begin_next()
 
-    def _begin_stop(self, goal_id: str, goal: Mapping[str, Any], now_ns: int) -> None:
+    def _takeover_ns(self, takeover: Takeover) -> int:
+        running = self._running
+        if running is None or running.goal_id != takeover.goal or running.stop is not None:
+            raise GoalRejected(f"goal {takeover.goal} does not run, so no trajectory can take over from it")
+        begin_ns = running.begin_ns + takeover.time_ns
+        if not self._now_ns <= begin_ns <= running.spline.end_ns:
+            raise GoalRejected(
+                f"takes_over is at {takeover.time_ns} ns of goal {takeover.goal}, which is at "
+                f"{self._now_ns - running.begin_ns} ns and ends at {running.spline.end_ns - running.begin_ns} ns"
+            )
+        return begin_ns
+
+    def _begin_next(self) -> None:
+        """Let the next trajectory take over from the running one."""
+        following, self._next = self._next, None
+        assert following is not None
+        self._end(GoalState.CANCELED, f"replaced by goal {following.goal_id}")
+        self._running = following
+        begin_ns = self._stamp_ns - (self._now_ns - following.begin_ns)
+        self._statuses.append(GoalStatus(following.goal_id, GoalState.EXECUTING, "", {"begin_ns": begin_ns}))
+
+    def _begin_stop(self, goal_id: str, goal: Mapping[str, Any]) -> None:
         if goal != {"stop": True}:
             raise GoalRejected(f"a goal that stops is {{'stop': True}}, got {dict(goal)!r}")
         running = self._running
@@ -126,15 +162,19 @@ class TrajectoryExecutor(Executor):
         if running is None:
             self._statuses.append(GoalStatus(goal_id, GoalState.SUCCEEDED))
         else:
-            stop = running.stop or _Stop(now_ns, now_ns)
-            self._running = _Running(goal_id, running.goal, running.spline, stop)
+            stop = running.stop or _Stop(self._now_ns, self._now_ns)
+            self._running = attrs.evolve(running, goal_id=goal_id, stop=stop)
 
     @override
     def update(self, measured: JointReading) -> Vector:
+        self._now_ns += min(max(measured.stamp_ns - self._stamp_ns, 0), self._period_ns)
+        self._stamp_ns = measured.stamp_ns
+        if self._next is not None and self._now_ns >= self._next.begin_ns:
+            self._begin_next()
         stop = self._running.stop if self._running is not None else None
         if self._running is not None and stop is not None:
-            self._slow_down(self._running.spline, stop, measured.stamp_ns)
-        setpoint, _, _ = self._sample(measured.stamp_ns)
+            self._slow_down(self._running.spline, stop, self._now_ns)
+        setpoint, _, _ = self._sample(self._now_ns)
         running = self._running
         if running is None:
             return setpoint.copy()
@@ -143,7 +183,7 @@ class TrajectoryExecutor(Executor):
             self._held = setpoint.copy()
             self._end(GoalState.SUCCEEDED, "")
             return setpoint.copy()
-        if stop is not None or measured.stamp_ns < running.spline.end_ns:
+        if stop is not None or self._now_ns < running.spline.end_ns:
             beyond = _exceeds(error, running.goal.path_tolerance)
             if beyond.any():
                 why = self._deviation(beyond, error, running.goal.path_tolerance, "off its path")
@@ -153,7 +193,7 @@ class TrajectoryExecutor(Executor):
         if not beyond.any():
             self._held = setpoint
             self._end(GoalState.SUCCEEDED, "")
-        elif running.goal.goal_time_ns and measured.stamp_ns >= running.spline.end_ns + running.goal.goal_time_ns:
+        elif running.goal.goal_time_ns and self._now_ns >= running.spline.end_ns + running.goal.goal_time_ns:
             why = self._deviation(beyond, error, running.goal.goal_tolerance, "off its goal")
             late = f"{why} {seconds(running.goal.goal_time_ns):.6g} s after the end"
             return self._stop(GoalState.ABORTED, late, measured)
@@ -169,7 +209,7 @@ class TrajectoryExecutor(Executor):
         return self._statuses.popleft() if self._statuses else None
 
     def _sample(self, now_ns: int) -> tuple[Vector, Vector, Vector]:
-        """The setpoint at `now_ns` [ns] with its velocity and acceleration, each shape (J,)."""
+        """The setpoint at `now_ns` [ns] of the executor's time, with its velocity and acceleration, each shape (J,)."""
         running = self._running
         if running is not None and running.stop is not None:
             position, velocity, acceleration = running.spline.at(round(running.stop.phase_ns))
@@ -198,9 +238,9 @@ class TrajectoryExecutor(Executor):
         left = _STOP_SHARE * self._acceleration + np.sign(velocity) * acceleration * rate**2
         return float((-left[moving] / np.abs(velocity[moving])).max())
 
-    def _spline(self, goal: TrajectoryGoal, now_ns: int) -> Spline:
-        """The goal's points in time [ns], begun at the setpoint of the moment."""
-        position, velocity, acceleration = self._sample(now_ns)
+    def _spline(self, goal: TrajectoryGoal, begin_ns: int) -> Spline:
+        """The goal's points in time [ns], begun at the setpoint of `begin_ns` [ns]."""
+        position, velocity, acceleration = self._sample(begin_ns)
         times_ns, positions = goal.times_ns, goal.positions
         velocities, accelerations = goal.velocities, goal.accelerations
         if times_ns[0] == 0:
@@ -215,7 +255,7 @@ class TrajectoryExecutor(Executor):
             velocities = None if velocities is None else velocities[1:]
             accelerations = None if accelerations is None else accelerations[1:]
         return Spline(
-            np.concatenate(([now_ns], now_ns + times_ns)),
+            np.concatenate(([begin_ns], begin_ns + times_ns)),
             np.vstack((position, positions)),
             None if velocities is None else np.vstack((velocity, velocities)),
             None if accelerations is None else np.vstack((acceleration, accelerations)),
@@ -223,12 +263,16 @@ class TrajectoryExecutor(Executor):
 
     def _stop(self, state: GoalState, why: str, measured: JointReading) -> Vector:
         """End the goal and hold the measured position [rad], shape (J,)."""
-        setpoint, _, _ = self._sample(measured.stamp_ns)
+        setpoint, _, _ = self._sample(self._now_ns)
         self._held = np.where(np.isfinite(measured.position), measured.position, setpoint)
         self._end(state, why)
         return self._held.copy()
 
     def _end(self, state: GoalState, message: str) -> None:
+        """End the running goal, and the one that waits to take over from it."""
+        if self._next is not None:
+            self._statuses.append(GoalStatus(self._next.goal_id, GoalState.CANCELED, message))
+            self._next = None
         if self._running is not None:
             self._statuses.append(GoalStatus(self._running.goal_id, state, message))
             self._running = None

@@ -14,6 +14,16 @@ from ibrobot_core.api import GoalRejected, Vector, ns
 from ibrobot_planning.executors.options import TrajectoryOptions
 
 
+@attrs.frozen
+class Takeover:
+    """When a trajectory takes over from the running one."""
+
+    goal: str
+    """Name of the running goal."""
+    time_ns: int
+    """From the beginning of its trajectory [ns]."""
+
+
 @attrs.frozen(eq=False)
 class TrajectoryGoal:
     """A goal in the executor's joint order: N points of J joints."""
@@ -32,6 +42,7 @@ class TrajectoryGoal:
     """[rad], shape (J,); 0: not checked."""
     goal_time_ns: int
     """[ns]; 0: no limit."""
+    takes_over: Takeover | None = None
 
 
 def parse_goal(goal: Mapping[str, Any], joints: Sequence[str], options: TrajectoryOptions) -> TrajectoryGoal:
@@ -40,7 +51,7 @@ def parse_goal(goal: Mapping[str, Any], joints: Sequence[str], options: Trajecto
     Raises:
         GoalRejected: with what is wrong, where, and what would be right.
     """
-    _keys(goal, ("trajectory",), ("path_tolerance", "goal_tolerance", "goal_time"), "the goal")
+    _keys(goal, ("trajectory",), ("path_tolerance", "goal_tolerance", "goal_time", "takes_over"), "the goal")
     trajectory = goal["trajectory"]
     _keys(trajectory, ("joint_names", "points"), (), "the trajectory")
     order = _order(trajectory["joint_names"], joints)
@@ -69,7 +80,15 @@ def parse_goal(goal: Mapping[str, Any], joints: Sequence[str], options: Trajecto
         path_tolerance=_tolerance(goal, "path_tolerance", options.path_tolerance, joints),
         goal_tolerance=_tolerance(goal, "goal_tolerance", options.goal_tolerance, joints),
         goal_time_ns=ns(_setting(goal.get("goal_time", 0), options.goal_time, "goal_time")),
+        takes_over=_takeover(goal["takes_over"]) if "takes_over" in goal else None,
     )
+
+
+def _takeover(value: Any) -> Takeover:
+    _keys(value, ("goal", "time_ns"), (), "takes_over")
+    if not isinstance(value["goal"], str):
+        raise GoalRejected(f"takes_over has goal {value['goal']!r}; it must be the name of the running goal")
+    return Takeover(value["goal"], _time_ns(value["time_ns"], "takes_over"))
 
 
 def _keys(value: Any, required: Sequence[str], optional: Sequence[str], what: str) -> None:
@@ -93,15 +112,19 @@ def _order(names: Any, joints: Sequence[str]) -> list[int]:
 def _times(points: Sequence[Mapping[str, Any]]) -> NDArray[np.int64]:
     previous = -1
     for index, point in enumerate(points):
-        time_ns = point["time_from_start_ns"]
-        if isinstance(time_ns, bool) or not isinstance(time_ns, int) or not 0 <= time_ns < 2**62:
-            raise GoalRejected(f"point {index} has time_from_start_ns {time_ns!r}; it must be an integer from 0 on")
+        time_ns = _time_ns(point["time_from_start_ns"], f"point {index}", "time_from_start_ns")
         if time_ns <= previous:
             raise GoalRejected(f"point {index} is at {time_ns} ns, not after the point before it at {previous} ns")
         previous = time_ns
     if previous == 0:
         raise GoalRejected("the last point is at time 0, which leaves no time to reach it")
     return np.array([point["time_from_start_ns"] for point in points], dtype=np.int64)
+
+
+def _time_ns(value: Any, what: str, key: str = "time_ns") -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 2**62:
+        raise GoalRejected(f"{what} has {key} {value!r}; it must be an integer from 0 on")
+    return value
 
 
 def _field(points: Sequence[Mapping[str, Any]], name: str, order: Sequence[int]) -> Vector | None:

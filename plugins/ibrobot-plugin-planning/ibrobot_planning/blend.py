@@ -1,0 +1,169 @@
+"""Changes between motions without a stop: one motion slows down along its path while the next one already begins.
+
+A motion that another one replaces brakes along its own path, which is known to be free. The next motion is planned from
+where the arm comes to rest. Its way is then added to the braking motion, as early as limits and obstacles permit. At
+worst it begins when the arm stands.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import product
+
+import attrs
+import numpy as np
+
+from ibrobot_core.api import Header, JointTrajectory, JointTrajectoryPoint, Vector, ns, seconds
+from ibrobot_planning.timing import Motion
+
+STEP_S = 0.01
+"""Time between the points of the motions made here."""
+_SAMPLE_S = 0.001
+_SHARE = 0.9
+"""Of the acceleration limits, what braking uses."""
+_JERK = 400.0
+"""Jerk of the joint that moves fastest, where braking begins and ends [rad/s^3]."""
+_OVERLAPS = 6
+"""Number of times at which the next motion may begin while the arm brakes."""
+_SLOWED = (1.0, 1.15, 1.35, 1.7)
+"""How much slower the next motion may be for an earlier beginning."""
+_GLANCE = 5
+"""Number of samples from one to the next that are checked before all."""
+_ROUNDING = 1e-3
+"""Allowed excess of the limits, as a share of them."""
+
+
+@attrs.frozen(eq=False)
+class Limits:
+    """Limits of the joints, each shape (J,)."""
+
+    lower: Vector
+    """[rad]."""
+    upper: Vector
+    """[rad]."""
+    velocity: Vector
+    """[rad/s]."""
+    acceleration: Vector
+    """[rad/s^2]."""
+
+    def hold(self, motion: Motion) -> bool:
+        """Whether a motion, as executors interpolate it, is within the limits."""
+        return self.hold_at(motion.sampled(_SAMPLE_S))
+
+    def hold_at(self, samples: Vector) -> bool:
+        """Whether samples of a motion, shape (3, N, J), are within the limits; it may begin outside the positions."""
+        positions, velocities, accelerations = samples
+        lower, upper = np.minimum(self.lower, positions[0]), np.maximum(self.upper, positions[0])
+        more = 1 + _ROUNDING
+        return bool(
+            (positions >= lower - _ROUNDING).all()
+            and (positions <= upper + _ROUNDING).all()
+            and (np.abs(velocities) <= more * self.velocity).all()
+            and (np.abs(accelerations) <= more * self.acceleration).all()
+        )
+
+
+def motion_of(trajectory: JointTrajectory) -> Motion | None:
+    """A trajectory as a motion; None if it lacks velocities or accelerations."""
+    points = trajectory.points
+    if len(points) < 2 or not all(point.velocities.size and point.accelerations.size for point in points):
+        return None
+    return Motion(
+        np.array([seconds(point.time_from_start_ns) for point in points]),
+        np.array([point.positions for point in points]),
+        np.array([point.velocities for point in points]),
+        np.array([point.accelerations for point in points]),
+    )
+
+
+def trajectory_of(made: Motion, joints: tuple[str, ...], stamp_ns: int) -> JointTrajectory:
+    """A motion as a message."""
+    rows = zip(made.times.tolist(), made.positions, made.velocities, made.accelerations, strict=True)
+    points = tuple(JointTrajectoryPoint(ns(time), *row) for time, *row in rows)
+    return JointTrajectory(Header(stamp_ns=stamp_ns), joints, points)
+
+
+def braking(old: Motion, begin_s: float, brake_s: float, acceleration: Vector) -> Motion:
+    """The rest of a motion from `begin_s` [s] on, which brakes along its path from `brake_s` [s] on.
+
+    Args:
+        old: the motion.
+        begin_s: where the result begins.
+        brake_s: where the braking begins; not before `begin_s`.
+        acceleration: limits of the joints [rad/s^2], shape (J,).
+    """
+    samples = old.sampled(_SAMPLE_S)
+    phase, rate, change = begin_s, 1.0, 0.0
+    rows = []
+    while True:
+        i = min(int(phase / _SAMPLE_S), samples.shape[1] - 1)
+        position, velocity, moved = samples[:, i]
+        ahead = phase - i * _SAMPLE_S
+        position, velocity = position + ahead * (velocity + ahead * moved / 2), velocity + ahead * moved
+        rows.append((position, velocity * rate, velocity * change + moved * rate**2))
+        if phase >= old.duration or rate <= 0:
+            break
+        if phase >= brake_s:
+            # Acceleration of a joint: velocity * change + moved * rate^2.
+            speed = np.maximum(np.abs(velocity), 1e-9)
+            left = (_SHARE * acceleration + np.sign(velocity) * moved * rate**2) / speed
+            jerk = _JERK / max(float(speed.max()), 0.1)
+            strongest = max(float((-left).max()), -np.sqrt(2 * jerk * rate), change - jerk * _SAMPLE_S)
+            change = min(strongest, 0.0)
+        after = max(rate + change * _SAMPLE_S, 0.0)
+        phase = min(phase + (rate + after) / 2 * _SAMPLE_S, old.duration)
+        rate = after
+    made = np.array(rows)
+    made[-1, 1:] = 0.0
+    return _every(made, STEP_S)
+
+
+def joined(old: Motion, new: Motion, begin_s: float, limits: Limits) -> Iterator[Motion]:
+    """Ways from one motion to another, the shortest first; each begins where `old` is at `begin_s` [s].
+
+    Args:
+        old: comes to rest where `new` begins.
+        new: from rest to rest.
+        begin_s: time of `old`, before its end.
+        limits: which the result keeps.
+    """
+    rest = old.sampled(_SAMPLE_S)[:, round(begin_s / _SAMPLE_S) :]
+    slowed = {}
+    for factor in _SLOWED:
+        slowed[factor] = new.slowed(factor).sampled(_SAMPLE_S)
+        slowed[factor][0] -= slowed[factor][0, 0]
+    starts = np.linspace(0, rest.shape[1] - 1, _OVERLAPS + 1).astype(int).tolist()
+    ways = [(start, slowed[factor]) for start, factor in product(starts, _SLOWED)]
+    for start, following in sorted(ways, key=lambda way: way[0] + way[1].shape[1]):
+        rows = _sum(rest, following, start)
+        if limits.hold_at(rows[:, ::_GLANCE]):
+            candidate = _every(rows.transpose(1, 0, 2), STEP_S)
+            if limits.hold(candidate):
+                yield candidate
+
+
+def _sum(rest: Vector, following: Vector, start: int) -> Vector:
+    """Samples of a motion, with a second motion added from sample `start` on, shape (3, N, J)."""
+    end = start + following.shape[1]
+    rows = np.zeros((3, max(rest.shape[1], end), rest.shape[2]))
+    rows[:, : rest.shape[1]] = rest
+    rows[0, rest.shape[1] :] = rest[0, -1]
+    rows[:, start:end] += following
+    rows[0, end:] += following[0, -1]
+    return rows
+
+
+def cut(whole: Motion, end_s: float) -> Motion:
+    """The beginning of a motion, up to its last point before `end_s` [s], and at least its first two points."""
+    number = max(int(np.searchsorted(whole.times, end_s, side="right")), 2)
+    return Motion(
+        whole.times[:number], whole.positions[:number], whole.velocities[:number], whole.accelerations[:number]
+    )
+
+
+def _every(rows: Vector, step_s: float) -> Motion:
+    """A motion through every so many of `rows`, shape (N, 3, J), one per sample, and through the last."""
+    every, last = round(step_s / _SAMPLE_S), max(len(rows) - 1, 1)
+    kept = np.append(np.arange(0, last, every), last)
+    rows = rows[np.minimum(kept, len(rows) - 1)]
+    return Motion(kept * _SAMPLE_S, rows[:, 0], rows[:, 1], rows[:, 2])

@@ -1,0 +1,228 @@
+"""Execution of planned motions by the executors of a mode: how they begin, blend, stop, and are supervised."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from typing import Any
+
+import attrs
+
+from ibrobot_core.api import HardwareError, JointTrajectory, Planner, Session, Vector, ns, seconds, trajectory_goal
+from ibrobot_planning.blend import Limits, braking, cut, joined, motion_of, trajectory_of
+
+_LATENCY_S = 0.04
+"""How far ahead a trajectory takes over from the running one: it must arrive there in time."""
+_LEAD_S = 0.15
+"""How long a replaced motion goes on before it brakes, so that fast planning costs no speed."""
+
+type ExecutorGoal = JointTrajectory | float
+"""A trajectory, or a position [rad]."""
+
+
+@attrs.define(eq=False)
+class _Track:
+    """What an executor follows."""
+
+    goal_id: str
+    trajectory: JointTrajectory | None
+    begin_ns: int | None = None
+    """When it began, if the executor reports it [ns]."""
+
+
+class Execution:
+    """The goals of executors under way. Methods may be called from several threads.
+
+    Args:
+        session: the run.
+        planner: says whether a motion touches anything.
+    """
+
+    def __init__(self, session: Session, planner: Planner) -> None:
+        self._session = session
+        self._planner = planner
+        self._lock = threading.RLock()
+        self._tracks: dict[str, _Track] = {}
+        """Executors that have not ended yet."""
+        self._ahead: dict[str, ExecutorGoal] = {}
+        """Goals that wait until the executor's braking motion permits them."""
+        self._number = 0
+
+    @property
+    def under_way(self) -> bool:
+        """Whether an executor has not ended yet."""
+        return bool(self._tracks or self._ahead)
+
+    def begin(self, number: int, goals: Mapping[str, ExecutorGoal]) -> None:
+        """Send goals to executors at rest.
+
+        Args:
+            number: of the move.
+            goals: executor -> its goal.
+
+        Raises:
+            HardwareError: if an executor refuses its goal; the others are cancelled.
+        """
+        with self._lock:
+            self._tracks, self._ahead, self._number = {}, {}, number
+            try:
+                for name, goal in goals.items():
+                    self._send(name, f"{number}:{name}", goal)
+            except HardwareError:
+                self._session.control.call("cancel")
+                self._tracks = {}
+                raise
+
+    def stop(self, number: int) -> None:
+        """Let all executors slow down and hold."""
+        session = self._session
+        with self._lock:
+            self._ahead.clear()
+            for name in sorted(self._tracks):
+                goal_id = f"{number}:stop:{name}"
+                try:
+                    session.control.call("goal", executor=name, goal_id=goal_id, goal={"stop": True})
+                except HardwareError as error:
+                    session.log.warning("%s does not slow down, and is cancelled: %s", name, error)
+                    session.control.call("cancel")
+                    return
+                self._tracks[name] = _Track(goal_id, None)
+
+    def brake(self, number: int) -> Vector | None:
+        """Let trajectories go on for a moment, and then brake along their path, until `follow` adds the next motion.
+
+        Args:
+            number: of the next move.
+
+        Returns:
+            Where the robot comes to rest [rad], shape (J,); None if a running goal cannot be continued like that.
+        """
+        with self._lock:
+            braked = self._braked()
+            if braked is None:
+                return None
+            rest = self.commanded().copy()
+            try:
+                for name, (begin_ns, way) in braked.items():
+                    takes_over = {"goal": self._tracks[name].goal_id, "time_ns": begin_ns}
+                    self._send(name, f"{number}:brake:{name}", way, takes_over)
+                    rest[self._session.config.robot.indices(way.joint_names)] = way.points[-1].positions
+            except HardwareError:
+                return None
+            self._number = number
+            return rest
+
+    def follow(self, goals: Mapping[str, ExecutorGoal]) -> None:
+        """Add the next motion to the braking one."""
+        with self._lock:
+            self._ahead = dict(goals)
+        self.step()
+
+    def step(self) -> None:
+        """Send goals of `follow` whose time has come."""
+        with self._lock:
+            for name, goal in list(self._ahead.items()):
+                track = self._tracks.get(name)
+                if isinstance(goal, float) or track is None or track.trajectory is None:
+                    sent = self._try(name, goal)
+                else:
+                    sent = self._blended(name, track, track.trajectory, goal)
+                if sent:
+                    self._ahead.pop(name, None)
+
+    def take(self, event: Mapping[str, Any]) -> str | None:
+        """Take an event of an executor.
+
+        Returns:
+            None if its present goal did not end by it; otherwise what went wrong, or an empty text.
+        """
+        name, state = str(event["executor"]), str(event["state"])
+        with self._lock:
+            track = self._tracks.get(name)
+            if track is None or track.goal_id != event["goal"]:
+                return None
+            if state == "executing":
+                track.begin_ns = event["result"].get("begin_ns")
+                return None
+            del self._tracks[name]
+        return "" if state == "succeeded" else f"{name} {state}: {event['message']}"
+
+    def blocked(self) -> str:
+        """What the rest of a motion touches in the present world; empty if nothing."""
+        state = self._session.state
+        if state is None:
+            return ""
+        others = dict(zip(self._session.config.robot.joint_names, state.command.tolist(), strict=True))
+        with self._lock:
+            tracks = list(self._tracks.values())
+        for track in tracks:
+            if track.trajectory is not None:
+                passed_ns = 0 if track.begin_ns is None else max(0, state.stamp_ns - track.begin_ns)
+                if touched := self._planner.blocked(track.trajectory, others, passed_ns):
+                    return touched
+        return ""
+
+    def commanded(self) -> Vector:
+        """Commanded positions [rad], shape (J,): unlike the measured ones, they do not sag."""
+        state = self._session.state
+        return state.command if state is not None else self._session.measured().position
+
+    def _send(self, name: str, goal_id: str, goal: ExecutorGoal, takes_over: Mapping[str, Any] | None = None) -> None:
+        message: dict[str, Any] = {"position": goal} if isinstance(goal, float) else trajectory_goal(goal)
+        if takes_over is not None:
+            message["takes_over"] = takes_over
+        self._session.control.call("goal", executor=name, goal_id=goal_id, goal=message)
+        self._tracks[name] = _Track(goal_id, None if isinstance(goal, float) else goal)
+
+    def _try(self, name: str, goal: ExecutorGoal, takes_over: Mapping[str, Any] | None = None) -> bool:
+        """Send a goal; return False if it came too late to take over."""
+        try:
+            self._send(name, f"{self._number}:{name}", goal, takes_over)
+        except HardwareError:
+            if takes_over is None:
+                raise
+            return False
+        return True
+
+    def _braked(self) -> dict[str, tuple[int, JointTrajectory]] | None:
+        """Executor -> when its braking motion takes over [ns], and that motion; None if one cannot brake like that."""
+        robot, state = self._session.config.robot, self._session.state
+        found = {}
+        for name, track in self._tracks.items():
+            if track.trajectory is None and self._session.config.executors[name].goals == "position":
+                continue
+            old = motion_of(track.trajectory) if track.trajectory is not None else None
+            if old is None or track.begin_ns is None or state is None or track.trajectory is None:
+                return None
+            begin_s = round(seconds(state.stamp_ns - track.begin_ns) + _LATENCY_S, 3)
+            if begin_s >= old.duration:
+                return None
+            joints = track.trajectory.joint_names
+            way = braking(old, begin_s, begin_s + _LEAD_S, robot.max_acceleration[robot.indices(joints)])
+            found[name] = ns(begin_s), trajectory_of(way, joints, self._session.clock.now_ns())
+        return found or None
+
+    def _blended(self, name: str, track: _Track, running: JointTrajectory, goal: JointTrajectory) -> bool:
+        """Let a motion begin while the executor brakes; return False if its time has not come."""
+        state, old, new = self._session.state, motion_of(running), motion_of(goal)
+        if track.begin_ns is None or state is None or old is None:
+            return False
+        passed_s = seconds(state.stamp_ns - track.begin_ns)
+        if passed_s > old.duration:
+            return self._try(name, goal)
+        begin_s = round(passed_s + _LATENCY_S, 3)
+        if new is None or begin_s >= old.duration:
+            return False
+        robot = self._session.config.robot
+        order = robot.indices(running.joint_names)
+        limits = Limits(
+            robot.lower[order], robot.upper[order], robot.max_velocity[order], robot.max_acceleration[order]
+        )
+        others = dict(zip(robot.joint_names, state.command.tolist(), strict=True))
+        for way in joined(old, new, begin_s, limits):
+            # After the old motion the way is that of the new one, which the planner has checked.
+            overlap = trajectory_of(cut(way, old.duration - begin_s), running.joint_names, goal.header.stamp_ns)
+            if not self._planner.blocked(overlap, others):
+                blend = trajectory_of(way, running.joint_names, goal.header.stamp_ns)
+                return self._try(name, blend, {"goal": track.goal_id, "time_ns": ns(begin_s)})
+        return False
