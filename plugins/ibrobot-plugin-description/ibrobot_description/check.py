@@ -47,6 +47,7 @@ def _mounts(frames: list[MountedFrame], urdf: Urdf | None) -> Iterator[OptionFau
         parents.setdefault(frame.name, frame.mount.parent)
         if frame.optical:
             parents.setdefault(frame.optical, frame.name)
+    roots: list[str] = []
     for frame in frames:
         place = (*_place(frame), "parent")
         parent = frame.mount.parent
@@ -56,6 +57,13 @@ def _mounts(frames: list[MountedFrame], urdf: Urdf | None) -> Iterator[OptionFau
         chain = [frame.name]
         while chain[-1] in parents and chain[-1] not in chain[:-1]:
             chain.append(parents[chain[-1]])
+        if urdf is None and chain[-1] not in chain[:-1]:
+            roots.append(chain[-1])
+            if roots[-1] != roots[0]:
+                message = (
+                    f"frame {frame.name!r} is not attached to the others: its root is {chain[-1]!r}, not {roots[0]!r}"
+                )
+                yield OptionFault(place, message)
         if chain[-1] == frame.name and len(chain) > 1:
             yield OptionFault(place, f"frame {frame.name!r} is its own ancestor: {' -> '.join(reversed(chain))}")
 

@@ -272,6 +272,26 @@ def test_srdf_needs_a_urdf(load: Callable[..., RobotConfig], tmp_path: Path, reg
         load_config(path, registry=registry)
 
 
+def test_mounts_without_a_urdf_need_one_root(
+    load: Callable[..., RobotConfig], tmp_path: Path, registry: Registry
+) -> None:
+    load()
+    path = tmp_path / "robot.yaml"
+    text = path.read_text().replace("  description: {urdf: robot.urdf}\n", "")
+    for name, parent in (("top", "base"), ("wrist", "hand")):
+        camera = f"name: {name}, kind: camera"
+        text = text.replace(camera, f"{camera}, transform: {{parent: {parent}}}")
+    path.write_text(text)
+    with pytest.raises(ConfigError) as failure:
+        load_config(path, registry=registry)
+    assert str(failure.value).replace(f"{tmp_path}/", "") == (
+        "robot.yaml:9: peripherals.wrist.transform.parent: frame 'wrist_frame' is not attached to the others: "
+        "its root is 'hand', not 'base'"
+    )
+    path.write_text(text.replace("parent: hand", "parent: top_frame"))
+    load_config(path, registry=registry)
+
+
 def test_empty_srdf_is_named(faults: Faults) -> None:
     error = faults(top="transform: {parent: tool}", srdf="")
     assert "robot.srdf:1: not valid XML" in error

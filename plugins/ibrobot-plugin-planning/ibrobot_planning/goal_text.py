@@ -113,17 +113,34 @@ def _parsed(text: str, robot: Robot) -> tuple[PositionGoal | PoseGoal | None, di
     if not text:
         raise _invalid("a goal is a pose's name, joints, e.g. wrist_flex=0.5, or a position, e.g. xyz=0.2,0.0,0.1")
     if "=" not in text:
-        try:
-            return None, dict(zip(robot.joint_names, robot.pose(text).tolist(), strict=True))
-        except KeyError as error:
-            hint = "; or give joints, e.g. wrist_flex=0.5, or a position, e.g. xyz=0.2,0.0,0.1"
-            raise _invalid(f"{error.args[0]}{hint}") from None
+        return None, _named(text, robot)
     words = _words(text)
     joints = {key: _angle(key, values, robot) for key, values in words.items() if key not in _KEYS}
     given = {key: values for key, values in words.items() if key in _KEYS}
     if given and "xyz" not in given:
         raise _invalid(f"{next(iter(given))} needs a position, e.g. xyz=0.2,0.0,0.1")
     return _tool_goal(given) if given else None, joints
+
+
+def _named(name: str, robot: Robot) -> dict[str, float]:
+    """Joint -> position of a pose of the robot YAML, or else of the SRDF."""
+    description = robot.description
+    if name not in description.poses and description.srdf is not None and description.urdf is not None:
+        from ibrobot_kinematics.errors import KinematicsError
+        from ibrobot_kinematics.srdf import read_srdf
+        from ibrobot_kinematics.urdf import read_urdf
+
+        try:
+            srdf = read_srdf(description.srdf, read_urdf(description.urdf))
+            if any(each.name == name for each in srdf.states):
+                return dict(srdf.state(name).positions)
+        except KinematicsError as error:
+            raise _invalid(str(error)) from None
+    try:
+        return dict(zip(robot.joint_names, robot.pose(name).tolist(), strict=True))
+    except KeyError as error:
+        hint = "; or give joints, e.g. wrist_flex=0.5, or a position, e.g. xyz=0.2,0.0,0.1"
+        raise _invalid(f"{error.args[0]}{hint}") from None
 
 
 def _words(text: str) -> dict[str, list[str]]:

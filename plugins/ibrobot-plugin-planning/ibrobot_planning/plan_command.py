@@ -38,7 +38,6 @@ from ibrobot_core.api import (
     load_config,
     ns,
     run_options,
-    run_overrides,
     seconds,
     wrong_input,
 )
@@ -119,10 +118,10 @@ def _loaded(config: str | None, options: dict[str, Any]) -> tuple[RobotConfig, C
         NotSupported: where the mode has no planner, or none is named and there are several.
     """
     registry = installed_plugins()
-    overrides = run_overrides({**options, "window": False, "headless": False})
     loaded = load_config(
-        find_config(config, registry), overrides=overrides, mode=options["mode"], sim=options["sim"], registry=registry
-    )
+        find_config(config, registry),
+        overrides=options["overrides"], mode=options["mode"], sim=options["sim"], registry=registry,
+    )  # fmt: skip
     planning = [name for name, mode in loaded.control_modes.items() if mode.planner is not None]
     name = loaded.default_control_mode
     if name not in planning:

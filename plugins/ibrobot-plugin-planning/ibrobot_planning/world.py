@@ -267,9 +267,20 @@ def read_mesh(path: Path, scale: float = 1.0, *, convex: bool = False) -> Mesh:
     try:
         model = coal.MeshLoader().load(str(path), np.full(3, scale))
     except (ValueError, RuntimeError) as error:
-        raise ValueError(f"{path} cannot be read as a mesh: {str(error).strip().splitlines()[-1]}") from error
+        raise ValueError(f"{path} cannot be read as a mesh: {_reason(error, path)}") from error
     triangles = [[model.tri_indices(i)[k] for k in range(3)] for i in range(model.num_tris)]
     try:
         return Mesh(np.array(model.vertices()), np.array(triangles, dtype=np.intp).reshape(-1, 3), convex)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
+
+
+def _reason(error: Exception, path: Path) -> str:
+    """What Assimp says about a file, of all the lines that Coal wraps it in."""
+    lines = str(error).strip().splitlines()
+    begin = next((i + 1 for i, line in enumerate(lines) if "Could not load resource" in line), 0)
+    text = " ".join(line.strip() for line in lines[begin:] if not line.startswith("Hint:"))
+    text = text.replace(f' "{path}"', "").replace(f" for {path}", "").rstrip(".")
+    if "No suitable reader" in text:
+        return f"{text}; use STL, OBJ or PLY"
+    return text or "it has no triangles"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 
 import numpy as np
 import pytest
@@ -123,6 +124,35 @@ def test_meshes_are_read_from_files(tmp_path):
     mesh = read_mesh(path, 0.001)
     np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), [0.03, 0.04, 0.0])
     assert mesh.triangles.shape == (1, 3)
+
+
+TRIANGLE_STL = struct.pack("<12fH", 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0)
+HEAD = b"\0" * 80
+MESHES = {
+    "empty": ("part.stl", b"", "File is empty"),
+    "bytes": ("part.stl", bytes(range(256)), "Failed to determine STL storage representation"),
+    "text": ("part.stl", b"not a mesh\n", "Failed to determine STL storage representation"),
+    "cut off": (
+        "part.stl",
+        HEAD + struct.pack("<I", 9) + TRIANGLE_STL,
+        "Failed to determine STL storage representation",
+    ),
+    "no triangles": ("part.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "No meshes remaining"),
+    "corner that is missing": ("part.obj", b"v 0 0 0\nv 1 0 0\nf 1 2 9\n", "OBJ: vertex index out of range"),
+    "another format": ("part.txt", b"v", "No suitable reader found for the file format of file; use STL, OBJ or PLY"),
+    "damaged head": ("part.ply", b"ply\n", "Invalid .ply file"),
+}
+
+
+@pytest.mark.parametrize(("name", "data", "told"), MESHES.values(), ids=MESHES)
+def test_unreadable_mesh_files_are_refused_with_the_reason(tmp_path, name: str, data: bytes, told: str):
+    path = tmp_path / name
+    path.write_bytes(data)
+    with pytest.raises(ValueError) as failure:
+        read_mesh(path)
+    message = str(failure.value)
+    assert message.startswith(f"{path} cannot be read as a mesh: {told}")
+    assert "Hint" not in message
 
 
 def test_mesh_files_that_cannot_be_used_are_refused(tmp_path):
