@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import queue
 import re
 from collections.abc import Callable, Iterator
 from importlib.util import find_spec
@@ -149,6 +150,79 @@ def test_twenty_unplugs_in_motion_hold_until_the_deadman_is_pressed_again(start:
         run.ticks(70, moving)
         np.testing.assert_allclose(run.position, stopped, atol=2e-3)
         direction = -direction
+    assert run.runtime.session.faults == ()
+
+
+@pytest.fixture
+def bimanual(hidapi: FakeHidapi) -> Iterator[tuple[Run, queue.SimpleQueue[str]]]:
+    """Two simulated arms: a pad moves the left one, the keyboard the right one."""
+    overrides = [
+        "peripherals=[]", "contract={}", "teleoperation.pad={type: gamepad, via: hid, gripper: left_gripper}",
+        "control_modes.both={executors: [left_position, right_position], teleop: {left: pad, right: keyboard_right}}",
+    ]  # fmt: skip
+    registry, typed = installed_plugins(), queue.SimpleQueue[str]()
+    config = load_config(CONFIG.parent / "bi_so101.yaml", sim=True, mode="both", overrides=overrides, registry=registry)
+    runtime = Runtime(Session(config, registry, LaunchRequest(lockstep=True, keys=lambda: typed)))
+    run = Run(runtime, hidapi.plug(Plugged(*DUALSENSE)))
+    run.device.send(dualsense())
+    runtime.start()
+    run.ticks(20, dualsense())
+    yield run, typed
+    runtime.stop()
+
+
+def test_a_pad_and_the_keyboard_move_an_arm_each(bimanual: tuple[Run, queue.SimpleQueue[str]], hidapi: FakeHidapi):
+    run, typed = bimanual
+    left, right = slice(0, 6), slice(6, 12)
+    before = run.position
+    run.ticks(50, dualsense(LB), dualsense(LB, left=(1, 0)))
+    way = run.position - before
+    assert way[left][0] == pytest.approx(0.4, abs=0.05)
+    assert np.max(np.abs(way[right])) < 0.02
+    run.ticks(20, dualsense(LB))
+    run.ticks(30, dualsense(LB, triggers=(1, 0)))
+    assert (run.position - before)[5] > 0.2
+
+    def jog(ticks: int, *reports: bytes) -> None:
+        for _ in range(ticks):
+            typed.put("w")
+            run.ticks(1, *reports)
+
+    run.ticks(20, dualsense())
+    before = run.position
+    jog(50, dualsense())
+    way = run.position - before
+    assert np.max(np.abs(way[left])) < 0.02
+    assert abs(way[right][0]) > 0.1
+
+    run.ticks(30, dualsense(LB), dualsense(LB, left=(-1, 0)))
+    hidapi.unplug(run.device)
+    run.ticks(20)
+    before = run.position
+    jog(50)
+    way = run.position - before
+    assert np.max(np.abs(way[left])) < 0.02, "the arm of the pad that is gone holds"
+    assert abs(way[right][0]) > 0.1, "the other one goes on"
+    assert run.runtime.session.faults == ()
+
+
+def test_the_tool_of_one_of_two_arms_moves_along_its_own_axes(bimanual: tuple[Run, queue.SimpleQueue[str]]):
+    from ibrobot_kinematics import robot_model
+
+    run, _ = bimanual
+    part = run.runtime.session.config.robot.part("left")
+    names = part.joint_names[:-1]
+
+    def tool() -> Vector:
+        return robot_model(part, names).forward(run.position[:5]).position
+
+    run.ticks(150, dualsense(LB), dualsense(LB, "west"))  # away from the limits, to home
+    run.ticks(60, dualsense(LB, "right_shoulder"))
+    run.ticks(10, dualsense(LB))
+    before = tool()
+    run.ticks(60, dualsense(LB, right=(0, -1)))
+    run.ticks(20, dualsense(LB))
+    assert (tool() - before)[2] < -0.03, "the tool went down"
     assert run.runtime.session.faults == ()
 
 
