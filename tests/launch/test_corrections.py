@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from ibrobot_core.errors import NotSupported, TeleopError
+from ibrobot_core.interfaces import EpisodeEnd, EpisodeStart
 from ibrobot_core.robot import Vector
 
 if TYPE_CHECKING:
@@ -267,3 +268,82 @@ def test_random_takeovers_stay_within_the_limits_and_are_labelled_as_they_happen
         assert set(labels[turn:]) == {"policy"}
     episode.check_steps()
     assert episode.run.session.bus.dropped() == {}
+
+
+class Notes:
+    """Episodes that a recorder was given: outcome, and time of receipt and word of who commanded."""
+
+    def __init__(self, recorder: object, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.episodes: list[list[tuple[int, str]]] = []
+        self.outcomes: list[str] = []
+        self.starts: list[int] = []
+        for name in ("begin", "write", "end"):
+            monkeypatch.setattr(recorder, name, getattr(self, name))
+
+    def begin(self, episode: EpisodeStart) -> None:
+        self.episodes.append([])
+        self.starts.append(episode.stamp_ns)
+
+    def write(self, topic: str, message: object, received_ns: int) -> None:
+        if topic == "/commander":
+            self.episodes[-1].append((received_ns, message.data))  # type: ignore[attr-defined]
+
+    def end(self, episode: EpisodeEnd) -> None:
+        self.outcomes.append(episode.outcome)
+
+
+PARTS = "recording={type: lines, root: kept}"
+
+
+def test_only_corrections_are_recorded_with_the_time_around_them(
+    begin, runs: Runs, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    episode = begin(PARTS, "episodes={keep: corrections, before: 0.4, after: 0.2}")
+    notes = Notes(runs.parts.MADE["recording"], monkeypatch)
+    for _ in range(2):
+        episode.ticks(50)
+        episode.press()
+        episode.ticks(40)
+        episode.device.deadman = True
+        episode.ticks(20)
+        episode.press()
+        episode.ticks(60)
+    assert notes.outcomes == ["unknown", "unknown"]
+    for start, labels in zip(notes.starts, notes.episodes, strict=True):
+        times, words = [each for each, _ in labels], [word for _, word in labels]
+        assert times == sorted(times)
+        turn, back = words.index("handover"), len(words) - words[::-1].index("handover") - 1
+        assert start == times[0]
+        assert (times[turn] - start) / 1e9 == pytest.approx(0.4, abs=0.021)
+        assert (times[-1] - times[back + 1]) / 1e9 == pytest.approx(0.2, abs=0.021)
+        assert list(dict.fromkeys(words)) == ["policy", "handover", "operator"]
+
+
+def test_the_end_of_an_episode_ends_its_correction_with_the_outcome(
+    begin, runs: Runs, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    episode = begin(PARTS, "episodes={keep: corrections}")
+    notes = Notes(runs.parts.MADE["recording"], monkeypatch)
+    episode.ticks(20)
+    episode.press()
+    episode.ticks(30)
+    runs.parts.Scene.success = lambda scene: True
+    episode.ticks(3)
+    assert notes.outcomes == ["success"]
+
+
+def test_highlights_are_recorded_from_before_a_key(begin, runs: Runs, monkeypatch: pytest.MonkeyPatch) -> None:
+    episode = begin(PARTS, "episodes={keep: highlights, before: 0.5}")
+    notes = Notes(runs.parts.MADE["recording"], monkeypatch)
+    call = episode.run.session.bus.call
+    episode.ticks(60)
+    assert notes.episodes == []
+    now_ns = episode.run.session.clock.now_ns()
+    call("/record_episode/highlight", None)
+    episode.ticks(30)
+    call("/record_episode/highlight", None)
+    episode.ticks(30)
+    assert (now_ns - notes.starts[0]) / 1e9 == pytest.approx(0.5, abs=0.041)
+    assert (notes.episodes[0][-1][0] - now_ns) / 1e9 == pytest.approx(0.6, abs=0.041)
+    assert notes.outcomes == ["unknown"]
+    assert len(notes.episodes) == 1

@@ -55,10 +55,15 @@ def ibrobot_sources() -> Iterable[SourceDescriptor]:
 
 
 def _recording(options: EpisodesOptions | None, session: Session) -> Component:
+    from ibrobot_data.partial_recording import PartialRecording
     from ibrobot_data.recording_worker import NoRecording, RecordingWorker
 
     config = session.config.recording
-    return RecordingWorker(session, config) if config is not None else NoRecording("recording", "of nothing")
+    if config is None:
+        return NoRecording("recording", "of nothing")
+    if options is None or options.keep == "all":
+        return RecordingWorker(session, config)
+    return PartialRecording(session, config, options)
 
 
 def _records(config: RobotConfig) -> bool:

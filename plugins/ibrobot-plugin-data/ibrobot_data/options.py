@@ -12,6 +12,11 @@ POLICY, OPERATOR, HANDOVER = "policy", "operator", "handover"
 """The words on `COMMANDER`; in a handover nobody commands, and the arm holds."""
 
 
+def _check_key(_: object, __: object, key: str) -> None:
+    if not key:
+        raise ValueError("is empty; name a key, e.g. enter")
+
+
 @documented
 @attrs.frozen
 class EpisodesOptions:
@@ -23,7 +28,18 @@ class EpisodesOptions:
         help="what takes the robot from a policy: the key or the device's button; deadman: also pressing the device's "
         "deadman, or moving a leader arm without one. Releasing it gives the robot back",
     )
-    takeover_key: str = option("enter", help="key that takes the robot from a policy, and gives it back")
+    takeover_key: str = option(
+        "enter", validator=_check_key, help="key that takes the robot from a policy, and gives it back"
+    )
+    keep: str = option(
+        "all",
+        choices=("all", "corrections", "highlights"),
+        help="which parts of a run are recorded: whole episodes; from before each takeover until after the handback; "
+        "or from before a key until it is pressed again",
+    )
+    before: float = option(5.0, unit="s", ge=0, le=600, help="time to keep before a correction or a highlight")
+    after: float = option(1.0, unit="s", ge=0, le=600, help="time to keep after a correction")
+    highlight_key: str = option("insert", validator=_check_key, help="key that begins and ends a highlight")
 
 
 def options_of(config: RobotConfig) -> EpisodesOptions:

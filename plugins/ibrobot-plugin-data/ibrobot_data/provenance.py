@@ -20,10 +20,9 @@ _KEPT_ONCE = ("contract", "fingerprint", "config", "calibration", "prompt")
 def conversion(request: ConversionRequest) -> dict[str, Any]:
     """The settings that must be equal for all episodes of a dataset."""
     options = attrs.asdict(request.options)
-    chosen = {"only": request.only, "context": request.context} if request.only != "all" else {}
     labels = {"labels": True} if request.labels else {}
     settings = {"writer": request.type, "options": options, "norm_mode": request.norm_mode, "success": request.success}
-    return settings | labels | chosen
+    return settings | labels
 
 
 def provenance(request: ConversionRequest, old: DatasetSummary | None, units: Sequence[Unit]) -> dict[str, Any]:

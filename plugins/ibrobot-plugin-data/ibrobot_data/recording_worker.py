@@ -102,18 +102,31 @@ class RecordingWorker(SessionWorker):
         """
         session = self.session
         self.failure = None
-        self._sizes = {}
-        topics = {topic: type_ for topic, (type_, _) in session.bus.topics().items()}
-        seed = session.request.seed + number - 1
         with self._pending_lock:
-            start = episode_start(
-                session.config, self._config, topics, mode=session.mode, seed=seed, stamp_ns=session.bus.snapshot_ns(),
-                lockstep=session.request.lockstep, prompt=prompt, plugins=session.registry.versions(),
-                policy=session.acting.described() if session.acting is not None else None,
-            )  # fmt: skip
+            start = self._start_of(number, prompt, session.bus.snapshot_ns())
             latched = tuple(i for i in session.bus.latched().values() if i.received_ns <= start.stamp_ns)
             begin = partial(self._open_episode, start, latched, self._incoming.lost.copy())
             self._pending.append((start.stamp_ns, begin))
+
+    def _start_of(self, number: int, prompt: str, stamp_ns: int) -> EpisodeStart:
+        """The start of the dataset's next episode, which is of episode `number` of the run.
+
+        Raises:
+            RecorderError: if it cannot be recorded in its dataset.
+        """
+        session = self.session
+        self._sizes = {}
+        topics = {topic: type_ for topic, (type_, _) in session.bus.topics().items()}
+        return episode_start(
+            session.config, self._config, topics, mode=session.mode, seed=session.request.seed + number - 1,
+            stamp_ns=stamp_ns, lockstep=session.request.lockstep, prompt=prompt, plugins=session.registry.versions(),
+            policy=session.acting.described() if session.acting is not None else None,
+        )  # fmt: skip
+
+    def _later(self, act: Callable[[], None]) -> None:
+        """Let the thread of the recorder do something between the messages received until now and the next ones."""
+        with self._pending_lock:
+            self._pending.append((self.session.bus.snapshot_ns(), act))
 
     def end(self, outcome: str) -> None:
         """End the episode; messages up to now belong to it."""

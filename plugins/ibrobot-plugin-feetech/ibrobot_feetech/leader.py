@@ -1,4 +1,4 @@
-"""Teleop `so101_leader`: an arm without torque, moved by hand, that the robot follows."""
+"""Teleop `so101_leader`: an arm moved by hand, that the robot follows, without torque except before a takeover."""
 
 from __future__ import annotations
 
@@ -18,12 +18,13 @@ from ibrobot_core.api import (
     TeleopCommand,
     TeleopError,
     Vector,
+    lerobot_to_ticks,
     load_calibration,
     ns,
     seconds,
     ticks_to_lerobot,
 )
-from ibrobot_feetech.arm import Arm, calibration_differences, find_servos, relax
+from ibrobot_feetech.arm import Arm, calibration_differences, find_servos, hold, relax
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.errors import FeetechError
 from ibrobot_feetech.options import TOOL, LeaderOptions
@@ -36,6 +37,11 @@ _FASTEST_HAND = 13_000
 """Upper bound on the speed of a joint moved by hand [ticks/s]: three turns per second."""
 _SLACK = 64
 """Change of a position that is always accepted [ticks]."""
+_ARRIVED = 30
+"""Largest distance of a joint from the robot's pose at which its motor lets go [ticks]: 2.6 degrees."""
+_PATIENCE_S = 2.0
+"""How much longer than the way takes the motors try to reach the robot's pose [s]."""
+_TICKS_PER_RADIAN = TICKS_PER_TURN / (2 * np.pi)
 _TAKEN_UP = 40
 """A joint that turned by more was moved by hand [ticks]: 3.5 degrees."""
 
@@ -91,6 +97,12 @@ class LeaderTeleop(Teleop):
         """The leader's positions at the start of the mode [ticks]; None until they are read."""
         self._taken_up = False
         """Whether the leader was moved since then."""
+        self._goal: Vector | None = None
+        """The goal of its motors while they move it [ticks]."""
+        self._driven_ns = 0
+        """When the goal was computed [ns]."""
+        self._give_up_ns = 0
+        """When its motors give up, e.g. because a hand holds the leader [ns]."""
 
     @override
     def connect(self) -> None:
@@ -112,7 +124,41 @@ class LeaderTeleop(Teleop):
         self._keys = self._ctx.keys() if self._ctx.keys is not None else None
 
     @override
+    def approach(self, measured: JointReading) -> bool:
+        if not self._options.driven:
+            return True
+        if self._bus is None or self._reader is None:
+            raise TeleopError(f"{self._ctx.name}: the leader is not connected: call connect before approach")
+        now_ns = measured.stamp_ns
+        try:
+            self._receive(self._reader, now_ns)
+            pose = self._leader_pose(measured.position[list(self._columns)])
+            if self._goal is None:
+                for servo in self._arm.servos:
+                    hold(self._bus, servo)
+                self._goal, self._driven_ns = self._ticks.astype(np.float64), now_ns
+                slowest_s = np.abs(pose - self._goal).max() / (self._ramp.min() * _TICKS_PER_RADIAN)
+                self._give_up_ns = now_ns + ns(_PATIENCE_S + float(slowest_s))
+            elapsed_s = min(seconds(now_ns - self._driven_ns), _LONGEST_STEP_S)
+            self._driven_ns = now_ns
+            step = self._ramp * _TICKS_PER_RADIAN * elapsed_s
+            self._goal = self._goal + np.clip(pose - self._goal, -step, step)
+            goals = np.rint(self._goal).astype(int).tolist()
+            self._bus.sync_write("goal_position", dict(zip(self._arm.servos, goals, strict=True)))
+            if np.abs(pose - self._ticks).max() > _ARRIVED and now_ns < self._give_up_ns:
+                return False
+            self._let_go()
+        except HardwareError as error:
+            raise TeleopError(f"{self._ctx.name}: {error}") from None
+        return True
+
+    @override
     def activate(self, measured: JointReading) -> None:
+        if self._goal is not None:
+            try:
+                self._let_go()
+            except HardwareError as error:
+                self._ctx.log.error("%s: %s", self._ctx.name, error)
         self._release()
         self._typed()  # discard keys typed before the mode
 
@@ -134,7 +180,13 @@ class LeaderTeleop(Teleop):
 
     @override
     def disconnect(self) -> None:
-        bus, self._bus, self._reader, self._keys = self._bus, None, None, None
+        bus = self._bus
+        try:
+            if self._goal is not None:
+                self._let_go()
+        except HardwareError as error:
+            self._ctx.log.error("%s: %s", self._ctx.name, error)
+        self._bus, self._reader, self._keys, self._goal = None, None, None, None
         if bus is not None:
             bus.close()
 
@@ -220,6 +272,27 @@ class LeaderTeleop(Teleop):
         )
         positions = np.where(self._scaled, self._lower + opened / 100 * (self._upper - self._lower), angles)
         return np.clip(positions, self._lower, self._upper)
+
+    def _leader_pose(self, positions: Vector) -> Vector:
+        """Positions of the robot's joints [rad] mapped to the leader's [ticks], within their calibrated ranges."""
+        low, high = self._range
+        angles = self._arm.positions(np.where(self._mirrored, -1.0, 1.0) * positions).astype(np.float64)
+        opened = lerobot_to_ticks(
+            (positions - self._lower) / (self._upper - self._lower) * 100, "range_0_100",
+            range_min=low, range_max=high, inverted=self._turned != self._mirrored,
+        )  # fmt: skip
+        pose: Vector = np.clip(np.where(self._scaled, opened, angles), low, high)
+        return pose
+
+    def _let_go(self) -> None:
+        """Switch its torque off.
+
+        Raises:
+            HardwareError: if a servo does not confirm it.
+        """
+        assert self._bus is not None
+        self._goal = None
+        relax(self._bus, self._arm.servos)
 
     def _next(self, measured: JointReading) -> Vector:
         """The setpoint [rad], which moves from the measured positions to the leader's and then follows."""

@@ -102,6 +102,11 @@ class LeaderOptions:
     follow_tolerance: float = option(
         0.02, unit="rad", gt=0, help="distance from the leader's pose at which the approach ends"
     )
+    driven: bool = option(
+        True,
+        help="whether its motors move it to the robot's pose when an operator takes the robot from a policy, at "
+        "ramp_velocity; otherwise the robot approaches the leader",
+    )
     deadman: str = option(
         "toggle",
         choices=("toggle", "hold", "none"),

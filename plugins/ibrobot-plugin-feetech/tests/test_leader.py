@@ -240,6 +240,52 @@ class TestApproach:
         assert rig.position[0] - before == pytest.approx(0.1, abs=1e-3)
 
 
+class TestTakeover:
+    """The motors of the leader move it to the robot's pose, and let go."""
+
+    def approach(self, rig: TeleopRig, ticks: int = 400) -> list[Vector]:
+        """The leader's positions on the way [ticks]."""
+        way = []
+        for _ in range(ticks):
+            Line.now_s += TICK_NS * 1e-9
+            arrived = rig.leader.approach(rig.measured())
+            way.append(np.array(rig.register("present_position"), dtype=float))
+            if arrived:
+                return way
+        pytest.fail("it does not arrive")
+
+    def test_the_leader_arrives_at_the_robots_pose_and_lets_go(self, rig: TeleopRig):
+        rig.position[:] = (0.5, -0.3, 0.2, 0.1, -0.4, 0.4)
+        way = self.approach(rig)
+        assert np.abs(np.diff(way, axis=0)).max() < 1.5 * RADIAN * 0.01 * 2, "at ramp_velocity, 1 rad/s"
+        assert rig.register("torque_enable") == [0] * 6
+        rig.leader.activate(rig.measured())
+        rig.typed.put("space")
+        held = rig.position.copy()
+        np.testing.assert_allclose(rig.follow(), held, atol=0.05)
+
+    def test_a_hand_that_holds_the_leader_wins(self, rig: TeleopRig):
+        rig.position[0] = 1.0
+        servo = rig.emulator.servos[1]
+        servo.drive(servo.encoder, 0.0)
+        assert 200 < len(self.approach(rig)) < 400
+        assert rig.register("torque_enable") == [0] * 6
+
+    def test_the_torque_is_off_if_the_takeover_is_broken_off(self, rig: TeleopRig):
+        rig.position[0] = 1.0
+        for end in (lambda: rig.leader.activate(rig.measured()), rig.leader.disconnect):
+            assert not rig.leader.approach(rig.measured())
+            assert rig.register("torque_enable") == [1] * 6
+            end()
+            assert rig.register("torque_enable") == [0] * 6
+
+    @options(driven=False)
+    def test_without_the_option_its_motors_stay_off(self, rig: TeleopRig):
+        rig.position[0] = 1.0
+        assert rig.leader.approach(rig.measured())
+        assert rig.register("torque_enable") == [0] * 6
+
+
 class TestDeadman:
     def test_without_a_word_in_the_yaml_it_waits_for_space(self, emulator: Emulator, calibration_file: Path):
         rig = TeleopRig(emulator, calibration_file)

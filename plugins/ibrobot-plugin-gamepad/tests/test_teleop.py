@@ -12,11 +12,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from ibrobot_gamepad import ibrobot_teleop
+from ibrobot_gamepad.mapping import events
 from ibrobot_gamepad.options import GamepadOptions, SpaceMouseOptions
 from ibrobot_gamepad.teleop import JogTeleop
 from ibrobot_testing import TeleopSuite, host_context, make_robot
 
-from ibrobot_core.api import Context, JointReading, Robot, Teleop, TeleopCommand, TeleopError, ns
+from ibrobot_core.api import Context, JointReading, OperatorEvent, Robot, Teleop, TeleopCommand, TeleopError, ns
 
 from .fake_hid import DUALSENSE, SPACEMOUSE, FakeHidapi, Plugged, dualsense, mouse_buttons, spacemouse
 
@@ -51,6 +52,12 @@ class TestGamepad(TeleopSuite):
     @override
     def release(self, teleop: Teleop) -> None:
         self.device.send(dualsense())
+
+    events = events(JOINTS)
+
+    @override
+    def press(self, teleop: Teleop, event: OperatorEvent) -> None:
+        self.device.send(dualsense(EVENTS[event]), dualsense())
 
 
 class TestSpaceMouse(TeleopSuite):

@@ -9,12 +9,12 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from ibrobot_core.api import Context, JointReading, Teleop, TeleopCommand, TeleopError, Vector
+from ibrobot_core.api import Context, JointReading, OperatorEvent, Teleop, TeleopCommand, TeleopError, Vector
 from ibrobot_testing.suite import Suite
 
 
 class TeleopSuite(Suite[Teleop]):
-    """Checks of every `Teleop`. The subclass plays the operator with `engage`, `release` and `operate`."""
+    """Checks of every `Teleop`. The subclass plays the operator with `engage`, `release`, `operate` and `press`."""
 
     has_deadman: ClassVar[bool] = True
     """Whether the device has a deadman, which `release` releases."""
@@ -22,6 +22,13 @@ class TeleopSuite(Suite[Teleop]):
     """Whether an operator starts every motion. False for a device that moves the robot by itself, e.g. a demo."""
     tolerance_rad: ClassVar[float] = 1e-6
     """Allowed distance of the first positions from the measured ones [rad]."""
+
+    events: ClassVar[tuple[OperatorEvent, ...]] = ()
+    """The events for which the device has buttons, which `press` presses."""
+
+    def press(self, teleop: Teleop, event: OperatorEvent) -> None:
+        """The operator presses the button of an event, and releases it."""
+        raise NotImplementedError(f"{type(self).__name__} must define press for its events")
 
     def engage(self, teleop: Teleop) -> None:
         """The operator presses the deadman or starts motion; does nothing for a device that moves by itself."""
@@ -124,6 +131,27 @@ class TeleopSuite(Suite[Teleop]):
                 teleop.read(self._measure(ctx, pose))
                 self.operate(teleop)
                 assert teleop.read(self._measure(ctx, pose)).positions, "no positions once the operator acted"
+
+    def test_each_press_is_one_event(self) -> None:
+        """Each press of a button gives its event once, even while the deadman is released."""
+        if not self.events:
+            pytest.skip("has no buttons")
+        with self.connected() as (teleop, ctx):
+            pose = self.poses(ctx)[0]
+            teleop.activate(self._measure(ctx, pose))
+            teleop.read(self._measure(ctx, pose))
+            for event in (*self.events, *self.events):
+                self.press(teleop, event)
+                found = [each for _ in range(3) for each in teleop.read(self._measure(ctx, pose)).events]
+                assert found == [event]
+
+    def test_approach_arrives(self) -> None:
+        """`approach` returns True within ten seconds of ticks; then the device begins where the robot is."""
+        with self.connected() as (teleop, ctx):
+            pose = self.poses(ctx)[1]
+            assert any(teleop.approach(self._measure(ctx, pose)) for _ in range(1000)), "it never arrives"
+            for joint, position in (self._begin(teleop, ctx, pose).positions or {}).items():
+                assert abs(position - pose[ctx.robot.joint_names.index(joint)]) <= self.tolerance_rad
 
     def test_leaves_the_measurement_alone(self) -> None:
         """`activate` and `read` do not change `measured`, and later changes of it do not affect the device."""

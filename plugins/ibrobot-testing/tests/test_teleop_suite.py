@@ -30,6 +30,12 @@ class TestTeleop(TeleopSuite):
     def operate(self, teleop):
         teleop.velocity = 0.1
 
+    events = ("success", "intervention")
+
+    @override
+    def press(self, teleop, event):
+        teleop.events = (event,)
+
 
 class BeginsAtZero(FakeTeleop):
     def activate(self, measured):
@@ -91,6 +97,19 @@ class ChangesTheMeasurement(FakeTeleop):
         return command
 
 
+class StaysPressed(FakeTeleop):
+    def read(self, measured):
+        pressed = self.events
+        command = super().read(measured)
+        self.events = pressed
+        return command
+
+
+class NeverArrives(FakeTeleop):
+    def approach(self, measured):
+        return False
+
+
 class DisconnectsOnce(FakeTeleop):
     def disconnect(self):
         if not self._open:
@@ -114,6 +133,8 @@ WRONG = {
     StaysPressedOverAReset: "waits_for_the_operator",
     KeepsTheMeasurement: "leaves_the_measurement_alone",
     ChangesTheMeasurement: "leaves_the_measurement_alone",
+    StaysPressed: "each_press_is_one_event",
+    NeverArrives: "approach_arrives",
     DisconnectsOnce: "disconnect_is_safe_at_any_time",
     ReadsWhileDisconnected: "refuses_reading_while_disconnected",
 }
