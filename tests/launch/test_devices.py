@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -134,7 +134,7 @@ def test_a_device_that_does_not_connect_fails_the_start_and_the_other_is_release
     kind = runs.parts.FakeTeleop
     monkeypatch.setattr(kind, "disconnect", lambda self: released.append(self.name))
 
-    def connect(self: object) -> None:
+    def connect(self: Any) -> None:
         self.name = next(name for name, made in runs.parts.MADE.items() if made is self)
         if self.name == "right":
             raise TeleopError("no such port")

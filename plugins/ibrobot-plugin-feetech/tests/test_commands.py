@@ -11,7 +11,7 @@ import attrs
 import pytest
 from click.testing import CliRunner
 from ibrobot_feetech.commands import feetech
-from ibrobot_feetech.commands.joints import Joint
+from ibrobot_feetech.commands.joints import Joint, joints_of
 from ibrobot_feetech.commands.ranges import Range, doubtful
 from ibrobot_feetech.emulator import EmulatedServo, Emulator
 from ibrobot_testing import terminal as terminal_module
@@ -298,6 +298,9 @@ def test_an_arm_of_lerobot_is_imported_with_its_0_or_with_the_pose(home, tmp_pat
     found = load_calibration("theirs")
     assert (found.zero_at, found.robot, found.joints["gripper"].zero()) == ("pose", "left", 2048)
     assert found.numbers() == numbers
+    one_of_two = run(feetech, ["import", str(file), "--name", "left", "--prefix", "left_"])
+    assert one_of_two.exit_code == 0, one_of_two.output
+    assert load_calibration("left").numbers() == {f"left_{joint}": each for joint, each in numbers.items()}
 
 
 def test_zero_in_the_middle_of_the_range_asks_for_limits_about_zero():
@@ -490,3 +493,9 @@ def test_the_port_is_found_by_pulling_its_cable_and_putting_it_back(tmp_path):
         terminal.wait_for("Then press Enter")
         terminal.interrupt()
         assert terminal.end() == 130
+
+
+def test_the_joints_of_one_of_two_arms_have_its_prefix():
+    joints = joints_of(prefix="left_")
+    assert [joint.name for joint in joints] == [f"left_{joint}" for joint in JOINTS]
+    assert [joint.name for joint in joints if joint.anchored] == ["left_gripper"]

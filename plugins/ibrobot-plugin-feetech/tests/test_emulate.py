@@ -21,7 +21,10 @@ def test_it_says_its_port_serves_and_ends_cleanly(
 ) -> None:
     monkeypatch.setattr(bus_module, "_ADAPTER_S", 2.0)  # so long does a scan take, whoever answers
     link = tmp_path / "arm"
-    command = (*ibrobot_command(), "feetech", "emulate", "--servos", "2", "--link", str(link), "--calibration", "two")
+    command = (
+        *ibrobot_command(), "feetech", "emulate", "--servos", "2", "--link", str(link), "--calibration", "two",
+        "--prefix", "left_",
+    )  # fmt: skip
     environment = {**os.environ, "XDG_CONFIG_HOME": str(tmp_path)}
     with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as ran:
         try:
@@ -40,8 +43,8 @@ def test_it_says_its_port_serves_and_ends_cleanly(
     assert ran.returncode == 0
     assert not link.is_symlink()
     calibration = load_calibration(tmp_path / "ibrobot" / "calibration" / "two.json")
-    assert list(calibration.joints) == ["shoulder_pan", "shoulder_lift"]
-    assert calibration.joints["shoulder_lift"].range_min == low
+    assert list(calibration.joints) == ["left_shoulder_pan", "left_shoulder_lift"]
+    assert calibration.joints["left_shoulder_lift"].range_min == low
 
 
 def test_a_file_in_the_links_place_is_left_alone(tmp_path: Path) -> None:

@@ -8,15 +8,26 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, override
 
+import attrs
 import numpy as np
 import pytest
 from ibrobot_feetech.emulator import Emulator
 from ibrobot_feetech.leader import LeaderTeleop
-from ibrobot_feetech.options import LeaderOptions
+from ibrobot_feetech.options import LeaderOptions, check_leader
 from ibrobot_testing import TeleopSuite
-from ibrobot_testing.contexts import START_NS, host_context
+from ibrobot_testing.contexts import START_NS, host_context, make_robot
 
-from ibrobot_core.api import Context, JointReading, SteppedClock, Teleop, TeleopCommand, TeleopError, Vector
+from ibrobot_core.api import (
+    Context,
+    Description,
+    JointReading,
+    Robot,
+    SteppedClock,
+    Teleop,
+    TeleopCommand,
+    TeleopError,
+    Vector,
+)
 
 from .conftest import JOINTS, OFFSETS, arm_calibration, prepare
 from .line import Line
@@ -193,6 +204,14 @@ class TestMapping:
         rig.turn("wrist_roll", 2048 + 0.5 * RADIAN)
         rig.follow()
         assert rig.read().positions == pytest.approx({"shoulder_pan": 0.5}, abs=1e-3)
+
+    @options(deadman_key="l")
+    def test_the_deadman_may_have_another_key(self, rig: TeleopRig):
+        rig.turn("shoulder_pan", 2048 + 0.5 * RADIAN)
+        assert rig.read().positions is None, "space is another device's"
+        assert rig.leader.help() == "PAUSED: press l to follow the leader arm   esc  emergency stop"
+        rig.read("l")
+        assert rig.follow()[0] == pytest.approx(0.5, abs=1e-3)
 
     def test_the_robots_limits_hold(self, rig: TeleopRig):
         rig.turn("wrist_flex", 600)
@@ -420,3 +439,50 @@ class TestBus:
             assert rig.read().positions is None, "it waits to be started again"
             assert rig.read("space").positions is not None
             rig.leader.disconnect()
+
+
+class TestOneOfTwo:
+    """The leader of one arm of a robot with two."""
+
+    def robot(self) -> Robot:
+        one = make_robot()
+        joints = tuple(
+            attrs.evolve(joint, name=f"{side}_{joint.name}") for side in ("left", "right") for joint in one.joints
+        )
+        groups = {side: tuple(f"{side}_{name}" for name in JOINTS) for side in ("left", "right")}
+        return attrs.evolve(one, joints=joints, groups=groups, description=Description())
+
+    def test_it_moves_the_joints_with_its_prefix(self, emulator: Emulator, calibration_file: Path):
+        ctx = host_context("leader", robot=self.robot().part("right"))
+        leader = LeaderTeleop(LeaderOptions(emulator.port, str(calibration_file), prefix="right_", deadman="none"), ctx)
+        leader.connect()
+        still = JointReading(START_NS, np.zeros(6), np.zeros(6), np.zeros(6))
+        leader.activate(still)
+        leader.read(still)
+        with emulator.lock:
+            emulator.servos[1].turn(emulator.servos[1].encoder + 100)
+        positions = leader.read(attrs.evolve(still, stamp_ns=START_NS + 500_000_000)).positions
+        leader.disconnect()
+        assert positions == dict.fromkeys((f"right_{name}" for name in JOINTS), 0.0), "it begins where the robot is"
+
+    def test_a_prefix_that_does_not_fit_is_a_fault(self):
+        options = LeaderOptions("/dev/null", "leader", prefix="right_")
+        assert list(check_leader(options, self.robot().part("right"), ())) == []
+        for robot in (self.robot().part("left"), self.robot()):
+            (fault,) = check_leader(options, robot, ())
+            assert fault.option == ("prefix",)
+            assert fault.message == (
+                "joint 'left_shoulder_pan' does not begin with 'right_'; give the device its arm in the mode, e.g. "
+                "teleop: {left: DEVICE}, where left is a joint group"
+            )
+
+    @pytest.mark.parametrize(
+        ("given", "message"),
+        [
+            ({"prefix": "left_", "joints": {"gripper": "left_gripper"}}, "joints and prefix exclude each other"),
+            ({"deadman_key": "esc"}, "deadman_key and estop_key are both 'esc'; give two different keys"),
+        ],
+    )
+    def test_options_that_exclude_each_other(self, given: dict[str, Any], message: str):
+        with pytest.raises(ValueError, match=message):
+            LeaderOptions("/dev/null", "leader", **given)

@@ -1,6 +1,6 @@
 """Messages of orientation sensors: bytes in, angles out. Damaged and foreign bytes are counted and left out.
 
-Sources: BNO08X datasheet 1.17, 1.3.5 "UART-RVC"; WitMotion "WT901C user manual", output protocol.
+Sources: BNO08X datasheet (CEVA), "UART-RVC"; WitMotion's manuals, output protocol.
 """
 
 from __future__ import annotations

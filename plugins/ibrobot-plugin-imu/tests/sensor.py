@@ -10,6 +10,7 @@ import struct
 import termios
 import time
 import tty
+from collections.abc import Callable
 from typing import Self
 
 _PATIENCE_S = 10.0
@@ -29,7 +30,7 @@ def witmotion(yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0, kind: int
     return body + bytes([sum(body) & 0xFF])
 
 
-MESSAGES = {"bno08x": bno08x, "witmotion": witmotion}
+MESSAGES: dict[str, Callable[[float, float, float], bytes]] = {"bno08x": bno08x, "witmotion": witmotion}
 
 
 class Sensor:

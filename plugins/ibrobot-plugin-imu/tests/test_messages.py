@@ -30,8 +30,8 @@ def near(found: Angles, degrees: tuple[float, float, float], model: str) -> bool
 
 
 def test_the_example_of_the_datasheet():
-    # BNO08X datasheet 1.17, figure 1-26: yaw 0.01, pitch -1.10, roll 20.85 degrees.
-    stream = bytes.fromhex("aaaade010092ff2508 8dfeecffd103000000e7".replace(" ", ""))
+    # BNO08X datasheet (CEVA), "UART-RVC": yaw 0.01, pitch -1.10, roll 20.85 degrees.
+    stream = bytes.fromhex("aaaa de 0100 92ff 2508 8dfe ecff d103 000000 e7")
     (found,) = READERS["bno08x"]().feed(stream)
     assert near(found, (0.01, -1.10, 20.85), "bno08x")
 
