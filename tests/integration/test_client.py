@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import logging
+import re
 import socket
+import subprocess
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 from threading import Thread
 
 import pytest
@@ -113,6 +117,21 @@ def test_script_moves_a_robot_over_the_network(arm: Runtime, endpoint: str):
     rclpy.shutdown()
     executor_thread.join(30)
     assert not executor_thread.is_alive()
+
+
+def test_script_on_the_page_runs(arm: Runtime, endpoint: str):
+    page = Path(__file__).parents[2] / "docs/how-to/move-a-pymoveit2-script.md"
+    _, imports, script = re.findall(
+        r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
+    )
+    here = f'Node("pick", "connect=[{endpoint}]", "shared_memory=false", namespace="arm1")'
+    assert 'Node("pick")' in script
+    checked = "assert moveit2.get_last_execution_error_code().val == 1\nnode.destroy_node()\nrclpy.shutdown()"
+    text = imports + script.replace('Node("pick")', here).replace("rclpy.shutdown()", checked)
+    done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, timeout=100, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert arm.session.state is not None
+    assert arm.session.state.position[5] == pytest.approx(1.5, abs=0.1)
 
 
 def test_missing_robot_is_an_error(endpoint: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture):
