@@ -49,7 +49,8 @@ const view = new View3D($("view"), {
   },
 });
 page.view = view;
-const parts = [new Cameras($("cameras"), page), new Joints($("joints"), page), new Thumb($("thumb"), page)];
+page.cameras = new Cameras($("cameras"), page);
+const parts = [page.cameras, new Joints($("joints"), page), new Thumb($("thumb"), page)];
 const panels = [DrivePanel, EpisodesPanel, PlotsPanel, HealthPanel, LogPanel].map((Panel) => new Panel(page));
 
 function stop() {

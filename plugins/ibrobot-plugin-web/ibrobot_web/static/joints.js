@@ -35,7 +35,7 @@ export class Joints {
     const less = button("−", -1), more = button("+", 1);
     const value = h("output", {}), bar = h("div", { class: "value" }), command = h("div", { class: "command" });
     const element = h("div", { class: "joint" }, h("span", { class: "name" }, joint.name), value,
-      h("div", { class: "bar", "aria-hidden": "true" }, bar, command), less, slider, more);
+      h("div", { class: "bar", "aria-hidden": "true" }, bar, command), h("div", { class: "jog" }, less, slider, more));
     return { element, slider, less, more, value, bar, command, joint };
   }
 

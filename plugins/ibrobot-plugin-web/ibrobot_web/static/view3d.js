@@ -18,7 +18,7 @@ export class View3D {
       h("span", { class: "planned" }, "plan"));
     section.append(this.canvas, this.note, this.legend);
     this.frames = 0;
-    this.age = 0;
+    this.ages = [];
     if (!this.canvas.transferControlToOffscreen) {
       this.note.textContent = "3D needs a newer browser.";
       return;
@@ -29,7 +29,10 @@ export class View3D {
     this.worker.onerror = (event) => { this.note.textContent = `3D failed: ${event.message}`; };
     this.worker.onmessage = ({ data }) => {
       if (data.problem !== undefined) this.note.textContent = data.problem;
-      if (data.drawn) { this.frames += 1; this.age = Date.now() - data.drawn; }
+      if (data.drawn) {
+        this.frames += 1;
+        this.ages = [...this.ages.slice(-499), Date.now() - data.drawn];
+      }
       if (data.tool) onTool(data.tool);
     };
     new ResizeObserver(() => this.resize()).observe(section);

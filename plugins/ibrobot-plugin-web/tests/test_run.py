@@ -1,0 +1,132 @@
+"""A run with its page, and pages without a browser: drive, watch, take over, and break off in motion."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import time
+from collections.abc import Awaitable, Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from page_run import PageClient, client, page_run
+
+from ibrobot_core.plugins import installed_plugins
+
+pytestmark = [
+    pytest.mark.integration,
+    pytest.mark.skipif(("hardware", "mujoco") not in installed_plugins().entries, reason="needs ibrobot-plugin-mujoco"),
+]
+HOLD_S = 0.3
+"""How long after a page is gone the robot may move."""
+MOVING_RAD = 1e-4
+"""Change of a command between two states that counts as motion."""
+PRESSES = itertools.count(1)
+
+
+@pytest.fixture(scope="module")
+def address() -> Iterator[str]:
+    with page_run("so101", "--sim", "--mode", "web") as found:
+        yield found
+
+
+def run(test: Callable[[], Awaitable[None]]) -> None:
+    asyncio.run(asyncio.wait_for(test(), 60))
+
+
+def moved_until_ns(page: PageClient) -> int:
+    """Stamp of the last state in which a command changed."""
+    last = 0
+    for before, after in itertools.pairwise(page.states):
+        if np.abs(np.subtract(after["command"], before["command"])).max() > MOVING_RAD:
+            last = after["stamp"]
+    return last
+
+
+async def ready(page: PageClient) -> None:
+    await page.until(lambda: page.states and "jog" in page.status.get("services", ()))
+    if page.status["faults"]:
+        await page.call("reset")
+
+
+@pytest.mark.parametrize("end", ["release", "close", "cut", "silence"])
+def test_the_arm_holds_soon_after_the_operator_is_gone(address: str, end: str) -> None:
+    async def test() -> None:
+        async with client(address) as watcher:
+            async with client(address) as operator:
+                await operator.call("operate", take_over=True)
+                await ready(operator)
+                middle = operator.states[-1]["position"][0] < 0
+                speed = 0.6 if middle else -0.6
+                await operator.jog(0.5, next(PRESSES), joints={"shoulder_pan": speed, "wrist_roll": speed})
+                if end == "release":
+                    await operator.call("release")
+                elif end == "close":
+                    await operator.drive.close()
+                elif end == "cut":
+                    operator.cut()
+                gone_ns = time.time_ns()
+                await asyncio.sleep(0.8)
+            last_ns = moved_until_ns(watcher)
+            assert last_ns > gone_ns - 1e9, "it did not move at all"
+            assert (last_ns - gone_ns) * 1e-9 <= HOLD_S
+            assert watcher.states[-1]["stamp"] > last_ns + 3e8, "states went on arriving"
+
+    run(test)
+
+
+def test_one_operates_and_the_other_watches(address: str) -> None:
+    async def test() -> None:
+        async with client(address) as one, client(address) as two:
+            await one.call("operate", take_over=True)
+            await ready(one)
+            with pytest.raises(RuntimeError, match="this page only watches"):
+                await two.call("mode", mode="moveit_planning")
+            await two.call("estop")
+            await one.until(lambda: one.states[-1]["estop"])
+            await one.until(lambda: one.status["faults"])
+            assert "emergency stop" in one.status["faults"][0]["text"]
+            assert "starts over" in await one.call("reset")
+            await two.until(lambda: not two.states[-1]["estop"])
+            await two.call("operate", take_over=True)
+            with pytest.raises(RuntimeError, match="this page only watches"):
+                await one.call("jog", joints={})
+
+    run(test)
+
+
+def test_modes_goals_and_errors_of_commands(address: str) -> None:
+    async def test() -> None:
+        async with client(address) as page:
+            await page.call("operate", take_over=True)
+            await ready(page)
+            for wrong, why in (
+                ({"do": "mode", "mode": "moveit"}, "no mode 'moveit'; the modes are"),
+                ({"do": "mode"}, "mode must be a text"),
+                ({"do": "fly"}, "unknown command 'fly'"),
+                ({"do": "goal", "goal": "home"}, "nobody serves /planning/go_to"),
+                ({"do": "jog", "joints": {"elbow": 1}}, "no joint 'elbow'"),
+                ({"do": "jog", "joints": {"gripper": 7}}, "between -1 and 1"),
+            ):
+                with pytest.raises(RuntimeError, match=why):
+                    await page.call(**wrong)
+            await page.call("mode", mode="moveit_planning")
+            await page.until(lambda: "goal" in page.status["services"])
+            await page.call("goal", goal="home")
+            await page.until(lambda: np.abs(page.states[-1]["position"]).max() < 0.05)
+            await page.call("mode", mode="web")
+
+    run(test)
+
+
+def test_states_and_pictures_are_fresh(address: str) -> None:
+    async def test() -> None:
+        async with client(address) as page:
+            await page.until(lambda: len(page.states) > 30)
+            if page.pictures:
+                assert {channel for channel, *_ in page.pictures} <= {16, 17}
+            stamps: Any = [state["stamp"] for state in page.states]
+            assert stamps == sorted(stamps)
+
+    run(test)
