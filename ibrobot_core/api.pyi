@@ -12,6 +12,7 @@ from ibrobot_core.descriptors import (
     ExecutorDescriptor as ExecutorDescriptor,
     Flag as Flag,
     HardwareDescriptor as HardwareDescriptor,
+    PanelDescriptor as PanelDescriptor,
     PlannerDescriptor as PlannerDescriptor,
     PolicyDescriptor as PolicyDescriptor,
     ReaderDescriptor as ReaderDescriptor,

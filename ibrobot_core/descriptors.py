@@ -241,6 +241,18 @@ class DecoderDescriptor:
 
 
 @attrs.frozen
+class PanelDescriptor:
+    """A table about a run, for viewers, e.g. temperatures."""
+
+    title: str
+    columns: tuple[str, ...]
+    """The heads of the columns; the first column names the rows."""
+    rows: Callable[[Session], Sequence[Sequence[str]]]
+    """Returns the present rows with one text for each column; none for a run that the panel does not concern. Called a
+    few times per second, in a thread of the host."""
+
+
+@attrs.frozen
 class ConfigFile:
     """A robot YAML that a plugin ships; `ibrobot launch NAME` finds it."""
 

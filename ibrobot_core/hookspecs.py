@@ -104,6 +104,11 @@ def ibrobot_sections() -> Iterable[descriptors.SectionDescriptor]:  # type: igno
 
 
 @hookspec
+def ibrobot_panels() -> Iterable[descriptors.PanelDescriptor]:  # type: ignore[empty-body]
+    """Tables about a run that viewers show."""
+
+
+@hookspec
 def ibrobot_configs() -> Iterable[descriptors.ConfigFile]:  # type: ignore[empty-body]
     """Robot YAMLs that this plugin ships."""
 

@@ -49,7 +49,7 @@ KINDS: Mapping[str, str] = {
     "section": "ibrobot_sections",
 }
 """Plugin kind -> its registration hook."""
-_UNTYPED = ("ibrobot_readers", "ibrobot_decoders", "ibrobot_configs", "ibrobot_commands")
+_UNTYPED = ("ibrobot_readers", "ibrobot_decoders", "ibrobot_configs", "ibrobot_commands", "ibrobot_panels")
 """Registration hooks for objects that the YAML does not name by `type`."""
 
 OFFICIAL = Path(__file__).with_name("official_plugins.json")
@@ -95,6 +95,7 @@ class Registry:
     failures: list[Failure] = attrs.field(factory=list)
     configs: list[descriptors.ConfigFile] = attrs.field(factory=list)
     readers: list[descriptors.ReaderDescriptor] = attrs.field(factory=list)
+    panels: list[descriptors.PanelDescriptor] = attrs.field(factory=list)
     decoders: list[descriptors.DecoderDescriptor] = attrs.field(factory=list)
     commands: dict[str, descriptors.Command] = attrs.field(factory=dict)
     managers: dict[str, pluggy.PluginManager] = attrs.field(factory=dict)
@@ -302,6 +303,7 @@ def _add(registry: Registry, plugin: str, package: str, version: str, load: Call
     registry.readers += offers["ibrobot_readers"]
     registry.decoders += offers["ibrobot_decoders"]
     registry.configs += offers["ibrobot_configs"]
+    registry.panels += offers["ibrobot_panels"]
     registry.commands.update({command.name: command for command in offers["ibrobot_commands"]})
     registry.managers[plugin] = manager
 

@@ -5,7 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.api import Check, Command, HardwareDescriptor, SensorDescriptor, TeleopDescriptor, hookimpl
+from ibrobot_core.api import (
+    Check,
+    Command,
+    HardwareDescriptor,
+    PanelDescriptor,
+    SensorDescriptor,
+    TeleopDescriptor,
+    hookimpl,
+)
 from ibrobot_feetech.options import (
     EmulatedSignalOptions,
     FollowerOptions,
@@ -20,7 +28,7 @@ from ibrobot_feetech.options import (
 if TYPE_CHECKING:
     import click
 
-    from ibrobot_core.api import Context, Hardware, Sensor, Teleop
+    from ibrobot_core.api import Context, Hardware, Sensor, Session, Teleop
 
 
 def _follower(options: Any, ctx: Context) -> Hardware:
@@ -39,6 +47,18 @@ def _leader(options: Any, ctx: Context) -> Teleop:
     from ibrobot_feetech.leader import LeaderTeleop
 
     return LeaderTeleop(options, ctx)
+
+
+def _servos(session: Session) -> list[tuple[str, ...]]:
+    from ibrobot_feetech.panel import servo_rows
+
+    return servo_rows(session)
+
+
+@hookimpl
+def ibrobot_panels() -> Iterable[PanelDescriptor]:
+    """State of the servos."""
+    yield PanelDescriptor("Servos", ("servo", "temperature", "voltage", "current", "load"), _servos)
 
 
 @hookimpl

@@ -8,13 +8,14 @@ import threading
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from ibrobot_core.api import IbrobotError, Session, error_text
+from ibrobot_core.api import IbrobotError, PlanningError, Session, error_text, seconds
 from ibrobot_web.teleop import JOG, Jog
 
 Reply = Callable[[Mapping[str, Any]], None]
 Handler = Callable[[Session, Mapping[str, Any]], Any]
 _AT_ONCE = frozenset({"jog", "release"})
 """Commands that are carried out in the thread that receives them: they only leave a note for the teleop."""
+_PREVIEW_ROWS = 40
 _log = logging.getLogger("ibrobot.web")
 
 
@@ -85,6 +86,35 @@ def _release(session: Session, message: Mapping[str, Any]) -> None:
         session.bus.call(JOG, None)
 
 
+def _joints_of(session: Session, pose: str) -> dict[str, float]:
+    """The positions of a named pose [rad], of the joints that follow trajectories in this mode."""
+    config = session.config
+    if pose not in config.robot.description.poses:
+        raise ValueError(f"no pose {pose!r}; the poses are: {', '.join(config.robot.description.poses)}")
+    values = dict(zip(config.robot.joint_names, config.robot.pose(pose).tolist(), strict=True))
+    executors = (config.executors[name] for name in config.control_modes[session.mode].executors)
+    return {joint: values[joint] for each in executors if each.goals == "trajectory" for joint in each.joints}
+
+
+def _preview(session: Session, message: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The path to a goal, planned and not executed: joints by index, and rows of positions [rad]."""
+    goal = message.get("goal")
+    if not isinstance(goal, Mapping):
+        raise ValueError('goal must be an object, e.g. {"pose": "home"}')
+    if "pose" in goal:
+        goal = {"joints": _joints_of(session, str(goal["pose"]))}
+    answer = session.bus.call("/plan_kinematic_path", {"goals": [dict(goal)]})
+    if answer.trajectory is None:
+        raise PlanningError(answer.message)
+    points = answer.trajectory.points
+    chosen = points[:: max(1, len(points) // _PREVIEW_ROWS)] + points[-1:]
+    return {
+        "joints": [int(i) for i in session.config.robot.indices(answer.trajectory.joint_names)],
+        "rows": [[round(float(value), 4) for value in point.positions] for point in chosen],
+        "duration_s": round(seconds(points[-1].time_from_start_ns), 2),
+    }
+
+
 def _service(name: str, argument: str | None = None) -> Handler:
     """Calls a service with a text of the message, or with None."""
     return lambda session, message: session.bus.call(name, _text(message, argument) if argument is not None else None)
@@ -104,13 +134,15 @@ _HANDLERS: Mapping[str, Handler] = {
     "smoothing": lambda session, message: session.bus.call(
         "/action_dispatcher/toggle_smoothing", message.get("enabled") is True
     ),
+    "intervene": lambda session, message: session.bus.call("/intervene", message.get("take") is True),
+    "preview": _preview,
     "goal": _service("/planning/go_to", "goal"),
     "cancel": _service("/planning/cancel"),
 }
 
 
 def _outcome(value: Any) -> Any:
-    return value if isinstance(value, str | int | float | bool) else None
+    return value if isinstance(value, str | int | float | bool | Mapping) else None
 
 
 def _text(message: Mapping[str, Any], name: str) -> str:

@@ -12,7 +12,7 @@ from typing import Any, override
 import attrs
 import numpy as np
 
-from ibrobot_core.api import NS_PER_S, ControlMode, ControlState, Message, Session, Vector
+from ibrobot_core.api import NS_PER_S, ControlMode, ControlState, Message, Session, Vector, error_text
 
 _LOG_LINES = 100
 _PLAN_ROWS = 24
@@ -27,6 +27,8 @@ SERVICES = {
     "smoothing": "/action_dispatcher/toggle_smoothing",
     "record": "/record_episode/start",
     "jog": "/web_teleop/jog",
+    "intervene": "/intervene",
+    "preview": "/plan_kinematic_path",
 }
 """What a page offers only while its service is served."""
 EPISODE_STATUS = "/record_episode/status"
@@ -116,8 +118,21 @@ def status_json(session: Session, log: LogLines, pages: int) -> dict[str, Any]:
         "counts": {group: {key: _plain(value) for key, value in values.items()} for group, values in counts.items()},
         "episode": _plain(session.bus.call(EPISODE_STATUS, None)) if session.bus.serves(EPISODE_STATUS) else None,
         "episodes": session.outcome.episodes, "successes": session.outcome.successes,
-        "pages": pages, "log": log.lines(),
+        "pages": pages, "log": log.lines(), "commander": session.commander, "panels": _panels(session),
     }  # fmt: skip
+
+
+def _panels(session: Session) -> list[dict[str, Any]]:
+    """The tables of plugins; the error of one takes the place of its rows."""
+    found = []
+    for panel in session.registry.panels:
+        try:
+            rows = [[str(cell) for cell in row] for row in panel.rows(session)]
+        except Exception as error:  # noqa: BLE001 - contained: a plugin's table must not end the run
+            rows = [[error_text(error)]]
+        if rows:
+            found.append({"title": panel.title, "columns": list(panel.columns), "rows": rows})
+    return found
 
 
 def plan_json(session: Session, now_ns: int) -> dict[str, Any]:

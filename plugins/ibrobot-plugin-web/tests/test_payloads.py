@@ -17,7 +17,17 @@ from ibrobot_web.link import JPEG, PICTURE_HEAD, FrameSender, receive_frame
 from ibrobot_web.pictures import as_jpeg, to_payload
 from ibrobot_web.status import LogLines, numbers_of, plan_json, status_json
 
-from ibrobot_core.api import Float64MultiArray, Header, Image, Imu, JointState, String, Vector3
+from ibrobot_core.api import (
+    Float64MultiArray,
+    Header,
+    Image,
+    Imu,
+    JointState,
+    PanelDescriptor,
+    Session,
+    String,
+    Vector3,
+)
 
 
 def gradient(encoding: str) -> Image:
@@ -113,3 +123,20 @@ def test_the_status_of_a_run_is_json_without_nan() -> None:
     text = json.dumps(status, allow_nan=False)
     assert json.loads(text)["robot"]["joints"][0]["name"] == "shoulder_pan"
     assert plan_json(session, 0) == {"joints": [], "rows": []}
+
+
+def test_panels_of_plugins_are_shown_and_a_failing_one_harms_nothing() -> None:
+    def fails(session: Session) -> list[list[str]]:
+        raise ValueError("no servos")
+
+    session = make_session()
+    session.registry.panels += [
+        PanelDescriptor(
+            "Joints", ("joint",), lambda session: [[name] for name in session.config.robot.joint_names[:2]]
+        ),
+        PanelDescriptor("Nothing here", ("joint",), lambda session: []),
+        PanelDescriptor("Broken", ("servo",), fails),
+    ]
+    joints, broken = status_json(session, LogLines(), 0)["panels"]
+    assert joints == {"title": "Joints", "columns": ["joint"], "rows": [["shoulder_pan"], ["shoulder_lift"]]}
+    assert "no servos" in broken["rows"][0][0]

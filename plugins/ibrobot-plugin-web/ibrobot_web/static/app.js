@@ -47,6 +47,7 @@ const view = new View3D($("view"), {
     if (held && !page.deadman.held) page.deadman.hold(() => ({ linear: toolMotion }));
     if (!held) page.deadman.release();
   },
+  onGoal: (point) => panels[0].setGoal?.(`xyz=${point.map((value) => value.toFixed(3)).join(",")}`),
 });
 page.view = view;
 page.cameras = new Cameras($("cameras"), page);
@@ -210,7 +211,10 @@ function update() {
   showHeader();
   showOperator();
   showFaults();
-  view.tell({ do: "jogs", enabled: Boolean(page.jogs && page.status?.robot.tool) });
+  const tool = page.operating && page.status?.robot.tool;
+  view.tell({
+    do: "handle", jog: Boolean(tool && page.jogs), goal: Boolean(tool && page.status.services.includes("goal")),
+  });
   for (const part of [...parts, ...panels]) if (page.status) part.update?.(page.status);
 }
 

@@ -6,7 +6,7 @@ import { h } from "./dom.js";
 const STEP = 0.1;
 
 export class View3D {
-  constructor(section, { onTool }) {
+  constructor(section, { onTool, onGoal }) {
     this.section = section;
     this.canvas = h("canvas", {
       tabindex: "0", role: "img",
@@ -31,9 +31,11 @@ export class View3D {
       if (data.problem !== undefined) this.note.textContent = data.problem;
       if (data.drawn) {
         this.frames += 1;
+        this.at = data.handle;
         this.ages = [...this.ages.slice(-499), Date.now() - data.drawn];
       }
       if (data.tool) onTool(data.tool);
+      if (data.goal) onGoal(data.goal);
     };
     new ResizeObserver(() => this.resize()).observe(section);
     this.resize();
@@ -49,6 +51,12 @@ export class View3D {
     } catch (error) {
       this.note.textContent = `The robot's shapes cannot be loaded: ${error.message}`;
     }
+  }
+
+  // Where the tool's handle is in the window [px].
+  handle() {
+    const box = this.canvas.getBoundingClientRect();
+    return [box.left + this.at[0], box.top + this.at[1]];
   }
 
   tell(message) { this.worker?.postMessage(message); }

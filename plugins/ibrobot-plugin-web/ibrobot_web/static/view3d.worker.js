@@ -10,12 +10,14 @@ const HANDLE_PX = 26, HANDLE_M = 0.012;
 const REACH_M = 0.05; // distance at which dragging the tool reaches full speed
 const GHOST_RAD = 0.03; // a command this close to the measured position has no ghost
 const FIELD_DEG = 40;
+const FRAME_MS = 40; // 25 frames a second leave a small machine time for the rest
 const COMMANDED = [0.18, 0.5, 0.83, 0.3], PLANNED = [0.12, 0.62, 0.33, 0.3];
 
 let screen, bodies = [], joints = [], tip = null, extras = [], dark = false;
 let measured = null, commanded = null, planned = null;
 let trail = [], path, future, grid, ball;
 let dirty = true, stamp = 0, drawn = 0, size = [1, 1], jogs = false, view = null;
+let goals = false, goal = null, kept = false, begun = 0;
 const orbit = { azimuth: -0.9, elevation: 0.45, distance: 1, target: [0.1, 0, 0.15] };
 const grip = { mode: null, at: [0, 0], through: [0, 0, 0], target: [0, 0, 0] };
 
@@ -98,8 +100,9 @@ function state({ state: message }) {
   dirty = true;
 }
 
-function plan({ plan: message, positions }) {
-  if (!bodies.length) return;
+function plan({ plan: message, positions, kept: keeps = false }) {
+  if (!bodies.length || (kept && !keeps && !message.rows.length)) return;
+  kept = keeps;
   const poses = message.rows.map((row) => {
     const values = positions.slice();
     message.joints.forEach((joint, i) => { values[joint] = row[i]; });
@@ -123,9 +126,10 @@ function look() {
   view = { from, ...looking(from, target), projection: perspective(FIELD_DEG, size[0] / size[1], 0.02 * distance, 50 * distance) };
 }
 
-function draw() {
+function draw(now = 0) {
   requestAnimationFrame(draw);
-  if (!dirty || size[0] < 2) return;
+  if (!dirty || size[0] < 2 || now - begun < FRAME_MS - 5) return;
+  begun = now;
   dirty = false;
   look();
   const gray = dark ? [0.3, 0.37, 0.43, 1] : [0.68, 0.73, 0.77, 1];
@@ -133,11 +137,12 @@ function draw() {
   if (measured) shown.push(...items(measured), { shape: path, matrix: identity(), color: [0.08, 0.47, 0.78, 1] });
   if (commanded) shown.push(...items(commanded, COMMANDED));
   if (planned) shown.push(...items(planned, PLANNED), { shape: future, matrix: identity(), color: [0.12, 0.62, 0.33, 1] });
-  if (jogs && measured && tip) {
-    shown.push({ shape: ball, matrix: shifted(tipOf(measured)), color: [0.9, 0.45, 0.1, 0.85], lit: true, above: true });
+  if ((jogs || goals) && measured && tip) {
+    shown.push({ shape: ball, matrix: shifted((goals && goal) || tipOf(measured)), color: [0.9, 0.45, 0.1, 0.85], lit: true, above: true });
   }
   screen.draw(shown, view.matrix, view.projection, dark ? [0.08, 0.1, 0.13] : [0.93, 0.945, 0.957]);
-  if (stamp !== drawn) postMessage({ drawn: stamp });
+  const here = measured && tip ? seen((goals && goal) || tipOf(measured)) : null;
+  if (stamp !== drawn) postMessage({ drawn: stamp, handle: here });
   drawn = stamp;
 }
 
@@ -182,12 +187,12 @@ function down({ at, pan: pans, fingers }) {
     return;
   }
   grip.mode = "turn";
-  const here = measured && jogs ? tipOf(measured) : null;
+  const here = measured && tip && (jogs || goals) ? (goals && goal) || tipOf(measured) : null;
   const shown = here && view ? seen(here) : null;
   if (!shown || Math.hypot(shown[0] - at[0], shown[1] - at[1]) > HANDLE_PX) return;
-  grip.mode = "tool";
+  grip.mode = goals ? "goal" : "tool";
   grip.through = grip.target = here;
-  steer();
+  if (!goals) steer();
 }
 
 function move({ at }) {
@@ -195,9 +200,11 @@ function move({ at }) {
   grip.at = at;
   if (grip.mode === "turn") turn([dx * 0.006, dy * 0.006]);
   else if (grip.mode === "pan") pan(dx, dy);
-  else if (grip.mode === "tool") {
+  else if (grip.mode === "tool" || grip.mode === "goal") {
     grip.target = under(at, grip.through);
-    steer();
+    if (grip.mode === "tool") steer();
+    else goal = grip.target;
+    dirty = true;
   }
 }
 
@@ -211,6 +218,7 @@ function steer() {
 
 function release() {
   if (grip.mode === "tool") postMessage({ tool: { held: false, linear: [0, 0, 0] } });
+  if (grip.mode === "goal" && goal) postMessage({ goal });
   grip.mode = null;
 }
 
@@ -233,9 +241,12 @@ const actions = {
   theme: (message) => { dark = message.dark; dirty = true; },
   turn: ({ by }) => turn(by), zoom: ({ factor }) => zoom(factor),
   joints: ({ names }) => { joints = names; },
-  jogs: ({ enabled }) => {
-    jogs = enabled;
-    if (!enabled) release();
+  handle: ({ jog, goal: moves }) => {
+    if (jogs && !jog) release();
+    if (goals !== moves) goal = null;
+    if (goals && !moves) kept = false;
+    jogs = jog;
+    goals = moves;
     dirty = true;
   },
 };

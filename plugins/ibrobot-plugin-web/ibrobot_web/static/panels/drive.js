@@ -1,6 +1,6 @@
 // Modes, reset, poses, goals and the tool.
 
-import { h, refresh } from "../dom.js";
+import { h, refresh, toast } from "../dom.js";
 
 const TOOL = [
   ["forward", { linear: [1, 0, 0] }], ["back", { linear: [-1, 0, 0] }],
@@ -37,7 +37,7 @@ export class DrivePanel {
     refresh(this.motion, [jogs, status.robot.tool, status.robot.poses, page.mode?.name, status.help], () => this.motions(status, jogs));
     const services = status.services;
     const dispatch = status.counts.dispatch;
-    refresh(this.plan, [services, operating, dispatch?.smoothing], () => this.plans(services, dispatch, status));
+    refresh(this.plan, [services, operating, dispatch?.smoothing, status.commander], () => this.plans(services, dispatch, status));
     refresh(this.run, [operating, page.links], () => [
       h("button", { disabled: !operating, onclick: () => page.command("reset") }, "Reset"),
       page.links.watch ? h("button", { onclick: () => this.copy() }, "Copy link for watching") : null,
@@ -66,17 +66,14 @@ export class DrivePanel {
   plans(services, dispatch, status) {
     const { page } = this;
     const found = [];
-    if (services.includes("goal")) {
-      const goal = h("input", { type: "text", id: "goal", placeholder: "home, or joint=rad,…", required: true });
-      const form = h("form", { class: "row" }, h("label", { for: "goal" }, "Goal"), goal,
-        h("button", { class: "primary", disabled: !page.operating }, "Go"),
-        h("button", { type: "button", disabled: !page.operating, onclick: () => page.command("cancel") }, "Cancel"));
-      form.addEventListener("submit", (event) => {
-        event.preventDefault();
-        page.command("goal", { goal: goal.value }, `goal ${goal.value}`);
-      });
-      found.push(h("h3", {}, "Planner"), form, h("div", { class: "row" }, Object.keys(status.robot.poses).map((pose) =>
-        h("button", { disabled: !page.operating, onclick: () => page.command("goal", { goal: pose }, `goal ${pose}`) }, pose))));
+    if (services.includes("goal")) found.push(...this.goals(services, status));
+    if (services.includes("intervene")) {
+      const taken = status.commander !== "policy";
+      found.push(h("h3", {}, "Policy"), h("p", { class: "note" }, `Commands: ${status.commander}.`), h("div", { class: "row" },
+        h("button", { class: taken ? "" : "primary", disabled: !page.operating || taken,
+          onclick: () => page.command("intervene", { take: true }) }, "Take the robot from the policy"),
+        h("button", { class: taken ? "primary" : "", disabled: !page.operating || !taken,
+          onclick: () => page.command("intervene", { take: false }) }, "Give it back")));
     }
     if (services.includes("smoothing") && dispatch) {
       const box = h("input", { type: "checkbox", disabled: !page.operating });
@@ -85,6 +82,40 @@ export class DrivePanel {
       found.push(h("h3", {}, "Policy"), h("label", { class: "row" }, box, "blend chunks (smoothing)"));
     }
     return found;
+  }
+
+  goals(services, status) {
+    const { page } = this;
+    const goal = h("input", { type: "text", id: "goal", placeholder: "home, joint=rad,… or xyz=x,y,z", required: true });
+    goal.value = this.goal ?? "";
+    goal.addEventListener("input", () => { this.goal = goal.value; });
+    this.setGoal = (text) => { goal.value = this.goal = text; this.preview(); };
+    const go = () => page.command("goal", { goal: goal.value }, `goal ${goal.value}`);
+    const form = h("form", { class: "row" }, h("label", { for: "goal" }, "Goal"), goal,
+      services.includes("preview") ? h("button", { type: "button", disabled: !page.operating, onclick: () => this.preview() }, "Preview") : null,
+      h("button", { class: "primary", disabled: !page.operating }, "Go"),
+      h("button", { type: "button", disabled: !page.operating, onclick: () => page.command("cancel") }, "Cancel"));
+    form.addEventListener("submit", (event) => {
+      event.preventDefault();
+      go();
+    });
+    return [h("h3", {}, "Planner"), h("p", { class: "note" }, "Or drag the orange ball in 3D to a goal of the tool."), form,
+      h("div", { class: "row" }, Object.keys(status.robot.poses).map((pose) =>
+        h("button", { disabled: !page.operating, onclick: () => this.setGoal(pose) }, pose)))];
+  }
+
+  // Shows the path to the goal in 3D, without moving.
+  async preview() {
+    const { page } = this;
+    if (!page.status.services.includes("preview")) return;
+    try {
+      const plan = await page.drive.call("preview", { goal: parsed(this.goal ?? "") });
+      page.view.tell({ do: "plan", plan, positions: page.state.position, kept: true });
+      toast(`The path takes ${plan.duration_s} s.`);
+    } catch (error) {
+      page.view.tell({ do: "plan", plan: { joints: [], rows: [] }, positions: page.state.position, kept: true });
+      toast(`No path: ${error.message}`, "error");
+    }
   }
 
   async copy() {
@@ -105,4 +136,12 @@ export class DrivePanel {
         h("button", { autofocus: true }, "Keep it running")));
     dialog.showModal();
   }
+}
+
+// A goal's text as an object: a pose's name, joint=rad,…, or xyz=x,y,z.
+function parsed(text) {
+  if (!text.includes("=")) return { pose: text.trim() };
+  const xyz = /^\s*xyz\s*=(.*)$/.exec(text);
+  if (xyz) return { xyz: xyz[1].split(",").map(Number) };
+  return { joints: Object.fromEntries(text.split(",").map((each) => each.split("=")).map(([name, value]) => [name.trim(), Number(value)])) };
 }

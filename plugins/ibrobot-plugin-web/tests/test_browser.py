@@ -1,0 +1,175 @@
+"""The page in headless Chromium: an operator's clicks and keys, a watcher, and what they see."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from ibrobot_core.plugins import installed_plugins
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=gl-egl", "--ignore-gpu-blocklist"]
+pytestmark = [
+    pytest.mark.integration,
+    pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium"),
+    pytest.mark.skipif(("hardware", "mujoco") not in installed_plugins().entries, reason="needs ibrobot-plugin-mujoco"),
+]
+WAIT_S = 30.0
+
+
+@pytest.fixture(scope="module")
+def address() -> Iterator[str]:
+    from page_run import page_run
+
+    with page_run("so101", "--sim", "--mode", "web") as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Any]:
+    sync_api = pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install playwright")
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        yield browser
+        browser.close()
+
+
+class Tab:
+    """A page in a browser of its own; its errors are collected."""
+
+    def __init__(self, chromium: Any, address: str, **context: Any) -> None:
+        self._context = chromium.new_context(**{"viewport": {"width": 1020, "height": 700}, **context})
+        self.page = self._context.new_page()
+        self.errors: list[str] = []
+        self.hosts: set[str] = set()
+        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
+        self.page.on("console", lambda line: line.type == "error" and self.errors.append(line.text))
+        self.page.on("request", lambda request: self.hosts.add(request.url.split("/")[2]))
+        self.page.goto(address)
+        self.until(lambda: self.ask("ibrobot.status !== null && ibrobot.state !== null"))
+
+    def ask(self, expression: str) -> Any:
+        return self.page.evaluate(expression)
+
+    def until(self, met: Callable[[], Any]) -> None:
+        deadline_s = time.monotonic() + WAIT_S
+        while not met():
+            assert time.monotonic() < deadline_s, f"still not; errors of the page: {self.errors}"
+            self.page.wait_for_timeout(50)
+
+    def position(self, joint: int) -> float:
+        return float(self.ask(f"ibrobot.state.position[{joint}]"))
+
+    def text(self, selector: str) -> str:
+        return str(self.page.locator(selector).inner_text())
+
+    def close(self) -> None:
+        assert not self.errors
+        self._context.close()
+
+
+@pytest.fixture
+def tab(chromium: Any, address: str) -> Iterator[Tab]:
+    found = Tab(chromium, address)
+    yield found
+    found.close()
+
+
+def test_the_page_shows_the_robot_and_asks_no_other_host(tab: Tab, address: str) -> None:
+    tab.until(lambda: tab.ask("ibrobot.view.frames") > 2)
+    assert tab.text("#robot") == "so101"
+    assert tab.text("#view .note") == "", "3D has a problem"
+    assert tab.page.locator(".joint").count() == 6
+    for name in ("Episodes", "Plots", "Health", "Log", "Drive"):
+        tab.page.get_by_role("tab", name=name).click()
+        assert tab.page.get_by_role("tabpanel", name=name).is_visible()
+    assert tab.hosts == {address.split("/")[2]}
+
+
+def test_a_held_button_moves_a_joint_and_leaving_the_page_stops_it(tab: Tab) -> None:
+    tab.until(lambda: tab.ask("Boolean(ibrobot.jogs)"))
+    before = tab.position(0)
+    up = tab.page.get_by_label("shoulder_pan up, hold to move")
+    up.hover()
+    tab.page.mouse.down()
+    tab.until(lambda: tab.position(0) > before + 0.1)
+    tab.ask("window.dispatchEvent(new Event('blur'))")
+    assert tab.ask("ibrobot.deadman.held") is False
+    tab.page.wait_for_timeout(400)
+    rest = tab.position(0)
+    tab.page.wait_for_timeout(300)
+    assert abs(tab.position(0) - rest) < 0.01
+    tab.page.mouse.up()
+    tab.page.get_by_label("shoulder_pan down, hold to move").focus()
+    tab.page.keyboard.down("Enter")
+    tab.until(lambda: tab.position(0) < rest - 0.05)
+    tab.page.keyboard.up("Enter")
+    assert tab.ask("ibrobot.deadman.held") is False
+
+
+def test_the_space_bar_stops_the_robot_wherever_the_focus_is(tab: Tab) -> None:
+    for focused in ("#theme", "[role=tab]", "#view canvas", ".joint input"):
+        tab.until(lambda: tab.ask("!ibrobot.state.estop && Boolean(ibrobot.jogs)"))
+        tab.page.locator(focused).first.focus()
+        tab.page.keyboard.press("Space")
+        tab.until(lambda: tab.ask("ibrobot.state.estop && ibrobot.status.faults.length > 0"))
+        assert "emergency stop" in tab.text("#faults")
+        tab.page.locator("#faults button").first.click()
+        tab.until(lambda: tab.ask("!ibrobot.state.estop"))
+
+
+def test_dragging_the_ball_moves_the_tool(tab: Tab) -> None:
+    tab.until(lambda: tab.ask("Boolean(ibrobot.jogs) && ibrobot.view.frames > 2"))
+    tab.page.get_by_role("button", name="home").hover()
+    tab.page.mouse.down()
+    tab.until(lambda: abs(tab.position(1)) < 0.02 and abs(tab.position(2)) < 0.02)
+    tab.page.mouse.up()
+    before = [tab.position(joint) for joint in range(5)]
+    tab.ask("window.scrollTo(0, 0)")
+    tab.page.wait_for_timeout(500)
+    x, y = tab.page.evaluate("ibrobot.view.handle()")
+    tab.page.mouse.move(x, y)
+    tab.page.mouse.down()
+    tab.page.mouse.move(x, y - 40, steps=4)
+    tab.until(lambda: tab.ask("ibrobot.deadman.held"))
+    tab.until(lambda: max(abs(tab.position(joint) - before[joint]) for joint in range(5)) > 0.1)
+    tab.page.mouse.up()
+    assert tab.ask("ibrobot.deadman.held") is False
+
+
+def test_one_operates_the_other_watches_and_takes_over(chromium: Any, address: str, tab: Tab) -> None:
+    tab.until(lambda: tab.ask("ibrobot.operating"))
+    other = Tab(chromium, address, viewport={"width": 390, "height": 844})
+    try:
+        assert "watching" in other.text("#operator")
+        assert other.page.locator("#thumb").is_hidden()
+        other.page.get_by_role("button", name="Take over").click()
+        other.until(lambda: other.ask("ibrobot.operating"))
+        tab.until(lambda: not tab.ask("ibrobot.operating"))
+        assert "operates" in tab.text("#operator")
+        other.until(lambda: other.page.locator("#thumb").is_visible())
+        assert other.ask("document.documentElement.scrollWidth") <= 390
+        box = other.page.locator("#stop").bounding_box()
+        other.page.mouse.wheel(0, 900)
+        other.page.wait_for_timeout(200)
+        assert other.page.locator("#stop").bounding_box() == box, "the stop stays on top"
+    finally:
+        other.close()
+
+
+def test_a_goal_is_previewed_before_it_is_executed(tab: Tab) -> None:
+    tab.until(lambda: tab.ask("ibrobot.operating"))
+    tab.page.get_by_role("button", name="moveit_planning").click()
+    tab.until(lambda: tab.page.locator("#goal").is_visible())
+    before = tab.position(1)
+    tab.page.get_by_role("button", name="rest", exact=True).click()
+    tab.until(lambda: "The path takes" in tab.text(".toasts"))
+    assert abs(tab.position(1) - before) < 0.02
+    tab.page.get_by_role("button", name="Go", exact=True).click()
+    tab.until(lambda: abs(tab.position(1) + 1.57) < 0.05)
+    tab.page.get_by_role("button", name="web teleoperation by web").click()
+    tab.until(lambda: tab.ask("ibrobot.status.mode === 'web'"))
