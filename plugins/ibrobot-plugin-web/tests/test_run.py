@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from page_run import PageClient, client, page_run
 
-from ibrobot_core.plugins import installed_plugins
+from ibrobot_core.api import installed_plugins
 
 pytestmark = [
     pytest.mark.integration,
