@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from typing import TYPE_CHECKING
 
 from ibrobot_core.api import Check, TeleopDescriptor, hookimpl
 from ibrobot_webxr.options import WebxrOptions, check_robot
 
 if TYPE_CHECKING:
-    from ibrobot_core.api import Context, OptionFault, Robot, Teleop
+    from ibrobot_core.api import Context, OperatorEvent, OptionFault, Robot, Teleop
 
 
 def _make(options: WebxrOptions, ctx: Context) -> Teleop:
@@ -22,11 +22,15 @@ def _check(options: WebxrOptions, robot: Robot, joints: tuple[str, ...]) -> Iter
     return check_robot(options, robot)
 
 
+def _events(options: WebxrOptions) -> Collection[OperatorEvent]:
+    return ("start", "success", "failure", "discard", "intervention")
+
+
 @hookimpl
 def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
     """Drive the tool with a hand in space."""
     yield TeleopDescriptor(
-        type="webxr", options=WebxrOptions, make=_make, check_options=_check,
+        type="webxr", options=WebxrOptions, make=_make, check_options=_check, events=_events,
         summary="moves the tool with a phone, a VR controller or a hand, through a web page",
     )  # fmt: skip
 

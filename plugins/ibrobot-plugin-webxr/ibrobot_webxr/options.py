@@ -10,10 +10,12 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.api import OptionFault, Robot, documented, option
+from ibrobot_core.api import OptionFault, Robot, did_you_mean, documented, option
 
 HANDS = ("left", "right")
 """The hands of an operator, as WebXR calls them; on a phone the page asks which arm it drives."""
+NONE = "none"
+"""In place of the gripper's group: the robot has none."""
 _HOST = re.compile(r"[A-Za-z0-9]([A-Za-z0-9-]*[A-Za-z0-9])?(\.[A-Za-z0-9]([A-Za-z0-9-]*[A-Za-z0-9])?)*")
 
 
@@ -63,7 +65,7 @@ class WebxrOptions:
     cameras: tuple[str, ...] = option((), help="cameras whose images the page shows; empty: all")
     image_rate: float = option(15.0, unit="Hz", gt=0, le=60, help="images per second of each camera, at most")
     hand: str = option("any", choices=("any", *HANDS), help="the controller that moves this arm")
-    gripper: str = option("gripper", help="group of joints that the trigger moves; all others move the tool")
+    gripper: str = option("gripper", help="group of joints that the trigger moves, or none; all others move the tool")
     scale: float = option(1.0, gt=0, le=10, help="distance of the tool for each metre of the hand")
     facing: float = option(
         0.0, unit="rad", ge=-7, le=7,
@@ -98,9 +100,12 @@ class WebxrOptions:
 
 
 def check_robot(options: WebxrOptions, robot: Robot) -> Iterator[OptionFault]:
-    """The robot has a model, and the certificate exists."""
+    """The robot has a model and the gripper, and the certificate exists."""
     if robot.description.mjcf is None:
         yield OptionFault((), "a hand moves the tool, which needs robot.description.mjcf: set it")
+    if options.gripper not in (NONE, *robot.groups):
+        known = did_you_mean(options.gripper, (*robot.groups, NONE), "the groups are")
+        yield OptionFault(("gripper",), f"unknown group {options.gripper!r}{known}; `{NONE}` if nothing grips")
     for name, path in (("certificate", options.certificate), ("key", options.key)):
         if path is not None and not path.is_file():
             yield OptionFault((name,), f"{path}: no such file; `ibrobot certs` makes certificates and keys")

@@ -19,7 +19,7 @@ robot:
   name: mini
   joints:
     - {name: shoulder_pan, lower: -1.0, upper: 1.0, max_velocity: 2.0, max_acceleration: 10.0}
-  groups: {arm: [shoulder_pan]}
+  groups: {arm: [shoulder_pan], gripper: []}
   description: {mjcf: arm.xml, tip: tool}
 hardware: {type: arm}
 executors: {arm: {type: position, group: arm}}
@@ -65,6 +65,8 @@ MISTAKES = {
     "key: arm.xml": "certificate and key belong together: give both, or neither",
     "{certificate: arm.xml, key: none.pem}": "key: ",
     "hand: both": "hand: 'both' is not one of: any, left, right",
+    "gripper: griper": "gripper: unknown group 'griper', did you mean 'gripper'?; `none` if nothing grips",
+    "gripper: hand": "gripper: unknown group 'hand'; the groups are: arm, gripper, none; `none` if nothing grips",
     "scale: 0": "scale: 0.0 is too small, must be above 0",
     "scale: .nan": "scale: nan is too small, must be above 0",
     "facing: 180": "facing: 180.0 is too large, must be at most 7 rad",
