@@ -35,6 +35,8 @@ _STATE_S = 0.1
 """Period of the states sent to pages [s]."""
 _SILENT_S = 1.0
 """A page that has control and sends nothing for that long loses it [s]."""
+_CLOSING_S = 0.05
+"""Time at the end in which connections close, those in the middle of their handshake among them [s]."""
 _MOST_PAGES = 8
 _MOST_REFUSED = 100
 """Wrong messages after which a page is disconnected."""
@@ -175,7 +177,7 @@ class PageServer:
                     if connection.transport is not None:
                         connection.transport.abort()  # browsers keep connections open
             await runner.cleanup()
-            await asyncio.sleep(0)  # closes them
+            await asyncio.sleep(_CLOSING_S)
 
     @web.middleware
     async def _guarded(
