@@ -36,7 +36,8 @@ _STATE_S = 0.1
 _SILENT_S = 1.0
 """A page that has control and sends nothing for that long loses it [s]."""
 _CLOSING_S = 0.05
-"""Time at the end in which connections close, those in the middle of their handshake among them [s]."""
+"""Time at the end in which connections close [s]."""
+_HANDSHAKE_S = 5.0
 _MOST_PAGES = 8
 _MOST_REFUSED = 100
 """Wrong messages after which a page is disconnected."""
@@ -157,25 +158,29 @@ class PageServer:
         # The access log would have the token.
         runner = web.AppRunner(app, access_log=None, logger=_quiet(self._log), shutdown_timeout=0.1)
         await runner.setup()
+        assert runner.server is not None
         try:
-            site = web.TCPSite(runner, self._options.host, self._options.port, ssl_context=context)
-            try:
-                await site.start()
-            except OSError as error:
-                self._failure = error
-                return
-            self.port = runner.addresses[0][1]
+            # Clients that do not finish their handshake are disconnected, which web.TCPSite leaves to a minute.
+            listener = await self._loop.create_server(
+                runner.server, self._options.host, self._options.port, ssl=context, ssl_handshake_timeout=_HANDSHAKE_S
+            )
+        except OSError as error:
+            self._failure = error
+            await runner.cleanup()
+            return
+        try:
+            self.port = listener.sockets[0].getsockname()[1]
             self._guard.serve_at(self.port)
             self._started.set()
             await self._tell_until_end()
         finally:
+            listener.close()
             for page in tuple(self._pages):
                 with contextlib.suppress(OSError, RuntimeError, asyncio.TimeoutError):
                     await asyncio.wait_for(page.socket.close(), 0.5)
-            if runner.server is not None:
-                for connection in runner.server.connections:
-                    if connection.transport is not None:
-                        connection.transport.abort()  # browsers keep connections open
+            for connection in runner.server.connections:
+                if connection.transport is not None:
+                    connection.transport.abort()  # browsers keep connections open
             await runner.cleanup()
             await asyncio.sleep(_CLOSING_S)
 

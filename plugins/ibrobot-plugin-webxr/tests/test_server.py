@@ -162,9 +162,10 @@ def test_without_tls_nothing_is_answered(page: PageServer):
 def test_old_tls_is_refused(page: PageServer):
     old = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     old.check_hostname, old.verify_mode = False, ssl.CERT_NONE
+    old.set_ciphers("ALL:@SECLEVEL=0")  # offers TLS 1.1
     with pytest.warns(DeprecationWarning, match="TLSv1_1"):
-        old.maximum_version = ssl.TLSVersion.TLSv1_1
-    with socket.create_connection(("127.0.0.1", page.port)) as plain, pytest.raises(ssl.SSLError):
+        old.minimum_version = old.maximum_version = ssl.TLSVersion.TLSv1_1
+    with socket.create_connection(("127.0.0.1", page.port)) as plain, pytest.raises(ssl.SSLError, match="ALERT"):
         old.wrap_socket(plain)
 
 
