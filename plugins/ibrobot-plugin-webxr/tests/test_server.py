@@ -165,7 +165,7 @@ def test_old_tls_is_refused(page: PageServer):
     old.set_ciphers("ALL:@SECLEVEL=0")  # offers TLS 1.1
     with pytest.warns(DeprecationWarning, match="TLSv1_1"):
         old.minimum_version = old.maximum_version = ssl.TLSVersion.TLSv1_1
-    with socket.create_connection(("127.0.0.1", page.port)) as plain, pytest.raises(ssl.SSLError, match="ALERT"):
+    with socket.create_connection(("127.0.0.1", page.port)) as plain, pytest.raises(ssl.SSLError, match=r"EOF|ALERT"):
         old.wrap_socket(plain)
 
 
