@@ -133,7 +133,7 @@ def test_controllers_of_a_headset_move_the_arm(arm: Arm, server: PageServer, tab
     tab.add_init_script(HEADSET.read_text())
     tab.goto(server.address)
     tab.get_by_role("button", name="Start VR").click()
-    tab.wait_for_function("document.getElementById('link').textContent.includes('Hz')")
+    tab.locator("#link", has_text="Hz").wait_for()
     tab.evaluate("emulated.right.position.z = -0.5")
     tab.wait_for_timeout(300)
     np.testing.assert_array_equal(arm.position, BENT)
