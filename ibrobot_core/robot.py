@@ -62,7 +62,7 @@ class Description:
     poses: Mapping[str, tuple[float, ...]] = option(factory=dict, unit="rad", help="joint positions in joint order")
     arms: Mapping[str, tuple[float, float, float, float]] = option(
         factory=dict,
-        help="of several equal arms: prefix of its names, as left_ -> x, y, z [m] and yaw [rad] of its base",
+        help="of several equal arms: prefix of its names, e.g. `left_`, with x, y, z [m] and yaw [rad] of its base",
     )
 
     def arm_of(self, joint: str) -> str:

@@ -97,6 +97,8 @@ def target(goal: str | Goal, robot: Robot, velocity_scaling: float = 1.0) -> Tar
 
 def _described(goal: Goal) -> str:
     match goal:
+        case JointGoal(joints=joints, positions=positions):
+            return ", ".join(f"{joint}={value:g}" for joint, value in zip(joints, positions.tolist(), strict=False))
         case PositionGoal(position=p):
             return f"position {p.x:g}, {p.y:g}, {p.z:g}"
         case PoseGoal(pose=Pose(position=p)):

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -95,7 +97,7 @@ def plan(start: str, goal: str, speed: float, plot: Path | None, config: str | N
         wanted = target(goal, robot, speed)
     facts: dict[str, Any] = {
         "robot": robot.name, "mode": mode.name, "planner": mode.planner.type if mode.planner else "",
-        "from": start, "goal": goal, "kind": _kind(wanted, robot),
+        "from": start, "goal": goal, "kind": _kind(wanted),
     }  # fmt: skip
     try:
         found = _planned(loaded, mode, options["seed"], joints, from_, wanted, facts)
@@ -150,12 +152,12 @@ def _positions(text: str, robot: Robot) -> Vector:
     return np.array([parsed.joints.get(name, 0.0) for name in robot.joint_names])
 
 
-def _kind(wanted: Target, robot: Robot) -> str:
+def _kind(wanted: Target) -> str:
     if isinstance(wanted.tool, PositionGoal):
         return "position" if wanted.tool.axis is None else "position with axis"
     if isinstance(wanted.tool, PoseGoal):
         return "pose"
-    return "named pose" if wanted.text in robot.description.poses else "joints"
+    return "joints" if "=" in wanted.text else "named pose"
 
 
 def _planned(
@@ -168,11 +170,6 @@ def _planned(
         PlanningError: if there is none.
     """
     robot = config.robot
-    # A run that never starts: its bus gives the planner the world.
-    session = Session(config, installed_plugins(), LaunchRequest(seed=seed))
-    for descriptor, section in session.registry.sections(config):
-        if descriptor.type == "world":
-            descriptor.make(section, session).start()
     goal: Goal | None = wanted.tool
     mine = {name: value for name, value in wanted.joints.items() if name in joints}
     if goal is None:
@@ -180,8 +177,8 @@ def _planned(
             raise PlanningError(f"goal {wanted.text!r} moves no joint of the arm: {', '.join(joints)}")
         goal = JointGoal(tuple(mine), np.array(list(mine.values())))
     assert mode.planner is not None
-    planner: Planner = session.make("planner", mode.planner, mode.planner.type)
-    try:
+    with _session(config, seed) as session:
+        planner: Planner = session.make("planner", mode.planner, mode.planner.type)
         planner.load()
         begun = time.monotonic()
         others = dict(zip(robot.joint_names, start.tolist(), strict=True))
@@ -189,9 +186,9 @@ def _planned(
             PlanRequest(joints, start[robot.indices(joints)], goal, wanted.velocity_scaling, others=others)
         )
         elapsed_s = time.monotonic() - begun
-    finally:
         planner.close()
-    found = _sampled(result.trajectory, robot, start)
+        found = _sampled(result.trajectory, robot, start)
+        clearance = _clearance(session, joints, others, found)
     limits = robot.max_velocity[robot.indices(joints)]
     peaks = np.abs(found.velocities).max(axis=0)
     facts |= {
@@ -201,7 +198,7 @@ def _planned(
         "length_rad": float(np.linalg.norm(np.diff(found.positions, axis=0), axis=1).sum()),
         "tool_path_m": None if found.tool is None else float(np.linalg.norm(np.diff(found.tool, axis=0), axis=1).sum()),
         "duration_s": float(found.times[-1]),
-        "clearance": _clearance(session, joints, others, found),
+        "clearance": clearance,
         "peak_velocity": {
             name: {"rad_s": float(peak), "share_of_limit": float(peak / limit)}
             for name, peak, limit in zip(joints, peaks, limits, strict=True)
@@ -209,6 +206,19 @@ def _planned(
         "planning_time_s": elapsed_s,
     }  # fmt: skip
     return found
+
+
+@contextmanager
+def _session(config: RobotConfig, seed: int) -> Iterator[Session]:
+    """A run that never starts, but whose bus has the world."""
+    session = Session(config, installed_plugins(), LaunchRequest(seed=seed))
+    with ExitStack() as stack:
+        for descriptor, options in session.registry.sections(config):
+            if descriptor.type == "world":
+                world = descriptor.make(options, session)
+                stack.callback(world.stop)
+                world.start()
+        yield session
 
 
 def _sampled(trajectory: JointTrajectory, robot: Robot, start: Vector) -> Plan:

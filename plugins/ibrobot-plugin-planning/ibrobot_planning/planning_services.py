@@ -221,6 +221,11 @@ class PlanningServices:
         checked = self._checked
         return pose(checked.arm.link_pose(checked.names.get(link, link), q))
 
+    def _links(self) -> tuple[str, ...]:
+        from ibrobot_planning.arm import robot_arm
+
+        return tuple(robot_arm(self._robot).frames)
+
     def _world(self) -> World:
         bus = self._session.bus
         world = bus.call(SNAPSHOT, None) if bus.serves(SNAPSHOT) else World()
@@ -234,7 +239,7 @@ class PlanningServices:
             for name, each in self._world().objects.items()
         }
         try:
-            tip, links = self._tool.model.tip, tuple(self._checked.arm.frames)
+            tip, links = self._tool.model.tip, self._links()
         except IbrobotError:  # a robot without a model can still move its joints
             tip, links = "", ()
         state = JointState(Header(reading.stamp_ns), robot.joint_names, reading.position, reading.velocity)

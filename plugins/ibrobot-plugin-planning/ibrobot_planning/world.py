@@ -113,7 +113,8 @@ class Mesh:
         if not np.issubdtype(triangles.dtype, np.integer):
             raise ValueError(f"triangles are {triangles.dtype}, must be whole numbers")
         if triangles.min() < 0 or triangles.max() >= len(vertices):
-            raise ValueError(f"a triangle has vertex {triangles.max()}, there are {len(vertices)}")
+            wrong = triangles.min() if triangles.min() < 0 else triangles.max()
+            raise ValueError(f"a triangle names vertex {wrong}; there are {len(vertices)}, numbered from 0")
         extent = float(np.ptp(vertices, axis=0).max())
         if extent > _LARGEST_M:
             raise ValueError(f"the mesh is {extent:g} m across; for millimetres give scale: 0.001")

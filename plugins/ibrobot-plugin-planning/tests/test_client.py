@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -241,34 +242,34 @@ def test_object_in_the_way(robot: SimpleNamespace, caplog: pytest.LogCaptureFixt
 POSE = PoseStamped(Header(frame_id="camera"), Pose(Vector3(0.2, 0.0, 0.1)))
 
 
-@pytest.mark.parametrize(
-    ("call", "error", "message"),
-    [
-        (lambda arm: arm.move_to_pose(POSE), PlanningError, "frame 'camera' is not the base"),
-        (lambda arm: arm.move_to_pose(position=(0.2, 0.1)), PlanningError, "expected x, y, z, got 2 numbers"),
-        (lambda arm: arm.move_to_pose(position=(0.2, 0, 0.1), target_link="hand"), PlanningError, "'hand' is not the"),
-        (lambda arm: arm.move_to_pose(quat_xyzw=DOWN), PlanningError, "a goal has one of pose, joints and xyz"),
-        (lambda arm: arm.move_to_pose(), PlanningError, "a request needs at least one goal"),
-        (lambda arm: arm.move_to_configuration([0.0] * 6), PlanningError, "6 positions for 5 joints"),
-        (lambda arm: arm.move_to_configuration([0.1], ["tilt"]), PlanningError, "no joint 'tilt'; the joints are: pan"),
-        (lambda arm: arm.plan(position=(0.2, 0, 0.1), quat_xyzw=(0, 0, 0, 2)), PlanningError, "quaternion has length"),
-        (lambda arm: arm.compute_ik((0.2, 0, 0.1), constraints=1), NotSupported, "takes no constraints"),
-        (lambda arm: arm.add_collision_cone("c", 1, 1), NotSupported, "the world has no cones"),
-        (lambda arm: arm.add_collision_mesh(None, "m", mesh=1), NotSupported, "takes a file on the robot's machine"),
-        (lambda arm: arm.add_collision_mesh("m.stl", "m", scale=(1, 2, 1)), NotSupported, "takes one scale"),
-        (lambda arm: arm.add_collision_mesh("/no.stl", "m", position=(0, 0, 0)), PlanningError, "no file /no.stl"),
-        (lambda arm: arm.add_collision_box("b", (1, 1, 1)), PlanningError, "the object needs a place"),
-        (lambda arm: arm.add_collision_box("b", (1, 1, 0), position=(0, 0, 0)), PlanningError, "three lengths above 0"),
-        (lambda arm: arm.remove_collision_object("cup"), PlanningError, "no object 'cup'; the objects are: none"),
-        (lambda arm: arm.attach("cup"), PlanningError, "no object 'cup'"),
-        (lambda arm: arm.set_path_orientation_constraint(DOWN), NotSupported, "paths take no constraints"),
-        (lambda arm: arm.reset_controller([0.0]), NotSupported, "joints do not jump"),
-        (lambda arm: arm.set_workspace_parameters((0, 0, 0), (1, 1, 1)), NotSupported, "the workspace is bounded"),
-    ],
-)  # fmt: skip
-def test_wrong_calls(robot: SimpleNamespace, call: Callable[[MoveIt2], Any], error: type[Exception], message: str):
-    with pytest.raises(error, match=message):
-        call(robot.arm)
+WRONG: list[tuple[Callable[[MoveIt2], Any], type[Exception], str]] = [
+    (lambda arm: arm.move_to_pose(POSE), PlanningError, "frame 'camera' is not the base"),
+    (lambda arm: arm.move_to_pose(position=(0.2, 0.1)), PlanningError, "expected x, y, z, got 2 numbers"),
+    (lambda arm: arm.move_to_pose(position=(0.2, 0, 0.1), target_link="hand"), PlanningError, "'hand' is not the"),
+    (lambda arm: arm.move_to_pose(quat_xyzw=DOWN), PlanningError, "a goal has one of pose, joints and xyz"),
+    (lambda arm: arm.move_to_pose(), PlanningError, "a request needs at least one goal"),
+    (lambda arm: arm.move_to_configuration([0.0] * 6), PlanningError, "6 positions for 5 joints"),
+    (lambda arm: arm.move_to_configuration([0.1], ["tilt"]), PlanningError, "no joint 'tilt'; the joints are: pan"),
+    (lambda arm: arm.plan(position=(0.2, 0, 0.1), quat_xyzw=(0, 0, 0, 2)), PlanningError, "quaternion has length"),
+    (lambda arm: arm.compute_ik((0.2, 0, 0.1), constraints=1), NotSupported, "takes no constraints"),
+    (lambda arm: arm.add_collision_cone("c", 1, 1), NotSupported, "the world has no cones"),
+    (lambda arm: arm.add_collision_mesh(None, "m", mesh=1), NotSupported, "takes a file on the robot's machine"),
+    (lambda arm: arm.add_collision_mesh("m.stl", "m", scale=(1, 2, 1)), NotSupported, "takes one scale"),
+    (lambda arm: arm.add_collision_mesh("/no.stl", "m", position=(0, 0, 0)), PlanningError, "no file /no.stl"),
+    (lambda arm: arm.add_collision_box("b", (1, 1, 1)), PlanningError, "the object needs a place"),
+    (lambda arm: arm.add_collision_box("b", (1, 1, 0), position=(0, 0, 0)), PlanningError, "three lengths above 0"),
+    (lambda arm: arm.remove_collision_object("cup"), PlanningError, "no object 'cup'; the objects are: none"),
+    (lambda arm: arm.attach("cup"), PlanningError, "no object 'cup'"),
+    (lambda arm: arm.set_path_orientation_constraint(DOWN), NotSupported, "constraints are not supported"),
+    (lambda arm: arm.reset_controller([0.0]), NotSupported, "joints do not jump"),
+    (lambda arm: arm.set_workspace_parameters((0, 0, 0), (1, 1, 1)), NotSupported, "the workspace is bounded"),
+]  # fmt: skip
+
+
+def test_wrong_calls(robot: SimpleNamespace):
+    for call, error, message in WRONG:
+        with pytest.raises(error, match=message):
+            call(robot.arm)
 
 
 def test_names_are_checked_at_once(robot: SimpleNamespace):
@@ -282,6 +283,81 @@ def test_names_are_checked_at_once(robot: SimpleNamespace):
         GripperInterface(robot.node, ["thumb"], [1.0], [0.0])
     with pytest.raises(PlanningError, match=r"2 open positions for 1 gripper joints"):
         GripperInterface(robot.node, ["jaw"], [1.0, 1.0], [0.0])
+
+
+SURFACE = {
+    "__init__": "node joint_names base_link_name end_effector_name group_name execute_via_moveit"
+    " ignore_new_calls_while_executing callback_group follow_joint_trajectory_action_name use_move_group_action",
+    "query_state": "", "cancel_execution": "", "get_execution_future": "", "get_last_execution_error_code": "",
+    "move_to_pose": "pose position quat_xyzw target_link frame_id tolerance_position tolerance_orientation"
+    " weight_position cartesian weight_orientation cartesian_max_step cartesian_fraction_threshold",
+    "move_to_configuration": "joint_positions joint_names tolerance weight",
+    "plan": "pose position quat_xyzw joint_positions joint_names frame_id target_link tolerance_position"
+    " tolerance_orientation tolerance_joint_position weight_position weight_orientation weight_joint_position"
+    " start_joint_state cartesian max_step cartesian_fraction_threshold",
+    "get_trajectory": "future cartesian cartesian_fraction_threshold",
+    "execute": "joint_trajectory", "wait_until_executed": "",
+    "set_pose_goal": "pose position quat_xyzw frame_id target_link tolerance_position tolerance_orientation"
+    " weight_position weight_orientation",
+    "set_position_goal": "position frame_id target_link tolerance weight",
+    "set_orientation_goal": "quat_xyzw frame_id target_link tolerance weight parameterization",
+    "set_joint_goal": "joint_positions joint_names tolerance weight",
+    "clear_goal_constraints": "", "create_new_goal_constraint": "", "clear_path_constraints": "",
+    "compute_fk": "joint_state fk_link_names", "get_compute_fk_result": "future fk_link_names",
+    "compute_ik": "position quat_xyzw ik_link_name start_joint_state constraints wait_for_server_timeout_sec",
+    "get_compute_ik_result": "future", "reset_new_joint_state_checker": "", "force_reset_executing_state": "",
+    "add_collision_primitive": "id primitive_type dimensions pose position quat_xyzw frame_id",
+    "add_collision_box": "id size pose position quat_xyzw frame_id",
+    "add_collision_sphere": "id radius pose position quat_xyzw frame_id",
+    "add_collision_cylinder": "id height radius pose position quat_xyzw frame_id",
+    "add_collision_mesh": "filepath id pose position quat_xyzw frame_id scale mesh",
+    "remove_collision_object": "id", "remove_collision_mesh": "id",
+    "attach_collision_object": "id link_name touch_links weight", "detach_collision_object": "id",
+    "detach_all_collision_objects": "", "move_collision": "id position quat_xyzw frame_id",
+    "update_planning_scene": "", "allow_collisions": "id allow", "process_allow_collision_future": "future",
+    "clear_all_collision_objects": "", "cancel_clear_all_collision_objects_future": "future",
+    "process_clear_all_collision_objects_future": "future",
+}  # fmt: skip
+"""Method of pymoveit2's MoveIt2 (June 2026) -> its parameters; `operation` of collision objects is left out."""
+OTHERS = (
+    "plan_async", "compute_fk_async", "compute_ik_async", "add_collision_cone", "reset_controller",
+    "set_path_joint_constraint", "set_path_position_constraint", "set_path_orientation_constraint",
+    "create_joint_constraints", "create_position_constraint", "create_orientation_constraint",
+    "set_workspace_parameters", "joint_state", "planning_scene", "new_joint_state_available", "num_planning_attempts",
+    "allowed_planning_time", "pipeline_id", "planner_id", "cartesian_avoid_collisions", "cartesian_jump_threshold",
+)  # fmt: skip
+"""Further names."""
+
+
+@pytest.mark.parametrize(("method", "parameters"), SURFACE.items(), ids=SURFACE)
+def test_methods_have_the_parameters_of_pymoveit2(method: str, parameters: str):
+    found = inspect.signature(vars(MoveIt2)[method]).parameters
+    assert list(found)[1:] == parameters.split()
+
+
+def test_no_name_of_pymoveit2_is_missing():
+    assert [name for name in OTHERS if name not in vars(MoveIt2)] == []
+
+
+def test_attributes_without_effect_say_so(robot: SimpleNamespace, caplog: pytest.LogCaptureFixture):
+    assert robot.arm.allowed_planning_time == 0.5
+    robot.arm.planner_id = "RRTConnectkConfigDefault"
+    assert robot.arm.planner_id == "RRTConnectkConfigDefault"
+    assert "planner_id has no effect: it is an option of the planner in the robot YAML" in caplog.text
+
+
+def test_primitives(robot: SimpleNamespace):
+    for number, sizes in ((1, (0.1, 0.1, 0.1)), (2, (0.05,)), (3, (0.1, 0.02))):
+        robot.arm.add_collision_primitive(f"part{number}", number, sizes, position=(0.3, 0.3, 0.1 * number))
+    robot.arm.update_planning_scene()
+    shapes = [each["shape"] for each in robot.arm.planning_scene["objects"].values()]
+    assert shapes == ["box", "sphere", "cylinder"]
+    assert robot.arm.process_allow_collision_future(robot.arm.allow_collisions("part1", True))
+    assert robot.arm.process_clear_all_collision_objects_future(robot.arm.clear_all_collision_objects())
+    with pytest.raises(NotSupported, match=r"primitive type 4 is not a box \(1\), sphere \(2\) or cylinder \(3\)"):
+        robot.arm.add_collision_primitive("cone", 4, (0.1, 0.1), position=(0, 0, 0))
+    with pytest.raises(PlanningError, match="a cylinder has 2 dimensions, got 3"):
+        robot.arm.add_collision_primitive("can", 3, (0.1, 0.1, 0.1), position=(0, 0, 0))
 
 
 def test_mode_without_a_planner_has_no_services(run: Callable[..., Runtime]):

@@ -54,6 +54,11 @@ def test_joint_goal_around_an_obstacle(yaml: Path):
     assert 0.2 < max(peak["share_of_limit"] for peak in peaks.values()) <= 1.01
 
 
+def test_world_with_clouds_has_no_cells_without_a_run(yaml: Path, no_leaks: None):
+    found = planned(yaml, "--from", "left", "--goal", "pan=0.9", "--set", "world={clouds: {top: {topic: /points}}}")
+    assert found["clearance"] is None
+
+
 @pytest.mark.parametrize(
     ("goal", "kind"),
     [

@@ -33,7 +33,7 @@ MALFORMED = {
     "mesh without triangles": (lambda: Mesh(TRIANGLE, ONE[:0]), r"triangles have shape \(0, 3\)"),
     "mesh of quadrangles": (lambda: Mesh(TRIANGLE, np.array([[0, 1, 2, 0]])), r"triangles have shape \(1, 4\)"),
     "mesh of fractions": (lambda: Mesh(TRIANGLE, ONE * 1.0), "triangles are float64, must be whole numbers"),
-    "mesh with a corner too many": (lambda: Mesh(TRIANGLE, ONE + 1), "a triangle has vertex 3, there are 3"),
+    "mesh with a corner too many": (lambda: Mesh(TRIANGLE, ONE + 1), "a triangle names vertex 3; there are 3"),
     "mesh without area": (lambda: Mesh(TRIANGLE * [1, 0, 0], ONE), "the mesh has no area"),
     "mesh in millimetres": (lambda: Mesh(TRIANGLE * 400, ONE), "400 m across; for millimetres give scale: 0.001"),
     "flat hull": (lambda: Mesh(TRIANGLE, ONE, convex=True), "a flat mesh has no convex hull"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from ibrobot_core.api import JointState, PlanningError
+from ibrobot_core.api import JointState, NotSupported, PlanningError
 from ibrobot_planning.client.motion import JointStates, Motions
 from ibrobot_planning.client.node import BaseNode
 
@@ -83,6 +83,15 @@ class GripperInterface:
     def wait_until_executed(self) -> bool:
         """Wait for the end of the motion; returns whether it succeeded. Grasping something is a success."""
         return self._motions.wait()
+
+    def force_reset_executing_state(self) -> None:
+        """Do nothing: the robot knows whether it executes a motion."""
+
+    def reset_open(self, sync: bool = True) -> None:
+        """Raise NotSupported."""
+        raise NotSupported("joints do not jump: open or close the gripper, or reset the simulation's episode")
+
+    reset_closed = reset_open
 
     @property
     def joint_state(self) -> JointState:

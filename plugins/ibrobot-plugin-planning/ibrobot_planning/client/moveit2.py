@@ -41,8 +41,31 @@ type JointPositions = JointState | Sequence[float]
 type AnyPose = Pose | PoseStamped
 
 _BASE_FRAMES = ("", "base", "base_link")
+_PRIMITIVES = {1: ("box", ()), 2: ("sphere", ("radius",)), 3: ("cylinder", ("height", "radius"))}
+"""Type of shape_msgs/msg/SolidPrimitive -> the shape, and the keys of its dimensions."""
 _LEAST = 1e-6
 """Fraction of a straight path in place of 0, which means any."""
+
+
+class _WithoutEffect:
+    """An attribute of pymoveit2 that has no effect here; setting it is logged."""
+
+    def __init__(self, default: Any, why: str) -> None:
+        self._default = default
+        self._why = why
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, client: MoveIt2 | None, owner: type) -> Any:
+        return self._default if client is None else client.__dict__.get(self._name, self._default)
+
+    def __set__(self, client: MoveIt2, value: Any) -> None:
+        client.__dict__[self._name] = value
+        client.warn("%s has no effect: %s", self._name, self._why)
+
+
+_BY_YAML = "it is an option of the planner in the robot YAML"
 
 
 class MoveIt2:
@@ -96,6 +119,19 @@ class MoveIt2:
             raise PlanningError(f"no joint {unknown[0]!r}; the joints are: {', '.join(known)}")
         self._check_frame(base_link_name)
         self._check_link(end_effector_name)
+
+    num_planning_attempts = _WithoutEffect(5, _BY_YAML)
+    allowed_planning_time = _WithoutEffect(0.5, _BY_YAML)
+    pipeline_id = _WithoutEffect("", _BY_YAML)
+    planner_id = _WithoutEffect("", _BY_YAML)
+    cartesian_avoid_collisions = _WithoutEffect(True, "straight paths always avoid collisions")
+    cartesian_jump_threshold = _WithoutEffect(0.0, "straight paths have no jumps")
+    cartesian_prismatic_jump_threshold = _WithoutEffect(0.0, "straight paths have no jumps")
+    cartesian_revolute_jump_threshold = _WithoutEffect(0.0, "straight paths have no jumps")
+
+    def warn(self, message: str, *arguments: Any) -> None:
+        """Log a warning."""
+        self._node.get_logger().warning(message, *arguments)
 
     # Motions.
 
@@ -344,6 +380,24 @@ class MoveIt2:
         shape = {"shape": "mesh", "file": str(Path(filepath).absolute()), "scale": scales.pop()}
         self._add(id, shape, pose, position, quat_xyzw, frame_id)
 
+    def add_collision_primitive(
+        self, id: str, primitive_type: int, dimensions: Sequence[float], pose: AnyPose | None = None,
+        position: Position | None = None, quat_xyzw: Orientation | None = None, frame_id: str | None = None,
+    ) -> None:  # fmt: skip
+        """Add a shape of shape_msgs/msg/SolidPrimitive, or replace an object; its dimensions are as there [m].
+
+        Raises:
+            NotSupported: for other shapes than box, sphere and cylinder.
+        """
+        if primitive_type not in _PRIMITIVES:
+            raise NotSupported(f"primitive type {primitive_type} is not a box (1), sphere (2) or cylinder (3)")
+        kind, keys = _PRIMITIVES[primitive_type]
+        sizes = [float(each) for each in dimensions]
+        if len(sizes) != (len(keys) or 3):
+            raise PlanningError(f"a {kind} has {len(keys) or 3} dimensions, got {len(sizes)}")
+        shape = dict(zip(keys, sizes, strict=True)) if keys else {"size": sizes}
+        self._add(id, {"shape": kind, **shape}, pose, position, quat_xyzw, frame_id)
+
     def remove_collision_object(self, id: str) -> None:
         """Remove an object.
 
@@ -394,14 +448,22 @@ class MoveIt2:
             if found["link"] is not None:
                 self.detach_collision_object(name)
 
-    def clear_all_collision_objects(self) -> None:
-        """Remove all objects, those of the robot YAML included."""
+    def clear_all_collision_objects(self) -> Future[bool]:
+        """Remove all objects, those of the robot YAML included. The future is done."""
         self.update_planning_scene()
         for name in self._scene["objects"]:
             self.remove_collision_object(name)
+        return _done()
 
-    def allow_collisions(self, id: str, allow: bool) -> None:
-        """Let an object touch everything, or nothing but the link that carries it.
+    def process_clear_all_collision_objects_future(self, future: Future[bool]) -> bool:
+        """Whether the objects were removed."""
+        return future.result()
+
+    def cancel_clear_all_collision_objects_future(self, future: Future[bool]) -> None:
+        """Do nothing: the objects were removed at once."""
+
+    def allow_collisions(self, id: str, allow: bool) -> Future[bool]:
+        """Let an object touch everything, or nothing but the link that carries it. The future is done.
 
         Raises:
             PlanningError: if there is none of this name.
@@ -409,6 +471,11 @@ class MoveIt2:
         self.update_planning_scene()
         others = [*self._scene["links"], *(name for name in self._scene["objects"] if name != id)]
         self._node.call("/world/allow", {"name": id, "may_touch": others if allow else []})
+        return _done()
+
+    def process_allow_collision_future(self, future: Future[bool]) -> bool:
+        """Whether the object may touch what was asked."""
+        return future.result()
 
     def update_planning_scene(self) -> bool:
         """Ask for the robot and its objects; see `planning_scene`."""
@@ -450,9 +517,11 @@ class MoveIt2:
 
     def set_path_joint_constraint(self, *arguments: Any, **options: Any) -> None:
         """Raise NotSupported."""
-        raise NotSupported("paths take no constraints; a straight path keeps the orientation: cartesian=True")
+        raise NotSupported("constraints are not supported; a straight path keeps the orientation: cartesian=True")
 
     set_path_position_constraint = set_path_orientation_constraint = set_path_joint_constraint
+    create_joint_constraints = create_position_constraint = set_path_joint_constraint
+    create_orientation_constraint = set_path_joint_constraint
 
     def clear_path_constraints(self) -> None:
         """Do nothing: there are no path constraints."""
@@ -542,3 +611,9 @@ def _numbers(values: Vector3 | Quaternion | Sequence[float], names: str) -> list
             f"expected {', '.join(names)}, got {len(numbers)} numbers", PlanCode.INVALID_GOAL_CONSTRAINTS
         )
     return numbers
+
+
+def _done() -> Future[bool]:
+    future: Future[bool] = Future()
+    future.set_result(True)
+    return future
