@@ -153,6 +153,7 @@ def test_services_answer_and_their_absence_is_reported(bus: Bus) -> None:
     bus.serve("/add", lambda request: request + 1)
 
     assert bus.call("/add", 2) == 3
+    assert bus.services() == ["/add"]
     with pytest.raises(TransportError, match=r"^service /add is served already$"):
         bus.serve("/add", lambda request: request)
     with pytest.raises(TransportError, match=r"^nobody serves /sub; served: /add$"):

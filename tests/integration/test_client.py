@@ -97,8 +97,10 @@ def test_script_moves_a_robot_over_the_network(arm: Runtime, endpoint: str):
     moveit2.move_to_pose(position=[0.25, 0.0, 0.12], quat_xyzw=None)
     assert moveit2.wait_until_executed()
     pose = moveit2.compute_fk()
+    assert pose is not None
     assert (pose.pose.position.x, pose.pose.position.z) == pytest.approx((0.25, 0.12), abs=0.02)
     trajectory = moveit2.plan(joint_positions=[0.3, 0.0, 0.0, 0.0, 0.0])
+    assert trajectory is not None
     moveit2.execute(trajectory)
     assert moveit2.wait_until_executed()
     assert moveit2.joint_state.position[0] == pytest.approx(0.3, abs=0.05)

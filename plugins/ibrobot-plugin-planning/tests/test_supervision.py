@@ -11,7 +11,7 @@ import pytest
 from ibrobot_planning.arm import robot_arm
 from ibrobot_planning.collision import Collisions
 from ibrobot_planning.source import GO_TO, RESULT
-from ibrobot_planning.world_keeper import SNAPSHOT
+from ibrobot_planning.world import SNAPSHOT
 
 from ibrobot_core.api import PlanCode, Runtime, Vector
 

@@ -12,8 +12,8 @@ from ibrobot_planning import ibrobot_sections
 from ibrobot_planning.options import RrtConnectOptions
 from ibrobot_planning.rrt import RrtConnectPlanner
 from ibrobot_planning.transforms import matrix
-from ibrobot_planning.world import Box, Capsule, Cylinder, Mesh, Plane, Sphere
-from ibrobot_planning.world_keeper import ATTACH, DETACH, SNAPSHOT, TOUCH, WorldKeeper
+from ibrobot_planning.world import SNAPSHOT, Box, Capsule, Cylinder, Mesh, Plane, Sphere
+from ibrobot_planning.world_keeper import ATTACH, DETACH, TOUCH, WorldKeeper
 from ibrobot_planning.world_options import WorldOptions
 from ibrobot_testing import SectionSuite, make_session
 

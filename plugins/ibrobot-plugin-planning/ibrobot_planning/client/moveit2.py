@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 from ibrobot_core.api import (
     JointState,
@@ -287,6 +287,16 @@ class MoveIt2:
         self._goals = [{}]
 
     # Kinematics.
+
+    @overload
+    def compute_fk(
+        self, joint_state: JointPositions | None = None, fk_link_names: None = None
+    ) -> PoseStamped | None: ...
+
+    @overload
+    def compute_fk(
+        self, joint_state: JointPositions | None, fk_link_names: Sequence[str]
+    ) -> list[PoseStamped] | None: ...
 
     def compute_fk(
         self, joint_state: JointPositions | None = None, fk_link_names: Sequence[str] | None = None
