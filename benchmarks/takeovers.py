@@ -1,0 +1,460 @@
+"""Random takeovers and handbacks by a gamepad, a leader arm and the keyboard: steps, lost frames, labels, parity.
+
+    python benchmarks/takeovers.py [--takeovers 100] [--seed 0] [--device gamepad --device leader --device keyboard]
+
+The simulated SO-101 follows a policy that moves all joints, in lockstep. At random times a scripted person takes it
+with the device, moves it, lets go of the deadman now and then, and gives it back. The gamepad is a DualSense whose
+reports come from a fake of hidapi, the leader consists of emulated servos, which its motors drive before each
+takeover, and the keyboard is a queue of keys. The run is recorded, and converted to a dataset.
+
+Prints one JSON object per device, and exits with 1 unless every velocity and acceleration of the commands is within the
+limits, nothing is lost, who commands is labelled at every state as the person acted, the frames from the recording
+equal those of the run bit by bit, the column `intervention` is true in exactly the rows that the person commanded, and
+`--only interventions` gives each takeover as an episode.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import json
+import math
+import queue
+import random
+import sys
+import tempfile
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any, override
+
+import attrs
+import numpy as np
+import pytest
+from ibrobot_data.commanders import Commanders
+from ibrobot_data.episode import DATASET, Job, convert_episode
+from ibrobot_data.options import HANDOVER, OPERATOR, POLICY
+from ibrobot_data.request import ConversionRequest
+from ibrobot_data.ticks import Ticks, frames
+from ibrobot_feetech.calibration import save_calibration
+from ibrobot_lerobot.options import LeRobotOptions
+from made_up import plugin
+
+from ibrobot_core.calibration import Calibration, JointCalibration
+from ibrobot_core.config import load_config
+from ibrobot_core.contract.frames import FrameAssembler, FrameSampler
+from ibrobot_core.contract.specs import Contract
+from ibrobot_core.interfaces import Frame
+from ibrobot_core.launch.runtime import Runtime
+from ibrobot_core.launch.session import LaunchRequest, Session
+from ibrobot_core.plugins import installed_plugins
+
+ROOT = Path(__file__).parents[1]
+CONFIG = ROOT / "configs" / "so101_blind.yaml"
+JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
+RADIAN = 4096 / (2 * math.pi)
+"""Ticks."""
+SLACK = 1.001
+_FIRST = 5
+"""Ticks before the first compared frame: the recording begins during the first one."""
+WANDER = """
+import numpy as np
+from ibrobot_core.api import Policy, PolicyDescriptor, PolicySpec, hookimpl
+
+class Wander(Policy):
+    def __init__(self, options, ctx):
+        names = ctx.robot.joint_names
+        self.spec = PolicySpec({"observation.state": (len(names),)}, names, len(names), chunk_size=30)
+        self._middle = np.array([0.0, -0.3, 0.3, 0.2, 0.0, 0.6])
+
+    def preprocess(self, frame):
+        return {"t": np.array([frame.stamp_ns])}
+
+    def infer(self, tensors):
+        return tensors
+
+    def postprocess(self, tensors):
+        times = tensors["t"][0] * 1e-9 + np.arange(30) / 30
+        return self._middle + 0.3 * np.sin(times[:, None] * np.linspace(1.0, 2.0, len(self._middle)))
+
+@hookimpl
+def ibrobot_policies():
+    yield PolicyDescriptor("wander", Wander, "moves all joints to and fro")
+"""
+
+
+def of_tests(plugin_name: str, module: str) -> ModuleType:
+    """A fake from a plugin's tests."""
+    path = ROOT / "plugins" / plugin_name / "tests" / f"{module}.py"
+    spec = importlib.util.spec_from_file_location(module, path)
+    assert spec is not None
+    assert spec.loader is not None
+    loaded = importlib.util.module_from_spec(spec)
+    sys.modules[module] = loaded
+    spec.loader.exec_module(loaded)
+    return loaded
+
+
+class Person(ABC):
+    """A person with a device. Each act counts at the next tick."""
+
+    device: str
+    """The device in the YAML."""
+
+    @abstractmethod
+    def toggle(self) -> None:
+        """Take the robot, or give it back."""
+
+    @abstractmethod
+    def engage(self) -> None:
+        """Press the deadman."""
+
+    @abstractmethod
+    def release(self) -> None:
+        """Let go of the deadman."""
+
+    def tick(self, rng: random.Random) -> None:
+        """Move the robot, while the deadman is pressed."""
+
+    def waits(self) -> bool:
+        """Whether the device is not ready after a takeover."""
+        return False
+
+    def close(self) -> None:
+        """Put the device away."""
+
+
+class WithPad(Person):
+    """A DualSense."""
+
+    device = "{type: gamepad, via: hid, cartesian: false}"
+
+    def __init__(self) -> None:
+        self._hid = of_tests("ibrobot-plugin-gamepad", "fake_hid")
+        self._bus = self._hid.FakeHidapi()
+        self._patches = pytest.MonkeyPatch()
+        for name in ("hidraw", "hid"):
+            self._patches.setitem(sys.modules, name, self._bus)
+        self._pad = self._bus.plug(self._hid.Plugged(*self._hid.DUALSENSE))
+        self._held: tuple[str, ...] = ()
+        self._stick = (0.0, 0.0)
+
+    @override
+    def toggle(self) -> None:
+        self._held = ()
+        self._pad.send(self._hid.dualsense("left_stick"), self._hid.dualsense())
+
+    @override
+    def engage(self) -> None:
+        self._held = ("left_shoulder",)
+
+    @override
+    def release(self) -> None:
+        self._held = ()
+
+    @override
+    def tick(self, rng: random.Random) -> None:
+        if rng.random() < 0.05:
+            self._stick = rng.uniform(-1, 1), rng.uniform(-1, 1)
+        self._pad.send(self._hid.dualsense(*self._held, left=self._stick))
+
+    @override
+    def close(self) -> None:
+        self._patches.undo()
+
+
+class WithKeys(Person):
+    """The keyboard."""
+
+    device = "{type: keyboard, cartesian: false}"
+
+    def __init__(self) -> None:
+        self.queues: list[queue.SimpleQueue[str]] = []
+        self._key = ""
+
+    def subscribe(self) -> queue.SimpleQueue[str]:
+        """A new queue of the keys typed from now on."""
+        self.queues.append(queue.SimpleQueue())
+        return self.queues[-1]
+
+    def type(self, key: str) -> None:
+        """Type a key."""
+        for each in self.queues:
+            each.put(key)
+
+    @override
+    def toggle(self) -> None:
+        self._key = ""
+        self.type("enter")
+
+    @override
+    def engage(self) -> None:
+        self._key = "w"
+        self.type(self._key)
+
+    @override
+    def release(self) -> None:
+        self._key = ""
+
+    @override
+    def tick(self, rng: random.Random) -> None:
+        if self._key:
+            if rng.random() < 0.05:
+                self._key = rng.choice("wsedrftgyhoc")
+            self.type(self._key)
+
+
+class WithLeader(WithKeys):
+    """An emulated leader arm; space is its deadman."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__()
+        joints = {joint: JointCalibration(i + 1, 0, 0, 700, 3400) for i, joint in enumerate(JOINTS)}
+        line = of_tests("ibrobot-plugin-feetech", "line")
+        self._patches = pytest.MonkeyPatch()
+        line.lay(self._patches)
+        self._line, self._emulator = line.Line, line.Line(6)
+        for servo in self._emulator.servos.values():
+            servo.set("min_position_limit", 700)
+            servo.set("max_position_limit", 3400)
+        self._emulator.start()
+        path = save_calibration(Calibration(joints), folder / "leader.json")
+        self.device = f"{{type: so101_leader, port: {self._emulator.port}, calibration: {path}}}"
+        self._speeds = np.zeros(6)
+
+    @override
+    def engage(self) -> None:
+        self._key = "-"
+        self.type("space")
+
+    @override
+    def release(self) -> None:
+        self._key = ""
+        self.type("space")
+
+    @override
+    def tick(self, rng: random.Random) -> None:
+        self._line.now_s += 0.01
+        if not self._key:
+            return
+        if rng.random() < 0.05:
+            self._speeds = np.array([rng.uniform(-1.0, 1.0) for _ in JOINTS])
+        with self._emulator.lock:
+            for servo, speed in zip(self._emulator.servos.values(), self._speeds, strict=True):
+                if not servo.torque:
+                    servo.turn(min(3300.0, max(800.0, servo.encoder + speed * RADIAN * 0.01)))
+
+    @override
+    def waits(self) -> bool:
+        with self._emulator.lock:
+            return any(servo.torque for servo in self._emulator.servos.values())
+
+    @override
+    def close(self) -> None:
+        self._emulator.stop()
+        self._patches.undo()
+
+
+@attrs.define(slots=False)
+class Trial:
+    """A run, and what happened in it at each tick."""
+
+    runtime: Runtime
+    person: Person
+    rng: random.Random
+    commands: list[Any] = attrs.field(factory=list)
+    stamps: list[int] = attrs.field(factory=list)
+    labels: list[str] = attrs.field(factory=list)
+    expected: list[str] = attrs.field(factory=list)
+    seen: list[Frame] = attrs.field(factory=list)
+    who: str = POLICY
+    """Who should command from the next tick on."""
+
+    def __attrs_post_init__(self) -> None:
+        session = self.runtime.session
+        self._words = session.bus.subscribe("/commander", 100)
+        self._words.drain()  # that of the start
+        contract = Contract.from_config(session.config)
+        self._sampler = FrameSampler(contract, session.bus)
+        self._step_ns, self._next_ns = contract.step_ns, 0
+
+    def tick(self, then: str | None = None) -> str:
+        """One tick; from the next one on, `then` should command. Returns who commanded."""
+        self.person.tick(self.rng)
+        if self.runtime.step():
+            self.runtime.raise_failure()
+            raise SystemExit("the run ended early")
+        session = self.runtime.session
+        state = session.state
+        assert state is not None
+        if session.faults:
+            raise SystemExit(f"fault: {'; '.join(session.faults)}")
+        (word,) = (str(item.message.data) for item in self._words.drain())  # type: ignore[attr-defined]
+        self.commands.append(state.command)
+        self.stamps.append(state.stamp_ns)
+        self.labels.append(word)
+        self.expected.append(self.who)
+        self.who = then or self.who
+        now_ns = session.clock.now_ns()
+        if len(self.commands) >= _FIRST and now_ns >= self._next_ns:
+            self.seen.append(self._sampler.sample(now_ns))
+            self._next_ns = now_ns + self._step_ns
+        return word
+
+    def wait(self, least_s: float, most_s: float) -> None:
+        """Let a random time pass."""
+        for _ in range(round(100 * self.rng.uniform(least_s, most_s))):
+            self.tick()
+
+    def until(self, condition: Callable[[], bool]) -> None:
+        """Let time pass until something has happened, for at most ten seconds."""
+        for _ in range(1000):
+            if condition():
+                return
+            self.tick()
+        raise SystemExit("it did not happen within 10 s")
+
+    def takeover(self) -> None:
+        """Take the robot, move it, and give it back."""
+        self.wait(0.2, 1.5)
+        self.person.toggle()
+        self.tick(HANDOVER)
+        self.wait(0.6, 0.8)  # the arm brakes
+        self.until(lambda: not self.person.waits())
+        self.wait(0.05, 0.3)
+        self.person.engage()
+        self.tick(OPERATOR)
+        self.wait(0.2, 1.5)
+        while self.rng.random() < 0.3:
+            self.person.release()
+            self.wait(0.1, 0.5)
+            self.person.engage()
+            self.wait(0.2, 1.0)
+        self.person.toggle()
+        self.tick(HANDOVER)
+        while self.tick() == HANDOVER:
+            pass
+        self.who = POLICY
+        self.expected[-1] = POLICY
+
+
+def measure(name: str, takeovers: int, seed: int) -> dict[str, Any]:
+    """All of one device."""
+    with tempfile.TemporaryDirectory() as made:
+        folder = Path(made)
+        person = {"gamepad": WithPad, "keyboard": WithKeys, "leader": lambda: WithLeader(folder)}[name]()
+        overrides = [
+            "models={wander: {type: wander}}",
+            "control_modes.model_inference.inference={model: wander, intervene: it}",
+            "control_modes.teleop.teleop=it", f"teleoperation={{it: {person.device}}}",
+            f"recording={{type: mcap, root: {folder}}}", "contract.max_duration_s=100000",
+        ]  # fmt: skip
+        keys = person.subscribe if isinstance(person, WithKeys) else None
+        config = load_config(CONFIG, overrides=overrides, sim=True)
+        runtime = Runtime(Session(config, installed_plugins(), LaunchRequest(lockstep=True, seed=seed, keys=keys)))
+        runtime.start()
+        try:
+            trial = Trial(runtime, person, random.Random(seed))
+            for _ in range(takeovers):
+                trial.takeover()
+            trial.wait(0.5, 0.5)
+        finally:
+            runtime.stop()
+            person.close()
+        runtime.raise_failure()
+        return {"device": name, "takeovers": takeovers, **figures(trial), **converted(trial, folder)}
+
+
+def figures(trial: Trial) -> dict[str, Any]:
+    """Steps, losses and labels of a run."""
+    session = trial.runtime.session
+    robot = session.config.robot
+    velocity = np.diff(trial.commands, axis=0) * 100
+    acceleration = np.diff(velocity, axis=0) * 100
+    summary = trial.runtime.summary()
+    return {
+        "ticks": len(trial.commands),
+        "velocity_share": round(float((np.abs(velocity) / robot.max_velocity).max()), 3),
+        "acceleration_share": round(float((np.abs(acceleration) / robot.max_acceleration).max()), 3),
+        "faults": summary["faults"],
+        "drops": sum(summary["drops"].values()),
+        "wrong_labels": sum(a != b for a, b in zip(trial.labels, trial.expected, strict=True)),
+    }
+
+
+def converted(trial: Trial, folder: Path) -> dict[str, Any]:
+    """The recording against the run, and the dataset against both."""
+    import pyarrow.parquet as pq
+
+    (episode,) = (folder / "default" / "episodes").iterdir()
+    reader = installed_plugins().open_episode(episode)
+    contract = Contract.from_config(trial.runtime.session.config)
+    messages = [(item.topic, item.message, item.received_ns) for item in reader.messages(set(contract.topics))]
+    again = list(frames(FrameAssembler(contract), messages, [frame.stamp_ns for frame in trial.seen]))
+    unequal = sum(
+        old.missing != new.missing or any(old.values[key].tobytes() != new.values[key].tobytes() for key in old.values)
+        for old, new in zip(trial.seen, again, strict=True)
+    )
+    ticks, wanted = Ticks(reader, contract, "refuse"), []
+    commanders = Commanders(reader, reader.summary())
+    by_stamp = dict(zip(trial.stamps, trial.expected, strict=True))
+    stamps = sorted(by_stamp)
+    for _ in ticks:
+        newest = stamps[max(0, int(np.searchsorted(stamps, ticks.stamp_ns, "right")) - 1)]
+        wanted.append(by_stamp[newest] == OPERATOR)
+        assert commanders.at(ticks.stamp_ns) in (POLICY, OPERATOR, HANDOVER)
+    lost = sum(each.dropped for each in reader.summary().topics.values())
+    reader.close()
+    request = ConversionRequest(folder / "dataset", LeRobotOptions(), "lerobot", labels=True)
+    report = convert_episode(Job(request, episode, "run", folder / "unit"), lambda frames: None)
+    assert not report.error, report.error
+    parts = attrs.evolve(request, only="interventions", context=0.0)
+    corrections = convert_episode(Job(parts, episode, "run", folder / "parts"), lambda frames: None)
+    (table,) = (folder / "unit" / DATASET / "data").rglob("*.parquet")
+    got, done = (
+        [bool(each[0] if isinstance(each, list) else each) for each in column.to_pylist()]
+        for column in pq.read_table(table, columns=["intervention", "next.done"]).columns
+    )
+    return {
+        "lost_messages": lost, "frames": len(trial.seen), "unequal_frames": unequal, "rows": len(got),
+        "skipped_rows": report.skipped, "intervention_rows": sum(got),
+        "corrections": len(corrections.stretches), "correction_rows": corrections.frames,
+        "wrong_dones": sum(done[:-1]) + (not done[-1]),
+        "wrong_interventions": sum(a != b for a, b in zip(got, wanted, strict=True)),
+    }  # fmt: skip
+
+
+def is_good(found: dict[str, Any]) -> bool:
+    """Whether all demands are met."""
+    none = (
+        "drops",
+        "wrong_labels",
+        "lost_messages",
+        "unequal_frames",
+        "skipped_rows",
+        "wrong_interventions",
+        "wrong_dones",
+    )
+    whole = (found["corrections"], found["correction_rows"]) == (found["takeovers"], found["intervention_rows"])
+    steps = max(found["velocity_share"], found["acceleration_share"])
+    return whole and not found["faults"] and steps <= SLACK and all(found[name] == 0 for name in none)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--takeovers", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--device", action="append", choices=("gamepad", "leader", "keyboard"))
+    arguments = parser.parse_args()
+    good = True
+    with plugin("wander", WANDER):
+        for name in arguments.device or ("gamepad", "leader", "keyboard"):
+            found = measure(name, arguments.takeovers, arguments.seed)
+            print(json.dumps(found), flush=True)
+            good = good and is_good(found)
+    return 0 if good else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
