@@ -16,7 +16,7 @@ import numpy as np
 from ibrobot_kinematics.meshes import cluster
 from numpy.typing import NDArray
 
-_GRID_M = 0.0025
+_GRID_M = 0.0035
 """Grid on which the vertices of meshes are merged, for robots of up to 1 m; larger ones have a larger one."""
 _SHOWN_GROUPS = 3
 """MuJoCo's viewers show geoms of the groups 0 to 2; files have collision shapes in group 3."""
@@ -40,8 +40,8 @@ def make_scene(description: Mapping[str, Any]) -> dict[str, Any]:
         description: `mjcf`, `urdf` and `xml` (paths, or the text of a scene), `tip`, and `cameras`.
 
     Returns:
-        `bodies` (parents first), `meshes` (base64 of float32 vertices and uint32 faces), `tip`, and `problem`: why
-        there are no shapes.
+        `bodies` (parents first), `meshes` (base64 of float32 vertices and uint32 faces), `tip`, `cameras`, and
+        `problem`: why there are no shapes.
     """
     try:
         model = _compiled(description)
@@ -59,6 +59,11 @@ def make_scene(description: Mapping[str, Any]) -> dict[str, Any]:
                    for body in range(model.nbody)],
         "meshes": [_mesh(model, mesh, grid) for mesh in meshes],
         "tip": _tip(model, str(description["tip"])),
+        "cameras": [
+            {"body": int(model.cam_bodyid[i]), "pos": model.cam_pos[i].tolist(), "quat": model.cam_quat[i].tolist(),
+             "fovy": float(model.cam_fovy[i])}
+            for i in range(model.ncam)
+        ],
         "extent": float(model.stat.extent),
         "centre": model.stat.center.tolist(),
         "problem": "",

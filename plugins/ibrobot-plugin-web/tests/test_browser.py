@@ -47,7 +47,7 @@ class Tab:
         self.errors: list[str] = []
         self.hosts: set[str] = set()
         self.page.on("pageerror", lambda error: self.errors.append(str(error)))
-        self.page.on("console", lambda line: line.type == "error" and self.errors.append(line.text))
+        self.page.on("console", lambda line: self.errors.extend([line.text] * (line.type == "error")))
         self.page.on("request", lambda request: self.hosts.add(request.url.split("/")[2]))
         self.page.goto(address)
         self.until(lambda: self.ask("ibrobot.status !== null && ibrobot.state !== null"))

@@ -5,7 +5,10 @@ from __future__ import annotations
 import asyncio
 import json
 import socket
+from types import SimpleNamespace
+from typing import Any
 
+import attrs
 import numpy as np
 import pytest
 import simplejpeg
@@ -24,6 +27,8 @@ from ibrobot_core.api import (
     Imu,
     JointState,
     PanelDescriptor,
+    Pose,
+    Quaternion,
     Session,
     String,
     Vector3,
@@ -34,7 +39,7 @@ def gradient(encoding: str) -> Image:
     """A picture that is red on the left and blue on the right, or bright on the left."""
     ramp = np.linspace(1.0, 0.0, 32)[None, :].repeat(16, axis=0)
     rgb = np.stack([ramp, 0 * ramp, 1 - ramp], axis=2)
-    data: np.ndarray = {
+    data: Any = {
         "rgb8": (255 * rgb).astype(np.uint8),
         "bgr8": (255 * rgb[..., ::-1]).astype(np.uint8),
         "mono8": (255 * ramp).astype(np.uint8),
@@ -140,3 +145,23 @@ def test_panels_of_plugins_are_shown_and_a_failing_one_harms_nothing() -> None:
     joints, broken = status_json(session, LogLines(), 0)["panels"]
     assert joints == {"title": "Joints", "columns": ["joint"], "rows": [["shoulder_pan"], ["shoulder_lift"]]}
     assert "no servos" in broken["rows"][0][0]
+
+
+def test_objects_around_the_robot_are_shown_where_they_are() -> None:
+    @attrs.frozen
+    class Box:
+        size: tuple[float, ...]
+
+    @attrs.frozen
+    class Plane:
+        pass
+
+    def thing(shape: object, link: str | None = None) -> SimpleNamespace:
+        return SimpleNamespace(shape=shape, link=link, pose=Pose(Vector3(1, 2, 3), Quaternion(0, 0, 0, 1)))
+
+    session = make_session()
+    objects = {"crate": thing(Box((0.2, 0.4, 0.6))), "floor": thing(Plane()), "held": thing(Box((1, 1, 1)), "gripper")}
+    session.bus.serve("/world/snapshot", lambda request: SimpleNamespace(objects=objects))
+    (crate,) = status_json(session, LogLines(), 0)["objects"]
+    shape = {"type": "box", "size": [0.1, 0.2, 0.3], "pos": [1, 2, 3], "quat": [1, 0, 0, 0]}
+    assert crate == {"name": "crate", **shape}

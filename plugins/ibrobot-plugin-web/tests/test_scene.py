@@ -14,6 +14,7 @@ LINK = '<geom type="capsule" size="0.02 0.08" fromto="0 0 0 0 0 0.16" rgba="0.2 
 def seven_joints() -> str:
     """An arm of six hinges and a slide, with a site at its tip and a collision shape that is not shown."""
     inner = '<site name="tip" pos="0 0 0.1"/><geom type="sphere" size="0.05" group="3"/>'
+    inner += '<camera name="eye" pos="0 0 0.05" fovy="50"/>'
     for i in reversed(range(7)):
         kind, axis = ("slide", "0 0 1") if i == 6 else ("hinge", ("0 0 1", "0 1 0")[i % 2])
         inner = (
@@ -33,6 +34,7 @@ def test_bodies_joints_and_shapes_of_any_robot(tmp_path: Path) -> None:
     assert [joint["type"] for joint in joints] == ["hinge"] * 6 + ["slide"]
     shapes = [geom for body in scene["bodies"] for geom in body["geoms"]]
     assert [geom["type"] for geom in shapes] == ["plane"] + ["capsule"] * 7
+    assert scene["cameras"] == [{"body": 7, "pos": [0.0, 0.0, 0.05], "quat": [1.0, 0.0, 0.0, 0.0], "fovy": 50.0}]
     assert scene["tip"] == {"body": 7, "pos": [0.0, 0.0, 0.1], "quat": [1.0, 0.0, 0.0, 0.0]}
 
 

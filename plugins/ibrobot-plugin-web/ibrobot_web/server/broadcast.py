@@ -11,8 +11,10 @@ from collections.abc import Callable
 
 from aiohttp import web
 
-CREDITS = 2
-"""Frames of a channel that may be on their way to a page."""
+from ibrobot_web.link import FIRST_PICTURE
+
+CREDITS, PICTURE_CREDITS = 2, 1
+"""Frames of a channel that may be on their way to a page; of pictures fewer, so that none is old when it is shown."""
 _GONE_S = 10.0
 """Time without an acknowledgement after which a page is disconnected [s]."""
 
@@ -43,7 +45,7 @@ class Page:
     async def send(self) -> None:
         """Send frames until the page is gone."""
         while not self._socket.closed:
-            ready = [channel for channel in self._waiting if self._flying.get(channel, 0) < CREDITS]
+            ready = [channel for channel in self._waiting if self._flying.get(channel, 0) < _credits(channel)]
             if not ready:
                 self._wake.clear()
                 waits = bool(self._waiting)
@@ -57,6 +59,10 @@ class Page:
                 self._flying[channel] = self._flying.get(channel, 0) + 1
                 async with asyncio.timeout(_GONE_S):
                     await self._socket.send_bytes(self._waiting.pop(channel))
+
+
+def _credits(channel: int) -> int:
+    return PICTURE_CREDITS if channel >= FIRST_PICTURE else CREDITS
 
 
 class Broadcast:

@@ -195,6 +195,9 @@ page.stream.addEventListener("state", ({ detail: state }) => {
 page.stream.addEventListener("status", ({ detail: status }) => {
   const first = !page.status;
   page.status = status;
+  const objects = JSON.stringify(status.objects);
+  if (objects !== page.objects) view.tell({ do: "objects", objects: status.objects });
+  page.objects = objects;
   if (first) view.tell({ do: "joints", names: status.robot.joints.map((joint) => joint.name) });
   update();
 });

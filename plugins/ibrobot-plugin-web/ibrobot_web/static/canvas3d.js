@@ -26,9 +26,16 @@ void main() {
   result = vec4(color.rgb * light, color.a);
 }`;
 
+// Whether WebGL draws without a graphics card: smooth edges then take most of the time.
+function isSoftware() {
+  const gl = new OffscreenCanvas(1, 1).getContext("webgl2");
+  const known = gl?.getExtension("WEBGL_debug_renderer_info");
+  return /swiftshader|llvmpipe|software/i.test(known ? gl.getParameter(known.UNMASKED_RENDERER_WEBGL) : "");
+}
+
 export class Canvas3D {
   constructor(canvas) {
-    const gl = canvas.getContext("webgl2", { antialias: true, powerPreference: "high-performance" });
+    const gl = canvas.getContext("webgl2", { antialias: !isSoftware(), powerPreference: "high-performance" });
     if (!gl) throw new Error("this browser offers no WebGL 2 here");
     this.gl = gl;
     this.canvas = canvas;

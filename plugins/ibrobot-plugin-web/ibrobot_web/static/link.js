@@ -53,6 +53,7 @@ export class Stream extends EventTarget {
     try {
       const bitmap = await createImageBitmap(new Blob([new Uint8Array(data, HEAD + PICTURE_HEAD)], { type }));
       this.emit("picture", { channel, bitmap, stamp: Number(head.getBigInt64(0, true)) / 1e6 });
+      await new Promise(requestAnimationFrame); // the next one when this one is on the screen; none while hidden
     } catch {
       this.emit("picture", { channel, bitmap: null });
     }

@@ -10,6 +10,8 @@ const HANDLE_PX = 26, HANDLE_M = 0.012;
 const REACH_M = 0.05; // distance at which dragging the tool reaches full speed
 const GHOST_RAD = 0.03; // a command this close to the measured position has no ghost
 const FIELD_DEG = 40;
+const FRUSTUM_M = 0.05;
+const OBJECT = [0.55, 0.6, 0.66, 0.75];
 const FRAME_MS = 40; // 25 frames a second leave a small machine time for the rest
 const COMMANDED = [0.18, 0.5, 0.83, 0.3], PLANNED = [0.12, 0.62, 0.33, 0.3];
 
@@ -17,6 +19,7 @@ let screen, bodies = [], joints = [], tip = null, extras = [], dark = false;
 let measured = null, commanded = null, planned = null;
 let trail = [], path, future, grid, ball;
 let dirty = true, stamp = 0, drawn = 0, size = [1, 1], jogs = false, view = null;
+let cameras = [];
 let goals = false, goal = null, kept = false, begun = 0;
 const orbit = { azimuth: -0.9, elevation: 0.45, distance: 1, target: [0.1, 0, 0.15] };
 const grip = { mode: null, at: [0, 0], through: [0, 0, 0], target: [0, 0, 0] };
@@ -57,9 +60,18 @@ function load({ scene }) {
     })),
   }));
   tip = scene.tip;
+  cameras = (scene.cameras ?? []).map(({ body, pos, quat, fovy }) => (
+    { body, local: placed(pos, quat), shape: screen.line(frustum(fovy), true) }));
   orbit.distance = Math.max(0.45, 1.5 * scene.extent);
   orbit.target = scene.centre;
   dirty = true;
+}
+
+// The view of a camera, which looks along its -z: lines from it to the corners of its picture, and the picture's edge.
+function frustum(fovy) {
+  const high = FRUSTUM_M * Math.tan(fovy * Math.PI / 360), wide = high * 4 / 3;
+  const corners = [[-wide, -high], [wide, -high], [wide, high], [-wide, high]].map(([x, y]) => [x, y, -FRUSTUM_M]);
+  return corners.flatMap((corner, i) => [0, 0, 0, ...corner, ...corner, ...corners[(i + 1) % 4]]);
 }
 
 // Where all bodies are, for positions of the joints.
@@ -114,8 +126,8 @@ function plan({ plan: message, positions, kept: keeps = false }) {
 }
 
 function objects({ objects: found }) {
-  extras = found.map(({ type, size: sizes, pos, quat, rgba }) => (
-    { shape: screen.mesh(primitive(type, sizes)), matrix: placed(pos, quat), color: rgba, lit: true }));
+  extras = found.map(({ type, size: sizes, pos, quat }) => (
+    { shape: screen.mesh(primitive(type, sizes)), matrix: placed(pos, quat), color: OBJECT, lit: true }));
   dirty = true;
 }
 
@@ -135,6 +147,10 @@ function draw(now = 0) {
   const gray = dark ? [0.3, 0.37, 0.43, 1] : [0.68, 0.73, 0.77, 1];
   const shown = [{ shape: grid, matrix: identity(), color: gray }, ...extras];
   if (measured) shown.push(...items(measured), { shape: path, matrix: identity(), color: [0.08, 0.47, 0.78, 1] });
+  if (measured) {
+    shown.push(...cameras.map(({ body, local, shape }) => (
+      { shape, matrix: multiply(measured[body], local), color: [0.75, 0.35, 0.7, 1] })));
+  }
   if (commanded) shown.push(...items(commanded, COMMANDED));
   if (planned) shown.push(...items(planned, PLANNED), { shape: future, matrix: identity(), color: [0.12, 0.62, 0.33, 1] });
   if ((jogs || goals) && measured && tip) {
