@@ -247,7 +247,11 @@ class WebViewer(Viewer):
             self._send(STATUS, {**status_json(session, self._log, self.pages), "cameras": cameras})
         if self._is_due(PLAN, _STATUS_S, now_s):
             self._send(PLAN, plan_json(session, session.clock.now_ns()))
-        if self._wanted is not None and self._is_due(SAMPLES, _SAMPLES_S, now_s):
+        if self._wanted is None or not self._shows(SAMPLES):  # pages that show all want pictures and states
+            for subscription in self._samples.values():
+                subscription.close()
+            self._samples.clear()
+        elif self._is_due(SAMPLES, _SAMPLES_S, now_s):
             self._send(SAMPLES, {"stamp": session.clock.now_ns(), "topics": self._sampled()})
 
     def _sampled(self) -> dict[str, dict[str, float]]:
