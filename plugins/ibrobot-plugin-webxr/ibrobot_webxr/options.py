@@ -87,7 +87,7 @@ class WebxrOptions:
     )
     dead_zone: float = option(0.001, unit="m", ge=0, lt=0.05, help="movement of a hand that counts as rest")
     dead_angle: float = option(0.005, unit="rad", ge=0, lt=0.2, help="turn of a hand that counts as rest")
-    timeout: float = option(0.06, unit="s", ge=0.03, le=0.09, help="silence of the page after which the robot holds")
+    timeout: float = option(0.05, unit="s", ge=0.03, le=0.09, help="silence of the page after which the robot holds")
     follow: float = option(
         0.1, unit="rad", ge=0, help="how far the robot may be from its last setpoint for the clutch to start there"
     )
