@@ -152,6 +152,14 @@ def test_a_key_takes_the_robot(begin) -> None:
     assert episode.run.session.command_source.help().startswith("x  give the robot back")
 
 
+def test_without_key_and_button_the_log_says_what_takes_the_robot(begin, caplog: pytest.LogCaptureFixture) -> None:
+    begin()
+    assert "and a button of lever (lever), only the service /intervene takes the robot" in caplog.text
+    caplog.clear()
+    begin("episodes={takeover: deadman}")
+    assert "only the service" not in caplog.text
+
+
 def test_the_service_takes_the_robot_for_other_front_ends(begin) -> None:
     episode = begin()
     call = episode.run.session.bus.call

@@ -15,6 +15,7 @@ from ibrobot_core.api import (
     SourceWorker,
     String,
     TeleopCommand,
+    TeleopDescriptor,
     TeleopError,
     seconds,
 )
@@ -78,6 +79,11 @@ class Corrections(SourceWorker):
         self._states = session.bus.subscribe("/joint_states", 1)
         self.on_end.callback(self._states.close)
         self._keys = session.request.keys() if session.request.keys is not None else None
+        if self._keys is None and self._options.takeover == "button" and not self._has_button():
+            session.log.warning(
+                "without a terminal and a button of %s, only the service %s takes the robot from the policy; "
+                "`episodes: {takeover: deadman}` lets the deadman take it, too", self._devices, INTERVENE,
+            )  # fmt: skip
         self._publish()
 
     @override
@@ -138,6 +144,18 @@ class Corrections(SourceWorker):
     @override
     def facts(self) -> dict[str, object]:
         return {"takeovers": self._takeovers, "operator_s": round(seconds(self._commanded_ns), 3)}
+
+    def _has_button(self) -> bool:
+        """Whether one of the devices has a button for takeovers."""
+        config, registry = self.session.config, self.session.registry
+        assert self.mode.inference is not None
+        for name in self.mode.inference.devices.values():
+            device = config.teleoperation[name]
+            descriptor = registry.find("teleop", device.type)
+            assert isinstance(descriptor, TeleopDescriptor)
+            if "intervention" in descriptor.events(device.options):
+                return True
+        return False
 
     def _tick(self, presses: int) -> None:
         session = self.session
