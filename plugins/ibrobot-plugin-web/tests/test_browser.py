@@ -131,7 +131,8 @@ def test_dragging_the_ball_moves_the_tool(tab: Tab) -> None:
     before = [tab.position(joint) for joint in range(5)]
     tab.ask("window.scrollTo(0, 0)")
     tab.page.wait_for_timeout(500)
-    x, y = tab.page.evaluate("ibrobot.view.handle()")
+    x, y = tab.ask("ibrobot.view.handle()")
+    assert 60 < y < 700, "the ball is on the screen"
     tab.page.mouse.move(x, y)
     tab.page.mouse.down()
     tab.page.mouse.move(x, y - 40, steps=4)
