@@ -112,7 +112,7 @@ def test_dry_run_prints_the_plan_and_starts_nothing(launch: Callable[..., Ran], 
         "description",
         "tool_pose",
     ]
-    assert "planner joint" in components[3]["summary"]
+    assert "planner rrt_connect" in components[3]["summary"]
 
 
 def test_an_episode_is_recorded_with_what_is_to_know_of_it(

@@ -60,8 +60,9 @@ NOTES = [
     "mode servo is unavailable: teleop type 'twist' needs a plugin that is not installed: "
     "pip install ibrobot-plugin-servo",
     "mode web is unavailable: teleop type 'web' needs a plugin that is not installed: pip install ibrobot-plugin-web",
-    "mode moveit_planning is unavailable: executor type 'trajectory', executor type 'gripper', planner type 'joint', "
-    "a mode with planner need plugins that are not installed: pip install ibrobot-plugin-planning",
+    "mode moveit_planning is unavailable: executor type 'trajectory', executor type 'gripper', "
+    "planner type 'rrt_connect', a mode with planner need plugins that are not installed: "
+    "pip install ibrobot-plugin-planning",
 ]
 CAMERAS = (
     "camera top, camera wrist: sensor type 'opencv' needs a plugin that is not installed; "

@@ -19,13 +19,13 @@ from ibrobot_planning.timing import Motion
 STEP_S = 0.01
 """Time between the points of the motions made here."""
 _SAMPLE_S = 0.001
-_SHARE = 0.9
-"""Of the acceleration limits, what braking uses."""
+_SHARE = 0.5
+"""Of the acceleration limits, what braking uses: the rest lets the next motion begin at once."""
 _JERK = 400.0
 """Jerk of the joint that moves fastest, where braking begins and ends [rad/s^3]."""
 _OVERLAPS = 6
 """Number of times at which the next motion may begin while the arm brakes."""
-_SLOWED = (1.0, 1.15, 1.35, 1.7)
+_SLOWED = (1.0, 1.2, 1.4, 1.8)
 """How much slower the next motion may be for an earlier beginning."""
 _GLANCE = 5
 """Number of samples from one to the next that are checked before all."""

@@ -27,6 +27,9 @@ class RrtConnectOptions:
 
     padding: float = option(0.005, unit="m", ge=0, le=0.1, help="least distance of the arm from objects")
     self_padding: float = option(0.0, unit="m", ge=0, le=0.1, help="least distance of the arm's links from one another")
+    floor: float | None = option(
+        None, unit="m", help="height in the base frame of the table or floor that the arm stands on; left out: none"
+    )
     planning_time: float = option(5.0, unit="s", gt=0, help="time after which a search gives up")
     velocity_scaling: float = option(1.0, gt=0, le=1, help="fraction of the velocity limits that a request's 1.0 means")
     acceleration_scaling: float = option(

@@ -27,9 +27,11 @@ from ibrobot_core.api import (
     PlanningError,
     PlanRequest,
     PlanResult,
+    Pose,
     PoseGoal,
     PositionGoal,
     Vector,
+    Vector3,
     ns,
     seconds,
 )
@@ -42,8 +44,10 @@ from ibrobot_planning.linear import linear_path
 from ibrobot_planning.options import RrtConnectOptions
 from ibrobot_planning.search import Space, connect, shortened
 from ibrobot_planning.timing import Motion, timed
-from ibrobot_planning.world import SNAPSHOT, World
+from ibrobot_planning.world import SNAPSHOT, Plane, World, WorldObject
 
+FLOOR = "floor"
+"""Name of the object that the option `floor` adds."""
 _RESOLUTIONS_M = (0.03, 0.01, 0.004)
 """Maximum motion of the arm between checks of the search; finer ones follow if the timed motion touches."""
 _FINEST_M = 0.0015
@@ -137,12 +141,14 @@ class RrtConnectPlanner(Planner):
         )  # fmt: skip
 
     def _snapshot(self) -> World:
-        bus = self._ctx.bus
+        bus, world = self._ctx.bus, self.world
         if bus is not None and bus.serves(SNAPSHOT):
             world = bus.call(SNAPSHOT, None)
             assert isinstance(world, World)
+        floor = self._options.floor
+        if floor is None or FLOOR in world.objects:
             return world
-        return self.world
+        return world.add(FLOOR, WorldObject(Plane(), Pose(Vector3(0.0, 0.0, floor))))
 
     def _check_start(self, request: PlanRequest) -> Vector:
         robot = self._ctx.robot

@@ -350,3 +350,14 @@ class Graph(Planner):
 def test_other_planners_fit_the_interface(planner):
     result = Graph(planner).plan(ask(AnyGoal((PositionGoal(Vector3(1, 0, 0)), NamedGoal("right")))))
     assert result.alternative == 1
+
+
+def test_floor_blocks_everything_below(tmp_path):
+    low = JointGoal(ARM, np.array([0.0, 1.6, 0.5, 0.5, 0.0]))
+    request = PlanRequest(ARM, np.zeros(5), low)
+    make_planner(tmp_path).plan(request)
+    planner = make_planner(tmp_path, floor=0.0)
+    with pytest.raises(PlanningError, match=r"the goal is in collision: \w+ overlaps floor by") as failure:
+        planner.plan(request)
+    assert failure.value.code is PlanCode.GOAL_IN_COLLISION
+    planner.plan(PlanRequest(ARM, np.zeros(5), NamedGoal("left")))

@@ -12,7 +12,7 @@ from ibrobot_core.api import documented, option
 class TrajectoryOptions:
     """Options of `type: trajectory`; a tolerance of 0 is not checked."""
 
-    path_tolerance: float = option(0.0, unit="rad", ge=0, help="largest deviation on the way")
+    path_tolerance: float = option(0.0, unit="rad", ge=0, help="largest deviation on the way, beyond a lag of 0.1 s")
     goal_tolerance: float = option(0.02, unit="rad", ge=0, help="largest deviation at the end")
     goal_time: float = option(1.0, unit="s", ge=0, help="time after the end to come within goal_tolerance; 0: no limit")
 

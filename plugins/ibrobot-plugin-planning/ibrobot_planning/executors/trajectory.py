@@ -24,6 +24,8 @@ from ibrobot_core.api import (
 from ibrobot_planning.executors.options import TrajectoryOptions
 from ibrobot_planning.executors.trajectory_goal import Takeover, TrajectoryGoal, parse_goal
 
+LAG_S = 0.1
+"""How long after its setpoint a joint that follows may be at a place [s], as in ADR 16."""
 START_TOLERANCE_RAD = 0.1
 """How far from the present setpoint a trajectory's point at time zero may lie."""
 
@@ -59,7 +61,8 @@ class TrajectoryExecutor(Executor):
     fields, so a new goal replaces a running one without a step. A point at time zero says where the trajectory was
     planned from: it must lie near the setpoint, which then stands for it. The last point is held. Success: the measured
     position comes within the goal tolerance, at the end or up to `goal_time` after it. A joint further off its path
-    than the path tolerance, or late, aborts the goal. Aborting and cancelling hold the measured position.
+    than the path tolerance and a servo's lag of 0.1 s, or late, aborts the goal. Aborting and cancelling hold the
+    measured position.
 
     A trajectory with `takes_over` waits until the running one has come to a given time, and begins at that time's
     setpoint, velocity and acceleration. The goal `{"stop": True}` slows down along the trajectory under way, within the
@@ -174,7 +177,7 @@ class TrajectoryExecutor(Executor):
         stop = self._running.stop if self._running is not None else None
         if self._running is not None and stop is not None:
             self._slow_down(self._running.spline, stop, self._now_ns)
-        setpoint, _, _ = self._sample(self._now_ns)
+        setpoint, velocity, _ = self._sample(self._now_ns)
         running = self._running
         if running is None:
             return setpoint.copy()
@@ -184,7 +187,7 @@ class TrajectoryExecutor(Executor):
             self._end(GoalState.SUCCEEDED, "")
             return setpoint.copy()
         if stop is not None or self._now_ns < running.spline.end_ns:
-            beyond = _exceeds(error, running.goal.path_tolerance)
+            beyond = _exceeds(error - LAG_S * np.abs(velocity), running.goal.path_tolerance)
             if beyond.any():
                 why = self._deviation(beyond, error, running.goal.path_tolerance, "off its path")
                 return self._stop(GoalState.ABORTED, why, measured)

@@ -1,0 +1,298 @@
+"""Motions under way: obstacles that appear, goals cancelled and replaced, and the control loop while planning runs.
+
+    python benchmarks/planned_motion.py [--obstacles 50] [--goals 200] [--pairs 5] [--seconds 6] [--seed 0]
+
+The simulated SO-101 with the planner `rrt_connect`, between the table, the bin and the cube of its scene.
+
+1. Obstacles, in lockstep: a box appears on the rest of a motion, far enough ahead for the arm to stop. The arm must
+   stand before it and name it; MuJoCo measures the distance of the measured positions from the box.
+2. Goals, in lockstep: each is cancelled or replaced at a random time. No command may exceed the limits of velocity and
+   acceleration, and the safety layer must have nothing to correct.
+3. Lateness, in real time: the control loop beside a thread that plans all the time in the host, and beside none, in
+   turn.
+
+Exits with 1 when one of these fails, or when the median ratio of p99 lateness with planning to that without exceeds
+1.5.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from ibrobot_kinematics import robot_model
+from ibrobot_planning.motion import MoveResult
+from ibrobot_planning.world import Box, World, WorldObject
+from planning import Referee
+from planning_scenes import ARM_JOINTS, Maker
+
+from ibrobot_core.api import (
+    LaunchRequest,
+    Pose,
+    Runtime,
+    Session,
+    Vector,
+    Vector3,
+    installed_plugins,
+    load_config,
+)
+
+CONFIG = Path(__file__).parents[1] / "configs" / "so101_blind.yaml"
+MODE = "moveit_planning"
+BOX_M = 0.05
+REACTION_S = 0.25
+"""Time in which the arm must come to rest: the box stands further along the motion."""
+ALLOWED_RATIO = 1.5
+
+
+@contextmanager
+def run(**asked: Any) -> Iterator[Runtime]:
+    document = yaml.safe_load(CONFIG.read_text())
+    document["control_modes"][MODE]["planner"] = {"type": "rrt_connect"}
+    document["world"] = {"scene": True}
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "robot.yaml"
+        path.write_text(yaml.safe_dump(document, sort_keys=False))
+        registry = installed_plugins()
+        config = load_config(path, mode=MODE, sim=True, registry=registry)
+        runtime = Runtime(Session(config, registry, LaunchRequest(**asked)))
+        runtime.start()
+        try:
+            yield runtime
+        finally:
+            runtime.stop()
+
+
+class Arm:
+    """A run in lockstep, with what it commanded and measured at each tick."""
+
+    def __init__(self, runtime: Runtime) -> None:
+        self._runtime = runtime
+        self.call = runtime.session.bus.call
+        self.commands: list[Vector] = []
+        self.measured: list[Vector] = []
+
+    def step(self, ticks: int = 1) -> None:
+        """Let so many ticks pass."""
+        for _ in range(ticks):
+            self._runtime.step()
+            if self._runtime.session.faults:
+                raise SystemExit(f"fault: {self._runtime.session.faults[0]}")
+            state = self._runtime.session.state
+            assert state is not None
+            self.commands.append(state.command.copy())
+            self.measured.append(state.position.copy())
+
+    def finish(self, goal: int) -> MoveResult:
+        """Let time pass until a goal has ended."""
+        while (result := self.call("/planning/result", goal)) is None:
+            self.step()
+        assert isinstance(result, MoveResult)
+        return result
+
+    def go(self, positions: Vector) -> int:
+        """Ask for positions of the arm [rad], shape (5,); returns the number of the goal."""
+        goal = ",".join(f"{name}={value:.4f}" for name, value in zip(ARM_JOINTS, positions.tolist(), strict=True))
+        return int(self.call("/planning/go_to", goal))
+
+    def faults(self) -> str:
+        """What was beyond the limits, or corrected by the safety layer; empty if nothing."""
+        robot = self._runtime.session.config.robot
+        rate = self._runtime.session.config.control.rate_hz
+        velocities = np.diff(self.commands, axis=0) * rate
+        accelerations = np.diff(velocities, axis=0) * rate
+        found = []
+        if (np.abs(velocities) > 1.001 * robot.max_velocity).any():
+            found.append(f"velocity {np.abs(velocities).max():.2f} rad/s")
+        if (np.abs(accelerations) > 1.02 * robot.max_acceleration).any():
+            found.append(f"acceleration {np.abs(accelerations).max():.1f} rad/s^2")
+        corrected = sum(self._runtime.session.counts()["interventions"].values())
+        if corrected:
+            found.append(f"{corrected} corrections by the safety layer")
+        return ", ".join(found)
+
+
+def obstacles(number: int, seed: int) -> bool:
+    rng = np.random.default_rng(seed)
+    clearances, reactions, stops = [], [], []
+    wrong: list[str] = []
+    with run(lockstep=True, seed=seed) as runtime:
+        arm, robot = Arm(runtime), runtime.session.config.robot
+        model = robot_model(robot)
+        lower, upper = robot.lower[:5] * 0.8, robot.upper[:5] * 0.8
+        rate = runtime.session.config.control.rate_hz
+        arm.step(5)
+        while len(clearances) < number:
+            start, goal = rng.uniform(lower, upper, (2, 5))
+            if not (arm.finish(arm.go(start)).success and _recorded(arm, goal)):
+                continue
+            free = np.array(arm.commands)
+            if not arm.finish(arm.go(start)).success:
+                continue
+            when = int(rng.uniform(0.15, 0.6) * len(free))
+            hit = when + int(rng.uniform(REACTION_S + 0.1, 1.0) * rate)
+            if hit >= len(free):
+                continue
+            place = model.forward(free[hit]).position
+            world = World({"box": WorldObject(Box((BOX_M,) * 3), Pose(Vector3(*place.tolist())))})
+            referee = Referee(world)
+            if referee.clearance(free[: when + int(REACTION_S * rate), :5]) < 0.015:
+                continue
+            arm.commands.clear()
+            arm.measured.clear()
+            move = arm.go(goal)
+            arm.step(when)
+            position = ", ".join(f"{value:.5f}" for value in place.tolist())
+            size = ", ".join([f"{BOX_M}"] * 3)
+            arm.call("/world/add", f"{{name: box, object: {{shape: box, size: [{size}], position: [{position}]}}}}")
+            result = arm.finish(move)
+            commands = np.array(arm.commands)
+            arm.step(50)
+            clearances.append(referee.clearance(np.array(arm.measured)[when:, :5]))
+            length = min(len(commands), len(free))
+            differ = np.flatnonzero(np.abs(commands[:length] - free[:length]).max(axis=1) > 1e-6)
+            reactions.append(1000 * (int(differ[0]) - when + 1) / rate if len(differ) else np.nan)
+            moving = np.flatnonzero(np.abs(np.diff(commands[when:], axis=0)).max(axis=1) > 1e-6)
+            stops.append(1000 * (int(moving[-1]) + 1) / rate)
+            if result.code.name != "MOTION_PLAN_INVALIDATED_BY_ENVIRONMENT_CHANGE" or "box" not in result.message:
+                wrong.append(f"{result.code.name}: {result.message}")
+            arm.call("/world/remove", "{name: box}")
+        faults = arm.faults()
+    hits = sum(clearance <= 0 for clearance in clearances)
+    print(
+        f"obstacles: the arm stood before {number - hits} of {number}; clearance at least"
+        f" {1000 * min(clearances):.1f} mm (MuJoCo measures up to 20 mm); first slower command"
+        f" {np.nanmedian(reactions):.0f} ms after the box appeared, at most {np.nanmax(reactions):.0f};"
+        f" at rest after {np.median(stops):.0f} ms, at most {max(stops):.0f}"
+        + "".join(f"; {each}" for each in (*wrong, faults) if each),
+        flush=True,
+    )
+    return not hits and not wrong and not faults
+
+
+def _recorded(arm: Arm, goal: Vector) -> bool:
+    arm.commands.clear()
+    arm.measured.clear()
+    return arm.finish(arm.go(goal)).success
+
+
+def goals(number: int, seed: int) -> bool:
+    rng = np.random.default_rng(seed)
+    outcomes: dict[str, int] = {}
+    slowest = []
+    with run(lockstep=True, seed=seed) as runtime:
+        arm, robot = Arm(runtime), runtime.session.config.robot
+        lower, upper = robot.lower[:5] * 0.6, robot.upper[:5] * 0.6
+        arm.step(5)
+        while outcomes.get("CANCELLED", 0) < number:
+            move = arm.go(rng.uniform(lower, upper))
+            arm.step(int(rng.integers(1, 60)))
+            if arm.call("/planning/result", move) is not None:
+                continue  # it has ended already, or could not be planned
+            if outcomes.get("CANCELLED", 0) % 2:
+                arm.call("/planning/cancel", None)
+                result = arm.finish(move)
+                arm.step(30)
+            else:
+                before = len(arm.commands)
+                following = arm.go(rng.uniform(lower, upper))
+                arm.step()
+                result = arm.finish(move)
+                arm.step(40)
+                speeds = np.linalg.norm(np.diff(arm.commands[before - 1 : before + 30], axis=0), axis=1)
+                reached = arm.finish(following).success
+                if result.outcome == "CANCELLED" and reached and speeds[0] > 0.005:
+                    slowest.append(float(speeds.min() / speeds[0]))
+                outcomes["next reached"] = outcomes.get("next reached", 0) + reached
+            outcomes[result.outcome] = outcomes.get(result.outcome, 0) + 1
+        faults = arm.faults()
+        ticks = len(arm.commands)
+    print(
+        f"goals: {number} cancelled or replaced under way ({outcomes}), {ticks} ticks; from one motion to the next the"
+        f" joints keep {100 * np.median(slowest):.0f} % of their speed or more (median);"
+        f" {faults or 'no command beyond the limits, nothing corrected'}",
+        flush=True,
+    )
+    return not faults
+
+
+def loop(seconds: float, *, planning: bool) -> dict[str, Any]:
+    """Lateness of the control loop in a run, beside a thread that plans or not."""
+    maker, end, plans = Maker(), threading.Event(), [0]
+    problem = maker.problem("cage", 0)
+
+    def plan() -> None:
+        from ibrobot_planning.search import Space, connect
+
+        checks = maker.checks(problem.world)
+        rng = np.random.default_rng(0)
+        while not end.is_set():
+            space = Space(checks, np.full(5, -1.6), np.full(5, 1.6), 0.01)
+            connect(space, problem.start, [problem.goal], rng, end.is_set)
+            plans[0] += 1
+
+    thread = threading.Thread(target=plan, daemon=True)
+    with run(duration_s=seconds) as runtime:
+        if planning:
+            thread.start()
+        while not runtime.wait(0.2):
+            pass
+        summary = runtime.summary()
+        end.set()
+        if planning:
+            thread.join()
+    return {**summary["loop"], "plans": plans[0]}
+
+
+def lateness(pairs: int, seconds: float) -> bool:
+    found: dict[str, list[dict[str, Any]]] = {"none": [], "planning": []}
+    for number in range(pairs):
+        # Each comes first in every second pair.
+        for which in ("none", "planning") if number % 2 else ("planning", "none"):
+            command = [sys.executable, __file__, "--only", which, "--seconds", str(seconds)]
+            ran = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
+            found[which].append(json.loads(ran.stdout.splitlines()[-1]))
+    ratios = {}
+    for key in ("lateness_p50_us", "lateness_p99_us"):
+        ratios[key] = statistics.median(
+            one[key] / max(1, other[key]) for one, other in zip(found["planning"], found["none"], strict=True)
+        )
+        values = {which: [result[key] for result in results] for which, results in found.items()}
+        print(f"{key}: planning {values['planning']}, none {values['none']}, median ratio {ratios[key]:.2f}")
+    missed = {which: sum(result["missed"] for result in results) for which, results in found.items()}
+    print(f"missed ticks: planning {missed['planning']}, none {missed['none']}")
+    return ratios["lateness_p99_us"] <= ALLOWED_RATIO and missed["planning"] <= missed["none"]
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--obstacles", type=int, default=50)
+    parser.add_argument("--goals", type=int, default=200)
+    parser.add_argument("--pairs", type=int, default=5)
+    parser.add_argument("--seconds", type=float, default=6.0, help="of each measurement of lateness")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", choices=("none", "planning"), help="one measurement of lateness, printed as JSON")
+    arguments = parser.parse_args()
+    if arguments.only is not None:
+        print(json.dumps(loop(arguments.seconds, planning=arguments.only == "planning")))
+        return 0
+    good = obstacles(arguments.obstacles, arguments.seed) if arguments.obstacles else True
+    good &= goals(arguments.goals, arguments.seed) if arguments.goals else True
+    good &= lateness(arguments.pairs, arguments.seconds) if arguments.pairs else True
+    print("passed" if good else "FAILED")
+    return 0 if good else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
