@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 
 class RunHooks:
     """A command's additions to a run. The base class adds nothing."""
@@ -28,3 +30,7 @@ class RunHooks:
     def summary_rows(self) -> list[tuple[str, str]]:
         """Rows for the summary of the run: heading and text."""
         return []
+
+    def facts(self) -> dict[str, Any]:
+        """Facts for the summary as JSON."""
+        return {}

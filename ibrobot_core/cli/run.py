@@ -232,7 +232,7 @@ def _print_summary(runtime: Runtime, hooks: RunHooks, as_json: bool) -> None:
     """Print the summary of a run."""
     summary = runtime.summary()
     if as_json:
-        echo(json.dumps(summary))
+        echo(json.dumps({**summary, **hooks.facts()}))
         return
     loop = summary["loop"]
     echo(f"{summary['robot']}: {summary['mode']} for {summary['duration_s']:.1f} s")

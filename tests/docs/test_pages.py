@@ -212,6 +212,7 @@ def _check_excerpt(values: Any, folder: Path, *, sim: bool) -> None:
 
 def test_every_robot_yaml_passes_the_check(tmp_path: Path) -> None:
     from ibrobot_data.given import load_contract
+    from ibrobot_planning.tasks.reading import read_task
 
     wrong = []
     robot = last = _robot()
@@ -223,11 +224,14 @@ def test_every_robot_yaml_passes_the_check(tmp_path: Path) -> None:
                 (tmp_path / "contract.yaml").write_text(excerpt.text)
                 load_contract(tmp_path / "contract.yaml")
                 continue
+            if excerpt.note == "a task":
+                read_task(excerpt.text, "task.yaml")
+                continue
             last = _merged(last if excerpt.note == "goes on" else robot, excerpt.load())
             _check_excerpt(last, tmp_path, sim="type: mujoco" in excerpt.text)
         except ConfigError as error:
             wrong.append(f"{excerpt}: {error}")
-    assert wrong == []
+    assert wrong == [], "\n".join(wrong)
 
 
 def test_an_excerpt_is_checked_where_it_stands(tmp_path: Path) -> None:

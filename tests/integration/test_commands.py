@@ -70,6 +70,10 @@ WRONG_FILES = {
     "feetech torque off BAD --yes": (),
     "feetech torque off no_port --robot BAD --yes": (),
     "gamepad map BAD": (),
+    "task check BAD": (),
+    "task check pick_cube BAD": (),
+    "task run BAD": (),
+    "task run pick_cube BAD": (),
     "topic echo /a --config BAD": (),
     "topic hz /a --config BAD": (),
     "topic list --config BAD": (),
@@ -202,6 +206,8 @@ JSON = {
     "episodes list BAD --json": 2,
     "feetech monitor BAD --json": 2,
     "gamepad list --json": 0,
+    "task run pick_cube so101_pick_cube --sim --lockstep --json": 0,
+    "task run BAD --json": 2,
 }
 """Command line -> its exit code; None where it depends on the machine."""
 INTERRUPTED = """

@@ -13,7 +13,16 @@ from ibrobot_mujoco.scene import scene_objects
 from ibrobot_mujoco.so101 import so101
 from ibrobot_testing import SimulatedHardwareSuite, control_context
 
-from ibrobot_core.api import ConfigError, Context, EpisodeSetup, HardwareError, SceneObject, Vector, single_options
+from ibrobot_core.api import (
+    ConfigError,
+    Context,
+    EpisodeSetup,
+    Hardware,
+    HardwareError,
+    SceneObject,
+    Vector,
+    single_options,
+)
 
 ROBOT = so101()
 OBJECTS = """objects:
@@ -38,7 +47,7 @@ class TestConformanceWithObjects(SimulatedHardwareSuite):
 
     @override
     @staticmethod
-    def _signals(hardware: MujocoHardware) -> list[Vector]:
+    def _signals(hardware: Hardware) -> list[Vector]:
         values = SimulatedHardwareSuite._signals(hardware)
         values[0][:2] = 0  # the stamp, which goes on from run to run
         return values

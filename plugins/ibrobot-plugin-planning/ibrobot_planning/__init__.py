@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from ibrobot_core.api import (
     Command,
     ExecutorDescriptor,
+    NoOptions,
     OptionFault,
     PlannerDescriptor,
     SectionDescriptor,
@@ -22,7 +23,16 @@ from ibrobot_planning.world_options import WorldOptions
 if TYPE_CHECKING:
     import click
 
-    from ibrobot_core.api import Component, Context, ControlMode, Executor, Planner, Robot, Session, SourceWorker
+    from ibrobot_core.api import (
+        Component,
+        Context,
+        ControlMode,
+        Executor,
+        Planner,
+        Robot,
+        Session,
+        SourceWorker,
+    )
 
 
 def _joint(options: Any, ctx: Context) -> Planner:
@@ -97,6 +107,12 @@ def _world(options: WorldOptions, session: Session) -> Component:
     return WorldKeeper(options, session)
 
 
+def _tasks(options: NoOptions, session: Session) -> Component:
+    from ibrobot_planning.tasks.runner import TaskRunner
+
+    return TaskRunner(session)
+
+
 def _check_world(options: WorldOptions, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
     """Check that the objects have sensible sizes and that meshes can be read."""
     for name, thing in options.objects.items():
@@ -111,10 +127,13 @@ def _check_world(options: WorldOptions, robot: Robot, joints: tuple[str, ...]) -
 
 @hookimpl
 def ibrobot_sections() -> Iterable[SectionDescriptor]:
-    """The section `world`."""
+    """The sections `world` and `tasks`."""
     yield SectionDescriptor(
         type="world", options=WorldOptions, make=_world, check=find_engines, check_options=_check_world,
         summary="what planners avoid: boxes, spheres, cylinders, meshes, planes, point clouds; services change it",
+    )  # fmt: skip
+    yield SectionDescriptor(
+        type="tasks", make=_tasks, summary="services of a run that perform tasks, with a mode with a planner"
     )  # fmt: skip
 
 
@@ -131,8 +150,15 @@ def _plan() -> click.Command:
     return plan
 
 
+def _task() -> click.Command:
+    from ibrobot_planning.tasks.command import task
+
+    return task
+
+
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
-    """`ibrobot plan` and `ibrobot description …`."""
+    """`ibrobot plan`, `ibrobot description …` and `ibrobot task …`."""
     yield Command("plan", "Plan a motion without moving, and print or plot it.", _plan)
     yield Command("description", "Make files that describe a robot, e.g. an SRDF.", _description)
+    yield Command("task", "Perform tasks: files of motions, grasps, policies and other steps.", _task)

@@ -50,11 +50,11 @@ class Target:
     """A trajectory to follow as it is, in place of a goal."""
 
 
-def target(goal: str | Goal, robot: Robot, velocity_scaling: float = 1.0) -> Target:
+def target(goal: str | Goal | Target, robot: Robot, velocity_scaling: float = 1.0) -> Target:
     """Divide a goal among the executors.
 
     Args:
-        goal: a goal, or its text: a pose's name; `joint=radians,joint=radians`; `xyz=X,Y,Z` [m], alone, with
+        goal: a goal, a `Target`, or text: a pose's name; `joint=radians,joint=radians`; `xyz=X,Y,Z` [m], alone, with
             `axis=X,Y,Z` (or `down`, `up`), with `rpy=R,P,Y` [rad] or with `quat=X,Y,Z,W`. Joints that do not move the
             tool may stand beside a position.
         robot: the robot.
@@ -63,6 +63,8 @@ def target(goal: str | Goal, robot: Robot, velocity_scaling: float = 1.0) -> Tar
     Raises:
         PlanningError: for a goal that makes no sense for this robot.
     """
+    if isinstance(goal, Target):
+        return goal
     # Written so that NaN fails it.
     if not 0 < velocity_scaling <= 1:
         raise _invalid(f"velocity_scaling is {velocity_scaling}, must be above 0 and at most 1")

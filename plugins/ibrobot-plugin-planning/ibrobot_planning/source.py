@@ -212,7 +212,7 @@ class PlannerSource(SourceWorker):
             if self._move is not None and self.session.clock.now_ns() - self._status_ns >= _STATUS_NS:
                 self._show("executing")
 
-    def _new(self, goal: str | Goal, velocity_scaling: float = 1.0, *, asked: bool = False) -> _Move:
+    def _new(self, goal: str | Goal | Target, velocity_scaling: float = 1.0, *, asked: bool = False) -> _Move:
         parsed = target(goal, self.session.config.robot, velocity_scaling)
         if parsed.tool is not None and not isinstance(parsed.tool, JointGoal):
             self._check_planner(parsed)
@@ -230,7 +230,7 @@ class PlannerSource(SourceWorker):
                 PlanCode.UNRECOGNIZED_GOAL_TYPE,
             )
 
-    def _submit(self, goal: str | Goal, velocity_scaling: float = 1.0) -> _Move:
+    def _submit(self, goal: str | Goal | Target, velocity_scaling: float = 1.0) -> _Move:
         """Replace all goals by this one."""
         return self._submitted(self._new(goal, velocity_scaling))
 

@@ -4,14 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from ibrobot_testing.fakes import FakeHardware, FakePlanner, FakeRealHardware, FakeTrajectoryExecutor
+from ibrobot_testing.fakes import (
+    FakeHardware,
+    FakePlanner,
+    FakePolicy,
+    FakeRealHardware,
+    FakeRecorder,
+    FakeSensor,
+    FakeTrajectoryExecutor,
+)
 
 from ibrobot_core.api import (
     ExecutorDescriptor,
     HardwareDescriptor,
     PlannerDescriptor,
+    PolicyDescriptor,
     Pose,
+    RecorderDescriptor,
     SceneObject,
+    SensorDescriptor,
     Vector3,
     hookimpl,
 )
@@ -42,3 +53,18 @@ def ibrobot_planners() -> Iterator[PlannerDescriptor]:
 @hookimpl
 def ibrobot_executors() -> Iterator[ExecutorDescriptor]:
     yield ExecutorDescriptor("waypoints", lambda options, ctx: FakeTrajectoryExecutor(ctx), "along straight lines")
+
+
+@hookimpl
+def ibrobot_policies() -> Iterator[PolicyDescriptor]:
+    yield PolicyDescriptor("wave", lambda options, ctx: FakePolicy(ctx), "a policy")
+
+
+@hookimpl
+def ibrobot_sensors() -> Iterator[SensorDescriptor]:
+    yield SensorDescriptor("eye", lambda options, ctx: FakeSensor(ctx), "a camera", kind="camera")
+
+
+@hookimpl
+def ibrobot_recorders() -> Iterator[RecorderDescriptor]:
+    yield RecorderDescriptor("lines", lambda options, ctx: FakeRecorder(ctx), "joint states")

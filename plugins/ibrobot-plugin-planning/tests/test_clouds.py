@@ -293,7 +293,7 @@ def test_mistakes_in_the_yaml(text: str, told: str):
 
 
 def test_cloud_with_the_name_of_an_object_is_refused(tmp_path: Path):
-    (descriptor,) = ibrobot_sections()
+    descriptor = next(each for each in ibrobot_sections() if each.type == "world")
     both = options("objects: {a: {shape: plane}}\nclouds: {a: {topic: /p}}")
     (fault,) = descriptor.check_options(both, make_robot(tmp_path), ())
     assert (fault.option, fault.message) == (

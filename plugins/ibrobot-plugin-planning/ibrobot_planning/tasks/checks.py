@@ -1,0 +1,306 @@
+"""Checks of a whole task before anything moves."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from typing import TYPE_CHECKING
+
+import attrs
+import numpy as np
+
+from ibrobot_core.api import (
+    AnyGoal,
+    ControlMode,
+    Goal,
+    IbrobotError,
+    LinearGoal,
+    PlannerDescriptor,
+    PlanningError,
+    PoseGoal,
+    PositionGoal,
+    Registry,
+    RobotConfig,
+    Vector,
+    check_models,
+)
+from ibrobot_planning.tasks.format import GoalOptions, GripperStep, LookStep, MoveStep, PolicyStep, RecordStep, WaitStep
+from ibrobot_planning.tasks.goals import move_target
+from ibrobot_planning.tasks.reading import TaskFile
+from ibrobot_planning.world import World
+
+if TYPE_CHECKING:
+    from ibrobot_planning.goals import Tool
+
+type Key = tuple[str | int, ...]
+
+
+@attrs.frozen(eq=False)
+class Circumstances:
+    """What a task is checked against."""
+
+    config: RobotConfig
+    registry: Registry
+    world: World | None
+    """The objects; None for a robot without a section `world`."""
+    movable: Collection[str] = ()
+    """Objects that a policy may move."""
+    start: Vector | None = None
+    """All joints [rad], shape (J,), where they are known."""
+    no_recording: str = ""
+    """Why no episode can be recorded; empty if one can."""
+    elsewhere: Collection[str] = ()
+    """Objects whose poses are not known yet."""
+
+
+@attrs.frozen(eq=False)
+class CheckedTask:
+    """A task that makes sense for a robot."""
+
+    file: TaskFile
+    mode: ControlMode
+    """The planning mode."""
+    arm: tuple[str, ...]
+    """Joints of the mode's executors of trajectories."""
+    grippers: tuple[str, ...]
+    """The mode's executors of positions."""
+
+
+def check_task(file: TaskFile, given: Circumstances) -> CheckedTask:
+    """Check a task for a robot: names, limits, order of the steps, models, and reach where positions are known.
+
+    Raises:
+        ConfigError: with all faults.
+    """
+    return _Checks(file, given).run()
+
+
+class _Checks:
+    def __init__(self, file: TaskFile, given: Circumstances) -> None:
+        self._file, self._document, self._given = file, file.document, given
+        self._tool: Tool | None = None
+        planners = given.registry.of_kind("planner")
+        self._tool_planners = [
+            each.type for each in planners if isinstance(each, PlannerDescriptor) and each.tool_goals
+        ]
+        self._moved = set(given.elsewhere)
+        """Objects that are not where the world has them."""
+        self._held: str | None = None
+        self._recording: Key | None = None
+
+    def run(self) -> CheckedTask:
+        mode = self._mode()
+        self._document.raise_problems()
+        assert mode is not None
+        executors = {name: self._given.config.executors[name] for name in mode.executors}
+        self._mode_name, self._planner = mode.name, mode.planner.type if mode.planner is not None else ""
+        self._trajectories = [name for name, each in executors.items() if each.goals == "trajectory"]
+        arm = tuple(joint for name in self._trajectories for joint in executors[name].joints)
+        grippers = tuple(name for name, each in executors.items() if each.goals == "position")
+        self._arm, self._grippers = arm, grippers
+        for i, step in enumerate(self._file.task.steps):
+            key: Key = ("steps", i, step.kind)
+            match step.action:
+                case MoveStep() as move:
+                    self._move(key, move)
+                case GripperStep() as gripper:
+                    self._gripper(key, gripper)
+                case PolicyStep() as policy:
+                    self._policy(key, policy)
+                case LookStep() as look:
+                    self._look(key, look)
+                case RecordStep() as record:
+                    self._record(key, record)
+                case WaitStep():
+                    pass
+        if self._recording is not None:
+            self._document.add(self._recording, "no step after it runs a policy, whose episode it would record")
+        self._document.raise_problems()
+        return CheckedTask(self._file, mode, arm, grippers)
+
+    def _mode(self) -> ControlMode | None:
+        config, name = self._given.config, self._file.task.mode
+        planning = [each for each, mode in config.control_modes.items() if mode.planner is not None]
+        if name is None:
+            first = config.default_control_mode
+            if first not in planning and len(planning) != 1:
+                which = f"name one of {', '.join(planning)}" if planning else "and this robot has none"
+                self._document.add(
+                    (), f"a task needs a mode with a planner: {which}" + (", e.g. `mode: NAME`" if planning else "")
+                )
+                return None
+            name = first if first in planning else planning[0]
+        elif not self._document.refer(("mode",), name, list(config.control_modes), "mode"):
+            return None
+        elif name not in planning:
+            self._document.add(
+                ("mode",), f"mode {name!r} has no planner; modes with one: {', '.join(planning) or 'none'}"
+            )
+            return None
+        self._available(("mode",), name)
+        return config.control_modes[name]
+
+    def _available(self, key: Key, mode: str) -> None:
+        if (reason := self._given.config.unavailable.get(mode)) is not None:
+            self._document.add(key, f"mode {mode!r} is unavailable: {reason}")
+
+    def _object(self, key: Key, name: str) -> bool:
+        """Whether there is an object; adds a fault if not."""
+        if self._given.world is None:
+            self._document.add(key, "objects need a section `world` in the robot YAML, e.g. `world: {scene: true}`")
+            return False
+        return self._document.refer(key, name, list(self._given.world.objects), "object")
+
+    def _move(self, key: Key, step: MoveStep) -> None:
+        before = len(self._document.problems)
+        known = True
+        for at, goal in _goals(key, step):
+            known &= self._goal(at, goal)
+        for i, name in enumerate(step.touch):
+            self._object((*key, "touch", i), name)
+        if known and len(self._document.problems) == before:
+            self._reach(key, step)
+
+    def _goal(self, key: Key, goal: GoalOptions) -> bool:
+        """Check the names and limits of one goal; whether its position is known."""
+        robot = self._given.config.robot
+        if goal.pose is not None:
+            self._document.refer((*key, "pose"), goal.pose, list(robot.description.poses), "pose")
+        for joint, value in goal.joints.items():
+            at = (*key, "joints", joint)
+            if not self._document.refer(at, joint, robot.joint_names, "joint"):
+                continue
+            limits = robot.joints[robot.joint_names.index(joint)]
+            if joint not in self._arm:
+                self._document.add(at, f"no executor of trajectories of mode {self._mode_name!r} has joint {joint!r}")
+            # Written so that NaN fails it.
+            elif not limits.lower <= value <= limits.upper:
+                self._document.add(at, f"{value} rad is outside the limits {limits.lower} .. {limits.upper} rad")
+        if goal.of_tool and self._planner not in self._tool_planners:
+            types = ", ".join(self._tool_planners) or "none is installed"
+            self._document.add(
+                key, f"planner type {self._planner!r} takes joint positions only; types that take others: {types}"
+            )
+        elif goal.of_tool and len(self._trajectories) != 1:
+            number = len(self._trajectories)
+            self._document.add(
+                key, f"mode {self._mode_name!r} has {number} executors of trajectories; a position needs one"
+            )
+        if goal.object is None:
+            return not goal.relative
+        if self._held == goal.object:
+            self._document.add(
+                (*key, "object"), f"{goal.object!r} is in the gripper; goals cannot refer to it until its release"
+            )
+        return self._object((*key, "object"), goal.object) and goal.object not in self._moved
+
+    def _reach(self, key: Key, step: MoveStep) -> None:
+        """Check by inverse kinematics that the tool can be where a step wants it."""
+        try:
+            world = self._given.world or World()
+            goal = move_target(step, self._given.config.robot, self._arm, world).tool
+            if goal is not None:
+                self._check_reach(goal)
+        except IbrobotError as error:
+            code = f"{error.code.name}: " if isinstance(error, PlanningError) else ""
+            self._document.add(key, f"{code}{error}")
+
+    def _check_reach(self, goal: Goal) -> None:
+        if isinstance(goal, LinearGoal):
+            for waypoint in goal.waypoints:
+                self._check_reach(waypoint)
+        elif isinstance(goal, AnyGoal):
+            errors = []
+            for each in goal.goals:
+                try:
+                    self._check_reach(each)
+                except PlanningError as error:
+                    errors.append(error)
+            if len(errors) == len(goal.goals):
+                raise errors[0]
+        elif isinstance(goal, PositionGoal | PoseGoal):
+            tool, start = self._kinematics(), self._given.start
+            model = tool.model
+            tool.candidates(goal, np.clip(0.0, model.lower, model.upper) if start is None else start)
+
+    def _kinematics(self) -> Tool:
+        if self._tool is None:
+            from ibrobot_kinematics import KinematicsError, robot_model
+
+            from ibrobot_planning.goals import Tool
+
+            try:
+                self._tool = Tool(robot_model(self._given.config.robot))
+            except KinematicsError as error:
+                raise PlanningError(str(error)) from error
+        return self._tool
+
+    def _gripper(self, key: Key, step: GripperStep) -> None:
+        config = self._given.config
+        if step.executor is not None:
+            fits = self._document.refer((*key, "executor"), step.executor, self._grippers, "gripper")
+        elif fits := len(self._grippers) == 1:
+            pass
+        else:
+            which = f"name its executor: {', '.join(self._grippers)}" if self._grippers else "use another mode"
+            self._document.add(key, f"mode {self._mode_name!r} has {len(self._grippers)} grippers; {which}")
+        if fits:
+            joint = config.robot.joint_names.index(config.executors[step.executor or self._grippers[0]].joints[0])
+            limits = config.robot.joints[joint]
+            if not limits.lower <= step.position <= limits.upper:
+                self._document.add(
+                    (*key, "position"),
+                    f"{step.position} rad is outside the limits {limits.lower} .. {limits.upper} rad",
+                )
+        if step.grasp is not None and self._object((*key, "grasp"), step.grasp):
+            if self._held is not None:
+                self._document.add((*key, "grasp"), f"the gripper has {self._held!r} already")
+            self._held = step.grasp
+        if step.release is not None and self._object((*key, "release"), step.release):
+            if self._held != step.release:
+                self._document.add((*key, "release"), f"no step before grasps {step.release!r}")
+            self._held = None
+            self._moved.add(step.release)
+
+    def _policy(self, key: Key, step: PolicyStep) -> None:
+        config, key = self._given.config, (*key, "mode")
+        self._moved.update(self._given.movable)
+        self._recording = None
+        if not self._document.refer(key, step.mode, list(config.control_modes), "mode"):
+            return
+        if config.control_modes[step.mode].inference is None:
+            policies = [name for name, mode in config.control_modes.items() if mode.inference is not None]
+            self._document.add(
+                key, f"mode {step.mode!r} runs no policy; modes that do: {', '.join(policies) or 'none'}"
+            )
+        elif step.mode in config.unavailable:
+            self._available(key, step.mode)
+        else:
+            try:
+                check_models(config, self._given.registry, [step.mode])
+            except IbrobotError as error:
+                self._document.add(key, str(error))
+
+    def _look(self, key: Key, step: LookStep) -> None:
+        for name in ("object", "near"):
+            value = step.object if name == "object" else step.near
+            if value is not None:
+                self._object((*key, name), value)
+        if step.camera is not None:
+            cameras = [name for name, each in self._given.config.peripherals.items() if each.kind == "camera"]
+            self._document.refer((*key, "camera"), step.camera, cameras, "camera")
+
+    def _record(self, key: Key, step: RecordStep) -> None:
+        if self._given.no_recording:
+            self._document.add(key, self._given.no_recording)
+        elif self._recording is not None:
+            self._document.add(key, "the step before it records the next policy already")
+        self._recording = key
+
+
+def _goals(key: Key, step: MoveStep) -> Iterator[tuple[Key, GoalOptions]]:
+    """Each goal of a step, with its key."""
+    for name, goals in (("any", step.any), ("line", step.line)):
+        for i, goal in enumerate(goals):
+            yield (*key, name, i), goal
+    if not (step.any or step.line):
+        yield key, step

@@ -1,0 +1,171 @@
+"""`ibrobot task …`: check and perform tasks."""
+
+from __future__ import annotations
+
+import json
+from typing import Any, override
+
+import click
+
+from ibrobot_core.api import (
+    ConfigError,
+    IbrobotError,
+    LaunchRequest,
+    Problem,
+    Registry,
+    RobotConfig,
+    RunHooks,
+    Runtime,
+    echo,
+    find_config,
+    installed_plugins,
+    load_config,
+    run_options,
+    run_overrides,
+    run_robot,
+)
+from ibrobot_planning.tasks.checks import CheckedTask, Circumstances, check_task
+from ibrobot_planning.tasks.reading import TaskFile, find_task, read_task
+from ibrobot_planning.tasks.result import TaskResult
+from ibrobot_planning.tasks.runner import RESULT, TaskRunner
+from ibrobot_planning.world_keeper import SECTION, first_world, scene_objects
+
+TASKS = "tasks"
+"""The section whose component performs tasks."""
+_PARAM = click.option(
+    "--param", "parameters", multiple=True, metavar="NAME=VALUE", help="Value of a parameter of the task."
+)
+
+
+@click.group()
+def task() -> None:
+    """Perform tasks: files of motions, grasps, policies and other steps."""
+
+
+@task.command()
+@click.argument("file")
+@run_options("config", "sim")
+@_PARAM
+@run_options("overrides")
+def check(file: str, config: str | None, **options: Any) -> None:
+    """Check the task in FILE for a robot, and move nothing.
+
+    CONFIG is a robot YAML as for `ibrobot launch`. Checks names, limits, the order of the steps, models, and by
+    inverse kinematics whether the tool can be where the steps want it, as far as positions are known.
+    """
+    registry, read = installed_plugins(), _read(file, options["parameters"])
+    robot = load_config(
+        find_config(config, registry), overrides=options["overrides"], sim=options["sim"], registry=registry
+    )
+    checked = _checked(read, robot, registry)
+    echo(f"{file}: {len(checked.file.task.steps)} steps for {robot.robot.name}, in mode {checked.mode.name}")
+
+
+@task.command()
+@click.argument("file")
+@run_options("config", "sim", "lockstep", "seed")
+@_PARAM
+@run_options("overrides", "viewer", "headless", "as_json")
+def run(file: str, config: str | None, **options: Any) -> None:
+    """Perform the task in FILE, after a check of all of it.
+
+    FILE is a path, or the name of a task that comes with ibrobot. CONFIG is a robot YAML as for `ibrobot launch`.
+    Ctrl-C cancels the task: the robot slows down and holds.
+
+    Exits as `ibrobot launch` does; with 3 if a step did not succeed.
+    """
+    registry, read = installed_plugins(), _read(file, options["parameters"])
+    path, changes, sim = find_config(config, registry), run_overrides(options), options["sim"]
+    robot = load_config(path, overrides=changes, sim=sim, registry=registry)
+    mode = _checked(read, robot, registry).mode.name
+    section = () if TASKS in robot.plugin_sections else (f"{TASKS}={{}}",)
+    robot = load_config(path, overrides=(*changes, *section), mode=mode, sim=sim, registry=registry)
+    request = LaunchRequest(options["lockstep"], options["seed"], by_operator=robot.recording is not None)
+    run_robot(
+        robot, request, headless=options["headless"], as_json=options["as_json"],
+        make_hooks=lambda runtime: TaskHooks(runtime, read),
+    )  # fmt: skip
+
+
+def _read(file: str, parameters: tuple[str, ...]) -> TaskFile:
+    path = find_task(file)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+        raise ConfigError([Problem(path, 0, "", f"cannot be read: {reason}")]) from None
+    return read_task(text, str(path), parameters)
+
+
+def _checked(file: TaskFile, robot: RobotConfig, registry: Registry) -> CheckedTask:
+    """Check a task without a run: objects are where they are at the beginning."""
+    scene = scene_objects(robot, registry)
+    section = robot.plugin_sections.get(SECTION)
+    world = first_world(section.options, scene) if section is not None else None
+    # The seed of the run decides where these are.
+    movable = [thing.name for thing in scene if thing.topic]
+    why = "" if robot.recording is not None else "the robot YAML has no section `recording`"
+    return check_task(file, Circumstances(robot, registry, world, movable, None, why, elsewhere=movable))
+
+
+class TaskHooks(RunHooks):
+    """Begins a task when the run has started, and ends the run with it."""
+
+    def __init__(self, runtime: Runtime, file: TaskFile) -> None:
+        self._session, self._file = runtime.session, file
+        self._runner = next(each for each in runtime.plan.components if isinstance(each, TaskRunner))
+        self._number: int | None = None
+        # A run that ends before it begins the task has not performed it.
+        self._session.outcome.goals_failed += 1
+        self._result: TaskResult | None = None
+
+    @override
+    def step(self) -> None:
+        session = self._session
+        if session.finished.is_set():
+            return
+        if self._number is None:
+            try:
+                self._number = self._runner.run(self._file)
+                session.outcome.goals_failed -= 1
+            except IbrobotError as error:
+                session.fail("task", error)
+        elif (result := session.bus.call(RESULT, self._number)) is not None:
+            self._result = result
+            session.finish()
+
+    @override
+    def line(self) -> str:
+        return self._runner.line()
+
+    @override
+    def rows(self) -> list[tuple[str, str]]:
+        return [("task", line)] if (line := self._runner.line()) else []
+
+    @override
+    def summary_rows(self) -> list[tuple[str, str]]:
+        result = self._ended()
+        if result is None:
+            return []
+        rows = [("task", f"{result.name}: {result.outcome.lower()} after {result.duration_s:.1f} s")]
+        for step in result.steps:
+            facts = f" {json.dumps(dict(step.facts))}" if step.facts else ""
+            told = f": {step.message}" if step.message else facts
+            rows.append(
+                (
+                    f"  step {step.number}",
+                    f"{step.outcome.lower():9} {step.duration_s:5.1f} s  {step.name or step.kind}{told}",
+                )
+            )
+        return rows
+
+    @override
+    def facts(self) -> dict[str, Any]:
+        result = self._ended()
+        return {"task": result.as_json() if result is not None else None}
+
+    def _ended(self) -> TaskResult | None:
+        """The result, also of a task that the end of the run cancelled."""
+        if self._result is None and self._number is not None:
+            self._result = self._runner.result(self._number)
+        return self._result

@@ -1,0 +1,95 @@
+"""Task files: from text, with parameters filled in."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import attrs
+
+from ibrobot_core.api import ConfigError, Document, Problem, did_you_mean, parse_yaml, single_options
+from ibrobot_planning.tasks.format import Task
+
+EXAMPLES = Path(__file__).with_name("examples")
+_PARAMETER = re.compile(r"\$([A-Za-z_]\w*)")
+_PLAIN = re.compile(r"[A-Za-z][\w ./-]*")
+_WORDS = ("true", "false", "null")
+
+
+@attrs.frozen(eq=False)
+class TaskFile:
+    """A task, and where each of its keys stands."""
+
+    task: Task
+    document: Document
+
+
+def find_task(name: str) -> Path:
+    """The file of a task: a path, or the name of one that comes with ibrobot.
+
+    Raises:
+        ConfigError: if there is neither.
+    """
+    bundled = {path.stem: path for path in EXAMPLES.glob("*.yaml")}
+    path = Path(name)
+    if path.is_file():
+        return path
+    if name not in bundled:
+        raise ConfigError([Problem(name, 0, "", f"no such file; tasks that come with ibrobot: {', '.join(bundled)}")])
+    return bundled[name]
+
+
+def read_task(text: str, file: str, parameters: Sequence[str] = ()) -> TaskFile:
+    """A task from its YAML.
+
+    Args:
+        text: the YAML.
+        file: its name, for errors.
+        parameters: `name=value` for parameters of the task.
+
+    Raises:
+        ConfigError: with all faults.
+    """
+    raw = parse_yaml(text, file)
+    declared = raw.root.get("parameters") if isinstance(raw.root, Mapping) else None
+    values = dict(declared) if isinstance(declared, Mapping) else {}
+    for each in parameters:
+        name, equals, value = each.partition("=")
+        flag = f"--param {each}"
+        if not equals:
+            raise ConfigError([Problem(flag, 0, "", "expected NAME=VALUE, e.g. hover=0.08")])
+        if name not in values:
+            raise ConfigError(
+                [Problem(flag, 0, "", f"no parameter {name!r}{did_you_mean(name, list(values), 'known')}")]
+            )
+        values[name] = parse_yaml(value, flag).root
+    filled = _PARAMETER.sub(lambda match: _shown(values[match[1]]) if match[1] in values else match[0], text)
+    document = parse_yaml(filled, file)
+    for key, name in _left(document.root, ()):
+        document.add(key, f"no parameter {name!r}{did_you_mean(name, list(values), 'parameters')}")
+    document.raise_problems()
+    task = single_options(Task, (), file, text=filled)
+    return TaskFile(attrs.evolve(task, name=task.name or Path(file).stem), document)
+
+
+def _shown(value: Any) -> str:
+    """A value as YAML that stands for itself, also within text."""
+    if isinstance(value, str) and _PLAIN.fullmatch(value) and value.lower() not in _WORDS:
+        return value
+    return json.dumps(value)
+
+
+def _left(value: Any, key: tuple[str | int, ...]) -> Iterator[tuple[tuple[str | int, ...], str]]:
+    """Key and name of each parameter that was not filled in."""
+    if isinstance(value, str):
+        for match in _PARAMETER.finditer(value):
+            yield key, match[1]
+    elif isinstance(value, Mapping):
+        for name, item in value.items():
+            yield from _left(item, (*key, name))
+    elif isinstance(value, list):
+        for i, item in enumerate(value):
+            yield from _left(item, (*key, i))
