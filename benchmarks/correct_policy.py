@@ -56,7 +56,8 @@ def train(dataset: Path, out: Path, steps: int, rate: float, start: tuple[str, .
         "lerobot-train", "--dataset.repo_id=local/pick_cube", f"--dataset.root={dataset}", *start,
         "--policy.push_to_hub=false", "--use_policy_training_preset=false", "--optimizer.type=adamw",
         f"--optimizer.lr={rate}", "--optimizer.weight_decay=1e-4", "--scheduler.type=cosine_annealing_with_warmup",
-        "--scheduler.num_warmup_steps=100", "--batch_size=32", f"--steps={steps}", f"--save_freq={steps}",
+        f"--scheduler.num_warmup_steps={min(100, steps // 10)}", "--batch_size=32", f"--steps={steps}",
+        f"--save_freq={steps}",
         "--num_workers=0", "--wandb.enable=false", f"--output_dir={out}",
         HF_HUB_OFFLINE="1", OMP_WAIT_POLICY="PASSIVE", OMP_NUM_THREADS="1",
     )  # fmt: skip
