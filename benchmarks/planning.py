@@ -2,6 +2,9 @@
 
     python benchmarks/planning.py [--problems N] [--kinds table_pick,cage] [--time S] [--roboplan]
 
+With `--roboplan`, roboplan solves each problem, too, in turns, and the run fails where ours is slower, or its motions
+take longer, on the problems that both solved.
+
 Every problem was solved before by a long search (`--prove` searches for more). MuJoCo measures the clearance of every
 timed trajectory at each millisecond, with shapes of its own making.
 """
@@ -13,13 +16,15 @@ import json
 import logging
 import sys
 import time
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
+import attrs
 import mujoco
 import numpy as np
 from ibrobot_planning.options import RrtConnectOptions
 from ibrobot_planning.rrt import RrtConnectPlanner
-from ibrobot_planning.search import Space, connect, shortened
+from ibrobot_planning.search import Pace, Space, connect, shortened
 from ibrobot_planning.timing import Motion
 from ibrobot_planning.transforms import matrix
 from ibrobot_planning.world import Box, Cylinder, World
@@ -32,6 +37,7 @@ PROOFS = Path(__file__).with_name("planning_proofs.json")
 LONG_S = {"cage": 60.0}
 FIRST_S = {"cage": 10.0}
 CLEARANCE_M = 0.0049
+PACE = Pace(np.full(5, MAX_VELOCITY), np.full(5, MAX_ACCELERATION), 0.5)
 
 
 class Referee:
@@ -107,7 +113,7 @@ def prove(maker: Maker, problem: Problem, seconds: float) -> list[list[int]] | N
     path = connect(space, problem.start, [problem.goal], rng, lambda: time.monotonic() > until)
     if path is None:
         return None
-    return np.round(1000 * np.array(shortened(space, path, rng))).astype(int).tolist()
+    return np.round(1000 * np.array(shortened(space, path, rng, PACE))).astype(int).tolist()
 
 
 def problems(maker: Maker, kind: str, number: int, proofs: dict[str, dict[str, list[list[int]]]]) -> list[Problem]:
@@ -131,49 +137,114 @@ def search_proofs(maker: Maker, kinds: list[str], number: int, seconds: float) -
         print(f"{kind}: {len(found)} problems of {seed}", flush=True)
 
 
-def measure(maker: Maker, kind: str, tasks: list[Problem], seconds: float, check: bool) -> bool:
+@attrs.define
+class Figures:
+    """What one pipeline made of the problems of a kind; dictionaries by the seeds of the solved ones."""
+
+    walls: dict[int, float] = attrs.field(factory=dict)
+    """[s]."""
+    cpus: dict[int, float] = attrs.field(factory=dict)
+    """[s]."""
+    durations: dict[int, float] = attrs.field(factory=dict)
+    """Of the motions [s]."""
+    failed: list[tuple[int, str]] = attrs.field(factory=list)
+    jerks: list[float] = attrs.field(factory=list)
+    clearances: list[float] = attrs.field(factory=list)
+    beyond: int = 0
+    """Number of motions beyond the limits."""
+
+    def run(self, task: Problem, plan: Callable[[], Motion]) -> Motion | None:
+        """Plan, and note the times; None where there is no plan."""
+        wall, cpu = time.perf_counter(), time.process_time()
+        try:
+            motion = plan()
+        except (PlanningError, RuntimeError) as error:
+            self.failed.append((task.seed, error.code.name if isinstance(error, PlanningError) else str(error)[:60]))
+            return None
+        self.walls[task.seed] = time.perf_counter() - wall
+        self.cpus[task.seed] = time.process_time() - cpu
+        self.durations[task.seed] = motion.duration
+        return motion
+
+    def check(self, task: Problem, motion: Motion) -> None:
+        """Measure limits and clearance."""
+        self.jerks.append(motion.jerk)
+        positions, velocities, accelerations = motion.sampled(0.001)
+        robot = so101()
+        self.beyond += bool(
+            (np.abs(velocities) > MAX_VELOCITY).any() or (np.abs(accelerations) > MAX_ACCELERATION).any()
+            or (positions < robot.lower[:5] - 1e-6).any() or (positions > robot.upper[:5] + 1e-6).any()
+        )  # fmt: skip
+        self.clearances.append(Referee(task.world).clearance(positions))
+
+    def text(self, number: int, first_s: float) -> str:
+        """A line about all `number` problems, and how many were solved within `first_s`."""
+        within = sum(wall <= first_s for wall in self.walls.values())
+        cpu_within = sum(cpu <= first_s for cpu in self.cpus.values())
+        return (
+            f"solved {len(self.walls)}/{number}, {within} (CPU time: {cpu_within}) within {first_s:g} s; wall"
+            f" {_ms(self.walls.values())} ms, CPU {_ms(self.cpus.values())} ms; motion"
+            f" {np.median(list(self.durations.values())):.2f} s"
+            + (f", jerk {max(self.jerks):.0f} rad/s^3" if self.jerks else "")
+            + (f"; clearance {1000 * min(self.clearances):.2f} mm" if self.clearances else "")
+            + (f", limits exceeded {self.beyond}" if self.clearances else "")
+            + (f"; failed {self.failed[:3]}" if self.failed else "")
+        )
+
+
+def compared(ours: Figures, theirs: Figures) -> tuple[str, bool]:
+    """Both on the problems that both solved, and whether ours are not slower and the motions not longer."""
+    both = sorted(ours.cpus.keys() & theirs.cpus.keys())
+    ratios = []
+    for mine, other in ((ours.cpus, theirs.cpus), (ours.durations, theirs.durations)):
+        a, b = np.array([mine[seed] for seed in both]), np.array([other[seed] for seed in both])
+        ratios.append([*(np.percentile(a, part) / np.percentile(b, part) for part in (50, 95)), np.median(a / b)])
+    (cpu, cpu_tail, cpu_pairs), (motion, motion_tail, motion_pairs) = ratios
+    text = (
+        f"on the {len(both)} solved by both, ours to roboplan's: CPU median {cpu:.2f}, p95 {cpu_tail:.2f}, of the pairs"
+        f" {cpu_pairs:.2f}; motion median {motion:.2f}, p95 {motion_tail:.2f}, of the pairs {motion_pairs:.2f}"
+    )
+    return text, cpu <= 1 and cpu_tail <= 1 and motion <= 1
+
+
+def measure(maker: Maker, kind: str, tasks: list[Problem], seconds: float, *, check: bool, beside: bool) -> bool:
+    """Plan all problems; with `beside`, each by roboplan, too, in turns."""
     context = Context("benchmark", SteppedClock(0), logging.getLogger("benchmark"), so101())
     planner = RrtConnectPlanner(RrtConnectOptions(padding=PADDING_M, planning_time=seconds), context)
     planner.load()
-    walls, cpus, durations, jerks, clearances = [], [], [], [], []
-    failed, beyond = [], 0
-    for task in tasks:
+    first_s = FIRST_S.get(kind, 1.0)
+    ours, theirs = Figures(), Figures()
+
+    def mine(task: Problem) -> None:
         planner.world = task.world
         request = PlanRequest(ARM_JOINTS, task.start, JointGoal(ARM_JOINTS, task.goal))
-        wall, cpu = time.perf_counter(), time.process_time()
-        try:
-            result = planner.plan(request)
-        except PlanningError as error:
-            failed.append((task.seed, error.code.name))
-            continue
-        walls.append(time.perf_counter() - wall)
-        cpus.append(time.process_time() - cpu)
-        motion = motion_of(result)
-        durations.append(motion.duration)
-        jerks.append(motion.jerk)
-        if check:
-            positions, velocities, accelerations = motion.sampled(0.001)
-            robot = so101()
-            beyond += bool(
-                (np.abs(velocities) > MAX_VELOCITY).any() or (np.abs(accelerations) > MAX_ACCELERATION).any()
-                or (positions < robot.lower[:5] - 1e-6).any() or (positions > robot.upper[:5] + 1e-6).any()
-            )  # fmt: skip
-            clearances.append(Referee(task.world).clearance(positions))
-    within = sum(wall <= FIRST_S.get(kind, 1.0) for wall in walls)
-    cpu_within = sum(cpu <= FIRST_S.get(kind, 1.0) for cpu in cpus)
-    print(
-        f"{kind:12s} solved {len(walls)}/{len(tasks)} in {seconds:g} s, {within} (CPU time: {cpu_within}) within"
-        f" {FIRST_S.get(kind, 1.0):g} s; wall {_ms(walls)} ms, CPU {_ms(cpus)} ms; motion {np.median(durations):.2f} s,"
-        f" jerk {max(jerks):.0f} rad/s^3"
-        + (f"; clearance {1000 * min(clearances):.2f} mm, limits exceeded {beyond}" if check else "")
-        + (f"; failed {failed}" if failed else ""),
-        flush=True,
-    )
-    return not failed and cpu_within >= 0.95 * len(tasks) and not beyond and min(clearances, default=1.0) > CLEARANCE_M
+        motion = ours.run(task, lambda: motion_of(planner.plan(request)))
+        if check and motion is not None:
+            ours.check(task, motion)
+
+    def other(task: Problem) -> None:
+        import planning_roboplan
+
+        scene = planning_roboplan.made(maker, task.world)
+        theirs.run(task, lambda: planning_roboplan.plan(scene, task, FIRST_S.get(kind, 5.0)))
+
+    for number, task in enumerate(tasks):
+        turns = (mine, other) if beside else (mine,)
+        for turn in turns if number % 2 else reversed(turns):
+            turn(task)
+    print(f"{kind:12s} {ours.text(len(tasks), first_s)}", flush=True)
+    good = not ours.failed and not ours.beyond and min(ours.clearances, default=1.0) > CLEARANCE_M
+    good &= sum(cpu <= first_s for cpu in ours.cpus.values()) >= 0.95 * len(tasks)
+    if beside:
+        text, not_worse = compared(ours, theirs)
+        good &= not_worse
+        print(f"{'':12s} roboplan {theirs.text(len(tasks), first_s)}\n{'':12s} {text}", flush=True)
+    return good
 
 
-def _ms(times: list[float]) -> str:
-    return f"{1000 * np.median(times):.0f} (p95 {1000 * np.percentile(times, 95):.0f})"
+def _ms(times: Iterable[float]) -> str:
+    listed = list(times)
+    return f"{1000 * np.median(listed):.1f} (p95 {1000 * np.percentile(listed, 95):.1f})"
 
 
 def main() -> int:
@@ -195,11 +266,7 @@ def main() -> int:
     good = True
     for kind in kinds:
         tasks = problems(maker, kind, arguments.problems, proofs)
-        good &= measure(maker, kind, tasks, arguments.time, not arguments.no_check)
-        if arguments.roboplan:
-            from planning_roboplan import measure_roboplan
-
-            measure_roboplan(maker, kind, tasks, FIRST_S.get(kind, 5.0))
+        good &= measure(maker, kind, tasks, arguments.time, check=not arguments.no_check, beside=arguments.roboplan)
     return 0 if good else 1
 
 

@@ -6,8 +6,6 @@ roboplan has no padding: the scene's objects are larger by it.
 from __future__ import annotations
 
 import tempfile
-import time
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -111,6 +109,12 @@ def scene(maker: Maker, world: World, folder: Path) -> Scene:
     return made
 
 
+def made(maker: Maker, world: World) -> Scene:
+    """A scene whose files are gone again."""
+    with tempfile.TemporaryDirectory() as folder:
+        return scene(maker, world, Path(folder))
+
+
 def plan(made: Scene, task: Problem, seconds: float) -> Motion:
     """One plan, as roboplan's examples do it.
 
@@ -131,29 +135,3 @@ def plan(made: Scene, task: Problem, seconds: float) -> Motion:
     trajectory = PathParameterizerTOPPRA(made, GROUP).generate(path, timing)
     states = (np.array(each) for each in (trajectory.positions, trajectory.velocities, trajectory.accelerations))
     return Motion(np.array(trajectory.times), *states)
-
-
-def measure_roboplan(maker: Maker, kind: str, tasks: list[Problem], seconds: float) -> None:
-    """Print what `planning.py` prints of ours."""
-    walls, cpus, durations, failed = [], [], [], []
-    for task in tasks:
-        with tempfile.TemporaryDirectory() as folder:
-            made = scene(maker, task.world, Path(folder))
-        wall, cpu = time.perf_counter(), time.process_time()
-        try:
-            motion = plan(made, task, seconds)
-        except RuntimeError as error:
-            failed.append((task.seed, str(error)[:60]))
-            continue
-        walls.append(time.perf_counter() - wall)
-        cpus.append(time.process_time() - cpu)
-        durations.append(motion.duration)
-        assert all(b > a for a, b in pairwise(motion.times.tolist()))
-    wall_ms, cpu_ms = (
-        f"{1000 * np.median(each):.0f} (p95 {1000 * np.percentile(each, 95):.0f})" for each in (walls, cpus)
-    )
-    print(
-        f"{'':12s} roboplan {len(walls)}/{len(tasks)} in {seconds:g} s; wall {wall_ms} ms, CPU {cpu_ms} ms; motion"
-        f" {np.median(durations):.2f} s" + (f"; failed {failed[:3]}" if failed else ""),
-        flush=True,
-    )

@@ -42,13 +42,13 @@ from ibrobot_planning.collision import Collisions, Contact
 from ibrobot_planning.goals import Candidate, Tool, joint_target
 from ibrobot_planning.linear import linear_path
 from ibrobot_planning.options import RrtConnectOptions
-from ibrobot_planning.search import Space, connect, shortened
+from ibrobot_planning.search import Pace, Space, connect, shortened
 from ibrobot_planning.timing import Motion, timed
 from ibrobot_planning.world import SNAPSHOT, Plane, World, WorldObject
 
 FLOOR = "floor"
 """Name of the object that the option `floor` adds."""
-_RESOLUTIONS_M = (0.03, 0.01, 0.004)
+_RESOLUTIONS_M = (0.05, 0.02, 0.005)
 """Maximum motion of the arm between checks of the search; finer ones follow if the timed motion touches."""
 _FINEST_M = 0.0015
 """The same for a whole path before it is timed."""
@@ -127,7 +127,7 @@ class RrtConnectPlanner(Planner):
         positions = made.sampled(_CHECK_S)[0][round(seconds(from_ns) / _CHECK_S) :: _WATCH_STRIDE]
         # What touches already may get away.
         leaving = _outwards(checks, positions) or 0 if len(positions) else 0
-        hit = leaving + checks.first_hit(positions[leaving:])
+        hit = leaving + checks.first_hit_on_path(positions[leaving:])
         if hit < len(positions):
             return _sentence(checks.contacts(positions[hit]))
         self._checked.append((trajectory, world))
@@ -260,8 +260,8 @@ class _Plan:
             found = connect(space, start, goals, rng, lambda: time.monotonic() > deadline)
             if found is None:
                 return
-            for closely in (resolution, *(finer for finer in _RESOLUTIONS_M if finer < resolution)):
-                yield shortened(Space(self.checks, *self._limits, closely), found, rng)
+            for closely in _RESOLUTIONS_M[1:]:
+                yield shortened(Space(self.checks, *self._limits, closely), found, rng, self._pace)
 
     def _candidates(self, tool: Tool, goal: object) -> list[Candidate]:
         robot = self.ctx.robot
@@ -337,7 +337,7 @@ class _Plan:
         """
         inside = np.clip(self.start, *self._limits)
         way = [self.start] if np.array_equal(inside, self.start) else [self.start, inside]
-        touching = [contact for q in way for contact in self.checks.contacts(q)]
+        touching = [contact for q in way if not self.checks.free(q) for contact in self.checks.contacts(q)]
         if not touching and Space(self.checks, *self._limits, _FINEST_M).free(way[0], way[-1]):
             return way
         deepest = min(touching, key=lambda contact: contact.distance, default=None)
@@ -395,6 +395,14 @@ class _Plan:
         end = Candidate(line.joints[possible - 1], 0.0, float(line.errors[possible - 1]))
         return self._result(motion, end, 0, fraction)
 
+    @property
+    def _pace(self) -> Pace:
+        """Limits of the motion, for estimates of its time."""
+        robot, options, request = self.ctx.robot, self.options, self.request
+        velocity = robot.max_velocity[self._order] * options.velocity_scaling * request.velocity_scaling
+        limit = robot.max_acceleration[self._order] * options.acceleration_scaling * request.acceleration_scaling
+        return Pace(velocity, np.minimum(limit, options.max_jerk * _WIDEST_WINDOW_S / 2), options.blend)
+
     def _checked(self, path: Sequence[Vector], *, linear: bool = False) -> Motion | None:
         """The fastest motion along a path without contacts; None if even one that stops at corners touches."""
         robot, options, request = self.ctx.robot, self.options, self.request
@@ -446,7 +454,7 @@ class _Plan:
 
     def _touching(self, motion: Motion) -> Vector:
         """Where a motion touches or leaves the limits, shape (N, J)."""
-        positions = motion.sampled(_CHECK_S)[0]
+        positions = motion.positions_within(_CHECK_S)
         lower, upper = self._limits
         # A joint outside its limits may only move inwards.
         lower, upper = np.minimum(lower, self.start), np.maximum(upper, self.start)
@@ -459,7 +467,7 @@ class _Plan:
                 return np.asarray(positions[:1])
             checked = out
         while checked < len(positions):
-            checked += self.checks.first_hit(positions[checked:])
+            checked += self.checks.first_hit_on_path(positions[checked:])
             if checked < len(positions):
                 bad.append(positions[checked : checked + 1])
                 # On past this contact, by what a corner takes at least.

@@ -6,8 +6,11 @@ from the start and a forest from all goals.
 
 from __future__ import annotations
 
+import math
+from bisect import bisect_left
 from collections.abc import Callable, Sequence
-from itertools import pairwise
+from functools import partial
+from itertools import accumulate, cycle, pairwise
 from typing import Protocol
 
 import attrs
@@ -15,19 +18,26 @@ import numpy as np
 
 from ibrobot_core.api import Vector
 
-_LONGEST = 0.8
-"""Length of an extension of the trees [rad]."""
+_RUNS = ((1.6, True), (1.6, True), (0.8, False))
+"""Length of the extensions of the trees [rad], run by run, and whether one that is blocked is left out. That is fast;
+narrow passages need the free part of it."""
+_SOME_JOINTS = 0.3
+"""Share of extensions that move only some of the joints, which mostly fit through narrow passages better."""
 _ITERATIONS, _MORE = 300, 1.6
 """Iterations of the first run, and how many times as many each further one has. Some random trees run into dead ends
 for a minute where others take a tenth of a second, so that starting again is the faster way."""
 _FIRST_NODES = 256
-_FRUITLESS = 10
+_FRUITLESS = 15
 """Attempts to shorten a path, one after the other, that end the shortening."""
 _ATTEMPTS = 200
 _SHORTER = 1e-3
-"""Share by which a shortcut must be shorter to be taken."""
+"""Share by which a shortcut must be faster to be taken."""
+_STRAIGHT = 0.5
+"""Share of straight shortcuts; in the others, one joint alone goes the straight way."""
 
 type Random = np.random.Generator
+type Extended = Callable[..., int | None]
+"""Grows a tree; see `_extended`."""
 
 
 class Checks(Protocol):
@@ -39,6 +49,9 @@ class Checks(Protocol):
 
     def first_hit(self, configurations: Vector) -> int:
         """Number of free configurations before the first in collision, of shape (N, J)."""
+
+    def line_free(self, a: Vector, b: Vector, resolution: float) -> bool:
+        """Whether the straight line from `a`, which is not checked, to `b` is free, checked every `resolution` [m]."""
 
 
 @attrs.frozen(eq=False)
@@ -60,30 +73,65 @@ class Space:
 
     def free(self, a: Vector, b: Vector) -> bool:
         """Whether the line is free; `a` is not checked."""
-        line = self.line(a, b)
-        # From coarse to fine, which mostly finds obstacles early.
-        spread = line[_spread(len(line))]
-        return self.checks.first_hit(spread) == len(line)
+        return self.checks.line_free(a, b, self.resolution)
 
 
-_SPREADS: dict[int, np.ndarray[tuple[int], np.dtype[np.intp]]] = {}
+@attrs.frozen(eq=False)
+class Pace:
+    """Limits of the joints, for an estimate of the time that a polyline takes."""
+
+    velocity: Vector
+    """[rad/s], shape (J,)."""
+    acceleration: Vector
+    """[rad/s^2], shape (J,)."""
+    blend: float
+    """Maximum distance before a corner at which the motion may leave the polyline [rad]."""
+
+    def time(self, points: Vector) -> float:
+        """Estimated time from rest to rest along a polyline, shape (N, J), with the widest blends [s]."""
+        steps = points[1:] - points[:-1]
+        lengths = np.sqrt((steps * steps).sum(axis=1)) + 1e-12
+        directions = steps / lengths[:, None]
+        across = np.abs(directions)
+        tops = 1 / (across / self.velocity).max(axis=1)
+        rates = 1 / (across / self.acceleration).max(axis=1)
+        if len(steps) == 1:
+            return _travel(float(lengths[0]), 0.0, 0.0, float(tops[0]), float(rates[0]))
+        turns = (np.abs(directions[1:] - directions[:-1]) / self.acceleration).max(axis=1) + 1e-12
+        radii = np.minimum(np.minimum(lengths[:-1], lengths[1:]) / 2, self.blend)
+        corners = np.minimum(np.sqrt(2 * radii / turns), np.minimum(tops[:-1], tops[1:]))
+        straight = lengths.copy()
+        straight[:-1] -= radii
+        straight[1:] -= radii
+        speeds = [0.0, *corners.tolist(), 0.0]
+        ways, rising = straight.tolist(), rates.tolist()
+        for i in range(len(ways) - 1, 0, -1):
+            speeds[i] = min(speeds[i], math.sqrt(speeds[i + 1] ** 2 + 2 * rising[i] * ways[i]))
+        for i in range(1, len(ways)):
+            speeds[i] = min(speeds[i], math.sqrt(speeds[i - 1] ** 2 + 2 * rising[i - 1] * ways[i - 1]))
+        total = 0.0
+        for radius, speed in zip(radii.tolist(), speeds[1:-1], strict=True):
+            total += 2 * radius / max(speed, 1e-6)
+        for way, before, after, top, rate in zip(ways, speeds[:-1], speeds[1:], tops.tolist(), rising, strict=True):
+            total += _travel(way, before, after, top, rate)
+        return total
 
 
-def _spread(number: int) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
-    """Indices 0 to number - 1, each far from those before it (van der Corput)."""
-    if number not in _SPREADS:
-        bits = max(number - 1, 1).bit_length()
-        codes = np.arange(1 << bits)
-        reversed_bits = sum(((codes >> i) & 1) << (bits - 1 - i) for i in range(bits))
-        _SPREADS[number] = np.asarray(reversed_bits)[np.asarray(reversed_bits) < number]
-    return _SPREADS[number]
+def _travel(way: float, before: float, after: float, top: float, rate: float) -> float:
+    """Time of a way [s] between two speeds, below a top speed."""
+    peak = min(top, math.sqrt(rate * way + (before * before + after * after) / 2))
+    if peak <= 0:
+        return 0.0
+    changing = (2 * peak * peak - before * before - after * after) / (2 * rate)
+    return (2 * peak - before - after) / rate + max(way - changing, 0.0) / peak
 
 
 class _Tree:
     """Nodes with their parents, from one or several roots."""
 
-    def __init__(self, roots: Vector) -> None:
+    def __init__(self, roots: Vector, weights: Vector) -> None:
         self.size = len(roots)
+        self._weights = weights
         self._nodes = np.empty((max(_FIRST_NODES, 2 * self.size), roots.shape[1]))
         self._nodes[: self.size] = roots
         self._parents = [-1] * self.size
@@ -99,8 +147,13 @@ class _Tree:
     def node(self, index: int) -> Vector:
         return np.asarray(self._nodes[index])
 
+    def distance(self, a: Vector, b: Vector) -> float:
+        """The distance that `nearest` goes by [rad]."""
+        way = (b - a) * self._weights
+        return math.sqrt(way @ way)
+
     def nearest(self, q: Vector) -> int:
-        away = self._nodes[: self.size] - q
+        away = (self._nodes[: self.size] - q) * self._weights
         return int(np.einsum("ij,ij->i", away, away).argmin())
 
     def way(self, index: int) -> list[Vector]:
@@ -131,8 +184,11 @@ def connect(
         if space.free(start, goal):
             return [start, goal]
     iterations = float(_ITERATIONS)
-    while not expired():
-        path = _grown(space, start, goals, rng, expired, int(iterations))
+    for longest, whole in cycle(_RUNS):
+        if expired():
+            break
+        extended = _extended if whole else _extended_in_part
+        path = _grown(space, start, goals, rng, expired, int(iterations), partial(extended, space, longest))
         if path is not None:
             return path
         iterations *= _MORE
@@ -140,10 +196,13 @@ def connect(
 
 
 def _grown(
-    space: Space, start: Vector, goals: Sequence[Vector], rng: Random, expired: Callable[[], bool], iterations: int
-) -> list[Vector] | None:
+    space: Space, start: Vector, goals: Sequence[Vector], rng: Random, expired: Callable[[], bool], iterations: int,
+    extended: Extended,
+) -> list[Vector] | None:  # fmt: skip
     """One run of RRT-Connect."""
-    here, there = _Tree(start[None]), _Tree(np.array(goals))
+    # A joint that moves the arm little counts little.
+    weights = np.sqrt(space.checks.reach / space.checks.reach.max())
+    here, there = _Tree(start[None], weights), _Tree(np.array(goals), weights)
     forwards = True
     for _ in range(iterations):
         if expired():
@@ -152,27 +211,51 @@ def _grown(
         if here.size > there.size:
             here, there, forwards = there, here, not forwards
         sample = rng.uniform(space.lower, space.upper)
-        grown = _extend(space, here, sample, once=True)
+        parent = here.nearest(sample)
+        if rng.random() < _SOME_JOINTS:
+            sample = np.where(rng.random(len(sample)) < 0.5, sample, here.node(parent))
+        grown = extended(here, parent, sample, once=True)
         if grown is None:
             continue
         node = here.node(grown)
-        met = _extend(space, there, node, once=False)
+        met = extended(there, there.nearest(node), node, once=False)
         if met is not None and np.array_equal(there.node(met), node):
             way = here.way(grown) + there.way(met)[-2::-1]
             return way if forwards else way[::-1]
     return None
 
 
-def _extend(space: Space, tree: _Tree, target: Vector, *, once: bool) -> int | None:
-    """Grow a tree towards `target`, as far as the line is free; with `once`, by one extension at most.
+def _extended(space: Space, longest: float, tree: _Tree, parent: int, target: Vector, *, once: bool) -> int | None:
+    """Grow a tree from a node towards `target`, by extensions of equal length up to the first that is blocked.
+
+    A blocked extension is mostly found at its middle or its end, so that it costs little.
 
     Returns:
-        The last node of it, or None where there was none.
+        The last new node, or None where there was none.
     """
-    parent = tree.nearest(target)
     base = tree.node(parent).copy()
-    length = float(np.linalg.norm(target - base))
-    end = base + (target - base) * (_LONGEST / length) if once and length > _LONGEST else target
+    number = max(int(np.ceil(tree.distance(base, target) / longest)), 1)
+    last, before = None, base
+    for k in range(1, 2 if once else number + 1):
+        end = target if k == number else base + (target - base) * (k / number)
+        if not space.free(before, end):
+            break
+        last = parent = tree.add(end, parent)
+        before = end
+    return last
+
+
+def _extended_in_part(
+    space: Space, longest: float, tree: _Tree, parent: int, target: Vector, *, once: bool
+) -> int | None:
+    """Grow a tree from a node towards `target`, as far as the line is free; with `once`, by one extension at most.
+
+    Returns:
+        The new node, or None where there was none.
+    """
+    base = tree.node(parent).copy()
+    length = tree.distance(base, target)
+    end = base + (target - base) * (longest / length) if once and length > longest else target
     line = space.line(base, end)
     free = space.checks.first_hit(line)
     if free == 0:
@@ -188,62 +271,52 @@ def length(path: Sequence[Vector]) -> float:
     return float(np.linalg.norm(np.diff(np.asarray(path), axis=0), axis=1).sum())
 
 
-def shortened(space: Space, path: Sequence[Vector], rng: Random) -> list[Vector]:
-    """A shorter free polyline between the same ends.
+def shortened(space: Space, path: Sequence[Vector], rng: Random, pace: Pace) -> list[Vector]:
+    """A faster free polyline between the same ends.
 
     Corners are cut by lines between random points of the path, and between points from which single joints go the
     straight way (partial shortcuts; Geraerts and Overmars, "Creating high-quality paths for motion planning", 2007).
     """
     best = _pruned(space, list(path))
+    time, ends = pace.time(np.array(best)), _ends(best)
     fruitless = 0
     for _ in range(_ATTEMPTS):
         if len(best) < 3 or fruitless >= _FRUITLESS:
             break
-        candidate = _cut(best, rng) if rng.random() < 0.6 else _cut_joint(best, rng)
-        first = next((i for i, (a, b) in enumerate(zip(best, candidate, strict=False)) if a is not b), 0)
-        if length(candidate) < length(best) * (1 - _SHORTER) and _changed_free(space, best, candidate, first):
-            best, fruitless = _straightened(candidate), 0
+        (i, a), (j, b) = (_at(best, ends, way) for way in sorted((rng.random(2) * ends[-1]).tolist()))
+        if i == j:
+            continue
+        inner = [] if rng.random() < _STRAIGHT else _with_even_joint(a, best[i + 1 : j + 1], b, rng)
+        candidate = _straightened([*best[: i + 1], a, *inner, b, *best[j + 1 :]])
+        faster = pace.time(np.array(candidate))
+        if faster < time * (1 - _SHORTER) and all(space.free(c, d) for c, d in pairwise([a, *inner, b])):
+            best, time, ends, fruitless = candidate, faster, _ends(candidate), 0
         else:
             fruitless += 1
     return _pruned(space, best)
 
 
-def _changed_free(space: Space, before: Sequence[Vector], after: Sequence[Vector], first: int) -> bool:
-    """Whether the segments of a polyline that differ from another are free."""
-    known = {(id(a), id(b)) for a, b in pairwise(before)}
-    segments = zip(after[max(first - 1, 0) :], after[max(first, 1) :], strict=False)
-    return all(space.free(a, b) for a, b in segments if (id(a), id(b)) not in known)
+def _ends(path: Sequence[Vector]) -> list[float]:
+    """The way along a path to the end of each segment [rad]."""
+    return list(accumulate(float(np.linalg.norm(b - a)) for a, b in pairwise(path)))
 
 
-def _at(path: Sequence[Vector], share: float) -> tuple[int, Vector]:
-    """The segment and the point at a share of a path's length."""
-    lengths = np.linalg.norm(np.diff(np.asarray(path), axis=0), axis=1)
-    ends = np.cumsum(lengths)
-    way = share * ends[-1]
-    segment = min(int(np.searchsorted(ends, way)), len(lengths) - 1)
-    rest = (way - ends[segment] + lengths[segment]) / max(lengths[segment], 1e-12)
-    return segment, path[segment] + rest * (path[segment + 1] - path[segment])
+def _at(path: Sequence[Vector], ends: Sequence[float], way: float) -> tuple[int, Vector]:
+    """The index of the segment and the point at a way along a path."""
+    segment = min(bisect_left(ends, way), len(ends) - 1)
+    begin = ends[segment - 1] if segment else 0.0
+    share = (way - begin) / max(ends[segment] - begin, 1e-12)
+    return segment, path[segment] + share * (path[segment + 1] - path[segment])
 
 
-def _cut(path: list[Vector], rng: Random) -> list[Vector]:
-    """A straight line between two random points."""
-    (i, a), (j, b) = (_at(path, share) for share in sorted(rng.random(2)))
-    return [*path[: i + 1], a, b, *path[j + 1 :]]
-
-
-def _cut_joint(path: list[Vector], rng: Random) -> list[Vector]:
-    """One joint moves linearly between two random points, the others as before."""
-    (i, a), (j, b) = (_at(path, share) for share in sorted(rng.random(2)))
+def _with_even_joint(a: Vector, inner: Sequence[Vector], b: Vector, rng: Random) -> list[Vector]:
+    """Waypoints between `a` and `b` along which one random joint moves evenly, and the others as before."""
     joint = int(rng.integers(len(a)))
-    inner = [point.copy() for point in path[i + 1 : j + 1]]
     points = np.array([a, *inner, b])
     ways = np.delete(np.abs(np.diff(points, axis=0)), joint, axis=1).sum(axis=1)
-    if not inner or ways.sum() < 1e-9:
-        return path
-    shares = np.cumsum(ways)[:-1] / ways.sum()
-    for point, share in zip(inner, shares.tolist(), strict=True):
-        point[joint] = a[joint] + share * (b[joint] - a[joint])
-    return [*path[: i + 1], a, *inner, b, *path[j + 1 :]]
+    shares = np.cumsum(ways)[:-1] / max(ways.sum(), 1e-12)
+    points[1:-1, joint] = a[joint] + shares * (b[joint] - a[joint])
+    return list(points[1:-1])
 
 
 def _pruned(space: Space, path: list[Vector]) -> list[Vector]:
@@ -263,7 +336,7 @@ def _straightened(path: list[Vector]) -> list[Vector]:
     kept = [path[0]]
     for point, after in pairwise(path[1:]):
         ahead, behind = after - point, point - kept[-1]
-        along = np.linalg.norm(ahead) * np.linalg.norm(behind)
+        along = math.sqrt((ahead @ ahead) * (behind @ behind))
         if along > 1e-12 and ahead @ behind < along * (1 - 1e-9):
             kept.append(point)
     return [*kept, path[-1]]

@@ -9,6 +9,7 @@
 
 from __future__ import annotations
 
+from functools import cache, cached_property
 from itertools import pairwise
 
 import attrs
@@ -24,11 +25,13 @@ _SAMPLE_S = 0.001
 """Time between samples of the motion before it is averaged."""
 _STILL = 1e-9
 """Shorter segments [rad] are left out."""
+_PEAKS = 20
+"""Samples between two points, for the maximum velocity and acceleration."""
 _EASED = 2e-3
 """Reduction of the limits, for the rounding of samples."""
 
 
-@attrs.frozen(eq=False)
+@attrs.frozen(eq=False, slots=False)
 class Motion:
     """Joint positions over time, from rest to rest."""
 
@@ -71,18 +74,58 @@ class Motion:
         at = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 2)
         h = np.diff(self.times)[at][:, None]
         u = (times - self.times[at])[:, None] / h
-        p0, p1 = self.positions[at], self.positions[at + 1]
-        v0, v1 = self.velocities[at] * h, self.velocities[at + 1] * h
-        a0, a1 = self.accelerations[at] * h * h, self.accelerations[at + 1] * h * h
-        way = p1 - p0
-        c3 = 10 * way - 6 * v0 - 4 * v1 - 1.5 * a0 + 0.5 * a1
-        c4 = -15 * way + 8 * v0 + 7 * v1 + 1.5 * a0 - a1
-        c5 = 6 * way - 3 * v0 - 3 * v1 - 0.5 * a0 + 0.5 * a1
+        c0, c1, c2, c3, c4, c5 = self._quintics[:, at]
         return np.stack([
-            p0 + u * (v0 + u * (a0 / 2 + u * (c3 + u * (c4 + u * c5)))),
-            (v0 + u * (a0 + u * (3 * c3 + u * (4 * c4 + u * 5 * c5)))) / h,
-            (a0 + u * (6 * c3 + u * (12 * c4 + u * 20 * c5))) / (h * h),
+            c0 + u * (c1 + u * (c2 + u * (c3 + u * (c4 + u * c5)))),
+            (c1 + u * (2 * c2 + u * (3 * c3 + u * (4 * c4 + u * 5 * c5)))) / h,
+            (2 * c2 + u * (6 * c3 + u * (12 * c4 + u * 20 * c5))) / (h * h),
         ])  # fmt: skip
+
+    def positions_within(self, step: float) -> Vector:
+        """Positions of the quintic at most `step` [s] apart, shape (M, J), all points among them."""
+        number = int(np.ceil(np.diff(self.times).max() / step - 1e-6))
+        between = _powers(number)[0] @ self._quintics.reshape(6, -1)
+        joints = self.positions.shape[1]
+        inner = between.reshape(number, -1, joints).swapaxes(0, 1).reshape(-1, joints)
+        return np.concatenate([inner, self.positions[-1:]])
+
+    @property
+    def peaks(self) -> tuple[Vector, Vector]:
+        """Maximum velocity [rad/s] and acceleration [rad/s^2] of each joint between the points, both shape (J,)."""
+        steps = np.diff(self.times)[:, None]
+        _, speeds, rates = _powers(_PEAKS)
+        flat = self._quintics.reshape(6, -1)
+        shape = _PEAKS, len(steps), self.positions.shape[1]
+        return (
+            (np.abs(speeds @ flat).reshape(shape).max(axis=0) / steps).max(axis=0),
+            (np.abs(rates @ flat).reshape(shape).max(axis=0) / (steps * steps)).max(axis=0),
+        )
+
+    @cached_property
+    def _quintics(self) -> Vector:
+        """Coefficients of the positions between points, by powers of the share of the time, shape (6, N - 1, J)."""
+        h = np.diff(self.times)[:, None]
+        way = np.diff(self.positions, axis=0)
+        v0, v1 = self.velocities[:-1] * h, self.velocities[1:] * h
+        a0, a1 = self.accelerations[:-1] * (h * h), self.accelerations[1:] * (h * h)
+        return np.stack([
+            self.positions[:-1], v0, a0 / 2,
+            10 * way - 6 * v0 - 4 * v1 - 1.5 * a0 + 0.5 * a1,
+            -15 * way + 8 * v0 + 7 * v1 + 1.5 * a0 - a1,
+            6 * way - 3 * v0 - 3 * v1 - 0.5 * a0 + 0.5 * a1,
+        ])  # fmt: skip
+
+
+@cache
+def _powers(number: int) -> tuple[Vector, Vector, Vector]:
+    """Factors of a quintic's coefficients at shares 0, 1 / number, …: of the value, and its two derivatives."""
+    u = (np.arange(number) / number)[:, None]
+    n = np.arange(6)
+    return (
+        u**n,
+        n * u ** np.maximum(n - 1, 0),
+        n * (n - 1) * u ** np.maximum(n - 2, 0),
+    )
 
 
 def timed(
@@ -117,9 +160,9 @@ def timed(
     # Rest for the width of the average, so that it does not cut a corner at which the motion stops.
     rested = [np.concatenate([part, np.repeat(part[-1:], samples, axis=0)]) for part in parts]
     motion = _averaged(np.concatenate([np.repeat(path[:1], samples, axis=0), *rested]), samples, step)
-    _, velocities, accelerations = motion.sampled(_SAMPLE_S / 2)
     # Between its points the quintic goes a little further than they do.
-    beyond = np.maximum(np.abs(velocities) / max_velocity, np.sqrt(np.abs(accelerations) / max_acceleration)).max()
+    velocities, accelerations = motion.peaks
+    beyond = np.maximum(velocities / max_velocity, np.sqrt(accelerations / max_acceleration)).max()
     return motion.slowed(max(float(beyond), 1.0))
 
 
@@ -190,18 +233,22 @@ def _speeds(s: Vector, slopes: Vector, bends: Vector, max_velocity: Vector, max_
     """Squares of the maximum speeds ds/dt at the grid points.
 
     With x = (ds/dt)^2 and u = d2s/dt2, each joint bounds |slope u + bend x| by its acceleration, and on an interval
-    x changes by 2 u ds.
+    x changes by 2 u ds. The bounds hold at both ends of an interval: at its end, where the slope is slope', they are
+    |slope' u + bend (x + 2 u ds)|.
     """
     count = len(s)
     width = 2 * np.diff(s)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         ceiling = np.min((max_velocity / np.abs(slopes)) ** 2, axis=1)
         # u lies between the lines -h - k x and h - k x of each joint.
-        h = max_acceleration / np.abs(slopes[:-1])
-        k = bends / slopes[:-1]
+        factors = np.concatenate([slopes[:-1], slopes[1:] + bends * width[:, None]], axis=1)
+        bent = np.concatenate([bends, bends], axis=1)
+        most = np.concatenate([max_acceleration, max_acceleration])
+        h = most / np.abs(factors)
+        k = bent / factors
         # A joint that does not move at this point bounds x alone.
-        still = np.abs(slopes[:-1]) < 1e-9
-        flat = np.where(still & (bends != 0), max_acceleration / np.abs(bends), np.inf).min(axis=1)
+        still = np.abs(factors) < 1e-9
+        flat = np.where(still & (bent != 0), most / np.abs(bent), np.inf).min(axis=1)
         h, k = np.where(still, np.inf, h), np.where(still, 0.0, k)
         # The lower line of one joint meets the upper line of another.
         apart = k[:, :, None] - k[:, None, :]

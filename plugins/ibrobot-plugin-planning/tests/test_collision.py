@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import mujoco
 import numpy as np
 import pytest
@@ -146,6 +148,33 @@ def test_free_is_what_mujoco_measures(arm, tmp_path):
             if 0 < distance < 0.005:
                 assert contacts[0].distance == pytest.approx(distance, abs=1e-5)
     assert compared > 290
+
+
+def test_wide_margins_find_the_same_first_hit_on_a_path_as_checks_of_every_configuration(arm):
+    checks = Collisions(arm, WORLD, ARM, padding=0.005, unchecked=unchecked_pairs(arm))
+    rng = np.random.default_rng(1)
+    hits = []
+    for _ in range(60):
+        corners = rng.uniform(arm.lower[:5], arm.upper[:5], (3, 5))
+        path = np.concatenate([np.linspace(a, b, 150) for a, b in pairwise(corners)])
+        path = path[checks.first_hit(path[:1]) == 0 :]
+        hits.append(checks.first_hit(path) / len(path))
+        assert checks.first_hit_on_path(path) == checks.first_hit(path)
+    assert min(hits) < 0.2
+    assert max(hits) == 1
+
+
+def test_lines_are_free_where_all_of_their_configurations_are(arm):
+    checks = Collisions(arm, WORLD, ARM, padding=0.005, unchecked=unchecked_pairs(arm))
+    rng = np.random.default_rng(2)
+    answers = []
+    for a, b in rng.uniform(arm.lower[:5], arm.upper[:5], (120, 2, 5)):
+        number = int(np.ceil(np.abs(b - a) @ checks.reach / 0.002))
+        answers.append(checks.line_free(a, b, 0.002))
+        assert answers[-1] == (checks.first_hit(np.linspace(a, b, number + 1)[1:]) == number)
+        # Coarser checks may miss a contact, but find none that is not there.
+        assert checks.line_free(a, b, 0.05) >= answers[-1]
+    assert 10 < sum(answers) < 110
 
 
 def test_unknown_names_are_refused(arm):

@@ -7,7 +7,8 @@ from itertools import pairwise
 import attrs
 import numpy as np
 import pytest
-from ibrobot_planning.search import Space, connect, length, shortened
+from ibrobot_planning.search import Pace, Space, connect, length, shortened
+from ibrobot_planning.timing import timed
 
 from ibrobot_core.api import Vector
 
@@ -25,7 +26,12 @@ class Walls:
                 return number
         return len(configurations)
 
+    def line_free(self, a: Vector, b: Vector, resolution: float) -> bool:
+        number = int(np.ceil(np.abs(b - a).sum() / resolution))
+        return self.first_hit(np.linspace(a, b, number + 1)[1:]) == number
 
+
+PACE = Pace(np.full(2, 3.0), np.full(2, 10.0), 0.5)
 SLALOM = Walls(((-0.5, -2.0, -0.3, 1.0), (0.3, -1.0, 0.5, 2.0)))
 START, GOAL = np.array([-1.0, -1.0]), np.array([1.0, 1.0])
 
@@ -47,7 +53,7 @@ def found(goals=(GOAL,), seed: int = 0, walls: Walls = SLALOM) -> list[Vector]:
 @pytest.mark.parametrize("seed", range(5))
 def test_paths_are_free_and_get_shorter(seed):
     path = found(seed=seed)
-    short = shortened(space(), path, np.random.default_rng(seed))
+    short = shortened(space(), path, np.random.default_rng(seed), PACE)
     for each in (path, short):
         np.testing.assert_array_equal(each[0], START)
         np.testing.assert_array_equal(each[-1], GOAL)
@@ -55,8 +61,8 @@ def test_paths_are_free_and_get_shorter(seed):
             assert space().free(a, b)
     # Around both corners: (-0.5, 1) to (-0.3, 1), (0.3, -1) to (0.5, -1).
     shortest = 2.0616 + 0.2 + 2.0881 + 0.2 + 2.0616
-    assert shortest - 0.01 < length(short) < 1.4 * shortest
-    assert length(short) < length(path)
+    assert shortest - 0.01 < length(short) < 1.6 * shortest
+    assert PACE.time(np.array(short)) < 0.9 * PACE.time(np.array(path))
 
 
 def test_equal_seeds_give_equal_paths():
@@ -78,3 +84,13 @@ def test_an_expired_search_gives_up():
     wall = Walls(((-0.1, -3.0, 0.1, 3.0),))
     calls = iter(range(100))
     assert connect(space(wall), START, [GOAL], np.random.default_rng(0), lambda: next(calls) > 50) is None
+
+
+@pytest.mark.parametrize("path", [[START, GOAL], [START, [0.0, 1.0], GOAL], [START, [0.0, 1.0], [0.5, -1.0], GOAL]])
+def test_the_estimated_time_is_about_that_of_the_motion(path):
+    way = np.array(path)
+    blends = np.minimum(
+        np.minimum(*(np.linalg.norm(np.diff(way, axis=0), axis=1)[i:][: len(way) - 2] for i in (0, 1))) / 2, 0.5
+    )
+    motion = timed(way, PACE.velocity, PACE.acceleration, blends=blends, window=0.01, step=0.01)
+    assert PACE.time(way) == pytest.approx(motion.duration, rel=0.12)

@@ -78,3 +78,24 @@ def test_a_path_of_one_place_stays_there():
     motion = move([[0.1, 0.2, 0.3], [0.1, 0.2, 0.3]])
     np.testing.assert_array_equal(motion.positions, [[0.1, 0.2, 0.3]] * 2)
     assert motion.duration > 0
+
+
+def test_corners_use_the_limits_up():
+    """Blends are no reason to slow the whole motion: somewhere on each part a joint is at a limit."""
+    motion = move([[0, 0, 0], [1, 0.5, 0.3], [1.5, -0.5, 0.6], [0, -1, 0.2]], blend=0.2, window=0.004)
+    _, velocities, accelerations = motion.sampled(0.002)
+    used = np.maximum(np.abs(velocities) / VELOCITY, np.abs(accelerations) / ACCELERATION).max(axis=1)
+    assert np.median(used) > 0.97
+
+
+def test_fine_positions_are_samples_of_the_motion():
+    motion = move([[0, 0, 0], [1, 0.5, 0.3], [1.5, -0.5, 0.6]])
+    fine = motion.positions_within(0.001)
+    np.testing.assert_allclose(fine[[0, -1]], motion.positions[[0, -1]])
+    assert len(fine) >= motion.duration / 0.001
+    every = (len(fine) - 1) // (len(motion.times) - 1)
+    np.testing.assert_allclose(fine[::every], motion.positions, atol=1e-12)
+    velocities, accelerations = motion.peaks
+    _, sampled, rates = motion.sampled(0.0005)
+    np.testing.assert_allclose(velocities, np.abs(sampled).max(axis=0), rtol=1e-3)
+    np.testing.assert_allclose(accelerations, np.abs(rates).max(axis=0), rtol=1e-2)
