@@ -125,7 +125,9 @@ class Arm:
 
 def obstacles(number: int, seed: int) -> bool:
     rng = np.random.default_rng(seed)
-    clearances, reactions, stops = [], [], []
+    clearances: list[float] = []
+    reactions: list[float] = []
+    stops: list[float] = []
     wrong: list[str] = []
     with run(lockstep=True, seed=seed) as runtime:
         arm, robot = Arm(runtime), runtime.session.config.robot

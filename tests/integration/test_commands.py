@@ -70,6 +70,9 @@ WRONG_FILES = {
     "feetech torque off BAD --yes": (),
     "feetech torque off no_port --robot BAD --yes": (),
     "gamepad map BAD": (),
+    "plan BAD --from rest --goal home": (),
+    "service call /a --config BAD": (),
+    "service list --config BAD": (),
     "task check BAD": (),
     "task check pick_cube BAD": (),
     "task run BAD": (),
@@ -206,6 +209,8 @@ JSON = {
     "episodes list BAD --json": 2,
     "feetech monitor BAD --json": 2,
     "gamepad list --json": 0,
+    "plan so101_blind --from rest --goal home --json": 0,
+    "plan BAD --from rest --goal home --json": 2,
     "task run pick_cube so101_pick_cube --sim --lockstep --json": 0,
     "task run BAD --json": 2,
 }

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 import yaml
-from ibrobot_data.episode_service import DISCARD, START, STATUS, STOP
+from ibrobot_data.episode_service import DISCARD, START, STATUS, STOP, EpisodeService
 
 from ibrobot_core.errors import DiskFull, NotSupported, RecorderError
 
@@ -67,7 +67,9 @@ def test_services_begin_end_and_discard_episodes(run: Runtime, runs: Runs):
     run.stop()
     assert ("ended", 1, "failure") in runs.parts.EVENTS
     assert ("ended", 2, "discarded") in runs.parts.EVENTS
-    assert run.session.episodes.saved == 1
+    service = run.session.episodes
+    assert isinstance(service, EpisodeService)
+    assert service.saved == 1
     assert folders(runs) == ["episode_000001"]
 
 
@@ -114,6 +116,7 @@ def test_a_disk_too_small_for_an_episode_is_refused_with_the_figures(
     flow = run.session.bus.call(STATUS, None)["bytes_per_s"]
     assert flow > 50 * (2 * 8 + 2 * 2 * 8), "joint states and commands alone"
     service, kept = run.session.episodes, runs.parts.MADE["recording"]
+    assert isinstance(service, EpisodeService)
     monkeypatch.setattr(kept, "min_free", 3 << 20)
     monkeypatch.setattr(service, "free_bytes", lambda: (3 << 20) + flow - 2)
     message = (

@@ -116,7 +116,9 @@ def record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Record]:
         runtime = Runtime(Session(config, registry, LaunchRequest(lockstep=True, by_operator=True)))
         made.append(runtime)
         flags = {"count": None, "reset_time_s": 0.0, "prompt": None, "auto": False, "keys": True, **asked}
-        operator = Operator(runtime.session, runtime.session.episodes, **flags)
+        service = runtime.session.episodes
+        assert isinstance(service, EpisodeService)
+        operator = Operator(runtime.session, service, **flags)
         runtime.start()
         for _ in range(5):
             assert not runtime.step()

@@ -11,7 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from ibrobot_mujoco.lowpoly import cluster, read_stl
+from ibrobot_kinematics.meshes import cluster
+from ibrobot_mujoco.lowpoly import read_stl
 from ibrobot_mujoco.model import build_model
 from ibrobot_mujoco.options import MujocoOptions, SceneCamera
 from ibrobot_mujoco.so101 import so101
