@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import attrs
 
-from ibrobot_core.api import RobotConfig, documented, option
+from ibrobot_core.api import documented, option
+
+if TYPE_CHECKING:
+    from ibrobot_core.api import RobotConfig
 
 COMMANDER = "/commander"
 """std_msgs/msg/String: who commands the robot at a state of control, in modes with `intervene`."""
