@@ -6,11 +6,14 @@ import ipaddress
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import attrs
 
-from ibrobot_core.api import OptionFault, Robot, did_you_mean, documented, option
+from ibrobot_core.api import OptionFault, did_you_mean, documented, option
+
+if TYPE_CHECKING:
+    from ibrobot_core.api import Robot
 
 HANDS = ("left", "right")
 """The hands of an operator, as WebXR calls them; on a phone the page asks which arm it drives."""
