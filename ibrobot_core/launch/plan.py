@@ -11,7 +11,7 @@ from ibrobot_core.component import CONTROL, Component
 from ibrobot_core.config.missing import unavailable_modes
 from ibrobot_core.config.schema import ActionSpec, ObservationSpec, PeripheralConfig
 from ibrobot_core.descriptors import SourceDescriptor, TransportDescriptor
-from ibrobot_core.errors import ComponentFailed, NotSupported
+from ibrobot_core.errors import ComponentFailed, NotSupported, PluginNotInstalled
 from ibrobot_core.launch.absence import describe
 from ibrobot_core.launch.control import ControlComponent
 from ibrobot_core.launch.outputs.status import Status
@@ -134,7 +134,10 @@ def build_plan(session: Session) -> LaunchPlan:
             f"known types: {', '.join(MESSAGE_TYPES)}"
         )
     if config.recording is not None:
-        session.registry.find("section", RECORDED)
+        try:
+            session.registry.find("section", RECORDED)
+        except PluginNotInstalled as error:
+            raise PluginNotInstalled("section", "recording", error.package, error.reason) from None
     link = None
     if (transport := config.transport) is not None:
         descriptor = session.registry.find("transport", transport.type)

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -106,10 +107,18 @@ def test_the_summary_names_the_cameras_that_could_not_run(launch: Callable[..., 
 
 
 def test_a_missing_library_is_an_error_with_the_remedy_where_it_is_needed(launch: Callable[..., Ran]):
+    pytest.importorskip("ibrobot_data")
     wanted = ("--set", "recording={type: unused, topics: all}")
     ran = launch(*LOCKSTEP, *CAMERA, *wanted)
     assert (ran.code, ran.out) == (2, "")
     assert ran.err.endswith("error: the recording needs camera top: no OpenGL; sudo apt-get install libegl1\n")
+
+
+@pytest.mark.skipif(find_spec("ibrobot_data") is not None, reason="ibrobot-plugin-data is installed")
+def test_a_recording_without_its_plugin_names_the_package(launch: Callable[..., Ran]):
+    ran = launch(*LOCKSTEP, "--set", "recording={type: unused, topics: all}")
+    message = "section 'recording' needs a plugin that is not installed: pip install ibrobot-plugin-data"
+    assert (ran.code, ran.out, ran.err) == (2, "", f"error: {message}\n")
 
 
 def test_the_summary_as_json_is_the_last_line(launch: Callable[..., Ran]):
