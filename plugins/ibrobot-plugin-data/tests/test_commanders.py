@@ -47,7 +47,8 @@ class Bag:
 def commanders(mode: dict[str, Any], *messages: tuple[int, str]) -> Commanders:
     metadata = {"mode": "it", "config": json.dumps({"control_modes": {"it": mode}})} if mode else {}
     topics = {"/commander": TopicSummary(String.ros_type, len(messages))}
-    return Commanders(Bag(messages), EpisodeSummary(Path("bag"), True, 0, 100, topics, metadata))
+    reader: Any = Bag(messages)
+    return Commanders(reader, EpisodeSummary(Path("bag"), True, 0, 100, topics, metadata))
 
 
 def test_the_newest_message_says_who_commands() -> None:

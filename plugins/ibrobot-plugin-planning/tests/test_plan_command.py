@@ -97,7 +97,7 @@ def test_text_and_picture(yaml: Path, tmp_path: Path):
 def test_no_plan_exits_with_3(yaml: Path):
     result = run(yaml, "--from", "up", "--goal", "xyz=2,0,0")
     assert result.exit_code == 3
-    assert result.stderr.startswith("error: no plan: NO_IK_SOLUTION: tip cannot reach (2.000, 0.000, 0.000) m")
+    assert result.output.startswith("error: no plan: NO_IK_SOLUTION: tip cannot reach (2.000, 0.000, 0.000) m")
     assert result.stdout == ""
     result = run(yaml, "--from", "up", "--goal", "pan=5", "--json")
     assert result.exit_code == 3
@@ -145,4 +145,4 @@ def test_plot_needs_matplotlib(yaml: Path, monkeypatch: pytest.MonkeyPatch):
 def test_gripper_alone_needs_no_plan(yaml: Path):
     result = run(yaml, "--from", "up", "--goal", "jaw=0.5")
     assert result.exit_code == 3
-    assert "moves no joint of the arm: pan, lift, elbow, flex, roll" in result.stderr
+    assert "moves no joint of the arm: pan, lift, elbow, flex, roll" in result.output

@@ -40,7 +40,7 @@ def loaded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[RobotConf
     """The robot in mode `plan`, loaded once."""
     folder = tmp_path_factory.mktemp("robot")
     path = folder / "robot.yaml"
-    path.write_text(task_robot(folder))
+    path.write_text(task_robot(folder, recorded=True))
     with pytest.MonkeyPatch.context() as patch, made_up_site(folder / "site", Path(__file__).parent, patch) as site:
         site.add("parts", "parts.py")
         registry = installed_plugins()

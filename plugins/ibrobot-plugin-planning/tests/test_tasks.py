@@ -26,7 +26,6 @@ peripherals:
 models: {wave: {type: wave}}
 world: {scene: true}
 tasks: {}
-recording: {type: lines, root: ROOT, topics: contract}
 contract:
   rate_hz: 20
   observations:
@@ -39,23 +38,28 @@ contract:
     - {key: action, executor: jaw_stream, topic: /jaw/commands, type: ARRAY, safety_behavior: hold}
 """
 WAIT = "wait: {seconds: 0.1}"
+RECORDING = "recording: {type: lines, root: ROOT, topics: contract}\n"
 DOWN = "{xyz: [0.2, 0.05, 0.1], axis: down}"
 
 
-def task_robot(folder: Path) -> str:
-    """The arm with a policy, a camera, a recording, and the objects of its scene."""
+def task_robot(folder: Path, *, recorded: bool = False) -> str:
+    """The arm with a policy, a camera, and the objects of its scene; `recorded` with a section `recording`."""
     streams = "  arm_stream: {type: position, group: arm}\n  jaw_stream: {type: position, group: gripper}\n"
     policy = "  policy: {executors: [arm_stream, jaw_stream], inference: {model: wave}}\n"
     text = robot_yaml(folder).replace("executors:\n", f"executors:\n{streams}", 1)
     text = text.replace("control_modes:\n", f"control_modes:\n{policy}")
-    rest = REST.replace("ROOT", str(folder / "episodes")).replace("ARRAY", "std_msgs/msg/Float64MultiArray")
+    rest = (
+        (REST + RECORDING * recorded)
+        .replace("ROOT", str(folder / "episodes"))
+        .replace("ARRAY", "std_msgs/msg/Float64MultiArray")
+    )
     return text + rest
 
 
 @pytest.fixture
 def run(start: Make, tmp_path: Path) -> Callable[..., Runtime]:
-    def started(*overrides: str, **asked: Any) -> Runtime:
-        return start(*overrides, text=task_robot(tmp_path), **{"by_operator": True, **asked})
+    def started(*overrides: str, recorded: bool = False, **asked: Any) -> Runtime:
+        return start(*overrides, text=task_robot(tmp_path, recorded=recorded), **{"by_operator": True, **asked})
 
     return started
 
@@ -218,7 +222,8 @@ def test_policy_without_success_fails_the_step(run):
 
 @pytest.mark.parametrize(("until", "outcome", "succeeded"), [("time", "success", True), ("success", "failure", False)])
 def test_policy_is_recorded_as_an_episode(run, tmp_path, until: str, outcome: str, succeeded: bool):
-    runtime = run()
+    pytest.importorskip("ibrobot_data")
+    runtime = run(recorded=True)
     policy = f"run_policy: {{mode: policy, seconds: 1, until: {until}}}"
     result = perform(runtime, steps("record: {prompt: wave, outcome: success}", policy))
     assert result.success == succeeded, result.message

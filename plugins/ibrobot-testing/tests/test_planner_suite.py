@@ -114,6 +114,11 @@ class ClosesOnce(FakePlanner):
         self.closed = True
 
 
+class BlocksItself(FakePlanner):
+    def blocked(self, trajectory, others, from_ns=0):
+        return "the arm is in its own way"
+
+
 WRONG = {
     StopsShort: "goes_from_start_to_goal",
     BeginsLate: "goes_from_start_to_goal",
@@ -127,6 +132,7 @@ WRONG = {
     ClampsTheGoal: "refuses_a_goal_outside_the_limits",
     IgnoresUnknownJoints: "refuses_an_impossible_goal",
     ChangesTheRequest: "leaves_the_request_alone",
+    BlocksItself: "nothing_blocks_its_own_trajectory",
     ClosesOnce: "close_is_safe_twice",
 }
 
