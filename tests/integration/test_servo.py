@@ -6,7 +6,7 @@ import json
 import subprocess
 import time
 from pathlib import Path
-from socket import socket
+from socket import create_connection, socket
 
 import pytest
 import yaml
@@ -22,6 +22,15 @@ def endpoint() -> str:
     with socket() as free:
         free.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{free.getsockname()[1]}"
+
+
+def listens(endpoint: str) -> bool:
+    host, port = endpoint.removeprefix("tcp/").split(":")
+    try:
+        create_connection((host, int(port)), timeout=1).close()
+    except OSError:
+        return False
+    return True
 
 
 def test_twists_from_another_process_move_the_tool(tmp_path: Path, ibrobot: tuple[str, ...], endpoint: str) -> None:
@@ -46,6 +55,9 @@ def test_twists_from_another_process_move_the_tool(tmp_path: Path, ibrobot: tupl
 
     with subprocess.Popen(run, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as launched:
         try:
+            while not listens(endpoint):
+                assert launched.poll() is None
+                time.sleep(0.1)
             before = height()
             pub = [*topic, "pub", "/arm1/servo_node/delta_twist_cmds", "geometry_msgs/msg/TwistStamped", TWIST]
             subprocess.run(

@@ -66,6 +66,8 @@ def test_checks_without_pytest_find_leaks(tmp_path: Path) -> None:
             files.append((tmp_path / "left").open("w"))
 
     class LeakingSuite(SensorSuite):
+        leak_check = LeakCheck(grace_s=0.0)
+
         def make(self, ctx: Context) -> LeavesAFile:
             return LeavesAFile(ctx)
 
