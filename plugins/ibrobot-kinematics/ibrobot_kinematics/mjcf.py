@@ -30,7 +30,7 @@ def robot_model(robot: Robot, joints: Sequence[str] | None = None) -> KinematicM
             robot with several arms, the joints of one of them; the base frame is then that of the arm.
 
     Raises:
-        KinematicsError: when there is no MJCF, or it cannot be read, or it lacks the tip or one of the joints, or the
+        KinematicsError: if the description has no MJCF, the MJCF cannot be read or lacks the tip or a joint, or the
             joints belong to several arms.
         KeyError: for a name in `joints` that is not a joint of the robot.
     """

@@ -138,7 +138,7 @@ def robot_arm(robot: Robot) -> Arm:
     """The arm of a robot, within the robot's joint limits.
 
     Raises:
-        PlanningError: when there is no MJCF, or it cannot be read, or lacks one of the joints.
+        PlanningError: if the description has no MJCF, or the MJCF cannot be read or lacks a joint.
     """
     if robot.description.mjcf is None:
         raise PlanningError(
