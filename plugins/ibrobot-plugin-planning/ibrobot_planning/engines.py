@@ -1,7 +1,9 @@
-"""Whether the packages for planning around obstacles are installed."""
+"""Whether the packages for planning around obstacles are installed, with the library that they need."""
 
 from __future__ import annotations
 
+import ctypes
+import sys
 from importlib.util import find_spec
 
 from ibrobot_core.api import MissingDependency
@@ -11,7 +13,7 @@ def find_engines() -> None:
     """Check that kinematics and collision checks are installed.
 
     Raises:
-        MissingDependency: with the command that installs them.
+        MissingDependency: with the command that installs what is missing.
     """
     missing = [name for name in ("pinocchio", "coal", "mujoco", "ibrobot_kinematics") if find_spec(name) is None]
     if missing:
@@ -19,3 +21,9 @@ def find_engines() -> None:
             f"planning around obstacles needs the Python package {missing[0]}, which is not installed",
             remedy="pip install 'ibrobot-plugin-planning[obstacles]'",
         )
+    if sys.platform == "linux":
+        try:
+            ctypes.CDLL("libgomp.so.1")  # Pinocchio's wheel does not bring it
+        except OSError:
+            message = "planning around obstacles needs the system library libgomp.so.1"
+            raise MissingDependency(message, apt=["libgomp1"]) from None

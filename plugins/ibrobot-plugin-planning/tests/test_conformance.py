@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from ibrobot_planning.arm import robot_arm
 from ibrobot_planning.collision import Collisions, unchecked_pairs
+from ibrobot_planning.engines import find_engines
 from ibrobot_planning.joint import JointPlanner
 from ibrobot_planning.options import JointPlannerOptions, RrtConnectOptions
 from ibrobot_planning.rrt import RrtConnectPlanner
 from ibrobot_planning.world import World
 from ibrobot_testing import PlannerSuite
 
-from ibrobot_core.api import Context, JointGoal, PlanRequest
+from ibrobot_core.api import Context, JointGoal, MissingDependency, PlanRequest
 
 from .table_arm import make_robot
 
@@ -56,3 +57,13 @@ class TestRrtConnectPlanner(PlannerSuite):
             if checks.free(mixed):
                 return PlanRequest(joints, start, JointGoal(joints, goal))
         raise AssertionError("no free goal")
+
+
+def test_missing_system_library_is_named_with_its_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    def load(name: str) -> None:
+        raise OSError(f"{name}: cannot open shared object file")
+
+    monkeypatch.setattr("sys.platform", "linux")
+    monkeypatch.setattr("ctypes.CDLL", load)
+    with pytest.raises(MissingDependency, match="sudo apt-get install libgomp1"):
+        find_engines()
