@@ -10,6 +10,7 @@ import re
 import shlex
 import shutil
 import sys
+from ctypes.util import find_library
 from pathlib import Path
 from typing import Any
 
@@ -114,8 +115,10 @@ def chromium(session: nox.Session) -> None:
     """Check for Chromium, which tests of web pages need: root installs it; they are skipped without it."""
     with Path(".nox/apt.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        if not shutil.which("chromium") and not apt_install(session, "chromium"):
-            note_untested(session, "web pages are not tested: needs Chromium; apt-get install chromium")
+        present = {"chromium": shutil.which("chromium"), "libatomic1": find_library("atomic")}  # for Playwright
+        wanted = [package for package, found in present.items() if not found]
+        if wanted and not apt_install(session, *wanted):
+            note_untested(session, f"web pages are not tested: apt-get install {' '.join(wanted)}")
 
 
 def system_libraries(session: nox.Session) -> None:
