@@ -81,6 +81,7 @@ WRONG_FILES = {
     "topic hz /a --config BAD": (),
     "topic list --config BAD": (),
     "topic pub /a std_msgs/msg/Bool {data:true} --config BAD": (),
+    "ui BAD --no-browser --port 0": ("folder",),
 }
 """Command line -> the kinds of files that are right there."""
 WITHOUT_FILES = {

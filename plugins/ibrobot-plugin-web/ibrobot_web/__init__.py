@@ -1,14 +1,16 @@
-"""The plugin's hooks: viewer and teleop `web`."""
+"""The plugin's hooks: viewer and teleop `web`, the command `ibrobot ui`."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from ibrobot_core.api import OptionFault, TeleopDescriptor, ViewerDescriptor, hookimpl
+from ibrobot_core.api import Command, OptionFault, TeleopDescriptor, ViewerDescriptor, hookimpl
 from ibrobot_web.options import WebOptions, WebTeleopOptions
 
 if TYPE_CHECKING:
+    import click
+
     from ibrobot_core.api import Context, Robot, Teleop, Viewer
 
 
@@ -46,3 +48,15 @@ def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
         type="web", options=WebTeleopOptions, make=_teleop,
         summary="joint and tool jog from the page of the viewer web, while a button is held",
     )  # fmt: skip
+
+
+def _ui() -> click.Command:
+    from ibrobot_web.ui.command import ui
+
+    return ui
+
+
+@hookimpl
+def ibrobot_commands() -> Iterable[Command]:
+    """`ibrobot ui`."""
+    yield Command("ui", "Set up, launch and record robots in the browser.", _ui)

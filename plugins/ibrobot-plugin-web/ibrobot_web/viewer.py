@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
 import select
 import socket
-import sys
 import threading
 import time
 import webbrowser
@@ -27,6 +25,7 @@ from ibrobot_core.api import (
     Viewer,
 )
 from ibrobot_web.commands import Commands
+from ibrobot_web.desktop import has_desktop
 from ibrobot_web.link import FIRST_PICTURE, PLAN, SAMPLES, STATE, STATUS, FrameSender
 from ibrobot_web.options import WebOptions
 from ibrobot_web.pictures import to_payload
@@ -96,7 +95,7 @@ class WebViewer(Viewer):
         self._commands = Commands(session, self._child.channel.send)
         self._thread = threading.Thread(target=self._receive, args=(self._child,), name="web commands", daemon=True)
         self._thread.start()
-        if self._options.browser and _has_desktop():
+        if self._options.browser and has_desktop():
             threading.Thread(target=webbrowser.open, args=(self.url,), name="browser", daemon=True).start()
 
     @override
@@ -269,10 +268,3 @@ class WebViewer(Viewer):
             if numbers:
                 found[topic] = numbers
         return found
-
-
-def _has_desktop() -> bool:
-    """Whether a browser can be opened on this machine for the person who launched the run."""
-    if "SSH_CONNECTION" in os.environ or "CI" in os.environ:
-        return False
-    return sys.platform == "darwin" or bool({"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ))

@@ -9,7 +9,7 @@ from aiohttp import web
 
 from ibrobot_web.server.broadcast import Broadcast
 from ibrobot_web.server.drive import LARGEST_MESSAGE, Drive
-from ibrobot_web.server.guard import Guard, session_of
+from ibrobot_web.server.guard import Guard
 
 STATIC = Path(__file__).parents[1] / "static"
 _HEARTBEAT_S = 5.0
@@ -59,8 +59,8 @@ def make_app(
         return web.Response(text=(STATIC / "index.html").read_text(encoding="utf-8"), content_type="text/html")
 
     async def session(request: web.Request) -> web.StreamResponse:
-        links = {"watch": guard.path("watch")} if session_of(request).role == "drive" else {}
-        return web.json_response({"role": session_of(request).role, "links": links})
+        links = {"watch": guard.path("watch")} if guard.session(request).role == "drive" else {}
+        return web.json_response({"role": guard.session(request).role, "links": links})
 
     async def shapes(request: web.Request) -> web.StreamResponse:
         return web.Response(body=await scene(), content_type="application/json")
@@ -72,7 +72,7 @@ def make_app(
 
     async def commands(request: web.Request) -> web.StreamResponse:
         socket = await _socket(request)
-        await drive.serve(socket, session_of(request).role, request.remote or "?")
+        await drive.serve(socket, guard.session(request).role, request.remote or "?")
         return socket
 
     app.router.add_get("/", index)

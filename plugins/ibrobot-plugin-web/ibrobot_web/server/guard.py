@@ -38,7 +38,6 @@ _HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "DENY",
 }
-_SESSION = "ibrobot.session"
 _LOGIN = """<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">
 <title>ibrobot: sign in</title><link rel="stylesheet" href="/static/style.css">
 <main class="signin"><h1>ibrobot</h1><form method="post" action="/login">
@@ -103,8 +102,11 @@ class Guard:
         if session is None:
             return await handler(request) if request.path == _STYLE else self._unknown(request)
         self._sessions.move_to_end(session.key)
-        request[_SESSION] = session
         return await handler(request)
+
+    def session(self, request: web.Request) -> Session:
+        """The session of an admitted request."""
+        return self._sessions[request.cookies[self._cookie]]
 
     async def add_headers(self, request: web.Request, response: web.StreamResponse) -> None:
         """Add the headers of every answer; a signal handler."""
@@ -124,7 +126,8 @@ class Guard:
         for origin in request.headers.getall("Origin", []):
             if origin.lower() != f"{scheme}://{hosts[0].lower()}":
                 return "requests of other sites are refused"
-        if request.headers.get("Sec-Fetch-Site", "none") not in ("same-origin", "none"):
+        site = request.headers.get("Sec-Fetch-Site", "none")
+        if site not in ("same-origin", "none") and not (site == "same-site" and _opens_page(request)):
             return "requests of other sites are refused"
         return None
 
@@ -173,7 +176,10 @@ class Guard:
         return web.Response(status=status, text=_LOGIN.format(message=message), content_type="text/html")
 
 
-def session_of(request: web.Request) -> Session:
-    """The session of an admitted request."""
-    session: Session = request[_SESSION]
-    return session
+def _opens_page(request: web.Request) -> bool:
+    """Whether a browser follows a link to the page itself, in a tab: `ibrobot ui` links to the pages of its runs.
+
+    To browsers, servers of one machine are one site, whatever their ports.
+    """
+    kind = (request.headers.get("Sec-Fetch-Mode"), request.headers.get("Sec-Fetch-Dest"))
+    return request.method == "GET" and request.path == "/" and kind == ("navigate", "document")

@@ -16,7 +16,6 @@ import itertools
 import json
 import logging
 import socket
-import ssl
 import sys
 import threading
 from collections.abc import Callable, Mapping
@@ -27,12 +26,12 @@ from aiohttp import web
 
 from ibrobot_core.api import Channel, IbrobotError, open_parent
 from ibrobot_web.link import FIRST_PICTURE, STATUS, receive_frame
-from ibrobot_web.options import is_loopback
 from ibrobot_web.pictures import as_jpeg
 from ibrobot_web.server.app import make_app
 from ibrobot_web.server.broadcast import Broadcast
 from ibrobot_web.server.drive import Drive
 from ibrobot_web.server.guard import Guard
+from ibrobot_web.server.listening import host_names, listen, tls_of
 
 _STREAM_BYTES = 4 << 20
 """Frames that wait to be broadcast [bytes]."""
@@ -110,39 +109,6 @@ class RunLink:
         self._channel.send(message)
 
 
-def _tls(order: Mapping[str, Any]) -> ssl.SSLContext | None:
-    if order["certificate"] is None:
-        return None
-    context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
-    context.minimum_version = ssl.TLSVersion.TLSv1_2
-    try:
-        context.load_cert_chain(order["certificate"], order["key"])
-    except (OSError, ssl.SSLError) as error:
-        raise IbrobotError(f"viewer: certificate {order['certificate']} and its key cannot be used: {error}") from None
-    return context
-
-
-def _names(order: Mapping[str, Any]) -> tuple[str, ...]:
-    """Host names under which browsers reach this server."""
-    host = order["address"]
-    given = tuple(order["names"])
-    if is_loopback(host):
-        return ("127.0.0.1", "localhost", "[::1]", *given)
-    own = socket.gethostname()
-    names = (own, f"{own}.local", *given)
-    return names if host in ("0.0.0.0", "::") else (f"[{host}]" if ":" in host else host, *names)
-
-
-def _listen(host: str, port: int) -> socket.socket:
-    try:
-        return socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
-    except OSError as error:
-        raise IbrobotError(
-            f"viewer: port {port} of {host} is not available: {error.strerror}; choose another, or any free one: "
-            "--set viewer.port=0"
-        ) from None
-
-
 async def serve(channel: Channel, stream: socket.socket, order: Mapping[str, Any]) -> None:
     """Serve until the run closes the channel.
 
@@ -151,9 +117,10 @@ async def serve(channel: Channel, stream: socket.socket, order: Mapping[str, Any
     """
     loop = asyncio.get_running_loop()
     link = RunLink(channel, order)
-    tls = _tls(order)
-    guard = Guard(_names(order), secure=tls is not None, password=order["password"])
-    listening = _listen(order["address"], order["port"])
+    tls = tls_of("viewer: ", order["certificate"], order["key"])
+    names = host_names(order["address"], order["names"])
+    guard = Guard(names, secure=tls is not None, password=order["password"])
+    listening = listen("viewer: ", order["address"], order["port"], "--set viewer.port=0")
     port = listening.getsockname()[1]
     guard.listen_on(port)
     runner = web.AppRunner(
@@ -166,7 +133,7 @@ async def serve(channel: Channel, stream: socket.socket, order: Mapping[str, Any
         loop.add_reader(channel.fileno(), link.receive)
         relaying = asyncio.create_task(link.relay(stream))
         scene = asyncio.create_task(link.scene())  # so that the first page does not wait for it
-        base = f"{'https' if tls else 'http'}://{_names(order)[0]}:{port}"
+        base = f"{'https' if tls else 'http'}://{names[0]}:{port}"
         links = {"url": base + guard.path("drive"), "watch_url": base + guard.path("watch")}
         channel.send({"event": "ready", **links})
         await link.ended.wait()

@@ -1,0 +1,62 @@
+"""Where a server listens: its socket, its certificate, and the host names under which browsers reach it."""
+
+from __future__ import annotations
+
+import socket
+import ssl
+from collections.abc import Sequence
+
+from ibrobot_core.api import IbrobotError
+from ibrobot_web.options import is_loopback
+
+
+def tls_of(prefix: str, certificate: str | None, key: str | None) -> ssl.SSLContext | None:
+    """The TLS context of a certificate and its key; None without a certificate.
+
+    Args:
+        prefix: of the error, e.g. `viewer: `.
+        certificate: path of the certificate, with the chain of its authority.
+        key: path of its private key.
+
+    Raises:
+        IbrobotError: if they cannot be used.
+    """
+    if certificate is None:
+        return None
+    context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    try:
+        context.load_cert_chain(certificate, key)
+    except (OSError, ssl.SSLError) as error:
+        raise IbrobotError(f"{prefix}certificate {certificate} and its key cannot be used: {error}") from None
+    return context
+
+
+def host_names(host: str, given: Sequence[str]) -> tuple[str, ...]:
+    """Host names under which browsers reach a server at `host`, and those `given`."""
+    if is_loopback(host):
+        return ("127.0.0.1", "localhost", "[::1]", *given)
+    own = socket.gethostname()
+    names = (own, f"{own}.local", *given)
+    return names if host in ("0.0.0.0", "::") else (f"[{host}]" if ":" in host else host, *names)
+
+
+def listen(prefix: str, host: str, port: int, any_port: str) -> socket.socket:
+    """A listening socket.
+
+    Args:
+        prefix: of the error, e.g. `viewer: `.
+        host: the address.
+        port: the port; 0 for any free one.
+        any_port: the option that chooses any free port.
+
+    Raises:
+        IbrobotError: if the port is not available.
+    """
+    try:
+        return socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
+    except OSError as error:
+        raise IbrobotError(
+            f"{prefix}port {port} of {host} is not available: {error.strerror}; choose another, or any free one: "
+            f"{any_port}"
+        ) from None

@@ -1,0 +1,149 @@
+// The page without a running robot: header, navigation, and one view at a time.
+
+import { h, refresh, say, toast } from "./dom.js";
+
+const $ = (id) => document.getElementById(id);
+
+// What every view works with. `get` and `post` ask the server's module of the same name as the view.
+class Ui extends EventTarget {
+  constructor() {
+    super();
+    this.jobs = new Map(); // number -> {number, kind, title, state, facts, lines, …}
+    this.session = { role: "watch", folders: [], views: [] };
+    this.connected = false;
+  }
+
+  get drives() { return this.session.role === "drive"; }
+
+  get(path, query = {}) {
+    const given = Object.entries(query).filter(([, value]) => value !== undefined && value !== null);
+    return ask(`/api/${path}${given.length ? `?${new URLSearchParams(given)}` : ""}`);
+  }
+
+  post(path, facts = {}) {
+    return ask(`/api/${path}`, {
+      method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(facts),
+    });
+  }
+
+  // The address of a picture or another file that a view's request answers with.
+  address(path, query = {}) { return `/api/${path}?${new URLSearchParams(query)}`; }
+
+  // Does something that may fail, and shows the error; returns undefined then.
+  async attempt(act) {
+    try {
+      return await act();
+    } catch (error) {
+      toast(error.message, "error");
+      return undefined;
+    }
+  }
+
+  // The jobs of a kind, newest first.
+  of(...kinds) { return [...this.jobs.values()].filter(({ kind }) => kinds.includes(kind)).reverse(); }
+
+  // A question in a dialog; resolves with whether it was confirmed.
+  confirm(title, text, confirm, danger = true) {
+    const dialog = $("dialog");
+    dialog.replaceChildren(h("h2", { id: "dialog-title" }, title), h("p", {}, text),
+      h("form", { method: "dialog", class: "row" },
+        h("button", { class: danger ? "danger" : "primary", value: "yes" }, confirm), h("button", { value: "no", autofocus: true }, "Cancel")));
+    dialog.returnValue = "no";
+    dialog.showModal();
+    return new Promise((resolve) => dialog.addEventListener("close", () => resolve(dialog.returnValue === "yes"), { once: true }));
+  }
+
+  follow() {
+    const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/api/jobs`);
+    socket.onopen = () => { this.connected = true; this.jobs.clear(); showConnection(); };
+    socket.onclose = () => { this.connected = false; showConnection(); setTimeout(() => this.follow(), 1000); };
+    socket.onmessage = ({ data }) => {
+      const { job, lines } = JSON.parse(data);
+      const known = this.jobs.get(job.number);
+      job.lines = [...(known?.lines ?? []), ...lines].slice(-2000);
+      this.jobs.set(job.number, job);
+      showRunning();
+      this.dispatchEvent(new CustomEvent("job", { detail: job }));
+      shown?.job?.(job);
+    };
+  }
+}
+
+async function ask(address, options) {
+  let response;
+  try {
+    response = await fetch(address, options);
+  } catch {
+    throw new Error("the server of this page does not answer: is `ibrobot ui` still running?");
+  }
+  const answer = response.headers.get("Content-Type")?.startsWith("application/json") ? await response.json() : null;
+  if (!response.ok) {
+    const error = new Error(answer?.error ?? (await response.text()));
+    error.problems = answer?.problems ?? [];
+    throw error;
+  }
+  return answer;
+}
+
+const ui = new Ui();
+const views = new Map();
+let shown, current = "";
+window.ibrobot = ui; // for tests and for the console
+
+// The address after # is VIEW or VIEW/REST; a view gets the rest.
+function address() {
+  const [name, ...rest] = location.hash.slice(1).split("/");
+  const known = ui.session.views.some((view) => view.name === name);
+  return known ? [name, decodeURIComponent(rest.join("/"))] : [ui.session.views[0].name, ""];
+}
+
+async function showView() {
+  const [name, rest] = address();
+  for (const link of $("nav").children) {
+    if (link.dataset.name === name) link.setAttribute("aria-current", "page");
+    else link.removeAttribute("aria-current");
+  }
+  document.title = `ibrobot: ${ui.session.views.find((view) => view.name === name).title}`;
+  if (current !== name) {
+    current = name;
+    if (!views.has(name)) {
+      const { View } = await import(`./ui/${name}.js`);
+      const view = new View(ui);
+      view.element = h("div", { id: `view-${name}` });
+      view.mount(view.element);
+      views.set(name, view);
+    }
+    if (current !== name) return; // left meanwhile
+    shown?.show?.(false);
+    shown = views.get(name);
+    $("main").replaceChildren(shown.element);
+  }
+  shown?.show?.(true, rest);
+}
+
+function showConnection() {
+  say($("connection"), ui.connected ? "" : "not connected: is `ibrobot ui` running?");
+  $("connection").classList.toggle("bad", !ui.connected);
+}
+
+function showRunning() {
+  const running = [...ui.jobs.values()].filter((job) => job.state === "running");
+  refresh($("busy"), running.map((job) => [job.number, job.facts.url]), () => running.map((job) => (job.facts.url
+    ? h("a", { class: "chip good", href: job.facts.url, target: "_blank" }, `${job.title}: open its page`)
+    : h("a", { class: "chip good", href: "#jobs" }, job.title))));
+}
+
+$("theme").addEventListener("click", () => {
+  const dark = document.documentElement.dataset.theme
+    ? document.documentElement.dataset.theme === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
+  document.documentElement.dataset.theme = dark ? "light" : "dark";
+  localStorage.setItem("theme", dark ? "light" : "dark");
+});
+window.addEventListener("hashchange", () => { showView(); $("main").focus(); });
+window.addEventListener("focus", () => shown?.show?.(true, address()[1]));
+ui.session = await ui.get("session");
+say($("folder"), ui.session.folders.join(" · "));
+say($("role"), ui.drives ? "" : "watching only");
+$("nav").append(...ui.session.views.map(({ name, title }) => h("a", { href: `#${name}`, "data-name": name }, title)));
+ui.follow();
+showView();

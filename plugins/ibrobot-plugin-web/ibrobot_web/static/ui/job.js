@@ -1,0 +1,59 @@
+// A card that shows a job: state, progress, output, and the button that ends it.
+
+import { h, refresh, say } from "../dom.js";
+
+const STATES = { running: "running", done: "done", failed: "failed", cancelled: "ended" };
+
+export class JobCard {
+  // `open`: whether the output is shown at once.
+  constructor(ui, { open = false } = {}) {
+    this.ui = ui;
+    this.shownLines = 0;
+    this.state = h("span", { class: "state", role: "status" });
+    this.title = h("h3", {});
+    this.controls = h("div", { class: "row" });
+    this.progress = h("progress", { max: "1", "aria-label": "Progress", hidden: true });
+    this.facts = h("p", {});
+    this.error = h("div", {});
+    this.output = h("pre", { class: "output", tabindex: "0", "aria-label": "Output" });
+    this.details = h("details", { open }, h("summary", {}, "Output"), this.output);
+    this.element = h("div", { class: "card job" }, h("div", { class: "row" }, this.title, this.state), this.progress,
+      this.facts, this.error, this.controls, this.details);
+  }
+
+  update(job) {
+    say(this.title, job.title);
+    say(this.state, job.cancelling && job.state === "running" ? "ending …" : STATES[job.state]);
+    this.state.className = `state ${job.state}`;
+    const { progress } = job.facts;
+    this.progress.hidden = progress === undefined || job.state !== "running";
+    if (progress !== undefined) this.progress.value = progress;
+    say(this.facts, job.facts.text ?? "");
+    refresh(this.error, [job.state, job.exit_code], () => (job.state === "failed" ? failure(job) : []));
+    refresh(this.controls, [job.state, job.cancelling, job.facts.url, this.ui.drives], () => this.buttons(job));
+    const text = job.lines.join("\n");
+    if (this.output.textContent !== text) {
+      const atEnd = this.output.scrollHeight - this.output.scrollTop - this.output.clientHeight < 30;
+      this.output.textContent = text;
+      if (atEnd) this.output.scrollTop = this.output.scrollHeight;
+    }
+  }
+
+  buttons(job) {
+    if (job.state !== "running") return [];
+    const open = job.facts.url
+      ? h("a", { class: "button primary", href: job.facts.url, target: "_blank" }, "Open the robot's page") : null;
+    const end = h("button", {
+      class: "danger", disabled: !this.ui.drives,
+      onclick: () => this.ui.attempt(() => this.ui.post("jobs/cancel", { number: job.number })),
+    }, job.cancelling ? "End it at once" : job.kind === "run" ? "Stop the run" : "Cancel");
+    return [open, end].filter(Boolean);
+  }
+}
+
+// Why a job failed: its error lines in full, or else its last lines.
+export function failure(job) {
+  const errors = job.lines.filter((line) => line.startsWith("error: "));
+  const text = errors.length ? errors.map((line) => line.slice("error: ".length)) : job.lines.slice(-8);
+  return [h("div", { class: "problem", role: "alert" }, [`exit code ${job.exit_code}`, ...text].join("\n"))];
+}

@@ -1,0 +1,107 @@
+"""`ibrobot ui`: serves a page without a running robot."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import signal
+import sys
+import threading
+import webbrowser
+from pathlib import Path
+
+import click
+from aiohttp import web
+
+from ibrobot_core.api import LogFormatter, echo, end_signals
+from ibrobot_web.desktop import has_desktop
+from ibrobot_web.options import WebOptions
+from ibrobot_web.server.guard import Guard
+from ibrobot_web.server.listening import host_names, listen, tls_of
+from ibrobot_web.ui.context import Ui
+from ibrobot_web.ui.folders import Folders
+from ibrobot_web.ui.job_runner import Jobs
+from ibrobot_web.ui.server import make_app
+
+_CLOSE_S = 1.0
+
+
+@click.command()
+@click.argument(
+    "folders", nargs=-1, metavar="[FOLDER]...", type=click.Path(exists=True, file_okay=False, path_type=Path)
+)
+@click.option("--port", type=click.IntRange(0, 65535), default=8090, show_default=True, help="0: any free port.")
+@click.option("--no-browser", is_flag=True, help="Do not open the page in the browser of this desktop.")
+@click.option("--host", default="127.0.0.1", show_default=True, help="Address; beyond this machine it needs TLS.")
+@click.option("--certificate", type=click.Path(path_type=Path), help="TLS certificate, with its chain.")
+@click.option("--key", type=click.Path(path_type=Path), help="Private key of the certificate.")
+@click.option("--name", "names", multiple=True, help="Further host name of this machine in browsers.")
+def ui(
+    folders: tuple[Path, ...], port: int, no_browser: bool, host: str, certificate: Path | None, key: Path | None,
+    names: tuple[str, ...],
+) -> None:  # fmt: skip
+    """Set up, launch and record robots in the browser.
+
+    Reads and writes the files of each FOLDER, and no others; of the current folder by default. Prints the address of
+    the page, which contains a token. Ctrl-C ends the page, and every run and job that it started.
+    """
+    try:
+        options = WebOptions(host=host, port=port, names=names, certificate=certificate, key=key)
+    except ValueError as error:
+        raise click.UsageError(str(error)) from None
+    opened = Folders(folders or (Path(),))
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(LogFormatter("%(levelname).1s %(message)s"))
+    logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
+    jobs = Jobs(opened.first)
+    try:
+        asyncio.run(_serve(options, Ui(opened, jobs, _run_options(options)), browser=not no_browser))
+    finally:
+        jobs.close()
+
+
+def _run_options(options: WebOptions) -> tuple[str, ...]:
+    """The options of runs, whose pages are served where this one is."""
+    values = {"port": 0, "browser": "false", "host": options.host}
+    if options.certificate is not None and options.key is not None:
+        values |= {"certificate": str(options.certificate.resolve()), "key": str(options.key.resolve())}
+    if options.names:
+        values["names"] = f"[{', '.join(options.names)}]"
+    return ("--web", *(word for key, value in values.items() for word in ("--set", f"viewer.{key}={value}")))
+
+
+async def _serve(options: WebOptions, context: Ui, *, browser: bool) -> None:
+    """Serve until a signal."""
+    certificate, key = (str(path) if path is not None else None for path in (options.certificate, options.key))
+    tls = tls_of("", certificate, key)
+    names = host_names(options.host, options.names)
+    guard = Guard(names, secure=tls is not None)
+    listening = listen("", options.host, options.port, "--port 0")
+    port = listening.getsockname()[1]
+    guard.listen_on(port)
+    runner = web.AppRunner(make_app(guard, context), access_log=None, shutdown_timeout=_CLOSE_S)
+    await runner.setup()
+    try:
+        await web.SockSite(runner, listening, ssl_context=tls).start()
+        address = f"{'https' if tls else 'http'}://{names[0]}:{port}{guard.path('drive')}"
+        echo(f"page: {address}")
+        sys.stdout.flush()
+        if browser and has_desktop():
+            threading.Thread(target=webbrowser.open, args=(address,), name="browser", daemon=True).start()
+        await _ended()
+    finally:
+        await runner.cleanup()
+
+
+async def _ended() -> None:
+    """Return at the first signal that ends a command; a second Ctrl-C ends it at once."""
+    loop = asyncio.get_running_loop()
+    ended = asyncio.Event()
+    for number in end_signals():
+        loop.add_signal_handler(number, ended.set)
+    await ended.wait()
+    for number in end_signals():
+        with contextlib.suppress(ValueError):
+            loop.remove_signal_handler(number)
+    signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -1,0 +1,42 @@
+"""The folders that the page may read and write; every path of a request is confined to them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from ibrobot_core.api import IbrobotError
+
+
+class Folders:
+    """The opened folders.
+
+    Args:
+        paths: existing folders; relative paths of requests start at the first.
+    """
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        self.paths = tuple(path.resolve() for path in paths)
+
+    @property
+    def first(self) -> Path:
+        """The folder in which jobs run."""
+        return self.paths[0]
+
+    def find(self, text: str) -> Path:
+        """The path that a request names, with links resolved; it need not exist.
+
+        Raises:
+            IbrobotError: if it is outside the opened folders.
+        """
+        if "\0" in text:
+            raise IbrobotError("a path contains a zero character")
+        path = (self.first / text).resolve()
+        if not any(path.is_relative_to(folder) for folder in self.paths):
+            opened = ", ".join(map(str, self.paths))
+            raise IbrobotError(f"{text} is outside the opened folders ({opened}); open its folder: ibrobot ui FOLDER")
+        return path
+
+    def name(self, path: Path) -> str:
+        """A path as the page shows it, and as `find` reads it: relative to the first folder, or absolute."""
+        return str(path.relative_to(self.first)) if path.is_relative_to(self.first) else str(path)

@@ -1,0 +1,228 @@
+"""Jobs: commands that run as child processes, with their output, progress and result."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import attrs
+
+from ibrobot_core.api import IbrobotError
+
+IBROBOT = (sys.executable, "-c", "from ibrobot_core.cli.command import main; main()")
+"""The command `ibrobot` of this environment, whatever PATH says."""
+LINES = 2000
+"""Lines of output that are kept of a job."""
+_ENDED = 50
+"""Ended jobs that are kept."""
+_END_S = 20.0
+"""Time that jobs get to end by themselves when the page's server ends [s]."""
+_CHUNK = 65536
+_LONGEST = 4000
+"""Longest line [characters]; the rest of a longer one is left out."""
+
+_CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]|[\x00-\x08\x0b-\x1f\x7f]")
+"""Colours, motions of the cursor and other control characters."""
+
+Reader = Callable[[str], Mapping[str, Any] | None]
+"""Reads facts from a line of output, e.g. `{"progress": 0.5}`; None if the line contains none."""
+State = Literal["running", "done", "failed", "cancelled"]
+
+
+@attrs.define(eq=False)
+class Job:
+    """A command that runs or has run."""
+
+    number: int
+    kind: str
+    """What the views look for, e.g. `run` or `convert`."""
+    title: str
+    command: tuple[str, ...]
+    """Arguments of the command, for the page."""
+    process: subprocess.Popen[bytes] = attrs.field(repr=False)
+    facts: dict[str, Any] = attrs.field(factory=dict)
+    """What is known about the job; `progress` is between 0 and 1."""
+    state: State = "running"
+    exit_code: int | None = None
+    started_s: float = attrs.field(factory=time.time)
+    ended_s: float | None = None
+    count: int = 0
+    """Number of lines so far."""
+    lines: deque[str] = attrs.field(factory=lambda: deque[str](maxlen=LINES), repr=False)
+    version: int = 0
+    cancelling: bool = False
+
+    def json(self) -> dict[str, Any]:
+        """The job for a page, without its lines."""
+        return {
+            "number": self.number, "kind": self.kind, "title": self.title, "command": " ".join(self.command),
+            "facts": self.facts, "state": self.state, "exit_code": self.exit_code, "started_s": self.started_s,
+            "ended_s": self.ended_s, "cancelling": self.cancelling,
+        }  # fmt: skip
+
+
+class Jobs:
+    """Starts, lists and ends jobs. Thread-safe.
+
+    Args:
+        folder: the working directory of jobs.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._jobs: dict[int, Job] = {}
+        self._threads: list[threading.Thread] = []
+        self._lock = threading.Lock()
+        self._closed = False
+        self.version = 0
+        """Counts changes; a job's `version` is that of its newest change."""
+        self.listeners: set[Callable[[], None]] = set()
+        """Called after every change, in any thread."""
+
+    def start(
+        self, kind: str, title: str, arguments: Sequence[str], *, facts: Mapping[str, Any] | None = None,
+        read: Reader | None = None, program: Sequence[str] = IBROBOT,
+    ) -> Job:  # fmt: skip
+        """Start a job.
+
+        Args:
+            kind: what the views look for.
+            title: its name on the page.
+            arguments: of the program, e.g. `["convert", …]`.
+            facts: what is known about it at the start.
+            read: reads facts from each line of its output.
+            program: the program; the command `ibrobot` by default.
+
+        Raises:
+            IbrobotError: if the program cannot be started.
+        """
+        with self._lock:
+            if self._closed:
+                raise IbrobotError("the page's server is ending")
+            try:
+                process = subprocess.Popen(
+                    [*program, *arguments], cwd=self._folder, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+                    stderr=subprocess.STDOUT, start_new_session=True, env={**os.environ, "PYTHONUNBUFFERED": "1"},
+                )  # fmt: skip
+            except OSError as error:
+                raise IbrobotError(f"{program[0]} cannot be started: {error.strerror}") from None
+            name = "ibrobot" if tuple(program) == IBROBOT else Path(program[0]).name
+            number = max(self._jobs, default=0) + 1
+            job = Job(number, kind, title, (name, *arguments), process, dict(facts or {}))
+            self._jobs[number] = job
+            self._forget()
+            thread = threading.Thread(target=self._follow, args=(job, read), name=f"job {number}", daemon=True)
+            self._threads = [each for each in self._threads if each.is_alive()] + [thread]
+            thread.start()
+        self._change(job)
+        return job
+
+    def all(self) -> list[Job]:
+        """The jobs, oldest first."""
+        with self._lock:
+            return list(self._jobs.values())
+
+    def get(self, number: Any) -> Job:
+        """The job with a number.
+
+        Raises:
+            IbrobotError: if there is none.
+        """
+        with self._lock:
+            job = self._jobs.get(number) if isinstance(number, int) else None
+        if job is None:
+            raise IbrobotError(f"no job {number}")
+        return job
+
+    def cancel(self, number: Any) -> None:
+        """End a job as Ctrl-C does; the second time at once.
+
+        Raises:
+            IbrobotError: if there is no such job.
+        """
+        job = self.get(number)
+        _signal(job, signal.SIGKILL if job.cancelling else signal.SIGINT)
+        job.cancelling = True
+        self._change(job)
+
+    def close(self) -> None:
+        """End all jobs, and wait for them."""
+        with self._lock:
+            self._closed = True
+            running = [job for job in self._jobs.values() if job.state == "running"]
+            threads = list(self._threads)
+        for job in running:
+            job.cancelling = True
+            _signal(job, signal.SIGINT)
+        deadline_s = time.monotonic() + _END_S
+        for job in running:
+            try:
+                job.process.wait(max(0.0, deadline_s - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                _signal(job, signal.SIGKILL)
+        for thread in threads:
+            thread.join()
+
+    def lines_after(self, job: Job, count: int) -> tuple[int, list[str]]:
+        """The lines of a job after the first `count`, as far as they are kept, and the number of lines in all."""
+        with self._lock:
+            new = min(job.count - count, len(job.lines))
+            return job.count, list(job.lines)[len(job.lines) - new :] if new > 0 else []
+
+    def _follow(self, job: Job, read: Reader | None) -> None:
+        """Take the output of a job until it ends."""
+        output = job.process.stdout
+        assert output is not None
+        rest = b""
+        while chunk := os.read(output.fileno(), _CHUNK):
+            *lines, rest = (rest + chunk).replace(b"\r\n", b"\n").replace(b"\r", b"\n").split(b"\n")
+            self._take(job, lines, read)
+            rest = rest[-_LONGEST:]
+        self._take(job, [rest] if rest else [], read)
+        output.close()
+        code = job.process.wait()
+        with self._lock:
+            job.exit_code, job.ended_s = code, time.time()
+            job.state = "done" if code == 0 else "cancelled" if job.cancelling else "failed"
+        self._change(job)
+
+    def _take(self, job: Job, lines: Sequence[bytes], read: Reader | None) -> None:
+        texts = [_CONTROL.sub("", line.decode(errors="replace"))[:_LONGEST] for line in lines]
+        with self._lock:
+            job.lines.extend(texts)
+            job.count += len(texts)
+            for text in texts if read is not None else ():
+                assert read is not None
+                job.facts.update(read(text) or {})
+        if texts:
+            self._change(job)
+
+    def _change(self, job: Job) -> None:
+        with self._lock:
+            self.version += 1
+            job.version = self.version
+            listeners = list(self.listeners)
+        for listener in listeners:
+            listener()
+
+    def _forget(self) -> None:
+        ended = [number for number, job in self._jobs.items() if job.state != "running"]
+        for number in ended[: max(0, len(ended) - _ENDED)]:
+            del self._jobs[number]
+
+
+def _signal(job: Job, number: signal.Signals) -> None:
+    if job.state == "running":
+        try:
+            os.killpg(job.process.pid, number)
+        except ProcessLookupError:
+            return

@@ -1,0 +1,167 @@
+"""The web application of `ibrobot ui`: its page, the views' requests, and the stream of jobs."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import functools
+import json
+import logging
+from collections.abc import Mapping
+from importlib import import_module
+from typing import Any
+
+import attrs
+from aiohttp import WSMsgType, web
+
+from ibrobot_core.api import ConfigError, IbrobotError, error_text
+from ibrobot_web.server.app import STATIC, Files
+from ibrobot_web.server.guard import Guard
+from ibrobot_web.ui.context import Blob, Handler, Ui
+from ibrobot_web.ui.job_runner import Job
+
+VIEWS = {
+    "jobs": "Jobs",
+}
+"""Name -> title in the navigation. The module `ibrobot_web.ui.NAME` has the view's `ROUTES`; `static/ui/NAME.js` shows
+it."""
+LARGEST_REQUEST = 1 << 20
+"""Largest body of a request [bytes]."""
+_HEARTBEAT_S = 5.0
+_JOBS_S = 0.1
+"""Shortest time between two messages about jobs [s]."""
+_UI: web.AppKey[Ui] = web.AppKey("ui", Ui)
+_log = logging.getLogger("ibrobot.ui")
+
+
+def make_app(guard: Guard, ui: Ui) -> web.Application:
+    """The application.
+
+    Args:
+        guard: admits requests.
+        ui: what views work with.
+    """
+    app = web.Application(middlewares=[guard.middleware, _errors], client_max_size=LARGEST_REQUEST)
+    app[_UI] = ui
+    app.on_response_prepare.append(guard.add_headers)
+    files = Files({"/static": STATIC})
+    page = (STATIC / "ui.html").read_text(encoding="utf-8")
+
+    async def index(request: web.Request) -> web.StreamResponse:
+        return web.Response(text=page, content_type="text/html")
+
+    async def session(request: web.Request) -> web.StreamResponse:
+        folders = [str(path) for path in ui.folders.paths]
+        views = [{"name": name, "title": title} for name, title in VIEWS.items()]
+        return web.json_response({"role": guard.session(request).role, "folders": folders, "views": views})
+
+    async def follow(request: web.Request) -> web.StreamResponse:
+        socket = web.WebSocketResponse(heartbeat=_HEARTBEAT_S, max_msg_size=LARGEST_REQUEST, compress=False)
+        await socket.prepare(request)
+        await _send_jobs(socket, ui)
+        return socket
+
+    app.router.add_get("/", index)
+    app.router.add_get("/api/session", session)
+    app.router.add_get("/api/jobs", follow)
+    app.router.add_get("/static/{path:.*}", files.serve)
+    for name in VIEWS:
+        for route, handler in routes_of(name).items():
+            method, path = route.split()
+            app.router.add_route(method, f"/api/{name}{path}", functools.partial(_answer, handler, guard))
+    return app
+
+
+def routes_of(view: str) -> dict[str, Handler]:
+    """The requests of a view, e.g. `GET /list`, and what answers each."""
+    routes: dict[str, Handler] = import_module(f"ibrobot_web.ui.{view}").ROUTES
+    return routes
+
+
+async def _answer(handler: Handler, guard: Guard, request: web.Request) -> web.StreamResponse:
+    """Answer a view's request, in a thread. Sessions for watching may only GET, which changes nothing."""
+    if request.method == "GET":
+        facts: Mapping[str, Any] = dict(request.query)
+    else:
+        if guard.session(request).role != "drive":
+            raise IbrobotError("this link is for watching only")
+        facts = await _body(request)
+    answer = await asyncio.to_thread(handler, request.app[_UI], facts)
+    if isinstance(answer, Blob):
+        return web.Response(body=answer.content, content_type=answer.content_type)
+    return web.json_response(answer, dumps=_dumps)
+
+
+async def _body(request: web.Request) -> Mapping[str, Any]:
+    if request.content_type != "application/json":
+        raise IbrobotError("a request must be JSON")
+    try:
+        body = json.loads(await request.read())
+    except (ValueError, RecursionError):
+        raise IbrobotError("a request must be JSON") from None
+    if not isinstance(body, dict):
+        raise IbrobotError("a request must be a JSON object")
+    return body
+
+
+def _dumps(value: Any) -> str:
+    return json.dumps(value, separators=(",", ":"), allow_nan=False)
+
+
+@web.middleware
+async def _errors(request: web.Request, handler: Any) -> web.StreamResponse:
+    """Answer with the errors that a page shows."""
+    try:
+        response: web.StreamResponse = await handler(request)
+    except ConfigError as error:
+        problems = [{**attrs.asdict(each), "file": str(each.file)} for each in error.problems]
+        return web.json_response({"error": str(error), "problems": problems}, status=400)
+    except IbrobotError as error:
+        return web.json_response({"error": str(error)}, status=400)
+    except web.HTTPException:
+        raise
+    except Exception as error:  # noqa: BLE001 - contained: a request must not end the server
+        _log.exception("%s %s failed", request.method, request.path)
+        return web.json_response({"error": error_text(error)}, status=500)
+    return response
+
+
+async def _send_jobs(socket: web.WebSocketResponse, ui: Ui) -> None:
+    """Send all jobs, and then each change, until the page is gone."""
+    loop = asyncio.get_running_loop()
+    changed = asyncio.Event()
+
+    def notify() -> None:
+        with contextlib.suppress(RuntimeError):  # the server has ended
+            loop.call_soon_threadsafe(changed.set)
+
+    ui.jobs.listeners.add(notify)
+    sending = asyncio.create_task(_send_changes(socket, ui, changed))
+    try:
+        async for message in socket:
+            if message.type is WSMsgType.ERROR:
+                break
+    finally:
+        ui.jobs.listeners.discard(notify)
+        sending.cancel()
+        await asyncio.gather(sending, return_exceptions=True)
+
+
+async def _send_changes(socket: web.WebSocketResponse, ui: Ui, changed: asyncio.Event) -> None:
+    sent: dict[int, tuple[int, int]] = {}
+    """Number of a job -> its version and its number of lines, as sent."""
+    while True:
+        changed.clear()
+        for job in ui.jobs.all():
+            version, count = sent.get(job.number, (-1, 0))
+            if job.version != version:
+                sent[job.number] = await _send_job(socket, ui, job, count)
+        await changed.wait()
+        await asyncio.sleep(_JOBS_S)
+
+
+async def _send_job(socket: web.WebSocketResponse, ui: Ui, job: Job, count: int) -> tuple[int, int]:
+    version = job.version
+    total, lines = ui.jobs.lines_after(job, count)
+    await socket.send_str(_dumps({"job": job.json(), "lines": lines}))
+    return version, total
