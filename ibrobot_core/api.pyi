@@ -177,6 +177,7 @@ from ibrobot_core.control.link import ControlState as ControlState
 from ibrobot_core.control.spline import Spline as Spline
 from ibrobot_core.launch.runtime import SET_MODE as SET_MODE, Runtime as Runtime
 from ibrobot_core.cli.run import run_robot as run_robot
+from ibrobot_core.launch.absence import absent_sensors as absent_sensors, describe_absent as describe_absent
 from ibrobot_core.launch.models import check_models as check_models
 from ibrobot_core.cli.options import run_options as run_options, run_overrides as run_overrides
 from ibrobot_core.run_hooks import RunHooks as RunHooks
@@ -229,7 +230,12 @@ from ibrobot_core.config import (
     from_document as from_document,
     load_config as load_config,
 )
-from ibrobot_core.config.load import contract_alone as contract_alone, read_document as read_document
+from ibrobot_core.config.load import (
+    contract_alone as contract_alone,
+    read_document as read_document,
+    shipped_configs as shipped_configs,
+)
+from ibrobot_core.config.missing import unavailable_modes as unavailable_modes
 from ibrobot_core.config.schema import (
     TASK_KEY as TASK_KEY,
     Align as Align,

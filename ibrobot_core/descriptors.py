@@ -188,7 +188,9 @@ class ViewerDescriptor(Descriptor["interfaces.Viewer"]):
     """A viewer."""
 
     flag: str = ""
-    """Flag of the command line that that runs the robot with this viewer, e.g. `--window`."""
+    """Flag of the command line that runs the robot with this viewer, e.g. `--window`."""
+    begins_episodes: bool = False
+    """Whether an operator can begin and end episodes in it."""
 
 
 @attrs.frozen

@@ -35,7 +35,7 @@ def check(
     """Report all faults of CONFIG; exit with 2 if there are any."""
     from ibrobot_core.config import find_config, load_config
     from ibrobot_core.config.missing import unavailable_modes
-    from ibrobot_core.launch.absence import absent_sensors, describe
+    from ibrobot_core.launch.absence import absent_sensors, describe_absent
     from ibrobot_core.launch.models import check_models
 
     try:
@@ -57,7 +57,7 @@ def check(
     echo(f"modes: {', '.join(found.control_modes)}; starts in {found.default_control_mode}")
     for line in unavailable_modes(found.unavailable):
         echo(f"note: {line}")
-    if absent := describe(absent_sensors(found, installed_plugins())):
+    if absent := describe_absent(absent_sensors(found, installed_plugins())):
         echo(f"note: runs start without {absent}")
     for line in models:
         echo(line)

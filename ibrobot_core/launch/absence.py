@@ -45,7 +45,7 @@ def absent_sensors(config: RobotConfig, registry: Registry) -> tuple[AbsentSenso
     return tuple(absent)
 
 
-def describe(absent: Iterable[AbsentSensor]) -> str:
+def describe_absent(absent: Iterable[AbsentSensor]) -> str:
     """The absent sensors, their missing dependencies and the remedies, on one line; empty if none are absent."""
     return "; and ".join(f"{labels}: {missing}" for missing, labels in by_cause(absent))
 

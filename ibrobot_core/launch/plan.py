@@ -12,7 +12,7 @@ from ibrobot_core.config.missing import unavailable_modes
 from ibrobot_core.config.schema import ActionSpec, ObservationSpec, PeripheralConfig
 from ibrobot_core.descriptors import SourceDescriptor, TransportDescriptor
 from ibrobot_core.errors import ComponentFailed, NotSupported, PluginNotInstalled
-from ibrobot_core.launch.absence import describe
+from ibrobot_core.launch.absence import describe_absent
 from ibrobot_core.launch.control import ControlComponent
 from ibrobot_core.launch.outputs.status import Status
 from ibrobot_core.launch.outputs.viewer import ViewerWorker
@@ -161,7 +161,7 @@ def build_plan(session: Session) -> LaunchPlan:
     if session.simulates_episodes:
         simulated = SimulatedEpisodes(session, (added.components()[-1].name,))
         components.append(simulated)
-    without = describe(session.absent)
+    without = describe_absent(session.absent)
     return LaunchPlan(tuple(_ordered(components)), link, added, simulated, without, config.unavailable)
 
 

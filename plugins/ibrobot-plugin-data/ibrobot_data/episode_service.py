@@ -44,6 +44,7 @@ class EpisodeService(Episodes):
 
     Attributes:
         by_mode: whether the mode begins and ends episodes, so that an operator can only watch.
+        wanted: number of episodes after which the run ends; None: it does not end by itself.
 
     Raises:
         RecorderError: if the dataset has another contract or cannot be written, or if `recording.topics` leaves out a
@@ -53,6 +54,7 @@ class EpisodeService(Episodes):
     def __init__(self, session: Session, recording: RecordingWorker) -> None:
         super().__init__(session)
         self._recording = recording
+        self.wanted: int | None = None
         self.by_mode = session.simulates_episodes or not session.request.by_operator
         self._lock = threading.Lock()
         config = session.config.recording
@@ -164,7 +166,7 @@ class EpisodeService(Episodes):
         """The state of recording, for a user interface."""
         failure = self._recording.failure
         return {
-            "recording": self.running, "episode": self.number, "saved": self.saved,
+            "recording": self.running, "episode": self.number, "saved": self.saved, "wanted": self.wanted,
             "prompt": self.prompt, "elapsed_s": round(self.elapsed_s(), 2),
             "max_duration_s": self._session.config.contract.max_duration_s,
             "rates_hz": {topic: round(rate, 1) for topic, rate in self._recording.rates().items()},

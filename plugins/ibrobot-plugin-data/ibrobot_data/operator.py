@@ -14,6 +14,7 @@ from ibrobot_core.api import (
     RunHooks,
     Session,
     TeleopDescriptor,
+    ViewerDescriptor,
     seconds,
 )
 from ibrobot_data.episode_service import EpisodeService
@@ -55,7 +56,8 @@ class Operator(RunHooks):
             )
         self._run = run
         self._service = service
-        self._count = count
+        self._count = service.wanted = count
+        self._keys = keys
         self._reset_time_s = reset_time_s
         self._prompt = prompt
         self._auto = auto or continuous
@@ -173,7 +175,7 @@ class Operator(RunHooks):
         pause_s = self._not_before_s - self._clock_s()
         if pause_s > 0:
             return f"set up the scene again, {pause_s:.0f} s"
-        return "waiting" if self._auto or self._service.by_mode else "waiting: Tab starts"
+        return "waiting: Tab starts" if self._keys and not (self._auto or self._service.by_mode) else "waiting"
 
     def _saved(self) -> str:
         saved = self._service.saved
@@ -229,7 +231,12 @@ class Operator(RunHooks):
 
 
 def _has_start_button(run: Session) -> bool:
-    """Whether a teleoperation device of the mode can begin episodes."""
+    """Whether the viewer, or a teleoperation device of the mode, can begin episodes."""
+    if (viewer := run.config.viewer) is not None:
+        shown_by = run.registry.find("viewer", viewer.type)
+        assert isinstance(shown_by, ViewerDescriptor)
+        if shown_by.begins_episodes:
+            return True
     for name in run.config.control_modes[run.mode].devices.values():
         device = run.config.teleoperation[name]
         descriptor = run.registry.find("teleop", device.type)

@@ -36,7 +36,7 @@ def _check_viewer(options: WebOptions, robot: Robot, joints: tuple[str, ...]) ->
 def ibrobot_viewers() -> Iterable[ViewerDescriptor]:
     """A page in the browser."""
     yield ViewerDescriptor(
-        type="web", options=WebOptions, make=_viewer, check_options=_check_viewer, flag="--web",
+        type="web", options=WebOptions, make=_viewer, check_options=_check_viewer, flag="--web", begins_episodes=True,
         summary="a page in the browser, which shows and drives the robot",
     )  # fmt: skip
 

@@ -95,7 +95,7 @@ def test_a_job_streams_its_output_its_progress_and_its_end(tmp_path: Path) -> No
         server.ui.jobs.start("convert", "Convert", [code], program=PYTHON, read=read)
         job, lines = await server.job(lambda job: job["state"] == "failed")
         assert (job["exit_code"], job["facts"], job["title"]) == (2, {"progress": 0.5}, "Convert")
-        assert lines == ["at: 0.5", "red", "50%", "", "error: no disk"]
+        assert lines == ["at: 0.5", "red", "50%", "error: no disk"]
 
     run(tmp_path, test)
 

@@ -33,6 +33,11 @@ _LONGEST = 4000
 _CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]|[\x00-\x08\x0b-\x1f\x7f]")
 """Colours, motions of the cursor and other control characters."""
 
+_END = re.compile(rb"\r\n|\n|\r(?!\Z)")
+"""The end of a line; whether a final CR is one shows in what follows it."""
+_TOKEN = re.compile(r"(?<=[?&]token=)[\w-]+")
+"""Tokens in output, which not every page may see."""
+
 Reader = Callable[[str], Mapping[str, Any] | None]
 """Reads facts from a line of output, e.g. `{"progress": 0.5}`; None if the line contains none."""
 State = Literal["running", "done", "failed", "cancelled"]
@@ -61,11 +66,14 @@ class Job:
     version: int = 0
     cancelling: bool = False
 
-    def json(self) -> dict[str, Any]:
-        """The job for a page, without its lines."""
+    def json(self, *, drives: bool = True) -> dict[str, Any]:
+        """The job for a page, without its lines; pages that only watch get `watch_url` in place of `url`."""
+        facts = {name: value for name, value in self.facts.items() if name not in ("url", "watch_url")}
+        if url := self.facts.get("url" if drives else "watch_url"):
+            facts["url"] = url
         return {
             "number": self.number, "kind": self.kind, "title": self.title, "command": " ".join(self.command),
-            "facts": self.facts, "state": self.state, "exit_code": self.exit_code, "started_s": self.started_s,
+            "facts": facts, "state": self.state, "exit_code": self.exit_code, "started_s": self.started_s,
             "ended_s": self.ended_s, "cancelling": self.cancelling,
         }  # fmt: skip
 
@@ -184,10 +192,10 @@ class Jobs:
         assert output is not None
         rest = b""
         while chunk := os.read(output.fileno(), _CHUNK):
-            *lines, rest = (rest + chunk).replace(b"\r\n", b"\n").replace(b"\r", b"\n").split(b"\n")
+            *lines, rest = _END.split(rest + chunk)
             self._take(job, lines, read)
             rest = rest[-_LONGEST:]
-        self._take(job, [rest] if rest else [], read)
+        self._take(job, [rest.rstrip(b"\r")] if rest else [], read)
         output.close()
         code = job.process.wait()
         with self._lock:
@@ -198,7 +206,7 @@ class Jobs:
     def _take(self, job: Job, lines: Sequence[bytes], read: Reader | None) -> None:
         texts = [_CONTROL.sub("", line.decode(errors="replace"))[:_LONGEST] for line in lines]
         with self._lock:
-            job.lines.extend(texts)
+            job.lines.extend(_TOKEN.sub("…", text) for text in texts)
             job.count += len(texts)
             for text in texts if read is not None else ():
                 assert read is not None

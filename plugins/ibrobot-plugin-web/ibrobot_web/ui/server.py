@@ -18,9 +18,10 @@ from ibrobot_core.api import ConfigError, IbrobotError, error_text
 from ibrobot_web.server.app import STATIC, Files
 from ibrobot_web.server.guard import Guard
 from ibrobot_web.ui.context import Blob, Handler, Ui
-from ibrobot_web.ui.job_runner import Job
 
 VIEWS = {
+    "robots": "Robots",
+    "record": "Record",
     "jobs": "Jobs",
 }
 """Name -> title in the navigation. The module `ibrobot_web.ui.NAME` has the view's `ROUTES`; `static/ui/NAME.js` shows
@@ -58,7 +59,7 @@ def make_app(guard: Guard, ui: Ui) -> web.Application:
     async def follow(request: web.Request) -> web.StreamResponse:
         socket = web.WebSocketResponse(heartbeat=_HEARTBEAT_S, max_msg_size=LARGEST_REQUEST, compress=False)
         await socket.prepare(request)
-        await _send_jobs(socket, ui)
+        await _send_jobs(socket, ui, drives=guard.session(request).role == "drive")
         return socket
 
     app.router.add_get("/", index)
@@ -126,7 +127,7 @@ async def _errors(request: web.Request, handler: Any) -> web.StreamResponse:
     return response
 
 
-async def _send_jobs(socket: web.WebSocketResponse, ui: Ui) -> None:
+async def _send_jobs(socket: web.WebSocketResponse, ui: Ui, *, drives: bool) -> None:
     """Send all jobs, and then each change, until the page is gone."""
     loop = asyncio.get_running_loop()
     changed = asyncio.Event()
@@ -136,7 +137,7 @@ async def _send_jobs(socket: web.WebSocketResponse, ui: Ui) -> None:
             loop.call_soon_threadsafe(changed.set)
 
     ui.jobs.listeners.add(notify)
-    sending = asyncio.create_task(_send_changes(socket, ui, changed))
+    sending = asyncio.create_task(_send_changes(socket, ui, changed, drives=drives))
     try:
         async for message in socket:
             if message.type is WSMsgType.ERROR:
@@ -147,7 +148,7 @@ async def _send_jobs(socket: web.WebSocketResponse, ui: Ui) -> None:
         await asyncio.gather(sending, return_exceptions=True)
 
 
-async def _send_changes(socket: web.WebSocketResponse, ui: Ui, changed: asyncio.Event) -> None:
+async def _send_changes(socket: web.WebSocketResponse, ui: Ui, changed: asyncio.Event, *, drives: bool) -> None:
     sent: dict[int, tuple[int, int]] = {}
     """Number of a job -> its version and its number of lines, as sent."""
     while True:
@@ -155,13 +156,9 @@ async def _send_changes(socket: web.WebSocketResponse, ui: Ui, changed: asyncio.
         for job in ui.jobs.all():
             version, count = sent.get(job.number, (-1, 0))
             if job.version != version:
-                sent[job.number] = await _send_job(socket, ui, job, count)
+                version = job.version
+                total, lines = ui.jobs.lines_after(job, count)
+                await socket.send_str(_dumps({"job": job.json(drives=drives), "lines": lines}))
+                sent[job.number] = (version, total)
         await changed.wait()
         await asyncio.sleep(_JOBS_S)
-
-
-async def _send_job(socket: web.WebSocketResponse, ui: Ui, job: Job, count: int) -> tuple[int, int]:
-    version = job.version
-    total, lines = ui.jobs.lines_after(job, count)
-    await socket.send_str(_dumps({"job": job.json(), "lines": lines}))
-    return version, total

@@ -30,7 +30,7 @@ export class EpisodesPanel {
     const left = episode.bytes_per_s ? ` · disk for ${Math.floor(episode.free_bytes / episode.bytes_per_s / 60)} min` : "";
     say(this.facts, episode.recording
       ? `Recording episode ${episode.episode}: ${episode.elapsed_s.toFixed(1)} of ${episode.max_duration_s} s${left}`
-      : `${episode.saved} saved${left}`);
+      : `${episode.saved}${episode.wanted ? ` of ${episode.wanted}` : ""} saved${left}`);
     this.facts.classList.toggle("recording", episode.recording);
     refresh(this.controls, [episode.recording, page.operating, episode.failure], () => this.buttons(episode));
     refresh(this.topics, [episode.rates_hz, episode.silent, episode.lost, Math.round(episode.free_bytes / MIB)], () => [

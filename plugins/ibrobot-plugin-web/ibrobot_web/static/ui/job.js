@@ -46,7 +46,7 @@ export class JobCard {
     const end = h("button", {
       class: "danger", disabled: !this.ui.drives,
       onclick: () => this.ui.attempt(() => this.ui.post("jobs/cancel", { number: job.number })),
-    }, job.cancelling ? "End it at once" : job.kind === "run" ? "Stop the run" : "Cancel");
+    }, job.cancelling ? "End it at once" : ["run", "record"].includes(job.kind) ? "Stop the run" : "Cancel");
     return [open, end].filter(Boolean);
   }
 }

@@ -1,0 +1,58 @@
+// View: choose a robot, see its problems, launch it, and stop it.
+
+import { h, refresh } from "../dom.js";
+import { Chooser } from "./chooser.js";
+import { JobCard } from "./job.js";
+
+const KINDS = ["run", "record"];
+
+export class View {
+  constructor(ui) {
+    this.ui = ui;
+    this.cards = new Map();
+    this.chooser = new Chooser(ui, () => this.enable());
+  }
+
+  mount(element) {
+    this.launch = h("button", { class: "primary", disabled: true, onclick: () => this.start() }, "Launch");
+    this.hint = h("p", { class: "note" });
+    this.runs = h("div", { class: "columns" });
+    element.append(h("h2", {}, "Robots"),
+      h("div", { class: "columns" },
+        h("section", { class: "card", "aria-label": "Choice" }, this.chooser.fields,
+          h("div", { class: "row" }, this.launch, h("a", { class: "button", href: "#record" }, "Record episodes")), this.hint),
+        h("section", { class: "card", "aria-label": "Check" }, this.chooser.report)),
+      h("h2", {}, "Runs"), this.runs);
+    this.none = h("p", { class: "note" }, "No run yet. A run opens a page of its own, which shows and drives the robot.");
+    this.runs.append(this.none);
+  }
+
+  show(shown) {
+    if (!shown) return;
+    this.chooser.load();
+    for (const job of this.ui.of(...KINDS)) this.job(job);
+  }
+
+  enable() {
+    this.launch.disabled = !this.chooser.ready || !this.ui.drives;
+    const { found, request } = this.chooser;
+    const kind = found?.modes?.find(({ name }) => name === request.mode)?.kind;
+    this.hint.textContent = found?.modes && !found.modes.some((mode) => mode.kind === "the robot's page")
+      ? "No mode of this YAML is driven from the robot's page. To jog from it, add `web: {type: web}` to `teleoperation`, and a mode with `teleop: web`."
+      : !request.sim && kind ? "Real hardware moves. Keep a hand at the power switch." : "";
+  }
+
+  async start() {
+    this.launch.disabled = true;
+    await this.ui.attempt(() => this.ui.post("robots/launch", this.chooser.request));
+    this.enable();
+  }
+
+  job(job) {
+    if (!KINDS.includes(job.kind)) return;
+    if (!this.cards.has(job.number)) this.cards.set(job.number, new JobCard(this.ui));
+    this.cards.get(job.number).update(job);
+    const numbers = this.ui.of(...KINDS).map(({ number }) => number);
+    refresh(this.runs, numbers, () => numbers.filter((n) => this.cards.has(n)).map((n) => this.cards.get(n).element));
+  }
+}

@@ -1,0 +1,71 @@
+"""View: recording sessions. A run that records, with the number of episodes still to come and the disk's free space."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ibrobot_core.api import IbrobotError, installed_plugins
+from ibrobot_web.ui.context import Handler, Ui, integer, text
+from ibrobot_web.ui.robots import read_address, run_arguments
+
+_DATASET = re.compile(r"\w[\w .-]*(?:/\w[\w .-]*)*")
+_LONGEST_PROMPT = 500
+_STATUS = re.compile(r"\| (?P<state>[^|]*), saved (?P<saved>\d+) of (?P<count>\d+)$")
+"""The end of a status line of `ibrobot record`."""
+
+
+def place(ui: Ui, facts: Mapping[str, Any]) -> dict[str, Any]:
+    """Where episodes go, how many the dataset has, how large they are, and the disk's free space."""
+    folder = _folder(ui, facts)
+    episodes = [path for path in (folder / "episodes").glob("episode_*") if path.is_dir()]
+    sizes = [sum(each.stat().st_size for each in path.rglob("*") if each.is_file()) for path in episodes]
+    existing = folder
+    while not existing.exists():
+        existing = existing.parent
+    return {
+        "folder": ui.folders.name(folder), "episodes": len(episodes), "free_bytes": shutil.disk_usage(existing).free,
+        "episode_bytes": round(sum(sizes) / len(sizes)) if sizes else None,
+    }  # fmt: skip
+
+
+def start(ui: Ui, facts: Mapping[str, Any]) -> dict[str, int]:
+    """Begin a session: `ibrobot record`, which ends by itself after the last episode."""
+    if "record" not in installed_plugins().commands:
+        raise IbrobotError("recording needs a plugin that is not installed: pip install ibrobot-plugin-data")
+    prompt, count = text(facts, "prompt", ""), integer(facts, "episodes", least=1)
+    if len(prompt) > _LONGEST_PROMPT:
+        raise IbrobotError(f"the task has {len(prompt)} characters; at most {_LONGEST_PROMPT} are possible")
+    folder = _folder(ui, facts)
+    root = ui.folders.find(text(facts, "root", "episodes"))
+    arguments = [
+        "record", *run_arguments(ui, facts), f"--root={root}", f"--dataset={folder.relative_to(root)}",
+        f"--prompt={prompt}", f"--episodes={count}",
+    ]  # fmt: skip
+    known = {"dataset": ui.folders.name(folder), "saved": 0, "episodes": count, "progress": 0.0}
+    job = ui.jobs.start("record", f"Record {folder.name}", arguments, facts=known, read=read_status)
+    return {"number": job.number}
+
+
+def _folder(ui: Ui, facts: Mapping[str, Any]) -> Path:
+    """The dataset's folder."""
+    dataset = text(facts, "dataset", "default").strip()
+    if _DATASET.fullmatch(dataset) is None:
+        raise IbrobotError(f"dataset {dataset!r}: use letters, digits, spaces, dots, - and _, e.g. pick_cube")
+    return ui.folders.find(str(Path(text(facts, "root", "episodes")) / dataset))
+
+
+def read_status(line: str) -> Mapping[str, Any] | None:
+    """The progress of a session, or the address of its page, from a line of its output."""
+    if (status := _STATUS.search(line)) is not None:
+        saved, count = int(status["saved"]), int(status["count"])
+        return {
+            "saved": saved, "progress": saved / count, "text": f"{status['state']} · {saved} of {count} episodes saved"
+        }  # fmt: skip
+    return read_address(line)
+
+
+ROUTES: dict[str, Handler] = {"GET /place": place, "POST /start": start}

@@ -1,0 +1,189 @@
+"""View: robots. Lists robot YAMLs, checks one, and launches it."""
+
+from __future__ import annotations
+
+import re
+import threading
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from ibrobot_core.api import (
+    ConfigError,
+    IbrobotError,
+    RobotConfig,
+    absent_sensors,
+    describe_absent,
+    find_config,
+    installed_plugins,
+    load_config,
+    shipped_configs,
+    unavailable_modes,
+)
+from ibrobot_web.ui.context import Handler, Ui, flag, text
+
+_ROBOT = re.compile(r"^robot:", re.MULTILINE)
+_SUMMARY = re.compile(r"\A(?:#[^\n]*\n)+")
+_DEPTH = 4
+"""Depth of folders in which robot YAMLs are found."""
+_MOST = 200
+"""Robot YAMLs that are listed."""
+_HEAD = 1 << 16
+"""Bytes of a file in which `robot:` is found."""
+_SKIPPED = frozenset({"node_modules", "site-packages", "episodes", "datasets", "outputs", "__pycache__"})
+_PAGE = re.compile(r"viewer: (?P<url>https?://\S+)(?:\s+\(to watch only: (?P<watch_url>\S+)\))?")
+_checking = threading.Lock()
+
+
+def listing(ui: Ui, facts: Mapping[str, Any]) -> list[dict[str, str]]:
+    """The robots to choose from: `robot`, its summary, and where it is from."""
+    found = []
+    plugins = {config.name: config.summary for config in installed_plugins().configs}
+    for name, path in shipped_configs(installed_plugins()).items():
+        source = "plugin" if name in plugins else "ibrobot"
+        found.append({"robot": name, "source": source, "summary": plugins.get(name) or _summary(_head(path))})
+    for path in _yamls(ui):
+        found.append({"robot": ui.folders.name(path), "source": "folder", "summary": _summary(_head(path))})
+    return found
+
+
+def _yamls(ui: Ui) -> Iterator[Path]:
+    """The robot YAMLs of the opened folders."""
+    seen = 0
+    for folder in ui.folders.paths:
+        for parent, folders, names in folder.walk():
+            depth = len(parent.relative_to(folder).parts)
+            kept = [name for name in folders if not name.startswith(".") and name not in _SKIPPED]
+            folders[:] = sorted(kept) if depth < _DEPTH else []
+            for name in sorted(names):
+                path = parent / name
+                if path.suffix in (".yaml", ".yml") and path.is_file() and _ROBOT.search(_head(path)):
+                    yield path
+                    seen += 1
+                    if seen == _MOST:
+                        return
+
+
+def _head(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            return file.read(_HEAD).decode(errors="replace")
+    except OSError:
+        return ""
+
+
+def _summary(content: str) -> str:
+    """The first sentence of the comment at a file's begin."""
+    comment = _SUMMARY.match(content)
+    words = " ".join(line.strip("# ") for line in comment[0].splitlines()) if comment is not None else ""
+    return re.split(r"(?<=[.:]) ", words, maxsplit=1)[0].rstrip(".:")
+
+
+def check(ui: Ui, facts: Mapping[str, Any]) -> dict[str, Any]:
+    """What `ibrobot config check` reports about a robot, and its modes and devices."""
+    robot, simulated = robot_of(ui, facts), facts.get("sim") == "true"
+    registry = installed_plugins()
+    with _checking:
+        try:
+            path = find_config(robot, registry)
+            config = load_config(path, sim=simulated, registry=registry)
+        except ConfigError as error:
+            return {"problems": [_problem(ui, each) for each in error.problems]}
+        except IbrobotError as error:
+            return {"problems": [{"file": robot, "line": 0, "path": "", "message": str(error)}]}
+        notes = unavailable_modes(config.unavailable)
+        if absent := describe_absent(absent_sensors(config, registry)):
+            notes.append(f"runs start without {absent}")
+    return {"problems": [], "notes": notes, **_facts(config)}
+
+
+def _problem(ui: Ui, problem: Any) -> dict[str, Any]:
+    file = str(problem.file)
+    shown = ui.folders.name(Path(file)) if file.startswith("/") else file
+    return {"file": shown, "line": problem.line, "path": problem.path, "message": problem.message}
+
+
+def _facts(config: RobotConfig) -> dict[str, Any]:
+    """What a page shows of a robot YAML without problems."""
+    registry = installed_plugins()
+    hardware = {} if config.simulated else config.hardware
+    devices = {
+        f"{name}: {what}": device
+        for name, each in hardware.items()
+        for what, device in registry.find("hardware", each.type).devices(each.options).items()
+    }
+    modes = [
+        {"name": name, "kind": _kind(config, name), "unavailable": config.unavailable.get(name, "")}
+        for name in config.control_modes
+    ]
+    recording = config.recording
+    return {
+        "name": config.robot.name, "simulated": config.simulated, "joints": list(config.robot.joint_names),
+        "modes": modes, "mode": _mode_for_page(config), "devices": devices,
+        "cameras": [name for name, each in config.peripherals.items() if each.kind == "camera"],
+        "has_simulation": config.simulation is not None, "has_hardware": bool(config.hardware),
+        "dataset": recording.dataset if recording is not None else "default",
+        "max_duration_s": config.contract.max_duration_s,
+    }  # fmt: skip
+
+
+def _kind(config: RobotConfig, name: str) -> str:
+    """How a mode is driven."""
+    mode = config.control_modes[name]
+    if mode.inference is not None:
+        return "policy"
+    if mode.planner is not None:
+        return "planner"
+    types = {config.teleoperation[device].type for device in mode.devices.values()}
+    return (
+        "the robot's page"
+        if types == {"web"}
+        else f"teleoperation by {', '.join(sorted(types))}"
+        if types
+        else "commands"
+    )
+
+
+def _mode_for_page(config: RobotConfig) -> str:
+    """The mode that a page chooses first: one that it drives, or else the default mode."""
+    own = [name for name in config.control_modes if _kind(config, name) == "the robot's page"]
+    return own[0] if own else config.default_control_mode
+
+
+def launch(ui: Ui, facts: Mapping[str, Any]) -> dict[str, int]:
+    """Launch a robot with its page."""
+    robot = robot_of(ui, facts)
+    job = ui.jobs.start("run", _title(robot, facts), ["launch", *run_arguments(ui, facts)], read=read_address)
+    return {"number": job.number}
+
+
+def robot_of(ui: Ui, facts: Mapping[str, Any]) -> str:
+    """The robot of a request: the name of a shipped one, or the path of a file in an opened folder.
+
+    Raises:
+        IbrobotError: if it is outside the opened folders.
+    """
+    name = text(facts, "robot")
+    return name if name in shipped_configs(installed_plugins()) else str(ui.folders.find(name))
+
+
+def run_arguments(ui: Ui, facts: Mapping[str, Any]) -> list[str]:
+    """The arguments of a run: robot, body, mode and page."""
+    mode = text(facts, "mode", "")
+    return [
+        robot_of(ui, facts), *(["--sim"] if flag(facts, "sim") else []), *([f"--mode={mode}"] if mode else []),
+        *ui.run_options,
+    ]  # fmt: skip
+
+
+def _title(robot: str, facts: Mapping[str, Any]) -> str:
+    return f"{Path(robot).stem} in simulation" if flag(facts, "sim") else Path(robot).stem
+
+
+def read_address(line: str) -> Mapping[str, Any] | None:
+    """The addresses of a run's page, from a line of its output."""
+    found = _PAGE.search(line)
+    return found.groupdict() if found is not None else None
+
+
+ROUTES: dict[str, Handler] = {"GET /list": listing, "GET /check": check, "POST /launch": launch}

@@ -1,0 +1,144 @@
+"""The views robots and record of `ibrobot ui`, with the application in this process."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from ibrobot_web.ui.job_runner import IBROBOT
+from ibrobot_web.ui.record import ROUTES
+from ui_server import UiServer, run_ui
+
+ROBOT = """# A pan axis: it turns a camera.
+robot:
+  name: pan
+  joints:
+  - {name: pan, lower: -1, upper: 1, max_velocity: 1, max_acceleration: 5}
+  description: {poses: {home: [0]}}
+hardware: {type: fake}
+executors:
+  position: {type: position, group: all}
+control_modes:
+  web: {executors: [position], teleop: web}
+  hold: {executors: [position]}
+default_control_mode: hold
+teleoperation:
+  web: {type: web}
+"""
+WRONG = ROBOT.replace("upper: 1", "uper: 1").replace("default_control_mode: hold", "default_control_mode: holt")
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "wrong.yaml").write_text(WRONG)
+    (tmp_path / "arms").mkdir()
+    (tmp_path / "arms" / "pan.yaml").write_text(ROBOT)
+    (tmp_path / "notes.yaml").write_text("a: 1")
+    return tmp_path
+
+
+def test_robots_of_the_folder_are_listed_with_the_shipped_ones(folder: Path) -> None:
+    async def test(server: UiServer) -> None:
+        listed = {each["robot"]: each for each in await server.get("robots/list")}
+        assert listed["so101"]["source"] == "ibrobot"
+        assert listed["so101"]["summary"].startswith("The SO-101")
+        mine = {name: each["summary"] for name, each in listed.items() if each["source"] == "folder"}
+        assert mine == {"wrong.yaml": "A pan axis", "arms/pan.yaml": "A pan axis"}
+
+    run_ui([folder], test)
+
+
+def test_problems_are_those_of_config_check(folder: Path) -> None:
+    async def test(server: UiServer) -> None:
+        found = await server.get("robots/check", robot="wrong.yaml", sim="false")
+        ran = subprocess.run(
+            [*IBROBOT, "config", "check", "wrong.yaml", "--json"],
+            cwd=folder, capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        assert found["problems"] == json.loads(ran.stdout)
+        assert {(each["line"], each["path"]) for each in found["problems"]} >= {(5, "robot.joints.pan.uper")}
+        for outside in ("../x.yaml", "/etc/passwd"):
+            with pytest.raises(RuntimeError, match="outside the opened folders"):
+                await server.get("robots/check", robot=outside)
+
+    run_ui([folder], test)
+
+
+def test_a_run_that_fails_shows_its_error(folder: Path) -> None:
+    async def test(server: UiServer) -> None:
+        number = (await server.post("robots/launch", robot="wrong.yaml", sim=False, mode="web"))["number"]
+        job, lines = await server.job(lambda job: job["state"] == "failed")
+        assert (job["number"], job["kind"], job["exit_code"]) == (number, "run", 2)
+        assert "--mode=web --web" in job["command"]
+        assert any("wrong.yaml:5: robot.joints.pan.uper: unknown key" in line for line in lines)
+        with pytest.raises(RuntimeError, match="sim must be true or false"):
+            await server.post("robots/launch", robot="so101", sim="yes")
+
+    run_ui([folder], test)
+
+
+def test_watchers_get_the_link_for_watching_alone(folder: Path) -> None:
+    from ibrobot_web.ui.robots import read_address
+
+    line = "I viewer: http://127.0.0.1:1/?token=drive-_1  (to watch only: http://127.0.0.1:1/?token=watch)"
+
+    async def test(server: UiServer) -> None:
+        job = server.ui.jobs.start(
+            "run", "Run", [f"print({line!r})"], program=(sys.executable, "-c"), read=read_address
+        )
+        seen, lines = await server.job(lambda job: job["state"] == "done")
+        assert seen["facts"] == {"url": "http://127.0.0.1:1/?token=drive-_1"}
+        assert job.json(drives=False)["facts"] == {"url": "http://127.0.0.1:1/?token=watch"}
+        assert "drive" not in str(lines)
+
+    run_ui([folder], test)
+
+
+@pytest.mark.parametrize("dataset", ["", "../x", "/x", "a/../b", "-x", "x/"])
+def test_a_dataset_is_a_folder_below_the_root(folder: Path, dataset: str) -> None:
+    async def test(server: UiServer) -> None:
+        with pytest.raises(RuntimeError, match="dataset '"):
+            await server.get("record/place", dataset=dataset)
+
+    run_ui([folder], test)
+
+
+def test_the_place_of_a_session_counts_episodes_and_the_disk(folder: Path) -> None:
+    for number in (1, 2):
+        episode = folder / f"episodes/pick/episodes/episode_00000{number}"
+        episode.mkdir(parents=True)
+        (episode / "a.mcap").write_bytes(bytes(1000 * number))
+
+    async def test(server: UiServer) -> None:
+        found = await server.get("record/place", dataset="pick")
+        assert (found["folder"], found["episodes"], found["episode_bytes"]) == ("episodes/pick", 2, 1500)
+        assert found["free_bytes"] > 0
+        assert (await server.get("record/place", dataset="new"))["episode_bytes"] is None
+
+    run_ui([folder], test)
+
+
+def test_the_progress_of_a_session_is_read_from_its_status_lines(folder: Path) -> None:
+    pytest.importorskip("ibrobot_data", reason="needs ibrobot-plugin-data")
+
+    async def test(server: UiServer) -> None:
+        for wrong in (0, 1.5, "x", None):
+            with pytest.raises(RuntimeError, match="episodes must be a whole number from 1"):
+                await server.post("record/start", robot="so101", sim=True, episodes=wrong)
+        asked = {"robot": "arms/pan.yaml", "sim": False, "mode": "nope", "episodes": 3, "prompt": "--pick"}
+        await server.post("record/start", **asked, dataset="a b")
+        job, _ = await server.job(lambda job: job["state"] == "failed")
+        assert f"--root={folder / 'episodes'} --dataset=a b --prompt=--pick --episodes=3" in job["command"]
+
+    assert set(ROUTES) == {"GET /place", "POST /start"}
+    run_ui([folder], test)
+    from ibrobot_web.ui.record import read_status
+
+    line = "mode web | episodes 1, successes 1 | recording “a, saved 1 of 2”, 3 s, 17 s left, saved 1 of 4"
+    assert read_status(line) == {
+        "saved": 1, "progress": 0.25,
+        "text": "recording “a, saved 1 of 2”, 3 s, 17 s left · 1 of 4 episodes saved",
+    }  # fmt: skip
