@@ -106,6 +106,13 @@ class EpisodeReader(ABC):
             RecorderError: if the file is damaged; earlier messages have been delivered.
         """
 
+    def messages_since(self, stamp_ns: int, topics: Collection[str] | None = None) -> Iterator[Recorded]:
+        """Yield the messages received at `stamp_ns` [ns] or later, as `messages` does.
+
+        Readers override it if they can skip earlier messages without reading them.
+        """
+        return (item for item in self.messages(topics) if item.received_ns >= stamp_ns)
+
     @abstractmethod
     def digest(self) -> str:
         """Hash of all stored messages, with topics and stamps; equal for copies of an episode.

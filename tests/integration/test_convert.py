@@ -178,6 +178,21 @@ def test_interrupted_by_the_keyboard_it_says_what_is_kept(bags: Path, tmp_path: 
     assert digest(out) == digest(whole)
 
 
+def test_events_tell_a_program_each_episode_and_the_result(bags: Path, tmp_path: Path) -> None:
+    record(tmp_path / "bad/episode_000001", 1, 0.2, contract=None)
+    shutil.copytree(tmp_path / "bad", tmp_path / "bad/.trash/1")  # no command finds what is in the trash
+    result = run(bags, tmp_path / "bad", "--out", tmp_path / "set", "--jobs", 1, "--events")
+    events = [json.loads(line) for line in result.out.splitlines()]
+    assert (result.code, events[0], result.err) == (1, {"event": "begin", "of": 5}, "")
+    of_episodes = [event for event in events if "episode" in event]
+    assert [event["done"] for event in of_episodes] == [1, 2, 3, 4, 5]
+    assert [bool(event["error"]) for event in of_episodes].count(True) == 1
+    assert "has no contract" in next(event["error"] for event in of_episodes if event["error"])
+    report = events[-1]
+    assert (report["event"], report["episodes"], report["failed"]) == ("report", 4, 1)
+    assert report["frames"] == of_episodes[-1]["frames"]
+
+
 def test_many_with_the_same_fault_are_reported_together(tmp_path: Path) -> None:
     for number in (1, 2, 3):
         record(tmp_path / f"bags/episode_{number:06d}", number, 0.2, contract=None)

@@ -9,7 +9,8 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,9 +35,12 @@ from ibrobot_data.words import plural
 if TYPE_CHECKING:
     from ibrobot_core.api import RobotConfig
 
+_Progress = Callable[[int], AbstractContextManager[Any]]
+"""Receives the number of episodes, and gives the function that shows the progress."""
 _MIB = 1 << 20
 _ONLY_TO_BAG = ("numbers",)
 _ONLY_TO_DATASET = ("append", "type_", "force_contract", "missing", "outcomes", "success", "jobs", "only", "context")
+_EVENT_S = 0.1
 _MUCH = 0.1
 """The report names episodes that lost a larger share of their ticks."""
 _MISSING = attrs.fields(ConversionRequest).missing.default
@@ -92,8 +96,9 @@ def _flags_of_writers(command: Callable[..., Any]) -> Callable[..., Any]:
     help="Episodes in parallel; by default half the CPU cores.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print the report as JSON.")
+@click.option("--events", is_flag=True, help="Print the progress as JSON lines, and the report as the last one.")
 @click.pass_context
-def convert(context: click.Context, /, to: str, as_json: bool, **asked: Any) -> None:
+def convert(context: click.Context, /, to: str, as_json: bool, events: bool, **asked: Any) -> None:
     """Make a dataset for training from recorded episodes, or with --to bag episodes from a dataset.
 
     EPISODES are episodes, folders of them such as episodes/default, or DATASET:N; with --to bag it is one dataset.
@@ -107,11 +112,16 @@ def convert(context: click.Context, /, to: str, as_json: bool, **asked: Any) -> 
         raise click.UsageError(f"{option} has no meaning for --to {to}")
     try:
         with wrong_input():
-            report = (_to_bags if to == "bag" else _to_dataset)(as_json=as_json, **asked)
+            progress = _events if events else partial(_progress, quiet=as_json)
+            report = (_to_bags if to == "bag" else _to_dataset)(progress=progress, **asked)
     except KeyboardInterrupt:
         echo("interrupted; finished episodes are kept: run the same command again to continue", err=True)
         sys.exit(130)
-    if as_json:
+    if events:
+        summary = report.summary()
+        del summary["reports"]  # each episode had its event
+        _emit("report", **summary)
+    elif as_json:
         echo(json.dumps(report.summary()))
     else:
         _print_report(report)
@@ -121,7 +131,7 @@ def convert(context: click.Context, /, to: str, as_json: bool, **asked: Any) -> 
 
 def _to_dataset(
     *, episodes: tuple[Path, ...], out: Path, type_: str | None, config: str | None, calibration: str | None,
-    as_json: bool, outcomes: tuple[str, ...], jobs: int | None, sets: tuple[str, ...], norm_mode: str | None,
+    progress: _Progress, outcomes: tuple[str, ...], jobs: int | None, sets: tuple[str, ...], norm_mode: str | None,
     numbers: str | None, **asked: Any,
 ) -> Report:  # fmt: skip
     from ibrobot_data.run import convert as run
@@ -136,12 +146,12 @@ def _to_dataset(
         **_given(config, calibration), **asked,
     )  # fmt: skip
     found = find_episodes(episodes)
-    with _progress(len(found), as_json) as watch:
+    with progress(len(found)) as watch:
         return run(request, found, watch)
 
 
 def _to_bags(
-    *, episodes: tuple[Path, ...], out: Path, config: str | None, calibration: str | None, as_json: bool,
+    *, episodes: tuple[Path, ...], out: Path, config: str | None, calibration: str | None, progress: _Progress,
     sets: tuple[str, ...], norm_mode: str | None, numbers: str | None, prompt: str, **_: Any,
 ) -> Report:  # fmt: skip
     from ibrobot_core.api import EpisodeAddress
@@ -163,7 +173,7 @@ def _to_bags(
         contract=Contract.from_config(robot) if robot is not None else None,
         given=metadata_from_config(robot, norm_mode, _calibration(calibration)) if robot is not None else {},
     )  # fmt: skip
-    with _progress(len(chosen), as_json) as watch:
+    with progress(len(chosen)) as watch:
         return convert_to_bags(request, watch)
 
 
@@ -226,6 +236,33 @@ def _calibration(name: str | None) -> Mapping[str, Mapping[str, Any]] | None:
     from ibrobot_core.api import load_calibration
 
     return load_calibration(name).snapshot()
+
+
+def _emit(event: str, **facts: Any) -> None:
+    """Print an event for a program that reads the output."""
+    echo(json.dumps({"event": event, **facts}))
+
+
+@contextmanager
+def _events(episodes: int) -> Iterator[Any]:
+    """A function that prints the progress as events: one for each episode, and at most ten a second beside them."""
+    begin = last = time.monotonic()
+    done = 0
+
+    def event(frames: int, total: int, report: EpisodeReport | None) -> None:
+        nonlocal done, last
+        now = time.monotonic()
+        if report is None and now - last < _EVENT_S:
+            return
+        last = now
+        done += report is not None
+        facts: dict[str, Any] = {"done": done, "of": episodes, "frames": frames, "total_frames": max(total, frames)}
+        if report is not None:
+            facts |= {"episode": report.source, "error": report.error}
+        _emit("progress", **facts, seconds=round(now - begin, 3))
+
+    _emit("begin", of=episodes)
+    yield event
 
 
 @contextmanager

@@ -74,7 +74,7 @@ def find_episodes(paths: Sequence[Path]) -> list[Path]:
             yield path
         elif path.is_dir():
             for child in sorted(path.iterdir(), key=_natural):
-                if child.is_dir():
+                if child.is_dir() and not child.name.startswith("."):  # e.g. the trash of `ibrobot episodes delete`
                     yield from below(child)
 
     found: dict[Path, Path] = {}

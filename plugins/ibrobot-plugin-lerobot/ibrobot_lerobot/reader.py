@@ -73,14 +73,20 @@ class LeRobotReader(EpisodeReader):
 
     @override
     def messages(self, topics: Collection[str] | None = None) -> Iterator[Recorded]:
+        return self.messages_since(self._start_ns, topics)
+
+    @override
+    def messages_since(self, stamp_ns: int, topics: Collection[str] | None = None) -> Iterator[Recorded]:
+        first = -(-(stamp_ns - 1 - self._start_ns) // self._step_ns)  # rounded up; some messages follow 1 ns later
+        first = min(max(0, first), self._rows.length)
         wanted = set(self._contract.topics if topics is None else topics)
         try:
-            for row, values in enumerate(self._rows.read(self._composer.keys(wanted))):
-                stamp_ns = self._start_ns + row * self._step_ns
-                composed = self._composer(self._in_radians(values), stamp_ns)
+            for row, values in enumerate(self._rows.read(self._composer.keys(wanted), first), first):
+                tick_ns = self._start_ns + row * self._step_ns
+                composed = self._composer(self._in_radians(values), tick_ns)
                 for topic in sorted(composed, key=self._delay_ns):
-                    if topic in wanted:
-                        at_ns = stamp_ns + self._delay_ns(topic)
+                    at_ns = tick_ns + self._delay_ns(topic)
+                    if topic in wanted and at_ns >= stamp_ns:
                         yield Recorded(topic, composed[topic], at_ns, at_ns)
         except DatasetError as error:
             raise RecorderError(f"{self._path}: {error}") from error

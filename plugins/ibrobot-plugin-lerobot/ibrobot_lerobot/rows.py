@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Collection, Generator, Iterator
 from contextlib import closing
 from pathlib import Path
@@ -47,18 +48,18 @@ class EpisodeRows:
         self.begin: int = found["dataset_from_index"]
         """Number of frames in the dataset before this episode."""
 
-    def read(self, keys: Collection[str]) -> Iterator[dict[str, NDArray[Any]]]:
-        """Yield each row as key -> value: stored vectors, shape (N,), and images, shape (H, W, C).
+    def read(self, keys: Collection[str], first: int = 0) -> Iterator[dict[str, NDArray[Any]]]:
+        """Yield each row from `first` on as key -> value: stored vectors, shape (N,), and images, shape (H, W, C).
 
         Raises:
             DatasetError: if a file cannot be read, or has fewer rows or images than the episode.
         """
         videos = [key for key in self._dataset.videos if key in keys]
         features = {key: each for key, each in self._dataset.features.items() if key in keys and key not in videos}
-        pictures = {key: self._pictures(key) for key in videos}
-        rows = 0
+        pictures = {key: self._pictures(key, first) for key in videos}
+        rows = first
         try:
-            for values in self._table(features):
+            for values in itertools.islice(self._table(features), first, None):
                 rows += 1
                 yield values | {key: next(each) for key, each in pictures.items()}
         finally:
@@ -86,14 +87,14 @@ class EpisodeRows:
         except (OSError, pa.ArrowException) as error:
             raise DatasetError(f"{path}: cannot be read: {error}") from error
 
-    def _pictures(self, key: str) -> Generator[NDArray[Any]]:
-        """The episode's part of a camera's video."""
+    def _pictures(self, key: str, first: int) -> Generator[NDArray[Any]]:
+        """The episode's part of a camera's video, from row `first` on."""
         path = self._file(f"videos/{key}", f"{layout.VIDEOS}/{key}", "mp4")
         fps = self._dataset.info["fps"]
         begin = round(self._row[f"videos/{key}/from_timestamp"] * fps)
-        wanted = begin
+        wanted = begin + first
         try:
-            with av.open(str(path)) as container, closing(_decoded(container, begin / fps)) as frames:
+            with av.open(str(path)) as container, closing(_decoded(container, wanted / fps)) as frames:
                 for frame in frames:
                     number = round(float(frame.time) * fps)
                     if number < wanted:

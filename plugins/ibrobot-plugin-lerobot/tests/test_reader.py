@@ -104,6 +104,17 @@ def test_the_summary_tells_topics_times_and_task_without_decoding(tmp_path: Path
     assert root.exists()
 
 
+def test_reading_from_a_time_on_skips_the_rows_and_pictures_before(tmp_path: Path):
+    reader = LeRobotReader(EpisodeAddress(foreign(tmp_path / "set", codec="h264"), 1, provenance()))
+    everything = list(reader.messages())
+    stamps = [item.received_ns for item in everything]
+    for since in (0, stamps[0], stamps[40], stamps[40] + 1, stamps[-1], stamps[-1] + 1):
+        found = list(reader.messages_since(since))
+        assert [item.received_ns for item in found] == [stamp for stamp in stamps if stamp >= since]
+        for one, other in zip(found, everything[len(everything) - len(found) :], strict=True):
+            assert (one.topic, str(one.message)) == (other.topic, str(other.message))
+
+
 def test_only_what_is_asked_for_is_read(tmp_path: Path):
     root = foreign(tmp_path / "set", codec="h264")
     for video in root.rglob("*.mp4"):

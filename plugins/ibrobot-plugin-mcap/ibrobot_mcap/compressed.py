@@ -52,8 +52,8 @@ class MessageCompressed(Source):
         self.latched, self.start_ns, self.end_ns = source.latched, source.start_ns, source.end_ns
 
     @override
-    def messages(self, topics: Collection[str]) -> Iterator[Raw]:
-        for raw in self._source.messages(topics):
+    def messages(self, topics: Collection[str], since_ns: int = 0) -> Iterator[Raw]:
+        for raw in self._source.messages(topics, since_ns):
             with reading(self._path):
                 data = _expand_message(raw.data)
             yield attrs.evolve(raw, data=data)

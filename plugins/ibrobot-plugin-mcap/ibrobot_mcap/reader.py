@@ -101,6 +101,10 @@ class Rosbag2Reader(EpisodeReader):
 
     @override
     def messages(self, topics: Collection[str] | None = None) -> Iterator[Recorded]:
+        return self.messages_since(0, topics)
+
+    @override
+    def messages_since(self, stamp_ns: int, topics: Collection[str] | None = None) -> Iterator[Recorded]:
         source, short = self._source, self.short()
         if short and source.finished:  # in the middle, so the rest would not match the recording
             missing = ", ".join(f"{count} of {self.stated[topic]} of {topic}" for topic, count in short.items())
@@ -108,7 +112,7 @@ class Rosbag2Reader(EpisodeReader):
                 f"{self._path}: is damaged: messages are missing in the middle: {missing}; "
                 "`ibrobot episodes repair` keeps what can be read"
             )
-        for raw in source.messages(frozenset(source.types if topics is None else topics)):
+        for raw in source.messages(frozenset(source.types if topics is None else topics), stamp_ns):
             try:
                 message = self._codec.decode(raw.type, raw.data)
                 if isinstance(message, CompressedImage):

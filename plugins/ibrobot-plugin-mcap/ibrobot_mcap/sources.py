@@ -50,8 +50,8 @@ class Source(ABC):
     end_ns: int
 
     @abstractmethod
-    def messages(self, topics: Collection[str]) -> Iterator[Raw]:
-        """Yield the messages of these topics in the order of receipt."""
+    def messages(self, topics: Collection[str], since_ns: int = 0) -> Iterator[Raw]:
+        """Yield the messages of these topics received at `since_ns` [ns] or later, in the order of receipt."""
 
     @abstractmethod
     def close(self) -> None:
@@ -115,15 +115,15 @@ class McapSource(Source):
         self.stated = stated
 
     @override
-    def messages(self, topics: Collection[str]) -> Iterator[Raw]:
+    def messages(self, topics: Collection[str], since_ns: int = 0) -> Iterator[Raw]:
         # Equal stamps keep the order of writing: file, chunk, position.
         waiting: list[tuple[int, int, int, int, Entry]] = []
         for index, (_, number, block) in enumerate(self._blocks):
             file = self._files[number]
             wanted = {key for key, channel in file.channels.items() if channel.topic in topics}
-            if not wanted.isdisjoint(block.counts):
+            if block.end_ns >= since_ns and not wanted.isdisjoint(block.counts):
                 for place, entry in enumerate(file.entries(block)):
-                    if entry.channel in wanted:
+                    if entry.channel in wanted and entry.received_ns >= since_ns:
                         heapq.heappush(waiting, (entry.received_ns, number, block.offset, place, entry))
             # No later block begins before this time.
             bound = self._blocks[index + 1][0] if index + 1 < len(self._blocks) else 2**64

@@ -66,14 +66,15 @@ class SqliteSource(Source):
             spans.append((_of(int, start_ns), _of(int, end_ns)))
 
     @override
-    def messages(self, topics: Collection[str]) -> Iterator[Raw]:
-        streams = (self._messages(number, topics) for number in range(len(self._files)))
+    def messages(self, topics: Collection[str], since_ns: int = 0) -> Iterator[Raw]:
+        streams = (self._messages(number, topics, since_ns) for number in range(len(self._files)))
         return heapq.merge(*streams, key=lambda raw: raw.received_ns)
 
-    def _messages(self, number: int, wanted: Collection[str]) -> Iterator[Raw]:
+    def _messages(self, number: int, wanted: Collection[str], since_ns: int) -> Iterator[Raw]:
         path, file, topics = self._files[number]
         with reading(path):
-            rows = file.execute("SELECT topic_id, timestamp, data FROM messages ORDER BY timestamp, id")
+            query = "SELECT topic_id, timestamp, data FROM messages WHERE timestamp >= ? ORDER BY timestamp, id"
+            rows = file.execute(query, (since_ns,))
             for key, stamp_ns, data in rows:
                 topic = topics[key]
                 if topic in wanted:

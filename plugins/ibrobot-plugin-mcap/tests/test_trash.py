@@ -1,0 +1,115 @@
+"""Deleting and trimming episodes so that both can be undone."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from click.testing import CliRunner
+from ibrobot_mcap import trash
+from ibrobot_mcap.commands import episodes
+from ibrobot_mcap.commands.found import episodes_in
+from ibrobot_mcap.reader import Rosbag2Reader
+
+from ibrobot_core.api import RecorderError
+
+from .conftest import JOINTS, Bench, read, stamp, summary
+
+
+@pytest.fixture
+def episode(tmp_path):
+    (tmp_path / "pick" / "episodes").mkdir(parents=True)
+    bench = Bench(tmp_path / "pick" / "episodes")
+    bench.begin(prompt="pick")
+    bench.write(100)
+    bench.end()
+    return bench.path
+
+
+def files(folder):
+    return {str(each.relative_to(folder)): each.read_bytes() for each in folder.rglob("*") if each.is_file()}
+
+
+def run(*arguments):
+    result = CliRunner().invoke(episodes, [str(argument) for argument in arguments], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def test_a_deleted_episode_comes_back_as_it_was(tmp_path, episode):
+    before = files(tmp_path)
+    assert "moved to .trash" in run("delete", "--to-trash", episode)
+    assert not episode.exists()
+    with pytest.raises(RecorderError, match="contains no episode"):
+        episodes_in(tmp_path)
+    (row,) = json.loads(run("trash", tmp_path, "--json"))
+    assert (row["done"], row["path"]) == ("deleted", str(episode))
+    assert "restored" in run("trash", tmp_path, "--restore", row["id"])
+    assert files(tmp_path) == before, "nothing else is left"
+
+
+def test_a_trim_in_place_keeps_the_original_until_the_trash_is_emptied(tmp_path, episode):
+    before = files(episode)
+    run("mark", episode, "failure")
+    run("mark", episode, "success")
+    run("trim", episode, "--in-place", "--from", "0.3", "--to", "0.5")
+    part = read(episode)
+    assert [item.received_ns for item in part] == [stamp(index) for index in range(30, 51)]
+    assert summary(episode).metadata["trimmed"] == "0.3 s to 0.5 s of episode_000001"
+    assert summary(episode).outcome == "success"
+    (trimmed,) = trash.trashed_in(tmp_path)
+    trash.restore(trimmed)
+    assert files(episode).keys() == before.keys()
+    assert len(read(episode)) == 100
+    (replaced,) = trash.trashed_in(tmp_path)
+    assert (replaced.done, len(read(replaced.kept))) == ("replaced", 21)
+    trash.restore(replaced)
+    assert len(read(episode)) == 21
+    assert "deleted 1 for good" in run("trash", tmp_path, "--empty", "--yes")
+    assert [each.name for each in episode.parent.iterdir()] == [episode.name]
+
+
+def test_a_failed_trim_leaves_the_episode(tmp_path, episode, monkeypatch):
+    before = files(tmp_path)
+    with pytest.raises(RecorderError, match=r"is 0\.99 s long; --from 0\.5 --to 2 is outside it"):
+        run("trim", episode, "--in-place", "--from", "0.5", "--to", "2")
+
+    def fail(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(trash, "discard", fail)
+    with pytest.raises(RecorderError, match="cannot be trimmed: No space left on device"):
+        trash.trim(episode, 0.1, 0.2)
+    assert files(tmp_path) == before
+
+
+def test_a_later_recording_keeps_its_place(tmp_path, episode):
+    trashed = trash.discard(episode)
+    bench = Bench(episode.parent)
+    bench.begin()
+    bench.write(5)
+    bench.end()
+    assert trash.restore(trashed) == episode.with_name("episode_000001_restored")
+    assert (len(read(episode)), len(read(episode.with_name("episode_000001_restored")))) == (5, 100)
+
+
+def test_only_episodes_are_moved_and_only_what_is_in_the_trash_is_restored(tmp_path, episode):
+    with pytest.raises(RecorderError, match="is not an episode; nothing was deleted"):
+        run("delete", "--to-trash", episode, tmp_path)
+    with pytest.raises(RecorderError, match=r"its trash has no '\.\./\.\.'; it has nothing"):
+        run("trash", tmp_path, "--restore", "../..")
+    (episode.parent / ".trash" / "x").mkdir(parents=True)
+    (episode.parent / ".trash" / "x" / "undo.json").write_text('{"name": "../../../..", "done": "deleted"}')
+    assert trash.trashed_in(tmp_path) == []
+    assert episode.is_dir()
+
+
+def test_reading_from_a_time_on_skips_what_is_before(episode):
+    reader = Rosbag2Reader(episode)
+    try:
+        stamps = [item.received_ns for item in reader.messages()]
+        for since in (0, stamp(0), stamp(40), stamp(40) + 1, stamp(200)):
+            found = [item.received_ns for item in reader.messages_since(since, {JOINTS})]
+            assert found == [each for each in stamps if each >= since]
+    finally:
+        reader.close()
