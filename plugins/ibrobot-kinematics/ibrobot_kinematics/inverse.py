@@ -214,7 +214,8 @@ def _samples(arm: PanPlanarRoll, target: Target, chain: Vector, every: bool) -> 
         yield arm.with_axis(target.position, target.axis, chain)
     elif not every:
         yield arm.at(target.position, None, chain, pitches=24, rolls=1)
-    yield arm.at(target.position, target.axis, chain, pitches=60, rolls=13)
+    # With an axis these are only where searches begin.
+    yield arm.at(target.position, target.axis, chain, pitches=60 if target.axis is None else 36, rolls=13)
 
 
 def _placed(model: KinematicModel, start: Vector, joints: Vector) -> Vector:

@@ -85,13 +85,27 @@ class KinematicModel:
 
     def forward_and_jacobian(self, q: Vector) -> tuple[TipPose, Vector]:
         """`forward(q)` and `jacobian(q)`, in little more time than one of them."""
-        tip, origins, axes = self._frames(q)
+        tip, linear, angular = self.twists(q)
         jacobian = np.zeros((*q.shape[:-1], 6, len(self.joint_names)))
-        slides = self._slides[:, None]
-        linear = np.where(slides, axes, cross(axes, tip.position[..., None, :] - origins))
         jacobian[..., :3, self.moving] = linear.swapaxes(-1, -2)
-        jacobian[..., 3:, self.moving] = np.where(slides, 0.0, axes).swapaxes(-1, -2)
+        jacobian[..., 3:, self.moving] = angular.swapaxes(-1, -2)
         return tip, jacobian
+
+    def twists(self, q: Vector) -> tuple[TipPose, Vector, Vector]:
+        """Pose of the tip, and its velocities for each of the chain's joints at unit speed.
+
+        Args:
+            q: joint positions, shape (…, J).
+
+        Returns:
+            The tip, the linear [m/s] and the angular velocities [rad/s], both shape (…, n, 3), all in the base frame.
+        """
+        tip, origins, axes = self._frames(q)
+        linear = cross(axes, tip.position[..., None, :] - origins)
+        if not self._slides.any():
+            return tip, linear, axes
+        slides = self._slides[:, None]
+        return tip, np.where(slides, axes, linear), np.where(slides, 0.0, axes)
 
     def screws(self, q: Vector) -> tuple[TipPose, Vector, Vector]:
         """Pose of the tip, and a point on the axis [m] and the direction of each of the chain's joints.
@@ -118,34 +132,50 @@ class KinematicModel:
         return np.array([joint.reference for joint in self.chain])
 
     @cached_property
-    def _rodrigues(self) -> Vector:
-        """Rotation of each joint in its predecessor's frame as A + sin(q) B + (1 - cos(q)) C, shape (3, n, 3, 3)."""
-        crosses = [skew(joint.axis) for joint in self.chain]
-        terms = [
-            (joint.rotation, joint.rotation @ k, joint.rotation @ k @ k)
-            for joint, k in zip(self.chain, crosses, strict=True)
-        ]
-        return np.array(terms).reshape(-1, 3, 3, 3).swapaxes(0, 1)
+    def _terms(self) -> Vector:
+        """Frame of each joint in its predecessor's as A + sin(q) B + (1 - cos(q)) C + q D, shape (4, n, 4, 4).
+
+        B and C are 0 for prismatic joints, D for revolute ones.
+        """
+        terms = np.zeros((4, len(self.chain), 4, 4))
+        for i, joint in enumerate(self.chain):
+            terms[0, i] = _homogeneous(joint.rotation, joint.position)
+            k = skew(joint.axis)
+            if joint.slides:
+                terms[3, i, :3, 3] = joint.rotation @ joint.axis
+            else:
+                terms[1, i, :3, :3], terms[2, i, :3, :3] = joint.rotation @ k, joint.rotation @ k @ k
+        return terms
 
     @cached_property
-    def _offsets(self) -> tuple[Vector, Vector]:
-        """Origin of each joint in its predecessor's frame, and how it moves with the joint; both shape (n, 3)."""
-        still = np.array([joint.position for joint in self.chain]).reshape(-1, 3)
-        moves = [joint.rotation @ joint.axis * joint.slides for joint in self.chain]
-        return still, np.array(moves).reshape(-1, 3)
+    def _axes(self) -> Vector:
+        """Axes of the chain's joints in their own frames, as columns, shape (n, 3, 1)."""
+        return np.array([joint.axis for joint in self.chain]).reshape(-1, 3, 1)
+
+    @cached_property
+    def _tip(self) -> Vector:
+        """The tip in the frame of the last joint of the chain, shape (4, 4)."""
+        return _homogeneous(self.tip_pose.rotation, self.tip_pose.position)
 
     def _frames(self, q: Vector) -> tuple[TipPose, Vector, Vector]:
         """The tip, and the origins and axes of the chain's joints in the base frame, both shape (…, n, 3)."""
-        way = q[..., self.moving] - self._reference
-        angle = np.where(self._slides, 0.0, way)[..., None, None]
-        still, turning, turned = self._rodrigues
-        turns = still + np.sin(angle) * turning + (1 - np.cos(angle)) * turned
-        offsets = self._offsets[0] + self._offsets[1] * way[..., None]
-        origins, axes = np.empty_like(offsets), np.empty_like(offsets)
-        position, rotation = np.zeros((*q.shape[:-1], 3)), np.broadcast_to(np.eye(3), (*q.shape[:-1], 3, 3))
-        for i, joint in enumerate(self.chain):
-            origins[..., i, :] = position = position + (rotation @ offsets[..., i, :, None])[..., 0]
-            rotation = rotation @ turns[..., i, :, :]
-            axes[..., i, :] = rotation @ joint.axis
-        tip = self.tip_pose
-        return TipPose(position + rotation @ tip.position, rotation @ tip.rotation), origins, axes
+        way = (q.take(self.moving, axis=-1) - self._reference)[..., None, None]
+        still, turning, turned, moved = self._terms
+        steps = still + np.sin(way) * turning + (1 - np.cos(way)) * turned
+        if self._slides.any():
+            steps += way * moved
+        frames = np.empty_like(steps)
+        frame = np.empty((*q.shape[:-1], 4, 4))
+        frame[:] = np.eye(4)
+        for i in range(len(self.chain)):
+            frames[..., i, :, :] = frame = frame @ steps[..., i, :, :]
+        tip = frame @ self._tip
+        axes = (frames[..., :3, :3] @ self._axes)[..., 0]
+        return TipPose(tip[..., :3, 3], tip[..., :3, :3]), frames[..., :3, 3], axes
+
+
+def _homogeneous(rotation: Vector, position: Vector) -> Vector:
+    """A pose as a matrix, shape (4, 4)."""
+    placed = np.eye(4)
+    placed[:3, :3], placed[:3, 3] = rotation, position
+    return placed

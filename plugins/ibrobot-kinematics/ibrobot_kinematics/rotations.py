@@ -9,10 +9,12 @@ from ibrobot_core.api import Vector
 _NO_SINE = 1e-6
 """Sine of the angle below which the antisymmetric part of a matrix does not determine the axis."""
 
+_AFTER, _BEFORE = np.array([1, 2, 0]), np.array([2, 0, 1])
+
 
 def cross(a: Vector, b: Vector) -> Vector:
     """Cross products along the last axis, shape (…, 3); several times faster than `numpy.cross` for few vectors."""
-    return a[..., [1, 2, 0]] * b[..., [2, 0, 1]] - a[..., [2, 0, 1]] * b[..., [1, 2, 0]]
+    return a.take(_AFTER, -1) * b.take(_BEFORE, -1) - a.take(_BEFORE, -1) * b.take(_AFTER, -1)
 
 
 def skew(v: Vector) -> Vector:

@@ -84,8 +84,7 @@ def search(
 
     def derivatives(q: Vector) -> tuple[TipPose, Vector, Vector, Vector]:
         """The tip, the objective, shape (N,), and half of its first and second derivatives by the joints."""
-        tip, jacobian = model.forward_and_jacobian(q)
-        linear, axes = jacobian[:, :3, moving].mT, jacobian[:, 3:, moving].mT
+        tip, linear, axes = model.twists(q)
         columns = target.columns_of(tip)
         error = weights[:, None] * (columns - asked)
         # Derivative of each column by each joint, shape (N, n, K, 3).

@@ -52,9 +52,9 @@ def make_robot(folder: Path) -> Robot:
 
 
 def make_planner(folder: Path, world: World | None = None, seed: int = 0, **options: Any) -> RrtConnectPlanner:
-    """A loaded planner with a world of its own."""
+    """A loaded planner with a world of its own; a slow machine does not end its searches."""
     context = Context("planner", SteppedClock(7), logging.getLogger("test"), make_robot(folder), seed=seed)
-    planner = RrtConnectPlanner(RrtConnectOptions(**options), context)
+    planner = RrtConnectPlanner(RrtConnectOptions(**{"planning_time": 300.0, **options}), context)
     planner.load()
     planner.world = world or World()
     return planner
