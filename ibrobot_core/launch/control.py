@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, override
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ibrobot_core.clock import RealClock, SteppedClock
 from ibrobot_core.component import CONTROL, Component
+from ibrobot_core.config.schema import ControlMode, RobotConfig
 from ibrobot_core.control.host import ControlClient, ControlHost, InlineControl
 from ibrobot_core.control.link import ControlState
 from ibrobot_core.descriptors import HardwareDescriptor
@@ -30,10 +32,7 @@ class ControlComponent(Component):
         super().__init__(CONTROL, f"{parts} at {config.control.rate_hz:g} Hz, {where}", needs)
         self._session = session
         self._joints = config.robot.joint_names
-        self._actions = [
-            (spec.executor, spec.topic, config.robot.indices(config.executors[spec.executor].joints))
-            for spec in config.contract.actions
-        ]
+        self._actions = {name: tuple(_action_topics(config, mode)) for name, mode in config.control_modes.items()}
 
     @override
     def start(self) -> None:
@@ -74,10 +73,8 @@ class ControlComponent(Component):
         header = Header(state.stamp_ns)
         effort = state.effort if np.isfinite(state.effort).all() else np.empty(0)
         bus.publish("/joint_states", JointState(header, self._joints, state.position, state.velocity, effort))
-        executors = session.config.control_modes[session.mode].executors
-        for executor, topic, columns in self._actions:
-            if executor in executors:
-                bus.publish(topic, Float64MultiArray(state.command[columns]))
+        for topic, columns in self._actions[session.mode]:
+            bus.publish(topic, Float64MultiArray(state.command[columns]))
         begin = 0
         for topic, size in session.control.signals:
             bus.publish(topic, Float64MultiArray(state.signals[begin : begin + size].copy()))
@@ -94,6 +91,15 @@ class ControlComponent(Component):
             session.emit("ibrobot_fault_raised", fault=fault, stamp_ns=int(event["stamp_ns"]))
         else:
             raise HardwareError(f"control sent an unknown event {event['event']!r}")
+
+
+def _action_topics(config: RobotConfig, mode: ControlMode) -> Iterator[tuple[str, NDArray[np.intp]]]:
+    """Topic and columns of each action whose joints a mode moves, by whichever executors."""
+    moved = {joint for name in mode.executors for joint in config.executors[name].joints}
+    for spec in config.contract.actions:
+        joints = config.executors[spec.executor].joints
+        if moved.issuperset(joints):
+            yield spec.topic, config.robot.indices(joints)
 
 
 def _aftermath(session: Session) -> str:

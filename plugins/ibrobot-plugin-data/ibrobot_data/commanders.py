@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 
 from ibrobot_core.api import EpisodeReader, EpisodeSummary, RecorderError, String
-from ibrobot_data.options import COMMANDER, OPERATOR, POLICY
+from ibrobot_data.options import COMMANDER, OPERATOR, PLANNER, POLICY
 
 
 def is_labelled(summary: EpisodeSummary) -> bool:
@@ -20,7 +20,7 @@ def is_labelled(summary: EpisodeSummary) -> bool:
 class Commanders:
     """Who commands an episode's robot, by time.
 
-    An episode of a mode without takeovers has one commander: the operator of its devices, or its policy.
+    An episode of a mode without takeovers has one commander: the operator of its devices, its planner, or its policy.
 
     Raises:
         RecorderError: if neither the messages nor the mode in the metadata say who commands.
@@ -46,7 +46,8 @@ class Commanders:
 def _of_mode(summary: EpisodeSummary) -> str:
     try:
         mode = json.loads(summary.metadata["config"])["control_modes"][summary.metadata["mode"]]
-        return OPERATOR if mode.get("teleop") is not None else POLICY
+        words = {"teleop": OPERATOR, "planner": PLANNER}
+        return next((word for key, word in words.items() if mode.get(key) is not None), POLICY)
     except (KeyError, TypeError, ValueError, AttributeError):
         raise RecorderError(
             f"nothing says who commanded: it has no {COMMANDER}, and its metadata name no mode of a robot YAML"

@@ -15,6 +15,8 @@ COMMANDER = "/commander"
 """std_msgs/msg/String: who commands the robot at a state of control, in modes with `intervene`."""
 POLICY, OPERATOR, HANDOVER = "policy", "operator", "handover"
 """The words on `COMMANDER`; in a handover nobody commands, and the arm holds."""
+PLANNER = "planner"
+"""Who commands in the episodes of a mode with a planner."""
 
 
 def _check_key(_: object, __: object, key: str) -> None:

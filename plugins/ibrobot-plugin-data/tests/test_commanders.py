@@ -58,7 +58,9 @@ def test_the_newest_message_says_who_commands() -> None:
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("mode", "who"), [({"teleop": "leader"}, "operator"), ({"inference": {}}, "policy")])
+@pytest.mark.parametrize(
+    ("mode", "who"), [({"teleop": "leader"}, "operator"), ({"inference": {}}, "policy"), ({"planner": {}}, "planner")]
+)
 def test_without_messages_the_mode_says_who_commands(mode: dict[str, Any], who: str) -> None:
     assert commanders(mode).at(50) == who
 

@@ -24,6 +24,7 @@ from ibrobot_core.api import (
     Robot,
     Vector3,
 )
+from ibrobot_planning.poses import named_pose
 from ibrobot_planning.transforms import from_rpy
 
 POLICIES: tuple[str, ...] = get_args(OrientationPolicy)
@@ -127,24 +128,11 @@ def _parsed(text: str, robot: Robot) -> tuple[PositionGoal | PoseGoal | None, di
 
 
 def _named(name: str, robot: Robot) -> dict[str, float]:
-    """Joint -> position of a pose of the robot YAML, or else of the SRDF."""
-    description = robot.description
-    if name not in description.poses and description.srdf is not None and description.urdf is not None:
-        from ibrobot_kinematics.errors import KinematicsError
-        from ibrobot_kinematics.srdf import read_srdf
-        from ibrobot_kinematics.urdf import read_urdf
-
-        try:
-            srdf = read_srdf(description.srdf, read_urdf(description.urdf))
-            if any(each.name == name for each in srdf.states):
-                return dict(srdf.state(name).positions)
-        except KinematicsError as error:
-            raise _invalid(str(error)) from None
     try:
-        return dict(zip(robot.joint_names, robot.pose(name).tolist(), strict=True))
-    except KeyError as error:
+        return named_pose(robot, name)
+    except PlanningError as error:
         hint = "; or give joints, e.g. wrist_flex=0.5, or a position, e.g. xyz=0.2,0.0,0.1"
-        raise _invalid(f"{error.args[0]}{hint}") from None
+        raise _invalid(f"{error}{hint}") from None
 
 
 def _words(text: str) -> dict[str, list[str]]:

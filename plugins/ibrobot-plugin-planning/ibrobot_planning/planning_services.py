@@ -26,6 +26,8 @@ from ibrobot_core.api import (
     Vector,
 )
 from ibrobot_planning.engines import find_engines
+from ibrobot_planning.goal_plans import GoalPlans
+from ibrobot_planning.goal_text import target
 from ibrobot_planning.options import RrtConnectOptions
 from ibrobot_planning.requests import (
     CartesianQuery,
@@ -34,6 +36,7 @@ from ibrobot_planning.requests import (
     IkAnswer,
     IkQuery,
     ObjectSummary,
+    PlanAhead,
     PlanAnswer,
     PlanningScene,
     PlanQuery,
@@ -52,6 +55,8 @@ COMPUTE_FK = "/compute_fk"
 """Takes an `FkQuery`, and answers with an `FkAnswer`."""
 PLAN = "/plan_kinematic_path"
 """Takes a `PlanQuery`, and answers with a `PlanAnswer`."""
+PLAN_GOAL = "/planning/plan"
+"""Takes a goal as `/planning/go_to` does, or a `PlanAhead`, and answers with a `PlanAnswer`."""
 CARTESIAN = "/compute_cartesian_path"
 """Takes a `CartesianQuery`, and answers with a `PlanAnswer`."""
 SCENE = "/get_planning_scene"
@@ -66,21 +71,22 @@ class PlanningServices:
     Args:
         session: the run.
         mode: the mode.
-        plan: plans a request by the mode's planner.
+        plans: plans by the mode's planner.
 
     Attributes:
         handlers: service -> its handler.
     """
 
-    def __init__(self, session: Session, mode: ControlMode, plan: Callable[[PlanRequest], PlanResult]) -> None:
+    def __init__(self, session: Session, mode: ControlMode, plans: GoalPlans) -> None:
         self._session = session
         self._robot = session.config.robot
         self._mode = mode
-        self._plan_request = plan
+        self._plans = plans
         self.handlers: dict[str, Callable[[Any], Any]] = {
             COMPUTE_IK: self._ik,
             COMPUTE_FK: self._fk,
             PLAN: self._plan,
+            PLAN_GOAL: self._plan_goal,
             CARTESIAN: self._cartesian,
             SCENE: self._scene,
         }
@@ -106,6 +112,19 @@ class PlanningServices:
         scaling = query.velocity_scaling, query.acceleration_scaling
         return self._planned(lambda: any_goal(query.goals), query.start, *scaling)
 
+    def _plan_goal(self, request: Any) -> PlanAnswer:
+        query = request if isinstance(request, PlanAhead) else PlanAhead(request)
+
+        def planned() -> PlanResult:
+            aim = target(query.goal, self._robot)
+            self._plans.check(aim)
+            found = self._plans.plan(aim, self._start(query.start))[1]
+            if found is None:
+                raise PlanningError(f"goal {aim.text!r} needs no plan", PlanCode.INVALID_GOAL_CONSTRAINTS)
+            return found
+
+        return _answer(planned)
+
     def _cartesian(self, request: object) -> PlanAnswer:
         query = requested(CartesianQuery, request)
         return self._planned(query.goal, query.start, query.velocity_scaling, query.acceleration_scaling)
@@ -113,19 +132,14 @@ class PlanningServices:
     def _planned(
         self, goal: Callable[[], Goal], start: Mapping[str, float], velocity: float, acceleration: float
     ) -> PlanAnswer:
-        begun = time.monotonic()
-        try:
+        def planned() -> PlanResult:
             joints, whole = self._joints(), self._start(start)
             others = dict(zip(self._robot.joint_names, whole.tolist(), strict=True))
-            planned = self._plan_request(
-                PlanRequest(joints, whole[self._robot.indices(joints)], goal(), velocity, acceleration, others)
-            )
-        except PlanningError as error:
-            return PlanAnswer(error.code, str(error), planning_time_s=time.monotonic() - begun)
-        return PlanAnswer(
-            PlanCode.SUCCESS, "", planned.trajectory, planned.fraction, planned.alternative,
-            planned.position_error, planned.orientation_error, time.monotonic() - begun,
-        )  # fmt: skip
+            aim = self._plans.with_states(goal(), joints)
+            first = whole[self._robot.indices(joints)]
+            return self._plans.planned(PlanRequest(joints, first, aim, velocity, acceleration, others))
+
+        return _answer(planned)
 
     def _joints(self) -> tuple[str, ...]:
         """The joints of the arm.
@@ -244,3 +258,16 @@ class PlanningServices:
             tip, links = "", ()
         state = JointState(Header(reading.stamp_ns), robot.joint_names, reading.position, reading.velocity)
         return PlanningScene(robot.name, state, robot.groups, tuple(robot.description.poses), tip, links, objects)
+
+
+def _answer(plan: Callable[[], PlanResult]) -> PlanAnswer:
+    """The answer of a service that plans."""
+    begun = time.monotonic()
+    try:
+        planned = plan()
+    except PlanningError as error:
+        return PlanAnswer(error.code, str(error), planning_time_s=time.monotonic() - begun)
+    return PlanAnswer(
+        PlanCode.SUCCESS, "", planned.trajectory, planned.fraction, planned.alternative,
+        planned.position_error, planned.orientation_error, time.monotonic() - begun,
+    )  # fmt: skip

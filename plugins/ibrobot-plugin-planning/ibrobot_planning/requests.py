@@ -33,6 +33,7 @@ from ibrobot_core.api import (
     option,
     single_options,
 )
+from ibrobot_planning.goal_text import Target
 from ibrobot_planning.transforms import from_rpy
 
 _NEARLY_ONE = 1e-3
@@ -148,6 +149,16 @@ class PlanQuery:
     start: Mapping[str, float] = option(factory=dict, unit="rad", help="start; other joints are where they are")
     velocity_scaling: float = _scaling("velocity")
     acceleration_scaling: float = _scaling("acceleration")
+
+
+@attrs.frozen
+class PlanAhead:
+    """A request to `/planning/plan`: plan to a goal, and stay."""
+
+    goal: str | Goal | Target
+    """As `/planning/go_to` takes it."""
+    start: Mapping[str, float] = attrs.field(factory=dict)
+    """Start of joints [rad]; the others are where they are."""
 
 
 @documented

@@ -20,14 +20,11 @@ from ibrobot_core.api import (
     HardwareError,
     JointGoal,
     JointState,
-    JointTrajectory,
     NotSupported,
     OrientationPolicy,
     PlanCode,
     Planner,
-    PlannerDescriptor,
     PlanningError,
-    PlanRequest,
     PlanResult,
     Pose,
     PoseGoal,
@@ -35,11 +32,11 @@ from ibrobot_core.api import (
     Session,
     SourceWorker,
     String,
-    Vector,
     ns,
     seconds,
 )
-from ibrobot_planning.execution import Execution, ExecutorGoal
+from ibrobot_planning.execution import Execution
+from ibrobot_planning.goal_plans import GoalPlans
 from ibrobot_planning.goal_text import Target, target
 from ibrobot_planning.motion import MoveResult, MoveToConfiguration, MoveToPose, Outcome
 from ibrobot_planning.planning_services import PlanningServices
@@ -74,8 +71,6 @@ _WATCH_S = 0.02
 _ENDED = MoveResult(False, "the mode or the run ended", 0.0, "CANCELLED", PlanCode.PREEMPTED)
 _STILL_RAD = 1e-4
 """Commands that change less between two checks are at rest."""
-_START_RAD = 0.01
-"""Allowed distance between the start of a trajectory and the robot, that of MoveIt."""
 _KEPT = 100
 """Number of results kept for `RESULT`."""
 _POLICIES: tuple[OrientationPolicy, ...] = ("keep_axis", "arm_plane", "current", "free")
@@ -115,6 +110,7 @@ class PlannerSource(SourceWorker):
         assert mode.planner is not None
         super().__init__(session, mode, f"planner {mode.planner.type}")
         self._component = mode.planner
+        self._plans = GoalPlans(session, mode)
         self._numbers = itertools.count(1)
         self._inbox: queue.SimpleQueue[Mapping[str, Any] | _Move | None] = queue.SimpleQueue()
         """Events of executors; goals that replace others; None to cancel."""
@@ -138,7 +134,6 @@ class PlannerSource(SourceWorker):
         self._asked = len(self._queue)
         self._ends = bool(self._queue)
         self._over = False
-        self._planning = threading.Lock()
         self._services: dict[str, Callable[[Any], Any]] = {
             GO_TO: lambda goal: self._submit(goal).number,
             RESULT: self._result,
@@ -147,18 +142,19 @@ class PlannerSource(SourceWorker):
             EXECUTE: self._execute,
             MOVE_TO_POSE: self._move_to_pose,
             MOVE_TO_CONFIGURATION: self._move_to_configuration,
-            **PlanningServices(session, mode, self._planned).handlers,
+            **PlanningServices(session, mode, self._plans).handlers,
         }
 
     @override
     def setup(self) -> None:
-        self._planner: Planner = self.session.make("planner", self._component, self._component.type)
-        self.on_end.callback(self._planner.close)
-        self._execution = Execution(self.session, self._planner)
+        planner: Planner = self.session.make("planner", self._component, self._component.type)
+        self.on_end.callback(planner.close)
+        self._plans.planner = planner
+        self._execution = Execution(self.session, planner)
         self._poses = self.session.bus.subscribe(CMD_POSE, 1)
         self.on_end.callback(self._poses.close)
         self.on_end.callback(self._drop_all)
-        self._planner.load()
+        planner.load()
         if not self.session.request.lockstep:
             self._watched.clear()
             watcher = threading.Thread(target=self._watch_on, name=f"{self.name} watch", daemon=True)
@@ -214,21 +210,8 @@ class PlannerSource(SourceWorker):
 
     def _new(self, goal: str | Goal | Target, velocity_scaling: float = 1.0, *, asked: bool = False) -> _Move:
         parsed = target(goal, self.session.config.robot, velocity_scaling)
-        if parsed.tool is not None and not isinstance(parsed.tool, JointGoal):
-            self._check_planner(parsed)
-        self._executors(parsed)
+        self._plans.check(parsed)
         return _Move(next(self._numbers), parsed, asked)
-
-    def _check_planner(self, parsed: Target) -> None:
-        """Refuse a goal of the tool, or alternatives, where the planner takes joint positions only."""
-        planners = self.session.registry.of_kind("planner")
-        takes = [each.type for each in planners if isinstance(each, PlannerDescriptor) and each.tool_goals]
-        if self._component.type not in takes:
-            raise PlanningError(
-                f"goal {parsed.text!r}: planner type {self._component.type!r} of mode {self.mode.name} takes joint"
-                f" positions only; types that take other goals: {', '.join(takes) or 'none is installed'}",
-                PlanCode.UNRECOGNIZED_GOAL_TYPE,
-            )
 
     def _submit(self, goal: str | Goal | Target, velocity_scaling: float = 1.0) -> _Move:
         """Replace all goals by this one."""
@@ -247,7 +230,7 @@ class PlannerSource(SourceWorker):
     def _execute(self, request: object) -> int:
         trajectory = trajectory_from(request)
         parsed = Target("trajectory", trajectory=trajectory)
-        self._executors(parsed)
+        self._plans.check(parsed)
         return self._submitted(_Move(next(self._numbers), parsed)).number
 
     def _known(self, move: _Move) -> _Move:
@@ -332,7 +315,7 @@ class PlannerSource(SourceWorker):
         new.begun_ns = self.session.clock.now_ns()
         self._show("executing")
         try:
-            goals = self._plan(new, rest)
+            goals, new.planned = self._plans.plan(new.target, rest)
         except PlanningError as error:
             self._execution.stop(new.number)
             self._finish(new, "PLANNING_FAILED", error.code, str(error))
@@ -381,7 +364,7 @@ class PlannerSource(SourceWorker):
         move.begun_ns = self.session.clock.now_ns()
         self._show("executing")
         try:
-            goals = self._plan(move, self._execution.commanded())
+            goals, move.planned = self._plans.plan(move.target, self._execution.commanded())
             with self._choosing:
                 self._move = move
             self._execution.begin(move.number, goals)
@@ -389,102 +372,6 @@ class PlannerSource(SourceWorker):
             self._finish(move, "PLANNING_FAILED", error.code, str(error))
         except HardwareError as error:
             self._finish(move, "EXECUTION_FAILED", PlanCode.CONTROL_FAILED, str(error))
-
-    def _executors(self, parsed: Target) -> dict[str, Goal | float | JointTrajectory]:
-        """Executor -> its target: a goal to plan for, a position [rad], or a trajectory to follow.
-
-        Raises:
-            PlanningError: where no executor of the mode can reach the goal.
-        """
-        executors = {name: self.session.config.executors[name] for name in self.mode.executors}
-        found: dict[str, Goal | float | JointTrajectory] = {}
-        if (trajectory := parsed.trajectory) is not None:
-            wanted = set(trajectory.joint_names)
-            arms = [
-                name for name, each in executors.items() if each.goals == "trajectory" and set(each.joints) == wanted
-            ]
-            if not arms:
-                raise PlanningError(
-                    f"no executor of mode {self.mode.name} follows trajectories of {', '.join(trajectory.joint_names)}",
-                    PlanCode.INVALID_GROUP_NAME,
-                )
-            return {arms[0]: trajectory}
-        for name, executor in executors.items():
-            mine = [joint for joint in executor.joints if joint in parsed.joints]
-            if mine and executor.goals == "position":
-                found[name] = parsed.joints[mine[0]]
-            elif mine:
-                found[name] = JointGoal(tuple(mine), np.array([parsed.joints[joint] for joint in mine]))
-        if parsed.tool is None:
-            return found
-        arms = [name for name, executor in executors.items() if executor.goals == "trajectory"]
-        if len(arms) != 1:
-            raise PlanningError(
-                f"goal {parsed.text!r}: mode {self.mode.name} has {len(arms)} executors of trajectories,"
-                " a goal of the tool needs one",
-                PlanCode.INVALID_GROUP_NAME,
-            )
-        if arms[0] in found:
-            joints = ", ".join(joint for joint in parsed.joints if joint in executors[arms[0]].joints)
-            raise PlanningError(
-                f"goal {parsed.text!r}: {joints} moves the tool, and cannot be given beside its position",
-                PlanCode.INVALID_GOAL_CONSTRAINTS,
-            )
-        return {arms[0]: parsed.tool, **found}
-
-    def _plan(self, move: _Move, start: Vector) -> dict[str, ExecutorGoal]:
-        """Executor -> its goal; `start` has the commanded positions of all joints [rad], shape (J,)."""
-        robot = self.session.config.robot
-        wanted = self._executors(move.target)
-        if not wanted:
-            raise PlanningError(f"goal {move.target.text!r}: no executor of mode {self.mode.name} has these joints")
-        goals: dict[str, ExecutorGoal] = {}
-        for name, goal in wanted.items():
-            if isinstance(goal, float):
-                goals[name] = goal
-                continue
-            if isinstance(goal, JointTrajectory):
-                self._check_begin(goal, start)
-                goals[name] = goal
-                continue
-            joints = self.session.config.executors[name].joints
-            others = dict(zip(robot.joint_names, start.tolist(), strict=True))
-            request = PlanRequest(
-                joints, start[robot.indices(joints)], goal,
-                move.target.velocity_scaling, move.target.acceleration_scaling, others,
-            )  # fmt: skip
-            planned = self._planned(request)
-            goals[name] = planned.trajectory
-            if goal is move.target.tool:
-                move.planned = planned
-        return goals
-
-    def _planned(self, request: PlanRequest) -> PlanResult:
-        with self._planning:
-            return self._planner.plan(request)
-
-    def _check_begin(self, trajectory: JointTrajectory, start: Vector) -> None:
-        """Check that a trajectory begins where the robot is.
-
-        Raises:
-            PlanningError: if it does not.
-        """
-        first = trajectory.points[0].positions
-        present = start[self.session.config.robot.indices(trajectory.joint_names)]
-        if first.shape != present.shape:
-            raise PlanningError(
-                f"point 0 of the trajectory has {first.size} positions for {present.size} joints",
-                PlanCode.INVALID_MOTION_PLAN,
-            )
-        away = np.abs(first - present)
-        # Written so that NaN fails it.
-        if not away.max() <= _START_RAD:
-            joint = int(away.argmax())
-            raise PlanningError(
-                f"the trajectory begins with {trajectory.joint_names[joint]} at {first[joint]:.4f} rad, the robot is at"
-                f" {present[joint]:.4f} rad; at most {_START_RAD} rad may lie between them",
-                PlanCode.START_STATE_INVALID,
-            )
 
     def _advance(self, event: Mapping[str, Any]) -> None:
         move = self._move

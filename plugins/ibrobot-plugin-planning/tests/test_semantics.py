@@ -11,11 +11,16 @@ from ibrobot_kinematics.srdf import read_srdf
 from ibrobot_kinematics.urdf import read_urdf
 from ibrobot_planning.arm import robot_arm
 from ibrobot_planning.collision import unchecked_pairs
+from ibrobot_planning.goal_text import target
 from ibrobot_planning.options import RrtConnectOptions
+from ibrobot_planning.poses import named_pose, pose_names
 from ibrobot_planning.rrt import RrtConnectPlanner
 from ibrobot_planning.semantics import srdf, urdf_names
+from ibrobot_planning.tasks.format import MoveStep
+from ibrobot_planning.tasks.goals import move_target
+from ibrobot_planning.world import World
 
-from ibrobot_core.api import Context, NamedGoal, PlanRequest, SteppedClock
+from ibrobot_core.api import Context, NamedGoal, PlanningError, PlanRequest, SteppedClock
 
 from .table_arm import ARM, make_robot
 
@@ -76,3 +81,49 @@ def test_the_planner_takes_pairs_and_poses_of_an_srdf(described, tmp_path, caplo
     assert caplog.messages == []
     result = planner.plan(PlanRequest(ARM, np.zeros(5), NamedGoal("aside")))
     np.testing.assert_allclose(result.trajectory.points[-1].positions, [0.7, 0, 0, 0, 0], atol=1e-9)
+
+
+def with_states(robot, path, *states: str):
+    """The robot with an SRDF of two groups, and these group states."""
+    groups = (
+        '<group name="arm"><joint name="pan"/><joint name="lift"/></group><group name="g"><joint name="jaw"/></group>'
+    )
+    path.write_text(f'<robot name="tabletop">{groups}{"".join(states)}</robot>')
+    return attrs.evolve(robot, description=attrs.evolve(robot.description, srdf=path))
+
+
+def state(name: str, group: str, **joints: float) -> str:
+    inner = "".join(f'<joint name="{joint}" value="{value}"/>' for joint, value in joints.items())
+    return f'<group_state name="{name}" group="{group}">{inner}</group_state>'
+
+
+PAN = state("aside", "arm", pan=0.7, lift=0.1)
+JAW = state("aside", "g", jaw=0.3)
+AGAIN = state("home", "arm", pan=0.2, lift=0.0)
+
+
+def test_group_states_of_all_groups_are_one_pose(described, tmp_path):
+    robot = with_states(described, tmp_path / "arm.srdf", PAN, JAW, AGAIN)
+    assert pose_names(robot) == ["up", "left", "right", "aside", "home"]
+    assert named_pose(robot, "aside") == {"pan": 0.7, "lift": 0.1, "jaw": 0.3}
+    assert target("aside", robot).joints == named_pose(robot, "aside")
+    assert named_pose(robot, "left")["pan"] == 1.0
+    with pytest.raises(PlanningError, match="no pose 'asid'; the poses are: up, left, right, aside, home"):
+        named_pose(robot, "asid")
+
+
+def test_group_state_is_a_goal_of_a_step_with_the_joints_of_the_arm(described, tmp_path):
+    robot = with_states(described, tmp_path / "arm.srdf", PAN, JAW)
+    assert move_target(MoveStep(pose="aside"), robot, ARM, World()).joints == {"pan": 0.7, "lift": 0.1}
+
+
+def test_group_states_that_contradict_each_other_are_named(described, tmp_path):
+    path = tmp_path / "arm.srdf"
+    robot = with_states(described, path, PAN, JAW)
+    path.write_text(
+        path.read_text()
+        .replace('<joint name="jaw"/></group>', '<joint name="jaw"/><joint name="pan"/></group>')
+        .replace('value="0.3"/>', 'value="0.3"/><joint name="pan" value="0"/>')
+    )
+    with pytest.raises(PlanningError, match="'aside' of the SRDF has two positions of joint pan, in groups arm, g"):
+        named_pose(robot, "aside")

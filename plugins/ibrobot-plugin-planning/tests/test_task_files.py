@@ -75,11 +75,11 @@ MALFORMED = {
     "unknown kind": ("steps:\n- jump: {}", "task.yaml:2: steps.0.jump: unknown key"),
     "step of no kind": (
         "steps:\n- name: x",
-        "task.yaml:2: steps.x: a step has one of move, gripper, wait, run_policy, look, record; there is none",
+        "task.yaml:2: steps.x: a step has one of move, gripper, wait, run_policy, look, record, alternatives; there",
     ),
     "step of two kinds": (
         "steps:\n- {wait: {seconds: 1}, move: {pose: up}}",
-        "task.yaml:2: steps.0: a step has one of move, gripper, wait, run_policy, look, record; move and wait exclude",
+        "task.yaml:2: steps.0: a step has one of move, gripper, wait, run_policy, look, record, alternatives; move and",
     ),
     "text for a number": (
         "steps:\n- wait: {seconds: soon}",
@@ -198,6 +198,44 @@ MALFORMED = {
         "steps:\n- record: {}\n- record: {}\n- run_policy: {mode: policy, seconds: 1}",
         "task.yaml:3: steps.1.record: the step before it records the next policy already",
     ),
+    "outcome of a task's recording": (
+        "steps:\n- record: {of: task, outcome: success}",
+        "steps.0.record: outcome belongs to the episode of a policy",
+    ),
+    "policy in a task that is recorded": (
+        "steps:\n- record: {of: task}\n- run_policy: {mode: policy, seconds: 1}",
+        "task.yaml:3: steps.1.run_policy.mode: a policy ends the episode that a step before it records of the task",
+    ),
+    "nothing left to record": ("steps:\n- move: {pose: up}\n- record: {of: task}", "steps.1.record: no step after it"),
+    "alternatives without steps": (
+        "steps:\n- alternatives: [[]]",
+        "steps.0.alternatives: alternatives are lists of steps, each with at least one step",
+    ),
+    "alternatives in alternatives": (
+        "steps:\n- alternatives: [[{alternatives: [[{move: {pose: up}}]]}]]",
+        "steps.0.alternatives.0.0.alternatives: unknown key",
+    ),
+    "unknown pose in alternatives": (
+        "steps:\n- alternatives:\n  - - move: {pose: up}\n  - - move: {pose: lef}",
+        "task.yaml:4: steps.0.alternatives.1.0.move.pose: unknown pose 'lef', did you mean 'left'?",
+    ),
+    "no list of steps in reach": (
+        "steps:\n- alternatives:\n  - - move: {xyz: [2, 0, 0.1]}\n  - - move: {pose: up}\n"
+        "    - move: {xyz: [3, 0, 0.1]}",
+        "task.yaml:5: steps.0.alternatives.1.1.move: NO_IK_SOLUTION: tip cannot reach (3.000, 0.000, 0.100) m",
+    ),
+    "alternatives with different objects in the gripper": (
+        "steps:\n- alternatives: [[{gripper: {position: 0, grasp: cube}}], [{move: {pose: up}}]]",
+        "steps.0.alternatives: the alternatives end with different objects in the gripper: 'cube', nothing",
+    ),
+    "recording of a task within alternatives": (
+        "steps:\n- alternatives: [[{record: {of: task}}, {move: {pose: up}}]]",
+        "steps.0.alternatives.0.0.record: a task is recorded by a step of its own, not by one of an alternative",
+    ),
+    "recording of nothing within alternatives": (
+        "steps:\n- record: {}\n- alternatives: [[{record: {}}]]",
+        "task.yaml:2: steps.0.record: the step after it must be a run_policy, or in the same list",
+    ),
 }
 
 
@@ -213,6 +251,10 @@ def test_all_faults_are_reported_together(check: Check):
     with pytest.raises(ConfigError) as failure:
         check("steps:\n- move: {pose: lef}\n- gripper: {position: 9}\n- look: {camera: ear}")
     assert [problem.line for problem in failure.value.problems] == [2, 3, 4]
+
+
+def test_one_list_of_alternatives_in_reach_is_enough(check: Check):
+    assert check("steps:\n- alternatives: [[{move: {xyz: [2, 0, 0.1]}}], [{move: {pose: up}}]]")
 
 
 def test_planner_of_joints_takes_no_positions(check: Check):

@@ -131,7 +131,7 @@ def test_result_of_a_failure_names_step_code_and_obstacle(run):
     )
     result = perform(runtime, text)
     assert result.outcome == "FAILED"
-    assert result.message.startswith("step 2 (into the cube): the goal is in collision")
+    assert result.message.startswith("step 2 (into the cube): GOAL_IN_COLLISION: the goal is in collision")
     assert "cube" in result.message
     assert [step.outcome for step in result.steps] == ["SUCCEEDED", "FAILED", "NOT_RUN"]
     assert result.steps[1].code == "GOAL_IN_COLLISION"
@@ -160,6 +160,37 @@ def test_feedback_per_step(run):
         ("two waits", 1, 2, "executing"), ("two waits", 2, 2, "executing"), ("two waits", 2, 2, "succeeded"),
     ]  # fmt: skip
     assert (messages[0]["kind"], messages[0]["name"]) == ("wait", "rest")
+
+
+def test_alternative_whose_later_step_cannot_be_planned_is_passed_over(run):
+    # From `left` the straight line would leave the reach of the arm.
+    far = "move: {line: [{xyz: [0, 0.5, 0], relative: true}]}"
+    runtime = run()
+    other = "{move: {pose: right}}, {wait: {seconds: 0.1}}"
+    text = steps(f"alternatives: [[{{move: {{pose: left}}}}, {{{far}}}], [{other}]]")
+    result = perform(runtime, text)
+    assert (result.success, result.steps[0].kind, result.steps[0].facts) == (True, "alternatives", {"alternative": 2})
+    assert joints(runtime)[0] == pytest.approx(-1.0, abs=0.05)
+
+
+def test_alternative_that_fails_gives_way_to_the_next(run):
+    runtime = run()
+    grasp = "gripper: {position: 0.2, grasp: cube}"
+    text = steps(f"alternatives: [[{{move: {{pose: left}}}}, {{{grasp}}}], [{{{grasp}}}]]")
+    result = perform(runtime, text)
+    assert joints(runtime)[0] == pytest.approx(1.0, abs=0.05), "the first list began"
+    nothing = "nothing stopped the gripper on its way to 0.2 rad: no 'cube' there"
+    assert result.message == (
+        f"step 1 (alternatives): no alternative succeeded: alternative 1: {nothing}; alternative 2: {nothing}"
+    )
+
+
+def test_fault_ends_all_alternatives(run):
+    runtime = run()
+    number = runtime.session.bus.call(RUN, steps("alternatives: [[{wait: {seconds: 5}}], [{move: {pose: left}}]]"))
+    runtime.step()
+    runtime.session.control.call("fault", fault="the cable is loose")
+    assert finish(runtime, number).message == "step 1 (alternatives): the robot stopped: the cable is loose"
 
 
 def test_cancel_slows_down_and_holds(run):

@@ -3,33 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
-from typing import TYPE_CHECKING
 
 import attrs
-import numpy as np
 
 from ibrobot_core.api import (
-    AnyGoal,
     ControlMode,
-    Goal,
     IbrobotError,
-    LinearGoal,
     PlannerDescriptor,
     PlanningError,
-    PoseGoal,
-    PositionGoal,
     Registry,
     RobotConfig,
     Vector,
     check_models,
 )
-from ibrobot_planning.tasks.format import GoalOptions, GripperStep, LookStep, MoveStep, PolicyStep, RecordStep, WaitStep
+from ibrobot_planning.poses import named_pose, pose_names
+from ibrobot_planning.tasks.format import (
+    AlternativesStep,
+    GoalOptions,
+    GripperStep,
+    LookStep,
+    MoveStep,
+    PolicyStep,
+    RecordStep,
+    Step,
+    WaitStep,
+)
 from ibrobot_planning.tasks.goals import move_target
+from ibrobot_planning.tasks.reach import Reach
 from ibrobot_planning.tasks.reading import TaskFile
 from ibrobot_planning.world import World
-
-if TYPE_CHECKING:
-    from ibrobot_planning.goals import Tool
 
 type Key = tuple[str | int, ...]
 
@@ -77,7 +79,7 @@ def check_task(file: TaskFile, given: Circumstances) -> CheckedTask:
 class _Checks:
     def __init__(self, file: TaskFile, given: Circumstances) -> None:
         self._file, self._document, self._given = file, file.document, given
-        self._tool: Tool | None = None
+        self._within_reach = Reach(given.config.robot, given.start)
         planners = given.registry.of_kind("planner")
         self._tool_planners = [
             each.type for each in planners if isinstance(each, PlannerDescriptor) and each.tool_goals
@@ -86,6 +88,9 @@ class _Checks:
         """Objects that are not where the world has them."""
         self._held: str | None = None
         self._recording: Key | None = None
+        """A step that records the next policy."""
+        self._records_task = False
+        self._out_of_reach: list[tuple[Key, str]] = []
 
     def run(self) -> CheckedTask:
         mode = self._mode()
@@ -98,24 +103,65 @@ class _Checks:
         grippers = tuple(name for name, each in executors.items() if each.goals == "position")
         self._arm, self._grippers = arm, grippers
         for i, step in enumerate(self._file.task.steps):
-            key: Key = ("steps", i, step.kind)
-            match step.action:
-                case MoveStep() as move:
-                    self._move(key, move)
-                case GripperStep() as gripper:
-                    self._gripper(key, gripper)
-                case PolicyStep() as policy:
-                    self._policy(key, policy)
-                case LookStep() as look:
-                    self._look(key, look)
-                case RecordStep() as record:
-                    self._record(key, record)
-                case WaitStep():
-                    pass
-        if self._recording is not None:
-            self._document.add(self._recording, "no step after it runs a policy, whose episode it would record")
+            self._step(("steps", i), step)
+            for key, message in self._out_of_reach:
+                self._document.add(key, message)
+            self._out_of_reach.clear()
+        self._nothing_to_record()
+        if self._file.task.steps[-1].record is not None and self._records_task:
+            last = len(self._file.task.steps) - 1
+            self._document.add(("steps", last, "record"), "no step after it is left to record")
         self._document.raise_problems()
         return CheckedTask(self._file, mode, arm, grippers)
+
+    def _step(self, key: Key, step: Step) -> None:
+        key = (*key, step.kind)
+        match step.action:
+            case MoveStep() as move:
+                self._move(key, move)
+            case GripperStep() as gripper:
+                self._gripper(key, gripper)
+            case PolicyStep() as policy:
+                self._policy(key, policy)
+            case LookStep() as look:
+                self._look(key, look)
+            case RecordStep() as record:
+                self._record(key, record)
+            case AlternativesStep() as alternatives:
+                self._alternatives(key, alternatives)
+            case WaitStep():
+                pass
+
+    def _alternatives(self, key: Key, step: AlternativesStep) -> None:
+        """Check each list of steps from the same beginning; one of them must be within reach."""
+        before, moved, held = self._moved, set(self._moved), self._held
+        ends: set[str | None] = set()
+        unreachable: list[list[tuple[Key, str]]] = []
+        if self._recording is not None:
+            self._document.add(self._recording, "the step after it must be a run_policy, or in the same list")
+            self._recording = None
+        for i, steps in enumerate(step.lists):
+            self._moved, self._held = set(before), held
+            for j, each in enumerate(steps):
+                self._step((*key, i, j), each)
+            self._nothing_to_record()
+            moved |= self._moved
+            ends.add(self._held)
+            unreachable.append(self._out_of_reach)
+            self._out_of_reach = []
+        self._moved = moved
+        if len(ends) > 1:
+            found = ", ".join(sorted("nothing" if each is None else repr(each) for each in ends))
+            self._document.add(key, f"the alternatives end with different objects in the gripper: {found}")
+        if all(unreachable):
+            self._out_of_reach = [each[0] for each in unreachable]
+
+    def _nothing_to_record(self) -> None:
+        if self._recording is not None:
+            self._document.add(
+                self._recording, "no step after it runs a policy, whose episode it would record; or set `of: task`"
+            )
+        self._recording = None
 
     def _mode(self) -> ControlMode | None:
         config, name = self._given.config, self._file.task.mode
@@ -164,7 +210,7 @@ class _Checks:
         """Check the names and limits of one goal; whether its position is known."""
         robot = self._given.config.robot
         if goal.pose is not None:
-            self._document.refer((*key, "pose"), goal.pose, list(robot.description.poses), "pose")
+            self._pose((*key, "pose"), goal.pose)
         for joint, value in goal.joints.items():
             at = (*key, "joints", joint)
             if not self._document.refer(at, joint, robot.joint_names, "joint"):
@@ -193,46 +239,24 @@ class _Checks:
             )
         return self._object((*key, "object"), goal.object) and goal.object not in self._moved
 
+    def _pose(self, key: Key, name: str) -> None:
+        robot = self._given.config.robot
+        try:
+            if self._document.refer(key, name, pose_names(robot), "pose"):
+                named_pose(robot, name)
+        except PlanningError as error:
+            self._document.add(key, str(error))
+
     def _reach(self, key: Key, step: MoveStep) -> None:
         """Check by inverse kinematics that the tool can be where a step wants it."""
         try:
             world = self._given.world or World()
             goal = move_target(step, self._given.config.robot, self._arm, world).tool
             if goal is not None:
-                self._check_reach(goal)
+                self._within_reach.check(goal)
         except IbrobotError as error:
             code = f"{error.code.name}: " if isinstance(error, PlanningError) else ""
-            self._document.add(key, f"{code}{error}")
-
-    def _check_reach(self, goal: Goal) -> None:
-        if isinstance(goal, LinearGoal):
-            for waypoint in goal.waypoints:
-                self._check_reach(waypoint)
-        elif isinstance(goal, AnyGoal):
-            errors = []
-            for each in goal.goals:
-                try:
-                    self._check_reach(each)
-                except PlanningError as error:
-                    errors.append(error)
-            if len(errors) == len(goal.goals):
-                raise errors[0]
-        elif isinstance(goal, PositionGoal | PoseGoal):
-            tool, start = self._kinematics(), self._given.start
-            model = tool.model
-            tool.candidates(goal, np.clip(0.0, model.lower, model.upper) if start is None else start)
-
-    def _kinematics(self) -> Tool:
-        if self._tool is None:
-            from ibrobot_kinematics import KinematicsError, robot_model
-
-            from ibrobot_planning.goals import Tool
-
-            try:
-                self._tool = Tool(robot_model(self._given.config.robot))
-            except KinematicsError as error:
-                raise PlanningError(str(error)) from error
-        return self._tool
+            self._out_of_reach.append((key, f"{code}{error}"))
 
     def _gripper(self, key: Key, step: GripperStep) -> None:
         config = self._given.config
@@ -265,6 +289,10 @@ class _Checks:
         config, key = self._given.config, (*key, "mode")
         self._moved.update(self._given.movable)
         self._recording = None
+        if self._records_task:
+            self._document.add(
+                key, "a policy ends the episode that a step before it records of the task; record the policy instead"
+            )
         if not self._document.refer(key, step.mode, list(config.control_modes), "mode"):
             return
         if config.control_modes[step.mode].inference is None:
@@ -292,9 +320,16 @@ class _Checks:
     def _record(self, key: Key, step: RecordStep) -> None:
         if self._given.no_recording:
             self._document.add(key, self._given.no_recording)
+        elif self._records_task:
+            self._document.add(key, "a step before it records the whole task already")
         elif self._recording is not None:
             self._document.add(key, "the step before it records the next policy already")
-        self._recording = key
+        elif step.of == "policy":
+            self._recording = key
+        elif len(key) > len(("steps", 0, "record")):
+            self._document.add(key, "a task is recorded by a step of its own, not by one of an alternative")
+        else:
+            self._records_task = True
 
 
 def _goals(key: Key, step: MoveStep) -> Iterator[tuple[Key, GoalOptions]]:

@@ -150,7 +150,7 @@ class TaskHooks(RunHooks):
         rows = [("task", f"{result.name}: {result.outcome.lower()} after {result.duration_s:.1f} s")]
         for step in result.steps:
             facts = f" {json.dumps(dict(step.facts))}" if step.facts else ""
-            told = f": {step.message}" if step.message else facts
+            told = f": {step.why}" if step.message else facts
             rows.append(
                 (
                     f"  step {step.number}",

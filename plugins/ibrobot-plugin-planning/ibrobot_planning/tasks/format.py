@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, override
 
 import attrs
 
@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 Vec3 = tuple[float, float, float]
-KINDS = ("move", "gripper", "wait", "run_policy", "look", "record")
-"""Kinds of steps, as they are called in the file."""
 _NEARLY_ONE = 1e-3
 """Allowed deviation of a quaternion's length from 1."""
 
@@ -168,15 +166,22 @@ class LookStep:
 @documented
 @attrs.frozen
 class RecordStep:
-    """`record`: the next policy is recorded, as one episode of the section `recording`."""
+    """`record`: an episode of the section `recording`."""
 
     prompt: str | None = option(None, help="description of the episode; None repeats the last one")
+    of: Literal["policy", "task"] = option(
+        "policy", help="policy: the next run_policy; task: all steps from here on, motions and grasps included"
+    )
     outcome: Literal["success", "failure", "unknown"] = option(
-        "unknown", help="outcome of an episode that ends with its time; `until: success` decides otherwise"
+        "unknown", help="outcome of a policy's episode that ends with its time; `until: success` decides otherwise"
     )
 
+    def __attrs_post_init__(self) -> None:
+        if self.of == "task" and self.outcome != "unknown":
+            raise ValueError("outcome belongs to the episode of a policy; that of a task is how the task ends")
 
-type Action = MoveStep | GripperStep | WaitStep | PolicyStep | LookStep | RecordStep
+
+type Action = MoveStep | GripperStep | WaitStep | PolicyStep | LookStep | RecordStep | AlternativesStep
 
 
 @documented
@@ -190,10 +195,11 @@ class Step:
     wait: WaitStep | None = option(None, help="the robot holds")
     run_policy: PolicyStep | None = option(None, help="a policy moves the robot")
     look: LookStep | None = option(None, help="where an object is, or a new image of a camera")
-    record: RecordStep | None = option(None, help="the next policy is recorded as an episode")
+    record: RecordStep | None = option(None, help="what follows is recorded as an episode")
 
     def __attrs_post_init__(self) -> None:
-        _exactly_one("a step", KINDS, [kind for kind, action in self._actions().items() if action is not None])
+        actions = self._actions()
+        _exactly_one("a step", list(actions), [kind for kind, action in actions.items() if action is not None])
 
     @property
     def kind(self) -> str:
@@ -212,9 +218,36 @@ class Step:
         }  # fmt: skip
 
 
-def _some(instance: object, attribute: attrs.Attribute[Any], value: tuple[Step, ...]) -> None:
+def _some(instance: object, attribute: attrs.Attribute[Any], value: Sequence[object]) -> None:
     if not value:
         raise ValueError("a task has at least one step")
+
+
+def _some_lists(instance: object, attribute: attrs.Attribute[Any], value: Sequence[Sequence[object]] | None) -> None:
+    if value is not None and not (value and all(value)):
+        raise ValueError("alternatives are lists of steps, each with at least one step")
+
+
+@attrs.frozen
+class AlternativesStep:
+    """`alternatives`: the first list of steps that succeeds."""
+
+    lists: tuple[tuple[Step, ...], ...]
+
+
+@documented
+@attrs.frozen
+class TaskStep(Step):
+    """A step of a task: as within alternatives, or alternatives."""
+
+    alternatives: tuple[tuple[Step, ...], ...] | None = option(
+        None, validator=_some_lists, help="lists of steps: the first one whose motions can be planned and that succeeds"
+    )
+
+    @override
+    def _actions(self) -> dict[str, Action | None]:
+        lists = self.alternatives
+        return {**super()._actions(), "alternatives": None if lists is None else AlternativesStep(lists)}
 
 
 @documented
@@ -222,7 +255,7 @@ def _some(instance: object, attribute: attrs.Attribute[Any], value: tuple[Step, 
 class Task:
     """A task: steps, one after another."""
 
-    steps: tuple[Step, ...] = option(validator=_some, help="the steps")
+    steps: tuple[TaskStep, ...] = option(validator=_some, help="the steps")
     name: str = option("", help="for feedback and results")
     mode: str | None = option(None, help="planning mode that moves the robot; None: the only one, or the first mode")
     parameters: Mapping[str, str | float | bool] = option(

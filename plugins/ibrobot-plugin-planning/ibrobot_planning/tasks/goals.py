@@ -23,6 +23,7 @@ from ibrobot_core.api import (
     Vector3,
 )
 from ibrobot_planning.goal_text import Target
+from ibrobot_planning.poses import named_pose
 from ibrobot_planning.tasks.format import GoalOptions, MoveStep
 from ibrobot_planning.transforms import from_rpy, matrix, pose
 from ibrobot_planning.world import World
@@ -97,11 +98,7 @@ def _simple(
 def _joints(goal: GoalOptions, robot: Robot, arm: Collection[str]) -> dict[str, float]:
     if goal.pose is None:
         return dict(goal.joints)
-    try:
-        positions = robot.pose(goal.pose).tolist()
-    except KeyError as error:
-        raise PlanningError(str(error.args[0]), PlanCode.INVALID_GOAL_CONSTRAINTS) from None
-    return {joint: value for joint, value in zip(robot.joint_names, positions, strict=True) if joint in arm}
+    return {joint: value for joint, value in named_pose(robot, goal.pose).items() if joint in arm}
 
 
 def _of_tool(goal: GoalOptions, world: World, tool: Vector | None) -> PositionGoal | PoseGoal:

@@ -29,6 +29,11 @@ class StepResult:
     facts: Mapping[str, Any] = attrs.field(factory=dict)
     """E.g. `position` of an object [m], or `position_error_m` of a motion; JSON values."""
 
+    @property
+    def why(self) -> str:
+        """The error with MoveIt's name of it; empty after a success."""
+        return f"{self.code}: {self.message}" if self.code else self.message
+
 
 @attrs.frozen
 class TaskResult:

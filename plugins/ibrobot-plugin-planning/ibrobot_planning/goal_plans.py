@@ -1,0 +1,207 @@
+"""Goals of a mode, divided among its executors, and planned by its planner."""
+
+from __future__ import annotations
+
+import threading
+
+import attrs
+import numpy as np
+
+from ibrobot_core.api import (
+    AnyGoal,
+    ControlMode,
+    Goal,
+    JointGoal,
+    JointTrajectory,
+    NamedGoal,
+    PlanCode,
+    Planner,
+    PlannerDescriptor,
+    PlanningError,
+    PlanRequest,
+    PlanResult,
+    PoseGoal,
+    PositionGoal,
+    Session,
+    Vector,
+)
+from ibrobot_planning.execution import ExecutorGoal
+from ibrobot_planning.goal_text import Target
+from ibrobot_planning.poses import named_pose
+
+_START_RAD = 0.01
+"""Allowed distance between the start of a trajectory and the robot, that of MoveIt."""
+
+
+class GoalPlans:
+    """Plans goals for the executors of a mode.
+
+    Args:
+        session: the run.
+        mode: a mode with a planner.
+
+    Attributes:
+        planner: the loaded planner, once the mode has begun.
+    """
+
+    planner: Planner
+
+    def __init__(self, session: Session, mode: ControlMode) -> None:
+        self._session = session
+        self._mode = mode
+        self._lock = threading.Lock()
+        """Held while the planner plans."""
+
+    def check(self, target: Target) -> None:
+        """Check that the mode can reach for a goal of this kind.
+
+        Raises:
+            PlanningError: if its planner does not take such goals, or no executor of the mode can reach it.
+        """
+        if target.tool is not None and not isinstance(target.tool, JointGoal):
+            self._check_planner(target)
+        self.divided(target)
+
+    def _check_planner(self, target: Target) -> None:
+        """Refuse a goal of the tool, or alternatives, where the planner takes joint positions only."""
+        planners = self._session.registry.of_kind("planner")
+        takes = [each.type for each in planners if isinstance(each, PlannerDescriptor) and each.tool_goals]
+        assert self._mode.planner is not None
+        if self._mode.planner.type not in takes:
+            raise PlanningError(
+                f"goal {target.text!r}: planner type {self._mode.planner.type!r} of mode {self._mode.name} takes joint"
+                f" positions only; types that take other goals: {', '.join(takes) or 'none is installed'}",
+                PlanCode.UNRECOGNIZED_GOAL_TYPE,
+            )
+
+    def divided(self, target: Target) -> dict[str, Goal | float | JointTrajectory]:
+        """Executor -> its part of a goal: a goal to plan for, a position [rad], or a trajectory to follow.
+
+        Raises:
+            PlanningError: where no executor of the mode can reach the goal.
+        """
+        executors = {name: self._session.config.executors[name] for name in self._mode.executors}
+        found: dict[str, Goal | float | JointTrajectory] = {}
+        if (trajectory := target.trajectory) is not None:
+            wanted = set(trajectory.joint_names)
+            arms = [
+                name for name, each in executors.items() if each.goals == "trajectory" and set(each.joints) == wanted
+            ]
+            if not arms:
+                raise PlanningError(
+                    f"no executor of mode {self._mode.name} follows trajectories of"
+                    f" {', '.join(trajectory.joint_names)}",
+                    PlanCode.INVALID_GROUP_NAME,
+                )
+            return {arms[0]: trajectory}
+        for name, executor in executors.items():
+            mine = [joint for joint in executor.joints if joint in target.joints]
+            if mine and executor.goals == "position":
+                found[name] = target.joints[mine[0]]
+            elif mine:
+                found[name] = JointGoal(tuple(mine), np.array([target.joints[joint] for joint in mine]))
+        if target.tool is None:
+            return found
+        arms = [name for name, executor in executors.items() if executor.goals == "trajectory"]
+        if len(arms) != 1:
+            raise PlanningError(
+                f"goal {target.text!r}: mode {self._mode.name} has {len(arms)} executors of trajectories,"
+                " a goal of the tool needs one",
+                PlanCode.INVALID_GROUP_NAME,
+            )
+        joints = executors[arms[0]].joints
+        if arms[0] in found:
+            given = ", ".join(joint for joint in target.joints if joint in joints)
+            raise PlanningError(
+                f"goal {target.text!r}: {given} moves the tool, and cannot be given beside its position",
+                PlanCode.INVALID_GOAL_CONSTRAINTS,
+            )
+        return {arms[0]: self.with_states(target.tool, joints), **found}
+
+    def with_states(self, goal: Goal, joints: tuple[str, ...]) -> Goal:
+        """A goal whose alternatives have positions of `joints` in place of group states of the SRDF.
+
+        Raises:
+            PlanningError: for an unknown pose.
+        """
+        robot = self._session.config.robot
+        if not isinstance(goal, AnyGoal):
+            return goal
+        goals: list[JointGoal | NamedGoal | PositionGoal | PoseGoal] = []
+        for each in goal.goals:
+            if isinstance(each, NamedGoal) and each.name not in robot.description.poses:
+                state = {joint: value for joint, value in named_pose(robot, each.name).items() if joint in joints}
+                goals.append(JointGoal(tuple(state), np.array(list(state.values()))))
+            else:
+                goals.append(each)
+        return attrs.evolve(goal, goals=tuple(goals))
+
+    def plan(self, target: Target, start: Vector) -> tuple[dict[str, ExecutorGoal], PlanResult | None]:
+        """Plan a goal.
+
+        Args:
+            target: the goal.
+            start: positions of all joints [rad], shape (J,), from which the motion begins.
+
+        Returns:
+            Executor -> what it has to do, and the last plan; None if nothing had to be planned.
+
+        Raises:
+            PlanningError: with MoveIt's code.
+        """
+        robot = self._session.config.robot
+        wanted = self.divided(target)
+        if not wanted:
+            raise PlanningError(f"goal {target.text!r}: no executor of mode {self._mode.name} has these joints")
+        goals: dict[str, ExecutorGoal] = {}
+        planned = None
+        for name, goal in wanted.items():
+            if isinstance(goal, float):
+                goals[name] = goal
+                continue
+            if isinstance(goal, JointTrajectory):
+                self._check_begin(goal, start)
+                goals[name] = goal
+                continue
+            joints = self._session.config.executors[name].joints
+            others = dict(zip(robot.joint_names, start.tolist(), strict=True))
+            planned = self.planned(
+                PlanRequest(
+                    joints, start[robot.indices(joints)], goal,
+                    target.velocity_scaling, target.acceleration_scaling, others,
+                )
+            )  # fmt: skip
+            goals[name] = planned.trajectory
+        return goals, planned
+
+    def planned(self, request: PlanRequest) -> PlanResult:
+        """Plan by the mode's planner, one request at a time.
+
+        Raises:
+            PlanningError: with MoveIt's code.
+        """
+        with self._lock:
+            return self.planner.plan(request)
+
+    def _check_begin(self, trajectory: JointTrajectory, start: Vector) -> None:
+        """Check that a trajectory begins where the robot is.
+
+        Raises:
+            PlanningError: if it does not.
+        """
+        first = trajectory.points[0].positions
+        present = start[self._session.config.robot.indices(trajectory.joint_names)]
+        if first.shape != present.shape:
+            raise PlanningError(
+                f"point 0 of the trajectory has {first.size} positions for {present.size} joints",
+                PlanCode.INVALID_MOTION_PLAN,
+            )
+        away = np.abs(first - present)
+        # Written so that NaN fails it.
+        if not away.max() <= _START_RAD:
+            joint = int(away.argmax())
+            raise PlanningError(
+                f"the trajectory begins with {trajectory.joint_names[joint]} at {first[joint]:.4f} rad, the robot is at"
+                f" {present[joint]:.4f} rad; at most {_START_RAD} rad may lie between them",
+                PlanCode.START_STATE_INVALID,
+            )

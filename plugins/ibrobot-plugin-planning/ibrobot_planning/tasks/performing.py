@@ -1,0 +1,418 @@
+"""Performs the steps of a checked task, one after another, through the services of the run."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+from ibrobot_core.api import (
+    SET_MODE,
+    CompressedImage,
+    IbrobotError,
+    Image,
+    PlanningError,
+    Session,
+    Vector,
+    ns,
+    seconds,
+)
+from ibrobot_planning.executors.options import GripperOptions
+from ibrobot_planning.goal_text import Target
+from ibrobot_planning.motion import MoveResult
+from ibrobot_planning.planning_services import PLAN_GOAL
+from ibrobot_planning.requests import PlanAhead, PlanAnswer
+from ibrobot_planning.source import CANCEL as CANCEL_MOTION
+from ibrobot_planning.source import GO_TO
+from ibrobot_planning.source import RESULT as MOTION_RESULT
+from ibrobot_planning.tasks.checks import CheckedTask
+from ibrobot_planning.tasks.format import (
+    Action,
+    AlternativesStep,
+    GripperStep,
+    LookStep,
+    MoveStep,
+    PolicyStep,
+    RecordStep,
+    Step,
+    WaitStep,
+)
+from ibrobot_planning.tasks.goals import move_target
+from ibrobot_planning.tasks.result import StepOutcome, StepResult
+from ibrobot_planning.world import SNAPSHOT, World
+from ibrobot_planning.world_keeper import ATTACH, DETACH, TOUCH
+
+BEGIN_EPISODE, END_EPISODE = "/record_episode/start", "/record_episode/stop"
+"""Services of a run that records: take a prompt, and an outcome."""
+_GRASP_RAD = 0.01
+"""A gripper that comes closer to its goal has grasped nothing, where its executor states no tolerance."""
+_ALIVE_NS = ns(2.0)
+"""How long the contract's topics may take to be alive after a recorded step has begun."""
+
+type Steps = Generator[None, None, Mapping[str, Any]]
+
+
+class Cancelled(Exception):
+    """The present task was cancelled."""
+
+
+class StepFailed(Exception):
+    """A step failed.
+
+    Args:
+        message: why, in one sentence.
+        code: MoveIt's name of the error, or empty.
+    """
+
+    def __init__(self, message: str, code: str = "") -> None:
+        super().__init__(message)
+        self.code = code
+
+
+class Performance:
+    """One performance of a task.
+
+    Args:
+        session: the run.
+        checked: the task.
+        begins: called with each step before it begins.
+
+    Attributes:
+        begun_ns: when it began [ns].
+        cancelled: why it ends early; empty otherwise.
+        results: of the steps that have ended.
+    """
+
+    def __init__(self, session: Session, checked: CheckedTask, begins: Callable[[Step], None]) -> None:
+        self._session = session
+        self.checked = checked
+        self._begins = begins
+        self.begun_ns = session.clock.now_ns()
+        self.cancelled = ""
+        self.results: list[StepResult] = []
+        self._episode: RecordStep | None = None
+        """The episode to record with the next policy."""
+        self._recording = False
+        """Whether an episode of the task is being recorded."""
+        self._held: str | None = None
+        """What the gripper holds."""
+        self._arm = self._perform()
+
+    def advance(self) -> bool:
+        """Go on with the steps, without waiting; return whether the task has ended."""
+        return next(self._arm, True) is True
+
+    def end(self) -> None:
+        """End the present step here, as cancelled."""
+        self._arm.close()
+        self.results.append(self._not_done("CANCELLED", self.cancelled))
+        self._end_recording("unknown")
+
+    def _perform(self) -> Generator[None, None, None]:
+        """Perform the steps; yields once per poll."""
+        session, steps = self._session, self.checked.file.task.steps
+        for number, step in enumerate(steps, 1):
+            session.log.info("step %d/%d: %s", number, len(steps), step.name or _text(step))
+            self._begins(step)
+            begun_ns = session.clock.now_ns()
+            outcome: StepOutcome = "SUCCEEDED"
+            message, code, facts = "", "", {}
+            try:
+                if self.cancelled:
+                    raise Cancelled
+                facts = dict((yield from self._act(step.action)))
+            except Cancelled:
+                outcome, message = "CANCELLED", self.cancelled
+            except (StepFailed, IbrobotError) as error:
+                outcome, message, code = "FAILED", str(error), _code(error)
+            duration_s = seconds(session.clock.now_ns() - begun_ns)
+            self.results.append(StepResult(number, step.kind, step.name, outcome, message, code, duration_s, facts))
+            if outcome != "SUCCEEDED":
+                break
+        self._end_recording({"SUCCEEDED": "success", "FAILED": "failure"}.get(self.results[-1].outcome, "unknown"))
+        while len(self.results) < len(steps):
+            self.results.append(self._not_done("NOT_RUN"))
+
+    def _not_done(self, outcome: StepOutcome, message: str = "") -> StepResult:
+        number = len(self.results)
+        step = self.checked.file.task.steps[number]
+        return StepResult(number + 1, step.kind, step.name, outcome, message)
+
+    def _act(self, action: Action) -> Steps:
+        match action:
+            case MoveStep():
+                acting = self._move(action)
+            case GripperStep():
+                acting = self._grip(action)
+            case WaitStep():
+                acting = self._wait(action)
+            case PolicyStep():
+                acting = self._policy(action)
+            case LookStep():
+                acting = self._look(action)
+            case RecordStep():
+                acting = self._record(action)
+            case AlternativesStep():
+                acting = self._alternatives(action)
+        return acting
+
+    def _tick(self) -> Generator[None, None, None]:
+        yield
+        if self.cancelled:
+            raise Cancelled
+        if self._session.faults:
+            raise StepFailed(f"the robot stopped: {self._session.faults[-1]}")
+
+    def _world(self) -> World:
+        if not self._session.bus.serves(SNAPSHOT):
+            return World()
+        world = self._session.bus.call(SNAPSHOT, None)
+        assert isinstance(world, World)
+        return world
+
+    def _commanded(self) -> Vector:
+        """Present positions of all joints, as commanded [rad], shape (J,)."""
+        session = self._session
+        return session.state.command if session.state is not None else session.measured().position
+
+    def _enter(self, mode: str) -> None:
+        if self._session.mode != mode:
+            self._session.bus.call(SET_MODE, mode)
+
+    # Steps.
+
+    def _alternatives(self, step: AlternativesStep) -> Steps:
+        """Perform the first list of steps that succeeds; those whose first motions cannot be planned are passed over.
+
+        A failure while the gripper holds what a list has grasped, or of the robot, ends them all.
+        """
+        failures: list[StepFailed | IbrobotError] = []
+        held = self._held
+        for number, steps in enumerate(step.lists, 1):
+            self._enter(self.checked.mode.name)
+            try:
+                self._check_ahead(steps)
+                for each in steps:
+                    yield from self._act(each.action)
+            except (StepFailed, IbrobotError) as error:
+                self._episode = None
+                if self._session.faults or self._held != held:
+                    raise
+                failures.append(error)
+                self._session.log.info("alternative %d of %d: %s", number, len(step.lists), error)
+            else:
+                return {"alternative": number}
+        reasons = "; ".join(f"alternative {number}: {error}" for number, error in enumerate(failures, 1))
+        raise StepFailed(f"no alternative succeeded: {reasons}", _code(failures[0]))
+
+    def _check_ahead(self, steps: Sequence[Step]) -> None:
+        """Plan the motions of some steps, one from the end of the other, up to the first step that moves the rest.
+
+        Raises:
+            StepFailed: if one cannot be planned.
+        """
+        robot, bus = self._session.config.robot, self._session.bus
+        q = self._commanded().copy()
+        for step in steps:
+            action = step.action
+            if isinstance(action, GripperStep | PolicyStep):
+                return
+            if not isinstance(action, MoveStep):
+                continue
+            target = self._target(action, q)
+            with self._touching(action):
+                answer = bus.call(PLAN_GOAL, PlanAhead(target, dict(zip(robot.joint_names, q.tolist(), strict=True))))
+            assert isinstance(answer, PlanAnswer)
+            if answer.trajectory is None:
+                raise StepFailed(answer.message, answer.code.name)
+            q[robot.indices(answer.trajectory.joint_names)] = answer.trajectory.points[-1].positions
+
+    def _target(self, step: MoveStep, q: Vector) -> Target:
+        """The goal of a motion that begins at positions `q` [rad], shape (J,)."""
+        from ibrobot_kinematics import robot_model
+
+        robot, tool = self._session.config.robot, None
+        if any(goal.relative for goal in (step, *step.any, *step.line)):
+            tool = robot_model(robot).forward(q).position
+        return move_target(step, robot, self.checked.arm, self._world(), tool)
+
+    @contextmanager
+    def _touching(self, step: MoveStep) -> Iterator[None]:
+        """Let the hand touch what a step names."""
+        bus = self._session.bus
+        if step.touch:
+            bus.call(TOUCH, f"{{objects: {json.dumps(step.touch)}}}")
+        try:
+            yield
+        finally:
+            if step.touch:
+                bus.call(TOUCH, "{}")
+
+    def _go(self, target: Target) -> Steps:
+        """Move to a goal in the planning mode, and wait for the end."""
+        bus = self._session.bus
+        self._enter(self.checked.mode.name)
+        number = bus.call(GO_TO, target)
+        try:
+            while (result := bus.call(MOTION_RESULT, number)) is None:
+                yield from self._tick()
+        except Cancelled:
+            if bus.serves(CANCEL_MOTION):  # otherwise the end of the mode stops the robot
+                bus.call(CANCEL_MOTION, None)
+            while bus.serves(MOTION_RESULT) and bus.call(MOTION_RESULT, number) is None:
+                yield
+            raise
+        assert isinstance(result, MoveResult)
+        if not result.success:
+            raise StepFailed(result.message, result.code.name)
+        return {
+            "position_error_m": round(result.position_error_m, 6),
+            "orientation_error_rad": round(result.orientation_error_rad, 6),
+        }
+
+    def _move(self, step: MoveStep) -> Steps:
+        target = self._target(step, self._commanded())
+        with self._touching(step):
+            return (yield from self._go(target))
+
+    def _grip(self, step: GripperStep) -> Steps:
+        session = self._session
+        name = step.executor or self.checked.grippers[0]
+        executor = session.config.executors[name]
+        joint = executor.joints[0]
+        target = Target(f"{joint}={step.position:g}", None, {joint: step.position})
+        if step.release is not None:
+            session.bus.call(DETACH, f"{{name: {json.dumps(step.release)}}}")
+            self._held = None
+        yield from self._go(target)
+        position = float(session.measured().position[session.config.robot.joint_names.index(joint)])
+        if step.grasp is not None:
+            options = executor.options
+            least = options.goal_tolerance if isinstance(options, GripperOptions) else _GRASP_RAD
+            if abs(position - step.position) <= least:
+                raise StepFailed(
+                    f"nothing stopped the gripper on its way to {step.position:g} rad: no {step.grasp!r} there"
+                )
+            session.bus.call(ATTACH, f"{{name: {json.dumps(step.grasp)}}}")
+            self._held = step.grasp
+        return {"position_rad": round(position, 4)}
+
+    def _wait(self, step: WaitStep) -> Steps:
+        clock = self._session.clock
+        until_ns = clock.now_ns() + ns(step.seconds)
+        while clock.now_ns() < until_ns:
+            yield from self._tick()
+        return {}
+
+    def _policy(self, step: PolicyStep) -> Steps:
+        session, episode, self._episode = self._session, self._episode, None
+        self._enter(step.mode)
+        begun_ns = session.clock.now_ns()
+        solved, recorded, outcome = False, False, "unknown"
+        try:
+            while not solved and (since_ns := session.clock.now_ns() - begun_ns) < ns(step.seconds):
+                if episode is not None and not recorded:
+                    recorded = self._begin_episode(episode, late=since_ns > _ALIVE_NS)
+                yield from self._tick()
+                state = session.state
+                solved = step.until == "success" and state is not None and bool(state.success)
+            if episode is not None and not recorded:
+                self._begin_episode(episode, late=True)
+            outcome = "success" if solved else "failure"
+            if step.until == "time":
+                outcome = episode.outcome if episode is not None else ""
+            elif not solved:
+                raise StepFailed(f"no success within {step.seconds:g} s")
+        finally:
+            # The mode, and with it the episode, ends here: nothing else moves the robot on.
+            if recorded and session.bus.serves(END_EPISODE):
+                session.bus.call(END_EPISODE, outcome)
+            if session.bus.serves(SET_MODE):
+                self._enter(self.checked.mode.name)
+        return {"success": solved} if step.until == "success" else {}
+
+    def _look(self, step: LookStep) -> Steps:
+        if step.camera is not None:
+            return (yield from self._image(step.camera, step.timeout))
+        assert step.object is not None
+        world = self._world()
+        place = _place(world, step.object)
+        facts: dict[str, Any] = {"position_m": np.round(place, 4).tolist()}
+        if step.near is not None and step.within is not None:
+            away = float(np.linalg.norm(place - _place(world, step.near)))
+            facts["distance_m"] = round(away, 4)
+            if away > step.within:
+                raise StepFailed(f"{step.object!r} is {away:.3f} m from {step.near!r}; at most {step.within:g} m asked")
+        return facts
+
+    def _image(self, camera: str, timeout_s: float) -> Steps:
+        session = self._session
+        begun_ns = session.clock.now_ns()
+        images = session.bus.subscribe(f"/camera/{camera}/image_raw", 1)
+        try:
+            while session.clock.now_ns() - begun_ns < ns(timeout_s):
+                received = images.get()
+                message = received.message if received is not None else None
+                if isinstance(message, Image | CompressedImage) and message.header.stamp_ns >= begun_ns:
+                    return {"topic": images.topic, "stamp_ns": message.header.stamp_ns}
+                yield from self._tick()
+        finally:
+            images.close()
+        raise StepFailed(f"no image of camera {camera!r} within {timeout_s:g} s")
+
+    def _record(self, step: RecordStep) -> Steps:
+        if step.of == "policy":
+            self._episode = step
+            return {}
+        self._enter(self.checked.mode.name)
+        begun_ns = self._session.clock.now_ns()
+        while not self._begin_episode(step, late=self._session.clock.now_ns() - begun_ns > _ALIVE_NS):
+            yield from self._tick()
+        self._recording = True
+        return {}
+
+    def _begin_episode(self, episode: RecordStep, *, late: bool) -> bool:
+        """Begin an episode, unless topics of the contract are still silent; when `late`, that is an error."""
+        try:
+            self._session.bus.call(BEGIN_EPISODE, episode.prompt)
+        except IbrobotError:
+            if late:
+                raise
+            return False
+        return True
+
+    def _end_recording(self, outcome: str) -> None:
+        """End the episode of the task, if there is one."""
+        recorded, self._recording = self._recording, False
+        if recorded and self._session.bus.serves(END_EPISODE):
+            self._session.bus.call(END_EPISODE, outcome)
+
+
+def _code(error: Exception) -> str:
+    """MoveIt's name of an error; empty without one."""
+    if isinstance(error, StepFailed):
+        return error.code
+    return error.code.name if isinstance(error, PlanningError) else ""
+
+
+def _place(world: World, name: str) -> Vector:
+    thing = world.named(name)
+    if thing.link is not None:
+        raise StepFailed(f"{name!r} is attached to {thing.link}; release it before a look")
+    p = thing.pose.position
+    return np.array([p.x, p.y, p.z])
+
+
+def _text(step: Step) -> str:
+    match step.action:
+        case GripperStep(position=position):
+            return f"gripper to {position:g} rad"
+        case WaitStep(seconds=duration):
+            return f"wait {duration:g} s"
+        case PolicyStep(mode=mode):
+            return f"run_policy {mode}"
+        case _:
+            return step.kind

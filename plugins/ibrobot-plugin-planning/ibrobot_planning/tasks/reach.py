@@ -1,0 +1,60 @@
+"""Whether the tool can be where a goal wants it, by inverse kinematics."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ibrobot_core.api import AnyGoal, Goal, LinearGoal, PlanningError, PoseGoal, PositionGoal, Robot, Vector
+
+if TYPE_CHECKING:
+    from ibrobot_planning.goals import Tool
+
+
+class Reach:
+    """Checks the reach of a robot; its model is read with the first check.
+
+    Args:
+        robot: the robot.
+        start: all joints [rad], shape (J,), where they are known.
+    """
+
+    def __init__(self, robot: Robot, start: Vector | None) -> None:
+        self._robot, self._start = robot, start
+        self._tool: Tool | None = None
+
+    def check(self, goal: Goal) -> None:
+        """Check that all waypoints of a goal, or one of its alternatives, can be reached.
+
+        Raises:
+            PlanningError: if not, or without a model of the robot.
+        """
+        if isinstance(goal, LinearGoal):
+            for waypoint in goal.waypoints:
+                self.check(waypoint)
+        elif isinstance(goal, AnyGoal):
+            errors = []
+            for each in goal.goals:
+                try:
+                    self.check(each)
+                except PlanningError as error:
+                    errors.append(error)
+            if len(errors) == len(goal.goals):
+                raise errors[0]
+        elif isinstance(goal, PositionGoal | PoseGoal):
+            tool, start = self._kinematics(), self._start
+            model = tool.model
+            tool.candidates(goal, np.clip(0.0, model.lower, model.upper) if start is None else start)
+
+    def _kinematics(self) -> Tool:
+        if self._tool is None:
+            from ibrobot_kinematics import KinematicsError, robot_model
+
+            from ibrobot_planning.goals import Tool
+
+            try:
+                self._tool = Tool(robot_model(self._robot))
+            except KinematicsError as error:
+                raise PlanningError(str(error)) from error
+        return self._tool
