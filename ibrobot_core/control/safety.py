@@ -24,9 +24,10 @@ class SafetyLayer:
     measured position and dt is the period. A step is taken only if braking from it at max_acceleration stops in time,
     so that braking never ends beyond a position limit, nor further than max_lead from the measured position.
 
-    The inequalities are in order of precedence. The first two always hold, the first before the second. The last two
-    yield if a joint's measured position moves away from the command faster than braking allows, e.g. because a person
-    pushes the joint; if p' itself is too far from m, p starts at rest at max_lead from m.
+    The inequalities are in order of precedence. The first two always hold, the first before the second. Setpoints use
+    max_lead but for a reserve, in which the command still follows within the last two if an obstacle or a person moves
+    a joint away from it. Beyond the reserve, the last two yield; if p' itself is too far from m, p starts at rest at
+    max_lead from m.
 
     Setpoints within these limits pass unchanged, bit for bit. After a setpoint beyond them, the command catches up as
     fast as the limits allow and brakes so as not to overshoot.
@@ -45,7 +46,10 @@ class SafetyLayer:
         self._period_s = seconds(period_ns)
         self._lower = robot.lower.astype(np.float64)
         self._upper = robot.upper.astype(np.float64)
-        self._max_lead = robot.max_lead
+        braking = robot.max_velocity**2 / (2 * robot.max_acceleration)
+        usable = robot.max_lead - np.minimum(braking, robot.max_lead) / 4
+        self._leads = np.array((robot.max_lead, usable))
+        """Of commands, and of setpoints; the difference suffices to change the speed by half of its limit."""
         # Velocities are steps [rad per tick] and accelerations changes of step, so that dt adds no rounding.
         max_step = robot.max_velocity * self._period_s
         self._change = robot.max_acceleration * self._period_s**2
@@ -113,7 +117,9 @@ class SafetyLayer:
             command = self._next(wanted, follow, lower, upper)
             differs = command != wanted
             if differs.any():
-                self._count(differs, wanted, known, before, np.where(wanted > before, upper, lower))
+                self._count(
+                    differs, wanted, known, before, np.where(wanted > before, upper[1] - before, before - lower[1])
+                )
             self._fresh &= ~follow
         return command.copy()
 
@@ -170,22 +176,25 @@ class SafetyLayer:
         return dict(zip(self._names, totals.tolist(), strict=True))
 
     def _bounds(self, seen: Vector, known: NDArray[np.bool_]) -> tuple[Vector, Vector]:
-        """Lowest and highest command of this tick [rad], by position limits and lead; shapes (J,)."""
+        """Lowest and highest command, and setpoint, of this tick [rad], by position limits and lead; shapes (2, J)."""
         # A joint that started outside its limits may move inwards, and then not back out.
         lower, upper = np.minimum(self._lower, self._position), np.maximum(self._upper, self._position)
-        lead = self._max_lead
+        lead = self._leads
         if not known.all():
             seen, lead = np.where(known, seen, 0.0), np.where(known, lead, np.inf)
         return _limited(seen - lead, lower, upper), _limited(seen + lead, lower, upper)
 
     def _next(self, wanted: Vector, follow: NDArray[np.bool_], lower: Vector, upper: Vector) -> Vector:
-        """Advance by a tick towards `wanted` [rad] where `follow`, to a stop elsewhere; all shapes (J,)."""
+        """Advance by a tick towards `wanted` [rad] where `follow`, to a stop elsewhere; shapes (J,) but for the bounds.
+
+        The command never leaves the first bounds. Where `follow`, it brakes for the second ones, and returns to them.
+        """
         slack = self._half_slack
-        position = _limited(self._position, lower, upper)
+        position = _limited(self._position, lower[0], upper[0])
         left = position != self._position
         if left.any():
             self._step, self._target = np.where(left, 0.0, self._step), np.where(left, np.nan, self._target)
-        target = _limited(np.where(follow, wanted, position), lower, upper)
+        target = _limited(np.where(follow, wanted, position), lower[0], upper[0])
         ahead = target - position
         # A target that moves smoothly is expected to continue; any other is treated as a place to stop.
         target_step = target - self._target
@@ -194,10 +203,11 @@ class SafetyLayer:
 
         slowest = np.maximum(self._step - self._max_change, -self._max_step)
         fastest = np.minimum(self._step + self._max_change, self._max_step)
-        room_below, room_above = _reach(np.array((position - lower, upper - position)), self._change)
+        room = np.array((position - lower, upper - position))
+        (room_below, below), (room_above, above) = np.copysign(_reach(np.abs(room), self._change), room)
         # Only a quarter of the slack beyond the room to brake: the next step must compensate for it within the slack.
-        within = (ahead <= np.minimum(fastest + slack, room_above + slack / 4)) & (
-            ahead >= np.maximum(slowest - slack, -room_below - slack / 4)
+        within = (ahead <= np.minimum(fastest + slack, above + slack / 4)) & (
+            ahead >= np.maximum(slowest - slack, -below - slack / 4)
         )
         # Arriving faster than the target moves would overshoot it; a joint already on the target follows it.
         matched = (self._target == position) | (np.abs(ahead - expected) <= self._max_change + slack)
@@ -207,11 +217,11 @@ class SafetyLayer:
             command = target
         else:
             gap = ahead - expected
-            step = np.where(follow, expected + np.copysign(_reach(np.abs(gap), self._change), gap), 0.0)
-            step = _limited(step, slowest, fastest)
+            step = _limited(expected + np.copysign(_reach(np.abs(gap), self._change), gap), -below, above)
+            step = _limited(np.where(follow, step, 0.0), slowest, fastest)
             # Last, since a position limit must hold even if rounding leaves no step that satisfies all limits.
             step = _limited(step, -room_below, room_above)
-            command = np.where(passes, target, _limited(position + step, lower, upper))
+            command = np.where(passes, target, _limited(position + step, lower[0], upper[0]))
         self._step = command - position
         self._position = command
         self._target = np.where(follow, target, np.nan)
@@ -219,7 +229,7 @@ class SafetyLayer:
         return command
 
     def _count(
-        self, differs: NDArray[np.bool_], wanted: Vector, known: NDArray[np.bool_], before: Vector, bound: Vector
+        self, differs: NDArray[np.bool_], wanted: Vector, known: NDArray[np.bool_], before: Vector, room: Vector
     ) -> None:
         """Count the joints marked in `differs`, each under the first of `KINDS` that applies.
 
@@ -228,13 +238,12 @@ class SafetyLayer:
             wanted: shape (J,).
             known: whether each joint is measured, shape (J,).
             before: the last commands, shape (J,).
-            bound: the furthest command of this tick in the direction of `wanted`, shape (J,).
+            room: the way to the last setpoint that the lead allows in the direction of `wanted` [rad], shape (J,).
         """
         lower, upper = np.minimum(self._lower, before), np.maximum(self._upper, before)
         step = _limited(wanted, lower, upper) - before
-        room = np.abs(bound - before)
         # The lead limits a joint as soon as braking for it begins.
-        leads = (np.abs(wanted - before) > room) & (_reach(room, self._change) < self._max_step)
+        leads = (np.abs(wanted - before) > room) & (_reach(np.maximum(room, 0.0), self._change) < self._max_step)
         reasons = np.array(
             (
                 differs & self._estopped,

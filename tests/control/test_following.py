@@ -93,7 +93,8 @@ class TestControl:
     def test_a_blocked_joint_is_a_fault_and_presses_no_longer(self, rig):
         start = rig.hardware._position[0]
         rig.plan([start - 0.9, 0.3, 0.5], 1.0)
-        lead = rig.config.robot.max_lead[0]
+        reserve = 3.0**2 / (2 * 40.0) / 4
+        lead = rig.config.robot.max_lead[0] - reserve
         leads = []
         for _ in range(400):
             state = rig.tick()

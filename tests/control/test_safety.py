@@ -29,6 +29,8 @@ def one_joint(lower: float = -2.0, upper: float = 2.0, velocity: float = 4.0, ac
 
 PERIOD_NS = 10_000_000
 ZERO = np.zeros(1)
+USABLE = 0.9
+"""Largest lead of setpoints of `one_joint` [rad]: its `max_lead` of 1.0 without the reserve."""
 
 
 class Watched:
@@ -204,7 +206,6 @@ def test_wherever_the_joints_are_the_command_is_within_reach_of_them(
 def test_a_blocked_joint_does_not_wind_up_and_its_release_makes_no_jump() -> None:
     watched = Watched(one_joint(), PERIOD_NS)  # checks velocity and acceleration: here they never yield
     watched.start(ZERO)
-    lead = watched.robot.max_lead[0]
     position, leads = 0.0, []
     for index in range(400):
         wanted = min(2.0 * index * 0.01, 1.9)
@@ -212,8 +213,8 @@ def test_a_blocked_joint_does_not_wind_up_and_its_release_makes_no_jump() -> Non
         position += 0.15 * (watched.before[-1][0] - position) if free else 0.0
         command = watched.tick(np.array([wanted]), np.array([position]))
         leads.append(abs(command[0] - position))
-    assert max(leads[:20]) < lead
-    assert leads[100:200] == [pytest.approx(lead)] * 100
+    assert max(leads[:20]) < USABLE
+    assert leads[100:200] == [pytest.approx(USABLE)] * 100
     assert command[0] == 1.9
     assert watched.layer.counters()["lead"] > 100
 
@@ -236,7 +237,21 @@ def test_a_joint_that_is_pushed_away_takes_its_command_along() -> None:
     watched.tick(None)
     assert watched.tick(None, np.array([1.5]))[0] == pytest.approx(1.5 - watched.robot.max_lead[0])
     assert watched.layer.at_rest
-    assert watched.tick(ZERO, np.array([-2.0]))[0] == pytest.approx(-2.0 + watched.robot.max_lead[0])
+    assert watched.tick(ZERO, np.array([-2.0]))[0] == pytest.approx(-2.0 + watched.robot.max_lead[0], abs=0.003)
+
+
+@pytest.mark.parametrize("speed", [0.3, 1.0, 1.8])
+def test_a_blocked_joint_that_slides_away_takes_its_command_along_within_the_limits(speed: float) -> None:
+    watched = Watched(one_joint(), PERIOD_NS)
+    watched.start(ZERO)
+    commands, position = [], 0.0
+    for index in range(250):
+        if 100 <= index < 170:
+            position -= speed * watched.dt
+        commands.append(watched.tick(np.array([1.9]), np.array([position]))[0])
+    assert np.abs(np.diff(commands, 2)).max() <= 20.0 * watched.dt**2 * 1.001
+    assert commands[99] == pytest.approx(USABLE)
+    assert commands[-1] == pytest.approx(position + USABLE)
 
 
 @pytest.mark.parametrize("side", [-1, 1])
@@ -258,7 +273,7 @@ def test_readings_that_repeat_do_not_let_the_command_run_away() -> None:
     watched.start(ZERO)
     for _ in range(200):
         command = watched.tick(np.array([2.0]), ZERO)
-    assert command[0] == watched.robot.max_lead[0]
+    assert command[0] == pytest.approx(USABLE)
 
 
 @settings(max_examples=40, deadline=None)
