@@ -1,6 +1,7 @@
 """Random takeovers and handbacks by a gamepad, a leader arm and the keyboard: steps, lost frames, labels, parity.
 
     python benchmarks/takeovers.py [--takeovers 100] [--seed 0] [--device gamepad --device leader --device keyboard]
+    python benchmarks/takeovers.py --live [--takeovers 10] [--seed 0] [--device gamepad --device keyboard]
 
 The simulated SO-101 follows a policy that moves all joints, in lockstep. At random times a scripted person takes it
 with the device, moves it, lets go of the deadman now and then, and gives it back. The gamepad is a DualSense whose
@@ -10,13 +11,15 @@ takeover, and the keyboard is a queue of keys. The run is recorded, and converte
 Prints one JSON object per device, and exits with 1 unless every velocity and acceleration of the commands is within the
 limits, nothing is lost, who commands is labelled at every state as the person acted, the frames from the recording
 equal those of the run bit by bit, the column `intervention` is true in exactly the rows that the person commanded, and
-`--only interventions` gives each takeover as an episode.
+`--only interventions` gives each takeover as an episode. With `--live` the run is one by the clock of the wall, with
+control in a process of its own; then who commands must change as the person acts, and each state must arrive.
 """
 
 from __future__ import annotations
 
 import argparse
 import importlib.util
+import itertools
 import json
 import math
 import queue
@@ -39,8 +42,12 @@ from ibrobot_data.request import ConversionRequest
 from ibrobot_data.ticks import Ticks, frames
 from ibrobot_feetech.calibration import save_calibration
 from ibrobot_lerobot.options import LeRobotOptions
+from ibrobot_webxr.messages import HandPose, Hands
+from ibrobot_webxr.options import WebxrOptions
+from ibrobot_webxr.shared import close_page, open_page
 from made_up import plugin
 
+from ibrobot_core.api import Context
 from ibrobot_core.calibration import Calibration, JointCalibration
 from ibrobot_core.config import load_config
 from ibrobot_core.contract.frames import FrameAssembler, FrameSampler
@@ -56,6 +63,10 @@ JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_ro
 RADIAN = 4096 / (2 * math.pi)
 """Ticks."""
 SLACK = 1.001
+PERIOD_NS = 10_000_000
+"""Of control."""
+_SETTLED_NS = 500_000_000
+"""Time before the first compared frame of a live run: the recording begins before it."""
 _FIRST = 5
 """Ticks before the first compared frame: the recording begins during the first one."""
 WANDER = """
@@ -121,6 +132,9 @@ class Person(ABC):
         """Whether the device is not ready after a takeover."""
         return False
 
+    def meet(self, runtime: Runtime) -> None:
+        """Take up the device once the run has started."""
+
     def close(self) -> None:
         """Put the device away."""
 
@@ -157,7 +171,11 @@ class WithPad(Person):
     def tick(self, rng: random.Random) -> None:
         if rng.random() < 0.05:
             self._stick = rng.uniform(-1, 1), rng.uniform(-1, 1)
-        self._pad.send(self._hid.dualsense(*self._held, left=self._stick))
+        self.send(self._held, self._stick)
+
+    def send(self, held: tuple[str, ...], left: tuple[float, float], right: tuple[float, float] = (0.0, 0.0)) -> None:
+        """Send a report."""
+        self._pad.send(self._hid.dualsense(*held, left=left, right=right))
 
     @override
     def close(self) -> None:
@@ -256,6 +274,90 @@ class WithLeader(WithKeys):
         self._patches.undo()
 
 
+class WithSensor(WithKeys):
+    """An orientation sensor in a hand, at a pseudo-terminal; space is its deadman, which a terminal repeats."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._sensor = of_tests("ibrobot-plugin-imu", "sensor").Sensor("bno08x").__enter__()
+        self.device = f"{{type: imu, model: bno08x, port: {self._sensor.port}}}"
+        self._tilt = {"pitch": 0.0, "yaw": 0.0}
+
+    @override
+    def engage(self) -> None:
+        self._key = "space"
+        self.type("space")
+
+    @override
+    def tick(self, rng: random.Random) -> None:
+        if self._key:
+            self.type(self._key)
+            if rng.random() < 0.05:
+                self._tilt = {"pitch": rng.uniform(-0.6, 0.6), "yaw": rng.uniform(-0.6, 0.6)}
+        self._sensor.turn(**self._tilt)
+
+    @override
+    def close(self) -> None:
+        self._sensor.unplug()
+
+
+class WithHand(Person):
+    """A controller of a headset, whose poses arrive at the page's server as those of a browser do."""
+
+    device = "{type: webxr, port: 0}"
+
+    def __init__(self) -> None:
+        self._clutch = False
+        self._at, self._velocity = np.array([0.0, 1.0, 0.0]), np.zeros(3)
+        self._sent = 0
+
+    @override
+    def meet(self, runtime: Runtime) -> None:
+        session = runtime.session
+        self._ctx = Context("hand", session.clock, session.log, session.config.robot, bus=session.bus)
+        self._exchange = open_page(self._options, self._ctx).exchange
+
+    @override
+    def toggle(self) -> None:
+        self._clutch = False
+        self._exchange.press("intervention")
+
+    @override
+    def engage(self) -> None:
+        self._clutch = True
+
+    @override
+    def release(self) -> None:
+        self._clutch = False
+
+    @override
+    def tick(self, rng: random.Random) -> None:
+        if rng.random() < 0.05:
+            self._velocity = np.array([rng.uniform(-0.3, 0.3) for _ in range(3)])
+        self._at = np.clip(self._at + 0.01 * self._velocity, (-0.2, 0.8, -0.2), (0.2, 1.2, 0.2))
+        self.send(HandPose((0.0, 0.0, 0.0, 1.0), tuple(self._at.tolist()), self._clutch))
+
+    def send(self, pose: HandPose) -> None:
+        """Send a pose, 10 ms after the last one by the page's clock."""
+        self._sent += 1
+        self._exchange.put(Hands(self._sent, 0.01 * self._sent, 0.0, {"right": pose}), 0.0)
+
+    @override
+    def close(self) -> None:
+        close_page(self._options, self._ctx)
+
+    _options = WebxrOptions(port=0)
+
+
+PERSONS: dict[str, Callable[[Path], Person]] = {
+    "gamepad": lambda folder: WithPad(),
+    "leader": WithLeader,
+    "keyboard": lambda folder: WithKeys(),
+    "webxr": lambda folder: WithHand(),
+    "imu": lambda folder: WithSensor(),
+}
+
+
 @attrs.define(slots=False)
 class Trial:
     """A run, and what happened in it at each tick."""
@@ -273,7 +375,7 @@ class Trial:
 
     def __attrs_post_init__(self) -> None:
         session = self.runtime.session
-        self._words = session.bus.subscribe("/commander", 100)
+        self._words = session.bus.subscribe("/commander", 1000)
         self._words.drain()  # that of the start
         contract = Contract.from_config(session.config)
         self._sampler = FrameSampler(contract, session.bus)
@@ -333,17 +435,85 @@ class Trial:
             self.wait(0.2, 1.0)
         self.person.toggle()
         self.tick(HANDOVER)
+        self.until_given_back()
+
+    def until_given_back(self) -> None:
+        """Let time pass until the policy commands."""
         while self.tick() == HANDOVER:
             pass
         self.who = POLICY
         self.expected[-1] = POLICY
 
+    def commanders(self) -> list[tuple[int, str]]:
+        """Who should have commanded, from which time on [ns]."""
+        return list(zip(self.stamps, self.expected, strict=True))
 
-def measure(name: str, takeovers: int, seed: int) -> dict[str, Any]:
+    def wrong_labels(self) -> int:
+        """How many states have another commander than they should."""
+        return sum(a != b for a, b in zip(self.labels, self.expected, strict=True))
+
+
+@attrs.define(slots=False)
+class LiveTrial(Trial):
+    """A trial by the clock of the wall: states and labels come when they come."""
+
+    said: list[tuple[int, str]] = attrs.field(factory=list)
+    """Time of receipt and word of each label."""
+
+    def __attrs_post_init__(self) -> None:
+        super().__attrs_post_init__()
+        bus, config = self.runtime.session.bus, self.runtime.session.config
+        self._states = bus.subscribe("/joint_states", 1000)
+        self._parts = [bus.subscribe(action.topic, 1000) for action in config.contract.actions]
+        self._begin_ns = self.runtime.session.clock.now_ns() + _SETTLED_NS
+
+    @override
+    def tick(self, then: str | None = None) -> str:
+        self.person.tick(self.rng)
+        if self.runtime.wait(0.01):
+            self.runtime.raise_failure()
+            raise SystemExit("the run ended early")
+        session = self.runtime.session
+        if session.faults:
+            raise SystemExit(f"fault: {'; '.join(session.faults)}")
+        self._collect()
+        if then is not None:
+            self.expected.append(then)
+        now_ns = session.bus.snapshot_ns()
+        if now_ns >= max(self._begin_ns, self._next_ns):
+            self.seen.append(self._sampler.sample(now_ns))
+            self._next_ns = now_ns + self._step_ns
+        return self.said[-1][1] if self.said else POLICY
+
+    @override
+    def until_given_back(self) -> None:
+        self.until(lambda: self.said[-1][1] == HANDOVER)
+        self.until(lambda: self.said[-1][1] != HANDOVER)
+        self.expected.append(POLICY)
+
+    def _collect(self) -> None:
+        self.said += [(item.received_ns, str(item.message.data)) for item in self._words.drain()]  # type: ignore[attr-defined]
+        while (state := self._states.get()) is not None:
+            self.stamps.append(state.message.header.stamp_ns)  # type: ignore[attr-defined]
+            parts = [part.get(1.0) for part in self._parts]  # published after the state
+            self.commands.append(np.concatenate([part.message.data for part in parts if part is not None]))  # type: ignore[attr-defined]
+
+    @override
+    def commanders(self) -> list[tuple[int, str]]:
+        return self.said
+
+    @override
+    def wrong_labels(self) -> int:
+        """How many changes of the commander are not those that the person caused."""
+        self.labels = [word for word, _ in itertools.groupby(word for _, word in self.said)]
+        return sum(a != b for a, b in itertools.zip_longest(self.labels, [POLICY, *self.expected]))
+
+
+def measure(name: str, takeovers: int, seed: int, *, live: bool = False) -> dict[str, Any]:
     """All of one device."""
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)
-        person = {"gamepad": WithPad, "keyboard": WithKeys, "leader": lambda: WithLeader(folder)}[name]()
+        person = PERSONS[name](folder)
         overrides = [
             "models={wander: {type: wander}}",
             "control_modes.model_inference.inference={model: wander, intervene: it}",
@@ -352,10 +522,11 @@ def measure(name: str, takeovers: int, seed: int) -> dict[str, Any]:
         ]  # fmt: skip
         keys = person.subscribe if isinstance(person, WithKeys) else None
         config = load_config(CONFIG, overrides=overrides, sim=True)
-        runtime = Runtime(Session(config, installed_plugins(), LaunchRequest(lockstep=True, seed=seed, keys=keys)))
+        runtime = Runtime(Session(config, installed_plugins(), LaunchRequest(lockstep=not live, seed=seed, keys=keys)))
         runtime.start()
         try:
-            trial = Trial(runtime, person, random.Random(seed))
+            person.meet(runtime)
+            trial = (LiveTrial if live else Trial)(runtime, person, random.Random(seed))
             for _ in range(takeovers):
                 trial.takeover()
             trial.wait(0.5, 0.5)
@@ -379,7 +550,8 @@ def figures(trial: Trial) -> dict[str, Any]:
         "acceleration_share": round(float((np.abs(acceleration) / robot.max_acceleration).max()), 3),
         "faults": summary["faults"],
         "drops": sum(summary["drops"].values()),
-        "wrong_labels": sum(a != b for a, b in zip(trial.labels, trial.expected, strict=True)),
+        "wrong_labels": trial.wrong_labels(),
+        "lost_states": int((np.diff(trial.stamps) > 1.5 * PERIOD_NS).sum()) - summary["loop"].get("missed", 0),
     }
 
 
@@ -398,11 +570,10 @@ def converted(trial: Trial, folder: Path) -> dict[str, Any]:
     )
     ticks, wanted = Ticks(reader, contract, "refuse"), []
     commanders = Commanders(reader, reader.summary())
-    by_stamp = dict(zip(trial.stamps, trial.expected, strict=True))
-    stamps = sorted(by_stamp)
+    times, words = zip(*trial.commanders(), strict=True)
     for _ in ticks:
-        newest = stamps[max(0, int(np.searchsorted(stamps, ticks.stamp_ns, "right")) - 1)]
-        wanted.append(by_stamp[newest] == OPERATOR)
+        newest = max(0, int(np.searchsorted(times, ticks.stamp_ns, "right")) - 1)
+        wanted.append(words[newest] == OPERATOR)
         assert commanders.at(ticks.stamp_ns) in (POLICY, OPERATOR, HANDOVER)
     lost = sum(each.dropped for each in reader.summary().topics.values())
     reader.close()
@@ -430,6 +601,7 @@ def is_good(found: dict[str, Any]) -> bool:
     none = (
         "drops",
         "wrong_labels",
+        "lost_states",
         "lost_messages",
         "unequal_frames",
         "skipped_rows",
@@ -443,14 +615,21 @@ def is_good(found: dict[str, Any]) -> bool:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--takeovers", type=int, default=100)
+    parser.add_argument("--takeovers", type=int, help="default: 100, with --live 10")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--device", action="append", choices=("gamepad", "leader", "keyboard"))
+    parser.add_argument("--device", action="append", choices=PERSONS)
+    parser.add_argument("--live", action="store_true", help="by the clock of the wall; not with the leader")
     arguments = parser.parse_args()
+    devices = arguments.device or ["gamepad", "leader", "keyboard"]
+    if arguments.live and arguments.device is None:
+        devices.remove("leader")
+    elif arguments.live and "leader" in devices:
+        parser.error("the emulated leader has stepped time: leave it out of --live")
+    takeovers = arguments.takeovers or (10 if arguments.live else 100)
     good = True
     with plugin("wander", WANDER):
-        for name in arguments.device or ("gamepad", "leader", "keyboard"):
-            found = measure(name, arguments.takeovers, arguments.seed)
+        for name in devices:
+            found = measure(name, takeovers, arguments.seed, live=arguments.live)
             print(json.dumps(found), flush=True)
             good = good and is_good(found)
     return 0 if good else 1

@@ -26,6 +26,11 @@ LOSSY = 0.15
 """Mean difference to what went into a codec, of values 0 to 1; another picture is about 0.37 away."""
 
 
+COMMANDERS = {1: [(0.0, "policy"), (0.4, "handover"), (0.5, "operator"), (1.0, "handover"), (1.2, "policy")],
+              2: [(0.0, "policy")], 3: [(0.0, "operator")]}  # fmt: skip
+OUTCOMES = {1: "success", 2: "failure", 3: "success"}
+
+
 def independently(folder: Path) -> list[dict[str, NDArray[Any]]]:
     """The rows of a bag, by the MCAP library, rosbags and a search through all messages."""
     store = get_typestore(Stores.ROS2_JAZZY)
@@ -38,6 +43,7 @@ def independently(folder: Path) -> list[dict[str, NDArray[Any]]]:
             header = getattr(decoded, "header", None)
             stamp = header.stamp.sec * 10**9 + header.stamp.nanosec if header else message.log_time
             streams.setdefault(channel.topic, []).append((stamp, message.log_time, decoded))
+    commanders = streams.pop("/commander")
     first = min(each[0][1] for each in streams.values())
     last = max(each[-1][1] for each in streams.values())
     rows = []
@@ -51,6 +57,8 @@ def independently(folder: Path) -> list[dict[str, NDArray[Any]]]:
             }
             for camera in CAMERAS:
                 row[f"observation.images.{camera}"] = newest[f"/{camera}"].data.reshape(*SIZE, 3)
+            said = [message.data for _, received, message in commanders if received <= t]
+            row["intervention"] = np.array([said[-1] == "operator"])
             rows.append(row)
     return rows
 
@@ -59,7 +67,10 @@ def independently(folder: Path) -> list[dict[str, NDArray[Any]]]:
 def bags(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("bags")
     for number, seconds in ((1, 1.5), (2, 0.8), (3, 2.1)):
-        record(root / f"episode_{number:06d}", number, seconds, "sort the blocks" if number == 2 else "pick the cube")
+        record(
+            root / f"episode_{number:06d}", number, seconds, "sort the blocks" if number == 2 else "pick the cube",
+            outcome=OUTCOMES[number], commanders=COMMANDERS[number],
+        )  # fmt: skip
     # The first conversion starts a process, and opens memory, that live as long as the interpreter.
     convert(
         ConversionRequest(tmp_path_factory.mktemp("first") / "set", LeRobotOptions(videos=False), "lerobot"),
@@ -68,8 +79,9 @@ def bags(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def converted(bags: Path, out: Path, **options: Any) -> LeRobotDataset:
-    report = convert(ConversionRequest(out, LeRobotOptions(**options), "lerobot"), find_episodes([bags]))
+def converted(bags: Path, out: Path, *, labels: bool = False, **options: Any) -> LeRobotDataset:
+    request = ConversionRequest(out, LeRobotOptions(**options), "lerobot", labels=labels)
+    report = convert(request, find_episodes([bags]))
     assert not report.failed
     return LeRobotDataset("local/converted", root=out)
 
@@ -112,13 +124,42 @@ def test_small_files_keep_step(bags: Path, tmp_path: Path) -> None:
     check_frames(LeRobotDataset("local/converted", root=tmp_path / "set"), bags, LOSSY)
 
 
+def test_labels_say_who_commanded_and_how_episodes_end(bags: Path, tmp_path: Path) -> None:
+    dataset = converted(bags, tmp_path / "set", labels=True, videos=False)
+    flag = {"dtype": "bool", "shape": (1,), "names": None}
+    labels = {"intervention": flag, "next.reward": {**flag, "dtype": "float32"}, "next.done": flag}
+    assert {key: dataset.meta.features[key] for key in labels} == labels
+    ends = np.array(dataset.meta.episodes["dataset_to_index"]) - 1
+    succeeded = ends[[OUTCOMES[number] == "success" for number in (1, 2, 3)]]
+    wanted = [row["intervention"] for number in (1, 2, 3) for row in independently(bags / f"episode_{number:06d}")]
+    rows = np.arange(len(dataset))
+    columns = {key: dataset.hf_dataset[key] for key in labels}
+    found = {key: np.array([np.asarray(each).item() for each in column]) for key, column in columns.items()}
+    np.testing.assert_array_equal(found["intervention"], np.concatenate(wanted))
+    np.testing.assert_array_equal(found["next.reward"], np.isin(rows, succeeded).astype(np.float32))
+    np.testing.assert_array_equal(found["next.done"], np.isin(rows, ends))
+    assert 10 < np.sum(found["intervention"]) < len(rows) - 10
+    for row in (0, int(ends[0]), len(rows) - 1):
+        item = dataset[row]
+        assert [str(item[key].dtype) for key in labels] == ["torch.bool", "torch.float32", "torch.bool"]
+        assert [item[key].item() for key in labels] == [found[key][row] for key in labels]
+    theirs = LeRobotDataset.create("local/theirs", 30, labels, root=tmp_path / "theirs", use_videos=False)
+    for i in range(3):
+        theirs.add_frame({key: values[i : i + 1] for key, values in found.items()} | {"task": "pick the cube"})
+    theirs.save_episode()
+    theirs.finalize()
+    theirs = LeRobotDataset("local/theirs", root=tmp_path / "theirs")
+    for key in labels:
+        assert dataset.hf_dataset.features[key] == theirs.hf_dataset.features[key]
+
+
 def test_statistics_are_lerobots(bags: Path, tmp_path: Path) -> None:
     ours = converted(bags, tmp_path / "ours", videos=False)
     features = {key: f for key, f in ours.meta.features.items() if key in ours[0] and key.startswith(("obs", "act"))}
     theirs = LeRobotDataset.create("local/theirs", 30, features, root=tmp_path / "theirs", use_videos=False)
     for number in (1, 2, 3):
         for row in independently(bags / f"episode_{number:06d}"):
-            theirs.add_frame(row | {"task": "pick the cube"})
+            theirs.add_frame({key: row[key] for key in features} | {"task": "pick the cube"})
         theirs.save_episode()
     theirs.finalize()
     for key in features:
@@ -131,7 +172,7 @@ def test_statistics_are_lerobots(bags: Path, tmp_path: Path) -> None:
 
 
 def test_act_trains_on_it(bags: Path, tmp_path: Path) -> None:
-    converted(bags, tmp_path / "set")
+    converted(bags, tmp_path / "set", labels=True)
     command = [
         sys.executable, "-m", "lerobot.scripts.lerobot_train", "--dataset.repo_id=local/converted",
         f"--dataset.root={tmp_path / 'set'}", "--policy.type=act", "--policy.device=cpu", "--policy.push_to_hub=false",

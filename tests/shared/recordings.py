@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from ibrobot_core.clock import SteppedClock
 from ibrobot_core.config.schema import Align, ImageSpec
 from ibrobot_core.contract.specs import ActionPart, Contract, ObservationPart
 from ibrobot_core.interfaces import EpisodeEnd, EpisodeStart, Feature
-from ibrobot_core.messages import Float64MultiArray, Header, Image, JointState
+from ibrobot_core.messages import Float64MultiArray, Header, Image, JointState, String
 
 START_NS = 1_700_000_000_000_000_000
 JOINTS = ("pan", "lift", "gripper")
@@ -60,6 +60,7 @@ def record(
     outcome: str = "success",
     contract: Contract | None = CONTRACT,
     gap: Mapping[str, tuple[float, float]] | None = None,
+    commanders: Sequence[tuple[float, str]] = (),
     chunk_size: int = 1 << 20,
     **metadata: str,
 ) -> None:
@@ -73,6 +74,7 @@ def record(
         outcome: how it ends.
         contract: what its metadata says; None for no contract there.
         gap: topic -> from when to when [s] it is silent.
+        commanders: from when on [s] who commands, as the topic `/commander` says with each state.
         chunk_size: of the file [bytes].
         metadata: more of it.
     """
@@ -82,7 +84,8 @@ def record(
     if contract is not None:
         metadata["contract"] = json.dumps(contract.canonical())
     folder.parent.mkdir(parents=True, exist_ok=True)
-    recorder.begin(EpisodeStart(folder, START_NS, CONTRACT.topics, metadata))
+    topics = dict(CONTRACT.topics) | ({"/commander": String.ros_type} if commanders else {})
+    recorder.begin(EpisodeStart(folder, START_NS, topics, metadata))
     events: list[tuple[int, str, Any]] = []
     for topic, rate in RATES.items():
         begin, end = (gap or {}).get(topic, (0.0, 0.0))
@@ -98,6 +101,9 @@ def record(
                 message = Image(Header(stamp), *SIZE, "rgb8", SIZE[1] * 3, pixels.ravel())
             if not begin <= i / rate < end:
                 events.append((received, topic, message))
+            if topic == "/joint_states" and commanders:
+                who = [word for since, word in commanders if since <= i / rate][-1]
+                events.append((received, "/commander", String(who)))
     for received, topic, message in sorted(events, key=lambda event: event[0]):
         recorder.write(topic, message, received)
     recorder.end(EpisodeEnd(START_NS + round(seconds * 1e9), outcome))
