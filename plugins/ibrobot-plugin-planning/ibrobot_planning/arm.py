@@ -64,6 +64,8 @@ class Arm:
     """Pinocchio's number of each joint, shape (J,)."""
     slides: np.ndarray[tuple[int], np.dtype[np.bool_]]
     """Which joints are prismatic, shape (J,)."""
+    hulls: tuple[LinkShape, ...] = ()
+    """Fewer shapes that contain `shapes`, for quick checks; empty where there are none. See `with_hulls`."""
 
     def native(self, q: Vector) -> Vector:
         """Joint positions, shape (..., J), in Pinocchio's order and zero."""
@@ -280,19 +282,34 @@ def _hull(source: Any, mesh: int) -> tuple[Vector, np.ndarray[tuple[int, ...], n
     return vertices[used], order[np.searchsorted(used, triangles, sorter=order)]
 
 
-def reach(arm: Arm, shapes: Sequence[LinkShape]) -> Vector:
-    """Maximum distance of any point of the shapes from each joint's axis [m], shape (J,); 1 for slide joints.
+def reach(arm: Arm, carried: Sequence[LinkShape]) -> Vector:
+    """Maximum distance of any point of the arm, and of what it carries, from each joint's axis [m], shape (J,).
 
-    An upper bound, from bounding spheres of the shapes on links that are stretched out in any direction.
+    An upper bound, from bounding spheres of the shapes on links that are stretched out in any direction; 1 for slide
+    joints.
     """
-    model = arm.model
-    farthest = np.zeros(model.njoints)
-    for shape in shapes:
+    model, farthest = arm.model, _farthest(arm).copy()
+    for shape in carried:
         if shape.joint:
-            shape.geometry.computeLocalAABB()
-            centre = shape.placement[:3, :3] @ shape.geometry.aabb_center + shape.placement[:3, 3]
-            farthest[shape.joint] = max(farthest[shape.joint], np.linalg.norm(centre) + shape.geometry.aabb_radius)
+            farthest[shape.joint] = max(farthest[shape.joint], _away(shape))
     for joint in range(model.njoints - 1, 0, -1):
         parent, away = model.parents[joint], np.linalg.norm(model.jointPlacements[joint].translation)
         farthest[parent] = max(farthest[parent], away + farthest[joint])
     return np.where(arm.slides, 1.0, farthest[arm.numbers])
+
+
+@lru_cache(maxsize=8)
+def _farthest(arm: Arm) -> Vector:
+    """Maximum distance of any point of the shapes on each of Pinocchio's joints from it [m]."""
+    farthest = np.zeros(arm.model.njoints)
+    for shape in arm.shapes:
+        if shape.joint:
+            farthest[shape.joint] = max(farthest[shape.joint], _away(shape))
+    return farthest
+
+
+def _away(shape: LinkShape) -> float:
+    """Maximum distance of any point of a shape from its joint [m]."""
+    shape.geometry.computeLocalAABB()
+    centre = shape.placement[:3, :3] @ shape.geometry.aabb_center + shape.placement[:3, 3]
+    return float(np.linalg.norm(centre) + shape.geometry.aabb_radius)

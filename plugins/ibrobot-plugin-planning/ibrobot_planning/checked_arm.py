@@ -12,6 +12,7 @@ from ibrobot_kinematics.urdf import read_urdf
 from ibrobot_core.api import Robot
 from ibrobot_planning.arm import SRDF, Arm, Pair, robot_arm, sorted_pair
 from ibrobot_planning.collision import unchecked_pairs
+from ibrobot_planning.hulls import with_hulls
 from ibrobot_planning.semantics import urdf_names
 
 
@@ -36,6 +37,7 @@ def checked_arm(robot: Robot, log: logging.Logger) -> CheckedArm:
     """
     arm = robot_arm(robot)
     unchecked = unchecked_pairs(arm)
+    arm = with_hulls(arm, unchecked)
     if robot.description.urdf is None:
         return CheckedArm(arm, unchecked, {})
     urdf = read_urdf(robot.description.urdf)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Collection, Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import attrs
@@ -27,6 +27,8 @@ WIDER_M = (0.0, 0.004, 0.02)
 that distance without a check."""
 _ALWAYS_SHARE = 0.95
 """Links that touch in at least this share of configurations always touch, as in MoveIt's setup assistant."""
+
+type Flags = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
 
 
 @attrs.frozen
@@ -60,11 +62,6 @@ class Collisions:
         self_padding: least distance [m] between links, and between links and what other links carry.
         unchecked: pairs of links that may touch; see `unchecked_pairs`.
 
-    Attributes:
-        data: pinocchio.Data.
-        geometry: pinocchio.GeometryModel with all shapes and pairs.
-        results: pinocchio.GeometryData, with the padding of each pair.
-
     Raises:
         PlanningError: for a joint or link that the arm does not have.
     """
@@ -82,42 +79,38 @@ class Collisions:
         indices = np.array([arm.joint_names.index(name) for name in joints], dtype=np.intp)
         self._still = arm.native(np.array([(others or {}).get(name, 0.0) for name in arm.joint_names]))
         self._columns, self._reference = arm.columns[indices], arm.reference[indices]
-        shapes = [*arm.shapes, *_objects(arm, world)]
-        self.reach = reach(arm, shapes)[indices]
+        objects = _objects(arm, world)
+        self.reach = reach(arm, objects)[indices]
         """Maximum motion of any point per joint [m/rad], shape (J,)."""
-        self._names = [shape.link for shape in shapes]
-        self.geometry = pinocchio.GeometryModel()
-        for number, shape in enumerate(shapes):
-            self.geometry.addGeometryObject(
-                pinocchio.GeometryObject(f"{number}", shape.joint, pinocchio.SE3(shape.placement), shape.geometry)
-            )
-        checked, self._margins = _pairs(arm, world, shapes, padding, self_padding, set(unchecked))
-        self.geometry.setCollisionPairs(checked, True)
         self.data = arm.model.createData()
-        self.results = self.geometry.createData()
-        self.results.setSecurityMargins(self.geometry, self._margins, True, True)
-        self._results = [self.results]
-        self._managers = [self._manager(self.results)]
+        """pinocchio.Data."""
 
-    def _manager(self, results: Any) -> Any:
-        # The naive manager compares all bounding boxes natively: for the few dozen shapes of an arm it is the fastest.
-        # It widens them by the margins, which must therefore be set before.
-        return pinocchio.BroadPhaseManager_NaiveCollisionManager(self.arm.model, self.geometry, results)
+        def engine(links: Sequence[LinkShape]) -> _Engine:
+            shapes = [*links, *objects]
+            return _Engine(
+                arm.model, self.data, shapes, *_pairs(arm, world, shapes, padding, self_padding, set(unchecked))
+            )
 
-    @cached_property
-    def _wider(self) -> list[Any]:
-        """A manager for each of the margins that `WIDER_M` widens."""
-        for width in WIDER_M[1:]:
-            results = self.geometry.createData()
-            results.setSecurityMargins(self.geometry, self._margins + width, True, True)
-            self._results.append(results)
-            self._managers.append(self._manager(results))
-        return self._managers
+        self._exact = engine(arm.shapes)
+        self._coarse = engine(arm.hulls) if arm.hulls else self._exact
+        """Contains everything that `_exact` has, in fewer shapes."""
+
+    @property
+    def geometry(self) -> Any:
+        """pinocchio.GeometryModel with all shapes and pairs."""
+        return self._exact.geometry
+
+    @property
+    def results(self) -> Any:
+        """pinocchio.GeometryData, with the padding of each pair."""
+        self._exact.widen(0)
+        return self._exact.results
 
     @property
     def pairs(self) -> list[Pair]:
         """Names of what each pair of `geometry.collisionPairs` has, links and objects."""
-        return [(self._names[pair.first], self._names[pair.second]) for pair in self.geometry.collisionPairs]
+        names = self._exact.names
+        return [(names[pair.first], names[pair.second]) for pair in self.geometry.collisionPairs]
 
     def free(self, q: Vector) -> bool:
         """Whether `q`, shape (J,), is free of contacts."""
@@ -125,9 +118,8 @@ class Collisions:
 
     def first_hit(self, configurations: Vector) -> int:
         """Number of free configurations before the first in collision, of shape (N, J)."""
-        model, data, manager, check = self.arm.model, self.data, self._managers[0], pinocchio.computeCollisions
         for number, q in enumerate(self.native(configurations)):
-            if check(model, data, manager, q, True):
+            if self._touches(q):
                 return number
         return len(configurations)
 
@@ -137,23 +129,22 @@ class Collisions:
         Equal to `first_hit`, with fewer checks: a configuration that is free with a margin wider by w proves that all
         those are free to which no point of the arm moves farther than w.
         """
-        model, data, managers, check = self.arm.model, self.data, self._wider, pinocchio.computeCollisions
-        native, number = self.native(path), len(path)
+        native, number, levels, widely = self.native(path), len(path), len(WIDER_M), self._coarse.touches
         travel = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(path, axis=0)) @ self.reach)]).tolist()
-        level, at, narrow = len(managers) - 1, 0, [-1] * len(managers)
+        level, at, narrow = levels - 1, 0, [-1] * levels
         while at < number:
             middle = at if level == 0 else bisect_right(travel, travel[at] + WIDER_M[level]) - 1
             if level and middle == at:
                 level -= 1
                 continue
-            if check(model, data, managers[level], native[middle], True):
+            if widely(native[middle], level) if level else self._touches(native[middle]):
                 if level == 0:
                     return at
                 narrow[level] = middle
                 level -= 1
             else:
                 at = middle + 1 if level == 0 else bisect_right(travel, travel[middle] + WIDER_M[level])
-                if level + 1 < len(managers) and at > narrow[level + 1]:
+                if level + 1 < levels and at > narrow[level + 1]:
                     level += 1
         return number
 
@@ -165,48 +156,43 @@ class Collisions:
             b: end.
             resolution: maximum motion of any point of the arm between two checks [m].
         """
-        model, data, managers, check = self.arm.model, self.data, self._managers, pinocchio.computeCollisions
         begin, way = self._still.copy(), np.zeros(len(self._still))
         begin[self._columns] = a - self._reference
         way[self._columns] = b - a
         travel = float(np.abs(b - a) @ self.reach)
         number = max(math.ceil(travel / resolution), 1)
+        order, shares = spread(number)
+        configurations = begin + shares * way
         if number <= _FEW:
-            return not any(
-                check(model, data, managers[0], begin + (i + 1) / number * way, True) for i in spread(number)
-            )
-        managers = self._wider
+            return not any(map(self._touches, configurations))
         level = min(bisect_right(WIDER_M, travel), len(WIDER_M) - 1)
         proved = bytearray(number)
-        for i in spread(number):
+        for i, q in zip(order, configurations, strict=True):
             if proved[i]:
                 continue
-            q = begin + (i + 1) / number * way
             covers = int(WIDER_M[level] / travel * number)
             if covers:
-                if not check(model, data, managers[level], q, True):
+                if not self._coarse.touches(q, level):
                     first, last = max(i - covers, 0), min(i + covers + 1, number)
                     proved[first:last] = b"\1" * (last - first)
                     continue
                 level -= 1
-            if check(model, data, managers[0], q, True):
+            if self._touches(q):
                 return False
         return True
 
     def contacts(self, q: Vector) -> list[Contact]:
         """Contacts closer than their padding at `q`, shape (J,): the closest of each pair of names, deepest first."""
-        pinocchio.computeCollisions(
-            self.arm.model, self.data, self.geometry, self.results, self.native(q[None])[0], False
-        )
+        shapes, results, names = self.geometry, self.results, self._exact.names
+        pinocchio.computeCollisions(self.arm.model, self.data, shapes, results, self.native(q[None])[0], False)
         found: dict[Pair, Contact] = {}
-        for number, (pair, result) in enumerate(
-            zip(self.geometry.collisionPairs, self.results.collisionResults, strict=True)
-        ):
+        for number, (pair, result) in enumerate(zip(shapes.collisionPairs, results.collisionResults, strict=True)):
             if not result.isCollision():
                 continue
-            first, second = self._names[pair.first], self._names[pair.second]
-            distance = pinocchio.computeDistance(self.geometry, self.results, number).min_distance
-            contact = Contact(first, second, float(distance), float(self._margins[pair.first, pair.second]))
+            first, second = names[pair.first], names[pair.second]
+            distance = pinocchio.computeDistance(shapes, results, number).min_distance
+            padding = self._exact.margins[0][pair.first, pair.second]
+            contact = Contact(first, second, float(distance), float(padding))
             known = found.get((first, second))
             if known is None or contact.distance < known.distance:
                 found[first, second] = contact
@@ -214,10 +200,10 @@ class Collisions:
 
     def distances(self, q: Vector) -> dict[Pair, float]:
         """Distance [m] of each checked pair of names at `q`, shape (J,); negative where they overlap."""
-        pinocchio.computeDistances(self.arm.model, self.data, self.geometry, self.results, self.native(q[None])[0])
+        shapes, results, native = self.geometry, self.results, self.native(q[None])[0]
+        pinocchio.computeDistances(self.arm.model, self.data, shapes, results, native)
         found: dict[Pair, float] = {}
-        for pair, result in zip(self.geometry.collisionPairs, self.results.distanceResults, strict=True):
-            names = self._names[pair.first], self._names[pair.second]
+        for names, result in zip(self.pairs, results.distanceResults, strict=True):
             found[names] = min(float(result.min_distance), found.get(names, np.inf))
         return found
 
@@ -228,19 +214,79 @@ class Collisions:
         whole[:, self._columns] = configurations - self._reference
         return whole
 
+    def _touches(self, native: Vector) -> bool:
+        """Whether anything is closer than its padding at a configuration in Pinocchio's order."""
+        return self._coarse.touches(native) and (self._exact is self._coarse or self._exact.touches(native))
 
-_SPREADS: dict[int, list[int]] = {}
+
+class _Engine:
+    """Native checks of shapes, with margins that can be widened.
+
+    Args:
+        model: pinocchio.Model.
+        data: pinocchio.Data.
+        shapes: S in number.
+        checked: which pairs to check, shape (S, S).
+        margins: their least distances [m], shape (S, S).
+    """
+
+    def __init__(self, model: Any, data: Any, shapes: Sequence[LinkShape], checked: Flags, margins: Vector) -> None:
+        self._model, self._data = model, data
+        self.names = [shape.link for shape in shapes]
+        self.geometry = pinocchio.GeometryModel()
+        for number, shape in enumerate(shapes):
+            self.geometry.addGeometryObject(
+                pinocchio.GeometryObject(f"{number}", shape.joint, pinocchio.SE3(shape.placement), shape.geometry)
+            )
+        self.geometry.setCollisionPairs(checked, True)
+        self.margins = [margins + width for width in WIDER_M]
+        self._set = -1
+        """Which of the margins `results` has."""
+
+    @cached_property
+    def results(self) -> Any:
+        """pinocchio.GeometryData; one for all margins, since it takes as long to create as a hundred checks."""
+        return self.geometry.createData()
+
+    @cached_property
+    def _managers(self) -> list[Any]:
+        """One for each of the margins.
+
+        The naive manager compares all bounding boxes natively: for the few dozen shapes of an arm it is the fastest. It
+        widens the boxes by the margins that are set when it is made.
+        """
+        managers = []
+        for level in range(len(WIDER_M)):
+            self.widen(level)
+            managers.append(pinocchio.BroadPhaseManager_NaiveCollisionManager(self._model, self.geometry, self.results))
+        return managers
+
+    def widen(self, level: int) -> None:
+        """Set the margins widened by `WIDER_M[level]`."""
+        if self._set != level:
+            self.results.setSecurityMargins(self.geometry, self.margins[level], True, True)
+            self._set = level
+
+    def touches(self, native: Vector, level: int = 0) -> bool:
+        """Whether anything is closer than its widened margin at a configuration in Pinocchio's order."""
+        manager = self._managers[level]
+        if self._set != level:
+            self.widen(level)
+        return bool(pinocchio.computeCollisions(self._model, self._data, manager, native, True))
 
 
-def spread(number: int) -> list[int]:
-    """Indices 0 to number - 1, each far from those before it (van der Corput)."""
-    if number not in _SPREADS:
-        bits = max(number - 1, 1).bit_length()
-        codes = np.arange(1 << bits)
-        reversed_bits = np.asarray(sum(((codes >> i) & 1) << (bits - 1 - i) for i in range(bits)))
-        # The middle comes before the ends.
-        _SPREADS[number] = [*reversed_bits[(reversed_bits < number) & (reversed_bits > 0)].tolist(), 0]
-    return _SPREADS[number]
+@lru_cache(maxsize=1024)
+def spread(number: int) -> tuple[list[int], Vector]:
+    """Indices 0 to number - 1, each far from those before it (van der Corput), and (index + 1) / number of each.
+
+    The shares have shape (number, 1).
+    """
+    bits = max(number - 1, 1).bit_length()
+    codes = np.arange(1 << bits)
+    reversed_bits = np.asarray(sum(((codes >> i) & 1) << (bits - 1 - i) for i in range(bits)))
+    # The middle comes before the ends.
+    order = np.append(reversed_bits[(reversed_bits < number) & (reversed_bits > 0)], 0)
+    return order.tolist(), (order[:, None] + 1) / number
 
 
 def unchecked_pairs(arm: Arm, *, samples: int = _SAMPLES, seed: int = 0, never: bool = False) -> dict[Pair, str]:
@@ -284,7 +330,7 @@ def _objects(arm: Arm, world: World) -> list[LinkShape]:
 
 def _pairs(
     arm: Arm, world: World, shapes: Sequence[LinkShape], padding: float, self_padding: float, unchecked: set[Pair]
-) -> tuple[np.ndarray[tuple[int, ...], np.dtype[np.bool_]], Vector]:
+) -> tuple[Flags, Vector]:
     """Which pairs of shapes to check, and their margins [m], both shape (S, S)."""
     names = list(dict.fromkeys(shape.link for shape in shapes))
     numbers = {name: number for number, name in enumerate(names)}

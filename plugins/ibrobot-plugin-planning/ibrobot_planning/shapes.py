@@ -39,9 +39,32 @@ def convex(vertices: Vector, triangles: Triangles) -> Any:
     return coal.Convex(_points(vertices), _triangles(triangles))
 
 
+def hull(points: Vector) -> Any:
+    """The convex hull of points, shape (N, 3)."""
+    return coal.Convex.convexHull(_points(points), False, None)
+
+
+def enclosing(shape: Any) -> Vector | None:
+    """Points whose convex hull contains a convex shape of Coal, shape (N, 3); None for a shape that is not convex."""
+    match shape:
+        case coal.Box():
+            half = shape.halfSide
+        case coal.Sphere():
+            half = np.full(3, shape.radius)
+        case coal.Cylinder():
+            half = np.array([shape.radius, shape.radius, shape.halfLength])
+        case coal.Capsule():
+            half = np.array([shape.radius, shape.radius, shape.halfLength + shape.radius])
+        case coal.ConvexBase():
+            return np.array(shape.points())
+        case _:
+            return None
+    return np.array([(x, y, z) for x in (-half[0], half[0]) for y in (-half[1], half[1]) for z in (-half[2], half[2])])
+
+
 def _mesh(mesh: Mesh) -> Any:
     if mesh.convex:
-        return coal.Convex.convexHull(_points(mesh.vertices), False, None)
+        return hull(mesh.vertices)
     model = coal.BVHModelOBBRSS()
     model.beginModel(len(mesh.triangles), len(mesh.vertices))
     model.addSubModel(_points(mesh.vertices), _triangles(mesh.triangles))

@@ -256,7 +256,11 @@ def _speeds(s: Vector, slopes: Vector, bends: Vector, max_velocity: Vector, max_
     ceiling[:-1] = np.minimum(ceiling[:-1], np.minimum(flat, meets.min(axis=(1, 2))))
     ceiling[0] = ceiling[-1] = 0.0
     # Both passes take one interval at a time: lists of floats are faster here than arrays of five.
-    lines = [list(zip(hs, ks, strict=True)) for hs, ks in zip(h.tolist(), k.tolist(), strict=True)]
+    least = h.min(axis=1).tolist()
+    lines = [
+        list(zip(hs, ks, strict=True)) if any(ks) else [(lowest, 0.0)]
+        for lowest, hs, ks in zip(least, h.tolist(), k.tolist(), strict=True)
+    ]
     widths, bound = width.tolist(), ceiling.tolist()
     for i in range(count - 2, -1, -1):
         # The strongest braking must reach the next bound: -h - k x <= (next - x) / width.
