@@ -109,6 +109,11 @@ def ibrobot_panels() -> Iterable[descriptors.PanelDescriptor]:  # type: ignore[e
 
 
 @hookspec
+def ibrobot_guides() -> Iterable[descriptors.GuideDescriptor]:  # type: ignore[empty-body]
+    """Work at devices in which an operator takes part, for pages."""
+
+
+@hookspec
 def ibrobot_configs() -> Iterable[descriptors.ConfigFile]:  # type: ignore[empty-body]
     """Robot YAMLs that this plugin ships."""
 

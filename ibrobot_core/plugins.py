@@ -49,7 +49,7 @@ KINDS: Mapping[str, str] = {
     "section": "ibrobot_sections",
 }
 """Plugin kind -> its registration hook."""
-_UNTYPED = ("ibrobot_readers", "ibrobot_decoders", "ibrobot_configs", "ibrobot_commands", "ibrobot_panels")
+_UNTYPED = tuple(f"ibrobot_{objects}" for objects in ("readers", "decoders", "configs", "commands", "panels", "guides"))
 """Registration hooks for objects that the YAML does not name by `type`."""
 
 OFFICIAL = Path(__file__).with_name("official_plugins.json")
@@ -96,6 +96,7 @@ class Registry:
     configs: list[descriptors.ConfigFile] = attrs.field(factory=list)
     readers: list[descriptors.ReaderDescriptor] = attrs.field(factory=list)
     panels: list[descriptors.PanelDescriptor] = attrs.field(factory=list)
+    guides: list[descriptors.GuideDescriptor] = attrs.field(factory=list)
     decoders: list[descriptors.DecoderDescriptor] = attrs.field(factory=list)
     commands: dict[str, descriptors.Command] = attrs.field(factory=dict)
     managers: dict[str, pluggy.PluginManager] = attrs.field(factory=dict)
@@ -304,6 +305,7 @@ def _add(registry: Registry, plugin: str, package: str, version: str, load: Call
     registry.decoders += offers["ibrobot_decoders"]
     registry.configs += offers["ibrobot_configs"]
     registry.panels += offers["ibrobot_panels"]
+    registry.guides += offers["ibrobot_guides"]
     registry.commands.update({command.name: command for command in offers["ibrobot_commands"]})
     registry.managers[plugin] = manager
 

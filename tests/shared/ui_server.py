@@ -49,7 +49,7 @@ class UiServer:
     async def __aexit__(self, *_: object) -> None:
         await self.client.close()
         await self._runner.cleanup()
-        await asyncio.to_thread(self.ui.jobs.close)
+        await asyncio.to_thread(self.ui.close)
 
     @property
     def address(self) -> str:

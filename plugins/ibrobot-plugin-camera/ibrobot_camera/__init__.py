@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from ibrobot_camera.device import realsense_stream, video_device
 from ibrobot_camera.options import OpenCvOptions, RealSenseOptions, picture_size
-from ibrobot_core.api import Check, Command, DecoderDescriptor, OptionFault, SensorDescriptor, SensorError, hookimpl
+from ibrobot_core.api import (
+    Check,
+    Command,
+    DecoderDescriptor,
+    GuideDescriptor,
+    OptionFault,
+    SensorDescriptor,
+    SensorError,
+    hookimpl,
+)
 
 if TYPE_CHECKING:
     import click
 
-    from ibrobot_core.api import CompressedImage, Context, Image, Robot, Sensor
+    from ibrobot_core.api import CompressedImage, Context, Guide, Image, Robot, Sensor
 
 
 def _opencv(options: Any, ctx: Context) -> Sensor:
@@ -80,6 +89,18 @@ def _commands() -> click.Command:
 def ibrobot_commands() -> Iterable[Command]:
     """`ibrobot camera …`."""
     yield Command("camera", "List and preview cameras, and save snapshots.", _commands)
+
+
+def _show(answers: Mapping[str, str | bool], guide: Guide) -> None:
+    from ibrobot_camera.guides import show_cameras
+
+    show_cameras(answers, guide)
+
+
+@hookimpl
+def ibrobot_guides() -> Iterable[GuideDescriptor]:
+    """The cameras, with pictures."""
+    yield GuideDescriptor("cameras", "Cameras", "List the cameras, with their formats and a picture of each.", _show)
 
 
 @hookimpl

@@ -1,13 +1,15 @@
-"""The plugin's hooks: hardware `feetech_so101`, teleop `so101_leader`, `ibrobot feetech …`, serial ports for doctor."""
+"""The plugin's hooks: hardware `feetech_so101`, teleop `so101_leader`, `ibrobot feetech …`, guides, serial ports."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from ibrobot_core.api import (
     Check,
     Command,
+    GuideDescriptor,
     HardwareDescriptor,
     PanelDescriptor,
     SensorDescriptor,
@@ -28,7 +30,7 @@ from ibrobot_feetech.options import (
 if TYPE_CHECKING:
     import click
 
-    from ibrobot_core.api import Context, Hardware, Sensor, Session, Teleop
+    from ibrobot_core.api import Context, Guide, Hardware, Question, Sensor, Session, Teleop
 
 
 def _follower(options: Any, ctx: Context) -> Hardware:
@@ -59,6 +61,37 @@ def _servos(session: Session) -> list[tuple[str, ...]]:
 def ibrobot_panels() -> Iterable[PanelDescriptor]:
     """State of the servos."""
     yield PanelDescriptor("Servos", ("servo", "temperature", "voltage", "current", "load"), _servos)
+
+
+def _guide(name: str, title: str, summary: str, run: str, questions: str = "") -> GuideDescriptor:
+    """A guide whose functions are in `ibrobot_feetech.guides`."""
+
+    def start(answers: Mapping[str, str | bool], guide: Guide) -> None:
+        getattr(import_module("ibrobot_feetech.guides"), run)(answers, guide)
+
+    def ask() -> Sequence[Question]:
+        found: Sequence[Question] = getattr(import_module("ibrobot_feetech.guides"), questions)() if questions else ()
+        return found
+
+    return GuideDescriptor(name, title, summary, start, ask)
+
+
+@hookimpl
+def ibrobot_guides() -> Iterable[GuideDescriptor]:
+    """Ports, motors and calibration."""
+    yield _guide("ports", "Serial ports", "List the USB serial ports, and which are adapters of an SO-101.", "list_all")
+    yield _guide("port", "Find an arm's port", "Unplug the arm and plug it in again to find its port.", "find")
+    yield _guide(
+        "motors", "Set up motors", "Give each servo its id and 1 Mbaud, with one servo connected at a time.",
+        "set_up", "setup_questions",
+    )  # fmt: skip
+    yield _guide(
+        "calibration", "Calibrate an arm", "Measure the middle pose and the range of each joint, moved by hand.",
+        "calibrate", "calibration_questions",
+    )  # fmt: skip
+    yield _guide(
+        "servos", "Check an arm", "Compare the servos with their calibration.", "check", "check_questions"
+    )  # fmt: skip
 
 
 @hookimpl

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -13,21 +14,24 @@ from ibrobot_core.api import (
     ZERO_AT_POSE,
     Calibration,
     Declined,
+    Guide,
     HardwareError,
     IbrobotError,
     JointCalibration,
     calibration_path,
-    echo,
 )
 from ibrobot_feetech.arm import relax, write_eprom
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.calibration import save_calibration
-from ibrobot_feetech.commands.dialogue import agree
+from ibrobot_feetech.commands.dialogue import TerminalGuide
 from ibrobot_feetech.commands.joints import by_servo, joints_of
 from ibrobot_feetech.commands.measure import Answers, Measurement
 from ibrobot_feetech.commands.ports import opened, port_argument
 from ibrobot_feetech.commands.zero import zero_text
 from ibrobot_feetech.usb import usb_port
+
+FULL_TURN = ("wrist_roll",)
+"""Joints of an SO-101 that can make a full turn."""
 
 
 @click.command()
@@ -37,7 +41,7 @@ from ibrobot_feetech.usb import usb_port
 @click.option("--robot", metavar="CONFIG", help="Robot YAML with the joints; by default an SO-101.")
 @click.option("--arm", help="Name of the arm, for the records.  [default: the adapter's serial number]")
 @click.option(
-    "--full-turn", multiple=True, default=("wrist_roll",), show_default=True, help="Joint that can make a full turn."
+    "--full-turn", multiple=True, default=FULL_TURN, show_default=True, help="Joint that can make a full turn."
 )
 @click.option(
     "--zero-at",
@@ -61,50 +65,69 @@ def calibrate(
 
     Nothing is written to the servos or to disk before everything is measured.
     """
-    name = name or ("so101_leader" if leader else "so101_follower")
+    calibrate_arm(
+        TerminalGuide(), port, name or ("so101_leader" if leader else "so101_follower"), leader=leader, robot=robot,
+        arm=arm, full_turn=full_turn, zero_at=zero_at, prefix=prefix, yes=yes,
+        answers=Answers(middle_now, range_seconds, accept_ranges, check_signs),
+    )  # fmt: skip
+
+
+def calibrate_arm(
+    guide: Guide, port: str | None, name: str, *, leader: bool = False, robot: str | None = None,
+    arm: str | None = None, full_turn: Sequence[str] = FULL_TURN, zero_at: str = ZERO_AT_POSE, prefix: str = "",
+    yes: bool = False, answers: Answers | None = None,
+) -> None:  # fmt: skip
+    """Calibrate an arm with an operator; the arguments are those of the command.
+
+    Raises:
+        CalibrationError: if the measured values are impossible.
+        Declined: if the operator does not go on.
+        HardwareError: if a servo does not answer, or is in another mode.
+    """
     joints = joints_of(robot, name, prefix)
     path = calibration_path(name)
-    if path.exists() and not yes and not agree(f"{path} exists already. Calibrate again?", flag="--yes"):
+    if path.exists() and not yes and not guide.confirm(f"{path} exists already. Calibrate again?", flag="--yes"):
         raise Declined
     compared = [joint.name for joint in joints if not (leader and joint.anchored)]
     turning = [
         joint.name for joint in joints if joint.name in full_turn or joint.name.removeprefix(prefix) in full_turn
     ]
-    answers = Answers(middle_now, range_seconds, accept_ranges, check_signs)
     with opened(port, joints=by_servo(joints)) as bus:
-        _prepare(bus, yes)
+        _prepare(bus, guide, yes)
         try:
             measurement = Measurement(
-                bus, joints, full_turn=turning, compared=compared, zero_at=zero_at, answers=answers
+                bus, guide, joints, full_turn=turning, compared=compared, zero_at=zero_at, answers=answers or Answers()
             )
             found = measurement.run()
         except BaseException:
-            echo("Nothing was written. The torque is off, and the servos' calibration is unchanged.", err=True)
+            guide.say("Nothing was written. The torque is off, and the servos' calibration is unchanged.", warning=True)
             raise
         usb = usb_port(bus.port.path)
         adapter = usb.serial_number if usb is not None else ""
         date = datetime.now(UTC).isoformat(timespec="seconds")
-        backup(path)
+        if kept := backup(path):
+            guide.say(f"the old file is kept: {kept}")
         made = Calibration(found, robot=arm or adapter or Path(name).stem, date=date, adapter=adapter)
         save_calibration(made, path, overwrite=True)
-        echo(f"saved: {path}")
-        echo(zero_text(made))
-        _write(bus, found, name)
-    echo(f"written to servos {', '.join(str(joint.servo) for joint in joints)}")
+        guide.say(f"saved: {path}")
+        guide.say(zero_text(made))
+        _write(bus, guide, found, name)
+    guide.say(f"written to servos {', '.join(str(joint.servo) for joint in joints)}")
 
 
-def backup(path: Path) -> None:
-    """Rename an existing calibration to include its date."""
-    if path.exists():
-        date = datetime.fromtimestamp(path.stat().st_mtime, UTC).strftime("%Y%m%dT%H%M%SZ")
-        for suffix in (".json", ".meta.json"):
-            former = path.with_suffix(suffix)
-            if former.exists():
-                shutil.copy2(former, path.with_name(f"{path.stem}.{date}{suffix}"))
-        echo(f"the old file is kept: {path.with_name(f'{path.stem}.{date}.json')}")
+def backup(path: Path) -> Path | None:
+    """Copy an existing calibration to a name with its date, and return that."""
+    if not path.exists():
+        return None
+    date = datetime.fromtimestamp(path.stat().st_mtime, UTC).strftime("%Y%m%dT%H%M%SZ")
+    for suffix in (".json", ".meta.json"):
+        former = path.with_suffix(suffix)
+        if former.exists():
+            shutil.copy2(former, path.with_name(f"{path.stem}.{date}{suffix}"))
+    return path.with_name(f"{path.stem}.{date}.json")
 
 
-def _prepare(bus: FeetechBus, yes: bool) -> None:
+def _prepare(bus: FeetechBus, guide: Guide, yes: bool) -> None:
     """Check that every servo answers and is in position mode, and switch its torque off."""
     servos = list(bus.joints)
     for servo in servos:
@@ -114,13 +137,13 @@ def _prepare(bus: FeetechBus, yes: bool) -> None:
                 f"`ibrobot feetech setup-motors --joint {bus.joints[servo]}` sets it"
             )
     if any(bus.sync_read("torque_enable", servos).values()) and not yes:
-        echo("The torque will be switched off, and the arm will fall: hold it.")
-        if not agree("Go on?", flag="--yes", default=True):
+        guide.say("The torque will be switched off, and the arm will fall: hold it.")
+        if not guide.confirm("Go on?", flag="--yes", default=True):
             raise Declined
     relax(bus, servos)
 
 
-def _write(bus: FeetechBus, found: dict[str, JointCalibration], name: str) -> None:
+def _write(bus: FeetechBus, guide: Guide, found: dict[str, JointCalibration], name: str) -> None:
     done: list[str] = []
     try:
         for joint, numbers in found.items():
@@ -133,9 +156,9 @@ def _write(bus: FeetechBus, found: dict[str, JointCalibration], name: str) -> No
             done.append(joint)
     except (IbrobotError, KeyboardInterrupt):
         left = ", ".join(joint for joint in found if joint not in done)
-        echo(
+        guide.say(
             f"The file is saved, but not all servos have it (not: {left}). "
             f"`ibrobot feetech check {bus.port.path} --name {name} --write` writes the rest.",
-            err=True,
+            warning=True,
         )
         raise

@@ -8,10 +8,10 @@ from collections.abc import Iterator
 import attrs
 import click
 
-from ibrobot_core.api import Calibration, Declined, echo, load_calibration
+from ibrobot_core.api import Calibration, Declined, Guide, load_calibration
 from ibrobot_feetech.arm import write_eprom
 from ibrobot_feetech.bus import FeetechBus
-from ibrobot_feetech.commands.dialogue import agree, show, table
+from ibrobot_feetech.commands.dialogue import TerminalGuide
 from ibrobot_feetech.commands.joints import joints_of
 from ibrobot_feetech.commands.ports import opened, port_argument
 from ibrobot_feetech.commands.zero import zero_text
@@ -46,26 +46,43 @@ class Difference:
 @click.option("--yes", is_flag=True, help="Write without asking.")
 def check(port: str | None, name: str, robot: str | None, write: bool, yes: bool) -> None:
     """Compare the servos with a calibration. If they differ, print a table and exit with 1."""
+    if not check_arm(TerminalGuide(), port, name, robot=robot, write=write, yes=yes):
+        sys.exit(1)
+
+
+def check_arm(
+    guide: Guide, port: str | None, name: str, *, robot: str | None = None, write: bool = False, yes: bool = False
+) -> bool:
+    """Compare the servos with a calibration, and return whether they match; the arguments are those of the command.
+
+    Raises:
+        CalibrationError: if the calibration cannot be read.
+        Declined: if the operator does not let it write.
+        HardwareError: if a servo answers wrongly, or the port is gone.
+    """
     calibration = load_calibration(name, [joint.name for joint in joints_of(robot, name)], tool=TOOL)
-    echo(f"{calibration.path}: arm {calibration.robot or 'unnamed'}, made {calibration.date or 'at an unknown time'}")
-    echo(zero_text(calibration))
+    guide.say(
+        f"{calibration.path}: arm {calibration.robot or 'unnamed'}, made {calibration.date or 'at an unknown time'}"
+    )
+    guide.say(zero_text(calibration))
     with opened(port, joints={joint.id: each for each, joint in calibration.joints.items()}) as bus:
         check_adapter(calibration, bus.port.path)
         found = list(differences(bus, calibration))
         if write and (wrong := [each for each in found if not each.remedy]):
-            _print(found)
+            _print(guide, found)
             servos = sorted({each.servo for each in wrong})
-            echo("The torque of these servos will be switched off, and the arm may fall: hold it.")
-            if not (yes or agree(f"Write to servos {', '.join(map(str, servos))}?", flag="--yes")):
+            guide.say("The torque of these servos will be switched off, and the arm may fall: hold it.")
+            if not (yes or guide.confirm(f"Write to servos {', '.join(map(str, servos))}?", flag="--yes")):
                 raise Declined
             for servo in servos:
                 write_eprom(bus, servo, {each.register: int(each.wanted) for each in wrong if each.servo == servo})
             found = list(differences(bus, calibration))
     if found:
-        _print(found)
+        _print(guide, found)
     if any(each.matters for each in found):
-        sys.exit(1)
-    echo(f"{len(calibration.joints)} servos match the calibration")
+        return False
+    guide.say(f"{len(calibration.joints)} servos match the calibration")
+    return True
 
 
 def differences(bus: FeetechBus, calibration: Calibration) -> Iterator[Difference]:
@@ -110,9 +127,9 @@ def differences(bus: FeetechBus, calibration: Calibration) -> Iterator[Differenc
             yield Difference(joint, servo, "firmware", version, common, "update the older servos")
 
 
-def _print(found: list[Difference]) -> None:
-    made = table(">id", "joint", "register", ">servo", ">file", "remedy")
-    for each in found:
-        remedy = each.remedy or "--write"
-        made.add_row(str(each.servo), each.joint, each.register, each.found, each.wanted, remedy)
-    show(made)
+def _print(guide: Guide, found: list[Difference]) -> None:
+    rows = [
+        (str(each.servo), each.joint, each.register, each.found, each.wanted, each.remedy or "--write")
+        for each in found
+    ]
+    guide.show((">id", "joint", "register", ">servo", ">file", "remedy"), rows)

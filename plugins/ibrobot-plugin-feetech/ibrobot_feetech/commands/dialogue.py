@@ -1,14 +1,23 @@
-"""Questions at the terminal, and tables."""
+"""Guides, questions and tables at the terminal."""
 
 from __future__ import annotations
 
+import queue
 import sys
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from typing import override
 
 import click
 from rich.box import SIMPLE_HEAD
+from rich.live import Live
 from rich.table import Table
 
-from ibrobot_core.api import IbrobotError, Screen
+from ibrobot_core.api import Guide, IbrobotError, KeyReader, Screen, echo
+
+_PERIOD_S = 0.03
+"""Time between two updates of a table [s]."""
 
 
 class Unanswered(IbrobotError):
@@ -60,3 +69,55 @@ def table(*columns: str) -> Table:
 def show(made: Table) -> None:
     """Print a table, in colour if the output is a terminal."""
     Screen().print(made)
+
+
+class TerminalGuide(Guide):
+    """The operator at a terminal. Warnings go to standard error."""
+
+    @override
+    def say(self, text: str, *, warning: bool = False) -> None:
+        echo(text, err=warning)
+
+    @override
+    def show(self, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+        show(_filled(columns, rows))
+
+    @override
+    def confirm(self, question: str, *, flag: str = "", default: bool = False) -> bool:
+        return agree(question, flag=flag, default=default)
+
+    @override
+    def wait(
+        self, request: str, *, flag: str = "", columns: Sequence[str] = (),
+        rows: Callable[[], Sequence[Sequence[str]]] | None = None, seconds: float | None = None,
+    ) -> None:  # fmt: skip
+        if rows is None:
+            wait_for_enter(request, flag=flag)
+            return
+        if seconds is None and not interactive():
+            raise Unanswered(f"There is no terminal to press Enter in; run the command in one, or give {flag}")
+        end = "Enter ends it" if seconds is None else f"for {seconds:g} s"
+        echo(f"{request.removesuffix('.')} ({end}).")
+        until = time.monotonic() + (seconds if seconds is not None else float("inf"))
+        with ExitStack() as stack:
+            typed = stack.enter_context(KeyReader()).subscribe() if interactive() else queue.SimpleQueue[str]()
+            console = Screen()
+            live = Live(console=console, auto_refresh=False)
+            if console.is_terminal:
+                stack.enter_context(live)
+            while time.monotonic() < until:
+                live.update(_filled(columns, rows()), refresh=console.is_terminal)
+                try:
+                    if typed.get(timeout=_PERIOD_S) == "enter":
+                        break
+                except queue.Empty:
+                    continue
+        if not console.is_terminal:
+            console.print(_filled(columns, rows()))
+
+
+def _filled(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
+    made = table(*columns)
+    for row in rows:
+        made.add_row(*row)
+    return made

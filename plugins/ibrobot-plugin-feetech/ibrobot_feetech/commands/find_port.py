@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import click
 
-from ibrobot_core.api import HardwareError, echo
-from ibrobot_feetech.commands.dialogue import wait_for_enter
+from ibrobot_core.api import Guide, HardwareError
+from ibrobot_feetech.commands.dialogue import TerminalGuide
 from ibrobot_feetech.usb import UsbPort, usb_ports
 
 
@@ -13,34 +15,49 @@ from ibrobot_feetech.usb import UsbPort, usb_ports
 @click.option("--list", "only_list", is_flag=True, help="Only list the ports.")
 def find_port(only_list: bool) -> None:
     """Find the port of an arm by unplugging its USB cable and plugging it in again."""
-    before = usb_ports()
-    for port in before:
-        _show(port)
-    if not before:
-        echo("There is no USB serial port.")
-    if only_list:
-        return
-    wait_for_enter("Unplug the arm's USB cable, if it is plugged in.", flag="--list")
+    guide = TerminalGuide()
+    before = list_ports(guide)
+    if not only_list:
+        find_arm(guide, before)
+
+
+def list_ports(guide: Guide) -> list[UsbPort]:
+    """Show the USB serial ports, and return them."""
+    found = usb_ports()
+    for port in found:
+        _show(guide, port)
+    if not found:
+        guide.say("There is no USB serial port.")
+    return found
+
+
+def find_arm(guide: Guide, before: Sequence[UsbPort]) -> None:
+    """Find the port of an arm with an operator, who unplugs it and plugs it in again.
+
+    Raises:
+        HardwareError: if no port appears, or several do.
+    """
+    guide.wait("Unplug the arm's USB cable, if it is plugged in.", flag="--list")
     without = {port.path for port in usb_ports()}
     gone = [port for port in before if port.path not in without]
     if len(gone) > 1:
         raise HardwareError(f"several ports are gone: {', '.join(p.path for p in gone)}; unplug one cable at a time")
-    wait_for_enter("Plug it in (again).", flag="--list")
+    guide.wait("Plug it in (again).", flag="--list")
     # The number in the path may have changed.
     new = [port for port in usb_ports() if port.path not in without]
     if not new:
         raise HardwareError("no port appeared; check the cable (some only charge) and the arm's board")
     if len(new) > 1:
         raise HardwareError(f"several ports appeared: {', '.join(p.path for p in new)}; plug in one arm at a time")
-    echo("\nThe arm is at:")
-    _show(new[0])
+    guide.say("\nThe arm is at:")
+    _show(guide, new[0])
 
 
-def _show(port: UsbPort) -> None:
+def _show(guide: Guide, port: UsbPort) -> None:
     arm = " (an SO-101's adapter)" if port.is_arm else ""
     number = f", serial number {port.serial_number}" if port.serial_number else ""
-    echo(f"{port.path}  {port.description}, USB {port.usb_id}{number}{arm}")
+    guide.say(f"{port.path}  {port.description}, USB {port.usb_id}{number}{arm}")
     if port.stable:
-        echo(f"    better for a YAML, because it does not change: {port.stable}")
+        guide.say(f"    better for a YAML, because it does not change: {port.stable}")
     if not port.permitted:
-        echo("    no permission: sudo usermod -aG dialout $USER, then log in again")
+        guide.say("    no permission: sudo usermod -aG dialout $USER, then log in again")

@@ -39,7 +39,8 @@ def import_calibration(
     adapter = found.adapter if port is None else _adapter(port)
     joints = {f"{prefix}{joint}": numbers for joint, numbers in found.joints.items()}
     made = attrs.evolve(found, joints=joints, robot=arm or found.robot, adapter=adapter)
-    backup(path)
+    if kept := backup(path):
+        echo(f"the old file is kept: {kept}")
     save_calibration(made, path, overwrite=True)
     echo(f"saved: {path}")
     echo(zero_text(made))

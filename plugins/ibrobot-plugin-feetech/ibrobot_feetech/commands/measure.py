@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-import queue
-import time
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 
 import attrs
-from rich.live import Live
-from rich.table import Table
 
-from ibrobot_core.api import TICKS_PER_TURN, CalibrationError, Declined, JointCalibration, KeyReader, Screen, echo
+from ibrobot_core.api import TICKS_PER_TURN, CalibrationError, Declined, Guide, JointCalibration
 from ibrobot_feetech.bus import FeetechBus
-from ibrobot_feetech.commands.dialogue import Unanswered, agree, interactive, table, wait_for_enter
 from ibrobot_feetech.commands.joints import Joint
 from ibrobot_feetech.commands.ranges import Range, doubtful, homing_offset, impossible
 
-_PERIOD_S = 0.03
+_COLUMNS = (">id", "joint", ">min", ">now", ">max", ">span", "")
 _TURNED = 40
 """A joint that moved by this much was turned on purpose [ticks]."""
 
@@ -26,10 +20,10 @@ _TURNED = 40
 class Answers:
     """Answers given by flags."""
 
-    middle_now: bool
-    range_seconds: float | None
-    accept_ranges: bool
-    check_signs: bool
+    middle_now: bool = False
+    range_seconds: float | None = None
+    accept_ranges: bool = False
+    check_signs: bool = False
 
 
 class Measurement:
@@ -37,6 +31,7 @@ class Measurement:
 
     Args:
         bus: an open bus.
+        guide: the operator.
         joints: the arm's joints.
         zero_at: position of 0 rad, one of `calibration.ZERO_AT`.
         full_turn: joints that can make a full turn, which is then their range.
@@ -45,10 +40,11 @@ class Measurement:
     """
 
     def __init__(
-        self, bus: FeetechBus, joints: Sequence[Joint], *, full_turn: Sequence[str], compared: Sequence[str],
-        zero_at: str, answers: Answers,
+        self, bus: FeetechBus, guide: Guide, joints: Sequence[Joint], *, full_turn: Sequence[str],
+        compared: Sequence[str], zero_at: str, answers: Answers,
     ) -> None:  # fmt: skip
         self._bus = bus
+        self._guide = guide
         self._joints = joints
         self._ids = [joint.servo for joint in joints]
         self._measured = [joint for joint in joints if joint.name not in full_turn]
@@ -87,14 +83,14 @@ class Measurement:
         request = "Move every joint to the middle of its range."
         while True:
             if not self._answers.middle_now:
-                wait_for_enter(request, flag="--middle-now")
+                self._guide.wait(request, flag="--middle-now")
             encoders = self._encoders()
             try:
                 return {joint.servo: homing_offset(joint.name, encoders[joint.servo]) for joint in self._joints}
             except CalibrationError as error:
                 if self._answers.middle_now:
                     raise
-                echo(f"error: {error}", err=True)
+                self._guide.say(f"error: {error}", warning=True)
 
     def _ranges(self, offsets: Mapping[int, int]) -> dict[str, Range]:
         reported = self._reported(offsets)
@@ -108,69 +104,61 @@ class Measurement:
             refused = "\n".join(wrong) or "the ranges were not accepted; --accept-ranges accepts them"
             if crossed or self._answers.range_seconds is not None:
                 raise CalibrationError(refused)
-            echo(refused, err=True)
-            if not agree("Measure on?", flag="--range-seconds", default=True):
+            self._guide.say(refused, warning=True)
+            if not self._guide.confirm("Measure on?", flag="--range-seconds", default=True):
                 raise Declined
 
     def _accepted(self, ranges: Mapping[str, Range]) -> bool:
         compared = [joint for joint in self._measured if joint.name in self._compared]
         doubts = [text for joint in compared if (text := doubtful(joint, ranges[joint.name], self._zero_at))]
         for text in doubts:
-            echo(f"warning: {text}", err=True)
+            self._guide.say(f"warning: {text}", warning=True)
         if not doubts or self._answers.accept_ranges:
             return True
-        return self._answers.range_seconds is None and agree("Use these ranges anyway?", flag="--accept-ranges")
+        return self._answers.range_seconds is None and self._guide.confirm(
+            "Use these ranges anyway?", flag="--accept-ranges"
+        )
 
     def _reported(self, offsets: Mapping[int, int]) -> dict[int, int]:
         """Servo id -> position that it will report with its new offset [ticks], 0 to 4095."""
         return {servo: (encoder - offsets[servo]) % TICKS_PER_TURN for servo, encoder in self._encoders().items()}
 
     def _follow(self, offsets: Mapping[int, int], ranges: Mapping[str, Range]) -> None:
-        """Record the joints' positions until Enter or the end of the time."""
-        seconds = self._answers.range_seconds
-        if seconds is None and not interactive():
-            raise Unanswered("There is no terminal to press Enter in; run the command in one, or give --range-seconds")
-        end = "Enter ends it" if seconds is None else f"for {seconds:g} s"
-        echo(f"Move each joint in the table to both ends ({end}).")
-        until = time.monotonic() + (seconds if seconds is not None else float("inf"))
-        with ExitStack() as stack:
-            typed = stack.enter_context(KeyReader()).subscribe() if interactive() else queue.SimpleQueue[str]()
-            console = Screen()
-            live = Live(console=console, auto_refresh=False)
-            if console.is_terminal:
-                stack.enter_context(live)
-            while time.monotonic() < until:
-                reported = self._reported(offsets)
-                for joint in self._measured:
-                    ranges[joint.name].follow(reported[joint.servo])
-                live.update(_rows(self._measured, ranges), refresh=console.is_terminal)
-                try:
-                    if typed.get(timeout=_PERIOD_S) == "enter":
-                        break
-                except queue.Empty:
-                    continue
-        if not console.is_terminal:
-            console.print(_rows(self._measured, ranges))
+        """Record the joints' positions until the operator, or the time, ends it."""
+
+        def rows() -> list[tuple[str, ...]]:
+            reported = self._reported(offsets)
+            for joint in self._measured:
+                ranges[joint.name].follow(reported[joint.servo])
+            return _rows(self._measured, ranges)
+
+        self._guide.wait(
+            "Move each joint in the table to both ends.", flag="--range-seconds", columns=_COLUMNS, rows=rows,
+            seconds=self._answers.range_seconds,
+        )  # fmt: skip
 
     def _is_inverted(self, joint: Joint) -> bool:
         """Whether radians decrease as ticks increase."""
         while True:
             before = self._encoders()[joint.servo]
-            wait_for_enter(f"Turn {joint.name} a little in its positive direction.", flag="no --check-signs")
+            self._guide.wait(f"Turn {joint.name} a little in its positive direction.", flag="no --check-signs")
             half = TICKS_PER_TURN // 2
             moved = (self._encoders()[joint.servo] - before + half) % TICKS_PER_TURN - half
             if abs(moved) >= _TURNED:
                 break
-            echo(f"error: {joint.name} moved by only {moved} ticks; try again", err=True)
+            self._guide.say(f"error: {joint.name} moved by only {moved} ticks; try again", warning=True)
         if moved < 0:
-            echo(f"warning: {joint.name}: ticks decrease as its angle increases: it is stored as inverted", err=True)
+            self._guide.say(
+                f"warning: {joint.name}: ticks decrease as its angle increases: it is stored as inverted", warning=True
+            )
         return moved < 0
 
 
-def _rows(joints: Sequence[Joint], ranges: Mapping[str, Range]) -> Table:
-    made = table(">id", "joint", ">min", ">now", ">max", ">span", "")
+def _rows(joints: Sequence[Joint], ranges: Mapping[str, Range]) -> list[tuple[str, ...]]:
+    made = []
     for joint in joints:
         found = ranges[joint.name]
         numbers = (found.least, found.now, found.greatest, found.span)
-        made.add_row(str(joint.servo), joint.name, *map(str, numbers), "crosses 0/4095" if found.crosses else "")
+        remark = "crosses 0/4095" if found.crosses else ""
+        made.append((str(joint.servo), joint.name, *map(str, numbers), remark))
     return made

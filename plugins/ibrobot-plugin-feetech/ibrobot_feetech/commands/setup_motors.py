@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 
 import click
 
-from ibrobot_core.api import Declined, HardwareError, echo
+from ibrobot_core.api import Declined, Guide, HardwareError
 from ibrobot_feetech.bus import FeetechBus
-from ibrobot_feetech.commands.dialogue import agree, interactive, wait_for_enter
+from ibrobot_feetech.commands.dialogue import TerminalGuide
 from ibrobot_feetech.commands.joints import Joint, by_servo, chosen, joints_of
 from ibrobot_feetech.commands.ports import opened, port_argument
 from ibrobot_feetech.commands.scan import BaudRates, search
@@ -30,32 +31,45 @@ def setup_motors(port: str | None, names: tuple[str, ...], robot: str | None, ba
     """Set each servo's id and 1 Mbaud, with only one servo connected at a time, beginning with the last joint."""
     if yes and len(names) != 1:
         raise click.UsageError("--yes needs exactly one --joint, because only one servo may be connected")
+    set_up_motors(TerminalGuide(), port, names, robot=robot, rates=baud, yes=yes)
+
+
+def set_up_motors(
+    guide: Guide, port: str | None, names: Sequence[str] = (), *, robot: str | None = None,
+    rates: Sequence[int] = tuple(BAUD_RATES), yes: bool = False,
+) -> None:  # fmt: skip
+    """Set up servos with an operator, who connects one at a time; the arguments are those of the command.
+
+    Raises:
+        Declined: if the operator gives up.
+        HardwareError: if a servo cannot be set up and nobody can be asked.
+    """
     every = joints_of(robot)
     with opened(port, joints=by_servo(every)) as bus:
         for joint in reversed(chosen(every, names)):
-            _set_up(bus, joint, baud, yes)
-    echo("Now connect the servos in a chain; `ibrobot feetech scan` must show all of them.")
+            _set_up(bus, guide, joint, rates, yes)
+    guide.say("Now connect the servos in a chain; `ibrobot feetech scan` must show all of them.")
 
 
-def _set_up(bus: FeetechBus, joint: Joint, rates: tuple[int, ...], yes: bool) -> None:
+def _set_up(bus: FeetechBus, guide: Guide, joint: Joint, rates: Sequence[int], yes: bool) -> None:
     while True:
         if not yes:
-            wait_for_enter(f"Connect only the servo of {joint.name} (id {joint.servo}), and power.", flag="--yes")
+            guide.wait(f"Connect only the servo of {joint.name} (id {joint.servo}), and power.", flag="--yes")
         try:
             servo, rate = _the_only_one(bus, joint, rates)
             _assign(bus, servo, rate, joint)
         except HardwareError as error:
-            if yes or not interactive():
+            if yes:
                 raise
-            echo(f"error: {error}", err=True)
-            if not agree("Try again?", flag="--yes", default=True):
+            guide.say(f"error: {error}", warning=True)
+            if not guide.confirm("Try again?", flag="--yes", default=True):
                 raise Declined from None
         else:
-            echo(f"{joint.name}: was id {servo} at {rate} baud, is id {joint.servo} at {_RATE} baud")
+            guide.say(f"{joint.name}: was id {servo} at {rate} baud, is id {joint.servo} at {_RATE} baud")
             return
 
 
-def _the_only_one(bus: FeetechBus, joint: Joint, rates: tuple[int, ...]) -> tuple[int, int]:
+def _the_only_one(bus: FeetechBus, joint: Joint, rates: Sequence[int]) -> tuple[int, int]:
     """Id and baud rate of the connected servo.
 
     Raises:

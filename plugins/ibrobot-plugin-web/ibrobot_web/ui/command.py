@@ -54,11 +54,11 @@ def ui(
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(LogFormatter("%(levelname).1s %(message)s"))
     logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
-    jobs = Jobs(opened.first)
+    context = Ui(opened, Jobs(opened.first), _run_options(options))
     try:
-        asyncio.run(_serve(options, Ui(opened, jobs, _run_options(options)), browser=not no_browser))
+        asyncio.run(_serve(options, context, browser=not no_browser))
     finally:
-        jobs.close()
+        context.close()
 
 
 def _run_options(options: WebOptions) -> tuple[str, ...]:

@@ -22,6 +22,14 @@ class Ui:
     """Options of runs that the page launches, so that their pages are reachable from where this page is."""
     view_state: dict[str, Any] = attrs.field(factory=dict)
     """What views keep between requests, by the view's name; use locks, since requests run in threads."""
+    closers: list[Callable[[], None]] = attrs.field(factory=list)
+    """Called when the server ends."""
+
+    def close(self) -> None:
+        """End what views and jobs have started."""
+        for close in self.closers:
+            close()
+        self.jobs.close()
 
 
 @attrs.frozen

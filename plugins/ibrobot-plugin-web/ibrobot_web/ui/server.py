@@ -21,6 +21,7 @@ from ibrobot_web.ui.context import Blob, Handler, Ui
 
 VIEWS = {
     "robots": "Robots",
+    "devices": "Devices",
     "record": "Record",
     "jobs": "Jobs",
 }

@@ -1,0 +1,47 @@
+"""Guide for pages: the cameras of this machine, with a picture of each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import cv2
+
+from ibrobot_camera import v4l2
+from ibrobot_camera.commands.sources import decoded, opened, pixels
+from ibrobot_core.api import Guide, SensorError
+
+_WAIT_S = 5.0
+_QUALITY = 80
+
+
+def show_cameras(answers: Mapping[str, str | bool], guide: Guide) -> None:
+    """Show what `device` of a robot YAML may be, and a picture of each camera."""
+    found = v4l2.cameras()
+    if not found:
+        guide.say("No camera: there is no /dev/video*. Is it plugged in, and does `lsusb` show it?")
+    for camera in found:
+        guide.say(f"{camera.path}: {camera.name}")
+        if camera.stable_id:
+            guide.say(f"better for a YAML, because it does not change: {camera.stable_id}")
+        if camera.problem:
+            guide.say(f"{camera.problem}: sudo usermod -aG video $USER, then log in again", warning=True)
+            continue
+        rows = [
+            (mode.fourcc, f"{mode.width}x{mode.height}", ", ".join(f"{r:g}" for r in mode.rates_hz))
+            for mode in camera.modes
+        ]
+        guide.show(("format", "size", "rates [Hz]"), rows)
+        try:
+            guide.picture(camera.path, _picture(camera.path))
+        except SensorError as error:
+            guide.say(f"no picture: {error}", warning=True)
+
+
+def _picture(device: str) -> bytes:
+    """A picture as JPEG."""
+    with opened(device) as cameras:
+        image = cameras["camera"].read(_WAIT_S)
+    if image is None:
+        raise SensorError(f"{device}: no image within {_WAIT_S:g} s; does a run use it?")
+    _, jpeg = cv2.imencode(".jpg", pixels(decoded(image)), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+    return jpeg.tobytes()

@@ -1,0 +1,86 @@
+"""Guides for pages: the port of an arm, its motors, its calibration, and whether its servos match it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from ibrobot_core.api import ZERO_AT, Guide, HardwareError, Question
+from ibrobot_feetech.commands.calibrate import calibrate_arm
+from ibrobot_feetech.commands.check import check_arm
+from ibrobot_feetech.commands.find_port import find_arm, list_ports
+from ibrobot_feetech.commands.joints import SO101
+from ibrobot_feetech.commands.setup_motors import set_up_motors
+from ibrobot_feetech.usb import usb_ports
+
+Answered = Mapping[str, str | bool]
+_FOLLOWER, _LEADER = "so101_follower", "so101_leader"
+_ALL = "all, one after the other"
+
+
+def list_all(answers: Answered, guide: Guide) -> None:
+    """Show the USB serial ports."""
+    list_ports(guide)
+
+
+def find(answers: Answered, guide: Guide) -> None:
+    """Find the port of an arm by its cable."""
+    find_arm(guide, list_ports(guide))
+
+
+def port_question() -> Question:
+    """The port, with the adapters of SO-101 as suggestions."""
+    arms = tuple(found.stable or found.path for found in usb_ports() if found.is_arm)
+    return Question("port", "Port of the arm", arms[0] if arms else "", arms, open=True)
+
+
+def setup_questions() -> Sequence[Question]:
+    """Port and joint."""
+    return (port_question(), Question("joint", "Joint", _ALL, (_ALL, *SO101)))
+
+
+def set_up(answers: Answered, guide: Guide) -> None:
+    """Set the servos up, one at a time."""
+    joint = str(answers["joint"])
+    set_up_motors(guide, _port(answers), () if joint == _ALL else (joint,))
+
+
+def calibration_questions() -> Sequence[Question]:
+    """Port, arm, name, and where 0 rad is."""
+    return (
+        port_question(),
+        Question("leader", "It is a leader arm, which is moved by hand", False),
+        Question("name", f"Name of the calibration; empty for {_FOLLOWER}, or {_LEADER} of a leader arm"),
+        Question("zero_at", "Position of 0 rad", next(iter(ZERO_AT)), tuple(ZERO_AT)),
+    )
+
+
+def calibrate(answers: Answered, guide: Guide) -> None:
+    """Calibrate an arm."""
+    calibrate_arm(
+        guide, _port(answers), _name(answers), leader=bool(answers["leader"]), zero_at=str(answers["zero_at"])
+    )
+
+
+def check_questions() -> Sequence[Question]:
+    """Port and calibration."""
+    return (
+        port_question(), Question("name", "Name of the calibration", _FOLLOWER, (_FOLLOWER, _LEADER), open=True),
+        Question("write", "Write the file's values to servos that differ", False),
+    )  # fmt: skip
+
+
+def check(answers: Answered, guide: Guide) -> None:
+    """Compare the servos with their calibration."""
+    if not check_arm(guide, _port(answers), _name(answers), write=bool(answers["write"])):
+        raise HardwareError("the servos do not match the calibration")
+
+
+def _port(answers: Answered) -> str | None:
+    return str(answers["port"]).strip() or None
+
+
+def _name(answers: Answered) -> str:
+    given = str(answers["name"]).strip()
+    if "/" in given or given.endswith(".json"):
+        raise HardwareError(f"calibration {given!r}: give a name, not a path, e.g. {_FOLLOWER}")
+    return given or (_LEADER if answers.get("leader") else _FOLLOWER)

@@ -1,0 +1,232 @@
+"""View: devices. Runs the guides of plugins, one at a time, each in a process of its own."""
+
+from __future__ import annotations
+
+import base64
+import threading
+from collections.abc import Mapping
+from typing import Any
+
+import attrs
+
+from ibrobot_core.api import Child, ComponentFailed, GuideDescriptor, IbrobotError, Question, installed_plugins
+from ibrobot_web.ui.context import Blob, Handler, Ui, integer, text
+
+_MODULE = "ibrobot_web.ui.guide_process"
+_POLL_S = 0.1
+_END_S = 5.0
+"""Time that a guide gets to end by itself after it was cancelled [s]."""
+_LARGEST_ANSWER = 500
+_making = threading.Lock()
+
+
+@attrs.define(eq=False)
+class Work:
+    """A guide that runs or has run."""
+
+    name: str
+    title: str
+    number: int
+    child: Child = attrs.field(repr=False)
+    items: list[dict[str, Any]] = attrs.field(factory=list)
+    """What was shown: texts, tables and pictures."""
+    pictures: list[bytes] = attrs.field(factory=list, repr=False)
+    ask: dict[str, Any] | None = None
+    """What the operator is asked at present."""
+    state: str = "running"
+    error: str = ""
+    cancelled: bool = False
+
+
+class Devices:
+    """Runs guides."""
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
+        self._starting = threading.Lock()
+        self.work: Work | None = None
+        self._thread: threading.Thread | None = None
+        self._count = 0
+
+    def start(self, guide: GuideDescriptor, answers: Mapping[str, str | bool]) -> int:
+        """Start a guide.
+
+        Raises:
+            IbrobotError: if another one runs.
+        """
+        with self._starting:
+            if self.work is not None and self.work.state == "running":
+                raise IbrobotError(f"{self.work.title} is running: end it first")
+            if self._thread is not None:
+                self._thread.join()
+            self._count += 1
+            child = Child(_MODULE, {"name": guide.name, "answers": dict(answers)})
+            self.work = Work(guide.name, guide.title, self._count, child)
+            self._thread = threading.Thread(target=self._follow, args=(self.work,), name="guide", daemon=True)
+            self._thread.start()
+            return self._count
+
+    def answer(self, number: int, ask: int, ok: bool) -> None:
+        """Answer the present question, or say that what was asked for is done.
+
+        Raises:
+            IbrobotError: if it was answered already.
+        """
+        with self.lock:
+            work = self._present(number)
+            if work.ask is None or work.ask["ask"] != ask:
+                raise IbrobotError("this question was answered already")
+            said = ("yes" if ok else "no") if work.ask["kind"] == "confirm" else "done"
+            work.items.append({"kind": "answered", "text": work.ask["text"], "answer": said, **_table(work.ask)})
+            work.ask = None
+            work.child.channel.send({"reply": ask, "ok": ok})
+
+    def cancel(self, number: int) -> None:
+        """End the guide where it waits for the operator; kill it if it does not end.
+
+        Raises:
+            IbrobotError: if it does not run.
+        """
+        with self.lock:
+            work = self._present(number)
+            work.cancelled = True
+
+    def close(self) -> None:
+        """End the guide."""
+        if self.work is not None:
+            self.work.cancelled = True
+        if self._thread is not None:
+            self._thread.join()
+
+    def _present(self, number: int) -> Work:
+        if self.work is None or self.work.number != number or self.work.state != "running":
+            raise IbrobotError("this guide does not run")
+        return self.work
+
+    def _follow(self, work: Work) -> None:
+        """Take the messages of a guide until it ends."""
+        child = work.child
+        done = False
+        while not work.cancelled and not done and child.failed is None:
+            try:
+                message = child.wait(_POLL_S)
+            except ComponentFailed:
+                break
+            if message is not None:
+                done = message["event"] == "done"
+                with self.lock:
+                    _take(work, message)
+        child.channel.close()
+        error = "" if done else "cancelled; nothing more is done" if work.cancelled else child.cause(_END_S)
+        child.end(_END_S)
+        with self.lock:
+            work.error = error
+            work.state = "done" if done else "failed"
+            work.ask = None
+
+
+def _take(work: Work, message: Mapping[str, Any]) -> None:
+    match message["event"]:
+        case "say":
+            work.items.append({"kind": "say", "text": message["text"], "warning": message["warning"]})
+        case "show":
+            work.items.append({"kind": "show", **_table(message)})
+        case "picture":
+            work.items.append({"kind": "picture", "title": message["title"], "picture": len(work.pictures)})
+            work.pictures.append(base64.b64decode(message["content"]))
+        case "ask":
+            work.ask = {name: message[name] for name in ("ask", "kind", "text")}
+        case "rows" if work.ask is not None and work.ask["ask"] == message["ask"]:
+            work.ask |= _table(message)
+
+
+def _table(message: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: message[name] for name in ("columns", "rows") if name in message}
+
+
+def devices_of(ui: Ui) -> Devices:
+    """The guides of a page's server."""
+    with _making:
+        if "devices" not in ui.view_state:
+            ui.view_state["devices"] = Devices()
+            ui.closers.append(ui.view_state["devices"].close)
+        devices = ui.view_state["devices"]
+    assert isinstance(devices, Devices)
+    return devices
+
+
+def listing(ui: Ui, facts: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The guides of all plugins, with their questions."""
+    return [
+        {
+            "name": guide.name, "title": guide.title, "summary": guide.summary,
+            "questions": [attrs.asdict(question) for question in guide.questions()],
+        }
+        for guide in installed_plugins().guides
+    ]  # fmt: skip
+
+
+def start(ui: Ui, facts: Mapping[str, Any]) -> dict[str, int]:
+    """Start a guide."""
+    name = text(facts, "name")
+    guide = next((each for each in installed_plugins().guides if each.name == name), None)
+    if guide is None:
+        raise IbrobotError(f"no guide {name!r}")
+    given = facts.get("answers", {})
+    if not isinstance(given, dict):
+        raise IbrobotError("answers must be an object")
+    return {"number": devices_of(ui).start(guide, {each.name: _answer(each, given) for each in guide.questions()})}
+
+
+def _answer(question: Question, given: Mapping[str, Any]) -> str | bool:
+    value = given.get(question.name, question.default)
+    if not isinstance(value, type(question.default)):
+        raise IbrobotError(f"{question.text}: the answer must be a {type(question.default).__name__}")
+    if isinstance(value, str) and len(value) > _LARGEST_ANSWER:
+        raise IbrobotError(f"{question.text}: the answer is too long")
+    if question.choices and not question.open and value not in question.choices:
+        raise IbrobotError(f"{question.text}: {value!r} is not one of {', '.join(question.choices)}")
+    assert isinstance(value, str | bool)
+    return value
+
+
+def state(ui: Ui, facts: Mapping[str, Any]) -> dict[str, Any]:
+    """What the guide shows, from item number `after` on, and what it asks."""
+    devices, after = devices_of(ui), integer(facts, "after", default=0)
+    with devices.lock:
+        work = devices.work
+        if work is None:
+            return {"number": 0, "state": "none", "items": [], "ask": None}
+        return {
+            "number": work.number, "name": work.name, "title": work.title, "state": work.state, "error": work.error,
+            "items": work.items[after:], "ask": work.ask,
+        }  # fmt: skip
+
+
+def picture(ui: Ui, facts: Mapping[str, Any]) -> Blob:
+    """A picture that the guide has shown."""
+    devices, index = devices_of(ui), integer(facts, "picture")
+    with devices.lock:
+        if devices.work is None or index >= len(devices.work.pictures):
+            raise IbrobotError("no such picture")
+        content = devices.work.pictures[index]
+    return Blob(content, "image/png" if content.startswith(b"\x89PNG") else "image/jpeg")
+
+
+def answer(ui: Ui, facts: Mapping[str, Any]) -> None:
+    """Answer what the guide asks."""
+    ok = facts.get("ok", True)
+    if not isinstance(ok, bool):
+        raise IbrobotError("ok must be true or false")
+    devices_of(ui).answer(integer(facts, "number"), integer(facts, "ask"), ok)
+
+
+def cancel(ui: Ui, facts: Mapping[str, Any]) -> None:
+    """End the guide."""
+    devices_of(ui).cancel(integer(facts, "number"))
+
+
+ROUTES: dict[str, Handler] = {
+    "GET /list": listing, "GET /state": state, "GET /picture": picture,
+    "POST /start": start, "POST /answer": answer, "POST /cancel": cancel,
+}  # fmt: skip
