@@ -56,6 +56,8 @@ PLATFORMS = ("x86_64-unknown-linux-gnu", "aarch64-unknown-linux-gnu", "aarch64-a
 """Where everything must install without a compiler: PCs, robots' own computers (e.g. Jetson), and Macs."""
 # A fixed seed: the same checks give the same result; `nox -s core -- --hypothesis-seed=random` explores.
 PYTEST = ("pytest", "--config-file=pyproject.toml", "--rootdir=.", "--hypothesis-seed=0", "-rs")
+TWO = ("-n", "2", "--dist", "worksteal")
+"""Two tests at once: in sessions so long that the others would end before them."""
 UNTYPED = [
     *(f"--allow-{what}" for what in ("untyped-defs", "incomplete-defs", "untyped-calls", "untyped-decorators")),
     "--no-warn-return-any", "--explicit-package-bases",
@@ -161,7 +163,7 @@ def integration(session: nox.Session) -> None:
     install(session, *PLUGINS, groups=("test", "browser"))
     system_libraries(session)
     chromium(session)
-    session.run(*PYTEST, "-m", "integration", "tests", "plugins", *session.posargs)
+    session.run(*PYTEST, *TWO, "-m", "integration", "tests", "plugins", *session.posargs)
 
 
 @nox.session
@@ -174,7 +176,7 @@ def minimums(session: nox.Session) -> None:
     system_libraries(session)
     few = ("--hypothesis-profile=few", "-m", "not integration and not lerobot")
     repository = ("--ignore=tests/house", "--ignore=tests/docs")  # they read files, with no dependency
-    session.run(*PYTEST, *few, *repository, "tests", "plugins", *session.posargs)
+    session.run(*PYTEST, *TWO, *few, *repository, "tests", "plugins", *session.posargs)
 
 
 @nox.session
