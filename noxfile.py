@@ -198,8 +198,9 @@ def core(session: nox.Session) -> None:
 def docs(session: nox.Session) -> None:
     """The documentation: every warning is an error, every example runs."""
     install(session, *PLUGINS, groups=("docs", "test"))
-    session.run("sphinx-build", "-q", "-W", "--keep-going", "-n", "-b", "html", "docs", "docs/_build/html")
-    session.run("sphinx-build", "-q", "-W", "--keep-going", "-b", "doctest", "docs", "docs/_build/doctest")
+    build = ("sphinx-build", "-q", "-W", "--keep-going", "-n", "-d", "docs/_build/doctrees")  # read once for both
+    session.run(*build, "-b", "html", "docs", "docs/_build/html")
+    session.run(*build, "-b", "doctest", "docs", "docs/_build/doctest")
 
 
 @nox.session

@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import attrs
 import yaml
+from yaml.composer import Composer
 from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from yaml.resolver import BaseResolver
 
@@ -27,6 +29,8 @@ _INT = re.compile(r"[-+]?[0-9]+")
 _BASED = re.compile(r"0o[0-7]+|0x[0-9a-fA-F]+")
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
 _SPECIAL = re.compile(r"([-+]?)\.(inf|Inf|INF)|\.(nan|NaN|NAN)")
+_READ_OTHERWISE = re.compile("[\t?!\ufeff\ud800-\udfff]")
+"""What libyaml takes where PyYAML does not, or cannot encode."""
 
 # Far above any robot's YAML (so101.yaml: 4 kB, 365 values), and read within a second.
 MAX_BYTES = 256 * 1024
@@ -131,24 +135,38 @@ def _child(value: Any, part: str | int) -> Any:
     return None
 
 
-class _Composer(yaml.SafeLoader):
-    """PyYAML's composer without YAML 1.1 scalars; plain scalars keep their text."""
+class _Composer(Composer):
+    """PyYAML's composer, bounded, before a document takes time and memory."""
 
     _values = 0
+    _depth = 0
 
     def compose_node(self, parent: Node | None, index: Any) -> Node | None:
         self._values += 1
-        if self._values > _MAX_VALUES:
-            raise _Excess(_TOO_MANY, self.peek_event().start_mark)  # type: ignore[no-untyped-call]
-        return super().compose_node(parent, index)
+        self._depth += 1
+        if self._values > _MAX_VALUES or self._depth > _MAX_DEPTH + 2:  # the document and its deepest key are nodes too
+            excess = _TOO_MANY if self._values > _MAX_VALUES else _TOO_DEEP
+            raise _Excess(excess, self.peek_event().start_mark)  # type: ignore[attr-defined]
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        return node
 
-    def fetch_flow_collection_start(self, token: Any) -> None:
-        if self.flow_level > _MAX_DEPTH:
-            raise _Excess(_TOO_DEEP, self.get_mark())
-        super().fetch_flow_collection_start(token)
+
+class _Loader(_Composer, yaml.SafeLoader):
+    """Without YAML 1.1 scalars; plain scalars keep their text."""
 
 
-_Composer.yaml_implicit_resolvers = {}
+_Loader.yaml_implicit_resolvers = {}
+_FastLoader: type[_Loader] = _Loader
+"""Reads the same some four times as fast where PyYAML has libyaml, whose errors are worded otherwise."""
+if yaml.__with_libyaml__:
+
+    class _FastLoader(_Composer, yaml.CSafeLoader):  # type: ignore[no-redef]
+        def __init__(self, text: str) -> None:
+            yaml.CSafeLoader.__init__(self, text)
+            Composer.__init__(self)
+
+    _FastLoader.yaml_implicit_resolvers = {}
 
 
 class _Excess(yaml.MarkedYAMLError):
@@ -199,17 +217,22 @@ def parse_yaml(text: str, file: str) -> Document:
     if len(text) > MAX_BYTES:
         raise ConfigError([Problem(file, 0, "", f"too long: a robot YAML has at most {MAX_BYTES // 1024} kB")])
     try:
-        node = _Composer(text).get_single_node()
+        node = _compose(text)
         document.root = None if node is None else _Constructor(document).value(node, ())
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = mark.line + 1 if mark else 0
         raise ConfigError([Problem(file, line, "", _reason(error))]) from None
-    except RecursionError:
-        raise ConfigError([Problem(file, 0, "", _TOO_DEEP)]) from None
     except yaml.YAMLError as error:
         raise ConfigError([Problem(file, 0, "", f"not valid YAML: {str(error).splitlines()[0]}")]) from None
     return document
+
+
+def _compose(text: str) -> Node | None:
+    if not _READ_OTHERWISE.search(text):
+        with suppress(yaml.YAMLError):  # which PyYAML words as users know it
+            return _FastLoader(text).get_single_node()
+    return _Loader(text).get_single_node()
 
 
 def _reason(error: yaml.MarkedYAMLError) -> str:
@@ -270,7 +293,7 @@ class _Constructor:
             text = expand(node.value)
             if text != node.value:
                 self.document.references[key] = node.value
-            return scalar(text) if node.style is None else text
+            return scalar(text) if not node.style else text
         except ValueError as error:
             self.fault(node, key, str(error))
             self.document.unread.add(key)
@@ -283,7 +306,7 @@ class _Constructor:
         for key_node, value_node in node.value:
             if not isinstance(key_node, ScalarNode):
                 self.fault(key_node, key, "a key must be a single word")
-            elif key_node.value == "<<" and key_node.style is None:
+            elif key_node.value == "<<" and not key_node.style:
                 merged += value_node.value if isinstance(value_node, SequenceNode) else [value_node]
             elif key_node.value in result:
                 first = lines[key_node.value]

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from ibrobot_core.config import RobotConfig, load_config
+from ibrobot_core.config import RobotConfig, load_config, yaml_nodes
 from ibrobot_core.config.show import to_yaml
 from ibrobot_core.config.yaml_nodes import parse_yaml
 from ibrobot_core.errors import ConfigError
@@ -38,7 +41,7 @@ CASES = {
     "unknown_keys": ("".join(f"key{i}: 1\n" for i in range(400_000)), f"robot.yaml: {TOO_LONG}"),
     "lists": ("x: " + "[" * 50_000, f"robot.yaml:1: {TOO_DEEP}"),
     "mappings": ("x: " + "{a: " * 10_000, f"robot.yaml:1: {TOO_DEEP}"),
-    "items": ("- " * 3_000, f"robot.yaml: {TOO_DEEP}"),
+    "items": ("- " * 3_000, f"robot.yaml:1: {TOO_DEEP}"),
     "keys": ("".join(" " * i + "a:\n" for i in range(60)), f"robot.yaml:52: {TOO_DEEP}"),
 }
 
@@ -98,3 +101,35 @@ def test_text_of_many_digits_is_shown_as_text(base: str, load_text: Callable[...
 
     assert f"port: '{digits}'" in shown
     assert load_text(shown).hardware["hardware"].options.port == digits
+
+
+LINES = Path("configs/so101.yaml").read_text(encoding="utf-8").splitlines(keepends=True)
+MARKS = [
+    *":#-[]{}&*!|>'\"%@`,?<~\\ \t\n\r\x85\u2028\ufeffé",
+    "---\n",
+    "- ",
+    "<<: ",
+    "&a ",
+    "*a",
+    "|2\n  x\n",
+    "%YAML 1.3\n",
+]
+PIECES = st.sampled_from(MARKS)
+
+
+@given(st.integers(0, len(LINES)), st.lists(st.tuples(st.integers(0, 400), st.integers(0, 5), PIECES), max_size=4))
+def test_libyaml_reads_what_pyyaml_reads(first: int, changes: list[tuple[int, int, str]]) -> None:
+    text = "".join(LINES[first : first + 8])
+    for at, dropped, added in changes:
+        text = text[:at] + added + text[at + dropped :]
+
+    def read() -> object:
+        try:
+            return repr(parse_yaml(text, "robot.yaml"))
+        except ConfigError as error:
+            return str(error)
+
+    fast = read()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(yaml_nodes, "_FastLoader", yaml_nodes._Loader)
+        assert fast == read()

@@ -98,7 +98,7 @@ def test_an_included_file_is_read_in_its_place(tmp_path: Path) -> None:
             r"arm\.xml:2: joint 'a': no default class 'b'; the classes are: main",
         ),
         ('<mujoco>\n<include file="gone.xml"/></mujoco>', r"gone\.xml: cannot be read: No such file"),
-        ("<mujoco>" + " " * (16 << 20) + "</mujoco>", r"arm\.xml: is larger than 16 MiB"),
+        pytest.param("<mujoco>" + " " * (16 << 20) + "</mujoco>", r"arm\.xml: is larger than 16 MiB", id="large"),
     ],
 )
 def test_other_files_are_refused_as_models_with_its_line(tmp_path: Path, text: str, message: str) -> None:
