@@ -142,3 +142,6 @@ def test_the_progress_of_a_session_is_read_from_its_status_lines(folder: Path) -
         "saved": 1, "progress": 0.25,
         "text": "recording “a, saved 1 of 2”, 3 s, 17 s left · 1 of 4 episodes saved",
     }  # fmt: skip
+    assert read_status("recorded   2 of 4 episodes into episodes/pick") == {
+        "saved": 2, "progress": 0.5, "text": "2 of 4 episodes saved",
+    }  # fmt: skip

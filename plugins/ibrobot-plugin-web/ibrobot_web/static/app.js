@@ -143,7 +143,7 @@ function showOperator() {
   say($("operator"), role === "watch" ? "watching only" : who + (pages > 1 ? ` · ${pages} pages` : ""));
   $("operator").classList.toggle("good", operating);
   $("operate").hidden = role === "watch";
-  say($("operate"), operating ? "Stop operating" : operator ? "Take over" : "Operate");
+  say($("operate"), operating ? "Only watch" : operator ? "Take over" : "Operate");
   $("stop").disabled = role === "watch";
 }
 
@@ -153,9 +153,12 @@ function showFaults() {
   const faults = status?.faults ?? [];
   const held = status?.held ?? "", failure = status?.failure ?? "";
   const absent = status?.absent ?? [], conditions = status?.conditions ?? [];
-  refresh($("faults"), { estop, faults, held, failure, absent, conditions, operating: page.operating }, () => {
+  const lost = page.connected === false;
+  refresh($("faults"), { lost, estop, faults, held, failure, absent, conditions, operating: page.operating }, () => {
     const reset = () => h("button", { onclick: () => page.command("reset"), disabled: !page.operating }, "Reset");
     return [
+      lost ? h("div", { class: "fault" }, h("strong", {}, "No connection to the run. "), h("span", {},
+        "It has ended, or the network is down. STOP on this page has no effect. The page keeps trying.")) : null,
       ...faults.map(({ text, remedy }) => h("div", { class: "fault" },
         h("strong", {}, "Fault: "), h("span", {}, `${text}. The robot holds. ${remedy}`), reset())),
       estop && !faults.length ? h("div", { class: "fault" }, h("strong", {}, "Emergency stop. "), reset()) : null,
@@ -205,7 +208,11 @@ page.stream.addEventListener("plan", ({ detail: plan }) => {
   if (page.state) view.tell({ do: "plan", plan, positions: page.state.position });
 });
 page.stream.addEventListener("samples", ({ detail }) => panels.forEach((panel) => panel.samples?.(detail)));
-page.stream.addEventListener("connection", ({ detail }) => { page.connected = detail.open; showConnection(); });
+page.stream.addEventListener("connection", ({ detail }) => {
+  page.connected = detail.open;
+  showConnection();
+  showFaults();
+});
 page.drive.addEventListener("operator", update);
 page.drive.addEventListener("connection", showConnection);
 page.drive.addEventListener("refused", ({ detail }) => toast(detail, "error"));

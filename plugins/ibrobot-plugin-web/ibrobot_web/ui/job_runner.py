@@ -54,6 +54,8 @@ class Job:
     command: tuple[str, ...]
     """Arguments of the command, for the page."""
     process: subprocess.Popen[bytes] = attrs.field(repr=False)
+    done_codes: tuple[int, ...] = (0,)
+    """Exit codes of a job that did what it was started for."""
     facts: dict[str, Any] = attrs.field(factory=dict)
     """What is known about the job; `progress` is between 0 and 1."""
     state: State = "running"
@@ -98,7 +100,7 @@ class Jobs:
 
     def start(
         self, kind: str, title: str, arguments: Sequence[str], *, facts: Mapping[str, Any] | None = None,
-        read: Reader | None = None, program: Sequence[str] = IBROBOT,
+        read: Reader | None = None, program: Sequence[str] = IBROBOT, done_codes: tuple[int, ...] = (0,),
     ) -> Job:  # fmt: skip
         """Start a job.
 
@@ -109,6 +111,7 @@ class Jobs:
             facts: what is known about it at the start.
             read: reads facts from each line of its output.
             program: the program; the command `ibrobot` by default.
+            done_codes: exit codes of a job that did what it was started for.
 
         Raises:
             IbrobotError: if the program cannot be started.
@@ -125,7 +128,7 @@ class Jobs:
                 raise IbrobotError(f"{program[0]} cannot be started: {error.strerror}") from None
             name = "ibrobot" if tuple(program) == IBROBOT else Path(program[0]).name
             number = max(self._jobs, default=0) + 1
-            job = Job(number, kind, title, (name, *arguments), process, dict(facts or {}))
+            job = Job(number, kind, title, (name, *arguments), process, done_codes, dict(facts or {}))
             self._jobs[number] = job
             self._forget()
             thread = threading.Thread(target=self._follow, args=(job, read), name=f"job {number}", daemon=True)
@@ -200,7 +203,7 @@ class Jobs:
         code = job.process.wait()
         with self._lock:
             job.exit_code, job.ended_s = code, time.time()
-            job.state = "done" if code == 0 else "cancelled" if job.cancelling else "failed"
+            job.state = "done" if code in job.done_codes else "cancelled" if job.cancelling else "failed"
         self._change(job)
 
     def _take(self, job: Job, lines: Sequence[bytes], read: Reader | None) -> None:

@@ -10,12 +10,14 @@ from typing import Any
 
 from ibrobot_core.api import IbrobotError, installed_plugins
 from ibrobot_web.ui.context import Handler, Ui, integer, text
-from ibrobot_web.ui.robots import read_address, run_arguments
+from ibrobot_web.ui.robots import RUN_DONE, read_address, run_arguments
 
 _DATASET = re.compile(r"\w[\w .-]*(?:/\w[\w .-]*)*")
 _LONGEST_PROMPT = 500
 _STATUS = re.compile(r"\| (?P<state>[^|]*), saved (?P<saved>\d+) of (?P<count>\d+)$")
 """The end of a status line of `ibrobot record`."""
+_SUMMARY = re.compile(r"recorded +(?P<saved>\d+) of (?P<count>\d+) episodes? into")
+"""The line of its summary."""
 
 
 def place(ui: Ui, facts: Mapping[str, Any]) -> dict[str, Any]:
@@ -46,7 +48,9 @@ def start(ui: Ui, facts: Mapping[str, Any]) -> dict[str, int]:
         f"--prompt={prompt}", f"--episodes={count}",
     ]  # fmt: skip
     known = {"dataset": ui.folders.name(folder), "saved": 0, "episodes": count, "progress": 0.0}
-    job = ui.jobs.start("record", f"Record {folder.name}", arguments, facts=known, read=read_status)
+    job = ui.jobs.start(
+        "record", f"Record {folder.name}", arguments, facts=known, read=read_status, done_codes=RUN_DONE
+    )
     return {"number": job.number}
 
 
@@ -65,6 +69,9 @@ def read_status(line: str) -> Mapping[str, Any] | None:
         return {
             "saved": saved, "progress": saved / count, "text": f"{status['state']} · {saved} of {count} episodes saved"
         }  # fmt: skip
+    if (summary := _SUMMARY.match(line)) is not None:
+        saved, count = int(summary["saved"]), int(summary["count"])
+        return {"saved": saved, "progress": saved / count, "text": f"{saved} of {count} episodes saved"}
     return read_address(line)
 
 

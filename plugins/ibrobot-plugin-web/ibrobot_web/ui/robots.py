@@ -32,6 +32,8 @@ _HEAD = 1 << 16
 """Bytes of a file in which `robot:` is found."""
 _SKIPPED = frozenset({"node_modules", "site-packages", "episodes", "datasets", "outputs", "__pycache__"})
 _PAGE = re.compile(r"viewer: (?P<url>https?://\S+)(?:\s+\(to watch only: (?P<watch_url>\S+)\))?")
+RUN_DONE = (0, 3)
+"""Exit codes of runs that ended as they should; 3: not all episodes or goals succeeded."""
 _checking = threading.Lock()
 
 
@@ -153,7 +155,8 @@ def _mode_for_page(config: RobotConfig) -> str:
 def launch(ui: Ui, facts: Mapping[str, Any]) -> dict[str, int]:
     """Launch a robot with its page."""
     robot = robot_of(ui, facts)
-    job = ui.jobs.start("run", _title(robot, facts), ["launch", *run_arguments(ui, facts)], read=read_address)
+    arguments = ["launch", *run_arguments(ui, facts)]
+    job = ui.jobs.start("run", _title(robot, facts), arguments, read=read_address, done_codes=RUN_DONE)
     return {"number": job.number}
 
 

@@ -40,7 +40,9 @@ export class JobCard {
   }
 
   buttons(job) {
-    if (job.state !== "running") return [];
+    if (job.state !== "running") {
+      return job.kind === "record" && job.facts.saved ? [h("a", { class: "button", href: "#episodes" }, "See the episodes")] : [];
+    }
     const open = job.facts.url
       ? h("a", { class: "button primary", href: job.facts.url, target: "_blank" }, "Open the robot's page") : null;
     const end = h("button", {

@@ -20,10 +20,10 @@ export class View {
     this.count = h("input", { type: "number", id: "record-count", min: "1", max: "10000", value: "10" });
     this.begin = h("button", { class: "primary", disabled: true }, "Start the session");
     this.disk = h("p", { class: "note", "aria-live": "polite" });
-    this.form = h("form", {}, this.chooser.fields, h("div", { class: "fields gap" },
-      h("label", { for: "record-prompt" }, "Task"), this.prompt,
+    this.chooser.fields.append(h("label", { for: "record-prompt" }, "Task"), this.prompt,
       h("label", { for: "record-dataset" }, "Dataset"), this.dataset,
-      h("label", { for: "record-count" }, "Episodes"), this.count), this.disk, h("div", { class: "row" }, this.begin));
+      h("label", { for: "record-count" }, "Episodes"), this.count, h("span", {}), this.disk);
+    this.form = h("form", {}, this.chooser.fields, h("div", { class: "row" }, this.begin));
     this.form.addEventListener("submit", (event) => { event.preventDefault(); this.start(); });
     this.sessions = h("div", { class: "columns" },
       h("p", { class: "note" }, "No session yet. In its page, you begin, judge and discard each episode."));

@@ -1,0 +1,41 @@
+"""The page of `ibrobot ui` in headless Chromium: by clicks alone from choosing a robot to its recorded episodes."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from ibrobot_core.api import installed_plugins
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+pytestmark = [
+    pytest.mark.integration,
+    pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium"),
+    pytest.mark.skipif(("hardware", "mujoco") not in installed_plugins().entries, reason="needs ibrobot-plugin-mujoco"),
+]
+
+
+def test_from_a_robot_to_its_episodes_by_clicks_alone(tmp_path: Path) -> None:
+    sync_api = pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install playwright")
+    from ui_path import FLAGS, own_robot, record, ui_process
+
+    own_robot(tmp_path)
+    errors: list[str] = []
+    hosts: set[str] = set()
+    with ui_process(tmp_path) as address, sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        page = browser.new_page()
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.on("console", lambda line: errors.extend([line.text] * (line.type == "error")))
+        page.on("request", lambda request: hosts.add(request.url.split("/")[2]))
+        page.goto(address)
+        record(page)
+        browser.close()
+    assert not errors
+    assert hosts == {address.split("/")[2]}
+    outcomes = [
+        (tmp_path / f"episodes/pick/episodes/episode_00000{number}/metadata.yaml").read_text() for number in (1, 2)
+    ]
+    assert ["success" in outcomes[0], "failure" in outcomes[1]] == [True, True]

@@ -1,0 +1,103 @@
+"""The way from choosing a robot to playing back its dataset, by clicks alone on the page of `ibrobot ui`."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from page_run import IBROBOT
+
+ROOT = Path(__file__).parents[2]
+FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=gl-egl", "--ignore-gpu-blocklist"]
+_WAIT_MS = 60_000
+Shot = Callable[[Any, str], None]
+"""Takes a screenshot of a page, by name."""
+
+
+@contextmanager
+def ui_process(folder: Path) -> Iterator[str]:
+    """Run `ibrobot ui` in a folder, and yield the address of its page."""
+    with tempfile.TemporaryFile("w+", encoding="utf-8") as log:
+        served = subprocess.Popen(
+            [*IBROBOT, "ui", "--port", "0", "--no-browser"], cwd=folder, stdout=log, stderr=log,
+            stdin=subprocess.DEVNULL, start_new_session=True, env={**os.environ, "CI": "1"},
+        )  # fmt: skip
+        try:
+            deadline_s = time.monotonic() + 60
+            found = None
+            while found is None and time.monotonic() < deadline_s and served.poll() is None:
+                time.sleep(0.05)
+                log.seek(0)
+                found = re.search(r"page: (\S+)", log.read())
+            assert found is not None, "the page did not come up"
+            yield found[1]
+        finally:
+            served.send_signal(signal.SIGINT)
+            try:
+                served.wait(30)
+            finally:
+                served.kill()
+                served.wait()
+
+
+def own_robot(folder: Path, size: str = "width: 160, height: 120, fps: 10") -> None:
+    """Put a robot YAML with small pictures into a folder, as its owner would."""
+    content = (ROOT / "configs/so101.yaml").read_text(encoding="utf-8")
+    content = content.replace("width: 640, height: 480, fps: 30", size)
+    (folder / "my_arm.yaml").write_text(content, encoding="utf-8")
+
+
+def until(page: Any, expression: str) -> None:
+    """Wait until an expression is true; the page's policy forbids Playwright's own way, which needs `eval`."""
+    deadline_s = time.monotonic() + _WAIT_MS / 1000
+    while not page.evaluate(f"Boolean({expression})"):
+        assert time.monotonic() < deadline_s, f"still not: {expression}"
+        page.wait_for_timeout(50)
+
+
+def record(page: Any, shot: Shot = lambda page, name: None) -> None:
+    """Choose the robot, launch a session that records it, jog, and record and judge two episodes."""
+    page.get_by_role("link", name="Robots").click()
+    page.get_by_label("Robot", exact=True).select_option("my_arm.yaml")
+    page.get_by_label("Simulation").check()
+    page.get_by_text("No problems found.").wait_for(timeout=_WAIT_MS)
+    shot(page, "robots")
+    page.get_by_role("link", name="Record episodes").click()
+    page.get_by_label("Task").fill("pick the cube")
+    page.get_by_label("Dataset").fill("pick")
+    page.get_by_label("Episodes", exact=True).fill("2")
+    page.get_by_label("Dataset").blur()
+    shot(page, "record")
+    page.get_by_role("button", name="Start the session").click()
+    with page.context.expect_page(timeout=_WAIT_MS) as opened:
+        page.get_by_role("link", name="Open the robot's page").click(timeout=_WAIT_MS)
+    run = opened.value
+    until(run, "window.ibrobot?.jogs && ibrobot.status.episode")
+    run.get_by_role("tab", name="Episodes").click()
+    for number, (joint, sign, verdict) in enumerate(
+        [("shoulder_pan", "up", "End: success"), ("shoulder_lift", "up", "End: failure")]
+    ):
+        run.get_by_role("button", name="Begin an episode").click()
+        until(run, "ibrobot.status.episode.recording")
+        before = run.evaluate("ibrobot.state.position")
+        hold = run.get_by_label(f"{joint} {sign}, hold to move")
+        hold.hover()
+        run.mouse.down()
+        until(run, f"Math.abs(ibrobot.state.position[{number}] - {before[number]}) > 0.3")
+        if number == 0:
+            shot(run, "episode")
+        run.mouse.up()
+        run.get_by_role("button", name=verdict).click()
+        if number == 0:
+            until(run, "ibrobot.status.episode.saved === 1")
+    page.locator(".job .state.done").wait_for(timeout=_WAIT_MS)
+    run.close()
+    shot(page, "session")
