@@ -1,6 +1,6 @@
-"""Motions under way: obstacles that appear, goals cancelled and replaced, and the control loop while planning runs.
+"""Motions under way: obstacles, goals cancelled and replaced, lost joints, and the control loop beside planning.
 
-    python benchmarks/planned_motion.py [--obstacles 50] [--goals 200] [--pairs 5] [--seconds 6] [--seed 0]
+    python benchmarks/planned_motion.py [--obstacles 50] [--goals 200] [--losses 21] [--pairs 5] [--seconds 6]
 
 The simulated SO-101 with the planner `rrt_connect`, between the table, the bin and the cube of its scene.
 
@@ -8,7 +8,11 @@ The simulated SO-101 with the planner `rrt_connect`, between the table, the bin 
    stand before it and name it; MuJoCo measures the distance of the measured positions from the box.
 2. Goals, in lockstep: each is cancelled or replaced at a random time. No command may exceed the limits of velocity and
    acceleration, and the safety layer must have nothing to correct.
-3. Lateness, in real time: the control loop beside a thread that plans all the time in the host, and beside none, in
+3. Losses, in lockstep: something that the planner does not know stops the arm, a joint no longer follows its commands,
+   or the hardware no longer answers. The arm must stop, no command may exceed the limits, and the result must name the
+   joint or what is lost. Acceleration does not count where a joint is further than half of `max_lead` from its command:
+   the limit on this lead comes first.
+4. Lateness, in real time: the control loop beside a thread that plans all the time in the host, and beside none, in
    turn.
 
 Exits with 1 when one of these fails, or when the median ratio of p99 lateness with planning to that without exceeds
@@ -19,12 +23,13 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 import statistics
 import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -54,13 +59,22 @@ BOX_M = 0.05
 REACTION_S = 0.25
 """Time in which the arm must come to rest: the box stands further along the motion."""
 ALLOWED_RATIO = 1.5
+LEAD_SHARE = 0.5
+"""Of `max_lead`: the command of a joint further from it brakes for the limit on its lead."""
+CAUSES = ("blocked", "joint", "hardware")
+LEAST_WAY_RAD = 0.8
+"""Least way of a joint that is lost: it has to deviate."""
 
 
 @contextmanager
-def run(**asked: Any) -> Iterator[Runtime]:
+def run(simulation: Mapping[str, Any] | None = None, **asked: Any) -> Iterator[Runtime]:
+    """A run in the scene with the cube; with options of the simulation, on an empty table that the planner knows."""
     document = yaml.safe_load(CONFIG.read_text())
-    document["control_modes"][MODE]["planner"] = {"type": "rrt_connect"}
-    document["world"] = {"scene": True}
+    if simulation is None:
+        document["control_modes"][MODE]["planner"] = {"type": "rrt_connect"}
+        document["world"] = {"scene": True}
+    else:
+        document["simulation"] |= {"scene": "empty", **simulation}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "robot.yaml"
         path.write_text(yaml.safe_dump(document, sort_keys=False))
@@ -77,8 +91,9 @@ def run(**asked: Any) -> Iterator[Runtime]:
 class Arm:
     """A run in lockstep, with what it commanded and measured at each tick."""
 
-    def __init__(self, runtime: Runtime) -> None:
+    def __init__(self, runtime: Runtime, *, faulty: bool = False) -> None:
         self._runtime = runtime
+        self._faulty = faulty
         self.call = runtime.session.bus.call
         self.commands: list[Vector] = []
         self.measured: list[Vector] = []
@@ -87,7 +102,7 @@ class Arm:
         """Let so many ticks pass."""
         for _ in range(ticks):
             self._runtime.step()
-            if self._runtime.session.faults:
+            if self._runtime.session.faults and not self._faulty:
                 raise SystemExit(f"fault: {self._runtime.session.faults[0]}")
             state = self._runtime.session.state
             assert state is not None
@@ -106,19 +121,21 @@ class Arm:
         goal = ",".join(f"{name}={value:.4f}" for name, value in zip(ARM_JOINTS, positions.tolist(), strict=True))
         return int(self.call("/planning/go_to", goal))
 
-    def faults(self) -> str:
+    def faults(self, *, corrections: bool = True) -> str:
         """What was beyond the limits, or corrected by the safety layer; empty if nothing."""
         robot = self._runtime.session.config.robot
         rate = self._runtime.session.config.control.rate_hz
         velocities = np.diff(self.commands, axis=0) * rate
         accelerations = np.diff(velocities, axis=0) * rate
+        leads = np.abs(np.array(self.commands) - self.measured)
+        accelerations[(leads > LEAD_SHARE * robot.max_lead)[:-2]] = 0.0
         found = []
         if (np.abs(velocities) > 1.001 * robot.max_velocity).any():
             found.append(f"velocity {np.abs(velocities).max():.2f} rad/s")
         if (np.abs(accelerations) > 1.02 * robot.max_acceleration).any():
             found.append(f"acceleration {np.abs(accelerations).max():.1f} rad/s^2")
         corrected = sum(self._runtime.session.counts()["interventions"].values())
-        if corrected:
+        if corrected and corrections:
             found.append(f"{corrected} corrections by the safety layer")
         return ", ".join(found)
 
@@ -229,6 +246,67 @@ def goals(number: int, seed: int) -> bool:
     return not faults
 
 
+def losses(number: int, seed: int) -> bool:
+    rng = np.random.default_rng(seed)
+    stops: list[float] = []
+    wrong: list[str] = []
+    messages: dict[str, str] = {}
+    done = slipped = 0
+    while done < number:
+        cause = CAUSES[done % len(CAUSES)]
+        with run({}, lockstep=True, seed=seed) as runtime:
+            arm, robot = Arm(runtime), runtime.session.config.robot
+            goal = rng.uniform(robot.lower[:5] * 0.6, robot.upper[:5] * 0.6)
+            arm.step(5)
+            if not (_recorded(arm, goal)):
+                continue
+            free = np.array(arm.commands)
+            rate = runtime.session.config.control.rate_hz
+            first, place, last = (
+                robot_model(robot).forward(free[i]).position for i in (0, len(free) // 2, len(free) - 1)
+            )
+        moved = int(np.abs(free[-1, :5] - free[0, :5]).argmax())
+        away = min(np.linalg.norm(place - first), np.linalg.norm(place - last))
+        if np.ptp(free[:, moved]) < LEAST_WAY_RAD or place[2] < BOX_M or away < 2 * BOX_M:
+            continue
+        at = 0.06 + 0.4 * len(free) / rate
+        if cause == "blocked":
+            box = {"shape": "box", "size": [BOX_M] * 3, "position": place.tolist()}
+            simulation: dict[str, Any] = {"objects": {"post": box}}
+        elif cause == "joint":
+            simulation = {"faults": [{"at": at, "kind": "freeze_joint", "joint": ARM_JOINTS[moved]}]}
+        else:
+            simulation = {"faults": [{"at": at, "kind": "silent"}]}
+        with run(simulation, lockstep=True, seed=seed) as runtime:
+            arm = Arm(runtime, faulty=True)
+            arm.step(5)
+            move = arm.go(goal)
+            result = arm.finish(move)
+            arm.step(80)
+            faults = arm.faults(corrections=False)
+        if cause == "blocked" and result.success:
+            slipped += 1
+            continue
+        done += 1
+        commands = np.array(arm.commands)
+        still = np.abs(np.diff(commands, axis=0)).max(axis=1) < 1e-6
+        moving = np.flatnonzero(~still)
+        stops.append(1000 * (int(moving[-1]) / rate - at))
+        named = {"blocked": " off its ", "joint": ARM_JOINTS[moved], "hardware": "state"}[cause]
+        messages[cause] = result.message
+        if result.code.name != "CONTROL_FAILED" or named not in result.message or faults or not still[-10:].all():
+            wrong.append(f"{cause}: {result.code.name}: {result.message} {faults}")
+    print(
+        f"losses: the arm stopped, and the result named the cause, in {number - len(wrong)} of {number}"
+        f" ({slipped} slipped past what was to block them); at rest"
+        f" {np.median(stops):.0f} ms after the loss, at most {max(stops):.0f}; the last messages: "
+        + "; ".join(messages.values())
+        + "".join(f"; WRONG {each}" for each in wrong),
+        flush=True,
+    )
+    return not wrong
+
+
 def loop(seconds: float, *, planning: bool) -> dict[str, Any]:
     """Lateness of the control loop in a run, beside a thread that plans or not."""
     maker, end, plans = Maker(), threading.Event(), [0]
@@ -281,16 +359,19 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--obstacles", type=int, default=50)
     parser.add_argument("--goals", type=int, default=200)
+    parser.add_argument("--losses", type=int, default=21)
     parser.add_argument("--pairs", type=int, default=5)
     parser.add_argument("--seconds", type=float, default=6.0, help="of each measurement of lateness")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", choices=("none", "planning"), help="one measurement of lateness, printed as JSON")
     arguments = parser.parse_args()
+    logging.getLogger("ibrobot").setLevel(logging.CRITICAL)
     if arguments.only is not None:
         print(json.dumps(loop(arguments.seconds, planning=arguments.only == "planning")))
         return 0
     good = obstacles(arguments.obstacles, arguments.seed) if arguments.obstacles else True
     good &= goals(arguments.goals, arguments.seed) if arguments.goals else True
+    good &= losses(arguments.losses, arguments.seed) if arguments.losses else True
     good &= lateness(arguments.pairs, arguments.seconds) if arguments.pairs else True
     print("passed" if good else "FAILED")
     return 0 if good else 1
