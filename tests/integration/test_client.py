@@ -18,6 +18,7 @@ from ibrobot_planning.client.rclpy import Node, ReentrantCallbackGroup
 from ibrobot_testing import host_context
 
 from ibrobot_core.api import (
+    Int8,
     LaunchRequest,
     Runtime,
     Session,
@@ -64,7 +65,9 @@ def arm(endpoint: str) -> Iterator[Runtime]:
             "world={objects: {table: {shape: box, size: [0.8, 0.8, 0.02], position: [0.2, 0, -0.05]}}}",
             f"transport={{type: zenoh, mode: router, listen: [{endpoint}], shared_memory: false, namespace: arm1, "
             "share: {services: [/planning/, /world/, /get_planning_scene, /compute_ik, /compute_fk, /move_action, "
-            "/plan_kinematic_path, /compute_cartesian_path, /execute_trajectory]}}",
+            "/plan_kinematic_path, /compute_cartesian_path, /execute_trajectory, /servo_node/, /set_mode]}}",
+            "teleoperation.twist={type: twist}",
+            "control_modes.servo={executors: [arm_position, gripper_position], teleop: twist}",
         ),
     )  # fmt: skip
     runtime = Runtime(Session(config, registry, LaunchRequest()))
@@ -123,17 +126,20 @@ def test_script_moves_a_robot_over_the_network(arm: Runtime, endpoint: str):
 
 def test_script_on_the_page_runs(arm: Runtime, endpoint: str):
     page = Path(__file__).parents[2] / "docs/how-to/move-a-pymoveit2-script.md"
-    _, imports, script = re.findall(
+    _, imports, script, servo = re.findall(
         r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
     )
     here = f'Node("pick", "connect=[{endpoint}]", "shared_memory=false", namespace="arm1")'
     assert 'Node("pick")' in script
-    checked = "assert moveit2.get_last_execution_error_code().val == 1\nnode.destroy_node()\nrclpy.shutdown()"
+    checked = f"assert moveit2.get_last_execution_error_code().val == 1\n{servo}node.destroy_node()\nrclpy.shutdown()"
+    codes = arm.session.bus.subscribe("/servo_node/status", 100)
     text = imports + script.replace('Node("pick")', here).replace("rclpy.shutdown()", checked)
     done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, timeout=100, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     assert arm.session.state is not None
     assert arm.session.state.position[5] == pytest.approx(1.5, abs=0.1)
+    twists = [received.message.data for received in codes.drain() if isinstance(received.message, Int8)]
+    assert (arm.session.mode, min(twists)) == ("moveit_planning", 0), "no twist was refused"
 
 
 def test_missing_robot_is_an_error(endpoint: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture):

@@ -131,6 +131,8 @@ class PlannerSource(SourceWorker):
             except PlanningError as error:
                 error.exit_code = 2
                 raise
+        self._goals = tuple(self._queue)
+        """The goals of the request."""
         self._asked = len(self._queue)
         self._ends = bool(self._queue)
         self._over = False
@@ -208,6 +210,23 @@ class PlannerSource(SourceWorker):
             if self._move is not None and self.session.clock.now_ns() - self._status_ns >= _STATUS_NS:
                 self._show("executing")
 
+    @override
+    def summary_rows(self) -> list[tuple[str, str]]:
+        if not self._goals:
+            return []
+        ended = [(move.target.text, move.result) for move in self._goals if move.result is not None]
+        reached = sum(result.success for _, result in ended)
+        failures = [
+            ("", f"{text}: {result.code.name}: {result.message}") for text, result in ended if not result.success
+        ]
+        return [("goals", f"{reached} of {len(self._goals)} reached"), *failures]
+
+    @override
+    def facts(self) -> dict[str, Any]:
+        ended = [(move.target.text, move.result) for move in self._goals if move.result is not None]
+        goals = [{"goal": text, **attrs.asdict(result), "code": result.code.name} for text, result in ended]
+        return {"goals": goals} if self._goals else {}
+
     def _new(self, goal: str | Goal | Target, velocity_scaling: float = 1.0, *, asked: bool = False) -> _Move:
         parsed = target(goal, self.session.config.robot, velocity_scaling)
         self._plans.check(parsed)
@@ -277,13 +296,19 @@ class PlannerSource(SourceWorker):
             if isinstance(message, PoseStamped):
                 if message.header.frame_id not in FRAMES:
                     names = ", ".join(filter(None, FRAMES))
-                    raise PlanningError(f"frame {message.header.frame_id!r} is not the base; it is called {names}")
+                    raise PlanningError(
+                        f"frame {message.header.frame_id!r} is not the base; it is called {names}",
+                        PlanCode.FRAME_TRANSFORM_FAILURE,
+                    )
                 message = message.pose
             if not isinstance(message, Pose):
-                raise PlanningError(f"takes geometry_msgs/msg/PoseStamped or Pose, got {message.ros_type}")
+                raise PlanningError(
+                    f"takes geometry_msgs/msg/PoseStamped or Pose, got {message.ros_type}",
+                    PlanCode.UNRECOGNIZED_GOAL_TYPE,
+                )
             self._replace(self._known(self._new(_nearest(message))))
         except PlanningError as error:
-            self.session.log.error("%s: %s", CMD_POSE, error)
+            self.session.log.error("%s: %s: %s", CMD_POSE, error.code.name, error)
             self._show("failed")
 
     def _replace(self, move: _Move | None) -> None:

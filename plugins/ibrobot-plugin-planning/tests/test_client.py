@@ -6,11 +6,12 @@ import inspect
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, override
 
 import numpy as np
 import pytest
-from ibrobot_planning.client import GripperInterface, LocalNode, MoveIt2, MoveIt2State
+from ibrobot_planning.client import GripperInterface, LocalNode, MoveIt2, MoveIt2Servo, MoveIt2State
+from ibrobot_planning.client.node import BaseNode
 from ibrobot_planning.client.robots import RobotNames, so101
 
 from ibrobot_core.api import (
@@ -331,12 +332,12 @@ OTHERS = (
 
 @pytest.mark.parametrize(("method", "parameters"), SURFACE.items(), ids=SURFACE)
 def test_methods_have_the_parameters_of_pymoveit2(method: str, parameters: str):
-    found = inspect.signature(vars(MoveIt2)[method]).parameters
+    found = inspect.signature(getattr(MoveIt2, method)).parameters
     assert list(found)[1:] == parameters.split()
 
 
 def test_no_name_of_pymoveit2_is_missing():
-    assert [name for name in OTHERS if name not in vars(MoveIt2)] == []
+    assert [name for name in OTHERS if not hasattr(MoveIt2, name)] == []
 
 
 def test_attributes_without_effect_say_so(robot: SimpleNamespace, caplog: pytest.LogCaptureFixture):
@@ -364,6 +365,74 @@ def test_mode_without_a_planner_has_no_services(run: Callable[..., Runtime]):
     runtime = run(mode="idle")
     with pytest.raises(PlanningError, match="nobody serves /get_planning_scene"):
         MoveIt2(LocalNode(runtime), list(ARM), "base_link", "tip")
+
+
+class TwistNode(BaseNode):
+    """A robot with a mode `servo`, and its calls."""
+
+    def __init__(self) -> None:
+        super().__init__("script")
+        self.calls: list[tuple[str, Any]] = []
+
+    @override
+    def call(self, service: str, request: Any = None) -> Any:
+        if service == "/set_mode" and request not in ("servo", "plan"):
+            raise PlanningError(f"no mode {request!r}")
+        self.calls.append((service, request))
+
+    @override
+    def wait(self, duration_s: float) -> None:
+        pass
+
+
+def test_servo_sends_scaled_twists_in_its_mode():
+    node = TwistNode()
+    servo = MoveIt2Servo(node, "base_link", linear_speed=0.5, angular_speed=2.0, mode_afterwards="plan")
+    assert servo.is_enabled
+    servo((0.1, 0.0, -0.2), angular=(0.0, 0.0, 1.0))
+    assert servo.disable()
+    assert not servo.is_enabled
+    linear, angular = {"x": 0.05, "y": 0.0, "z": -0.1}, {"x": 0.0, "y": 0.0, "z": 2.0}
+    still = dict.fromkeys("xyz", 0.0)
+    topic = "/servo_node/delta_twist_cmds"
+    assert node.calls == [
+        ("/set_mode", "servo"),
+        (topic, {"header": {"frame_id": "base_link"}, "twist": {"linear": linear, "angular": angular}}),
+        (topic, {"header": {"frame_id": "base_link"}, "twist": {"linear": still, "angular": still}}),
+        ("/set_mode", "plan"),
+    ]
+    servo.servo()
+    assert servo.is_enabled, "a twist enables it"
+    with pytest.raises(PlanningError, match="linear: expected x, y, z, got 2 numbers"):
+        servo(linear=(0.1, 0.2))
+    with pytest.raises(NotSupported, match="twists move the tool, not single joints"):
+        servo.servo_jog(["pan"], [0.1])
+
+
+def test_servo_of_a_robot_without_the_mode_is_not_enabled(caplog: pytest.LogCaptureFixture):
+    node = TwistNode()
+    servo = MoveIt2Servo(node, "base_link", mode="twists")
+    assert not servo.is_enabled
+    servo(linear=(0.1, 0.0, 0.0))
+    servo.servo(enable_if_disabled=False)
+    assert node.calls == []
+    assert "mode twists: no mode 'twists'" in caplog.text
+    assert "the twist is not sent: the servo is not enabled" in caplog.text
+
+
+SERVO = {
+    "__init__": "node frame_id namespace linear_speed angular_speed enable_at_init callback_group",
+    "__call__": "linear angular", "servo": "linear angular enable_if_disabled",
+    "servo_jog": "joint_names velocities enable_if_disabled",
+    "enable": "wait_for_server_timeout_sec sync", "disable": "wait_for_server_timeout_sec sync",
+}  # fmt: skip
+"""Method of pymoveit2's MoveIt2Servo (June 2026) -> its parameters."""
+
+
+@pytest.mark.parametrize(("method", "parameters"), SERVO.items(), ids=SERVO)
+def test_servo_has_the_parameters_of_pymoveit2(method: str, parameters: str):
+    found = inspect.signature(getattr(MoveIt2Servo, method)).parameters.values()
+    assert [each.name for each in found if each.kind is not each.KEYWORD_ONLY][1:] == parameters.split()
 
 
 def test_names_of_the_so101():

@@ -172,8 +172,11 @@ def test_cmd_pose_is_a_goal(run, stamped: bool):
 @pytest.mark.parametrize(
     ("message", "expected"),
     [
-        (PoseStamped(Header(0, "camera"), Pose()), "frame 'camera' is not the base; it is called base, base_link"),
-        (String("up"), "takes geometry_msgs/msg/PoseStamped or Pose, got std_msgs/msg/String"),
+        (
+            PoseStamped(Header(0, "camera"), Pose()),
+            "FRAME_TRANSFORM_FAILURE: frame 'camera' is not the base; it is called base, base_link",
+        ),
+        (String("up"), "UNRECOGNIZED_GOAL_TYPE: takes geometry_msgs/msg/PoseStamped or Pose, got std_msgs/msg/String"),
     ],
 )
 def test_wrong_cmd_pose_moves_nothing(run, message, expected: str, caplog: pytest.LogCaptureFixture):

@@ -79,8 +79,13 @@ def test_goal_that_cannot_be_reached_is_counted_and_the_next_one_tried(
 ):
     runtime = start(mode="plan", goals=(goal, "up"))
     to_the_end(runtime)
-    assert runtime.summary()["goals_failed"] == 1
+    summary = runtime.summary()
+    assert summary["goals_failed"] == 1
+    assert [(each["goal"], each["code"]) for each in summary["goals"]] == [(goal, "PLANNING_FAILED"), ("up", "SUCCESS")]
     assert f"goal {goal} failed: PLANNING_FAILED: " in caplog.text
+    rows = runtime.plan.mode.source.summary_rows()
+    assert rows[0] == ("goals", "1 of 2 reached")
+    assert rows[1][1].startswith(f"{goal}: PLANNING_FAILED: ")
     assert position(runtime)[0] == pytest.approx(0.4, abs=0.03)
 
 

@@ -175,7 +175,7 @@ def test_a_path_violation_aborts_and_holds_the_measured_position() -> None:
     arm.at(0.06)
     *_, status = arm.statuses()
     assert status.state is GoalState.ABORTED
-    assert status.message == "roll is 0.2 rad off its path (tolerance 0.1)"
+    assert status.message == "roll is 0.2 rad off its path (tolerance 0.1), beyond a lag of 0.1 s"
     assert arm.setpoint.tolist() == pytest.approx([0.05, -0.2])
     held = arm.setpoint.tolist()
     arm.off = np.zeros(2)

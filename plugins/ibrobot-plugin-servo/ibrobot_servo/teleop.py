@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import override
+import json
+from typing import Any, override
 
 import numpy as np
 from ibrobot_kinematics import KinematicsError, Servo, ServoStatus, robot_model, world_clearance
@@ -25,6 +26,7 @@ from ibrobot_core.api import (
     Vector,
     Vector3,
     ns,
+    single_options,
 )
 from ibrobot_servo.options import TwistOptions
 
@@ -51,6 +53,8 @@ class TwistTeleop(Teleop):
         self._chain: tuple[int, ...] = ()
         """Indices of the arm's joints that move the tool."""
         self._twists: Subscription | None = None
+        self._serves = False
+        """Whether it serves calls that send a twist."""
         self._fresh = True
         """Whether the next twist starts from the measured position."""
         self._published: tuple[ServoStatus, int] | None = None
@@ -71,6 +75,10 @@ class TwistTeleop(Teleop):
         limits = robot.max_velocity[self._indices], robot.max_acceleration[self._indices]
         self._servo = Servo(model, *limits, self._options, clearance=world_clearance(ctx.bus, self._arm))
         self._twists = ctx.bus.subscribe(self._options.topic)
+        # Devices may share a topic; one of them serves it.
+        self._serves = not ctx.bus.serves(self._options.topic)
+        if self._serves:
+            ctx.bus.serve(self._options.topic, self._asked)
         self._fresh = True
 
     @override
@@ -102,8 +110,10 @@ class TwistTeleop(Teleop):
 
     @override
     def disconnect(self) -> None:
-        if self._twists is not None:
+        if self._twists is not None and self._ctx.bus is not None:
             self._twists.close()
+            if self._serves:
+                self._ctx.bus.unserve(self._options.topic)
         self._twists = self._servo = None
 
     @override
@@ -111,6 +121,19 @@ class TwistTeleop(Teleop):
         options = self._options
         frames = f"{options.frame} or {self._ctx.robot.description.tip}"
         return f"publish geometry_msgs/msg/TwistStamped on {options.topic}, its frame_id {frames}"
+
+    def _asked(self, request: Any) -> int:
+        """Publish the twist of a service call; answers with the newest status.
+
+        Raises:
+            ConfigError: for wrong keys and values.
+        """
+        if not isinstance(request, TwistStamped):
+            text = request if isinstance(request, str) else json.dumps(request)
+            request = single_options(TwistStamped, (), "the twist", text=text)
+        assert self._ctx.bus is not None
+        self._ctx.bus.publish(self._options.topic, request)
+        return int(self._published[0]) if self._published is not None else int(ServoStatus.NO_WARNING)
 
     def _take(self, servo: Servo, received: Received, now_ns: int, here: Vector) -> None:
         """Follow a twist, or refuse it."""

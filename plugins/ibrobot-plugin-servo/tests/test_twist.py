@@ -17,6 +17,7 @@ from ibrobot_testing import TeleopSuite, host_context, make_robot
 
 from ibrobot_core.api import (
     Bool,
+    ConfigError,
     Context,
     Description,
     DiagnosticArray,
@@ -216,6 +217,27 @@ def test_the_status_is_published_when_it_changes_and_at_ten_hertz(model):
     for _ in range(600):
         rig.tick(twist((0.2, 0, 0)))
     assert {received.message for received in rig.status.drain()} & {Int8(1), Int8(2), Int8(5)}
+
+
+def test_service_of_the_topic_takes_twists_and_answers_with_the_status(model):
+    rig = Rig(model)
+    asked = {"header": {"frame_id": "base_link"}, "twist": {"linear": {"z": 0.1}}}
+    begin = rig.tool().copy()
+    for _ in range(50):
+        assert rig.bus.call(TOPIC, asked) == ServoStatus.NO_WARNING
+        rig.tick()
+    np.testing.assert_allclose(rig.tool() - begin, [0, 0, 0.05], atol=3e-3)
+    rig.bus.call(TOPIC, twist((np.nan, 0, 0)))
+    rig.tick()
+    assert rig.bus.call(TOPIC, asked) == ServoStatus.INVALID
+    with pytest.raises(ConfigError, match=r"twist\.linear\.w: unknown key"):
+        rig.bus.call(TOPIC, {"twist": {"linear": {"w": 0.1}}})
+    other = TwistTeleop(TwistOptions(), rig.ctx)
+    other.connect()
+    other.disconnect()
+    assert rig.bus.serves(TOPIC)
+    rig.teleop.disconnect()
+    assert not rig.bus.serves(TOPIC)
 
 
 REFUSED = {

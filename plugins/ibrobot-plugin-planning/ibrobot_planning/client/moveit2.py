@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
-from pathlib import Path
 from typing import Any, overload
 
 from ibrobot_core.api import (
@@ -13,11 +12,9 @@ from ibrobot_core.api import (
     NotSupported,
     PlanCode,
     PlanningError,
-    Pose,
     PoseStamped,
-    Quaternion,
-    Vector3,
 )
+from ibrobot_planning.client.collision_objects import AnyPose, CollisionObjects, Orientation, Position, numbers
 from ibrobot_planning.client.motion import (
     ExecutionFuture,
     JointStates,
@@ -31,18 +28,11 @@ from ibrobot_planning.client.motion import (
 )
 from ibrobot_planning.client.node import BaseNode
 from ibrobot_planning.requests import trajectory_from
-from ibrobot_planning.transforms import to_rpy
 
 __all__ = ["MoveIt2", "MoveIt2State", "MoveItErrorCodes"]
 
-type Position = Vector3 | Sequence[float]
-type Orientation = Quaternion | Sequence[float]
 type JointPositions = JointState | Sequence[float]
-type AnyPose = Pose | PoseStamped
 
-_BASE_FRAMES = ("", "base", "base_link")
-_PRIMITIVES = {1: ("box", ()), 2: ("sphere", ("radius",)), 3: ("cylinder", ("height", "radius"))}
-"""Type of shape_msgs/msg/SolidPrimitive -> the shape, and the keys of its dimensions."""
 _LEAST = 1e-6
 """Fraction of a straight path in place of 0, which means any."""
 
@@ -68,7 +58,7 @@ class _WithoutEffect:
 _BY_YAML = "it is an option of the planner in the robot YAML"
 
 
-class MoveIt2:
+class MoveIt2(CollisionObjects):
     """Plans and moves an arm that `ibrobot launch` runs in a mode with a planner.
 
     Methods, arguments and defaults are those of pymoveit2. Failures of planning and moving are logged, and answered
@@ -103,7 +93,7 @@ class MoveIt2:
         group_name: str = "arm", execute_via_moveit: bool = False, ignore_new_calls_while_executing: bool = False,
         callback_group: Any = None, follow_joint_trajectory_action_name: str = "", use_move_group_action: bool = False,
     ) -> None:  # fmt: skip
-        self._node = node
+        super().__init__(node)
         self._states = JointStates(node)
         self._motions = Motions(node, ignore_new_calls_while_executing=ignore_new_calls_while_executing)
         self.joint_names = list(joint_names)
@@ -113,7 +103,6 @@ class MoveIt2:
         self.max_acceleration = 0.0
         self.beyond_reach = "refuse"
         self._goals: list[dict[str, Any]] = [{}]
-        self.update_planning_scene()
         known = self._scene["joint_state"]["name"]
         if unknown := [name for name in self.joint_names if name not in known]:
             raise PlanningError(f"no joint {unknown[0]!r}; the joints are: {', '.join(known)}")
@@ -258,7 +247,7 @@ class MoveIt2:
         """Set the position of the next goal [m]."""
         self._check_frame(frame_id)
         self._check_link(target_link)
-        self._goals[-1] |= {"xyz": _numbers(position, "xyz"), "position_tolerance": float(tolerance)}
+        self._goals[-1] |= {"xyz": numbers(position, "xyz"), "position_tolerance": float(tolerance)}
 
     def set_orientation_goal(
         self, quat_xyzw: Orientation, frame_id: str | None = None, target_link: str | None = None,
@@ -268,7 +257,7 @@ class MoveIt2:
         self._check_frame(frame_id)
         self._check_link(target_link)
         least = tolerance if isinstance(tolerance, int | float) else min(tolerance)
-        self._goals[-1] |= {"quaternion": _numbers(quat_xyzw, "xyzw"), "orientation_tolerance": float(least)}
+        self._goals[-1] |= {"quaternion": numbers(quat_xyzw, "xyzw"), "orientation_tolerance": float(least)}
 
     def set_joint_goal(
         self, joint_positions: Sequence[float], joint_names: Sequence[str] | None = None, tolerance: float = 0.001,
@@ -333,9 +322,9 @@ class MoveIt2:
         if constraints is not None:
             raise NotSupported("compute_ik takes no constraints")
         self._check_link(ik_link_name)
-        goal: dict[str, Any] = {"xyz": _numbers(position, "xyz")}
+        goal: dict[str, Any] = {"xyz": numbers(position, "xyz")}
         if quat_xyzw is not None:
-            goal |= {"quaternion": _numbers(quat_xyzw, "xyzw"), "beyond_reach": self.beyond_reach}
+            goal |= {"quaternion": numbers(quat_xyzw, "xyzw"), "beyond_reach": self.beyond_reach}
         request = {"goal": goal, "start": positions_of(start_joint_state, self.joint_names)}
         answer = self._node.call("/compute_ik", request)
         return None if self._failed(answer) else joint_state_from(answer["joint_state"])
@@ -347,155 +336,6 @@ class MoveIt2:
     def get_compute_ik_result(self, future: Future[JointState | None]) -> JointState | None:
         """The result of `compute_ik_async`; None if it is not done."""
         return future.result() if future.done() else None
-
-    # The world.
-
-    def add_collision_box(
-        self, id: str, size: Sequence[float], pose: AnyPose | None = None, position: Position | None = None,
-        quat_xyzw: Orientation | None = None, frame_id: str | None = None,
-    ) -> None:  # fmt: skip
-        """Add a box, or replace an object; `size` are its lengths along x, y and z [m]."""
-        self._add(id, {"shape": "box", "size": [float(each) for each in size]}, pose, position, quat_xyzw, frame_id)
-
-    def add_collision_sphere(
-        self, id: str, radius: float, pose: AnyPose | None = None, position: Position | None = None,
-        quat_xyzw: Orientation | None = None, frame_id: str | None = None,
-    ) -> None:  # fmt: skip
-        """Add a sphere, or replace an object [m]."""
-        self._add(id, {"shape": "sphere", "radius": float(radius)}, pose, position, quat_xyzw, frame_id)
-
-    def add_collision_cylinder(
-        self, id: str, height: float, radius: float, pose: AnyPose | None = None, position: Position | None = None,
-        quat_xyzw: Orientation | None = None, frame_id: str | None = None,
-    ) -> None:  # fmt: skip
-        """Add a cylinder along its z axis, or replace an object [m]."""
-        shape = {"shape": "cylinder", "height": float(height), "radius": float(radius)}
-        self._add(id, shape, pose, position, quat_xyzw, frame_id)
-
-    def add_collision_mesh(
-        self, filepath: str | Path | None, id: str, pose: AnyPose | None = None, position: Position | None = None,
-        quat_xyzw: Orientation | None = None, frame_id: str | None = None, scale: float | Sequence[float] = 1.0,
-        mesh: Any = None,
-    ) -> None:  # fmt: skip
-        """Add a mesh of a file on the robot's machine, or replace an object.
-
-        Raises:
-            NotSupported: for `mesh`, and for a scale that differs along the axes.
-        """
-        if filepath is None or mesh is not None:
-            raise NotSupported("add_collision_mesh takes a file on the robot's machine: filepath")
-        scales = {float(scale)} if isinstance(scale, int | float) else {float(each) for each in scale}
-        if len(scales) != 1:
-            raise NotSupported("add_collision_mesh takes one scale for all axes")
-        shape = {"shape": "mesh", "file": str(Path(filepath).absolute()), "scale": scales.pop()}
-        self._add(id, shape, pose, position, quat_xyzw, frame_id)
-
-    def add_collision_primitive(
-        self, id: str, primitive_type: int, dimensions: Sequence[float], pose: AnyPose | None = None,
-        position: Position | None = None, quat_xyzw: Orientation | None = None, frame_id: str | None = None,
-    ) -> None:  # fmt: skip
-        """Add a shape of shape_msgs/msg/SolidPrimitive, or replace an object; its dimensions are as there [m].
-
-        Raises:
-            NotSupported: for other shapes than box, sphere and cylinder.
-        """
-        if primitive_type not in _PRIMITIVES:
-            raise NotSupported(f"primitive type {primitive_type} is not a box (1), sphere (2) or cylinder (3)")
-        kind, keys = _PRIMITIVES[primitive_type]
-        sizes = [float(each) for each in dimensions]
-        if len(sizes) != (len(keys) or 3):
-            raise PlanningError(f"a {kind} has {len(keys) or 3} dimensions, got {len(sizes)}")
-        shape = dict(zip(keys, sizes, strict=True)) if keys else {"size": sizes}
-        self._add(id, {"shape": kind, **shape}, pose, position, quat_xyzw, frame_id)
-
-    def remove_collision_object(self, id: str) -> None:
-        """Remove an object.
-
-        Raises:
-            PlanningError: if there is none of this name.
-        """
-        self._node.call("/world/remove", {"name": id})
-
-    remove_collision_mesh = remove_collision_object
-
-    def move_collision(
-        self, id: str, position: Position, quat_xyzw: Orientation | None = None, frame_id: str | None = None
-    ) -> None:
-        """Move an object.
-
-        Raises:
-            PlanningError: if there is none of this name.
-        """
-        self._node.call("/world/move", {"name": id, **self._placed(None, position, quat_xyzw, frame_id)})
-
-    def attach_collision_object(
-        self, id: str, link_name: str | None = None, touch_links: Sequence[str] = (), weight: float = 0.0
-    ) -> None:
-        """Attach an object to a link, by default to the hand, whose links it may touch; it stays where it is on it.
-
-        Raises:
-            PlanningError: for an unknown object or link.
-        """
-        link = None if link_name == self._scene["tip"] else link_name
-        self._node.call("/world/attach", {"name": id, "link": link, "may_touch": list(touch_links)})
-
-    attach = attach_collision_object
-
-    def detach_collision_object(self, id: str) -> None:
-        """Detach an object; it stays where it is.
-
-        Raises:
-            PlanningError: if it is not attached.
-        """
-        self._node.call("/world/detach", {"name": id})
-
-    detach = detach_collision_object
-
-    def detach_all_collision_objects(self) -> None:
-        """Detach all objects."""
-        self.update_planning_scene()
-        for name, found in self._scene["objects"].items():
-            if found["link"] is not None:
-                self.detach_collision_object(name)
-
-    def clear_all_collision_objects(self) -> Future[bool]:
-        """Remove all objects, those of the robot YAML included. The future is done."""
-        self.update_planning_scene()
-        for name in self._scene["objects"]:
-            self.remove_collision_object(name)
-        return _done()
-
-    def process_clear_all_collision_objects_future(self, future: Future[bool]) -> bool:
-        """Whether the objects were removed."""
-        return future.result()
-
-    def cancel_clear_all_collision_objects_future(self, future: Future[bool]) -> None:
-        """Do nothing: the objects were removed at once."""
-
-    def allow_collisions(self, id: str, allow: bool) -> Future[bool]:
-        """Let an object touch everything, or nothing but the link that carries it. The future is done.
-
-        Raises:
-            PlanningError: if there is none of this name.
-        """
-        self.update_planning_scene()
-        others = [*self._scene["links"], *(name for name in self._scene["objects"] if name != id)]
-        self._node.call("/world/allow", {"name": id, "may_touch": others if allow else []})
-        return _done()
-
-    def process_allow_collision_future(self, future: Future[bool]) -> bool:
-        """Whether the object may touch what was asked."""
-        return future.result()
-
-    def update_planning_scene(self) -> bool:
-        """Ask for the robot and its objects; see `planning_scene`."""
-        self._scene: Mapping[str, Any] = self._node.call("/get_planning_scene")
-        return True
-
-    @property
-    def planning_scene(self) -> Mapping[str, Any]:
-        """The robot and its objects at the last `update_planning_scene`: the robot's `PlanningScene` as a mapping."""
-        return self._scene
 
     # The robot.
 
@@ -516,10 +356,6 @@ class MoveIt2:
         """Do nothing: the robot knows whether it executes a motion."""
 
     # What pymoveit2 has and this client has not.
-
-    def add_collision_cone(self, *arguments: Any, **options: Any) -> None:
-        """Raise NotSupported."""
-        raise NotSupported("the world has no cones; add a cylinder or a mesh")
 
     def reset_controller(self, *arguments: Any, **options: Any) -> None:
         """Raise NotSupported."""
@@ -572,58 +408,9 @@ class MoveIt2:
             self._motions.refuse(code, answer["message"])
         return code is not PlanCode.SUCCESS
 
-    def _add(
-        self, name: str, shape: Mapping[str, Any], pose: AnyPose | None, position: Position | None,
-        quat_xyzw: Orientation | None, frame_id: str | None,
-    ) -> None:  # fmt: skip
-        placed = self._placed(pose, position, quat_xyzw, frame_id)
-        self._node.call("/world/add", {"name": name, "object": {**shape, **placed}, "replace": True})
-
-    def _placed(
-        self, pose: AnyPose | None, position: Position | None, quat_xyzw: Orientation | None, frame_id: str | None
-    ) -> dict[str, list[float]]:
-        """Keys `position` and `rpy` of an object."""
-        if isinstance(pose, PoseStamped):
-            frame_id, pose = frame_id or pose.header.frame_id, pose.pose
-        if pose is not None:
-            position, quat_xyzw = pose.position, pose.orientation
-        self._check_frame(frame_id)
-        if position is None:
-            raise PlanningError(
-                "the object needs a place: pose, or position and quat_xyzw", PlanCode.INVALID_OBJECT_NAME
-            )
-        turned = Quaternion(*_numbers(quat_xyzw, "xyzw")) if quat_xyzw is not None else Quaternion()
-        return {"position": _numbers(position, "xyz"), "rpy": list(to_rpy(turned))}
-
-    def _check_frame(self, frame_id: str | None) -> None:
-        if frame_id is not None and frame_id not in _BASE_FRAMES:
-            raise PlanningError(
-                f"frame {frame_id!r} is not the base; it is called {', '.join(filter(None, _BASE_FRAMES))}",
-                PlanCode.FRAME_TRANSFORM_FAILURE,
-            )
-
     def _check_link(self, link: str | None) -> None:
         tip = self._scene["tip"]
         if link is not None and tip and link != tip:
             raise PlanningError(
                 f"{link!r} is not the tool centre point, which is called {tip!r}", PlanCode.INVALID_LINK_NAME
             )
-
-
-def _numbers(values: Vector3 | Quaternion | Sequence[float], names: str) -> list[float]:
-    if isinstance(values, Vector3):
-        values = (values.x, values.y, values.z)
-    elif isinstance(values, Quaternion):
-        values = (values.x, values.y, values.z, values.w)
-    numbers = [float(each) for each in values]
-    if len(numbers) != len(names):
-        raise PlanningError(
-            f"expected {', '.join(names)}, got {len(numbers)} numbers", PlanCode.INVALID_GOAL_CONSTRAINTS
-        )
-    return numbers
-
-
-def _done() -> Future[bool]:
-    future: Future[bool] = Future()
-    future.set_result(True)
-    return future

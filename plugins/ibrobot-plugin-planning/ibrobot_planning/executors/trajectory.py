@@ -190,6 +190,7 @@ class TrajectoryExecutor(Executor):
             beyond = _exceeds(error - LAG_S * np.abs(velocity), running.goal.path_tolerance)
             if beyond.any():
                 why = self._deviation(beyond, error, running.goal.path_tolerance, "off its path")
+                why += f", beyond a lag of {LAG_S} s"
                 return self._stop(GoalState.ABORTED, why, measured)
             return setpoint
         beyond = _exceeds(error, running.goal.goal_tolerance)
