@@ -71,7 +71,7 @@ class UiServer:
             assert answer.status == 200, path
             return await answer.text()
 
-    async def get(self, path: str, **query: str) -> Any:
+    async def get(self, path: str, /, **query: str) -> Any:
         """The answer of a view, `VIEW/REQUEST`.
 
         Raises:
@@ -80,7 +80,7 @@ class UiServer:
         async with self.client.get(f"/api/{path}", params=query) as answer:
             return await _content(answer)
 
-    async def post(self, path: str, **facts: Any) -> Any:
+    async def post(self, path: str, /, **facts: Any) -> Any:
         """As `get`, with a POST."""
         async with self.client.post(f"/api/{path}", json=facts) as answer:
             return await _content(answer)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import Any
 
+import attrs
 import numpy as np
 from ibrobot_ros2.jpeg import to_jpeg
 
@@ -14,6 +15,14 @@ from ibrobot_web.link import JPEG, PICTURE_HEAD, PNG, RGB
 _QUALITY = 80
 _DEPTH_M = 4.0
 """Distance shown as black in pictures of depth [m]."""
+
+
+@attrs.frozen
+class Picture:
+    """A picture as browsers show it."""
+
+    content: bytes
+    content_type: str
 
 
 def to_payload(message: Message) -> bytes | None:
@@ -55,10 +64,28 @@ def _rgb(message: Image) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
 
 async def as_jpeg(payload: bytes) -> bytes:
     """A payload that browsers show: pixels are encoded in a thread."""
-    stamp_ns, width, height, encoding = PICTURE_HEAD.unpack_from(payload)
-    if encoding != RGB:
-        return payload
+    return payload if PICTURE_HEAD.unpack_from(payload)[3] != RGB else await asyncio.to_thread(_encoded, payload)
+
+
+def to_picture(message: Message) -> Picture | None:
+    """A picture message as browsers show it; None for messages without such a picture.
+
+    Raises:
+        ContractError: for a damaged picture.
+    """
+    payload = to_payload(message)
+    if payload is None:
+        return None
+    if PICTURE_HEAD.unpack_from(payload)[3] == RGB:
+        payload = _encoded(payload)
+    kind = "image/png" if PICTURE_HEAD.unpack_from(payload)[3] == PNG else "image/jpeg"
+    return Picture(payload[PICTURE_HEAD.size :], kind)
+
+
+def _encoded(payload: bytes) -> bytes:
+    """Pixels as JPEG."""
+    stamp_ns, width, height, _ = PICTURE_HEAD.unpack_from(payload)
     data = np.frombuffer(payload, np.uint8, offset=PICTURE_HEAD.size)
     image = Image(Header(stamp_ns), height, width, "rgb8", 3 * width, data)
-    encoded = await asyncio.to_thread(to_jpeg, image, _QUALITY)
+    encoded = to_jpeg(image, _QUALITY)
     return PICTURE_HEAD.pack(stamp_ns, width, height, JPEG) + encoded.data.tobytes()

@@ -6,7 +6,8 @@ import { h } from "./dom.js";
 const STEP = 0.1;
 
 export class View3D {
-  constructor(section, { onTool, onGoal }) {
+  // `scene`: the address of the robot's shapes; null to give it later, to `load`.
+  constructor(section, { onTool = () => {}, onGoal = () => {}, scene = "/api/scene" } = {}) {
     this.section = section;
     this.canvas = h("canvas", {
       tabindex: "0", role: "img",
@@ -40,12 +41,12 @@ export class View3D {
     new ResizeObserver(() => this.resize()).observe(section);
     this.resize();
     this.listen();
-    this.load();
+    if (scene) this.load(scene);
   }
 
-  async load() {
+  async load(scene) {
     try {
-      const response = await fetch("/api/scene");
+      const response = await fetch(scene);
       if (!response.ok) throw new Error(await response.text());
       this.tell({ do: "scene", scene: await response.json() });
     } catch (error) {

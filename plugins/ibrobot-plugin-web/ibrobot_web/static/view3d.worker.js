@@ -257,6 +257,12 @@ const actions = {
   theme: (message) => { dark = message.dark; dirty = true; },
   turn: ({ by }) => turn(by), zoom: ({ factor }) => zoom(factor),
   joints: ({ names }) => { joints = names; },
+  clear: () => {
+    measured = commanded = planned = null;
+    trail = [];
+    screen.change(path, []);
+    dirty = true;
+  },
   handle: ({ jog, goal: moves }) => {
     if (jogs && !jog) release();
     if (goals !== moves) goal = null;

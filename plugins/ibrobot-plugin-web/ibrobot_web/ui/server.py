@@ -23,6 +23,7 @@ VIEWS = {
     "robots": "Robots",
     "devices": "Devices",
     "record": "Record",
+    "episodes": "Episodes",
     "jobs": "Jobs",
 }
 """Name -> title in the navigation. The module `ibrobot_web.ui.NAME` has the view's `ROUTES`; `static/ui/NAME.js` shows

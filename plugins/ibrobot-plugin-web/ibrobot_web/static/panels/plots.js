@@ -1,10 +1,10 @@
 // Plots of any numbers on any topic, over the last minutes in which this page was open.
 
 import { h, refresh } from "../dom.js";
+import { COLORS, drawPlot } from "../plot.js";
 
 const SAMPLES = 2;
 const KEPT = 1800; // three minutes at 10 Hz
-const COLORS = ["#1478c8", "#c2410c", "#15803d", "#7e22ce", "#a16207", "#0e7490", "#be185d", "#4b5563"];
 
 export class PlotsPanel {
   id = "plots";
@@ -62,46 +62,11 @@ export class PlotsPanel {
   }
 
   draw() {
-    const { canvas } = this;
-    const box = canvas.getBoundingClientRect();
-    if (box.width < 2) return;
-    const ratio = window.devicePixelRatio;
-    canvas.width = box.width * ratio;
-    canvas.height = box.height * ratio;
-    const context = canvas.getContext("2d");
-    context.scale(ratio, ratio);
-    const style = getComputedStyle(document.documentElement);
     const shown = [...this.series].filter(([name]) => name.startsWith(`${this.topic} `)).slice(0, COLORS.length);
-    const values = shown.flatMap(([, each]) => each).filter((value) => value !== null);
-    let low = Infinity, high = -Infinity;
-    for (const value of values) { low = Math.min(low, value); high = Math.max(high, value); }
-    if (!(low < high)) { low = (values[0] ?? 0) - 1; high = low + 2; }
-    const left = 56, bottom = 22, width = box.width - left - 8, height = box.height - bottom - 8;
-    const x = (time) => left + width * (1 - (this.times.at(-1) - time) / Math.max(10, this.times.at(-1) - this.times[0]));
-    const y = (value) => 8 + height * (high - value) / (high - low);
-    context.font = "12px system-ui";
-    context.fillStyle = context.strokeStyle = style.getPropertyValue("--muted");
-    for (let i = 0; i <= 4; i += 1) {
-      const value = low + (high - low) * i / 4;
-      context.fillText(value.toPrecision(3), 4, y(value) + 4);
-      context.globalAlpha = 0.25;
-      context.strokeRect(left, y(value), width, 0);
-      context.globalAlpha = 1;
-    }
-    const span = Math.max(10, (this.times.at(-1) ?? 0) - (this.times[0] ?? 0));
-    context.fillText(`−${span.toFixed(0)} s`, left, box.height - 6);
-    context.fillText("now", left + width - 24, box.height - 6);
-    context.lineWidth = 1.5;
-    shown.forEach(([, each], i) => {
-      context.strokeStyle = COLORS[i];
-      context.beginPath();
-      let drawing = false;
-      each.forEach((value, at) => {
-        if (value === null) { return; }
-        context[drawing ? "lineTo" : "moveTo"](x(this.times[at]), y(value));
-        drawing = true;
-      });
-      context.stroke();
+    const end = this.times.at(-1) ?? 0;
+    const span = Math.max(10, end - (this.times[0] ?? 0));
+    drawPlot(this.canvas, {
+      times: this.times, lines: shown, begin: end - span, end, labels: [`−${span.toFixed(0)} s`, "now"],
     });
     refresh(this.legend, shown.map(([name]) => name), () => shown.map(([name], i) => {
       const mark = h("i", {});

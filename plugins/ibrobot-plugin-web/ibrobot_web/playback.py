@@ -1,0 +1,262 @@
+"""Plays an episode back: what it contains, the robot's motion, plots of its topics, and pictures by time.
+
+Works for every episode that an installed plugin reads: a recording, or `DATASET:N`.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import attrs
+import numpy as np
+
+from ibrobot_core.api import (
+    NS_PER_S,
+    CompressedImage,
+    Contract,
+    ContractError,
+    EpisodeReader,
+    EpisodeSummary,
+    Float64MultiArray,
+    IbrobotError,
+    Image,
+    JointState,
+    Message,
+    Recorded,
+    installed_plugins,
+    resolve_path,
+)
+from ibrobot_web.pictures import Picture, to_picture
+from ibrobot_web.status import numbers_of
+
+STATES_HZ = 30.0
+"""Highest rate of the joint states that a page gets [Hz]."""
+_MOST_STATES = 20_000
+_POINTS = 1000
+"""Most points of a plot."""
+_AHEAD_NS, _BACK_NS = 2 * NS_PER_S, NS_PER_S
+"""How far ahead a picture is reached by reading on, and how far before its time reading begins otherwise [ns]."""
+_PICTURES = (Image.ros_type, CompressedImage.ros_type)
+_LONG = 300
+"""Longer values of the metadata are not shown [characters]."""
+
+
+@attrs.define(eq=False)
+class _Stream:
+    """The pictures of a topic, read on as far as they were asked for."""
+
+    reader: EpisodeReader
+    items: Iterator[Recorded] = iter(())
+    current: Recorded | None = None
+    following: Recorded | None = None
+    begun_ns: int = 0
+    """Time from which `items` begin."""
+    lock: threading.Lock = attrs.field(factory=threading.Lock)
+
+    def at(self, topic: str, stamp_ns: int) -> Recorded | None:
+        """The newest picture at a time, if there is one within `_BACK_NS` before it."""
+        reached_ns = self.current.received_ns if self.current is not None else self.begun_ns
+        if not reached_ns <= stamp_ns <= reached_ns + _AHEAD_NS:
+            self.begun_ns = stamp_ns - _BACK_NS
+            self.items = self.reader.messages_since(self.begun_ns, {topic})
+            self.current, self.following = None, next(self.items, None)
+        while self.following is not None and self.following.received_ns <= stamp_ns:
+            self.current, self.following = self.following, next(self.items, None)
+        found = self.current
+        return found if found is not None and found.received_ns >= stamp_ns - _BACK_NS else None
+
+
+class Playback:
+    """An open episode. Thread-safe.
+
+    Args:
+        path: the episode, or `DATASET:N`.
+
+    Raises:
+        IbrobotError: if it cannot be read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        reader = installed_plugins().open_episode(path)
+        try:
+            self.summary = reader.summary()
+        except BaseException:
+            reader.close()
+            raise
+        self._plain = _Stream(reader)
+        self._streams: dict[str, _Stream] = {}
+        self._opening = threading.Lock()
+        self._closed = False
+        contract = _contract(self.summary.metadata)
+        self._actions = {part.topic: part.joints for part in contract.action_parts} if contract is not None else {}
+
+    def close(self) -> None:
+        """Release the files."""
+        with self._opening:
+            self._closed = True
+            streams, self._streams = [self._plain, *self._streams.values()], {}
+        for stream in streams:
+            with stream.lock:
+                stream.items = iter(())
+                stream.reader.close()
+
+    def facts(self) -> dict[str, Any]:
+        """What the episode contains, and the robot's motion, as JSON; times from the first message [s]."""
+        summary = self.summary
+        length_s = (summary.end_ns - summary.start_ns) / NS_PER_S
+        cameras = [topic for topic, each in summary.topics.items() if each.type in _PICTURES and each.count]
+        shown = {key: value for key, value in summary.metadata.items() if len(value) <= _LONG}
+        return {
+            "duration_s": length_s, "outcome": summary.outcome, "finished": summary.finished, "metadata": shown,
+            "task": summary.metadata.get("prompt", ""), "cameras": cameras, "problems": problems_of(summary),
+            "topics": [
+                {"name": name, "type": each.type, "count": each.count, "lost": each.dropped + each.missing,
+                 "rate_hz": round((each.count - 1) / length_s, 1) if length_s and each.count > 1 else None}
+                for name, each in summary.topics.items()
+            ],
+            "motion": self._motion(),
+        }  # fmt: skip
+
+    def series(self, topic: str) -> dict[str, Any]:
+        """The numbers of a topic over time, at most `_POINTS` of each: `times` [s], and `values`, path -> numbers.
+
+        Raises:
+            IbrobotError: if the episode has no such topic.
+        """
+        known = self._topic(topic)
+        step = max(1, -(-known.count // _POINTS))
+        times: list[float] = []
+        rows: list[dict[str, float]] = []
+        with self._plain.lock:
+            for i, item in enumerate(self._plain.reader.messages({topic})):
+                if i % step == 0:
+                    times.append(self._seconds(item))
+                    rows.append(self._named(topic, item.message))
+        names = dict.fromkeys(name for row in rows for name in row)
+        return {"times": times, "values": {name: [row.get(name) for row in rows] for name in names}}
+
+    def picture(self, topic: str, at_s: float) -> Picture | None:
+        """The newest picture of a camera at a time [s]; None if there is none within the second before.
+
+        Raises:
+            IbrobotError: if the episode has no such topic, or a picture is damaged.
+        """
+        self._topic(topic)
+        with self._opening:
+            if self._closed:
+                raise IbrobotError(f"{self._path}: was closed; open it again")
+            if topic not in self._streams:
+                self._streams[topic] = _Stream(installed_plugins().open_episode(self._path))
+            stream = self._streams[topic]
+        with stream.lock:
+            found = stream.at(topic, self.summary.start_ns + round(at_s * NS_PER_S))
+        return to_picture(found.message) if found is not None else None
+
+    def description(self, find: Callable[[str], Path]) -> dict[str, Any]:
+        """The robot's files, as `make_scene` takes them.
+
+        Args:
+            find: gives the file of a path which is not `package://…`, or raises IbrobotError.
+
+        Raises:
+            IbrobotError: if the episode does not say which robot it is of, or a file is missing.
+        """
+        try:
+            found = json.loads(self.summary.metadata["config"])["robot"]["description"]
+            texts = {kind: found[kind] for kind in ("mjcf", "urdf") if isinstance(found.get(kind), str)}
+            tip = str(found.get("tip", ""))
+        except (KeyError, TypeError, ValueError, AttributeError):
+            raise IbrobotError("the episode does not contain the robot's model") from None
+        return {"tip": tip, **{kind: str(_file(text, find)) for kind, text in texts.items()}}
+
+    def _topic(self, topic: str) -> Any:
+        if topic not in self.summary.topics:
+            raise IbrobotError(f"{self._path}: has no topic {topic!r}; available: {', '.join(self.summary.topics)}")
+        return self.summary.topics[topic]
+
+    def _seconds(self, item: Recorded) -> float:
+        return round((item.received_ns - self.summary.start_ns) / NS_PER_S, 4)
+
+    def _named(self, topic: str, message: Message) -> dict[str, float]:
+        """The numbers of a message; those of joints by name."""
+        found = numbers_of(message)
+        joints = message.name if isinstance(message, JointState) else self._actions.get(topic, ())
+        return {_by_name(path, joints): value for path, value in found.items()}
+
+    def _motion(self) -> dict[str, Any]:
+        """Joint states over time, thinned: `joints`, `times` [s], `positions`, and `commands` where known."""
+        states = [topic for topic, each in self.summary.topics.items() if each.type == JointState.ros_type]
+        chosen = "/joint_states" if "/joint_states" in states else next(iter(states), None)
+        motion: dict[str, Any] = {"joints": [], "times": [], "positions": [], "commands": []}
+        if chosen is None:
+            return motion
+        length_s = (self.summary.end_ns - self.summary.start_ns) / NS_PER_S
+        step_s = max(0.9 / STATES_HZ, length_s / _MOST_STATES)
+        commanded: dict[str, float] = {}
+        with self._plain.lock:
+            for item in self._plain.reader.messages({chosen, *self._actions}):
+                message: Any = item.message
+                if item.topic != chosen:
+                    if isinstance(message, Float64MultiArray):
+                        commanded.update(zip(self._actions[item.topic], message.data.tolist(), strict=False))
+                    continue
+                at_s = self._seconds(item)
+                if motion["times"] and at_s < motion["times"][-1] + step_s:
+                    continue
+                known = dict(zip(message.name, message.position.tolist(), strict=False))
+                motion["joints"] = motion["joints"] or list(known)
+                joints = motion["joints"]
+                motion["times"].append(at_s)
+                motion["positions"].append([_number(known.get(joint)) for joint in joints])
+                motion["commands"].append([_number(commanded.get(joint, known.get(joint))) for joint in joints])
+        return motion
+
+
+def problems_of(summary: EpisodeSummary) -> list[str]:
+    """The problems of an episode that its summary shows."""
+    found = [] if summary.finished else ["unfinished: its recorder was killed, or the file is cut off"]
+    for topic, known in summary.topics.items():
+        if known.dropped:
+            found.append(f"{topic}: {known.dropped} messages were lost while recording")
+        if known.missing:
+            found.append(f"{topic}: {known.missing} recorded messages cannot be read")
+    return found
+
+
+def _contract(metadata: Mapping[str, str]) -> Contract | None:
+    if "contract" not in metadata:
+        return None
+    try:
+        return Contract.from_canonical(json.loads(metadata["contract"]))
+    except (ValueError, ContractError):
+        return None  # a foreign key of the same name
+
+
+def _file(text: str, find: Callable[[str], Path]) -> Path:
+    """The file of a robot's model: of a package, or one that `find` admits."""
+    if not text.startswith("package://"):
+        return find(text)
+    if ".." in text.split("/"):
+        raise IbrobotError(f"the robot's model: {text} leads out of its package")
+    try:
+        return resolve_path(text, Path())
+    except ValueError as error:
+        raise IbrobotError(f"the robot's model: {error}") from None
+
+
+def _by_name(path: str, joints: tuple[str, ...]) -> str:
+    """`position[0]` as `position.shoulder_pan`, and `data[0]` of a command as the joint's name."""
+    field, bracket, index = path.partition("[")
+    if not bracket or not index[:-1].isdigit() or int(index[:-1]) >= len(joints):
+        return path
+    name = joints[int(index[:-1])]
+    return name if field == "data" else f"{field}.{name}"
+
+
+def _number(value: float | None) -> float | None:
+    return round(value, 5) if value is not None and np.isfinite(value) else None

@@ -1,0 +1,245 @@
+// View: recorded episodes.
+
+import { h, refresh, say, toast } from "../dom.js";
+import { Player } from "./player.js";
+
+const OUTCOMES = ["success", "failure", "unknown"];
+const DONE = { deleted: "deleted", trimmed: "trimmed; this is the original", replaced: "replaced when a trim was undone" };
+
+export class View {
+  constructor(ui) {
+    this.ui = ui;
+    this.chosen = new Set();
+    this.rows = [];
+  }
+
+  mount(element) {
+    this.note = h("p", { class: "note", role: "status" });
+    this.filter = h("input", { type: "text", id: "episode-filter", placeholder: "task, outcome, name" });
+    this.filter.addEventListener("input", () => this.draw());
+    this.bulk = h("div", { class: "row" });
+    this.table = h("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Episodes" });
+    this.trash = h("details", { class: "card", hidden: true });
+    this.player = new Player(this.ui, "episodes");
+    this.title = h("h2", { tabindex: "-1" });
+    this.about = h("div", {});
+    this.controls = h("div", {});
+    this.detail = h("section", { class: "card", hidden: true, "aria-label": "Episode" },
+      h("div", { class: "row" }, this.title, h("button", { onclick: () => { location.hash = "episodes"; } }, "Close")),
+      this.about, this.player.element, this.controls);
+    element.append(this.detail, h("section", { class: "card" }, h("h2", {}, "Episodes"), this.note,
+      h("div", { class: "row" }, h("label", { for: "episode-filter" }, "Filter"), this.filter,
+        h("button", { onclick: () => this.load() }, "Refresh")), this.bulk, this.table), this.trash);
+  }
+
+  async show(shown, rest) {
+    this.shown = shown;
+    if (!shown) { this.player.pause(); return; }
+    await this.load();
+    if (rest !== this.path) await this.open(rest);
+  }
+
+  job(job) {
+    if (this.shown && job.state !== "running" && ["run", "record"].includes(job.kind)) this.load();
+  }
+
+  async load() {
+    const found = await this.ui.attempt(() => this.ui.get("episodes/list"));
+    if (!found) return;
+    this.rows = found.episodes;
+    const known = new Set(this.rows.map(({ path }) => path));
+    for (const path of this.chosen) if (!known.has(path)) this.chosen.delete(path);
+    say(this.note, this.rows.length ? "" : "No episodes in the opened folders. Record some, e.g. in the view Record.");
+    if (!found.complete) say(this.note, "There are too many folders to look into all of them. Open a smaller folder: ibrobot ui FOLDER");
+    this.draw();
+    this.trashes = found.trashes;
+    this.loadTrash();
+  }
+
+  shownRows() {
+    const words = this.filter.value.toLowerCase().split(/\s+/).filter(Boolean);
+    return this.rows.filter((row) => {
+      const text = `${row.path} ${row.task} ${row.outcome} ${row.robot} ${row.mode} ${row.problems.join(" ")}`.toLowerCase();
+      return words.every((word) => text.includes(word));
+    });
+  }
+
+  draw() {
+    const rows = this.shownRows();
+    const { drives } = this.ui;
+    refresh(this.bulk, [[...this.chosen], drives, rows.length], () => this.bulkControls(rows));
+    refresh(this.table, [rows, [...this.chosen], this.path], () => (rows.length ? [h("table", {},
+      h("thead", {}, h("tr", {}, h("th", { scope: "col" }, this.all(rows)),
+        ["Episode", "Task", "Length", "Began", "Size", "Outcome", "Problems"].map((name) => h("th", { scope: "col" }, name)))),
+      h("tbody", {}, rows.map((row) => this.row(row))))] : []));
+  }
+
+  all(rows) {
+    const box = h("input", { type: "checkbox", "aria-label": "Choose all" });
+    box.checked = rows.length > 0 && rows.every(({ path }) => this.chosen.has(path));
+    box.addEventListener("change", () => {
+      for (const { path } of rows) this.chosen[box.checked ? "add" : "delete"](path);
+      this.draw();
+    });
+    return box;
+  }
+
+  row(row) {
+    const box = h("input", { type: "checkbox", "aria-label": `Choose ${row.name} of ${row.group}` });
+    box.checked = this.chosen.has(row.path);
+    box.addEventListener("change", () => {
+      this.chosen[box.checked ? "add" : "delete"](row.path);
+      this.draw();
+    });
+    const place = row.group === "." ? row.name : `${row.group}/${row.name}`;
+    return h("tr", { class: row.path === this.path ? "current" : "" }, h("td", {}, box),
+      h("th", { scope: "row" }, h("a", { href: `#episodes/${encodeURIComponent(row.path)}` }, place)),
+      h("td", {}, row.task || h("span", { class: "note" }, "none")),
+      h("td", {}, row.duration_s === null ? "" : `${row.duration_s.toFixed(1)} s`),
+      h("td", {}, began(row.began_s)),
+      h("td", {}, size(row.bytes)),
+      h("td", { class: { success: "good", failure: "bad" }[row.outcome] ?? "" }, row.outcome),
+      h("td", { class: "bad" }, row.problems.join("; ")));
+  }
+
+  bulkControls(rows) {
+    const paths = rows.map(({ path }) => path).filter((path) => this.chosen.has(path));
+    if (!paths.length) return [h("p", { class: "note" }, `${rows.length} episodes. Choose some to judge or delete them together.`)];
+    const off = !this.ui.drives;
+    return [h("span", {}, `${paths.length} chosen:`),
+      ...OUTCOMES.map((outcome) => h("button", { disabled: off, onclick: () => this.mark(paths, outcome) }, `Judge ${outcome}`)),
+      h("button", { class: "danger", disabled: off, onclick: () => this.remove(paths) }, "Delete")];
+  }
+
+  async open(path) {
+    this.path = path;
+    this.draw();
+    this.detail.hidden = !path;
+    if (!path) { this.player.close(); return; }
+    say(this.title, path);
+    this.about.replaceChildren(h("p", { class: "note" }, "Opening …"));
+    this.controls.replaceChildren();
+    this.player.posed = undefined;
+    this.player.element.hidden = false;
+    this.player.setCut(null);
+    let facts;
+    try {
+      facts = await this.player.open(path);
+    } catch (error) {
+      this.player.close();
+      this.player.element.hidden = true;
+      this.about.replaceChildren(h("div", { class: "problem", role: "alert" }, error.message));
+      return;
+    }
+    if (!facts || this.path !== path) return;
+    const { metadata, topics } = facts;
+    this.about.replaceChildren(
+      h("p", {}, [metadata.robot, metadata.mode, facts.task && `“${facts.task}”`, facts.outcome, metadata.trimmed && `trimmed: ${metadata.trimmed}`]
+        .filter(Boolean).join(" · ")),
+      ...facts.problems.map((problem) => h("div", { class: "problem" }, problem)));
+    this.drawControls(facts);
+    this.controls.append(h("details", {}, h("summary", {}, `${topics.length} topics`),
+      h("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Topics" }, h("table", {}, h("thead", {}, h("tr", {},
+        ["Topic", "Type", "Messages", "Rate", "Lost"].map((name) => h("th", { scope: "col" }, name)))),
+      h("tbody", {}, topics.map((each) => h("tr", {}, h("th", { scope: "row" }, each.name), h("td", {}, each.type),
+        h("td", {}, String(each.count)), h("td", {}, each.rate_hz === null ? "" : `${each.rate_hz} Hz`), h("td", {}, String(each.lost || "")))))))));
+  }
+
+  drawControls(facts) {
+    const off = !this.ui.drives, { path, player } = this;
+    const cut = [0, facts.duration_s];
+    const kept = h("output", {});
+    const trim = h("button", { disabled: true, onclick: () => this.trim(path, cut) }, "Trim to this span");
+    const show = () => {
+      const whole = cut[0] === 0 && cut[1] === facts.duration_s;
+      say(kept, `keep ${cut[0].toFixed(2)} to ${cut[1].toFixed(2)} s`);
+      trim.disabled = off || whole || cut[1] - cut[0] < 0.01;
+      player.setCut(whole ? null : cut);
+    };
+    const begin = h("button", { disabled: off, onclick: () => { cut[0] = Math.min(round(player.at), cut[1]); show(); } }, "Begin here");
+    const end = h("button", { disabled: off, onclick: () => { cut[1] = Math.min(facts.duration_s, Math.max(round(player.at), cut[0])); show(); } }, "End here");
+    const whole = h("button", { disabled: off, onclick: () => { cut[0] = 0; cut[1] = facts.duration_s; show(); } }, "Whole");
+    show();
+    this.controls.replaceChildren(
+      h("div", { class: "row" }, h("span", {}, "Judge:"), OUTCOMES.map((outcome) => h("button", {
+        disabled: off || !facts.finished, "aria-pressed": String(facts.outcome === outcome), onclick: () => this.mark([path], outcome),
+      }, outcome)),
+      facts.finished ? null : h("button", { class: "primary", disabled: off, onclick: () => this.repair(path) }, "Repair"),
+      h("button", { class: "danger", disabled: off, onclick: () => this.remove([path]) }, "Delete")),
+      h("div", { class: "row" }, h("span", {}, "Trim:"), begin, end, whole, kept, trim));
+  }
+
+  // Does something to episodes, and shows the new state.
+  async change(act, done) {
+    const answer = await this.ui.attempt(act);
+    if (answer === undefined) return false;
+    toast(done);
+    await this.load();
+    return true;
+  }
+
+  async mark(paths, outcome) {
+    if (await this.change(() => this.ui.post("episodes/mark", { paths, outcome }), `${count(paths)}: ${outcome}`)
+      && paths.includes(this.path)) await this.open(this.path);
+  }
+
+  async trim(path, [begin_s, end_s]) {
+    const sure = await this.ui.confirm("Trim the episode?",
+      `Only ${begin_s.toFixed(2)} to ${end_s.toFixed(2)} s stay. The original goes to the trash, from which you can restore it.`, "Trim", false);
+    if (!sure) return;
+    if (await this.change(() => this.ui.post("episodes/trim", { path, begin_s, end_s }), "Trimmed. The trash below has the original.")) await this.open(path);
+  }
+
+  async remove(paths) {
+    if (!await this.change(() => this.ui.post("episodes/delete", { paths }), `${count(paths)} moved to the trash below`)) return;
+    if (paths.includes(this.path)) location.hash = "episodes";
+  }
+
+  async repair(path) {
+    if (await this.change(() => this.ui.post("episodes/repair", { path }), "Repaired")) await this.open(path);
+  }
+
+  async loadTrash() {
+    const found = [];
+    for (const path of this.trashes) found.push(...await this.ui.attempt(() => this.ui.get("episodes/trash", { path })) ?? []);
+    this.trash.hidden = !found.length;
+    refresh(this.trash, [found, this.ui.drives], () => [h("summary", {}, `Trash: ${found.length}, ${size(found.reduce((sum, { bytes }) => sum + bytes, 0))}`),
+      h("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Trash" }, h("table", {}, h("thead", {}, h("tr", {},
+        ["Episode", "What was done", "Size", ""].map((name) => h("th", { scope: "col" }, name || h("span", { class: "hidden-label" }, "Restore"))))),
+      h("tbody", {}, found.map((each) => h("tr", {}, h("th", { scope: "row" }, each.path), h("td", {}, DONE[each.done] ?? each.done),
+        h("td", {}, size(each.bytes)), h("td", {}, h("button", {
+          disabled: !this.ui.drives, "aria-label": `Restore ${each.path}`, onclick: () => this.restore(each),
+        }, "Restore"))))))),
+      ...this.trashes.map((path) => h("button", { class: "danger", disabled: !this.ui.drives, onclick: () => this.empty(path) },
+        `Empty the trash of ${path}`))]);
+  }
+
+  async restore({ folder, id, path }) {
+    if (await this.change(() => this.ui.post("episodes/restore", { path: folder, id }), `${path}: restored`)
+      && this.path === path) await this.open(path);
+  }
+
+  async empty(path) {
+    const sure = await this.ui.confirm("Empty the trash?", `What is in the trash of ${path} is deleted for good.`, "Delete for good");
+    if (sure) await this.change(() => this.ui.post("episodes/empty", { path }), "The trash is empty.");
+  }
+}
+
+const count = (paths) => (paths.length === 1 ? paths[0] : `${paths.length} episodes`);
+
+// Lockstep runs have a clock of their own, which begins in 1970.
+function began(seconds) {
+  if (!seconds) return "";
+  return seconds < 1e9 ? "simulated time" : new Date(seconds * 1000).toLocaleString([], { dateStyle: "short", timeStyle: "short" });
+}
+
+function round(seconds) { return Math.round(seconds * 1000) / 1000; }
+
+export function size(bytes) {
+  let number = bytes;
+  for (const unit of ["B", "kB", "MB"]) {
+    if (number < 1000) return `${unit === "B" ? number : number.toFixed(1)} ${unit}`;
+    number /= 1000;
+  }
+  return `${number.toFixed(1)} GB`;
+}

@@ -1,0 +1,198 @@
+"""Episodes and datasets in the opened folders, and the commands of `ibrobot` that change them."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import attrs
+
+from ibrobot_core.api import NS_PER_S, IbrobotError, installed_plugins
+from ibrobot_web.playback import Playback, problems_of
+from ibrobot_web.ui.context import Ui, text
+from ibrobot_web.ui.job_runner import IBROBOT
+
+_DEPTH = 6
+"""Levels of folders below an opened one in which recordings are looked for."""
+_MOST_FOLDERS = 20_000
+_OPEN = 4
+"""Episodes that stay open."""
+_COMMAND_S = 600.0
+_SKIPPED = frozenset({"node_modules", "__pycache__", "site-packages"})
+
+
+@attrs.frozen
+class Found:
+    """What the folders contain."""
+
+    episodes: tuple[Path, ...]
+    datasets: tuple[Path, ...]
+    trashes: tuple[Path, ...]
+    """Folders that have a trash."""
+    complete: bool
+    """False if there are too many folders to look into."""
+
+
+def find_recordings(folders: Sequence[Path]) -> Found:
+    """The episodes and datasets in folders. Hidden folders and links are left out."""
+    readers = installed_plugins().readers
+    episodes: list[Path] = []
+    datasets: list[Path] = []
+    trashes: list[Path] = []
+    left = _MOST_FOLDERS
+
+    def look(folder: Path, depth: int) -> None:
+        nonlocal left
+        left -= 1
+        if any(reader.reads(folder) for reader in readers if not reader.numbered):
+            episodes.append(folder)
+        elif any(reader.reads(folder) for reader in readers if reader.numbered):
+            datasets.append(folder)
+        elif depth and left > 0:
+            for child in _folders_in(folder):
+                if child.name == ".trash":
+                    trashes.append(folder)
+                elif not child.name.startswith(".") and child.name not in _SKIPPED:
+                    look(child, depth - 1)
+
+    for folder in folders:
+        look(folder, _DEPTH)
+    once = [tuple(dict.fromkeys(each)) for each in (episodes, datasets, trashes)]
+    return Found(once[0], once[1], once[2], left > 0)
+
+
+def _folders_in(folder: Path) -> Iterator[Path]:
+    try:
+        with os.scandir(folder) as entries:
+            found = sorted(entry.path for entry in entries if entry.is_dir(follow_symlinks=False))
+    except OSError:
+        return
+    yield from map(Path, found)
+
+
+class Episodes:
+    """Summaries of episodes, read once while their files stay the same, and the open ones. Thread-safe."""
+
+    def __init__(self) -> None:
+        self._summaries: dict[Path, tuple[Any, dict[str, Any]]] = {}
+        self._open: dict[tuple[str, Any], Playback] = {}
+        self._lock = threading.Lock()
+
+    def row(self, ui: Ui, path: Path) -> dict[str, Any]:
+        """An episode as a row of the list."""
+        state = _state_of(path)
+        with self._lock:
+            known, row = self._summaries.get(path, (None, {}))
+        if known != state:
+            row = _row(ui, path)
+            with self._lock:
+                self._summaries[path] = (state, row)
+        return row
+
+    def opened(self, path: Path) -> Playback:
+        """The open episode at a path, or `DATASET:N`.
+
+        Raises:
+            IbrobotError: if it cannot be read.
+        """
+        key = (str(path), _state_of(path))
+        with self._lock:
+            if key not in self._open:
+                self._open[key] = Playback(path)
+            found = self._open[key] = self._open.pop(key)  # the newest is last
+            while len(self._open) > _OPEN:
+                self._open.pop(next(iter(self._open))).close()
+        return found
+
+    def forget(self) -> None:
+        """Close all episodes, e.g. before one is changed."""
+        with self._lock:
+            opened, self._open = list(self._open.values()), {}
+        for each in opened:
+            each.close()
+
+
+_creating = threading.Lock()
+
+
+def episodes_of(ui: Ui) -> Episodes:
+    """The episodes that the views share."""
+    with _creating:
+        found: Episodes = ui.view_state.setdefault("recordings", Episodes())
+    return found
+
+
+def playback(ui: Ui, facts: Mapping[str, Any]) -> Playback:
+    """The episode that a request names, or `DATASET:N`.
+
+    Raises:
+        IbrobotError: if it is outside the opened folders, or cannot be read.
+    """
+    return episodes_of(ui).opened(ui.folders.find(text(facts, "path")))
+
+
+def paths_of(ui: Ui, facts: Mapping[str, Any]) -> list[str]:
+    """The paths that a request names, confined to the opened folders.
+
+    Raises:
+        IbrobotError: if there is none, or one is outside.
+    """
+    given = facts.get("paths")
+    if not isinstance(given, list) or not given or not all(isinstance(each, str) for each in given):
+        raise IbrobotError("paths must be a list of paths")
+    return [str(ui.folders.find(each)) for each in given]
+
+
+def run_command(ui: Ui, *arguments: str) -> str:
+    """The output of a command of `ibrobot`, which runs in the first folder.
+
+    Raises:
+        IbrobotError: with its error, if it fails.
+    """
+    try:
+        done = subprocess.run(
+            [*IBROBOT, *arguments], cwd=ui.folders.first, stdin=subprocess.DEVNULL, capture_output=True,
+            timeout=_COMMAND_S, start_new_session=True, check=False, text=True,
+        )  # fmt: skip
+    except subprocess.TimeoutExpired:
+        raise IbrobotError(f"ibrobot {arguments[0]} did not end within {_COMMAND_S:g} s") from None
+    if done.returncode:
+        raise IbrobotError(done.stderr.strip().removeprefix("error: ") or f"exit code {done.returncode}")
+    return done.stdout
+
+
+def _state_of(path: Path) -> Any:
+    """What changes with an episode's files."""
+    if not path.is_dir():
+        return None
+    with os.scandir(path) as entries:
+        return tuple(sorted((each.name, each.stat().st_size, each.stat().st_mtime_ns) for each in entries))
+
+
+def _row(ui: Ui, path: Path) -> dict[str, Any]:
+    name = ui.folders.name(path)
+    group = path.parent.parent if path.parent.name == "episodes" else path.parent
+    row: dict[str, Any] = {
+        "path": name, "name": path.name, "group": ui.folders.name(group), "task": "", "duration_s": None,
+        "began_s": None, "outcome": "unknown", "finished": False, "mode": "", "robot": "", "problems": [],
+        "bytes": sum(file.stat().st_size for file in path.rglob("*") if file.is_file()),
+    }  # fmt: skip
+    try:
+        reader = installed_plugins().open_episode(path)
+        try:
+            summary = reader.summary()
+        finally:
+            reader.close()
+    except IbrobotError as error:
+        return {**row, "problems": [str(error)]}
+    known = summary.metadata
+    return {
+        **row, "task": known.get("prompt", ""), "outcome": summary.outcome, "finished": summary.finished,
+        "duration_s": round((summary.end_ns - summary.start_ns) / NS_PER_S, 2), "problems": problems_of(summary),
+        "began_s": summary.start_ns / NS_PER_S, "mode": known.get("mode", ""), "robot": known.get("robot", ""),
+        "trimmed": known.get("trimmed", ""), "marked": known.get("marked", "") == "true",
+    }  # fmt: skip

@@ -1,0 +1,154 @@
+"""The view episodes of `ibrobot ui`: recordings are listed, played back, judged, trimmed, deleted and restored."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import attrs
+import numpy as np
+import pytest
+from ibrobot_web.playback import Playback
+from ibrobot_web.ui.recordings import episodes_of, find_recordings
+from ui_server import UiServer, run_ui
+
+from ibrobot_core.api import IbrobotError
+
+pytest.importorskip("ibrobot_mcap", reason="needs ibrobot-plugin-mcap")
+TOP = "/camera/top/image_raw"
+MODEL = '<mujoco><worldbody><body name="arm"><joint name="pan"/><geom size="0.1"/></body></worldbody></mujoco>'
+
+
+@pytest.fixture
+def episode(tmp_path: Path) -> Path:
+    from made_episodes import make_episode
+
+    (tmp_path / "arm.xml").write_text(MODEL)
+    config = {"robot": {"description": {"mjcf": "arm.xml", "tip": "tool"}}}
+    return make_episode(
+        tmp_path / "pick/episodes/episode_000001", prompt="pick", robot="arm", config=config
+    )  # fmt: skip
+
+
+@pytest.fixture
+def opened(episode: Path) -> Iterator[Playback]:
+    found = Playback(episode)
+    yield found
+    found.close()
+
+
+def test_the_motion_and_plots_are_thinned(opened: Playback) -> None:
+    facts = opened.facts()
+    motion = facts["motion"]
+    assert (facts["task"], facts["duration_s"], facts["cameras"]) == ("pick", 1.0, [TOP])
+    assert motion["joints"] == ["pan", "tilt"]
+    assert 24 <= len(motion["times"]) <= 31
+    assert motion["positions"][-1] == pytest.approx([motion["times"][-1], 2 * motion["times"][-1]])
+    series = opened.series("/joint_states")
+    assert series["values"]["position.tilt"][-1] == pytest.approx(2 * series["times"][-1])
+    with pytest.raises(IbrobotError, match="has no topic '/imu'; available: "):
+        opened.series("/imu")
+
+
+def brightness(picture: Any) -> int:
+    import simplejpeg
+
+    return int(np.median(simplejpeg.decode_jpeg(picture.content)))
+
+
+def test_pictures_are_the_newest_at_a_time_in_any_order(opened: Playback) -> None:
+    for at_s in (0.0, 0.21, 0.2, 1.0, 0.5, 0.519, 0.0):
+        assert brightness(opened.picture(TOP, at_s)) == pytest.approx(int(at_s / 0.02 + 1e-6), abs=1)
+    assert opened.picture(TOP, 1.9) is not None
+    assert opened.picture(TOP, 2.1) is None, "a camera that fell silent shows nothing old"
+
+
+def test_a_model_outside_the_opened_folders_is_not_read(episode: Path, tmp_path: Path) -> None:
+    other = {
+        "/etc/hostname": "outside the opened", "package://yaml/../../../../etc/hostname": "out of its package",
+        "../a.xml": "outside the opened",
+    }  # fmt: skip
+
+    async def test(server: UiServer) -> None:
+        scene = await server.get("episodes/scene", path=str(episode))
+        assert [body["name"] for body in scene["bodies"]] == ["world", "arm"]
+        found = episodes_of(server.ui).opened(episode)
+        for mjcf, problem in other.items():
+            config = json.dumps({"robot": {"description": {"mjcf": mjcf}}})
+            found.summary = attrs.evolve(found.summary, metadata={"config": config})
+            scene = await server.get("episodes/scene", path=str(episode))
+            assert scene["bodies"] == []
+            assert problem in scene["problem"]
+        episodes_of(server.ui).forget()
+
+    run_ui([tmp_path], test)
+
+
+def test_episodes_are_judged_trimmed_deleted_and_restored(episode: Path, tmp_path: Path) -> None:
+    async def test(server: UiServer) -> None:
+        async def row() -> Any:
+            (found,) = (await server.get("episodes/list"))["episodes"]
+            return found
+
+        path = (await row())["path"]
+        assert ((await row())["group"], (await row())["outcome"], (await row())["duration_s"]) == (
+            "pick",
+            "success",
+            1.0,
+        )
+        await server.post("episodes/mark", paths=[path], outcome="failure")
+        assert (await row())["outcome"] == "failure"
+        assert (await server.get("episodes/open", path=path))["outcome"] == "failure"
+        await server.post("episodes/trim", path=path, begin_s=0.2, end_s=0.6)
+        assert (await row())["duration_s"] == pytest.approx(0.4)
+        await server.post("episodes/delete", paths=[path])
+        listed = await server.get("episodes/list")
+        assert (listed["episodes"], listed["trashes"]) == ([], ["pick/episodes"])
+        deleted, original = await server.get("episodes/trash", path="pick/episodes")
+        assert (deleted["done"], original["done"]) == ("deleted", "trimmed")
+        await server.post("episodes/restore", path="pick/episodes", id=original["id"])
+        assert (await row())["duration_s"] == 1.0
+        episodes_of(server.ui).forget()
+
+    run_ui([tmp_path], test)
+
+
+def test_what_is_outside_or_malformed_is_refused(episode: Path, tmp_path: Path) -> None:
+    inside = tmp_path / "inside"
+    inside.mkdir()
+    (inside / "link").symlink_to(episode.parent)
+
+    async def test(server: UiServer) -> None:
+        for path in (str(episode), f"../{episode.relative_to(tmp_path)}", "link/episode_000001", "..", "/etc", "a\0b"):
+            for name in ("open", "series", "picture", "scene", "trash"):
+                answer = server.get(f"episodes/{name}", path=path, topic=TOP, at_s="0")
+                if name == "scene":
+                    assert (await answer)["bodies"] == []
+                    continue
+                with pytest.raises(RuntimeError, match=r"outside the opened folders|zero character"):
+                    await answer
+            for name in ("trim", "repair", "restore", "empty"):
+                with pytest.raises(RuntimeError, match=r"outside the opened folders|zero character"):
+                    await server.post(f"episodes/{name}", path=path, id="x", begin_s=0, end_s=1)
+            for name in ("mark", "delete"):
+                with pytest.raises(RuntimeError, match=r"outside the opened folders|zero character"):
+                    await server.post(f"episodes/{name}", paths=[path], outcome="success")
+        wrong: Any
+        for wrong in ("paths", [], [1], {"a": 1}, None):
+            with pytest.raises(RuntimeError, match="paths must be a list"):
+                await server.post("episodes/delete", paths=wrong)
+        for wrong in ("nan", "inf", -1, None, "1 s", [], {}):
+            with pytest.raises(RuntimeError, match="begin_s must be"):
+                await server.post("episodes/trim", path=".", begin_s=wrong, end_s=1)
+        assert await server.get("episodes/list") == {"episodes": [], "complete": True, "trashes": []}
+
+    run_ui([inside], test)
+    assert episode.is_dir()
+
+
+def test_hidden_folders_and_links_are_not_looked_into(episode: Path, tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(episode.parent)
+    episode.parent.rename(tmp_path / ".hidden")
+    assert find_recordings([tmp_path]).episodes == ()
