@@ -6,10 +6,12 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.api import DatasetDescriptor, Flag, PolicyDescriptor, ReaderDescriptor, hookimpl
+from ibrobot_core.api import Command, DatasetDescriptor, Flag, PolicyDescriptor, ReaderDescriptor, hookimpl
 from ibrobot_lerobot.options import LeRobotOptions, LeRobotPolicyOptions
 
 if TYPE_CHECKING:
+    import click
+
     from ibrobot_core.api import Context, DatasetWriter, EpisodeAddress, EpisodeReader, Policy
 
 
@@ -61,3 +63,22 @@ def ibrobot_policies() -> Iterable[PolicyDescriptor]:
         type="lerobot", options=LeRobotPolicyOptions, make=_policy,
         summary="a LeRobot checkpoint: ACT, Diffusion, VQ-BeT, SmolVLA, pi0, …",
     )  # fmt: skip
+
+
+def _datasets() -> click.Command:
+    from ibrobot_lerobot.commands import datasets
+
+    return datasets
+
+
+def _train() -> click.Command:
+    from ibrobot_lerobot.train import train
+
+    return train
+
+
+@hookimpl
+def ibrobot_commands() -> Iterable[Command]:
+    """`ibrobot datasets info` and `ibrobot train`."""
+    yield Command("datasets", "Show LeRobot datasets.", _datasets)
+    yield Command("train", "Train a policy by LeRobot.", _train)

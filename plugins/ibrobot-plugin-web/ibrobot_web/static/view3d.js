@@ -45,6 +45,7 @@ export class View3D {
   }
 
   async load(scene) {
+    this.note.textContent = "Loading the robot …";
     try {
       const response = await fetch(scene);
       if (!response.ok) throw new Error(await response.text());

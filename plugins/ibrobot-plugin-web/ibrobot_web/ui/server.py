@@ -24,6 +24,9 @@ VIEWS = {
     "devices": "Devices",
     "record": "Record",
     "episodes": "Episodes",
+    "convert": "Convert",
+    "datasets": "Datasets",
+    "training": "Training",
     "jobs": "Jobs",
 }
 """Name -> title in the navigation. The module `ibrobot_web.ui.NAME` has the view's `ROUTES`; `static/ui/NAME.js` shows

@@ -1,0 +1,76 @@
+"""What a dataset contains, as JSON: counts, features with units, statistics, and episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ibrobot_core.api import DatasetError
+from ibrobot_lerobot import layout
+
+_UNITS = {"radians": "rad", "degrees": "°", "range_m100_100": "% of the range, -100 to 100"}
+_SHOWN = ("min", "max", "mean", "std", "q01", "q99")
+
+
+def dataset_facts(root: Path) -> dict[str, Any]:
+    """What the dataset at `root` contains.
+
+    Raises:
+        DatasetError: if there is none, or it cannot be read.
+    """
+    found = layout.open_dataset(root)
+    if found is None:
+        raise DatasetError(f"{root}: is not a LeRobot dataset: it has no {layout.INFO}")
+    info, own = found.info, found.metadata
+    norm_mode = str((own.get("conversion") or {}).get("norm_mode", ""))
+    try:
+        return {
+            "path": str(root), "robot_type": info.get("robot_type") or "", "fps": info["fps"],
+            "episodes": info["total_episodes"], "frames": info["total_frames"],
+            "seconds": info["total_frames"] / info["fps"], "tasks": found.tasks, "norm_mode": norm_mode,
+            "bytes": sum(file.stat().st_size for file in root.rglob("*") if file.is_file()),
+            "fingerprint": str(own.get("fingerprint", "")),
+            "features": [
+                _feature(key, entry, norm_mode, found.stats.get(key) or {})
+                for key, entry in info["features"].items() if key not in layout.COUNTERS
+            ],
+            "list": _episodes(found, own),
+        }  # fmt: skip
+    except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
+        raise DatasetError(f"{root}: is not a LeRobot dataset: {error!r}") from error
+
+
+def _feature(key: str, entry: Mapping[str, Any], norm_mode: str, stats: Mapping[str, Any]) -> dict[str, Any]:
+    """A feature with its unit, and statistics of each value or colour."""
+    shape = list(entry["shape"])
+    picture = entry["dtype"] in ("video", "image")
+    names = entry.get("names") or []
+    values = {name: np.ravel(stats[name]).tolist() for name in _SHOWN if name in stats}
+    return {
+        "key": key, "dtype": entry["dtype"], "shape": shape, "names": list(names) if not picture else [],
+        "unit": _unit(entry, norm_mode, names), "stats": values, "picture": picture,
+    }  # fmt: skip
+
+
+def _unit(entry: Mapping[str, Any], norm_mode: str, names: Any) -> str:
+    """The unit of a feature; empty if the dataset does not say it."""
+    if entry["dtype"] in ("video", "image"):
+        return str((entry.get("info") or {}).get("depth_unit", "")) or "colour, 0 to 1 in the statistics"
+    joints = bool(names) and all(str(name).endswith(".pos") for name in names)
+    return _UNITS.get(norm_mode, "") if joints else ""
+
+
+def _episodes(found: layout.OnDisk, own: Mapping[str, Any]) -> list[dict[str, Any]]:
+    recorded = own.get("episodes") or []
+    rows = []
+    for row in found.episodes():
+        number = int(row["episode_index"])
+        known = recorded[number] if number < len(recorded) else {}
+        rows.append({
+            "number": number, "frames": row["length"], "seconds": row["length"] / found.info["fps"],
+            "task": "; ".join(row["tasks"]), "source": known.get("source", ""), "outcome": known.get("outcome", ""),
+        })  # fmt: skip
+    return rows

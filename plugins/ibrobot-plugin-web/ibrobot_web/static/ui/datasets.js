@@ -1,0 +1,91 @@
+// View: datasets: counts, features, statistics, and their episodes, which are played back.
+
+import { h, refresh, say } from "../dom.js";
+import { size } from "./episodes.js";
+import { Player } from "./player.js";
+
+export class View {
+  constructor(ui) { this.ui = ui; }
+
+  mount(element) {
+    this.choice = h("select", { id: "dataset" });
+    this.choice.addEventListener("change", () => { location.hash = `datasets/${encodeURIComponent(this.choice.value)}`; });
+    this.note = h("p", { class: "note", role: "status" });
+    this.facts = h("section", { "aria-label": "Dataset" });
+    this.player = new Player(this.ui, "datasets");
+    this.title = h("h3", {});
+    this.problem = h("div", {});
+    this.playing = h("section", { class: "card", hidden: true, "aria-label": "Episode" }, h("div", { class: "row" }, this.title,
+      h("button", { onclick: () => this.play(null) }, "Close")), this.problem, this.player.element);
+    element.append(h("h2", {}, "Datasets"), h("div", { class: "row" }, h("label", { for: "dataset" }, "Dataset"), this.choice),
+      this.note, this.playing, this.facts);
+  }
+
+  async show(shown, rest) {
+    if (!shown) { this.player.pause(); return; }
+    const found = await this.ui.attempt(() => this.ui.get("datasets/list"));
+    if (!found) return;
+    const chosen = rest || this.path || found[0];
+    refresh(this.choice, [found, chosen], () => found.map((path) => h("option", { value: path, selected: path === chosen }, path)));
+    say(this.note, found.length ? "" : "No datasets in the opened folders. Convert episodes into one, in the view Convert.");
+    if (chosen && found.includes(chosen)) await this.open(chosen);
+    else if (rest) say(this.note, `${rest}: there is no such dataset in the opened folders`);
+  }
+
+  async open(path) {
+    if (this.path !== path) this.play(null);
+    this.path = path;
+    say(this.note, "Reading …");
+    const facts = await this.ui.attempt(() => this.ui.get("datasets/info", { path }));
+    if (this.path !== path) return;
+    say(this.note, "");
+    refresh(this.facts, facts ?? path, () => (facts ? this.tables(facts) : []));
+  }
+
+  tables(facts) {
+    const counts = [["Episodes", facts.episodes], ["Frames", facts.frames], ["Rate", `${facts.fps} Hz`],
+      ["Length", `${facts.seconds.toFixed(1)} s`], ["Size", size(facts.bytes)], ["Robot", facts.robot_type || "not given"],
+      ["Tasks", facts.tasks.join("; ") || "none"], ["Unit of joints", facts.norm_mode || "not given"]];
+    return [h("div", { class: "columns" },
+      h("div", { class: "card" }, h("h3", {}, "Contents"), h("table", {}, h("tbody", {}, counts.map(([name, value]) => (
+        h("tr", {}, h("th", { scope: "row" }, name), h("td", {}, String(value)))))))),
+      h("div", { class: "card" }, h("h3", {}, "Episodes"), h("div", { class: "scroll tall", tabindex: "0", role: "region", "aria-label": "Episodes" },
+        h("table", {}, head(["Episode", "Length", "Frames", "Outcome", "Task", "Source"]), h("tbody", {}, facts.list.map((each) => h("tr", {},
+          h("th", { scope: "row" }, h("button", { onclick: () => this.play(each.number) }, `Play ${each.number}`)),
+          h("td", {}, `${each.seconds.toFixed(1)} s`), h("td", {}, String(each.frames)), h("td", {}, each.outcome),
+          h("td", {}, each.task), h("td", {}, each.source)))))))),
+    h("div", { class: "card" }, h("h3", {}, "Features"), h("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Features" },
+      h("table", {}, head(["Feature", "Type", "Shape", "Unit", "Value", "Minimum", "Mean", "Maximum", "Deviation"]),
+        h("tbody", {}, facts.features.flatMap((feature) => rows(feature))))))];
+  }
+
+  async play(number) {
+    this.playing.hidden = number === null;
+    if (number === null) { this.player.close(); return; }
+    say(this.title, `${this.path}, episode ${number}`);
+    this.problem.replaceChildren();
+    this.player.element.hidden = false;
+    this.player.posed = undefined;
+    try {
+      await this.player.open(`${this.path}:${number}`);
+      this.player.toggle();
+    } catch (error) {
+      this.player.close();
+      this.player.element.hidden = true;
+      this.problem.replaceChildren(h("div", { class: "problem", role: "alert" }, error.message));
+    }
+    this.playing.scrollIntoView({ block: "nearest" });
+  }
+}
+
+function head(names) { return h("thead", {}, h("tr", {}, names.map((name) => h("th", { scope: "col" }, name)))); }
+
+// One row for each value of a feature; pictures have one for each colour.
+function rows({ key, dtype, shape, unit, names, stats, picture }) {
+  const count = stats.mean?.length ?? 1;
+  const colors = ["red", "green", "blue"];
+  return Array.from({ length: count }, (_, i) => h("tr", {}, i ? h("td", {}) : h("th", { scope: "row" }, key),
+    ...(i ? ["", "", ""] : [dtype, shape.join(" × "), unit]).map((text) => h("td", {}, text)),
+    h("td", {}, picture && count === 3 ? colors[i] : names[i] ?? (count > 1 ? String(i) : "")),
+    ...["min", "mean", "max", "std"].map((name) => h("td", {}, stats[name] ? Number(stats[name][i].toPrecision(4)).toString() : ""))));
+}

@@ -1,0 +1,108 @@
+"""View: conversion of episodes into a dataset, by `ibrobot convert`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from ibrobot_core.api import NORM_MODES, IbrobotError, installed_plugins
+from ibrobot_web.ui.context import Handler, Ui, flag, text
+from ibrobot_web.ui.job_runner import Reader
+from ibrobot_web.ui.recordings import find_recordings, paths_of
+
+_CHOICES = {
+    "only": ("all", "interventions", "policy"), "missing": ("skip", "hold", "refuse"), "norm_mode": NORM_MODES,
+    "outcome": ("", "success", "failure", "unknown"),
+}  # fmt: skip
+
+
+def listing(ui: Ui, facts: Mapping[str, Any]) -> dict[str, Any]:
+    """Folders with episodes, and how many each has; and the datasets to which episodes can be added."""
+    found = find_recordings(ui.folders.paths)
+    counts: dict[str, int] = {}
+    for path in found.episodes:
+        name = ui.folders.name(path.parent)
+        counts[name] = counts.get(name, 0) + 1
+    return {
+        "groups": [{"path": name, "episodes": count} for name, count in counts.items()],
+        "datasets": [ui.folders.name(path) for path in found.datasets],
+    }
+
+
+def start(ui: Ui, facts: Mapping[str, Any]) -> dict[str, int]:
+    """Begin a conversion."""
+    if "convert" not in installed_plugins().commands:
+        raise IbrobotError("converting needs a plugin that is not installed: pip install ibrobot-plugin-data")
+    paths = paths_of(ui, facts)
+    out = ui.folders.find(text(facts, "out"))
+    if out in ui.folders.paths:
+        raise IbrobotError(f"{out}: is an opened folder; choose a new folder in it, e.g. datasets/pick_cube")
+    arguments = ["convert", "--events", f"--out={out}"]
+    for name, choices in _CHOICES.items():
+        chosen = text(facts, name, "")
+        if chosen and chosen not in choices:
+            raise IbrobotError(f"{name} must be one of {', '.join(each for each in choices if each)}, got {chosen!r}")
+        if chosen:
+            arguments.append(f"--{name.replace('_', '-')}={chosen}")
+    if prompt := text(facts, "prompt", ""):
+        arguments.append(f"--prompt={prompt}")
+    for name in ("append", "success"):
+        if flag(facts, name):
+            arguments.append(f"--{name}")
+    known = {"out": ui.folders.name(out), "problems": [], "progress": 0.0}
+    job = ui.jobs.start(
+        "convert", f"Convert into {ui.folders.name(out)}", [*arguments, *paths], facts=known, read=event_reader()
+    )
+    return {"number": job.number}
+
+
+def event_reader() -> Reader:
+    """A function that reads the events of `ibrobot convert --events` into facts: progress, text, problems, report."""
+    problems: list[dict[str, str]] = []
+
+    def read(line: str) -> Mapping[str, Any] | None:
+        event = parse_event(line)
+        match event.get("event"):
+            case "progress":
+                if event.get("error"):
+                    problems.append({"episode": str(event["episode"]), "error": str(event["error"])})
+                total = max(1, int(event["total_frames"]))
+                frames, seconds = event["frames"], event["seconds"]
+                return {
+                    "progress": min(1.0, int(event["frames"]) / total),
+                    "problems": list(problems),
+                    "text": f"{event['done']} of {event['of']} episodes, {frames} frames, {seconds:.0f} s",
+                }
+            case "report":
+                return {"progress": 1.0, "report": event, "text": told(event)}
+        return None
+
+    return read
+
+
+def parse_event(line: str) -> Mapping[str, Any]:
+    """The event in a line of output; empty if it is another line."""
+    if not line.startswith('{"event"'):
+        return {}
+    try:
+        event = json.loads(line)
+    except ValueError:
+        return {}
+    return event if isinstance(event, dict) else {}
+
+
+def told(report: Mapping[str, Any]) -> str:
+    """The result of a conversion in a line."""
+    counts = {
+        "left out": report["failed"], "passed over": report["passed_over"], "ticks skipped": report["skipped_ticks"],
+        "ticks held": report["held_ticks"], "messages lost in recording": report["lost_messages"],
+        "without a task": report["without_prompt"],
+    }  # fmt: skip
+    others = "".join(f", {name} {count}" for name, count in counts.items() if count)
+    size = report["size_bytes"] / 1e6
+    episodes = f"{report['episodes']} episode{'' if report['episodes'] == 1 else 's'}"
+    return f"{episodes}, {report['frames']} frames{others}; the dataset has {size:.1f} MB"
+
+
+ROUTES: dict[str, Handler] = {"GET /list": listing, "POST /start": start}
