@@ -157,13 +157,19 @@ def installation(page: str) -> list[str]:
     return [block[1], *re.findall(r"^\$ (.*)$", block[2], re.MULTILINE)]
 
 
+def marked(mark: str) -> list[str]:
+    """The files with tests of `mark`: each process that collects all of them takes seconds."""
+    files = (*Path("tests").rglob("test_*.py"), *Path("plugins").glob("*/tests/**/test_*.py"))
+    return sorted(str(file) for file in files if f"mark.{mark}" in file.read_text(encoding="utf-8"))
+
+
 @nox.session
 def integration(session: nox.Session) -> None:
     """What needs every plugin, or starts processes."""
     install(session, *PLUGINS, groups=("test", "browser"))
     system_libraries(session)
     chromium(session)
-    session.run(*PYTEST, *TWO, "-m", "integration", "tests", "plugins", *session.posargs)
+    session.run(*PYTEST, *TWO, "-m", "integration", *marked("integration"), *session.posargs)
 
 
 @nox.session
@@ -184,7 +190,7 @@ def lerobot(session: nox.Session) -> None:
     """LeRobot itself, unmodified, against what the plugins offer; the one session with torch."""
     install(session, *PLUGINS, options=("lerobot[dataset,diffusion,feetech,smolvla,training]>=0.6.1,<0.7",))
     system_libraries(session)
-    session.run(*PYTEST, "-m", "lerobot", "tests", *session.posargs)
+    session.run(*PYTEST, "-m", "lerobot", *marked("lerobot"), *session.posargs)
 
 
 @nox.session
