@@ -46,3 +46,7 @@ class MoveResult:
     """Distance of the planned tool position from the requested one [m]."""
     orientation_error_rad: float = 0.0
     """Angle between the planned orientation, or axis, and the requested one [rad]."""
+    fraction: float = 1.0
+    """Fraction of a straight path that was planned."""
+    alternative: int = 0
+    """Index of the goal that was chosen, of several."""

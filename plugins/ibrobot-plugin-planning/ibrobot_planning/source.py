@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import queue
 import threading
 from collections import deque
@@ -73,6 +74,8 @@ _STILL_RAD = 1e-4
 """Commands that change less between two checks are at rest."""
 _KEPT = 100
 """Number of results kept for `RESULT`."""
+_NEARLY_ONE = 1e-3
+"""Allowed deviation of a quaternion's length from 1."""
 _POLICIES: tuple[OrientationPolicy, ...] = ("keep_axis", "arm_plane", "current", "free")
 
 
@@ -266,9 +269,16 @@ class PlannerSource(SourceWorker):
 
     def _move_to_pose(self, request: object) -> MoveResult:
         wanted = requested(MoveToPose, request)
-        return self._wait(_nearest(wanted.target_pose), wanted.velocity_scaling)
+        try:
+            goal = _nearest(wanted.target_pose)
+        except PlanningError as error:
+            return MoveResult(False, str(error), 0.0, "REJECTED", error.code)
+        return self._wait(goal, wanted.velocity_scaling)
 
     def _move_to_configuration(self, request: object) -> MoveResult:
+        given = request.get("target_joint_state") if isinstance(request, Mapping) else None
+        if isinstance(request, Mapping) and isinstance(given, Mapping):  # a goal has no time and no frame
+            request = {**request, "target_joint_state": {"header": {}, **given}}
         wanted = requested(MoveToConfiguration, request)
         state: JointState = wanted.target_joint_state
         return self._wait(JointGoal(state.name, state.position), wanted.velocity_scaling)
@@ -429,8 +439,11 @@ class PlannerSource(SourceWorker):
             if move is self._move:
                 self._move = None
         duration = seconds(session.clock.now_ns() - move.begun_ns) if move.begun_ns is not None else 0.0
-        errors = (move.planned.position_error, move.planned.orientation_error) if move.planned is not None else ()
-        move.result = MoveResult(success, message, duration, outcome, code, *errors)
+        plan = move.planned
+        facts = (
+            (plan.position_error, plan.orientation_error, plan.fraction, plan.alternative) if plan is not None else ()
+        )
+        move.result = MoveResult(success, message, duration, outcome, code, *facts)
         move.ended.set()
         if success:
             session.log.info("goal %s reached", move.target.text)
@@ -460,5 +473,16 @@ class PlannerSource(SourceWorker):
 
 
 def _nearest(pose: Pose) -> AnyGoal:
-    """A pose with the orientation policies of IB-Robot's gateway, in their order."""
+    """A pose with the orientation policies of IB-Robot's gateway, in their order.
+
+    Raises:
+        PlanningError: for a quaternion whose length is not 1.
+    """
+    q = pose.orientation
+    length = math.hypot(q.x, q.y, q.z, q.w)
+    # Written so that NaN fails it.
+    if not abs(length - 1) <= _NEARLY_ONE:
+        raise PlanningError(
+            f"the orientation is a quaternion of length {length:.3g}, must be 1", PlanCode.INVALID_GOAL_CONSTRAINTS
+        )
     return AnyGoal(tuple(PoseGoal(pose, beyond_reach=policy) for policy in _POLICIES))

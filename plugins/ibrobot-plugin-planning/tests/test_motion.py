@@ -176,6 +176,10 @@ def test_cmd_pose_is_a_goal(run, stamped: bool):
             PoseStamped(Header(0, "camera"), Pose()),
             "FRAME_TRANSFORM_FAILURE: frame 'camera' is not the base; it is called base, base_link",
         ),
+        (
+            Pose(Vector3(0.2, 0.0, 0.1), Quaternion(1.0, 0.0, 0.0, 1.0)),
+            "INVALID_GOAL_CONSTRAINTS: the orientation is a quaternion of length 1.41, must be 1",
+        ),
         (String("up"), "UNRECOGNIZED_GOAL_TYPE: takes geometry_msgs/msg/PoseStamped or Pose, got std_msgs/msg/String"),
     ],
 )
@@ -214,6 +218,8 @@ def test_move_to_configuration_waits_for_the_motion(run):
     state = JointState(Header(0), ("pan", "jaw"), np.array([0.4, 0.3]), np.empty(0), np.empty(0))
     assert call(runtime, MOVE_TO_CONFIGURATION, MoveToConfiguration(state)).success
     assert runtime.session.state.position[[0, 5]] == pytest.approx([0.4, 0.3], abs=0.05)
+    mapping = {"target_joint_state": {"name": ["pan"], "position": [0.1]}}
+    assert call(runtime, MOVE_TO_CONFIGURATION, mapping).success
 
 
 def test_request_that_makes_no_sense_is_rejected(run):
@@ -223,6 +229,8 @@ def test_request_that_makes_no_sense_is_rejected(run):
     assert (result.outcome, result.message) == ("REJECTED", f"no joint 'tilt'; the joints are: {', '.join(JOINTS)}")
     result = call(runtime, MOVE_TO_POSE, MoveToPose(Pose(), 1.5))
     assert result.message == "velocity_scaling is 1.5, must be above 0 and at most 1"
+    result = call(runtime, MOVE_TO_POSE, MoveToPose(Pose(Vector3(0.2, 0.0, 0.1), Quaternion(w=0.0))))
+    assert (result.outcome, result.message) == ("REJECTED", "the orientation is a quaternion of length 0, must be 1")
 
 
 def test_end_of_the_run_ends_a_service_that_waits(run):

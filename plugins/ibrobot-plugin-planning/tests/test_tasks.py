@@ -113,6 +113,8 @@ def test_every_kind_of_move(run):
     assert [step.outcome for step in result.steps] == ["SUCCEEDED"] * 11
     assert (result.steps[0].name, result.steps[0].kind, result.steps[0].number) == ("to a pose", "move", 1)
     assert all(step.duration_s > 0 for step in result.steps)
+    assert result.steps[6].facts["alternative"] == 2
+    assert [result.steps[i].facts["fraction"] for i in (8, 9)] == [1.0, 1.0]
     assert result.steps[10].facts["position_error_m"] < 1e-3
     assert runtime.summary()["goals_failed"] == 0
 

@@ -251,7 +251,7 @@ class Performance:
             if step.touch:
                 bus.call(TOUCH, "{}")
 
-    def _go(self, target: Target) -> Steps:
+    def _go(self, target: Target) -> Generator[None, None, MoveResult]:
         """Move to a goal in the planning mode, and wait for the end."""
         bus = self._session.bus
         self._enter(self.checked.mode.name)
@@ -268,15 +268,21 @@ class Performance:
         assert isinstance(result, MoveResult)
         if not result.success:
             raise StepFailed(result.message, result.code.name)
-        return {
-            "position_error_m": round(result.position_error_m, 6),
-            "orientation_error_rad": round(result.orientation_error_rad, 6),
-        }
+        return result
 
     def _move(self, step: MoveStep) -> Steps:
         target = self._target(step, self._commanded())
         with self._touching(step):
-            return (yield from self._go(target))
+            result = yield from self._go(target)
+        facts: dict[str, Any] = {
+            "position_error_m": round(result.position_error_m, 6),
+            "orientation_error_rad": round(result.orientation_error_rad, 6),
+        }
+        if step.any:
+            facts["alternative"] = result.alternative + 1
+        if step.line:
+            facts["fraction"] = round(result.fraction, 3)
+        return facts
 
     def _grip(self, step: GripperStep) -> Steps:
         session = self._session
