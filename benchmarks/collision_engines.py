@@ -2,7 +2,7 @@
 
     python benchmarks/collision_engines.py
 
-The figures decided for Pinocchio's naive broadphase with Coal: ADR 31.
+The figures decided for Pinocchio's naive broadphase with Coal, and for hulls of links that are checked first: ADR 31.
 """
 
 from __future__ import annotations
@@ -15,13 +15,18 @@ from typing import Any
 import mujoco
 import numpy as np
 import pinocchio
+from ibrobot_planning.collision import Collisions
+from ibrobot_planning.hulls import with_hulls
 from planning import Referee
-from planning_scenes import KINDS, PADDING_M, Maker, so101
+from planning_scenes import ARM_JOINTS, KINDS, PADDING_M, Maker, so101
 
 from ibrobot_core.api import Vector
 
 CONFIGURATIONS = 2000
 MANAGERS = ("Naive", "SSaP", "DynamicAABBTree")
+
+FREE = ("Naive, free", "hulls, free")
+"""Of these, the time of configurations in which nothing touches, as three of four are in a search."""
 
 
 def timed(check: Callable[[Vector], bool], configurations: Vector) -> tuple[float, list[bool]]:
@@ -34,10 +39,11 @@ def timed(check: Callable[[Vector], bool], configurations: Vector) -> tuple[floa
 
 def main() -> None:
     maker, robot = Maker(), so101()
+    hulls = with_hulls(maker.arm, maker.unchecked)
     samples = np.random.default_rng(0).uniform(robot.lower[:5], robot.upper[:5], (CONFIGURATIONS, 5))
     print(
         f"{'':12s} {'objects':>8s} {'free':>6s} "
-        + " ".join(f"{name:>16s}" for name in ("all pairs", *MANAGERS, "MuJoCo"))
+        + " ".join(f"{name:>16s}" for name in ("all pairs", *MANAGERS, "hulls first", "MuJoCo"))
     )
     for kind in KINDS:
         world = maker.problem(kind, 0).world
@@ -52,8 +58,15 @@ def main() -> None:
             took, answers = timed(partial(native_check, (model, data, manager)), native)
             differ = sum(a != b for a, b in zip(answers, expected, strict=True))
             columns.append(f"{took:.1f} µs" + (f" ({differ} differ)" if differ else ""))
+        quick = Collisions(hulls, world, ARM_JOINTS, padding=PADDING_M, unchecked=maker.unchecked)
+        took, answers = timed(quick.touches, native)
+        differ = sum(a != b for a, b in zip(answers, expected, strict=True))
+        columns.append(f"{took:.1f} µs" + (f" ({differ} differ)" if differ else ""))
         took, answers = timed(mujoco_check(Referee(world)), samples)
         columns.append(f"{took:.1f} µs")
+        nothing = native[~np.array(expected)]
+        for each in (checks, quick):
+            columns.append(f"{timed(each.touches, nothing)[0]:.1f} µs")
         free = 1 - np.mean(expected)
         print(f"{kind:12s} {len(world.objects):8d} {free:6.0%} " + " ".join(f"{column:>16s}" for column in columns))
 

@@ -119,7 +119,7 @@ class Collisions:
     def first_hit(self, configurations: Vector) -> int:
         """Number of free configurations before the first in collision, of shape (N, J)."""
         for number, q in enumerate(self.native(configurations)):
-            if self._touches(q):
+            if self.touches(q):
                 return number
         return len(configurations)
 
@@ -137,7 +137,7 @@ class Collisions:
             if level and middle == at:
                 level -= 1
                 continue
-            if widely(native[middle], level) if level else self._touches(native[middle]):
+            if widely(native[middle], level) if level else self.touches(native[middle]):
                 if level == 0:
                     return at
                 narrow[level] = middle
@@ -164,7 +164,7 @@ class Collisions:
         order, shares = spread(number)
         configurations = begin + shares * way
         if number <= _FEW:
-            return not any(map(self._touches, configurations))
+            return not any(map(self.touches, configurations))
         level = min(bisect_right(WIDER_M, travel), len(WIDER_M) - 1)
         proved = bytearray(number)
         for i, q in zip(order, configurations, strict=True):
@@ -177,7 +177,7 @@ class Collisions:
                     proved[first:last] = b"\1" * (last - first)
                     continue
                 level -= 1
-            if self._touches(q):
+            if self.touches(q):
                 return False
         return True
 
@@ -214,7 +214,7 @@ class Collisions:
         whole[:, self._columns] = configurations - self._reference
         return whole
 
-    def _touches(self, native: Vector) -> bool:
+    def touches(self, native: Vector) -> bool:
         """Whether anything is closer than its padding at a configuration in Pinocchio's order."""
         return self._coarse.touches(native) and (self._exact is self._coarse or self._exact.touches(native))
 

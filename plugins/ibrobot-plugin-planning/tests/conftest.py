@@ -37,8 +37,17 @@ control: {rate_hz: 50, stop: hold}
 Make = Callable[..., Runtime]
 
 
+@pytest.fixture(scope="module")
+def parts(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """The made-up hardware is installed, discovered once for the tests of a file."""
+    folder = tmp_path_factory.mktemp("made_up") / "site"
+    with pytest.MonkeyPatch.context() as patch, made_up_site(folder, Path(__file__).parent, patch) as site:
+        site.add("parts", "parts.py")
+        yield
+
+
 @pytest.fixture
-def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
+def make(tmp_path: Path, parts: None) -> Iterator[Make]:
     """Makes runs of a robot YAML (`mini` where none is given); stops those that a test leaves running."""
     made: list[Runtime] = []
 
@@ -50,11 +59,9 @@ def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
         made.append(Runtime(Session(config, registry, LaunchRequest(**{"lockstep": True, **asked}))))
         return made[-1]
 
-    with made_up_site(tmp_path / "site", Path(__file__).parent, monkeypatch) as site:
-        site.add("parts", "parts.py")
-        yield make_run
-        for runtime in made:
-            runtime.stop()
+    yield make_run
+    for runtime in made:
+        runtime.stop()
 
 
 @pytest.fixture
