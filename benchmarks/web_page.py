@@ -6,6 +6,7 @@
     python benchmarks/web_page.py kills [--kills 50]
     python benchmarks/web_page.py pages [--seconds 10]        # CPU of one page and of ten
     python benchmarks/web_page.py memory [--minutes 60]
+    python benchmarks/web_page.py deadman [--minutes 10]      # needs Chromium and playwright
 
 Each runs the simulated SO-101 with its cameras, prints a table, and exits with 1 if it misses its limit.
 """
@@ -206,15 +207,66 @@ async def memory(minutes: float) -> bool:
     return used[-1] - used[min(2, len(used) - 1)] <= 20
 
 
+HELD = """ibrobot.deadman.hold(() => (
+  {joints: {shoulder_pan: Math.sin(performance.now() / 1000) > 0 ? 0.5 : -0.5}}))"""
+"""Holds the page's own deadman, and turns the joint to and fro."""
+_PAUSE_S = 0.12
+"""A pause in motion that is longer than this is a release: the deadman's messages come every 0.04 s."""
+
+
+def deadman(minutes: float) -> bool:
+    """False releases of a deadman that is held in Chromium while 3D and cameras run: pauses of the joint's motion."""
+    from playwright.sync_api import sync_playwright
+
+    with page_run(*SO101) as address, sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=list(FLAGS))
+        tab = chromium.new_page(viewport={"width": 1440, "height": 900})
+        tab.goto(address)
+        while tab.evaluate("ibrobot.view.frames") < 3 or not tab.evaluate("Boolean(ibrobot.jogs)"):
+            tab.wait_for_timeout(100)
+        tab.evaluate(
+            """() => {
+              ibrobot.pauses = []; ibrobot.longest = 0; ibrobot.count = 0;
+              let command = null, moved = null;
+              ibrobot.stream.addEventListener("state", ({detail}) => {
+                ibrobot.count += 1;
+                if (command !== null && Math.abs(detail.command[0] - command) > 1e-4) {
+                  if (moved !== null) {
+                    const pause = (detail.stamp - moved) / 1e9;
+                    ibrobot.longest = Math.max(ibrobot.longest, pause);
+                    if (pause > PAUSE) ibrobot.pauses.push(pause);
+                  }
+                  moved = detail.stamp;
+                }
+                command = detail.command[0];
+              });
+            }""".replace("PAUSE", str(_PAUSE_S))
+        )
+        tab.evaluate(HELD)
+        press = tab.evaluate("ibrobot.deadman.press")
+        row("minute", "pauses", "longest s", "states/s", "3D/s")
+        for minute in range(1, round(minutes) + 1):
+            before = tab.evaluate("[ibrobot.count, ibrobot.view.frames]")
+            tab.wait_for_timeout(60_000)
+            after = tab.evaluate("[ibrobot.count, ibrobot.view.frames]")
+            pauses, longest = tab.evaluate("[ibrobot.pauses, ibrobot.longest]")
+            rates = [f"{(b - a) / 60:.1f}" for a, b in zip(before, after, strict=True)]
+            row(minute, len(pauses), f"{longest:.3f}", *rates)
+        held = tab.evaluate("ibrobot.deadman.held") and tab.evaluate("ibrobot.deadman.press") == press
+        row("held all the time" if held else "released by the page")
+        chromium.close()
+        return bool(held and not pauses)
+
+
 def main() -> None:
     """Run one of the measurements."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("lateness", "ages", "browser", "kills", "pages", "memory"))
+    parser.add_argument("what", choices=("lateness", "ages", "browser", "kills", "pages", "memory", "deadman"))
     parser.add_argument("--blocks", type=int, default=4)
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--pages", type=int, default=3)
     parser.add_argument("--kills", type=int, default=50)
-    parser.add_argument("--minutes", type=float, default=60.0)
+    parser.add_argument("--minutes", type=float, help="60; of the deadman 10")
     given = parser.parse_args()
     match given.what:
         case "lateness":
@@ -227,8 +279,10 @@ def main() -> None:
             met = asyncio.run(kills(given.kills))
         case "pages":
             met = asyncio.run(pages(given.seconds))
+        case "memory":
+            met = asyncio.run(memory(given.minutes or 60))
         case _:
-            met = asyncio.run(memory(given.minutes))
+            met = deadman(given.minutes or 10)
     sys.exit(0 if met else 1)
 
 

@@ -77,10 +77,14 @@ class PageClient:
         """Sign in and connect."""
         async with self._browser.get(address) as answer:
             assert answer.status == 200
-        base = str(answer.url).rstrip("/")
+        base = self._base = str(answer.url).rstrip("/")
         self.drive = await self._browser.ws_connect(f"{base}/drive")
         self.stream = await self._browser.ws_connect(f"{base}/stream", max_msg_size=0)
         self._tasks = [asyncio.create_task(self._receive()), asyncio.create_task(self._listen())]
+
+    def get(self, path: str) -> Any:
+        """Request a file or a fact of the page."""
+        return self._browser.get(self._base + path)
 
     async def _receive(self) -> None:
         async for message in self.stream:

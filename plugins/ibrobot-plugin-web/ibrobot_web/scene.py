@@ -7,7 +7,8 @@ the positions of joints.
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping
+import logging
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,8 @@ import mujoco
 import numpy as np
 from ibrobot_kinematics.meshes import cluster
 from numpy.typing import NDArray
+
+from ibrobot_core.api import ModelError, read_xml
 
 _GRID_M = 0.0035
 """Grid on which the vertices of meshes are merged, for robots of up to 1 m; larger ones have a larger one."""
@@ -30,6 +33,9 @@ _SHAPES = {
     int(mujoco.mjtGeom.mjGEOM_MESH): "mesh",
 }
 _JOINTS = {int(mujoco.mjtJoint.mjJNT_HINGE): "hinge", int(mujoco.mjtJoint.mjJNT_SLIDE): "slide"}
+_FIELD_DEG = 45.0
+"""Vertical field of view of cameras that the robot YAML mounts, whose own is not known [°]."""
+_log = logging.getLogger("ibrobot.web")
 _MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
 
 
@@ -37,7 +43,7 @@ def make_scene(description: Mapping[str, Any]) -> dict[str, Any]:
     """The shapes of a robot, as JSON.
 
     Args:
-        description: `mjcf`, `urdf` and `xml` (paths, or the text of a scene), `tip`, and `cameras`.
+        description: `mjcf`, `urdf` and `xml` (paths, or the text of a scene), `tip`, and `mounts` of sensors.
 
     Returns:
         `bodies` (parents first), `meshes` (base64 of float32 vertices and uint32 faces), `tip`, `cameras`, and
@@ -63,11 +69,65 @@ def make_scene(description: Mapping[str, Any]) -> dict[str, Any]:
             {"body": int(model.cam_bodyid[i]), "pos": model.cam_pos[i].tolist(), "quat": model.cam_quat[i].tolist(),
              "fovy": float(model.cam_fovy[i])}
             for i in range(model.ncam)
-        ],
+        ] + list(_mounted(model, description)),
         "extent": float(model.stat.extent),
         "centre": model.stat.center.tolist(),
         "problem": "",
     }  # fmt: skip
+
+
+def _mounted(model: Any, description: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+    """The cameras that the robot YAML mounts. They look along the x axis of their frame, MuJoCo's along -z."""
+    known = {str(each["frame"]): each for each in description.get("mounts") or ()}
+    looking: NDArray[np.float64] = np.empty(4)
+    mujoco.mju_mat2Quat(looking, np.array([0.0, 0.0, -1.0, -1.0, 0.0, 0.0, 0.0, 1.0, 0.0]))
+    root = _root_link(description.get("urdf"))
+    for each in known.values():
+        if not each["camera"]:
+            continue
+        pos, quat = np.zeros(3), looking.copy()
+        frame = each["frame"]
+        for _ in range(len(known) + 1):  # from the camera to the body that carries it
+            mount = known.get(frame)
+            if mount is None:
+                break
+            turned: NDArray[np.float64] = np.empty(4)
+            outer = _quaternion(mount)
+            mujoco.mju_rotVecQuat(pos, pos.copy(), outer)
+            pos += mount["xyz"]
+            mujoco.mju_mulQuat(turned, outer, quat)
+            quat, frame = turned, mount["parent"]
+        body = 0 if frame == root else mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, frame)
+        if body < 0:
+            _log.warning("the page does not show where camera %s is: the model has no body %r", each["name"], frame)
+            continue
+        yield {"body": body, "pos": pos.round(5).tolist(), "quat": quat.round(5).tolist(), "fovy": _FIELD_DEG}
+
+
+def _quaternion(mount: Mapping[str, Any]) -> NDArray[np.float64]:
+    """The rotation of a mount, wxyz."""
+    found: NDArray[np.float64] = np.empty(4)
+    if mount["quaternion"] is not None:
+        x, y, z, w = mount["quaternion"]
+        return np.array([w, x, y, z])
+    mujoco.mju_euler2Quat(found, np.array(mount["rpy"], float), "XYZ")
+    return found
+
+
+def _root_link(urdf: str | None) -> str | None:
+    """The link of a URDF that is no joint's child: the base frame."""
+    if urdf is None:
+        return None
+    try:
+        elements = read_xml(Path(urdf)).children
+    except ModelError:
+        return None
+    links = [each.attributes.get("name") for each in elements if each.tag == "link"]
+    children = {
+        inner.attributes.get("link")
+        for each in elements if each.tag == "joint" for inner in each.children if inner.tag == "child"
+    }  # fmt: skip
+    return next((link for link in links if link not in children), None)
 
 
 def _compiled(description: Mapping[str, Any]) -> Any:

@@ -32,8 +32,6 @@ SERVICES = {
 }
 """What a page offers only while its service is served."""
 EPISODE_STATUS = "/record_episode/status"
-WORLD = "/world/snapshot"
-"""Answers with the objects around the robot, of which the page shows those with simple shapes."""
 
 
 class LogLines(logging.Handler):
@@ -121,31 +119,7 @@ def status_json(session: Session, log: LogLines, pages: int) -> dict[str, Any]:
         "episode": _plain(session.bus.call(EPISODE_STATUS, None)) if session.bus.serves(EPISODE_STATUS) else None,
         "episodes": session.outcome.episodes, "successes": session.outcome.successes,
         "pages": pages, "log": log.lines(), "commander": session.commander, "panels": _panels(session),
-        "objects": _objects(session.bus.call(WORLD, None)) if session.bus.serves(WORLD) else [],
     }  # fmt: skip
-
-
-def _objects(world: Any) -> list[dict[str, Any]]:
-    """The objects of a world that are fixed in the base frame, as the page draws shapes."""
-    found = []
-    for name, thing in world.objects.items():
-        shape = _plain(attrs.asdict(thing.shape))
-        match type(thing.shape).__name__:
-            case "Box":
-                size = [length / 2 for length in shape["size"]]
-            case "Sphere":
-                size = [shape["radius"]] * 3
-            case "Cylinder" | "Capsule":
-                size = [shape["radius"], shape["height"] / 2, 0.0]
-            case _:
-                continue
-        if thing.link is None:
-            at, turn = thing.pose.position, thing.pose.orientation
-            found.append({
-                "name": name, "type": type(thing.shape).__name__.lower(), "size": size, "pos": [at.x, at.y, at.z],
-                "quat": [turn.w, turn.x, turn.y, turn.z],
-            })  # fmt: skip
-    return found
 
 
 def _panels(session: Session) -> list[dict[str, Any]]:

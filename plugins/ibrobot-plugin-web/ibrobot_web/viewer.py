@@ -27,6 +27,7 @@ from ibrobot_core.api import (
 from ibrobot_web.commands import Commands
 from ibrobot_web.desktop import has_desktop
 from ibrobot_web.link import FIRST_PICTURE, PLAN, SAMPLES, STATE, STATUS, FrameSender
+from ibrobot_web.objects import SceneObjects, mounts
 from ibrobot_web.options import WebOptions
 from ibrobot_web.pictures import to_payload
 from ibrobot_web.status import LogLines, numbers_of, plan_json, state_json, status_json
@@ -88,6 +89,7 @@ class WebViewer(Viewer):
         self._log = LogLines()
         self._ctx.log.parent.addHandler(self._log) if self._ctx.log.parent else None
         self._states = bus.subscribe("/joint_states", 1)
+        self._objects = SceneObjects(session)
         self._pictures: dict[str, Subscription] = {}
         self._samples: dict[str, Subscription] = {}
         self._due: dict[int, float] = {}
@@ -130,6 +132,7 @@ class WebViewer(Viewer):
                 self._ctx.log.parent.removeHandler(self._log)
             for subscription in (self._states, *self._pictures.values(), *self._samples.values()):
                 subscription.close()
+            self._objects.close()
             self._commands.close(_END_S)
         self._frames.close()
         child.channel.close()
@@ -152,7 +155,7 @@ class WebViewer(Viewer):
             "certificate": str(options.certificate) if options.certificate is not None else None,
             "key": str(options.key) if options.key is not None else None,
             "description": {
-                "tip": robot.description.tip,
+                "tip": robot.description.tip, "mounts": mounts(session.config.peripherals),
                 **{name: str(path) if path is not None else None for name, path in paths.items()},
             },
         }  # fmt: skip
@@ -243,7 +246,8 @@ class WebViewer(Viewer):
         session = self._session
         if self._is_due(STATUS, _STATUS_S, now_s):
             cameras = [{"channel": FIRST_PICTURE + i, "topic": topic} for i, topic in enumerate(self._pictures)]
-            self._send(STATUS, {**status_json(session, self._log, self.pages), "cameras": cameras})
+            status = status_json(session, self._log, self.pages)
+            self._send(STATUS, {**status, "cameras": cameras, "objects": self._objects.json()})
         if self._is_due(PLAN, _STATUS_S, now_s):
             self._send(PLAN, plan_json(session, session.clock.now_ns()))
         if self._wanted is None or not self._shows(SAMPLES):  # pages that show all want pictures and states

@@ -17,11 +17,13 @@ from hypothesis import strategies as st
 from ibrobot_ros2.jpeg import to_jpeg
 from ibrobot_testing import make_session
 from ibrobot_web.link import JPEG, PICTURE_HEAD, FrameSender, receive_frame
+from ibrobot_web.objects import SceneObjects
 from ibrobot_web.pictures import as_jpeg, to_payload
 from ibrobot_web.status import LogLines, numbers_of, plan_json, status_json
 
 from ibrobot_core.api import (
     Float64MultiArray,
+    HardwareDescriptor,
     Header,
     Image,
     Imu,
@@ -29,6 +31,7 @@ from ibrobot_core.api import (
     PanelDescriptor,
     Pose,
     Quaternion,
+    SceneObject,
     Session,
     String,
     Vector3,
@@ -162,6 +165,25 @@ def test_objects_around_the_robot_are_shown_where_they_are() -> None:
     session = make_session()
     objects = {"crate": thing(Box((0.2, 0.4, 0.6))), "floor": thing(Plane()), "held": thing(Box((1, 1, 1)), "gripper")}
     session.bus.serve("/world/snapshot", lambda request: SimpleNamespace(objects=objects))
-    (crate,) = status_json(session, LogLines(), 0)["objects"]
+    (crate,) = SceneObjects(session).json()
     shape = {"type": "box", "size": [0.1, 0.2, 0.3], "pos": [1, 2, 3], "quat": [1, 0, 0, 0]}
     assert crate == {"name": "crate", **shape}
+
+
+def test_objects_of_a_simulated_scene_are_where_the_simulation_has_them() -> None:
+    here = Pose(Vector3(1, 2, 3), Quaternion(0, 0, 0, 1))
+    things = (
+        SceneObject("table", "plane", (), here), SceneObject("bin", "box", (0.2, 0.4, 0.6), here),
+        SceneObject("cube", "box", (0.2, 0.2, 0.2), here, "/simulation/scene", 2),
+    )  # fmt: skip
+    session = make_session()
+    descriptor = HardwareDescriptor("sim", make=lambda *_: None, summary="", scene=lambda options, robot: things)
+    config = SimpleNamespace(simulated=True, simulation=SimpleNamespace(type="sim", options=None), robot=None)
+    registry = SimpleNamespace(find=lambda kind, name: descriptor)
+    objects: Any = SceneObjects(SimpleNamespace(bus=session.bus, config=config, registry=registry))  # type: ignore[arg-type]
+    assert [(each["name"], each["pos"]) for each in objects.json()] == [("bin", [1, 2, 3]), ("cube", [1, 2, 3])]
+    session.bus.publish("/simulation/scene", Float64MultiArray(np.array([9.0, 9.0, 0.5, 0.6, 0.7, 0.0, 1.0, 0.0, 0.0])))
+    bin_, cube = objects.json()
+    assert (bin_["pos"], bin_["size"]) == ([1, 2, 3], [0.1, 0.2, 0.3])
+    assert (cube["pos"], cube["quat"]) == ([0.5, 0.6, 0.7], [0.0, 1.0, 0.0, 0.0])
+    objects.close()

@@ -81,3 +81,30 @@ def test_a_robot_without_shapes_says_why(tmp_path: Path) -> None:
     broken = make_scene({"mjcf": str(tmp_path / "broken.xml"), "urdf": None, "tip": "tip"})
     assert broken["bodies"] == []
     assert "XML" in broken["problem"]
+
+
+def test_cameras_of_the_robot_yaml_are_where_their_mounts_say(tmp_path: Path) -> None:
+    (tmp_path / "arm.xml").write_text(seven_joints())
+    mount = {"camera": True, "rpy": [0.0, 0.0, 0.0], "quaternion": None, "xyz": [0.0, 0.0, 0.0]}
+    mounts = [
+        {**mount, "name": "ahead", "frame": "ahead_frame", "parent": "link2", "xyz": [0.1, 0.0, 0.2]},
+        {**mount, "name": "plate", "frame": "plate_frame", "parent": "link6", "camera": False, "xyz": [0.0, 0.0, 0.1],
+         "rpy": [0.0, 0.0, np.pi / 2]},
+        {**mount, "name": "down", "frame": "down_frame", "parent": "plate_frame", "xyz": [0.1, 0.0, 0.0],
+         "rpy": [0.0, np.pi / 2, 0.0]},
+        {**mount, "name": "lost", "frame": "lost_frame", "parent": "nowhere"},
+    ]  # fmt: skip
+    scene = make_scene({"mjcf": str(tmp_path / "arm.xml"), "urdf": None, "tip": "tip", "mounts": mounts})
+    _, ahead, down = scene["cameras"]
+    assert (ahead["body"], ahead["pos"]) == (3, [0.1, 0.0, 0.2])
+    assert down["body"] == 7
+    np.testing.assert_allclose(down["pos"], [0.0, 0.1, 0.1], atol=1e-6)
+    for camera, direction, up in ((ahead, [1, 0, 0], [0, 0, 1]), (down, [0, 0, -1], [0, 1, 0])):
+        w, x, y, z = camera["quat"]
+        turn = np.array([
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ])  # fmt: skip
+        np.testing.assert_allclose(turn @ [0, 0, -1], direction, atol=1e-4)
+        np.testing.assert_allclose(turn @ [0, 1, 0], up, atol=1e-4)

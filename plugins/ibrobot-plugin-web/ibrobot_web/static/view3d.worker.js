@@ -20,6 +20,7 @@ let measured = null, commanded = null, planned = null;
 let trail = [], path, future, grid, ball;
 let dirty = true, stamp = 0, drawn = 0, size = [1, 1], jogs = false, view = null;
 let cameras = [];
+const shapes = new Map(); // of objects, by type and size
 let goals = false, goal = null, kept = false, begun = 0;
 const orbit = { azimuth: -0.9, elevation: 0.45, distance: 1, target: [0.1, 0, 0.15] };
 const grip = { mode: null, at: [0, 0], through: [0, 0, 0], target: [0, 0, 0] };
@@ -126,8 +127,11 @@ function plan({ plan: message, positions, kept: keeps = false }) {
 }
 
 function objects({ objects: found }) {
-  extras = found.map(({ type, size: sizes, pos, quat }) => (
-    { shape: screen.mesh(primitive(type, sizes)), matrix: placed(pos, quat), color: OBJECT, lit: true }));
+  extras = found.map(({ type, size: sizes, pos, quat }) => {
+    const kind = `${type} ${sizes}`;
+    if (!shapes.has(kind)) shapes.set(kind, screen.mesh(primitive(type, sizes)));
+    return { shape: shapes.get(kind), matrix: placed(pos, quat), color: OBJECT, lit: true };
+  });
   dirty = true;
 }
 

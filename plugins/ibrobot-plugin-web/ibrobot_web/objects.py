@@ -1,0 +1,135 @@
+"""The objects around the robot, as pages draw them: those of planners, and those of a simulated scene."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import attrs
+
+from ibrobot_core.api import (
+    Float64MultiArray,
+    HardwareDescriptor,
+    IbrobotError,
+    Pose,
+    SceneObject,
+    Session,
+    Subscription,
+    Vector,
+)
+
+WORLD = "/world/snapshot"
+"""Answers with the objects around the robot, of which the page shows those with simple shapes."""
+_POSE_SIZE = 7
+_log = logging.getLogger("ibrobot.web")
+
+
+class SceneObjects:
+    """The objects of a run: the planners' world, if the run has one, and the simulated scene where it is now.
+
+    Args:
+        session: the run.
+    """
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._things = [each for each in _simulated(session) if each.shape != "plane"]
+        topics = {each.topic for each in self._things if each.topic}
+        self._topics: dict[str, Subscription] = {topic: session.bus.subscribe(topic, 1) for topic in topics}
+        self._newest: dict[str, Vector] = {}
+
+    def json(self) -> list[dict[str, Any]]:
+        """The objects that are fixed in the base frame, and those of the scene."""
+        bus = self._session.bus
+        known = of_world(bus.call(WORLD, None)) if bus.serves(WORLD) else []
+        names = {each["name"] for each in known}
+        for topic, subscription in self._topics.items():
+            for received in subscription.drain():
+                if isinstance(received.message, Float64MultiArray):
+                    self._newest[topic] = received.message.data
+        return known + [self._placed(thing) for thing in self._things if thing.name not in names]
+
+    def close(self) -> None:
+        """End the subscriptions."""
+        for subscription in self._topics.values():
+            subscription.close()
+        self._topics.clear()
+
+    def _placed(self, thing: SceneObject) -> dict[str, Any]:
+        vector = self._newest.get(thing.topic)
+        place = vector[thing.first : thing.first + _POSE_SIZE] if vector is not None else ()
+        pos, quat = _pose(thing.pose)
+        if len(place) == _POSE_SIZE:
+            pos, quat = [round(float(each), 4) for each in place[:3]], [round(float(each), 3) for each in place[3:]]
+        return {
+            "name": thing.name,
+            "type": thing.shape,
+            "size": _half(thing.shape, thing.size),
+            "pos": pos,
+            "quat": quat,
+        }
+
+
+def of_world(world: Any) -> list[dict[str, Any]]:
+    """The objects of a planners' world that are fixed in the base frame."""
+    found = []
+    for name, thing in world.objects.items():
+        shape = attrs.asdict(thing.shape)
+        kind = type(thing.shape).__name__.lower()
+        match kind:
+            case "box":
+                size = _half(kind, shape["size"])
+            case "sphere":
+                size = _half(kind, (shape["radius"],))
+            case "cylinder" | "capsule":
+                size = _half(kind, (shape["radius"], shape["height"]))
+            case _:
+                continue
+        if thing.link is None:
+            pos, quat = _pose(thing.pose)
+            found.append({"name": name, "type": kind, "size": size, "pos": pos, "quat": quat})
+    return found
+
+
+def _half(kind: str, size: Sequence[float]) -> list[float]:
+    """The size as pages draw it: half lengths, and the radius first."""
+    match kind:
+        case "box":
+            return [round(float(length) / 2, 4) for length in size]
+        case "sphere":
+            return [round(float(size[0]), 4)] * 3
+        case _:
+            return [round(float(size[0]), 4), round(float(size[1]) / 2, 4), 0.0]
+
+
+def _pose(pose: Pose) -> tuple[list[float], list[float]]:
+    at, turn = pose.position, pose.orientation
+    return [at.x, at.y, at.z], [turn.w, turn.x, turn.y, turn.z]
+
+
+def _simulated(session: Session) -> Sequence[SceneObject]:
+    """The objects of the simulated scene; none on hardware."""
+    config = session.config
+    if not config.simulated or config.simulation is None:
+        return ()
+    descriptor = session.registry.find("hardware", config.simulation.type)
+    assert isinstance(descriptor, HardwareDescriptor)
+    try:
+        return descriptor.scene(config.simulation.options, config.robot)
+    except IbrobotError as error:
+        _log.warning("the page shows no objects of the scene: %s", error)
+        return ()
+
+
+def mounts(peripherals: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The mounts of sensors as JSON, for `make_scene`: parents may be frames of other mounts."""
+    found = []
+    for name, each in peripherals.items():
+        if (mount := each.transform) is not None:
+            found.append({
+                "name": name, "camera": each.kind == "camera", "frame": mount.frame or f"{name}_frame",
+                "parent": mount.parent, "xyz": list(mount.xyz), "rpy": list(mount.rpy or (0.0, 0.0, 0.0)),
+                "quaternion": list(mount.quaternion) if mount.quaternion is not None else None,
+            })  # fmt: skip
+    return found
