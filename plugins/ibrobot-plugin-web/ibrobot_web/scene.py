@@ -115,7 +115,7 @@ def _quaternion(mount: Mapping[str, Any]) -> NDArray[np.float64]:
 
 
 def _root_link(urdf: str | None) -> str | None:
-    """The link of a URDF that is no joint's child: the base frame."""
+    """The first link of a URDF that no joint carries: the base frame."""
     if urdf is None:
         return None
     try:

@@ -177,7 +177,8 @@ def test_objects_of_a_simulated_scene_are_where_the_simulation_has_them() -> Non
         SceneObject("cube", "box", (0.2, 0.2, 0.2), here, "/simulation/scene", 2),
     )  # fmt: skip
     session = make_session()
-    descriptor = HardwareDescriptor("sim", make=lambda *_: None, summary="", scene=lambda options, robot: things)
+    make: Any = None
+    descriptor = HardwareDescriptor("sim", make=make, summary="", scene=lambda options, robot: things)
     config = SimpleNamespace(simulated=True, simulation=SimpleNamespace(type="sim", options=None), robot=None)
     registry = SimpleNamespace(find=lambda kind, name: descriptor)
     objects: Any = SceneObjects(SimpleNamespace(bus=session.bus, config=config, registry=registry))  # type: ignore[arg-type]

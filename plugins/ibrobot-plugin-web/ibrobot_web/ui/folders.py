@@ -7,6 +7,9 @@ from pathlib import Path
 
 from ibrobot_core.api import IbrobotError
 
+_LONGEST, _LONGEST_NAME = 4000, 255
+"""Longest path [characters], and longest name in it [bytes]."""
+
 
 class Folders:
     """The opened folders.
@@ -31,6 +34,8 @@ class Folders:
         """
         if "\0" in text:
             raise IbrobotError("a path contains a zero character")
+        if len(text) > _LONGEST or any(len(part.encode(errors="replace")) > _LONGEST_NAME for part in text.split("/")):
+            raise IbrobotError(f"a path is too long: {text[:60]}…")
         path = (self.first / text).resolve()
         if not any(path.is_relative_to(folder) for folder in self.paths):
             opened = ", ".join(map(str, self.paths))

@@ -139,12 +139,16 @@ def paths_of(ui: Ui, facts: Mapping[str, Any]) -> list[str]:
     """The paths that a request names, confined to the opened folders.
 
     Raises:
-        IbrobotError: if there is none, or one is outside.
+        IbrobotError: if there is none, one is outside, or one does not exist.
     """
     given = facts.get("paths")
     if not isinstance(given, list) or not given or not all(isinstance(each, str) for each in given):
         raise IbrobotError("paths must be a list of paths")
-    return [str(ui.folders.find(each)) for each in given]
+    paths = [ui.folders.find(each) for each in given]
+    for path in paths:
+        if not path.exists():
+            raise IbrobotError(f"{ui.folders.name(path)}: there is no such file or folder")
+    return [str(path) for path in paths]
 
 
 def run_command(ui: Ui, *arguments: str) -> str:
