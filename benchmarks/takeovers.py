@@ -63,10 +63,13 @@ JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_ro
 RADIAN = 4096 / (2 * math.pi)
 """Ticks."""
 SLACK = 1.001
-PERIOD_NS = 10_000_000
-"""Of control."""
 _SETTLED_NS = 500_000_000
 """Time before the first compared frame of a live run: the recording begins before it."""
+_KEYS = "wsedrftgyhoc"
+"""Pairs of keys that jog a joint up and down."""
+_AWAY_RAD, _AWAY_TICKS, _ACTS = 0.2, 100, 25
+"""A joint that is away from its setpoint for that long is blocked, and the person acts on it again and again [ticks].
+After twice as long it would be a fault."""
 _FIRST = 5
 """Ticks before the first compared frame: the recording begins during the first one."""
 WANDER = """
@@ -127,6 +130,9 @@ class Person(ABC):
 
     def tick(self, rng: random.Random) -> None:
         """Move the robot, while the deadman is pressed."""
+
+    def turn_back(self, joint: int, ahead: bool) -> None:
+        """Move a blocked joint back, whose setpoint is `ahead` of it, or behind it."""
 
     def waits(self) -> bool:
         """Whether the device is not ready after a takeover."""
@@ -219,8 +225,13 @@ class WithKeys(Person):
     def tick(self, rng: random.Random) -> None:
         if self._key:
             if rng.random() < 0.05:
-                self._key = rng.choice("wsedrftgyhoc")
+                self._key = rng.choice(_KEYS)
             self.type(self._key)
+
+    @override
+    def turn_back(self, joint: int, ahead: bool) -> None:
+        if self._key:
+            self._key = _KEYS[2 * joint + ahead]
 
 
 class WithLeader(WithKeys):
@@ -264,6 +275,10 @@ class WithLeader(WithKeys):
                     servo.turn(min(3300.0, max(800.0, servo.encoder + speed * RADIAN * 0.01)))
 
     @override
+    def turn_back(self, joint: int, ahead: bool) -> None:
+        self._speeds = -self._speeds
+
+    @override
     def waits(self) -> bool:
         with self._emulator.lock:
             return any(servo.torque for servo in self._emulator.servos.values())
@@ -295,6 +310,10 @@ class WithSensor(WithKeys):
             if rng.random() < 0.05:
                 self._tilt = {"pitch": rng.uniform(-0.6, 0.6), "yaw": rng.uniform(-0.6, 0.6)}
         self._sensor.turn(**self._tilt)
+
+    @override
+    def turn_back(self, joint: int, ahead: bool) -> None:
+        self._tilt = {axis: -tilt for axis, tilt in self._tilt.items()}
 
     @override
     def close(self) -> None:
@@ -337,6 +356,10 @@ class WithHand(Person):
         self._at = np.clip(self._at + 0.01 * self._velocity, (-0.2, 0.8, -0.2), (0.2, 1.2, 0.2))
         self.send(HandPose((0.0, 0.0, 0.0, 1.0), tuple(self._at.tolist()), self._clutch))
 
+    @override
+    def turn_back(self, joint: int, ahead: bool) -> None:
+        self._velocity = -self._velocity
+
     def send(self, pose: HandPose) -> None:
         """Send a pose, 10 ms after the last one by the page's clock."""
         self._sent += 1
@@ -372,6 +395,8 @@ class Trial:
     seen: list[Frame] = attrs.field(factory=list)
     who: str = POLICY
     """Who should command from the next tick on."""
+    away: int = 0
+    """For how many ticks a joint has been away from its setpoint."""
 
     def __attrs_post_init__(self) -> None:
         session = self.runtime.session
@@ -402,7 +427,18 @@ class Trial:
         if len(self.commands) >= _FIRST and now_ns >= self._next_ns:
             self.seen.append(self._sampler.sample(now_ns))
             self._next_ns = now_ns + self._step_ns
+        self.look()
         return word
+
+    def look(self) -> None:
+        """Let the person see whether something blocks the robot."""
+        state = self.runtime.session.state
+        assert state is not None
+        lead = state.command - state.position
+        joint = int(np.abs(lead).argmax())
+        self.away = self.away + 1 if abs(lead[joint]) > _AWAY_RAD else 0
+        if self.away >= _AWAY_TICKS and self.away % _ACTS == 0:
+            self.person.turn_back(joint, bool(lead[joint] > 0))
 
     def wait(self, least_s: float, most_s: float) -> None:
         """Let a random time pass."""
@@ -452,6 +488,10 @@ class Trial:
         """How many states have another commander than they should."""
         return sum(a != b for a, b in zip(self.labels, self.expected, strict=True))
 
+    def lost_states(self) -> int:
+        """How many states of control did not arrive."""
+        return 0
+
 
 @attrs.define(slots=False)
 class LiveTrial(Trial):
@@ -477,6 +517,7 @@ class LiveTrial(Trial):
         if session.faults:
             raise SystemExit(f"fault: {'; '.join(session.faults)}")
         self._collect()
+        self.look()
         if then is not None:
             self.expected.append(then)
         now_ns = session.bus.snapshot_ns()
@@ -507,6 +548,11 @@ class LiveTrial(Trial):
         """How many changes of the commander are not those that the person caused."""
         self.labels = [word for word, _ in itertools.groupby(word for _, word in self.said)]
         return sum(a != b for a, b in itertools.zip_longest(self.labels, [POLICY, *self.expected]))
+
+    @override
+    def lost_states(self) -> int:
+        _, published = self.runtime.session.bus.topics()["/joint_states"]
+        return int(self.runtime.summary()["loop"]["ticks"]) - published
 
 
 def measure(name: str, takeovers: int, seed: int, *, live: bool = False) -> dict[str, Any]:
@@ -551,7 +597,7 @@ def figures(trial: Trial) -> dict[str, Any]:
         "faults": summary["faults"],
         "drops": sum(summary["drops"].values()),
         "wrong_labels": trial.wrong_labels(),
-        "lost_states": int((np.diff(trial.stamps) > 1.5 * PERIOD_NS).sum()) - summary["loop"].get("missed", 0),
+        "lost_states": trial.lost_states(),
     }
 
 

@@ -1,4 +1,4 @@
-"""Takeovers and handbacks with a gamepad, a leader arm and the keyboard; `benchmarks/takeovers.py` makes a hundred."""
+"""A takeover and a handback with each device that can intervene; `benchmarks/takeovers.py` makes a hundred."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ibrobot_testing.site import made_up_site
 pytestmark = pytest.mark.integration
 
 
-@pytest.mark.parametrize("device", ["gamepad", "leader", "keyboard"])
+@pytest.mark.parametrize("device", list(takeovers.PERSONS))
 def test_a_takeover_is_smooth_labelled_and_recorded(
     device: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
