@@ -134,7 +134,10 @@ def test_labels_say_who_commanded_and_how_episodes_end(bags: Path, tmp_path: Pat
     wanted = [row["intervention"] for number in (1, 2, 3) for row in independently(bags / f"episode_{number:06d}")]
     rows = np.arange(len(dataset))
     columns = {key: dataset.hf_dataset[key] for key in labels}
-    found = {key: np.array([np.asarray(each).item() for each in column]) for key, column in columns.items()}
+    found = {
+        key: np.array([np.asarray(each).item() for each in column], dtype=np.dtype(str(labels[key]["dtype"])))
+        for key, column in columns.items()
+    }
     np.testing.assert_array_equal(found["intervention"], np.concatenate(wanted))
     np.testing.assert_array_equal(found["next.reward"], np.isin(rows, succeeded).astype(np.float32))
     np.testing.assert_array_equal(found["next.done"], np.isin(rows, ends))

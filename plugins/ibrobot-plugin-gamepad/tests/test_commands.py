@@ -108,7 +108,7 @@ def test_map_learns_controls_and_prints_yaml(hidapi: FakeHidapi, robot: Path, mo
     hidapi.plug(Replaying(*DUALSENSE, reports=deque(reports)))
     with made_up_site(robot.parent / "site", Path(__file__).parent, monkeypatch) as site:
         site.add("arms", "arms.py")
-        output = run("map", str(robot), "--wait", "0.1")
+        output = run("map", str(robot), "--wait", "0.05")
     assert "Move what moves pan towards its upper limit: -left_x" in output
     assert "Press the button of the emergency stop (estop): default" in output
     assert yaml.safe_load(output[output.index("teleoperation:") :]) == {
@@ -126,7 +126,7 @@ def test_map_learns_a_spacemouse(hidapi: FakeHidapi, robot: Path, monkeypatch: p
     hidapi.plug(Replaying(*SPACEMOUSE, usage=0x08, reports=deque(reports)))
     with made_up_site(robot.parent / "site", Path(__file__).parent, monkeypatch) as site:
         site.add("arms", "arms.py")
-        output = run("map", str(robot), "--wait", "0.05")
+        output = run("map", str(robot), "--wait", "0.02")
     section = yaml.safe_load(output[output.index("teleoperation:") :])["teleoperation"]["spacemouse"]
     assert section == {"type": "spacemouse", "device": "256f:c635", "joints": {"pan": "-yaw", "lift": "x"}}
 

@@ -64,7 +64,8 @@ def start() -> Iterator[Start]:
     def start(robot: str, mode: str) -> Run:
         registry = installed_plugins()
         path = ROOT / "configs" / robot
-        config = load_config(path, sim=True, mode=mode, overrides=documented(mode), registry=registry)
+        overrides = [*documented(mode), "peripherals=[]", "contract.observations=[]"]  # no cameras to render
+        config = load_config(path, sim=True, mode=mode, overrides=overrides, registry=registry)
         runtime = Runtime(Session(config, registry, LaunchRequest(lockstep=True, seed=3)))
         runtime.start()
         address = re.search(r"https://\S+", runtime.session.command_source.help())
