@@ -19,7 +19,7 @@ import attrs
 from aiohttp import WSMsgType, web
 
 from ibrobot_core.api import Bus, Clock, RobotStatus, TeleopError, error_text
-from ibrobot_webxr.certificate import server_names, tls_context
+from ibrobot_webxr.certificate import CERTIFICATE, own_folder, server_names, tls_context
 from ibrobot_webxr.exchange import Delays, Exchange
 from ibrobot_webxr.guard import Guard, Refused, Request
 from ibrobot_webxr.images import CameraImages
@@ -112,6 +112,7 @@ class PageServer:
             for path in files("ibrobot_webxr").joinpath("page").iterdir()
             if path.name.rpartition(".")[2] in _KINDS
         }
+        self._files["certificate.pem"] = _trusted(options, folder)
         self._loop = asyncio.new_event_loop()
         self._ending = asyncio.Event()
         self._started = threading.Event()
@@ -376,6 +377,13 @@ class PageServer:
                     page.waits.add(name)
                     with contextlib.suppress(OSError, RuntimeError):
                         await page.socket.send_bytes(bytes([min(index, 255)]) + data)
+
+
+def _trusted(options: WebxrOptions, folder: Any) -> tuple[bytes, str]:
+    """What a phone installs to trust the page, and its type; a text if that is not here."""
+    if options.certificate is not None:
+        return b"the certificate of this page is from an authority: install that one, ca.pem\n", "text/plain"
+    return ((own_folder() if folder is None else folder) / CERTIFICATE).read_bytes(), "application/x-x509-ca-cert"
 
 
 def _quiet(log: logging.Logger) -> logging.Logger:

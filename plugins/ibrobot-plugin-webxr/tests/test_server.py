@@ -16,6 +16,7 @@ import attrs
 import numpy as np
 import pytest
 from ibrobot_testing import host_context
+from ibrobot_webxr.certificate import own_certificate, own_folder
 from ibrobot_webxr.options import WebxrOptions
 from ibrobot_webxr.server import PageServer
 from ibrobot_webxr.teleop import WebxrTeleop
@@ -89,6 +90,20 @@ def test_files_of_the_page_name_no_other_host(page: PageServer, browser: Browser
     assert status == 200
     assert "http://" not in text
     assert "https://" not in text
+
+
+def test_the_page_offers_its_own_certificate_for_phones_to_install(
+    ctx: Context, page: PageServer, browser: Browser, tmp_path: Path
+):
+    assert browser.get("/certificate.pem")[0] == 401
+    status, text, headers = browser.log_in().get("/certificate.pem")
+    assert (status, headers["Content-Type"]) == (200, "application/x-x509-ca-cert")
+    assert text == (own_folder() / "certificate.pem").read_text()
+    certificate, key = own_certificate(tmp_path, ["localhost", "127.0.0.1"])
+    given = attrs.evolve(ANY_PORT, certificate=certificate, key=key)
+    other = PageServer(given, ctx.clock, None, logging.getLogger("ibrobot.test"))
+    with contextlib.closing(other), Browser(other.address) as second:
+        assert "ca.pem" in second.log_in().get("/certificate.pem")[1]
 
 
 def test_requests_without_the_token_are_refused(page: PageServer, browser: Browser):
@@ -230,7 +245,10 @@ def test_a_second_page_only_watches(ctx: Context, teleop: WebxrTeleop, page: Pag
         assert teleop.read(measured(ctx)).positions is not None
 
 
-def test_a_silent_page_loses_control(ctx: Context, teleop: WebxrTeleop, browser: Browser):
+def test_a_silent_page_loses_control(
+    ctx: Context, teleop: WebxrTeleop, browser: Browser, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("ibrobot_webxr.server._SILENT_S", 0.3)
     browser.log_in().connect()
     engage(browser, teleop, ctx)
     assert browser.state(control="free")

@@ -6,10 +6,12 @@ import { Headset, supportedMode } from "/headset.js";
 import { Phone } from "/phone.js";
 
 const IDLE_MS = 200;
+const REFUSED_MS = 3000; // a socket that does not open for that long needs a remedy
 const $ = (id) => document.getElementById(id);
 const figures = [];
 let state = null;
 let failure = "";
+let refusedSince = performance.now(); // the socket has never been open since then; null once it has
 
 const controls = new Controls(document);
 const connection = new Connection({ onState, onImage, onLink });
@@ -46,6 +48,8 @@ function reason({ control, robot, error }, arms) {
 
 function onLink({ open, silent, rate, roundTrip }) {
   $("link").textContent = !open ? "not connected" : silent ? "the network is slow" : roundTrip === undefined ? "connected" : `${rate} Hz, ${roundTrip.toFixed(0)} ms`;
+  if (open) refusedSince = null;
+  $("trust").hidden = refusedSince === null || performance.now() - refusedSince < REFUSED_MS;
   if (!open || silent) controls.release();
 }
 
