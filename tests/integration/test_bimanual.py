@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import queue
 import time
@@ -10,10 +11,14 @@ from pathlib import Path
 
 import attrs
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
+from ibrobot_data.episode import DATASET, Job, convert_episode
+from ibrobot_data.request import ConversionRequest
 from ibrobot_feetech import bus
 from ibrobot_feetech.calibration import save_calibration
 from ibrobot_feetech.emulator import Emulator
+from ibrobot_lerobot.options import LeRobotOptions
 from noting import Noting
 
 from ibrobot_core.calibration import Calibration, JointCalibration
@@ -183,3 +188,35 @@ def test_datasets_have_the_names_of_lerobots_bimanual_robot(station: Station):
     assert cameras == [f"observation.images.{name}" for name in ("top", "left_wrist", "right_wrist")]
     snapshot = calibrations(station.runtime.session.config)
     assert [joint for arm in snapshot.values() for joint in arm] == [name.removesuffix(".pos") for name in names]
+
+
+def test_a_simulated_recording_becomes_a_dataset_of_two_arms(tmp_path: Path):
+    overrides = [f"recording={{type: mcap, root: {tmp_path / 'episodes'}}}", "recording.topics=contract"]
+    config = load_config(CONFIG, sim=True, overrides=overrides)
+    typed = queue.SimpleQueue[str]()
+    runtime = Runtime(Session(config, installed_plugins(), LaunchRequest(lockstep=True, keys=lambda: typed)))
+    runtime.start()
+    try:
+        for _ in range(40):
+            typed.put("w")
+            runtime.step()
+    finally:
+        runtime.stop()
+    runtime.raise_failure()
+    (episode,) = (tmp_path / "episodes" / "default" / "episodes").iterdir()
+    request = ConversionRequest(tmp_path / "all", LeRobotOptions(videos=False), "lerobot")
+    report = convert_episode(Job(request, episode, "run", tmp_path / "unit"), lambda frames: None)
+    assert report.frames == pytest.approx(12, abs=2)
+    dataset = tmp_path / "unit" / DATASET
+    info = json.loads((dataset / "meta" / "info.json").read_text())
+    names = [f"{side}_{joint}.pos" for side in SIDES for joint in JOINTS]
+    features = info["features"]
+    assert info["robot_type"] == "bi_so_follower"
+    for key in ("observation.state", "action"):
+        assert (features[key]["shape"], features[key]["names"]) == ([12], names)
+    for camera in ("top", "left_wrist", "right_wrist"):
+        assert features[f"observation.images.{camera}"]["shape"] == [240, 320, 3]
+    (rows,) = (dataset / "data").rglob("*.parquet")
+    moved = np.ptp(np.array(pq.read_table(rows)["action"].to_pylist()), axis=0)
+    assert moved[0] > 0.1, "the left pan"
+    assert (moved[1:] < 0.01).all()
