@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import json
 import re
-from typing import Any
 
 import attrs
 import yaml
-from yaml.nodes import MappingNode, Node, ScalarNode
+from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
 from ibrobot_core.api import IbrobotError
 
@@ -110,8 +109,8 @@ def _executors(root: Node | None, modes: Node | None) -> list[str]:
     types = {name: _scalar(_at(each, "type")) for name, each in _items(_at(root, "executors"))}
     named = sorted(_items(modes), key=lambda item: item[0] != default)
     for _, mode in named:
-        node: Any = _at(mode, "executors")
-        chosen = [str(each.value) for each in getattr(node, "value", [])]
+        node = _at(mode, "executors")
+        chosen = [str(each.value) for each in node.value] if isinstance(node, SequenceNode) else []
         if chosen and all(types.get(name) == "position" for name in chosen):
             return chosen
     return [name for name, type_ in types.items() if type_ == "position"]
