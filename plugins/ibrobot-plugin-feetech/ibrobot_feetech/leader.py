@@ -109,7 +109,8 @@ class LeaderTeleop(Teleop):
         if self._options.deadman != "none" and self._ctx.keys is None:
             raise TeleopError(
                 f"{self._ctx.name}: deadman: {self._options.deadman} needs a terminal: start ibrobot in one, without "
-                "redirecting its input, or set deadman: none, so that the robot follows once the leader arm is moved"
+                "--headless and without redirecting its input, or set deadman: none, so that the robot follows once "
+                "the leader arm is moved"
             )
         bus = FeetechBus(self._options.port, baud_rate=self._options.baud_rate, joints=self._arm.names)
         try:

@@ -57,7 +57,8 @@ class ImuTeleop(Teleop):
         options, name = self._options, self._ctx.name
         if options.deadman == "key" and self._ctx.keys is None:
             raise TeleopError(
-                f"{name}: deadman: key needs a terminal: start ibrobot in one, without redirecting its input, or wire "
+                f"{name}: deadman: key needs a terminal: start ibrobot in one, without --headless and without "
+                "redirecting its input, or wire "
                 "a button to the port and set deadman: cts"
             )
         self._arm.load_model("another type of device")

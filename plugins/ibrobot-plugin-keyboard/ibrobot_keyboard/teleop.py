@@ -47,8 +47,8 @@ class KeyboardTeleop(Teleop):
     def connect(self) -> None:
         if self._ctx.keys is None:
             raise TeleopError(
-                f"{self._ctx.name}: the keyboard needs a terminal: start ibrobot in one, its input not redirected, "
-                "or choose another teleop"
+                f"{self._ctx.name}: the keyboard needs a terminal: start ibrobot in one, without --headless "
+                "and without redirecting its input, or choose another teleop"
             )
         if self._options.cartesian:
             self._arm.load_model("cartesian: false", self._ctx.bus)
