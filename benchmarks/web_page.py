@@ -213,7 +213,8 @@ HELD = """ibrobot.deadman.hold(() => (
   {joints: {shoulder_pan: Math.sin(performance.now() / 1000) > 0 ? 0.5 : -0.5}}))"""
 """Holds the page's own deadman, and turns the joint to and fro."""
 _PAUSE_S = 0.12
-"""A pause in motion that is longer than this is a release: the deadman's messages come every 0.04 s."""
+"""A joint that stands still for longer than this was released: the deadman's messages come every 0.04 s. The page may
+skip states, so that time counts between two states without motion."""
 
 
 def deadman(minutes: float) -> bool:
@@ -232,18 +233,15 @@ def deadman(minutes: float) -> bool:
         tab.evaluate(
             """() => {
               ibrobot.pauses = []; ibrobot.longest = 0; ibrobot.count = 0;
-              let command = null, moved = null;
+              let before = null, still = 0;
               ibrobot.stream.addEventListener("state", ({detail}) => {
                 ibrobot.count += 1;
-                if (command !== null && Math.abs(detail.command[0] - command) > 1e-4) {
-                  if (moved !== null) {
-                    const pause = (detail.stamp - moved) / 1e9;
-                    ibrobot.longest = Math.max(ibrobot.longest, pause);
-                    if (pause > PAUSE) ibrobot.pauses.push(pause);
-                  }
-                  moved = detail.stamp;
-                }
-                command = detail.command[0];
+                const moves = before && Math.abs(detail.command[0] - before.command[0]) > 1e-4;
+                still = before && !moves ? still + (detail.stamp - before.stamp) / 1e9 : 0;
+                ibrobot.longest = Math.max(ibrobot.longest, still);
+                if (still > PAUSE && !ibrobot.paused) ibrobot.pauses.push(still);
+                ibrobot.paused = still > PAUSE;
+                before = detail;
               });
             }""".replace("PAUSE", str(_PAUSE_S))
         )

@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ibrobot_core.api import EpisodeEnd, EpisodeStart, Header, Image, JointState, RealClock, installed_plugins
+from ibrobot_core.api import (
+    EpisodeEnd,
+    EpisodeStart,
+    Float64MultiArray,
+    Header,
+    Image,
+    JointState,
+    RealClock,
+    installed_plugins,
+)
 
 START_NS = 1_700_000_000_000_000_000
 STEP_NS = 20_000_000
@@ -18,14 +27,18 @@ JOINTS = "/joint_states"
 
 def make_episode(
     path: Path, seconds: float = 1.0, *, joints: Sequence[str] = ("pan", "tilt"), cameras: Sequence[str] = ("top",),
-    outcome: str = "success", **metadata: Any,
+    outcome: str = "success", signals: Mapping[str, Sequence[float]] | None = None, **metadata: Any,
 ) -> Path:  # fmt: skip
-    """Record an episode at 50 Hz. Joint i moves by i + 1 rad/s; the pixels of pictures are the number of the tick."""
+    """Record an episode at 50 Hz. Joint i moves by i + 1 rad/s; the pixels of pictures are the number of the tick.
+
+    `signals`: topic -> vector that it has all the time.
+    """
     from ibrobot_testing.contexts import host_context
 
     descriptor = installed_plugins().find("recorder", "mcap")
     recorder = descriptor.make(descriptor.options(), host_context(clock=RealClock()))
     topics = {JOINTS: JointState.ros_type, **{f"/camera/{name}/image_raw": Image.ros_type for name in cameras}}
+    topics |= dict.fromkeys(signals or {}, Float64MultiArray.ros_type)
     texts = {key: value if isinstance(value, str) else json.dumps(value) for key, value in metadata.items()}
     path.parent.mkdir(parents=True, exist_ok=True)
     recorder.begin(EpisodeStart(path, START_NS, topics, texts))
@@ -37,6 +50,8 @@ def make_episode(
         for name in cameras:
             picture = Image(Header(stamp_ns), 16, 16, "rgb8", 48, np.full(768, tick, np.uint8))
             recorder.write(f"/camera/{name}/image_raw", picture, stamp_ns)
+        for topic, vector in (signals or {}).items():
+            recorder.write(topic, Float64MultiArray(np.array(vector)), stamp_ns)
     recorder.end(EpisodeEnd(START_NS + round(seconds * 1e9), outcome, {}))
     recorder.close()
     return path

@@ -59,16 +59,18 @@ class SceneObjects:
     def _placed(self, thing: SceneObject) -> dict[str, Any]:
         vector = self._newest.get(thing.topic)
         place = vector[thing.first : thing.first + _POSE_SIZE] if vector is not None else ()
-        pos, quat = _pose(thing.pose)
+        found = place_of(thing)
         if len(place) == _POSE_SIZE:
-            pos, quat = [round(float(each), 4) for each in place[:3]], [round(float(each), 3) for each in place[3:]]
-        return {
-            "name": thing.name,
-            "type": thing.shape,
-            "size": _half(thing.shape, thing.size),
-            "pos": pos,
-            "quat": quat,
-        }
+            found["pos"] = [round(float(each), 4) for each in place[:3]]
+            found["quat"] = [round(float(each), 3) for each in place[3:]]
+        return found
+
+
+def place_of(thing: SceneObject) -> dict[str, Any]:
+    """An object where it is at the beginning."""
+    pos, quat = _pose(thing.pose)
+    size = _half(thing.shape, thing.size)
+    return {"name": thing.name, "type": thing.shape, "size": size, "pos": pos, "quat": quat}
 
 
 def of_world(world: Any) -> list[dict[str, Any]]:

@@ -22,14 +22,17 @@ from ibrobot_core.api import (
     EpisodeReader,
     EpisodeSummary,
     Float64MultiArray,
+    HardwareDescriptor,
     IbrobotError,
     Image,
     JointState,
     Message,
     Recorded,
+    from_document,
     installed_plugins,
     resolve_path,
 )
+from ibrobot_web.objects import place_of
 from ibrobot_web.pictures import Picture, to_picture
 from ibrobot_web.status import numbers_of
 
@@ -173,6 +176,51 @@ class Playback:
         except (KeyError, TypeError, ValueError, AttributeError):
             raise IbrobotError("the episode does not contain the robot's model") from None
         return {"tip": tip, **{kind: str(_file(text, find)) for kind, text in texts.items()}}
+
+    def objects(self, find: Callable[[str], Path]) -> list[dict[str, Any]]:
+        """The objects of a simulated scene, as pages draw them, with `times` [s] and `poses` of those that move.
+
+        Empty if no topic with their poses was recorded. Arguments as of `description`.
+        """
+        try:
+            self.description(find)
+            document = json.loads(self.summary.metadata["config"])
+            config = from_document(document, source=self._path, sim=True)
+            simulation = config.simulation
+            descriptor = installed_plugins().find("hardware", simulation.type) if simulation is not None else None
+            if not isinstance(descriptor, HardwareDescriptor) or simulation is None:
+                return []
+            things = [each for each in descriptor.scene(simulation.options, config.robot) if each.shape != "plane"]
+        except (IbrobotError, KeyError, ValueError):  # the episode says too little, or its plugins are missing
+            return []
+        moving = {each.topic for each in things if each.topic} & {
+            name for name, known in self.summary.topics.items() if known.count
+        }  # fmt: skip
+        if not moving:
+            return []
+        tracks = {topic: self._track(topic) for topic in moving}
+        found = []
+        for thing in things:
+            placed = {**place_of(thing), "times": [], "poses": []}
+            if thing.topic in moving:
+                times, vectors = tracks[thing.topic]
+                placed["times"] = times
+                placed["poses"] = [row[thing.first : thing.first + 7] for row in vectors]
+            found.append(placed)
+        return found
+
+    def _track(self, topic: str) -> tuple[list[float], list[list[float]]]:
+        """The vectors of a topic over time, thinned."""
+        times: list[float] = []
+        rows: list[list[float]] = []
+        with self._plain.lock:
+            for item in self._plain.reader.messages({topic}):
+                message: Any = item.message
+                at_s = self._seconds(item)
+                if isinstance(message, Float64MultiArray) and (not times or at_s >= times[-1] + 0.9 / STATES_HZ):
+                    times.append(at_s)
+                    rows.append(np.round(message.data, 4).tolist())
+        return times, rows
 
     def _topic(self, topic: str) -> Any:
         if topic not in self.summary.topics:

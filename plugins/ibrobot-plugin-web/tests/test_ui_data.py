@@ -83,6 +83,7 @@ def test_a_shipped_robot_is_copied_and_an_own_one_is_changed(ui: Ui) -> None:
     assert (seen["target"], seen["new"]) == ("so101_blind_trained.yaml", True)
     assert seen["problems"] == [] or ("hardware", "mujoco") not in installed_plugins().entries
     assert sum(line.startswith("+") for line in seen["diff"]) == 3, "a model, a mode, and the diff's head"
+    assert not list(ui.folders.first.glob("*.yaml")), "looking changes nothing"
     done = training.apply(ui, {**asked, "digest": seen["digest"]})
     assert CONFIG.read_bytes() == shipped
     own = {"robot": done["robot"], "checkpoint": checkpoint}
@@ -90,6 +91,8 @@ def test_a_shipped_robot_is_copied_and_an_own_one_is_changed(ui: Ui) -> None:
     assert (again["target"], again["new"], again["diff"]) == ("so101_blind_trained.yaml", False, [])
     with pytest.raises(IbrobotError, match="exists already"):
         training.apply(ui, {**asked, "digest": seen["digest"]})
+    (ui.folders.first / "wrong.yaml").write_text(shipped.decode().replace("upper:", "uper:", 1))
+    assert any("uper" in problem for problem in training.preview(ui, {**own, "robot": "wrong.yaml"})["problems"])
     (ui.folders.first / done["robot"]).write_text(shipped.decode() + "# mine\n")
     with pytest.raises(IbrobotError, match="has changed since"):
         training.apply(ui, {**own, "digest": again["digest"]})

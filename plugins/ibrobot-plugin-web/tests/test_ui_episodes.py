@@ -10,13 +10,14 @@ from typing import Any
 import attrs
 import numpy as np
 import pytest
+import yaml
 from click.testing import CliRunner
 from ibrobot_web.playback import Playback
 from ibrobot_web.ui.context import Ui
 from ibrobot_web.ui.recordings import episodes_of, find_recordings
 from ui_server import UiServer, run_ui
 
-from ibrobot_core.api import IbrobotError, installed_plugins
+from ibrobot_core.api import IbrobotError, find_config, installed_plugins
 
 pytest.importorskip("ibrobot_mcap", reason="needs ibrobot-plugin-mcap")
 TOP = "/camera/top/image_raw"
@@ -65,6 +66,24 @@ def test_pictures_are_the_newest_at_a_time_in_any_order(opened: Playback) -> Non
         assert brightness(opened.picture(TOP, at_s)) == pytest.approx(int(at_s / 0.02 + 1e-6), abs=1)
     assert opened.picture(TOP, 1.9) is not None
     assert opened.picture(TOP, 2.1) is None, "a camera that fell silent shows nothing old"
+
+
+def test_objects_of_the_simulated_scene_are_where_they_were(opened: Playback, tmp_path: Path) -> None:
+    assert opened.objects(Path) == [], "nothing is known of a scene"
+    if ("hardware", "mujoco") not in installed_plugins().entries:
+        pytest.skip("needs ibrobot-plugin-mujoco")
+    from made_episodes import make_episode
+
+    robot = yaml.safe_load(Path(find_config("so101_pick_cube", installed_plugins())).read_text(encoding="utf-8"))
+    pose = [0.1, 0.2, 0.3, 1.0, 0.0, 0.0, 0.0]
+    scene = {"/simulation/scene": [*pose, 0.1, 0.24, 0.0]}
+    path = make_episode(tmp_path / "picked", 0.1, cameras=(), config=robot, signals=scene)
+    found = Playback(path)
+    cube, *parts = found.objects(Path)
+    assert (cube["name"], cube["times"][0], cube["poses"][-1]) == ("cube", 0.0, pose)
+    assert {each["name"].partition("_")[0] for each in parts} == {"bin"}
+    assert all(each["poses"] == [] for each in parts)
+    found.close()
 
 
 def test_a_model_outside_the_opened_folders_is_not_read(episode: Path, tmp_path: Path) -> None:

@@ -28,5 +28,5 @@ def info(ui: Ui, facts: Mapping[str, Any]) -> dict[str, Any]:
 
 ROUTES: dict[str, Handler] = {
     "GET /list": listing, "GET /info": info, "GET /open": episodes.facts_of, "GET /series": episodes.series,
-    "GET /picture": episodes.picture, "GET /scene": episodes.scene,
+    "GET /picture": episodes.picture, "GET /scene": episodes.scene, "GET /objects": episodes.objects,
 }  # fmt: skip

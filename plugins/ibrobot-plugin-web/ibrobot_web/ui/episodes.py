@@ -61,6 +61,11 @@ def scene(ui: Ui, facts: Mapping[str, Any]) -> dict[str, Any]:
     return found
 
 
+def objects(ui: Ui, facts: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The objects of a simulated scene, and where they were."""
+    return playback(ui, facts).objects(ui.folders.find)
+
+
 def mark(ui: Ui, facts: Mapping[str, Any]) -> str:
     """Judge episodes."""
     return run_command(ui, "episodes", "mark", *paths_of(ui, facts), text(facts, "outcome"))
@@ -112,6 +117,6 @@ def _seconds(facts: Mapping[str, Any], name: str) -> float:
 
 ROUTES: dict[str, Handler] = {
     "GET /list": listing, "GET /trash": trash, "GET /open": facts_of, "GET /series": series, "GET /picture": picture,
-    "GET /scene": scene, "POST /mark": mark, "POST /trim": trim, "POST /delete": delete, "POST /restore": restore,
-    "POST /empty": empty, "POST /repair": repair,
+    "GET /scene": scene, "GET /objects": objects, "POST /mark": mark, "POST /trim": trim, "POST /delete": delete,
+    "POST /restore": restore, "POST /empty": empty, "POST /repair": repair,
 }  # fmt: skip

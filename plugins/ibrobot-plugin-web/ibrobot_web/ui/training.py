@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from ibrobot_core.api import ConfigError, IbrobotError, find_config, installed_plugins, load_config
+from ibrobot_core.api import ConfigError, IbrobotError, find_config, from_document, installed_plugins, parse_yaml
 from ibrobot_web.model_edit import ModelEdit, with_model
 from ibrobot_web.ui.context import Handler, Ui, integer, text
 from ibrobot_web.ui.convert import parse_event
@@ -108,7 +108,7 @@ def preview(ui: Ui, facts: Mapping[str, Any]) -> dict[str, Any]:
     diff = difflib.unified_diff(old.splitlines(), edit.text.splitlines(), *names, lineterm="", n=2)
     return {
         "diff": list(diff), "target": ui.folders.name(target), "new": target != source, "digest": _digest(old),
-        "mode": edit.mode, "models": list(edit.models), "problems": _problems(edit.text, source, target),
+        "mode": edit.mode, "models": list(edit.models), "problems": _problems(edit.text, target),
     }  # fmt: skip
 
 
@@ -149,19 +149,18 @@ def _digest(content: str) -> str:
     return hashlib.sha256(content.encode()).hexdigest()
 
 
-def _problems(content: str, source: Path, target: Path) -> list[str]:
-    """What the check of configurations says about the new text."""
-    checked = target.with_name(f".{target.stem}.check.yaml")
+def _problems(content: str, target: Path) -> list[str]:
+    """What the check of configurations says about the new text, without writing it."""
     try:
-        checked.write_text(content, encoding="utf-8")
-        load_config(checked, sim=True, registry=installed_plugins())
+        document = parse_yaml(content, str(target))
+        found = [problem for _, problem in document.problems]
+        if not found:
+            from_document(document.root, source=target, sim="simulation" in document.root)
     except ConfigError as error:
-        return [f"line {each.line}: {each.path}: {each.message}" for each in error.problems]
-    except (IbrobotError, OSError) as error:
+        found = list(error.problems)
+    except IbrobotError as error:
         return [str(error)]
-    finally:
-        checked.unlink(missing_ok=True)
-    return []
+    return [f"{each.path}: {each.message}" for each in found]
 
 
 ROUTES: dict[str, Handler] = {

@@ -73,9 +73,28 @@ export class Player {
     const chosen = plotted.includes(this.topic.value) ? this.topic.value
       : plotted.includes("/joint_states") ? "/joint_states" : plotted[0];
     this.topic.replaceChildren(...plotted.map((name) => h("option", { selected: name === chosen }, name)));
+    this.objects = [];
+    this.view.tell({ do: "objects", objects: [] });
     this.seek(0);
     this.plot();
+    this.loadObjects(path);
     return facts;
+  }
+
+  // The objects of a simulated scene, which take the server a moment.
+  async loadObjects(path) {
+    const found = await this.ui.attempt(() => this.ui.get(`${this.routes}/objects`, { path }));
+    if (this.path !== path || !found?.length) return;
+    this.objects = found;
+    this.place();
+  }
+
+  place() {
+    if (!this.objects?.length) return;
+    this.view.tell({ do: "objects", objects: this.objects.map(({ type, size, pos, quat, times, poses }) => {
+      const pose = times.length ? poses[last(times, this.at)] : [...pos, ...quat];
+      return { type, size, pos: pose.slice(0, 3), quat: pose.slice(3) };
+    }) });
   }
 
   close() {
@@ -134,6 +153,7 @@ export class Player {
     if (i === this.posed && !again) return;
     if (this.posed === undefined || i < this.posed || i > this.posed + 60) this.view.tell({ do: "clear" });
     this.posed = i;
+    this.place();
     this.view.tell({ do: "state", state: { stamp: Math.round(times[i] * 1e9) + 1, position: positions[i], command: commands[i] } });
   }
 
