@@ -95,7 +95,8 @@ class ControlComponent(Component):
 
 def _action_topics(config: RobotConfig, mode: ControlMode) -> Iterator[tuple[str, NDArray[np.intp]]]:
     """Topic and columns of each action whose joints a mode moves, by whichever executors."""
-    moved = {joint for name in mode.executors for joint in config.executors[name].joints}
+    loaded = [config.executors[name] for name in mode.executors if name in config.executors]  # not all, if unavailable
+    moved = {joint for executor in loaded for joint in executor.joints}
     for spec in config.contract.actions:
         joints = config.executors[spec.executor].joints
         if moved.issuperset(joints):
