@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import shutil
 import sys
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -31,13 +32,52 @@ def found(page: Any, where: str) -> int:
     return len(serious)
 
 
+def check_ui(chromium: Any, axe: str, address: str) -> int:
+    """Check all views of `ibrobot ui`, with a robot YAML with problems and with a dialog; return the findings."""
+    wrong = 0
+    for theme in ("light", "dark"):
+        for name, (width, height) in SIZES.items():
+            viewport = {"width": width, "height": height}
+            context = chromium.new_context(viewport=viewport, color_scheme=theme, bypass_csp=True)
+            page = context.new_page()
+            page.goto(address)
+            page.wait_for_timeout(1500)
+            page.add_script_tag(content=axe)
+            for view in page.evaluate("ibrobot.session.views.map(({name}) => name)"):
+                page.evaluate(f"location.hash = '{view}'")
+                page.wait_for_timeout(1500)
+                wrong += found(page, f"{theme} {name} ui {view}")
+            page.evaluate("location.hash = 'robots'")
+            page.get_by_label("Robot", exact=True).select_option("wrong.yaml")
+            page.wait_for_timeout(1500)
+            wrong += found(page, f"{theme} {name} ui problems")
+            page.evaluate("void ibrobot.confirm('Delete?', 'Two episodes.', 'Delete')")
+            wrong += found(page, f"{theme} {name} ui dialog")
+            context.close()
+    return wrong
+
+
+def check_views_of_ui(chromium: Any, axe: str) -> int:
+    """Start `ibrobot ui` in a folder with a good and a wrong robot YAML, and check its views."""
+    from ui_path import own_robot, ui_process
+
+    with tempfile.TemporaryDirectory() as folder:
+        own_robot(Path(folder))
+        (Path(folder) / "wrong.yaml").write_text("robot:\n  name: wrong\n", encoding="utf-8")
+        with ui_process(Path(folder)) as address:
+            return check_ui(chromium, axe, address)
+
+
 def main() -> None:
     """Check all views."""
     from page_run import page_run
     from playwright.sync_api import sync_playwright
 
     axe = Path(sys.argv[1]).read_text(encoding="utf-8")
-    wrong = 0
+    with sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS)
+        wrong = check_views_of_ui(chromium, axe)
+        chromium.close()
     with page_run("so101", "--sim", "--mode", "web") as address, sync_playwright() as playwright:
         chromium = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS)
         for theme in ("light", "dark"):
