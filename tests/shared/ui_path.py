@@ -101,3 +101,34 @@ def record(page: Any, shot: Shot = lambda page, name: None) -> None:
     page.locator(".job .state.done").wait_for(timeout=_WAIT_MS)
     run.close()
     shot(page, "session")
+
+
+def convert(page: Any, shot: Shot = lambda page, name: None) -> None:
+    """Play back an episode, convert both, and play back the dataset."""
+    page.get_by_role("link", name="See the episodes").click()
+    page.get_by_role("link", name="episode_000001").click(timeout=_WAIT_MS)
+    plays(page)
+    shot(page, "episodes")
+    page.get_by_role("link", name="Convert", exact=True).click()
+    page.get_by_label("Dataset", exact=True).fill("datasets/pick")
+    page.get_by_role("button", name="Convert", exact=True).click()
+    page.get_by_role("link", name="Open the dataset").wait_for(timeout=_WAIT_MS)
+    shot(page, "convert")
+    page.get_by_role("link", name="Open the dataset").click()
+    page.get_by_role("button", name="Play 1").click(timeout=_WAIT_MS)
+    plays(page)
+    shot(page, "datasets")
+
+
+def plays(page: Any) -> None:
+    """Wait until the player on the page plays."""
+    time_line = page.get_by_label("Time", exact=True)
+    time_line.wait_for(timeout=_WAIT_MS)
+    page.locator("output.clock:visible").filter(has_text=" of ").wait_for(timeout=_WAIT_MS)
+    play = page.get_by_role("button", name="Play", exact=True)
+    if play.count():  # a dataset's episode plays at once
+        play.click()
+    deadline_s = time.monotonic() + _WAIT_MS / 1000
+    while float(time_line.input_value()) < 0.3:
+        assert time.monotonic() < deadline_s, "the player does not play"
+        page.wait_for_timeout(50)

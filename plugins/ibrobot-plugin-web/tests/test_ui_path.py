@@ -1,4 +1,4 @@
-"""The page of `ibrobot ui` in headless Chromium: by clicks alone from choosing a robot to its recorded episodes."""
+"""The page of `ibrobot ui` in headless Chromium: by clicks alone from choosing a robot to its dataset."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ pytestmark = [
 ]
 
 
-def test_from_a_robot_to_its_episodes_by_clicks_alone(tmp_path: Path) -> None:
+def test_from_a_robot_to_its_dataset_by_clicks_alone(tmp_path: Path) -> None:
     sync_api = pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install playwright")
-    from ui_path import FLAGS, own_robot, record, ui_process
+    from ui_path import FLAGS, convert, own_robot, record, ui_process
 
     own_robot(tmp_path)
     errors: list[str] = []
@@ -32,6 +32,7 @@ def test_from_a_robot_to_its_episodes_by_clicks_alone(tmp_path: Path) -> None:
         page.on("request", lambda request: hosts.add(request.url.split("/")[2]))
         page.goto(address)
         record(page)
+        convert(page)
         browser.close()
     assert not errors
     assert hosts == {address.split("/")[2]}
@@ -39,3 +40,4 @@ def test_from_a_robot_to_its_episodes_by_clicks_alone(tmp_path: Path) -> None:
         (tmp_path / f"episodes/pick/episodes/episode_00000{number}/metadata.yaml").read_text() for number in (1, 2)
     ]
     assert ["success" in outcomes[0], "failure" in outcomes[1]] == [True, True]
+    assert (tmp_path / "datasets/pick/meta/info.json").is_file()
