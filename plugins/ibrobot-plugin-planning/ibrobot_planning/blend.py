@@ -8,6 +8,7 @@ worst it begins when the arm stands.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import lru_cache
 from itertools import product
 
 import attrs
@@ -92,7 +93,7 @@ def braking(old: Motion, begin_s: float, brake_s: float, acceleration: Vector) -
         brake_s: where the braking begins; not before `begin_s`.
         acceleration: limits of the joints [rad/s^2], shape (J,).
     """
-    samples = old.sampled(_SAMPLE_S)
+    samples = _samples(old)
     phase, rate, change = begin_s, 1.0, 0.0
     rows = []
     while True:
@@ -127,15 +128,14 @@ def joined(old: Motion, new: Motion, begin_s: float, limits: Limits) -> Iterator
         begin_s: time of `old`, before its end.
         limits: which the result keeps.
     """
-    rest = old.sampled(_SAMPLE_S)[:, round(begin_s / _SAMPLE_S) :]
-    slowed = {}
-    for factor in _SLOWED:
-        slowed[factor] = new.slowed(factor).sampled(_SAMPLE_S)
-        slowed[factor][0] -= slowed[factor][0, 0]
+    rest = _samples(old)[:, round(begin_s / _SAMPLE_S) :]
+    slowed = {factor: _samples(new, factor) for factor in _SLOWED}
     starts = np.linspace(0, rest.shape[1] - 1, _OVERLAPS + 1).astype(int).tolist()
     ways = [(start, slowed[factor]) for start, factor in product(starts, _SLOWED)]
     for start, following in sorted(ways, key=lambda way: way[0] + way[1].shape[1]):
         rows = _sum(rest, following, start)
+        # Executors refuse a motion that does not end at rest, be it by rounding.
+        rows[1:, -1] = 0.0
         if limits.hold_at(rows[:, ::_GLANCE]):
             candidate = _every(rows.transpose(1, 0, 2), STEP_S)
             if limits.hold(candidate):
@@ -143,14 +143,21 @@ def joined(old: Motion, new: Motion, begin_s: float, limits: Limits) -> Iterator
 
 
 def _sum(rest: Vector, following: Vector, start: int) -> Vector:
-    """Samples of a motion, with a second motion added from sample `start` on, shape (3, N, J)."""
+    """Samples of a motion, with the way of a second motion added from sample `start` on, shape (3, N, J)."""
     end = start + following.shape[1]
     rows = np.zeros((3, max(rest.shape[1], end), rest.shape[2]))
     rows[:, : rest.shape[1]] = rest
     rows[0, rest.shape[1] :] = rest[0, -1]
-    rows[:, start:end] += following
-    rows[0, end:] += following[0, -1]
+    rows[0, start:end] += following[0] - following[0, 0]
+    rows[1:, start:end] += following[1:]
+    rows[0, end:] += following[0, -1] - following[0, 0]
     return rows
+
+
+@lru_cache(maxsize=16)
+def _samples(motion: Motion, slower: float = 1.0) -> Vector:
+    """Samples of a motion in `slower` times its time, shape (3, N, J); kept, since changes are tried at every tick."""
+    return motion.slowed(slower).sampled(_SAMPLE_S)
 
 
 def cut(whole: Motion, end_s: float) -> Motion:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping
+from functools import cached_property
 from typing import Any
 
 import attrs
 
 from ibrobot_core.api import HardwareError, JointTrajectory, Planner, Session, Vector, ns, seconds, trajectory_goal
 from ibrobot_planning.blend import Limits, braking, cut, joined, motion_of, trajectory_of
+from ibrobot_planning.timing import Motion
 
 _LATENCY_S = 0.04
 """How far ahead a trajectory takes over from the running one: it must arrive there in time."""
@@ -29,6 +31,23 @@ class _Track:
     begin_ns: int | None = None
     """When it began, if the executor reports it [ns]."""
 
+    @cached_property
+    def motion(self) -> Motion | None:
+        """The trajectory as a motion, if it is one."""
+        return None if self.trajectory is None else motion_of(self.trajectory)
+
+
+@attrs.define(eq=False)
+class _Next:
+    """A goal that waits."""
+
+    goal: ExecutorGoal
+
+    @cached_property
+    def motion(self) -> Motion | None:
+        """The goal as a motion, if it is one."""
+        return None if isinstance(self.goal, float) else motion_of(self.goal)
+
 
 class Execution:
     """The goals of executors under way. Methods may be called from several threads.
@@ -44,7 +63,7 @@ class Execution:
         self._lock = threading.RLock()
         self._tracks: dict[str, _Track] = {}
         """Executors that have not ended yet."""
-        self._ahead: dict[str, ExecutorGoal] = {}
+        self._ahead: dict[str, _Next] = {}
         """Goals that wait until the executor's braking motion permits them."""
         self._number = 0
 
@@ -115,18 +134,18 @@ class Execution:
     def follow(self, goals: Mapping[str, ExecutorGoal]) -> None:
         """Add the next motion to the braking one."""
         with self._lock:
-            self._ahead = dict(goals)
+            self._ahead = {name: _Next(goal) for name, goal in goals.items()}
         self.step()
 
     def step(self) -> None:
         """Send goals of `follow` whose time has come."""
         with self._lock:
-            for name, goal in list(self._ahead.items()):
-                track = self._tracks.get(name)
+            for name, following in list(self._ahead.items()):
+                track, goal = self._tracks.get(name), following.goal
                 if isinstance(goal, float) or track is None or track.trajectory is None:
                     sent = self._try(name, goal)
                 else:
-                    sent = self._blended(name, track, track.trajectory, goal)
+                    sent = self._blended(name, track, track.trajectory, goal, following.motion)
                 if sent:
                     self._ahead.pop(name, None)
 
@@ -191,7 +210,7 @@ class Execution:
         for name, track in self._tracks.items():
             if track.trajectory is None and self._session.config.executors[name].goals == "position":
                 continue
-            old = motion_of(track.trajectory) if track.trajectory is not None else None
+            old = track.motion
             if old is None or track.begin_ns is None or state is None or track.trajectory is None:
                 return None
             begin_s = round(seconds(state.stamp_ns - track.begin_ns) + _LATENCY_S, 3)
@@ -202,9 +221,11 @@ class Execution:
             found[name] = ns(begin_s), trajectory_of(way, joints, self._session.clock.now_ns())
         return found or None
 
-    def _blended(self, name: str, track: _Track, running: JointTrajectory, goal: JointTrajectory) -> bool:
+    def _blended(
+        self, name: str, track: _Track, running: JointTrajectory, goal: JointTrajectory, new: Motion | None
+    ) -> bool:
         """Let a motion begin while the executor brakes; return False if its time has not come."""
-        state, old, new = self._session.state, motion_of(running), motion_of(goal)
+        state, old = self._session.state, track.motion
         if track.begin_ns is None or state is None or old is None:
             return False
         passed_s = seconds(state.stamp_ns - track.begin_ns)

@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 from ibrobot_planning.arm import robot_arm
+from ibrobot_planning.blend import Limits, joined
 from ibrobot_planning.collision import Collisions
 from ibrobot_planning.source import GO_TO, RESULT
+from ibrobot_planning.timing import timed
 from ibrobot_planning.world import SNAPSHOT
 
 from ibrobot_core.api import PlanCode, Runtime, Vector
@@ -64,6 +66,22 @@ def test_new_goal_blends_with_the_motion_under_way(run, mode: str):
     np.testing.assert_allclose(command(runtime)[:2], [1.6, 0.4], atol=1e-6)
     speed = np.linalg.norm(np.diff(commands, axis=0), axis=1) * RATE_HZ
     assert speed[20:50].min() > 0.6 * speed[24], "it does not slow down for the next motion"
+
+
+def test_blends_end_exactly_at_rest():
+    """Executors refuse others, and the arm would stop between the motions."""
+    rng = np.random.default_rng(0)
+    limits = Limits(np.full(5, -2.0), np.full(5, 2.0), np.full(5, 3.0), np.full(5, 10.0))
+    for _ in range(10):
+        a, b, c = rng.uniform(-1, 1, (3, 5))
+        old, new = (
+            timed(np.array(path), limits.velocity, limits.acceleration, blends=np.zeros(0), window=0.05, step=0.01)
+            for path in ((a, b), (b, c))
+        )
+        way = next(joined(old, new, 0.1, limits))
+        np.testing.assert_allclose(way.positions[-1], c, atol=1e-9)
+        assert not way.velocities[-1].any()
+        assert not way.accelerations[-1].any()
 
 
 def test_new_goal_in_the_opposite_direction_blends_within_the_limits(run):
