@@ -21,6 +21,8 @@ from ibrobot_web.link import FIRST_PICTURE, STATE, STATUS
 
 IBROBOT = (sys.executable, "-c", "from ibrobot_core.cli.main import main; main()")
 _START_S = 60.0
+SO101 = ("so101", "--sim", "--mode", "web", "--set", "peripherals.top.fps=5", "--set", "peripherals.wrist.fps=5")
+"""A simulated arm whose two cameras take little of the processor."""
 _WEB = ("--web", "--set", "viewer.port=0", "--set", "viewer.browser=false")
 
 

@@ -23,9 +23,9 @@ WAIT_S = 30.0
 
 @pytest.fixture(scope="module")
 def address() -> Iterator[str]:
-    from page_run import page_run
+    from page_run import SO101, page_run
 
-    with page_run("so101", "--sim", "--mode", "web") as found:
+    with page_run(*SO101) as found:
         yield found
 
 

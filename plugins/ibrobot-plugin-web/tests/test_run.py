@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from page_run import PageClient, client, page_run
+from page_run import SO101, PageClient, client, page_run
 
 from ibrobot_core.api import installed_plugins
 
@@ -27,7 +27,7 @@ PRESSES = itertools.count(1)
 
 @pytest.fixture(scope="module")
 def address() -> Iterator[str]:
-    with page_run("so101", "--sim", "--mode", "web") as found:
+    with page_run(*SO101) as found:
         yield found
 
 
