@@ -107,6 +107,18 @@ def test_velocities_make_cubics() -> None:
     assert arm.at(0.25) == pytest.approx([3 * 0.25**2 - 2 * 0.25**3, 0.0])
 
 
+def test_rounding_takes_no_setpoint_beyond_the_limits() -> None:
+    arm, rounded = Arm((2.0, 0.0)), (1e-9, -1e-9)
+    arm.go(goal(point(1.0, (3.0, -3.0), rounded, (0.0, 0.0)), point(1.5, (3.0, -3.0), (0.0, 0.0), (0.0, 0.0))))
+    assert max(np.abs(arm.at(tick / 100)).max() for tick in range(200)) == 3.0
+
+
+def test_setpoint_beyond_the_limits_is_left_to_the_safety_layer() -> None:
+    arm = Arm((2.9, 0.0))
+    arm.go(goal(point(1.0, (3.5, 0.0), (0.0, 0.0)), point(2.0, (2.9, 0.0), (0.0, 0.0))))
+    assert arm.at(1.0)[0] == pytest.approx(3.5)
+
+
 def test_accelerations_make_quintics() -> None:
     arm = Arm()
     arm.go(goal(point(1.0, (1.0, 0.0), (0.0, 0.0), (0.0, 0.0))))

@@ -30,6 +30,8 @@ START_TOLERANCE_RAD = 0.1
 """How far from the present setpoint a trajectory's point at time zero may lie."""
 
 
+_ROUNDING_RAD = 1e-9
+"""How far the polynomials of a trajectory may leave its points by rounding."""
 _STOP_SHARE = 0.8
 """Of the acceleration limits, what a stop uses: it is computed from tick to tick."""
 
@@ -178,6 +180,7 @@ class TrajectoryExecutor(Executor):
         if self._running is not None and stop is not None:
             self._slow_down(self._running.spline, stop, self._now_ns)
         setpoint, velocity, _ = self._sample(self._now_ns)
+        setpoint = self._without_rounding(setpoint)
         running = self._running
         if running is None:
             return setpoint.copy()
@@ -211,6 +214,11 @@ class TrajectoryExecutor(Executor):
     @override
     def pop_status(self) -> GoalStatus | None:
         return self._statuses.popleft() if self._statuses else None
+
+    def _without_rounding(self, setpoint: Vector) -> Vector:
+        """The setpoint, at the limit where only rounding takes it beyond: the safety layer has nothing to correct."""
+        inside = np.clip(setpoint, self._lower, self._upper)
+        return np.where(np.abs(setpoint - inside) <= _ROUNDING_RAD, inside, setpoint)
 
     def _sample(self, now_ns: int) -> tuple[Vector, Vector, Vector]:
         """The setpoint at `now_ns` [ns] of the executor's time, with its velocity and acceleration, each shape (J,)."""
