@@ -20,11 +20,11 @@ from packaging.requirements import Requirement
 nox.needs_version = ">=2026.8.10"
 nox.options.default_venv_backend = "uv"
 nox.options.reuse_venv = "yes"
-# `nox` alone runs sessions side by side, one more than there are cores since tests wait too, and prints each one's
+# `nox` alone runs sessions side by side, two more than there are cores since tests wait too, and prints each one's
 # output when it ends. They start in the order of this file: the longest come first, so that none is left alone at the
 # end. A named session prints as it runs. `-j` says otherwise.
 nox.options.allow_parallel = True
-nox.options.parallel = 1 if sys.argv[1:] else (os.cpu_count() or 1) + 1
+nox.options.parallel = 1 if sys.argv[1:] else (os.cpu_count() or 1) + 2
 # The many processes that tests start would otherwise compile what they import, each for itself.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 # More threads than one gain nothing beside other sessions: torch's and NumPy's wait for one another by spinning.
