@@ -20,11 +20,11 @@ from packaging.requirements import Requirement
 nox.needs_version = ">=2026.8.10"
 nox.options.default_venv_backend = "uv"
 nox.options.reuse_venv = "yes"
-# `nox` alone runs sessions side by side, two more than there are cores since tests wait too, and prints each one's
+# `nox` alone runs sessions side by side, one more than there are cores since tests wait too, and prints each one's
 # output when it ends. They start in the order of this file: the longest come first, so that none is left alone at the
 # end. A named session prints as it runs. `-j` says otherwise.
 nox.options.allow_parallel = True
-nox.options.parallel = 1 if sys.argv[1:] else (os.cpu_count() or 1) + 2
+nox.options.parallel = 1 if sys.argv[1:] else (os.cpu_count() or 1) + 1
 # The many processes that tests start would otherwise compile what they import, each for itself.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 # More threads than one gain nothing beside other sessions: torch's and NumPy's wait for one another by spinning.
@@ -57,7 +57,8 @@ PLATFORMS = ("x86_64-unknown-linux-gnu", "aarch64-unknown-linux-gnu", "aarch64-a
 # A fixed seed: the same checks give the same result; `nox -s core -- --hypothesis-seed=random` explores.
 PYTEST = ("pytest", "--config-file=pyproject.toml", "--rootdir=.", "--hypothesis-seed=0", "-rs")
 TWO = ("-n", "2", "--dist", "worksteal")
-"""Two tests at once: in sessions so long that the others would end before them."""
+THREE = ("-n", "3", "--dist", "worksteal")
+"""Several tests at once: in sessions so long that the others would end before them."""
 UNTYPED = [
     *(f"--allow-{what}" for what in ("untyped-defs", "incomplete-defs", "untyped-calls", "untyped-decorators")),
     "--no-warn-return-any", "--explicit-package-bases",
@@ -169,7 +170,7 @@ def integration(session: nox.Session) -> None:
     install(session, *PLUGINS, groups=("test", "browser"))
     system_libraries(session)
     chromium(session)
-    session.run(*PYTEST, *TWO, "-m", "integration", *marked("integration"), *session.posargs)
+    session.run(*PYTEST, *THREE, "-m", "integration", *marked("integration"), *session.posargs)
 
 
 @nox.session

@@ -98,7 +98,8 @@ def record(page: Any, shot: Shot = lambda page, name: None) -> None:
         run.get_by_role("button", name=verdict).click()
         if number == 0:
             until(run, "ibrobot.status.episode.saved === 1")
-    page.locator(".job .state.done").wait_for(timeout=_WAIT_MS)
+    page.locator(".job .state:not(.running)").first.wait_for(timeout=_WAIT_MS)
+    assert page.locator(".job .state.done").count() == 1, page.locator(".job").all_inner_texts()
     run.close()
     shot(page, "session")
 

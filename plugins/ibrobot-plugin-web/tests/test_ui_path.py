@@ -28,7 +28,7 @@ def test_from_a_robot_to_its_dataset_by_clicks_alone(tmp_path: Path) -> None:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
         page = browser.new_page()
         page.on("pageerror", lambda error: errors.append(str(error)))
-        page.on("console", lambda line: errors.extend([line.text] * (line.type == "error")))
+        page.on("console", lambda line: errors.extend([f"{line.text} {line.location}"] * (line.type == "error")))
         page.on("request", lambda request: hosts.add(request.url.split("/")[2]))
         page.goto(address)
         record(page)

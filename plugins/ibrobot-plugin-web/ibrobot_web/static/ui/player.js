@@ -116,10 +116,10 @@ export class Player {
     if (this.at >= this.length - STEP_S) this.seek(0);
     this.playing = true;
     say(this.play, "Pause");
-    let before = performance.now();
+    let before = null; // a frame's time may lie before the click
     const step = (now) => {
       if (!this.playing) return;
-      const next = this.at + (now - before) / 1000 * Number(this.speed.value);
+      const next = this.at + (before === null ? 0 : (now - before) / 1000 * Number(this.speed.value));
       before = now;
       this.seek(Math.min(next, this.length));
       if (next >= this.length) this.pause();
