@@ -57,8 +57,7 @@ PLATFORMS = ("x86_64-unknown-linux-gnu", "aarch64-unknown-linux-gnu", "aarch64-a
 # A fixed seed: the same checks give the same result; `nox -s core -- --hypothesis-seed=random` explores.
 PYTEST = ("pytest", "--config-file=pyproject.toml", "--rootdir=.", "--hypothesis-seed=0", "-rs")
 TWO = ("-n", "2", "--dist", "worksteal")
-THREE = ("-n", "3", "--dist", "worksteal")
-"""Several tests at once: in sessions so long that the others would end before them."""
+"""Two tests at once: in sessions so long that the others would end before them."""
 UNTYPED = [
     *(f"--allow-{what}" for what in ("untyped-defs", "incomplete-defs", "untyped-calls", "untyped-decorators")),
     "--no-warn-return-any", "--explicit-package-bases",
@@ -170,7 +169,7 @@ def integration(session: nox.Session) -> None:
     install(session, *PLUGINS, groups=("test", "browser"))
     system_libraries(session)
     chromium(session)
-    session.run(*PYTEST, *THREE, "-m", "integration", *marked("integration"), *session.posargs)
+    session.run(*PYTEST, *TWO, "-m", "integration", *marked("integration"), *session.posargs)
 
 
 @nox.session
