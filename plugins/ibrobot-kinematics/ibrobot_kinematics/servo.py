@@ -31,6 +31,9 @@ _AT_REST = 1e-6
 """Speed of joints [rad/s or m/s] that counts as none."""
 _LONGEST_TICK_S = 0.1
 """A longer gap between steps counts as a stop: what was missed is not made up for."""
+_VELOCITY, _ACCELERATION = 0.95, 0.85
+"""Shares of the limits of joints that are used. The times of the steps jitter a little, and a setpoint beyond a limit
+would lag behind and then overshoot."""
 _DEFAULTS = ServoOptions()
 
 
@@ -98,7 +101,8 @@ class Servo:
         self._model = model
         self._options = options
         self._clearance = clearance
-        self._max_velocity, self._max_acceleration = max_velocity[model.moving], max_acceleration[model.moving]
+        self._max_velocity = _VELOCITY * max_velocity[model.moving]
+        self._max_acceleration = _ACCELERATION * max_acceleration[model.moving]
         # From full speed a joint stops within the margin, unless its acceleration is too low for that.
         braking = self._max_velocity**2 / (2 * options.joint_limit_margin)
         self._braking = np.minimum(braking, self._max_acceleration)

@@ -103,15 +103,21 @@ class WebxrTeleop(Teleop):
         if stop:
             self._clutches = {hand: _Clutch(self._options.timeout) for hand in self._hands}
         exchange.report(self._hands, self._ctx.name, self._engaged, self._why())
-        if self._engaged is None or self._setpoint is None:
+        if self._setpoint is None or stop:
             return TeleopCommand(None, estop=stop, events=events)
         dt = min(max(seconds(measured.stamp_ns - self._stamp_ns), 0.0), _LONGEST_STEP_S)
         self._stamp_ns = measured.stamp_ns
         count = len(self._tool.joints)
-        newest = self._clutches[self._engaged].sample
-        assert newest is not None
-        arm = self._tool.follow(measured.stamp_ns, here[:count])
-        gripper = self._gripper.follow(newest, here[count:], dt)
+        gripper = self._setpoint[count:]
+        if self._engaged is not None:
+            arm = self._tool.follow(measured.stamp_ns, here[:count])
+            newest = self._clutches[self._engaged].sample
+            assert newest is not None
+            gripper = self._gripper.follow(newest, here[count:], dt)
+        elif self._tool.moves and np.isfinite(here).all():
+            arm = self._tool.brake(measured.stamp_ns, here[:count])
+        else:
+            return TeleopCommand(None, events=events)
         self._setpoint = np.concatenate([arm, gripper])
         return TeleopCommand(dict(zip(self._joints, self._setpoint.tolist(), strict=True)), events=events)
 
@@ -285,6 +291,22 @@ class _Tool:
             servo.command(linear, angular, now_ns)
         else:
             servo.halt()
+        return self._next(now_ns, here)
+
+    @property
+    def moves(self) -> bool:
+        """Whether the last setpoints moved the arm."""
+        return self._servo is not None and bool(self._servo.velocity.any())
+
+    def brake(self, now_ns: int, here: Vector) -> Vector:
+        """Setpoints [rad] on the way to a stop, at the time of the measured positions `here` [rad]."""
+        assert self._servo is not None
+        self._servo.halt()
+        return self._next(now_ns, here)
+
+    def _next(self, now_ns: int, here: Vector) -> Vector:
+        servo = self._servo
+        assert servo is not None
         position = servo.step(now_ns)
         lead = self._robot.max_lead[self._indices]
         if (np.abs(position - here) > lead).any():

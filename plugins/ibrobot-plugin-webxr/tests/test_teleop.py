@@ -187,12 +187,21 @@ def test_a_network_that_is_gone_holds_within_a_tenth_of_a_second(start: Start):
     assert rig.last.positions is None
 
 
-def test_a_hand_that_is_not_tracked_holds_at_once(start: Start):
+def test_without_tracking_the_arm_brakes_within_the_limits_and_does_not_return(start: Start):
     rig = start()
     rig.press()
     moving(rig)
+    path = [rig.position]
     rig.tracked = False
-    assert lasts(rig) <= 2
+    for _ in range(12):
+        rig.tick()
+        path.append(rig.position)
+    steps = np.diff(path, axis=0)
+    assert np.abs(steps[2]).max() > 0, "it does not stop at once"
+    assert not steps[8:].any()
+    assert (steps * steps[0] >= 0).all()
+    assert np.abs(np.diff(steps, axis=0)).max() < 40.0 * TICK_S**2
+    assert rig.last.positions is None
 
 
 def test_late_poses_hold_and_a_burst_of_them_moves_nothing(start: Start):
