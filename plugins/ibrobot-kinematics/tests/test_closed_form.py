@@ -91,7 +91,7 @@ def test_every_branch_reaches_the_target_nearest_first(
     for q in solutions:
         assert_reached(model, target, q, 1e-5, 1e-4)
     distances = [np.linalg.norm(q - start) for q in solutions]
-    assert distances == sorted(distances)
+    assert (np.diff(distances) >= -1e-12).all()
 
 
 @settings(deadline=None, max_examples=60)

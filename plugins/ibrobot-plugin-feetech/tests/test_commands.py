@@ -219,19 +219,11 @@ def test_a_middle_that_no_offset_reaches_is_explained_and_asked_again(emulator, 
 
 
 def test_signs_are_learnt_from_turning_each_joint(emulator, person, home):
-    with Terminal(
-        "feetech",
-        "calibrate",
-        emulator.port,
-        "--middle-now",
-        "--range-seconds",
-        "8",
-        "--check-signs",
-        "--zero-at",
-        "range",
-    ) as terminal:
-        terminal.wait_for("to both ends")
+    options = ("--middle-now", "--check-signs", "--zero-at", "range")
+    with Terminal("feetech", "calibrate", emulator.port, *options) as terminal:
+        terminal.wait_for("(Enter ends it)")
         person.sweep(ENDS)
+        terminal.type("\r")
         for servo, joint in enumerate(JOINTS, 1):
             terminal.wait_for(f"Turn {joint} a little")
             person.turn(servo, -100 if joint == "elbow_flex" else 100)
@@ -241,6 +233,14 @@ def test_signs_are_learnt_from_turning_each_joint(emulator, person, home):
     found = load_calibration("so101_follower", JOINTS).joints
     assert {joint.zero_at for joint in found.values()} == {"range"}
     assert [name for name, joint in found.items() if joint.inverted] == ["elbow_flex"]
+
+
+def test_ranges_that_are_measured_for_a_time_end_without_enter(emulator, person, home):
+    code, screen = ran("calibrate", emulator.port, "--middle-now", "--range-seconds", "0.2")
+    assert code == 2
+    assert "for 0.2 s" in screen
+    assert "elbow_flex: it moved by only 0 ticks" in screen
+    assert not home.exists()
 
 
 def test_a_servo_that_dies_while_measuring_is_named_and_nothing_is_written(emulator, person, home):
