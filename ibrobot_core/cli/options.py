@@ -53,7 +53,7 @@ _OPTIONS: dict[str, Callable[..., Any]] = {
     "duration": option("--duration", type=click.FloatRange(min=0), metavar="S", help="Stop after S seconds."),
     "episodes": option("--episodes", type=click.IntRange(min=1), metavar="N", help="Stop after N episodes."),
     "goals": option(
-        "--goal", "goals", multiple=True, metavar="GOAL", help="For planning modes: a pose, or joint=rad,…"
+        "--goal", "goals", multiple=True, metavar="GOAL", help="Planning modes: a pose, joint=rad,… or xyz=X,Y,Z."
     ),
     "viewer": option("--viewer", metavar="TYPE", cls=_ViewerOption, help="Show the robot in this viewer."),
     "headless": option("--headless", is_flag=True, help="Print plain lines, without window, viewer and panel."),

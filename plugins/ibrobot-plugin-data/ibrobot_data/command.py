@@ -65,24 +65,26 @@ def _flags_of_writers(command: Callable[..., Any]) -> Callable[..., Any]:
 @click.argument("episodes", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="The dataset: a new folder.")
 @click.option("--to", type=click.Choice(("dataset", "bag")), default="dataset", show_default=True, help="What to make.")
-@click.option("--episodes", "numbers", metavar="N,N-M", help="Which of a dataset's, from 0; all when left out.")
+@click.option("--episodes", "numbers", metavar="N,N-M", help="With --to bag: only these episodes, counted from 0.")
 @click.option("--append", is_flag=True, help="Add new episodes to an existing dataset.")
 @click.option("--type", "type_", help="Dataset writer; by default that of an installed plugin.")
 @_flags_of_writers
 @click.option("--set", "sets", multiple=True, metavar="OPTION=VALUE", help="Any other option of the dataset writer.")
-@click.option("--config", metavar="CONFIG", help="Robot YAML, or one with a contract alone; for foreign bags.")
+@click.option("--config", metavar="CONFIG", help="Robot YAML, or a YAML with only a contract, for foreign bags.")
 @click.option("--force-contract", is_flag=True, help="Use --config's contract even if the recorded one differs.")
 @click.option("--norm-mode", type=click.Choice(NORM_MODES), help="Unit of the dataset's joints; by default radians.")
-@click.option("--calibration", metavar="NAME", help="For --norm-mode, in place of the recorded one.")
+@click.option("--calibration", metavar="NAME", help="Calibration for --norm-mode, instead of the recorded one.")
 @click.option(
     "--missing", type=click.Choice(MISSING), default=_MISSING, show_default=True,
     help="If an observation is missing: refuse the episode, skip the tick, or hold the last value.",
 )  # fmt: skip
-@click.option("--outcome", "outcomes", multiple=True, type=click.Choice(OUTCOMES), help="Only these; repeatable.")
+@click.option(
+    "--outcome", "outcomes", multiple=True, type=click.Choice(OUTCOMES), help="Only this outcome; repeatable."
+)
 @click.option("--prompt", default="", metavar="TEXT", help="Task of episodes recorded without one.")
 @click.option(
     "--only", type=click.Choice(ONLY), default="all", show_default=True,
-    help="Keep only what the operator commanded, or only what the policy commanded; each stretch is an episode.",
+    help="Keep only the rows that the operator or the policy commanded; each stretch becomes an episode.",
 )  # fmt: skip
 @click.option(
     "--context", type=click.FloatRange(min=0), default=_CONTEXT, show_default=True, metavar="S",

@@ -31,7 +31,12 @@ from ibrobot_data.operator import Operator
 @click.option("--auto", is_flag=True, help="Begin episodes automatically; end them after contract.max_duration_s.")
 @click.option("--continuous", is_flag=True, help="One episode, from the start of the run to its end.")
 @click.option(
-    "--reset-time", type=click.FloatRange(min=0), default=0.0, metavar="S", help="Pause between episodes [s]."
+    "--reset-time",
+    type=click.FloatRange(min=0),
+    default=0.0,
+    show_default=True,
+    metavar="S",
+    help="Pause between episodes [s].",
 )
 def record(config: str | None, dataset: str | None, root: Path | None, **options: Any) -> None:
     """Run a robot and record its episodes as bags.

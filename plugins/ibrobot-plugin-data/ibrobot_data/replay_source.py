@@ -38,7 +38,7 @@ class Replay:
     """The episode's name on the command line."""
     playback: Playback
     speed: float = 1.0
-    """Seconds of the recording per second."""
+    """Seconds of the recording that are played per second."""
 
 
 class ReplaySource(SourceWorker):

@@ -81,4 +81,4 @@ def _train() -> click.Command:
 def ibrobot_commands() -> Iterable[Command]:
     """`ibrobot datasets info` and `ibrobot train`."""
     yield Command("datasets", "Show LeRobot datasets.", _datasets)
-    yield Command("train", "Train a policy by LeRobot.", _train)
+    yield Command("train", "Train a policy with LeRobot.", _train)

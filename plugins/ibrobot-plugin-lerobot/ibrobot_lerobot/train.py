@@ -39,20 +39,20 @@ _PROGRESS = re.compile(r"\bstep:\S+ .*?\bloss:(?P<loss>[-+.\deinfa]+)(?:.*?\blr:
 @click.command(context_settings={"ignore_unknown_options": True})
 @click.argument("dataset", type=click.Path(path_type=Path))
 @click.argument("options", nargs=-1, type=click.UNPROCESSED)
-@click.option("--out", required=True, type=click.Path(path_type=Path), help="Folder of the training: a new one.")
+@click.option("--out", required=True, type=click.Path(path_type=Path), help="New folder for the checkpoints.")
 @click.option("--policy", default=SMALL, show_default=True, help="small_act, or a policy type of LeRobot, e.g. act.")
-@click.option("--steps", type=click.IntRange(min=1), default=5000, show_default=True, help="Steps of training.")
-@click.option("--batch-size", type=click.IntRange(min=1), default=32, show_default=True, help="Frames in a step.")
-@click.option("--device", default="cpu", show_default=True, help="cpu, cuda, mps, …")
+@click.option("--steps", type=click.IntRange(min=1), default=5000, show_default=True, help="Training steps.")
+@click.option("--batch-size", type=click.IntRange(min=1), default=32, show_default=True, help="Frames per step.")
+@click.option("--device", default="cpu", show_default=True, help="Device of torch: cpu, cuda, mps, …")
 @click.option("--events", is_flag=True, help="Print the progress as JSON lines.")
 @wrong_input()
 def train(
     dataset: Path, options: tuple[str, ...], out: Path, policy: str, steps: int, batch_size: int, device: str,
     events: bool,
 ) -> None:  # fmt: skip
-    """Train a policy on a DATASET by LeRobot, which must be installed.
+    """Train a policy on a DATASET with LeRobot, which must be installed.
 
-    OPTIONS are further options of lerobot-train, e.g. --save_freq=1000.
+    Further OPTIONS are passed to lerobot-train, e.g. --save_freq=1000.
     """
     if not (dataset / "meta" / "info.json").is_file():
         raise DatasetError(f"{dataset}: is not a LeRobot dataset: it has no meta/info.json")

@@ -24,9 +24,8 @@ def description() -> None:
 def srdf(config: str, samples: int, seed: int, output: Path | None) -> None:
     """Write an SRDF of the robot in CONFIG: groups, poses, and links whose collisions need no check.
 
-    Pairs are left out where one joint connects them, or they touch in nearly all or in none of the random
-    configurations, as MoveIt's setup assistant has it. Links have the names of the URDF, or of the MJCF where the robot
-    has no URDF.
+    Two links need no check if one joint connects them, or if they touch in nearly all or in none of the random
+    configurations, as in MoveIt's setup assistant. Links have the names of the URDF or, without a URDF, of the MJCF.
     """
     from ibrobot_kinematics.urdf import read_urdf
 

@@ -82,7 +82,7 @@ class Plan:
 def plan(start: str, goal: str, speed: float, plot: Path | None, config: str | None, **options: Any) -> None:
     """Plan a motion of the robot in CONFIG, without moving it.
 
-    The planner and the world are those of the robot YAML. Prints what was planned: joints at the goal, path length,
+    The planner and the world are those of the robot YAML. Prints the joints at the goal, path length,
     duration, clearance, and the peak velocity of each joint.
 
     Exits with 0 if there is a plan, 3 if there is none, 2 for a wrong command line, YAML or goal.

@@ -32,7 +32,7 @@ _UNITS = {
 @click.command()
 @port_argument
 @click.option("--robot", metavar="CONFIG", help="Robot YAML with the joints; by default an SO-101.")
-@click.option("--period", type=click.FloatRange(0.01), default=0.1, show_default=True, help="Between readings [s].")
+@click.option("--period", type=click.FloatRange(0.01), default=0.1, show_default=True, help="Reading interval [s].")
 @click.option("--once", is_flag=True, help="Print one reading, then exit.")
 @click.option("--json", "as_json", is_flag=True, help="Print one line of JSON per reading.")
 def monitor(port: str | None, robot: str | None, period: float, once: bool, as_json: bool) -> None:

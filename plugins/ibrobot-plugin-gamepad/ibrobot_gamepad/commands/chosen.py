@@ -64,5 +64,5 @@ def watch(device: Device, seconds: float, see: Callable[[Controls], bool]) -> bo
 
 
 device_option: Callable[[Any], Any] = click.option(
-    "--device", default="", metavar="ID", help="VENDOR:PRODUCT, as `ibrobot gamepad list` prints; else the first."
+    "--device", default="", metavar="ID", help="VENDOR:PRODUCT, as `ibrobot gamepad list` prints; default: the first."
 )

@@ -39,8 +39,8 @@ _Find = Callable[[Controls, Controls], str | None]
 def map_controls(config: str | None, device: str, wait: float) -> None:
     """Learn the controls of a device, and print them as YAML for the section `teleoperation`.
 
-    CONFIG is a robot YAML, as for `ibrobot launch`: its joints are asked for. Asks for one control after another: press
-    or move it to its end, then let go. What is not touched in time keeps its default.
+    CONFIG is a robot YAML as for `ibrobot launch`; it names the joints. The command asks for one control after another:
+    press it, or move it to its end, then let go. A function whose control you do not touch in time keeps its default.
     """
     registry = installed_plugins()
     robot = load_config(find_config(config, registry), registry=registry).robot

@@ -11,7 +11,7 @@ from ibrobot_core.api import echo, wrong_input
 
 @click.command()
 @click.argument("episode", type=click.Path(path_type=Path))
-@click.option("--from", "begin_s", type=click.FloatRange(min=0), default=0.0, show_default=True, help="[s]")
+@click.option("--from", "begin_s", type=click.FloatRange(min=0), default=0.0, show_default=True, help="Start [s].")
 @click.option("--to", "end_s", type=click.FloatRange(min=0), help="End [s]; by default the end of the episode.")
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="The new episode.")
 @click.option("--in-place", is_flag=True, help="Replace EPISODE; the original moves to .trash beside it.")

@@ -50,8 +50,8 @@ def task() -> None:
 def check(file: str, config: str | None, **options: Any) -> None:
     """Check the task in FILE for a robot, and move nothing.
 
-    CONFIG is a robot YAML as for `ibrobot launch`. Checks names, limits, the order of the steps, models, and by
-    inverse kinematics whether the tool can be where the steps want it, as far as positions are known.
+    CONFIG is a robot YAML as for `ibrobot launch`. Checks names, limits, models and the order of the steps, and by
+    inverse kinematics whether the tool can reach every goal whose position is known.
     """
     registry, read = installed_plugins(), _read(file, options["parameters"])
     robot = load_config(

@@ -48,7 +48,7 @@ def list_(transport: ZenohTransport, namespace: str) -> None:
 @_command
 @click.argument("name", metavar="SERVICE")
 @click.argument("request", default="null")
-@click.option("--timeout", default=60.0, show_default=True, type=click.FloatRange(0.01), help="For the answer [s].")
+@click.option("--timeout", default=60.0, show_default=True, type=click.FloatRange(0.01), help="Longest wait [s].")
 @click.option("--text", is_flag=True, help="Send REQUEST as it is, as text.")
 def call(transport: ZenohTransport, namespace: str, name: str, request: str, timeout: float, text: bool) -> None:
     """Call SERVICE with REQUEST, as YAML, and print the answer.
