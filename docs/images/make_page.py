@@ -1,8 +1,9 @@
 """Screenshots of the page for the documentation; needs Chromium.
 
-    uv run --with pillow python docs/images/make_page.py [FOLDER]
+    uv run --with pillow python docs/images/make_page.py
 
-Without FOLDER it writes page.webp and page_phone.webp here; with one, PNGs of all sizes and themes to look at.
+Writes page.webp and page_phone.webp here. `plugins/ibrobot-plugin-web/tests/look.py` takes pictures of all states to
+look at.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from PIL import Image
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests/shared"))
 
 FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=gl-egl", "--ignore-gpu-blocklist"]
-SIZES = {"desktop": (1440, 900), "tablet": (820, 1180), "phone": (390, 844)}
+DESKTOP, PHONE = (1440, 900), (390, 844)
 
 
 def opened(chromium: Any, address: str, size: tuple[int, int], theme: str) -> Any:
@@ -43,30 +44,17 @@ def main() -> None:
     from page_run import page_run
     from playwright.sync_api import sync_playwright
 
-    folder = Path(sys.argv[1]) if sys.argv[1:] else None
     here = Path(__file__).parent
     with page_run("so101", "--sim") as address, sync_playwright() as playwright:
         chromium = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS)
-        if folder is None:
-            save(opened(chromium, address, SIZES["desktop"], "light"), here / "page.webp")
-            page = opened(chromium, address, SIZES["phone"], "dark")
-            page.get_by_role("button", name="Take over").click()
-            page.get_by_role("button", name="web teleoperation").click()
-            page.wait_for_timeout(2000)
-            page.evaluate("window.scrollTo(0, 0)")
-            page.wait_for_timeout(500)
-            save(page, here / "page_phone.webp")
-            return
-        folder.mkdir(parents=True, exist_ok=True)
-        for theme in ("light", "dark"):
-            for name, size in SIZES.items():
-                page = opened(chromium, address, size, theme)
-                page.screenshot(path=folder / f"{name}-{theme}.png")
-                for tab in ("Plots", "Health"):
-                    page.get_by_role("tab", name=tab).click()
-                    page.wait_for_timeout(2500)
-                    page.screenshot(path=folder / f"{name}-{theme}-{tab}.png", full_page=True)
-                page.context.close()
+        save(opened(chromium, address, DESKTOP, "light"), here / "page.webp")
+        page = opened(chromium, address, PHONE, "dark")
+        page.get_by_role("button", name="Take over").click()
+        page.get_by_role("button", name="web teleoperation").click()
+        page.wait_for_timeout(2000)
+        page.evaluate("window.scrollTo(0, 0)")
+        page.wait_for_timeout(500)
+        save(page, here / "page_phone.webp")
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 """Screenshots of `ibrobot ui` for the documentation, taken on the way that the tests walk; needs Chromium.
 
-    uv run --with pillow python docs/images/make_ui.py [FOLDER]
+    uv run --with pillow python docs/images/make_ui.py
 
-Without FOLDER it writes ui_*.webp here; with one, PNGs of all views in all sizes and themes to look at.
+Writes ui_*.webp here. `plugins/ibrobot-plugin-web/tests/look.py` takes pictures of all views in all states to look at.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests/shared"))
 
-SIZES = {"desktop": (1440, 900), "tablet": (820, 1180), "phone": (390, 844)}
 _WIDTH = 1200
 """Width of the page in the documentation [px]."""
 
@@ -28,7 +27,6 @@ def main() -> None:
     from playwright.sync_api import sync_playwright
     from ui_path import FLAGS, convert, own_robot, record, ui_process
 
-    looked_at = Path(sys.argv[1]) if sys.argv[1:] else None
     here = Path(__file__).parent
 
     def shot(page: Any, name: str) -> None:
@@ -38,10 +36,9 @@ def main() -> None:
                 break
             page.wait_for_timeout(100)
         page.wait_for_timeout(1500)
-        if looked_at is None:
-            path = here / f"ui_{name}.webp"
-            Image.open(BytesIO(page.screenshot())).save(path, quality=85)
-            print(path)
+        path = here / f"ui_{name}.webp"
+        Image.open(BytesIO(page.screenshot())).save(path, quality=85)
+        print(path)
 
     with tempfile.TemporaryDirectory() as made, sync_playwright() as playwright:
         folder = Path(made) / "arm"
@@ -55,24 +52,7 @@ def main() -> None:
             convert(page, shot)
             page.get_by_role("link", name="Devices").click()
             shot(page, "devices")
-            if looked_at is not None:
-                looked_at.mkdir(parents=True, exist_ok=True)
-                look(chromium, address, looked_at)
             chromium.close()
-
-
-def look(chromium: Any, address: str, folder: Path) -> None:
-    """Take pictures of all views in all sizes and themes."""
-    for theme in ("light", "dark"):
-        for name, (width, height) in SIZES.items():
-            page = chromium.new_context(viewport={"width": width, "height": height}, color_scheme=theme).new_page()
-            page.goto(address)
-            page.wait_for_timeout(1500)
-            for view in page.evaluate("ibrobot.session.views.map(({name}) => name)"):
-                page.evaluate(f"location.hash = '{view}'")
-                page.wait_for_timeout(1500)
-                page.screenshot(path=folder / f"{view}-{name}-{theme}.png")
-            page.context.close()
 
 
 if __name__ == "__main__":

@@ -124,6 +124,14 @@ class Contract:
             raise ContractError(f"a contract of version {canonical.get('version')}; the only known version is 1")
         return contract
 
+    @classmethod
+    def of_episode(cls, metadata: Mapping[str, str]) -> Contract | None:
+        """The contract in an episode's metadata; None if it has none."""
+        try:
+            return cls.from_canonical(json.loads(metadata["contract"])) if "contract" in metadata else None
+        except (ValueError, ContractError):
+            return None  # a foreign key of the same name
+
     @cached_property
     def step_ns(self) -> int:
         """Time between ticks [ns]."""

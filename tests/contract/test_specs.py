@@ -84,6 +84,15 @@ def test_a_message_without_a_header_goes_by_its_receipt(make_config: Make) -> No
     assert [part.align.stamp for part in made.observation_parts] == ["header", "receive"]
 
 
+def test_an_episode_has_a_contract_or_none(make_config: Make) -> None:
+    contract = Contract.from_config(make_config((STATE,)))
+    found = Contract.of_episode({"contract": json.dumps(contract.canonical())})
+    assert found is not None
+    assert found.fingerprint() == contract.fingerprint()
+    for foreign in ({}, {"contract": "of sale"}, {"contract": "3"}, {"contract": '{"rate_hz": 30}'}):
+        assert Contract.of_episode(foreign) is None
+
+
 def test_a_foreign_type_is_read_back_as_it_was(make_config: Make) -> None:
     spec = ObservationSpec(
         "observation.touch", topic="/touch", type="lamp_msgs/msg/Touch", foreign=True, select=("tags.0.id", "x")

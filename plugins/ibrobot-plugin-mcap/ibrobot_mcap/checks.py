@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections import defaultdict
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import numpy as np
 
-from ibrobot_core.api import NS_PER_S, Contract, ContractError, RecorderError
+from ibrobot_core.api import NS_PER_S, Contract, RecorderError
 from ibrobot_mcap.metadata import METADATA
 from ibrobot_mcap.reader import Rosbag2Reader
 
@@ -64,19 +63,9 @@ def problems_of(path: Path, longest_gap: float) -> list[str]:
     return problems
 
 
-def contract_of(metadata: Mapping[str, str]) -> Contract | None:
-    """The contract of a recorded episode; None if it has none."""
-    if "contract" not in metadata:
-        return None
-    try:
-        return Contract.from_canonical(json.loads(metadata["contract"]))
-    except (ValueError, ContractError):
-        return None  # a foreign key of the same name
-
-
 def _required(metadata: Mapping[str, str]) -> Collection[str]:
     """The topics of an episode's contract; empty if it has none."""
-    contract = contract_of(metadata)
+    contract = Contract.of_episode(metadata)
     return () if contract is None else contract.topics
 
 

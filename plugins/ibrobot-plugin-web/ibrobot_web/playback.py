@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,6 @@ from ibrobot_core.api import (
     NS_PER_S,
     CompressedImage,
     Contract,
-    ContractError,
     EpisodeReader,
     EpisodeSummary,
     Float64MultiArray,
@@ -26,7 +25,6 @@ from ibrobot_core.api import (
     IbrobotError,
     Image,
     JointState,
-    Message,
     Recorded,
     from_document,
     installed_plugins,
@@ -95,7 +93,7 @@ class Playback:
         self._streams: dict[str, _Stream] = {}
         self._opening = threading.Lock()
         self._closed = False
-        contract = _contract(self.summary.metadata)
+        contract = Contract.of_episode(self.summary.metadata)
         self._actions = {part.topic: part.joints for part in contract.action_parts} if contract is not None else {}
 
     def close(self) -> None:
@@ -139,7 +137,7 @@ class Playback:
             for i, item in enumerate(self._plain.reader.messages({topic})):
                 if i % step == 0:
                     times.append(self._seconds(item))
-                    rows.append(self._named(topic, item.message))
+                    rows.append(numbers_of(item.message, self._actions.get(topic, ())))
         names = dict.fromkeys(name for row in rows for name in row)
         return {"times": times, "values": {name: [row.get(name) for row in rows] for name in names}}
 
@@ -230,12 +228,6 @@ class Playback:
     def _seconds(self, item: Recorded) -> float:
         return round((item.received_ns - self.summary.start_ns) / NS_PER_S, 4)
 
-    def _named(self, topic: str, message: Message) -> dict[str, float]:
-        """The numbers of a message; those of joints by name."""
-        found = numbers_of(message)
-        joints = message.name if isinstance(message, JointState) else self._actions.get(topic, ())
-        return {_by_name(path, joints): value for path, value in found.items()}
-
     def _motion(self) -> dict[str, Any]:
         """Joint states over time, thinned: `joints`, `times` [s], `positions`, and `commands` where known."""
         states = [topic for topic, each in self.summary.topics.items() if each.type == JointState.ros_type]
@@ -276,15 +268,6 @@ def problems_of(summary: EpisodeSummary) -> list[str]:
     return found
 
 
-def _contract(metadata: Mapping[str, str]) -> Contract | None:
-    if "contract" not in metadata:
-        return None
-    try:
-        return Contract.from_canonical(json.loads(metadata["contract"]))
-    except (ValueError, ContractError):
-        return None  # a foreign key of the same name
-
-
 def _file(text: str, find: Callable[[str], Path]) -> Path:
     """The file of a robot's model: of a package, or one that `find` admits."""
     if not text.startswith("package://"):
@@ -295,15 +278,6 @@ def _file(text: str, find: Callable[[str], Path]) -> Path:
         return resolve_path(text, Path())
     except ValueError as error:
         raise IbrobotError(f"the robot's model: {error}") from None
-
-
-def _by_name(path: str, joints: tuple[str, ...]) -> str:
-    """`position[0]` as `position.shoulder_pan`, and `data[0]` of a command as the joint's name."""
-    field, bracket, index = path.partition("[")
-    if not bracket or not index[:-1].isdigit() or int(index[:-1]) >= len(joints):
-        return path
-    name = joints[int(index[:-1])]
-    return name if field == "data" else f"{field}.{name}"
 
 
 def _number(value: float | None) -> float | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 import threading
 from collections import deque
 from collections.abc import Iterator, Mapping
@@ -12,8 +13,9 @@ from typing import Any, override
 import attrs
 import numpy as np
 
-from ibrobot_core.api import NS_PER_S, ControlMode, ControlState, Message, Session, Vector, error_text
+from ibrobot_core.api import NS_PER_S, ControlMode, ControlState, JointState, Message, Session, Vector, error_text
 
+_TOKEN = re.compile(r"(?<=[?&]token=)[\w-]+")
 _LOG_LINES = 100
 _PLAN_ROWS = 24
 """Setpoints of the plan that a page gets, evenly spaced."""
@@ -34,6 +36,11 @@ SERVICES = {
 EPISODE_STATUS = "/record_episode/status"
 
 
+def without_tokens(text: str) -> str:
+    """A line of output without the tokens in its links, which not every page may see."""
+    return _TOKEN.sub("…", text)
+
+
 class LogLines(logging.Handler):
     """Keeps the last lines of the log, for pages that open later. Thread-safe."""
 
@@ -48,7 +55,7 @@ class LogLines(logging.Handler):
         with self._adding:
             self._number += 1
             line = {"n": self._number, "level": record.levelname.lower(), "time": round(record.created, 3)}
-            self._lines.append({**line, "text": record.getMessage()})
+            self._lines.append({**line, "text": without_tokens(record.getMessage())})
 
     def lines(self) -> list[dict[str, Any]]:
         """The last lines, oldest first."""
@@ -150,14 +157,30 @@ def plan_json(session: Session, now_ns: int) -> dict[str, Any]:
     }
 
 
-def numbers_of(message: Message) -> dict[str, float]:
-    """The numbers of a message for plots: path -> value; at most `_LEAVES`."""
+def numbers_of(message: Message, joints: tuple[str, ...] = ()) -> dict[str, float]:
+    """The numbers of a message for plots: path -> value; at most `_LEAVES`.
+
+    Args:
+        message: the message; the paths of a JointState have the names of its joints.
+        joints: the joints of a vector of commands.
+    """
+    if isinstance(message, JointState):
+        joints = message.name
     found: dict[str, float] = {}
     for path, value in _leaves(message, ""):
         if len(found) >= _LEAVES:
             break
-        found[path] = value
+        found[_by_name(path, joints)] = value
     return found
+
+
+def _by_name(path: str, joints: tuple[str, ...]) -> str:
+    """`position[0]` as `position.shoulder_pan`, and `data[0]` of a command as the joint's name."""
+    field, bracket, index = path.partition("[")
+    if not bracket or not index[:-1].isdigit() or int(index[:-1]) >= len(joints):
+        return path
+    name = joints[int(index[:-1])]
+    return name if field == "data" else f"{field}.{name}"
 
 
 def _leaves(value: Any, path: str) -> Iterator[tuple[str, float]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import logging
 import socket
 from types import SimpleNamespace
 from typing import Any
@@ -120,7 +121,8 @@ def test_numbers_of_messages_are_paths() -> None:
     assert numbers_of(Float64MultiArray(np.array([1.5, np.nan]))) == {"data[0]": 1.5}
     assert numbers_of(String("5")) == {}
     names = numbers_of(JointState(Header(1), ("a", "b"), np.array([1.0, 2.0])))
-    assert names == {"position[0]": 1.0, "position[1]": 2.0}
+    assert names == {"position.a": 1.0, "position.b": 2.0}
+    assert numbers_of(Float64MultiArray(np.array([1.5, 2.0])), ("a",)) == {"a": 1.5, "data[1]": 2.0}
     assert numbers_of(Imu(Header(1), linear_acceleration=Vector3(0, 0, 9.81)))["linear_acceleration.z"] == 9.81
 
 
@@ -131,6 +133,14 @@ def test_the_status_of_a_run_is_json_without_nan() -> None:
     text = json.dumps(status, allow_nan=False)
     assert json.loads(text)["robot"]["joints"][0]["name"] == "shoulder_pan"
     assert plan_json(session, 0) == {"joints": [], "rows": []}
+
+
+def test_pages_that_only_watch_see_no_token_in_the_log() -> None:
+    log = LogLines()
+    link = "viewer: http://127.0.0.1:8080/?token=x-Y_z  (to watch only: http://127.0.0.1:8080/?token=abc)"
+    log.emit(logging.LogRecord("ibrobot", logging.INFO, "", 0, link, None, None))
+    (line,) = log.lines()
+    assert line["text"] == "viewer: http://127.0.0.1:8080/?token=…  (to watch only: http://127.0.0.1:8080/?token=…)"
 
 
 def test_panels_of_plugins_are_shown_and_a_failing_one_harms_nothing() -> None:

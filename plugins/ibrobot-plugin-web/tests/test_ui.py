@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import io
+import os
 import sys
 from collections.abc import Awaitable, Callable
 from pathlib import Path
@@ -98,6 +99,21 @@ def test_a_job_streams_its_output_its_progress_and_its_end(tmp_path: Path) -> No
         assert lines == ["at: 0.5", "red", "50%", "error: no disk"]
 
     run(tmp_path, test)
+
+
+def test_a_job_ends_with_its_process_even_if_another_one_keeps_its_output_open(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "end")
+
+    async def test(server: UiServer) -> None:
+        child = "import subprocess; print('started', flush=True); subprocess.Popen(['sh', '-c', 'read line < end'])"
+        server.ui.jobs.start("run", "Run", [child], program=PYTHON)
+        job, lines = await server.job(lambda job: job["state"] != "running")
+        assert (job["state"], lines) == ("done", ["started"])
+
+    try:
+        run(tmp_path, test)
+    finally:
+        (tmp_path / "end").write_text("\n")  # the other one ends
 
 
 def test_a_job_is_cancelled_as_by_ctrl_c_and_then_at_once(tmp_path: Path) -> None:

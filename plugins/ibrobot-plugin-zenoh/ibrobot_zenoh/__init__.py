@@ -1,11 +1,11 @@
-"""The plugin's hooks: transport `zenoh`, the commands `ibrobot topic …`, `ibrobot service …` and `ibrobot certs`."""
+"""The plugin's hooks: transport `zenoh`, its panel, the commands `ibrobot topic …`, `service …` and `certs`."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.api import Command, DecoderDescriptor, TransportDescriptor, hookimpl
+from ibrobot_core.api import Command, DecoderDescriptor, PanelDescriptor, TransportDescriptor, hookimpl
 from ibrobot_zenoh.options import Share, ZenohOptions, server_options
 
 if TYPE_CHECKING:
@@ -34,6 +34,18 @@ def ibrobot_transports() -> Iterable[TransportDescriptor]:
         used=lambda options: options.share != Share(),
         summary="between machines, including ROS 2 nodes with rmw_zenoh",
     )  # fmt: skip
+
+
+def _peers(session: Session) -> list[tuple[str, ...]]:
+    from ibrobot_zenoh.panel import peer_rows
+
+    return peer_rows(session)
+
+
+@hookimpl
+def ibrobot_panels() -> Iterable[PanelDescriptor]:
+    """The machines that a run is connected to."""
+    yield PanelDescriptor("Zenoh peers", ("peer", "kind", "address", "certificate"), _peers)
 
 
 def _decoder() -> Callable[[CompressedImage], Image | None]:

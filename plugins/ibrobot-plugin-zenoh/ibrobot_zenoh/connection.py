@@ -103,6 +103,11 @@ def first_line(error: BaseException) -> str:
 _open: WeakSet[Connection] = WeakSet()
 
 
+def open_connections() -> list[Connection]:
+    """The connections of this process that are not closed."""
+    return [each for each in tuple(_open) if not each.closed]
+
+
 @cache
 def _close_at_the_end() -> None:
     """Register a handler, once, that closes open sessions at exit, so that the process ends.
@@ -130,7 +135,8 @@ class Connection:
     def __init__(self, options: ZenohOptions, log: logging.Logger) -> None:
         self._log = log
         set_malloc(_LARGEST_KEPT, _KEPT_BYTES)
-        self._endpoints = ", ".join(options.connect or options.listen)
+        self.endpoints = ", ".join(options.connect or options.listen)
+        """The addresses that it connects to, or listens on."""
         self._config = zenoh_config(options)
         self.knows_who_asks = restrict(self._config, options)
         """Whether the name in a request's key is verified."""
@@ -143,7 +149,7 @@ class Connection:
         _open.add(self)
         _close_at_the_end()
         self._options = options
-        self.why_not = f"nobody answers at {self._endpoints}"
+        self.why_not = f"nobody answers at {self.endpoints}"
         """Why there is no connection yet."""
         self.answered = threading.Event()
         """Set when the session is open."""
@@ -152,7 +158,7 @@ class Connection:
             try:
                 self._session = zenoh.open(self._config)
             except zenoh.ZError as error:
-                raise TransportError(f"{self._endpoints}: {first_line(error)}") from error
+                raise TransportError(f"{self.endpoints}: {first_line(error)}") from error
             return
         self._thread = threading.Thread(target=self._connect, name="zenoh connects", daemon=True)
         self._thread.start()
@@ -177,6 +183,11 @@ class Connection:
         """
         self.check_open()
         return self._session
+
+    @property
+    def closed(self) -> bool:
+        """Whether it is closed."""
+        return self._closed.is_set()
 
     def check_open(self) -> None:
         """Check that the session is not closed.
@@ -247,6 +258,6 @@ class Connection:
                     self._pending.clear()
                     self.answered.set()
                     if logged:
-                        self._log.info("connected to %s", self._endpoints)
+                        self._log.info("connected to %s", self.endpoints)
                     return
             session.close()  # type: ignore[no-untyped-call]  # its stub has no types

@@ -24,9 +24,11 @@ from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 from cryptography.x509.oid import NameOID
+from ibrobot_testing import make_session
 from ibrobot_zenoh.certificates import Authority
 from ibrobot_zenoh.commands.certs import certs
 from ibrobot_zenoh.options import Tls
+from ibrobot_zenoh.panel import peer_rows
 from ibrobot_zenoh.reasons import why_not
 
 from ibrobot_core.api import Int32, String, TransportError
@@ -60,8 +62,14 @@ def test_requests_pass_with_certificates(lab: Path):
     for robot, name in zip(robots, ("robot1", "robot2"), strict=True):
         settle(robot, server, name)
         assert robot.request("echo", b"hello", WAIT_S) == b"hello"
+    peers = peer_rows(make_session())
+    assert sorted((kind, name) for _, kind, _, name in peers if kind == "client") == [
+        ("client", "robot1"), ("client", "robot2"),
+    ]  # fmt: skip
+    assert {address for _, kind, address, _ in peers if kind == "router"} == {endpoint}
     for end in (*robots, server):
         end.close()
+    assert peer_rows(make_session()) == []
 
 
 def test_another_authority_s_certificate_gets_nothing(lab: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture):

@@ -10,8 +10,7 @@ from typing import Any
 import click
 import numpy as np
 
-from ibrobot_core.api import NS_PER_S, Float64MultiArray, Image, JointState, RecorderError, echo, wrong_input
-from ibrobot_mcap.checks import contract_of
+from ibrobot_core.api import NS_PER_S, Contract, Float64MultiArray, Image, JointState, RecorderError, echo, wrong_input
 
 _THUMBNAILS = 8
 
@@ -72,7 +71,7 @@ class Facts:
 
 def actions_of(metadata: Mapping[str, str], topics: Collection[str]) -> dict[str, tuple[str, ...]]:
     """Topic of an action -> joints, from the recorded contract or else from the names of controllers."""
-    contract = contract_of(metadata)
+    contract = Contract.of_episode(metadata)
     if contract is not None:
         return {part.topic: part.joints for part in contract.action_parts}
     return {topic: () for topic in topics if topic.endswith("/commands")}

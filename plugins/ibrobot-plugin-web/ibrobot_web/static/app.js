@@ -86,7 +86,6 @@ $("theme").addEventListener("click", () => {
   const theme = isDark() ? "light" : "dark";
   document.documentElement.dataset.theme = theme;
   localStorage.setItem("theme", theme);
-  view.theme();
 });
 for (const which of ["3d", "cameras"]) {
   $(`show-${which}`).addEventListener("click", () => {
@@ -132,17 +131,17 @@ function showHeader() {
   document.title = `${status.robot.name}: ${status.mode}`;
   say($("mode"), `${status.mode}${status.robot.simulated ? " · simulation" : ""}`);
   const loop = status.counts.loop ?? {};
-  say($("late"), loop.ticks ? `late p99 ${Math.round(loop.lateness_p99_us)} µs · missed ${loop.missed}` : "");
+  say($("late"), loop.ticks ? `${Math.round(loop.rate_hz)} Hz · late p99 ${Math.round(loop.lateness_p99_us)} µs · missed ${loop.missed}` : "");
   $("late").classList.toggle("bad", (loop.missed ?? 0) > 0);
 }
 
 function showOperator() {
   const { operating, operator, role, pages } = page.drive.facts;
   document.body.classList.toggle("operating", operating);
-  const who = operating ? "you operate" : operator ? `watching · ${operator} operates` : "watching · no operator";
-  say($("operator"), role === "watch" ? "watching only" : who + (pages > 1 ? ` · ${pages} pages` : ""));
+  const who = !page.drive.open ? "" : operating ? "you operate" : operator ? `watching · ${operator} operates` : "watching · no operator";
+  say($("operator"), role === "watch" ? "watching only" : who && who + (pages > 1 ? ` · ${pages} pages` : ""));
   $("operator").classList.toggle("good", operating);
-  $("operate").hidden = role === "watch";
+  $("operate").hidden = role === "watch" || !page.drive.open;
   say($("operate"), operating ? "Only watch" : operator ? "Take over" : "Operate");
   $("stop").disabled = role === "watch";
 }

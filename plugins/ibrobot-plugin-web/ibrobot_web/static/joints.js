@@ -43,11 +43,18 @@ export class Joints {
     this.rows.forEach((row, i) => {
       const { lower, upper } = row.joint;
       const share = (value) => `${100 * Math.min(1, Math.max(0, (value - lower) / (upper - lower)))}%`;
-      row.value.textContent = `${position[i].toFixed(2)} rad · ${(position[i] * 180 / Math.PI).toFixed(0)}°`;
+      row.value.textContent = this.page.view.slides.includes(row.joint.name) ? `${signed(position[i], 3)} m`
+        : `${signed(position[i], 2)} rad · ${signed(position[i] * 180 / Math.PI, 0)}°`;
       row.bar.style.width = share(position[i]);
       row.command.style.left = share(command[i]);
       row.element.classList.toggle("outside", position[i] < lower || position[i] > upper);
       if (document.activeElement !== row.slider || !this.page.deadman.held) row.slider.value = position[i];
     });
   }
+}
+
+// A number with a typographic minus, and none before zero.
+function signed(value, digits) {
+  const text = value.toFixed(digits);
+  return Number(text) === 0 ? text.replace("-", "") : text.replace("-", "−");
 }

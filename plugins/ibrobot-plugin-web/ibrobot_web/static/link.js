@@ -80,7 +80,7 @@ export class Drive extends EventTarget {
     this.socket.onmessage = ({ data }) => this.take(JSON.parse(data));
     this.socket.onopen = () => this.emit("connection", { open: true });
     this.socket.onclose = () => {
-      this.facts = { ...this.facts, operating: false };
+      this.facts = { ...this.facts, operating: false, operator: "" };
       for (const { reject } of this.waiting.values()) reject(new Error("the connection to the robot was lost"));
       this.waiting.clear();
       this.emit("operator", this.facts);

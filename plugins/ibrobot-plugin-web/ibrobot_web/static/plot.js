@@ -69,3 +69,8 @@ export function timeAt(canvas, event, begin, end) {
   const share = (event.clientX - box.left - LEFT) / (box.width - LEFT - 8);
   return begin + Math.min(1, Math.max(0, share)) * (end - begin);
 }
+
+// Values of a kind are plotted together: position.shoulder_pan is one of position, latency_p50_ms one of latency.
+export function kindOf(name) {
+  return /^[^.[]+(?=[.[])/.exec(name)?.[0] ?? /^(lateness|latency)(?=_)/.exec(name)?.[0] ?? "values";
+}

@@ -2,9 +2,7 @@
 
 import { h, refresh } from "./dom.js";
 
-const TOOL = {
-  "tool forward and back": [0, 1], "tool left and right": [1, 1], "tool up and down": [2, 1],
-};
+const TOOL = { "forward / back": [0, 1], "left / right": [1, 1], "up / down": [2, 1] };
 
 export class Thumb {
   constructor(bar, page) {
@@ -14,8 +12,9 @@ export class Thumb {
 
   update({ robot }) {
     refresh(this.bar, [robot.joints, robot.tool], () => {
-      const motions = [...(robot.tool ? Object.keys(TOOL) : []), ...robot.joints.map((joint) => joint.name)];
-      const choice = h("select", { "aria-label": "Motion" }, motions.map((name) => h("option", {}, name)));
+      const group = (label, names) => h("optgroup", { label }, names.map((name) => h("option", {}, name)));
+      const choice = h("select", { "aria-label": "Motion" }, robot.tool ? group("Tool", Object.keys(TOOL)) : null,
+        group("Joints", robot.joints.map((joint) => joint.name)));
       const button = (label, speed) => this.page.deadman.button(h("button", { "aria-label": `${label}, hold to move` },
         speed < 0 ? "−" : "+"), () => request(choice.value, speed));
       return [button("less", -1), choice, button("more", 1)];

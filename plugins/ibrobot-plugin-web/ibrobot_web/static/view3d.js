@@ -19,6 +19,7 @@ export class View3D {
       h("span", { class: "planned" }, "plan"));
     section.append(this.canvas, this.note, this.legend);
     this.frames = 0;
+    this.slides = []; // joints whose positions are metres
     this.ages = [];
     if (!this.canvas.transferControlToOffscreen) {
       this.note.textContent = "3D needs a newer browser.";
@@ -29,6 +30,7 @@ export class View3D {
     this.worker.postMessage({ do: "start", canvas: offscreen, dark: isDark() }, [offscreen]);
     this.worker.onerror = (event) => { this.note.textContent = `3D failed: ${event.message}`; };
     this.worker.onmessage = ({ data }) => {
+      if (data.slides) this.slides = data.slides;
       if (data.problem !== undefined) this.note.textContent = data.problem;
       if (data.drawn) {
         this.frames += 1;
@@ -41,6 +43,8 @@ export class View3D {
     new ResizeObserver(() => this.resize()).observe(section);
     this.resize();
     this.listen();
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.theme());
+    new MutationObserver(() => this.theme()).observe(document.documentElement, { attributeFilter: ["data-theme"] });
     if (scene) this.load(scene);
   }
 

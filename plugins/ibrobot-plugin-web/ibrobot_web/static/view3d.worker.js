@@ -60,6 +60,7 @@ function load({ scene }) {
       local: placed(geom.pos, geom.quat), color: geom.rgba,
     })),
   }));
+  postMessage({ slides: bodies.flatMap(({ joints: own }) => own.filter(({ type }) => type === "slide").map(({ name }) => name)) });
   tip = scene.tip;
   cameras = (scene.cameras ?? []).map(({ body, pos, quat, fovy }) => (
     { body, local: placed(pos, quat), shape: screen.line(frustum(fovy), true) }));

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import select
 import signal
 import subprocess
 import sys
@@ -17,6 +18,7 @@ from typing import Any, Literal
 import attrs
 
 from ibrobot_core.api import IbrobotError
+from ibrobot_web.status import without_tokens
 
 IBROBOT = (sys.executable, "-c", "from ibrobot_core.cli.command import main; main()")
 """The command `ibrobot` of this environment, whatever PATH says."""
@@ -26,6 +28,8 @@ _ENDED = 50
 """Ended jobs that are kept."""
 _END_S = 20.0
 """Time that jobs get to end by themselves when the page's server ends [s]."""
+_POLL_S = 0.5
+"""Time between two looks at whether a silent job has ended [s]."""
 _CHUNK = 65536
 _LONGEST = 4000
 """Longest line [characters]; the rest of a longer one is left out."""
@@ -35,9 +39,6 @@ _CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]|[\x00-\x08\x0b-\x1f\x7f]")
 
 _END = re.compile(rb"\r\n|\n|\r(?!\Z)")
 """The end of a line; whether a final CR is one shows in what follows it."""
-_TOKEN = re.compile(r"(?<=[?&]token=)[\w-]+")
-"""Tokens in output, which not every page may see."""
-
 Reader = Callable[[str], Mapping[str, Any] | None]
 """Reads facts from a line of output, e.g. `{"progress": 0.5}`; None if the line contains none."""
 State = Literal["running", "done", "failed", "cancelled"]
@@ -194,7 +195,7 @@ class Jobs:
         output = job.process.stdout
         assert output is not None
         rest = b""
-        while chunk := os.read(output.fileno(), _CHUNK):
+        while chunk := _read(job.process, output.fileno()):
             *lines, rest = _END.split(rest + chunk)
             self._take(job, lines, read)
             rest = rest[-_LONGEST:]
@@ -209,7 +210,7 @@ class Jobs:
     def _take(self, job: Job, lines: Sequence[bytes], read: Reader | None) -> None:
         texts = [_CONTROL.sub("", line.decode(errors="replace"))[:_LONGEST] for line in lines]
         with self._lock:
-            job.lines.extend(_TOKEN.sub("…", text) for text in texts)
+            job.lines.extend(without_tokens(text) for text in texts)
             job.count += len(texts)
             for text in texts if read is not None else ():
                 assert read is not None
@@ -229,6 +230,14 @@ class Jobs:
         ended = [number for number, job in self._jobs.items() if job.state != "running"]
         for number in ended[: max(0, len(ended) - _ENDED)]:
             del self._jobs[number]
+
+
+def _read(process: subprocess.Popen[bytes], output: int) -> bytes:
+    """The next output; empty once the process has ended, even if its own children keep the output open."""
+    while not select.select([output], [], [], _POLL_S)[0]:
+        if process.poll() is not None and not select.select([output], [], [], 0)[0]:
+            return b""
+    return os.read(output, _CHUNK)
 
 
 def _signal(job: Job, number: signal.Signals) -> None:

@@ -34,7 +34,7 @@ export class DrivePanel {
         onclick: () => page.command("mode", { mode: mode.name }, `mode ${mode.name}`),
       }, mode.name, h("small", {}, mode.about))));
     const jogs = Boolean(page.jogs);
-    refresh(this.motion, [jogs, status.robot.tool, status.robot.poses, page.mode?.name, status.help], () => this.motions(status, jogs));
+    refresh(this.motion, [jogs, page.operating, status.robot.tool, status.robot.poses, page.mode?.name, status.help], () => this.motions(status, jogs));
     const services = status.services;
     const dispatch = status.counts.dispatch;
     refresh(this.plan, [services, operating, dispatch?.smoothing, status.commander], () => this.plans(services, dispatch, status));
@@ -51,8 +51,9 @@ export class DrivePanel {
       const web = status.robot.modes.filter((mode) => mode.web).map((mode) => mode.name);
       const how = web.length ? `To jog from this page, enter mode ${web.join(" or ")}.`
         : "To jog from this page, the robot needs a mode whose teleop is of type web.";
-      return [this.page.mode?.web ? h("p", { class: "note" }, "Reset, and operate, to jog.") : h("p", { class: "note" }, how),
-        status.help ? h("pre", {}, status.help) : null].filter(Boolean);
+      const missing = !this.page.operating ? "Only the page that operates can jog." : "Reset the fault to jog.";
+      return [h("p", { class: "note" }, this.page.mode?.web ? missing : how),
+        status.help && !this.page.mode?.web ? h("pre", {}, status.help) : null].filter(Boolean);
     }
     const hold = (name, motion) => deadman.button(h("button", {}, name), () => motion);
     return [
@@ -130,7 +131,7 @@ export class DrivePanel {
   end() {
     const dialog = document.getElementById("dialog");
     dialog.replaceChildren(h("h2", { id: "dialog-title" }, "End the run?"),
-      h("p", {}, "The robot stops as its YAML says, and this page closes."),
+      h("p", {}, "The robot stops as its YAML says. This page then shows nothing new."),
       h("form", { method: "dialog", class: "row" },
         h("button", { class: "danger", onclick: () => this.page.command("finish") }, "End the run"),
         h("button", { autofocus: true }, "Keep it running")));

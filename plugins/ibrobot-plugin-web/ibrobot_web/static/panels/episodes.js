@@ -21,8 +21,8 @@ export class EpisodesPanel {
     const { page } = this;
     const { episode } = status;
     if (!episode) {
-      say(this.facts, `Episodes: ${status.episodes}, successful: ${status.successes}. This run does not record; `
-        + "`ibrobot record` does, and so does a robot YAML with a recording section.");
+      say(this.facts, `Episodes: ${status.episodes}, successful: ${status.successes}. This run does not record. `
+        + "To record, start it by the command ibrobot record, or add a recording section to its YAML.");
       refresh(this.controls, "none", () => []);
       refresh(this.topics, "none", () => []);
       return;

@@ -1,10 +1,10 @@
-// Plots of any numbers on any topic, over the last minutes in which this page was open.
+// Plots of any numbers on any topic while this tab is shown, and of the run's counters, such as latencies, all the time.
 
 import { h, refresh } from "../dom.js";
-import { COLORS, drawPlot } from "../plot.js";
+import { COLORS, drawPlot, kindOf } from "../plot.js";
 
 const SAMPLES = 2;
-const KEPT = 1800; // three minutes at 10 Hz
+const KEPT_S = 180;
 
 export class PlotsPanel {
   id = "plots";
@@ -12,18 +12,20 @@ export class PlotsPanel {
 
   constructor(page) {
     this.page = page;
-    this.times = [];
-    this.series = new Map();
+    this.topics = new Map(); // topic -> {times, series: path -> values}
     this.topic = "/joint_states";
+    this.kind = "position";
   }
 
   mount(element) {
     this.choice = h("select", { id: "plot-topic" });
     this.choice.addEventListener("change", () => { this.topic = this.choice.value; this.draw(); });
+    this.kinds = h("select", { "aria-label": "Values", hidden: true });
+    this.kinds.addEventListener("change", () => { this.kind = this.kinds.value; this.draw(); });
     this.canvas = h("canvas", { class: "plot", role: "img", "aria-label": "Plot of the chosen topic" });
     this.legend = h("p", { class: "legend" });
     this.latency = h("p", { class: "note" });
-    element.append(h("div", { class: "row" }, h("label", { for: "plot-topic" }, "Topic"), this.choice), this.canvas,
+    element.append(h("div", { class: "row" }, h("label", { for: "plot-topic" }, "Topic"), this.choice, this.kinds), this.canvas,
       this.legend, this.latency);
     new ResizeObserver(() => this.draw()).observe(this.canvas);
   }
@@ -36,22 +38,23 @@ export class PlotsPanel {
   }
 
   samples({ stamp, topics }) {
-    this.times.push(stamp / 1e9);
-    for (const [topic, values] of Object.entries(topics)) {
-      for (const [path, value] of Object.entries(values)) {
-        const name = `${topic} ${path}`;
-        if (!this.series.has(name)) this.series.set(name, new Array(this.times.length - 1).fill(null));
-        this.series.get(name).push(value);
-      }
-    }
-    for (const values of this.series.values()) if (values.length < this.times.length) values.push(null);
-    if (this.times.length > KEPT) {
-      this.times.shift();
-      for (const values of this.series.values()) values.shift();
-    }
-    const known = [...new Set([...this.series.keys()].map((name) => name.split(" ")[0]))].sort();
-    refresh(this.choice, known, () => known.map((topic) => h("option", { selected: topic === this.topic }, topic)));
+    for (const [topic, values] of Object.entries(topics)) this.add(topic, stamp / 1e9, values);
     if (this.shown) this.draw();
+  }
+
+  add(topic, time, values) {
+    if (!this.topics.has(topic)) this.topics.set(topic, { times: [], series: new Map() });
+    const { times, series } = this.topics.get(topic);
+    times.push(time);
+    for (const [path, value] of Object.entries(values)) {
+      if (!series.has(path)) series.set(path, new Array(times.length - 1).fill(null));
+      series.get(path).push(value);
+    }
+    for (const kept of series.values()) if (kept.length < times.length) kept.push(null);
+    while (times[0] < time - KEPT_S) {
+      times.shift();
+      for (const kept of series.values()) kept.shift();
+    }
   }
 
   update(status) {
@@ -59,19 +62,29 @@ export class PlotsPanel {
     this.latency.textContent = (dispatch ? `policy latency p50 ${dispatch.latency_p50_ms} ms, p99 ${dispatch.latency_p99_ms} ms, `
       + `plan ${dispatch.plan_length}, holds ${dispatch.holds} · ` : "")
       + (loop?.ticks ? `loop late p50 ${Math.round(loop.lateness_p50_us)} µs, p99 ${Math.round(loop.lateness_p99_us)} µs` : "");
+    const now = (this.page.state?.stamp ?? 0) / 1e9;
+    for (const [group, counts] of Object.entries(now ? status.counts : {})) {
+      const values = Object.entries(counts).filter(([, value]) => typeof value === "number");
+      if (values.length) this.add(`counters of ${group}`, now, Object.fromEntries(values));
+    }
   }
 
   draw() {
-    const shown = [...this.series].filter(([name]) => name.startsWith(`${this.topic} `)).slice(0, COLORS.length);
-    const end = this.times.at(-1) ?? 0;
-    const span = Math.max(10, end - (this.times[0] ?? 0));
-    drawPlot(this.canvas, {
-      times: this.times, lines: shown, begin: end - span, end, labels: [`−${span.toFixed(0)} s`, "now"],
-    });
-    refresh(this.legend, shown.map(([name]) => name), () => shown.map(([name], i) => {
+    const known = [...this.topics.keys()].sort();
+    refresh(this.choice, known, () => known.map((topic) => h("option", { selected: topic === this.topic }, topic)));
+    const { times, series } = this.topics.get(this.topic) ?? { times: [], series: new Map() };
+    const kinds = [...new Set([...series.keys()].map(kindOf))];
+    if (!kinds.includes(this.kind)) [this.kind] = kinds;
+    refresh(this.kinds, [kinds, this.kind], () => kinds.map((kind) => h("option", { selected: kind === this.kind }, kind)));
+    this.kinds.hidden = kinds.length < 2;
+    const lines = [...series].filter(([path]) => kindOf(path) === this.kind).slice(0, COLORS.length);
+    const end = times.at(-1) ?? 0;
+    const span = Math.max(10, end - (times[0] ?? 0));
+    drawPlot(this.canvas, { times, lines, begin: end - span, end, labels: [`−${span.toFixed(0)} s`, "now"] });
+    refresh(this.legend, lines.map(([name]) => name), () => lines.map(([name], i) => {
       const mark = h("i", {});
       mark.style.background = COLORS[i];
-      return h("span", {}, mark, name.slice(this.topic.length + 1));
+      return h("span", {}, mark, name);
     }));
   }
 }

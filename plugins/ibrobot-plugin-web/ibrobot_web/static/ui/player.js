@@ -1,7 +1,7 @@
 // Plays an episode: 3D, camera pictures and plots on one time line. Pictures are asked for by time, the newest only.
 
 import { h, refresh, say } from "../dom.js";
-import { COLORS, drawPlot, timeAt } from "../plot.js";
+import { COLORS, drawPlot, kindOf, timeAt } from "../plot.js";
 import { View3D } from "../view3d.js";
 
 const STEP_S = 0.05;
@@ -26,8 +26,8 @@ export class Player {
   build() {
     this.scene = h("section", { class: "player-3d", "aria-label": "3D view of the robot" });
     this.pictures = h("section", { class: "player-cameras", "aria-label": "Cameras", tabindex: "0" });
-    this.play = h("button", { class: "primary", onclick: () => this.toggle() }, "Play");
-    this.line = h("input", { type: "range", min: "0", max: "1", step: String(STEP_S), value: "0", "aria-label": "Time" });
+    this.play = h("button", { class: "primary", disabled: true, onclick: () => this.toggle() }, "Play");
+    this.line = h("input", { type: "range", min: "0", max: "1", step: String(STEP_S), value: "0", "aria-label": "Time", disabled: true });
     this.line.addEventListener("input", () => { this.pause(); this.seek(Number(this.line.value)); });
     this.clock = h("output", { class: "clock" });
     this.speed = h("select", { "aria-label": "Speed" },
@@ -56,6 +56,8 @@ export class Player {
     this.path = path;
     this.facts = null;
     this.series = null;
+    this.enable();
+    say(this.clock, "");
     const facts = await this.ui.get(`${this.routes}/open`, { path });
     if (this.path !== path) return null; // another was opened meanwhile
     this.facts = facts;
@@ -66,6 +68,7 @@ export class Player {
     if (this.robot !== robot) this.view.load(this.ui.address(`${this.routes}/scene`, { path })).then(() => this.pose(true));
     this.robot = robot;
     this.line.max = String(this.length);
+    this.enable();
     this.cameras = facts.cameras.map((topic) => this.camera(topic));
     this.pictures.replaceChildren(...(this.cameras.length ? this.cameras.map(({ element }) => element)
       : [h("p", { class: "note" }, "No cameras.")]));
@@ -101,7 +104,11 @@ export class Player {
     this.pause();
     this.path = null;
     this.facts = null;
+    this.enable();
   }
+
+  // An episode that is not open yet, or that has no length, cannot be played.
+  enable() { for (const control of [this.play, this.line]) control.disabled = !this.length; }
 
   camera(topic) {
     const name = topic.split("/").filter(Boolean).slice(-2)[0];
@@ -193,7 +200,7 @@ export class Player {
     const found = await this.ui.attempt(() => this.ui.get(`${this.routes}/series`, { path, topic }));
     if (this.path !== path || this.topic.value !== topic) return;
     this.series = found ?? null;
-    const groups = [...new Set(Object.keys(found?.values ?? {}).map(groupOf))];
+    const groups = [...new Set(Object.keys(found?.values ?? {}).map(kindOf))];
     const chosen = groups.includes(this.group.value) ? this.group.value : groups[0];
     this.group.replaceChildren(...groups.map((name) => h("option", { selected: name === chosen }, name)));
     this.group.hidden = groups.length < 2;
@@ -207,7 +214,7 @@ export class Player {
   }
 
   draw() {
-    const lines = Object.entries(this.series?.values ?? {}).filter(([name]) => groupOf(name) === this.group.value).slice(0, COLORS.length);
+    const lines = Object.entries(this.series?.values ?? {}).filter(([name]) => kindOf(name) === this.group.value).slice(0, COLORS.length);
     const shade = this.cut ? [[0, this.cut[0]], [this.cut[1], this.length]] : [];
     drawPlot(this.canvas, {
       times: this.series?.times ?? [], lines, begin: 0, end: this.length || 1, labels: ["0 s", `${this.length.toFixed(1)} s`],
@@ -219,11 +226,6 @@ export class Player {
       return h("span", {}, mark, name);
     }));
   }
-}
-
-// Values of a kind are plotted together: position.shoulder_pan is one of position, and data[3] one of data.
-function groupOf(name) {
-  return /^[^.[]+(?=[.[])/.exec(name)?.[0] ?? "values";
 }
 
 // The index of the last of ascending times at or before one.

@@ -1,0 +1,312 @@
+"""Every view and dialog of both pages, in all states: pictures to look at, and what axe-core finds.
+
+    npm pack axe-core && tar xzf axe-core-*.tgz
+    uv run python plugins/ibrobot-plugin-web/tests/look.py FOLDER --axe package/axe.min.js [--only run]
+
+Writes FOLDER/STATE-SIZE-THEME.png for three sizes and for a desktop at 200 %, light and dark. Prints what axe-core
+finds serious or critical, and exits with 1 if there is any. It needs Chromium and playwright, and takes ten minutes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[3] / "tests/shared"))
+
+FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=gl-egl", "--ignore-gpu-blocklist"]
+SIZES = {"phone": (390, 844), "zoom": (720, 450), "tablet": (820, 1180), "desktop": (1440, 900)}
+"""Width and height [px]; 1440x900 at 200 % has the layout of half its size. The last one stays set."""
+CHECKED = ("phone", "desktop")
+"""Sizes at which axe checks: the layouts differ in these."""
+TABS = ("Drive", "Episodes", "Plots", "Health", "Log")
+_SETTLE_MS = 400
+WRONG = """robot:
+  name: wrong
+  joints:
+    - {name: pan, lower: 1.0, upper: -1.0, max_velocty: 3.0, max_acceleration: 20.0}
+hardware: {type: feetech_so100, port: /dev/ttyACM0}
+"""
+POLICY = ("    inference: {model: scripted_pick}", "    inference: {model: scripted_pick, intervene: page}")
+"""What lets an operator take the robot from the policy by the page."""
+
+
+class Look:
+    """Takes pictures of a state in all sizes and themes, and checks it.
+
+    Args:
+        folder: for the pictures.
+        axe: source of axe-core; empty to check nothing.
+    """
+
+    def __init__(self, folder: Path, axe: str) -> None:
+        self._folder = folder
+        self._axe = axe
+        self.wrong = 0
+        folder.mkdir(parents=True, exist_ok=True)
+
+    def __call__(self, page: Any, name: str) -> None:
+        """Look at the state of a page."""
+        page.evaluate("window.scrollTo(0, 0)")
+        for theme in ("light", "dark"):
+            page.emulate_media(color_scheme=theme)
+            for size, (width, height) in SIZES.items():
+                page.set_viewport_size({"width": width, "height": height})
+                page.wait_for_timeout(_SETTLE_MS)
+                page.screenshot(path=self._folder / f"{name}-{size}-{theme}.png", full_page=True)
+                if self._axe and size in CHECKED:
+                    self._check(page, f"{name}, {size}, {theme}")
+        print(name, flush=True)
+
+    def _check(self, page: Any, where: str) -> None:
+        if page.evaluate("typeof axe === 'undefined'"):
+            page.add_script_tag(content=self._axe)
+        for each in page.evaluate("axe.run(document, {resultTypes: ['violations']})")["violations"]:
+            if each["impact"] not in ("serious", "critical"):
+                continue
+            self.wrong += 1
+            targets = ", ".join(str(node["target"][0]) for node in each["nodes"][:4])
+            print(f"{where}: {each['impact']}: {each['id']}: {each['help']}: {targets}", flush=True)
+
+
+def opened(chromium: Any, address: str) -> Any:
+    """A page in a browser of its own."""
+    width, height = SIZES["desktop"]
+    page = chromium.new_context(viewport={"width": width, "height": height}, bypass_csp=True).new_page()
+    page.goto(address)
+    return page
+
+
+def view(page: Any, name: str) -> None:
+    """Go to a view, and wait until it shows what it loads."""
+    page.evaluate(f"location.hash = {name!r}")
+    page.wait_for_timeout(2500)
+
+
+def look_at_empty(chromium: Any, look: Look) -> None:
+    """`ibrobot ui` in an empty folder, without its link, and after its end."""
+    from ui_path import ui_process
+
+    with tempfile.TemporaryDirectory() as made, ui_process(Path(made)) as address:
+        page = opened(chromium, address)
+        page.wait_for_timeout(1500)
+        for name in page.evaluate("ibrobot.session.views.map(({name}) => name)"):
+            view(page, name)
+            look(page, f"ui-empty-{name}")
+        look(opened(chromium, address.split("?")[0]), "no-link")
+    page.wait_for_timeout(2000)
+    view(page, "record")
+    look(page, "ui-ended")
+
+
+def look_at_filled(chromium: Any, look: Look) -> None:
+    """`ibrobot ui` on the way from a robot to its dataset, and what goes wrong on it."""
+    from ui_path import convert, own_robot, record, ui_process
+
+    with tempfile.TemporaryDirectory() as made:
+        folder = Path(made)
+        own_robot(folder)
+        (folder / "wrong.yaml").write_text(WRONG, encoding="utf-8")
+        (folder / "training/checkpoints/last/pretrained_model").mkdir(parents=True)
+        (folder / "training/checkpoints/last/pretrained_model/config.json").write_text("{}", encoding="utf-8")
+        with ui_process(folder) as address:
+            page = opened(chromium, address)
+            record(page, lambda page, name: look(page, f"ui-{name}"))
+            convert(page, lambda page, name: look(page, f"ui-{name}"))
+            look_at_episodes(page, look, folder)
+            look_at_failures(page, look)
+            look_at_devices(page, look)
+            view(page, "training")
+            page.get_by_role("button", name="Show the change").click()
+            page.wait_for_timeout(2000)
+            look(page, "ui-training-change")
+            view(page, "jobs")
+            page.locator(".job summary:visible").first.click()
+            look(page, "ui-jobs")
+
+
+def look_at_episodes(page: Any, look: Look, folder: Path) -> None:
+    """Episodes that are chosen, trimmed, deleted and damaged."""
+    view(page, "episodes")
+    page.get_by_label("Choose all").check()
+    look(page, "ui-episodes-chosen")
+    page.get_by_role("link", name="episode_000001").click()
+    page.get_by_role("button", name="Begin here").wait_for()
+    page.get_by_label("Time", exact=True).fill("0.5")
+    page.get_by_role("button", name="Begin here").click()
+    page.get_by_role("button", name="Trim to this span").click()
+    look(page, "ui-dialog-trim")
+    page.get_by_role("button", name="Trim", exact=True).click()
+    page.wait_for_timeout(4000)
+    damaged = next((folder / "episodes/pick/episodes/episode_000002").glob("*.mcap"))
+    damaged.write_bytes(damaged.read_bytes()[:2000])
+    view(page, "episodes")
+    page.get_by_text("Trash: ").click()
+    look(page, "ui-episodes-trash")
+    page.get_by_role("button", name="Empty the trash").click()
+    look(page, "ui-dialog-empty")
+    page.get_by_role("button", name="Cancel").click()
+    page.get_by_role("link", name="episode_000002").click()
+    page.wait_for_timeout(2000)
+    look(page, "ui-episode-damaged")
+
+
+def look_at_failures(page: Any, look: Look) -> None:
+    """A YAML with problems, a run and a conversion that fail, and an error."""
+    view(page, "robots")
+    page.get_by_label("Robot", exact=True).select_option("wrong.yaml")
+    page.wait_for_timeout(1500)
+    look(page, "ui-robots-problems")
+    page.get_by_label("Robot", exact=True).select_option("my_arm.yaml")
+    page.get_by_label("Real hardware").check()
+    page.get_by_text("No problems found.").wait_for()
+    look(page, "ui-robots-hardware")
+    page.get_by_role("button", name="Launch").click()
+    page.locator(".job .state.failed").first.wait_for(timeout=60_000)
+    look(page, "ui-robots-failed")
+    page.get_by_label("Simulation").check()
+    view(page, "convert")
+    page.get_by_label("Dataset", exact=True).fill("datasets/pick")
+    page.get_by_text("More options").click()
+    page.get_by_role("button", name="Convert", exact=True).click()
+    page.locator(".job .state.failed:visible").first.wait_for(timeout=60_000)
+    look(page, "ui-convert-failed")
+    page.evaluate("void ibrobot.attempt(() => ibrobot.get('episodes/open', {path: '../elsewhere'}))")
+    page.wait_for_timeout(500)
+    look(page, "ui-toast")
+
+
+def look_at_devices(page: Any, look: Look) -> None:
+    """The guides of devices: one that works, one that asks, and one that fails."""
+    view(page, "devices")
+    guides = page.locator(".guides form button")
+    for number in range(guides.count()):
+        guides.nth(number).click()
+        page.locator(".card .state.done, .card .state.failed, .ask:not(:empty)").first.wait_for(timeout=60_000)
+        page.wait_for_timeout(1500)
+        look(page, f"ui-devices-{number}")
+        if page.locator(".ask:not(:empty)").count():
+            page.get_by_role("button", name="Cancel").click()
+            page.locator(".card .state.done, .card .state.failed").first.wait_for(timeout=60_000)
+
+
+def look_at_run(chromium: Any, look: Look) -> None:
+    """The page of a run: all tabs, an operator, watchers, faults, dialogs, plans, and after its end."""
+    from page_run import page_run
+
+    with page_run("so101", "--sim", "--mode", "web") as address:
+        page = ready(chromium, address)
+        for tab in TABS:
+            page.get_by_role("tab", name=tab).click()
+            page.wait_for_timeout(2500)
+            look(page, f"run-{tab.lower()}")
+        page.set_viewport_size({"width": 390, "height": 844})
+        page.get_by_role("tab", name="Drive").click()
+        page.get_by_role("button", name="Cameras").click()
+        look(page, "run-cameras")
+        page.set_viewport_size({"width": 390, "height": 844})
+        page.get_by_role("button", name="3D").click()
+        page.set_viewport_size({"width": 1440, "height": 900})
+        page.get_by_role("button", name="End the run").click()
+        look(page, "run-dialog-end")
+        page.get_by_role("button", name="Keep it running").click()
+        other = ready(chromium, address)
+        look(other, "run-watcher")
+        other.close()
+        link = page.evaluate("location.origin + ibrobot.links.watch")
+        watcher = ready(chromium, link)
+        look(watcher, "run-watch-link")
+        watcher.close()
+        page.get_by_role("button", name="moveit_planning").click()
+        page.locator("#goal").wait_for()
+        page.get_by_role("button", name="rest", exact=True).click()
+        page.get_by_text("The path takes").wait_for()
+        look(page, "run-preview")
+        page.locator("#goal").fill("xyz=3,0,0")
+        page.get_by_role("button", name="Preview").click()
+        page.get_by_text("No path").wait_for()
+        look(page, "run-no-path")
+        page.keyboard.press("Escape")
+        page.locator("#robot").click()
+        page.locator("#stop").focus()
+        page.keyboard.press("Space")
+        page.locator("#faults .fault").first.wait_for()
+        look(page, "run-fault")
+        page.locator("#faults button").first.click()
+        page.wait_for_timeout(500)
+    page.wait_for_timeout(3000)
+    look(page, "run-ended")
+
+
+def look_at_policy(chromium: Any, look: Look) -> None:
+    """The page of a run whose policy an operator corrects, without cameras, and then of seven joints."""
+    from page_run import page_run
+    from seven_joints import write_seven_joints
+
+    with tempfile.TemporaryDirectory() as made:
+        config = Path(made) / "corrected.yaml"
+        content = (Path(__file__).parents[3] / "configs/so101_pick_cube.yaml").read_text(encoding="utf-8")
+        assert POLICY[0] in content
+        config.write_text(
+            content.replace(*POLICY) + "\nteleoperation:\n  page: {type: web}\nepisodes: {takeover: deadman}\n", "utf-8"
+        )
+        with page_run(str(config), "--sim", "--episodes", "50") as address:
+            page = ready(chromium, address)
+            page.wait_for_timeout(3000)
+            look(page, "run-policy")
+            page.get_by_role("button", name="Take the robot").click()
+            page.wait_for_timeout(1500)
+            look(page, "run-policy-taken")
+        with page_run(str(write_seven_joints(Path(made))), "--sim") as address:
+            look(ready(chromium, address), "run-seven-joints")
+
+
+def ready(chromium: Any, address: str) -> Any:
+    """The page of a run, once it shows the robot."""
+    page = opened(chromium, address)
+    page.wait_for_timeout(500)
+    for _ in range(300):
+        if page.evaluate("Boolean(ibrobot?.status) && ibrobot.view.frames > 3"):
+            break
+        page.wait_for_timeout(100)
+    page.wait_for_timeout(1000)
+    return page
+
+
+PARTS = {"empty": look_at_empty, "filled": look_at_filled, "run": look_at_run, "policy": look_at_policy}
+
+
+@contextlib.contextmanager
+def browser() -> Iterator[Any]:
+    """Chromium."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS)
+        yield chromium
+        chromium.close()
+
+
+def main() -> None:
+    """Look at everything."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("folder", type=Path, help="for the pictures")
+    parser.add_argument("--axe", type=Path, help="axe.min.js; without it nothing is checked")
+    parser.add_argument("--only", choices=PARTS, action="append", help="a part of the pages")
+    chosen = parser.parse_args()
+    look = Look(chosen.folder, chosen.axe.read_text(encoding="utf-8") if chosen.axe is not None else "")
+    for name in chosen.only or PARTS:
+        with browser() as chromium:
+            PARTS[name](chromium, look)
+    print(f"{look.wrong} serious or critical")
+    sys.exit(1 if look.wrong else 0)
+
+
+if __name__ == "__main__":
+    main()
