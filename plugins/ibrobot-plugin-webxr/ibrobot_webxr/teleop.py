@@ -29,6 +29,11 @@ _RESUME_S = 0.3
 """A clutch still held after a loss shorter than this engages again by itself [s]."""
 _LONGEST_STEP_S = 0.1
 """Longest motion of the gripper in one command [s]: after a pause of the host it does not jump."""
+_LATE = 0.6
+"""Share of the timeout from which on the arm slows down, before it holds."""
+_STOP_S = 0.045
+"""Speeds of joints are such that their highest acceleration stops them in this time [s]. Then the arm stands 0.1 s after
+the last pose."""
 _LEAD_M, _LEAD_RAD = 0.1, 0.5
 """How far the hand may be ahead of a tool that cannot follow. Beyond it the hand slips, so that a hand that returns
 moves the tool soon."""
@@ -110,9 +115,10 @@ class WebxrTeleop(Teleop):
         count = len(self._tool.joints)
         gripper = self._setpoint[count:]
         if self._engaged is not None:
-            arm = self._tool.follow(measured.stamp_ns, here[:count])
             newest = self._clutches[self._engaged].sample
             assert newest is not None
+            is_late = newest.age_s(now_ns) > _LATE * self._options.timeout
+            arm = (self._tool.brake if is_late else self._tool.follow)(measured.stamp_ns, here[:count])
             gripper = self._gripper.follow(newest, here[count:], dt)
         elif self._tool.moves and np.isfinite(here).all():
             arm = self._tool.brake(measured.stamp_ns, here[:count])
@@ -259,7 +265,9 @@ class _Tool:
         except KinematicsError as error:
             raise TeleopError(f"{device}: {error}") from error
         self._is_full = len(model.moving) >= _FULL
-        self._servo = Servo(model, robot.max_velocity[self._indices], robot.max_acceleration[self._indices])
+        max_acceleration = robot.max_acceleration[self._indices]
+        max_velocity = np.minimum(robot.max_velocity[self._indices], _STOP_S * max_acceleration)
+        self._servo = Servo(model, max_velocity, max_acceleration)
 
     def engage(self, position: Vector, sample: Sample) -> None:
         """Stand at positions of the joints [rad], with the hand at a sample."""
