@@ -176,23 +176,26 @@ def memory_mb(pid: int) -> float:
 
 
 async def pages(seconds: float) -> bool:
-    """CPU of the run and of the page's server for one page and for ten, beyond those without a page."""
-    row("pages", "CPU %", "more than 0")
-    used = []
+    """CPU of the run and of the page's server without a page, with one and with ten, each twice in turn."""
+    row("pages", "run %", "server %", "both %")
+    used: dict[int, list[float]] = {0: [], 1: [], 10: []}
     with page_run(*SO101) as address:
         await asyncio.sleep(3)
         server = server_of()
         host = int((Path("/proc") / str(server) / "stat").read_text().rpartition(")")[2].split()[1])
-        for count in (0, 1, 10):
+        for count in (*used, *used):
             async with contextlib.AsyncExitStack() as stack:
                 for _ in range(count):
                     await stack.enter_async_context(client(address))
                 await asyncio.sleep(3)
-                begun = cpu_s(server) + cpu_s(host)
+                begun = cpu_s(host), cpu_s(server)
                 await asyncio.sleep(seconds)
-                used.append(100 * (cpu_s(server) + cpu_s(host) - begun) / seconds)
-                row(count, f"{used[-1]:.1f}", f"{used[-1] - used[0]:.1f}")
-    return used[2] - used[0] <= 2 * (used[1] - used[0])
+                shares = [
+                    100 * (cpu_s(pid) - before) / seconds for pid, before in zip((host, server), begun, strict=True)
+                ]
+                used[count].append(sum(shares))
+                row(count, *(f"{share:.1f}" for share in (*shares, sum(shares))))
+    return sum(used[10]) <= 2 * sum(used[1])
 
 
 async def memory(minutes: float) -> bool:
