@@ -42,6 +42,8 @@ class _Next:
     """A goal that waits."""
 
     goal: ExecutorGoal
+    refused: str = ""
+    """Why the executor last refused to let it take over from the braking motion; often because it came too late."""
 
     @cached_property
     def motion(self) -> Motion | None:
@@ -126,7 +128,8 @@ class Execution:
                     takes_over = {"goal": self._tracks[name].goal_id, "time_ns": begin_ns}
                     self._send(name, f"{number}:brake:{name}", way, takes_over)
                     rest[self._session.config.robot.indices(way.joint_names)] = way.points[-1].positions
-            except HardwareError:
+            except HardwareError as error:
+                self._session.log.warning("the arm stops before its next motion: braking was refused: %s", error)
                 return None
             self._number = number
             return rest
@@ -143,9 +146,9 @@ class Execution:
             for name, following in list(self._ahead.items()):
                 track, goal = self._tracks.get(name), following.goal
                 if isinstance(goal, float) or track is None or track.trajectory is None:
-                    sent = self._try(name, goal)
+                    sent = self._begin(name, following)
                 else:
-                    sent = self._blended(name, track, track.trajectory, goal, following.motion)
+                    sent = self._blended(name, track, track.trajectory, following, goal)
                 if sent:
                     self._ahead.pop(name, None)
 
@@ -193,13 +196,19 @@ class Execution:
         self._session.control.call("goal", executor=name, goal_id=goal_id, goal=message)
         self._tracks[name] = _Track(goal_id, None if isinstance(goal, float) else goal)
 
-    def _try(self, name: str, goal: ExecutorGoal, takes_over: Mapping[str, Any] | None = None) -> bool:
-        """Send a goal; return False if it came too late to take over."""
+    def _begin(self, name: str, following: _Next) -> bool:
+        """Send a goal to an executor at rest."""
+        if following.refused:
+            self._session.log.warning("the next motion of %s began after a stop: %s", name, following.refused)
+        self._send(name, f"{self._number}:{name}", following.goal)
+        return True
+
+    def _take_over(self, name: str, following: _Next, way: JointTrajectory, takes_over: Mapping[str, Any]) -> bool:
+        """Let a trajectory take over from the running one; return False if the executor refuses it, e.g. too late."""
         try:
-            self._send(name, f"{self._number}:{name}", goal, takes_over)
-        except HardwareError:
-            if takes_over is None:
-                raise
+            self._send(name, f"{self._number}:{name}", way, takes_over)
+        except HardwareError as error:
+            following.refused = str(error)
             return False
         return True
 
@@ -222,15 +231,15 @@ class Execution:
         return found or None
 
     def _blended(
-        self, name: str, track: _Track, running: JointTrajectory, goal: JointTrajectory, new: Motion | None
+        self, name: str, track: _Track, running: JointTrajectory, following: _Next, goal: JointTrajectory
     ) -> bool:
         """Let a motion begin while the executor brakes; return False if its time has not come."""
-        state, old = self._session.state, track.motion
+        state, old, new = self._session.state, track.motion, following.motion
         if track.begin_ns is None or state is None or old is None:
             return False
         passed_s = seconds(state.stamp_ns - track.begin_ns)
         if passed_s > old.duration:
-            return self._try(name, goal)
+            return self._begin(name, following)
         begin_s = round(passed_s + _LATENCY_S, 3)
         if new is None or begin_s >= old.duration:
             return False
@@ -245,5 +254,5 @@ class Execution:
             overlap = trajectory_of(cut(way, old.duration - begin_s), running.joint_names, goal.header.stamp_ns)
             if not self._planner.blocked(overlap, others):
                 blend = trajectory_of(way, running.joint_names, goal.header.stamp_ns)
-                return self._try(name, blend, {"goal": track.goal_id, "time_ns": ns(begin_s)})
+                return self._take_over(name, following, blend, {"goal": track.goal_id, "time_ns": ns(begin_s)})
         return False

@@ -15,7 +15,7 @@ from ibrobot_planning.source import GO_TO, RESULT
 from ibrobot_planning.timing import timed
 from ibrobot_planning.world import SNAPSHOT
 
-from ibrobot_core.api import PlanCode, Runtime, Vector
+from ibrobot_core.api import HardwareError, PlanCode, Runtime, Vector
 
 from .conftest import Make
 from .table_arm import JOINTS
@@ -66,6 +66,30 @@ def test_new_goal_blends_with_the_motion_under_way(run, mode: str):
     np.testing.assert_allclose(command(runtime)[:2], [1.6, 0.4], atol=1e-6)
     speed = np.linalg.norm(np.diff(commands, axis=0), axis=1) * RATE_HZ
     assert speed[20:50].min() > 0.6 * speed[24], "it does not slow down for the next motion"
+
+
+@pytest.mark.parametrize(
+    ("refuse", "told"),
+    [(":brake:", "the arm stops before its next motion: braking was refused: too fast"),
+     ("2:arm", "the next motion of arm began after a stop: too fast")],
+)  # fmt: skip
+def test_refused_blend_is_reported_and_the_motion_begins_after_a_stop(
+    run, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, refuse: str, told: str
+):
+    runtime = run()
+    runtime.session.bus.call(GO_TO, "pan=1.0")
+    commands = step(runtime, 25)
+    call = runtime.session.control.call
+
+    def refused(what: str, **asked: Any) -> Any:
+        if refuse in asked.get("goal_id", "") and "takes_over" in asked["goal"]:
+            raise HardwareError("too fast")
+        return call(what, **asked)
+
+    monkeypatch.setattr(runtime.session.control, "call", refused)
+    assert finish(runtime, runtime.session.bus.call(GO_TO, "pan=1.6,lift=0.4"), commands).success
+    assert_within_limits(runtime, commands)
+    assert caplog.messages.count(told) == 1
 
 
 def test_blends_end_exactly_at_rest():
