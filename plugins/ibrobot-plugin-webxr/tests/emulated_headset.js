@@ -1,4 +1,4 @@
-// A headset with two controllers in place of the browser's WebXR: tests set `emulated`.
+// A headset with two controllers in place of the browser's WebXR: tests set `emulated`. `hand` makes one a tracked hand.
 
 (() => {
   const emulated = { visible: true, viewer: { x: 0, y: 1.6, z: 0 }, left: controller(-0.2), right: controller(0.2) };
@@ -25,7 +25,8 @@
     end() { this.ended = true; this.dispatchEvent(new Event("end")); }
     get inputSources() {
       return ["left", "right"].map((handedness) => {
-        const { squeeze, trigger, pressed } = emulated[handedness];
+        const { squeeze, trigger, pressed, hand } = emulated[handedness];
+        if (hand) return { handedness, hand: { get: (joint) => ({ handedness, joint }) } };
         const buttons = [trigger, squeeze, 0, 0, 0, 0].map((value, i) => ({ value, pressed: value > 0.5 || pressed.includes(i) }));
         return { handedness, gripSpace: handedness, gamepad: { buttons } };
       });
@@ -41,6 +42,14 @@
     getPose(hand) {
       const { position, tracked } = emulated[hand];
       return tracked ? poseAt(position) : null;
+    }
+    // Fingers point away from the wrist: the middle finger bends onto its knuckle, the thumb meets the index finger.
+    getJointPose({ handedness, joint }) {
+      const { position: { x, y, z }, tracked, hand } = emulated[handedness];
+      const away = { "middle-finger-phalanx-proximal": 0.09, "middle-finger-tip": hand.bent ? 0.09 : 0.18 }[joint];
+      if (away) return tracked ? poseAt({ x, y, z: z - away }) : null;
+      const aside = { "thumb-tip": 0.05, "index-finger-tip": hand.pinched ? 0.05 : -0.05 }[joint] ?? 0;
+      return tracked ? poseAt({ x: x + aside, y, z }) : null;
     }
   }
 

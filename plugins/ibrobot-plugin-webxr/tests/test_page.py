@@ -161,6 +161,28 @@ def test_controllers_of_a_headset_move_the_arm(arm: Arm, server: PageServer, tab
     arm.wait(lambda: arm.stopped)
 
 
+def test_a_tracked_hand_moves_the_arm_and_closes_its_gripper(arm: Arm, server: PageServer, tab):
+    tab.add_init_script(HEADSET.read_text())
+    tab.add_init_script("emulated.right.hand = { bent: false, pinched: false }")
+    tab.goto(server.address)
+    tab.get_by_role("button", name="Start VR").click()
+    tab.locator("#link", has_text="Hz").wait_for()
+    tab.evaluate("emulated.right.hand.pinched = true; emulated.right.position.z -= 0.1")
+    tab.wait_for_timeout(300)
+    np.testing.assert_array_equal(arm.position, BENT)
+
+    def bend() -> None:
+        tab.evaluate("Object.assign(emulated.right.hand, { bent: false, pinched: false })")
+        tab.wait_for_timeout(200)
+        tab.evaluate("emulated.right.hand.bent = true")
+        tab.wait_for_timeout(100)
+        tab.evaluate("emulated.right.hand.pinched = true; emulated.right.position.z -= 0.05")
+
+    arm.wait(lambda: far(arm, BENT) and arm.position[5] < 0, bend)
+    tab.evaluate("emulated.right.hand.bent = false")
+    arm.wait(lambda: not arm.moves)
+
+
 def test_a_phone_without_webxr_moves_the_arm_by_its_sensors_and_sticks(arm: Arm, server: PageServer, tab):
     tab.goto(server.address)
     sensors = tab.context.new_cdp_session(tab)
