@@ -159,6 +159,8 @@ class WithPad(Person):
         self._pad = self._bus.plug(self._hid.Plugged(*self._hid.DUALSENSE))
         self._held: tuple[str, ...] = ()
         self._stick = (0.0, 0.0)
+        self.trigger = 0.0
+        """How far the left trigger is pulled, 0 to 1; it opens the gripper."""
 
     @override
     def toggle(self) -> None:
@@ -181,7 +183,8 @@ class WithPad(Person):
 
     def send(self, held: tuple[str, ...], left: tuple[float, float], right: tuple[float, float] = (0.0, 0.0)) -> None:
         """Send a report."""
-        self._pad.send(self._hid.dualsense(*held, left=left, right=right))
+        triggers = self.trigger, 0.0
+        self._pad.send(self._hid.dualsense(*held, left=left, right=right, triggers=triggers))
 
     @override
     def close(self) -> None:
