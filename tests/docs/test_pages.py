@@ -82,7 +82,7 @@ def _command(arguments: list[str]) -> tuple[click.Command, click.Context, list[s
 
 def _check_command(text: str) -> None:
     """That click takes it as it is: options, their values, and as many arguments as there must be."""
-    text, _, _ = text.partition(" > ")  # a redirection is the shell's
+    text, *_ = re.split(" [>|] ", text)  # a redirection is the shell's
     command, context, arguments = _command(shlex.split(text, comments=True)[1:])
     alone = not isinstance(command, click.Group) or command.invoke_without_command
     assert alone, "a command of the group is missing"
