@@ -152,6 +152,9 @@ class SectionParser:
         for name, value in self.document.root.items():
             if name not in known:
                 self._plugin_section(sections, name, value, faults)
+            elif (entry := self.registry.entries.get(("section", name))) is not None:
+                reason = f"{entry.package} adds a section of this name, which is one of ibrobot's own"
+                faults.add((name,), f"{reason}: rename it there, or pip uninstall {entry.package}")
         sections.plain = _Outline(self.base).arguments(known, self.document.root, faults)
         self._report((), faults)
 

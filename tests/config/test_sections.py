@@ -104,6 +104,14 @@ def test_a_section_that_no_plugin_has_is_an_unknown_key(load_text: Load, base: s
     assert "arround: unknown key, did you mean 'around'?" in faults(load_text, base + "arround: {}\n")
 
 
+def test_a_section_named_like_one_of_core_is_refused(load_text: Load, base: str, registry: Registry) -> None:
+    registry.entries["section", "executors"] = registry.entries.pop(("section", "around"))
+    assert faults(load_text, base) == (
+        "robot.yaml:17: executors: ibrobot-plugin-fake adds a section of this name, which is one of ibrobot's own: "
+        "rename it there, or pip uninstall ibrobot-plugin-fake"
+    )
+
+
 def test_broken_plugins_are_named_beside_an_unknown_section(load_text: Load, base: str, registry: Registry) -> None:
     registry.failures.append(Failure("fake_maps", "fake-maps", "import", "ImportError: no maps"))
     message = faults(load_text, base + "maps: {}\n")
