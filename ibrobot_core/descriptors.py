@@ -91,6 +91,9 @@ class TeleopDescriptor(Descriptor["interfaces.Teleop"]):
         default=lambda options: (), kw_only=True
     )
     """The events for which the device has a button, by its options, e.g. `start` to begin an episode."""
+    keys: Callable[[Any, Robot], Mapping[str, str]] = attrs.field(default=lambda options, robot: {}, kw_only=True)
+    """Maps the keys that the device reads from the terminal to what they do, e.g. `space` to `deadman`, by its options
+    and the robot that it moves. Devices of one mode share a key only if it does the same for all of them."""
 
 
 @attrs.frozen

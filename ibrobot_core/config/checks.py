@@ -19,7 +19,7 @@ from ibrobot_core.config.schema import (
 )
 from ibrobot_core.config.structure import ParsedComponent, ParsedSections
 from ibrobot_core.config.yaml_nodes import Document, Key
-from ibrobot_core.descriptors import ExecutorDescriptor, TransportDescriptor
+from ibrobot_core.descriptors import ExecutorDescriptor, TeleopDescriptor, TransportDescriptor
 from ibrobot_core.plugins import example_type
 from ibrobot_core.robot import Joint, Robot
 from ibrobot_core.units import radians
@@ -260,6 +260,7 @@ class Checks:
                 message = f"groups {mover[shared[0]]!r} and {group!r} both have joint {shared[0]!r}"
                 self.document.add((*at, group), message)
             mover |= dict.fromkeys(robot.groups[group], group)
+        self._keys(at, groups, robot)
         unmoved = set(mover)
         for i, name in enumerate(mode.executors):
             if (part := self.sections.executors.get(name)) is None:
@@ -273,6 +274,22 @@ class Checks:
         for group in groups:
             if left := [joint for joint in robot.groups.get(group, ()) if joint in unmoved]:
                 self.document.add((*at, group), f"no executor of this mode moves {', '.join(left)}")
+
+    def _keys(self, at: Key, devices: Mapping[str, str], robot: Robot) -> None:
+        """Check that no key does two things, since each device of a mode gets every key of the terminal."""
+        known: dict[str, tuple[str, str]] = {}
+        for group, name in devices.items():
+            part = self.sections.teleoperation.get(name)
+            if part is None or group not in robot.groups:
+                continue
+            assert isinstance(part.descriptor, TeleopDescriptor)
+            for key, does in part.descriptor.keys(part.component.options, robot.part(group)).items():
+                other, meaning = known.setdefault(key, (name, does))
+                if meaning != does:
+                    message = (
+                        f"key {key!r} is both {does} ({name}) and {meaning} ({other}); give one of them another key"
+                    )
+                    self.document.add((*at, group), message)
 
     def _reaches(self, part: ParsedComponent[InferenceConfig]) -> None:
         """Check that an engine that uses the transport has one to other machines."""

@@ -51,6 +51,9 @@ CASES = {
         "robot.yaml:31: teleoperation.left.joint: no joint 'grip', only pan, lift"),
     "same port": ([("/dev/b", "/dev/a")],
         "robot.yaml:32: teleoperation.right.port: /dev/a is already used by teleoperation.left"),
+    "key of two meanings": ([("/dev/b", "/dev/b, deadman: z, stop: space")],
+        f"{MODE}.teleop.gripper: key 'space' is both emergency stop (right) and deadman (left); give one of them "
+        "another key"),
     "two sources": ([("gripper: right}}", "gripper: right}, planner: {type: straight}}")],
         f"{MODE}.planner: teleop already drives this mode; make a mode for each"),
     "goals": ([("[arm_position, grip_position], teleop", "[arm_trajectory, grip_position], teleop")],
@@ -67,6 +70,8 @@ CASES = {
 class WiredOptions:
     port: str = option(help="serial port")
     joint: str = option("", help="a joint that it moves")
+    deadman: str = option("space", help="key of the deadman")
+    stop: str = option("esc", help="key of the emergency stop")
 
 
 def check(options: WiredOptions, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:
@@ -79,6 +84,7 @@ def registry(registry: Registry) -> Registry:
     wired = TeleopDescriptor(
         "wired", lambda options, ctx: pytest.fail("it is only checked"), "a device", WiredOptions, check_options=check,
         devices=lambda options: {"port": options.port},
+        keys=lambda options, robot: {options.deadman: "deadman", options.stop: "emergency stop"},
     )  # fmt: skip
     registry.entries["teleop", "wired"] = Entry("teleop", wired, "fake", "ibrobot-plugin-fake", "1.0")
     return registry

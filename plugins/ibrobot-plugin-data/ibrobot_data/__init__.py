@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 from ibrobot_core.api import Command, SectionDescriptor, SourceDescriptor, hookimpl
-from ibrobot_data.options import EpisodesOptions
+from ibrobot_data.options import EpisodesOptions, check_keys
 
 if TYPE_CHECKING:
     import click
@@ -75,5 +75,6 @@ def ibrobot_sections() -> Iterable[SectionDescriptor]:
     """What records the episodes of a run with a section `recording`."""
     yield SectionDescriptor(
         type="episodes", options=EpisodesOptions, make=_recording, without_section=_records,
+        check_config=check_keys,
         summary="how an operator corrects a policy, and which parts of a run are kept",
     )  # fmt: skip

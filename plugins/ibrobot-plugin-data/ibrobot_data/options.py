@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import attrs
 
-from ibrobot_core.api import documented, option
+from ibrobot_core.api import OptionFault, TeleopDescriptor, documented, installed_plugins, option
 
 if TYPE_CHECKING:
     from ibrobot_core.api import RobotConfig
@@ -56,3 +57,28 @@ def options_of(config: RobotConfig) -> EpisodesOptions:
         return EpisodesOptions()
     assert isinstance(section.options, EpisodesOptions)
     return section.options
+
+
+def check_keys(config: RobotConfig) -> Iterator[OptionFault]:
+    """Check that the keys of a robot YAML's takeovers and highlights do nothing else in modes with `intervene`."""
+    options = options_of(config)
+    modes = [mode for mode in config.control_modes.values() if mode.inference is not None and mode.inference.devices]
+    keys = {"takeover_key": (options.takeover_key, "takes the robot from the policy")} if modes else {}
+    if options.keep == "highlights":
+        keys["highlight_key"] = options.highlight_key, "begins a highlight"
+        if modes and options.highlight_key == options.takeover_key:
+            message = f"{options.highlight_key!r} is the takeover_key, too; give one of them another key"
+            yield OptionFault(("episodes", "highlight_key"), message)
+    for mode in modes:
+        assert mode.inference is not None
+        for group, name in mode.inference.devices.items():
+            device = config.teleoperation.get(name)
+            entry = installed_plugins().entries.get(("teleop", device.type)) if device is not None else None
+            if device is None or entry is None:
+                continue
+            assert isinstance(entry.descriptor, TeleopDescriptor)
+            used = entry.descriptor.keys(device.options, config.robot.part(group) if group else config.robot)
+            for option_, (key, does) in keys.items():
+                if key in used:
+                    message = f"{key!r} is {used[key]} of {name} in mode {mode.name}, where it also {does}"
+                    yield OptionFault(("episodes", option_), f"{message}; give one of them another key")

@@ -24,6 +24,7 @@ from ibrobot_feetech.options import (
     calibration_of,
     check_follower,
     check_leader,
+    leader_keys,
     serial_port,
 )
 
@@ -118,7 +119,7 @@ def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
     """The SO-101 leader arm."""
     yield TeleopDescriptor(
         type="so101_leader", options=LeaderOptions, make=_leader, summary="SO-101 leader arm, moved by hand",
-        check_options=check_leader, devices=serial_port,
+        check_options=check_leader, devices=serial_port, keys=leader_keys,
     )  # fmt: skip
 
 

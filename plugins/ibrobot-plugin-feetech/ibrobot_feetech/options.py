@@ -147,6 +147,12 @@ def check_follower(options: FollowerOptions, robot: Robot, joints: tuple[str, ..
             yield from _unknown(key, names, robot.joint_names, "joint")
 
 
+def leader_keys(options: LeaderOptions, robot: Robot) -> Mapping[str, str]:
+    """The keys of the terminal that it reads."""
+    deadman = {} if options.deadman == "none" else {options.deadman_key: "deadman"}
+    return {**deadman, options.estop_key: "emergency stop"}
+
+
 def check_leader(options: LeaderOptions, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:
     """Check that the leader's joints map to joints of the robot, and that the options name joints of the leader."""
     for ours, theirs in options.joints.items():

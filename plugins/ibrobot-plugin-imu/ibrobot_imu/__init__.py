@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 from ibrobot_core.api import Check, TeleopDescriptor, hookimpl
-from ibrobot_imu.options import ImuOptions, check_imu, serial_port
+from ibrobot_imu.options import ImuOptions, check_imu, imu_keys, serial_port
 
 if TYPE_CHECKING:
     from ibrobot_core.api import Context, Teleop
@@ -23,6 +23,7 @@ def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
     """The teleop `imu`."""
     yield TeleopDescriptor(
         type="imu", options=ImuOptions, make=_imu, check_options=check_imu, devices=serial_port,
+        keys=imu_keys,
         summary="moves the tool by the tilt of an orientation sensor (BNO08x, WitMotion)",
     )  # fmt: skip
 

@@ -89,6 +89,12 @@ class ImuOptions:
         return self.baud_rate if self.baud_rate is not None else BAUD_RATES[self.model]
 
 
+def imu_keys(options: ImuOptions, robot: Robot) -> Mapping[str, str]:
+    """The keys of the terminal that it reads."""
+    deadman = {options.deadman_key: "deadman"} if options.deadman == "key" else {}
+    return {**deadman, options.estop_key: "emergency stop"}
+
+
 def check_imu(options: ImuOptions, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:
     """Check that the robot has one tool to move."""
     groups = tuple(robot.groups)

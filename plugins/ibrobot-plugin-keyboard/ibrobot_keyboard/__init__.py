@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from ibrobot_core.api import TeleopDescriptor, hookimpl
@@ -24,10 +24,16 @@ def _check(options: Any, robot: Robot, joints: tuple[str, ...]) -> Iterable[Opti
     return check_keys(options, robot)
 
 
+def _keys(options: Any, robot: Robot) -> Mapping[str, str]:
+    from ibrobot_keyboard.keymap import keys_of
+
+    return keys_of(options, robot)
+
+
 @hookimpl
 def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
     """Jog from the terminal."""
     yield TeleopDescriptor(
-        type="keyboard", options=KeyboardOptions, make=_keyboard, check_options=_check,
+        type="keyboard", options=KeyboardOptions, make=_keyboard, check_options=_check, keys=_keys,
         summary="joint and Cartesian jog from the terminal",
     )  # fmt: skip

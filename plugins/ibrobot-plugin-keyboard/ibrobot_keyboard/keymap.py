@@ -20,6 +20,8 @@ _CARTESIAN_KEYS = {"x": ("w", "s"), "y": ("a", "d"), "z": ("r", "f"), "pitch": (
 CARTESIAN_AXES = tuple(_CARTESIAN_KEYS)
 _GRIPPER_KEYS = {"gripper_open": "o", "gripper_close": "c"}
 _COMMON_KEYS = {"faster": "+", "slower": "-", "estop": "space"}
+_WORDS = {"estop": "emergency stop"}
+"""Action -> what the keys of other devices call it."""
 
 
 @attrs.frozen
@@ -114,6 +116,16 @@ def keymap_of(options: KeyboardOptions, robot: Robot) -> Keymap:
         home="home" in robot.description.poses,
         overrides=options.keys,
     )
+
+
+def keys_of(options: KeyboardOptions, robot: Robot) -> Mapping[str, str]:
+    """Key -> what it does; nothing for options with faults, which `check_keys` yields."""
+    try:
+        keymap = keymap_of(options, robot)
+    except TeleopError:
+        return {}
+    actions = {**keymap.cartesian, **keymap.joints, **keymap.common}
+    return {key: _WORDS.get(action, action) for action, key in actions.items()}
 
 
 def check_keys(options: KeyboardOptions, robot: Robot) -> Iterator[OptionFault]:
