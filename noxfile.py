@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import contextlib
 import fcntl
 import json
 import os
@@ -67,6 +68,12 @@ IS_FIRST = "NOX_NOT_TESTED" not in os.environ
 """Whether this process started the others: those that run one session each, side by side."""
 NOT_TESTED = Path(os.environ.setdefault("NOX_NOT_TESTED", str(Path(f".nox/not-tested-{os.getpid()}").absolute())))
 """The file of what no session could test on this machine, and what to do about it."""
+if not IS_FIRST and "integration" not in sys.argv:
+    # All others end beside the longest one if they leave the processor to it. Linux shares the processor among the
+    # sessions of processes first, and each of nox is one.
+    os.nice(5)
+    with contextlib.suppress(OSError):
+        Path("/proc/self/autogroup").write_text("5", encoding="ascii")
 
 
 def packages(*requirements: str) -> list[str]:
