@@ -54,7 +54,7 @@ def api_page() -> Iterator[str]:
         yield "```{eval-rst}"
         for name in found:
             value = getattr(api, name)
-            kind = "class" if inspect.isclass(value) else "function" if callable(value) else "data"
+            kind = "class" if inspect.isclass(value) else "function" if inspect.isroutine(value) else "data"
             yield f".. auto{kind}:: {module}.{name}"
             if kind == "data":
                 yield "   :no-value:"

@@ -110,7 +110,7 @@ def _table(kind: type[Any], *, links: bool = True) -> Iterator[str]:
 
 def _text(help_text: str) -> str:
     """A help text with its flags, e.g. --sim, as code; otherwise they get a dash for their two hyphens."""
-    return re.sub(r"(?<!\S)--\w[\w-]*", lambda flag: f"`{flag[0]}`", help_text)
+    return re.sub(r"`[^`]*`|(?<!\S)--\w[\w-]*", lambda found: f"`{found[0].strip('`')}`", help_text)
 
 
 def _row(cells: Iterable[str]) -> str:

@@ -240,8 +240,8 @@ class DecoderDescriptor:
     make: Callable[[], Callable[[CompressedImage], Image | None]]
     """Imports the decoder, which returns pixels, or None for an unknown format.
 
-    Equal bytes give equal pixels, in a run and in a conversion. The decoder raises:
-        ContractError: if an image is damaged.
+    Equal bytes give equal pixels, in a run and in a conversion. The decoder raises `ContractError` if an image is
+    damaged.
     """
 
 

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 hookspec = pluggy.HookspecMarker("ibrobot")
 hookimpl = pluggy.HookimplMarker("ibrobot")
+"""Decorator of a plugin's hook implementations."""
 
 
 @hookspec
