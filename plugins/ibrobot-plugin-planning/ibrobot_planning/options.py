@@ -12,12 +12,12 @@ from ibrobot_core.api import documented, option
 class JointPlannerOptions:
     """Options of `type: joint`."""
 
-    velocity_scaling: float = option(1.0, gt=0, le=1, help="fraction of the velocity limits that a request's 1.0 means")
+    velocity_scaling: float = option(1.0, gt=0, le=1, help="fraction of the velocity limits for a scaling of 1.0")
     acceleration_scaling: float = option(
-        1.0, gt=0, le=1, help="fraction of the acceleration limits that a request's 1.0 means"
+        1.0, gt=0, le=1, help="fraction of the acceleration limits for a scaling of 1.0"
     )
-    max_jerk: float = option(200.0, unit="rad/s^3", gt=0, help="jerk that no joint exceeds")
-    step: float = option(0.02, unit="s", ge=0.001, help="greatest time between points of the trajectory")
+    max_jerk: float = option(200.0, unit="rad/s^3", gt=0, help="maximum jerk of any joint")
+    step: float = option(0.02, unit="s", ge=0.001, help="longest time between points of the trajectory")
 
 
 @documented
@@ -25,22 +25,25 @@ class JointPlannerOptions:
 class RrtConnectOptions:
     """Options of `type: rrt_connect`."""
 
-    padding: float = option(0.005, unit="m", ge=0, le=0.1, help="least distance of the arm from objects")
-    self_padding: float = option(0.0, unit="m", ge=0, le=0.1, help="least distance of the arm's links from one another")
+    padding: float = option(0.005, unit="m", ge=0, le=0.1, help="minimum distance of the arm from objects")
+    self_padding: float = option(0.0, unit="m", ge=0, le=0.1, help="minimum distance between links of the arm")
     floor: float | None = option(
-        None, unit="m", help="height in the base frame of the table or floor that the arm stands on; left out: none"
+        None, unit="m", help="height of the table or floor in the base frame; everything below is blocked"
     )
-    planning_time: float = option(5.0, unit="s", gt=0, help="time after which a search gives up")
-    velocity_scaling: float = option(1.0, gt=0, le=1, help="fraction of the velocity limits that a request's 1.0 means")
+    planning_time: float = option(5.0, unit="s", gt=0, help="time limit of a search")
+    velocity_scaling: float = option(1.0, gt=0, le=1, help="fraction of the velocity limits for a scaling of 1.0")
     acceleration_scaling: float = option(
-        1.0, gt=0, le=1, help="fraction of the acceleration limits that a request's 1.0 means"
+        1.0, gt=0, le=1, help="fraction of the acceleration limits for a scaling of 1.0"
     )
-    max_jerk: float = option(400.0, unit="rad/s^3", gt=0, help="jerk that no joint exceeds")
+    max_jerk: float = option(400.0, unit="rad/s^3", gt=0, help="maximum jerk of any joint")
     step: float = option(0.01, unit="s", ge=0.002, le=0.05, help="time between points of the trajectory")
     blend: float = option(0.5, unit="rad", ge=0, help="how far before a corner of the path the arm may leave it")
     start_beyond_limits: float = option(
-        0.1, unit="rad", ge=0, help="how far outside its limits a joint may start; from there it only moves inwards"
+        0.1, unit="rad", ge=0, help="how far outside its limits a joint may start; from there it moves only inwards"
     )
     start_overlap: float = option(
-        0.01, unit="m", ge=0, help="how deep the arm may overlap something at the start; from there it only moves out"
+        0.01,
+        unit="m",
+        ge=0,
+        help="how deep the arm may overlap something at the start; from there it moves only outwards",
     )
