@@ -13,10 +13,12 @@ import attrs
 import numpy as np
 import pytest
 import yaml
+from ibrobot_gamepad.options import GamepadOptions
 
 from ibrobot_core.api import LaunchRequest, Runtime, Session, Vector, installed_plugins, load_config
 
 from .fake_hid import DUALSENSE, SPACEMOUSE, FakeHidapi, Plugged, dualsense, mouse_buttons, spacemouse
+from .test_teleop import Rig
 
 pytestmark = [
     pytest.mark.integration,
@@ -122,6 +124,18 @@ def test_a_long_press_changes_to_the_tool(start: Start):
     assert run.runtime.session.faults == ()
 
 
+def test_a_long_press_starts_from_the_measured_position(hidapi: FakeHidapi):
+    robot = load_config(CONFIG, sim=True).robot
+    rig = Rig(hidapi, GamepadOptions(via="hid"), robot=robot, blocked=True, position=robot.pose("home").copy())
+    rig.engage()
+    rig.hold(2, dualsense(LB, left=(1, 0)))
+    lead = rig.setpoint(rig.tick(dualsense(LB))) - rig.position
+    assert lead[0] == pytest.approx(0.1), "a joint at rest is ahead of a robot that does not follow"
+    ahead = [rig.setpoint(rig.tick(dualsense(LB, "right_shoulder"))) - rig.position for _ in range(60)]
+    assert ahead[40][0] == pytest.approx(0.1)
+    np.testing.assert_allclose(ahead[-1], 0.0, atol=1e-9)
+
+
 def test_a_spacemouse_moves_the_tool(start: Start):
     run = start("spacemouse", Plugged(*SPACEMOUSE, usage=0x08), mouse_buttons())
     before = run.tool
@@ -133,11 +147,12 @@ def test_a_spacemouse_moves_the_tool(start: Start):
     np.testing.assert_allclose(run.position, held, atol=0.02)
 
 
-def test_twenty_unplugs_in_motion_hold_until_the_deadman_is_pressed_again(start: Start, hidapi: FakeHidapi):
+def test_unplugs_in_motion_hold_until_the_deadman_is_pressed_again(start: Start, hidapi: FakeHidapi):
+    """`guest/boot.sh` unplugs each device 20 times."""
     run = pad(start)
     rng = np.random.default_rng(7)
     direction = 1
-    for _ in range(20):
+    for _ in range(5):
         moving = dualsense(LB, left=(direction, 0))
         before = run.position[0]
         run.ticks(int(rng.integers(10, 40)), dualsense(), dualsense(LB), moving)

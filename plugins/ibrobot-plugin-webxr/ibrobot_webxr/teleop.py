@@ -32,8 +32,8 @@ _LONGEST_STEP_S = 0.1
 _LATE = 0.6
 """Share of the timeout from which on the arm slows down, before it holds."""
 _STOP_S = 0.045
-"""Speeds of joints are such that their highest acceleration stops them in this time [s]. Then the arm stands 0.1 s after
-the last pose."""
+"""Speeds of joints are such that their highest acceleration stops them in this time [s]. Then the arm stands 0.1 s
+after the last pose."""
 _LEAD_M, _LEAD_RAD = 0.1, 0.5
 """How far the hand may be ahead of a tool that cannot follow. Beyond it the hand slips, so that a hand that returns
 moves the tool soon."""
