@@ -7,6 +7,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import chdir
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -94,11 +95,21 @@ def ibrobot() -> tuple[str, ...]:
 
 @pytest.fixture
 def launch(tmp_path: Path) -> Callable[..., Ran]:
-    """Run `ibrobot launch so101_blind --sim --headless --json …` (without cameras) in a folder of its own."""
+    """Run `ibrobot launch so101_blind --sim --headless --json …` (without cameras) in a folder of its own.
 
-    def run(*arguments: str, robot: str = "so101_blind") -> Ran:
-        command = [*IBROBOT, "launch", robot, "--sim", "--headless", "--json", *arguments]
-        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
+    A run in lockstep is one of this process, which has imported already what each child would import again, unless
+    `child` says otherwise.
+    """
+
+    def run(*arguments: str, robot: str = "so101_blind", child: bool = False) -> Ran:
+        command = ["launch", robot, "--sim", "--headless", "--json", *arguments]
+        if "--lockstep" in arguments and not child:
+            with chdir(tmp_path):
+                done = run_here(*command)
+        else:
+            done = subprocess.run(
+                [*IBROBOT, *command], cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False
+            )
         return Ran(done.returncode, done.stdout, done.stderr)
 
     return run
@@ -108,9 +119,9 @@ def launch(tmp_path: Path) -> Callable[..., Ran]:
 def recorded(launch: Callable[..., Ran], tmp_path: Path) -> Callable[..., tuple[Ran, list[Log]]]:
     """As `launch`, with the joint log of each episode."""
 
-    def run(*arguments: str, dataset: str = "default") -> tuple[Ran, list[Log]]:
+    def run(*arguments: str, dataset: str = "default", child: bool = False) -> tuple[Ran, list[Log]]:
         recording = f"recording={{type: joint_log, root: kept, dataset: {dataset}}}"
-        ran = launch("--set", recording, *arguments)
+        ran = launch("--set", recording, *arguments, child=child)
         folders = sorted((tmp_path / "kept" / dataset / "episodes").iterdir()) if ran.code in (0, 3) else []
         return ran, [Log.read(folder / "joints.csv") for folder in folders]
 

@@ -82,7 +82,7 @@ def test_a_fault_in_real_time(launch: Callable[..., Ran]):
     ids=["pose", "joint", "no planner", "mode", "key", "options"],
 )
 def test_a_wrong_command_line_is_exit_code_2(launch: Callable[..., Ran], arguments: tuple[str, ...], message: str):
-    ran = launch(*arguments)
+    ran = launch("--lockstep", *arguments)
     assert ran.code == 2
     assert message in ran.err
     assert "Traceback" not in ran.err
@@ -99,7 +99,7 @@ def test_a_component_that_cannot_start_is_exit_code_1(launch: Callable[..., Ran]
 
 
 def test_dry_run_prints_the_plan_and_starts_nothing(launch: Callable[..., Ran], rendering: None):
-    ran = launch("--dry-run", "--mode", "moveit_planning", robot="so101")
+    ran = launch("--lockstep", "--dry-run", "--mode", "moveit_planning", robot="so101")
     assert (ran.code, ran.err) == (0, "")
     components = json.loads(ran.out)["components"]
     names = [component["name"] for component in components]

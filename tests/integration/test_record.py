@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import subprocess
+from contextlib import chdir
 from pathlib import Path
 
 import pytest
 import yaml
+from command_line import run_here
 from ibrobot_testing.terminal import Terminal
 
 from ibrobot_core.plugins import installed_plugins
@@ -27,10 +29,11 @@ def outcomes(folder: Path) -> list[tuple[str, str, int]]:
     return found
 
 
-def test_simulated_episodes_are_recorded_unattended_with_the_scenes_judgement(tmp_path: Path, ibrobot: tuple[str, ...]):
-    command = [*ibrobot, "record", "so101_blind", "--sim", "--lockstep", "--headless", "--json", "--episodes", "3"]
+def test_simulated_episodes_are_recorded_unattended_with_the_scenes_judgement(tmp_path: Path):
+    command = ["record", "so101_blind", "--sim", "--lockstep", "--headless", "--json", "--episodes", "3"]
     options = ["--dataset", "pick", "--prompt", "pick the cube", "--set", "contract.max_duration_s=4.5"]
-    done = subprocess.run([*command, *options], cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
+    with chdir(tmp_path):
+        done = run_here(*command, *options)
     summary = json.loads(done.stdout.splitlines()[-1])
     kept = outcomes(tmp_path / "episodes" / "pick")
     assert [outcome for outcome, _, _ in kept].count("success") == summary["successes"]

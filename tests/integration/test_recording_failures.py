@@ -43,17 +43,12 @@ def run(ibrobot: tuple[str, ...]) -> Run:
     def execute(*arguments: object, largest: int | None = None) -> Ran:
         """Run `ibrobot`; no file may become larger than `largest` [bytes]."""
 
-        def limit() -> None:
-            if largest is not None:
-                resource.setrlimit(resource.RLIMIT_FSIZE, (largest, largest))
-
-        if arguments[0] == "convert" and largest is None:
+        if largest is None:
             done = run_here(*arguments)
         else:
-            command = [*ibrobot, *map(str, arguments)]
             done = subprocess.run(
-                command, capture_output=True, text=True, timeout=120, check=False,
-                preexec_fn=limit if largest is not None else None,
+                [*ibrobot, *map(str, arguments)], capture_output=True, text=True, timeout=120, check=False,
+                preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (largest, largest)),
             )  # fmt: skip
         assert "Traceback" not in done.stderr, done.stderr
         return Ran(done.returncode, done.stdout, done.stderr)

@@ -5,27 +5,36 @@ from __future__ import annotations
 import json
 import subprocess
 from collections.abc import Callable
+from contextlib import chdir
 from pathlib import Path
 
 import pytest
+from command_line import run_here
 
-pytestmark = pytest.mark.integration
+pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("first_conversion")]
 
+BLIND = ("so101_blind", "--sim", "--lockstep", "--headless")
 Command = Callable[..., "subprocess.CompletedProcess[str]"]
 
 
 @pytest.fixture(scope="module")
-def picks(tmp_path_factory: pytest.TempPathFactory, ibrobot: tuple[str, ...]) -> Path:
+def picks(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two recorded episodes in which the cube came into the bin."""
     folder = tmp_path_factory.mktemp("picks")
-    command = [*ibrobot, "record", "so101_blind", "--sim", "--lockstep", "--headless", "--episodes", "2", "--seed", "3"]
-    subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120, check=True)
+    with chdir(folder):
+        done = run_here(
+            "record", *["so101_blind", "--sim", "--lockstep", "--headless", "--episodes", "2", "--seed", "3"]
+        )
+    assert done.returncode == 0, done.stderr
     return folder / "episodes/default/episodes"
 
 
 @pytest.fixture
 def replay(ibrobot: tuple[str, ...], tmp_path: Path) -> Command:
     def run(*arguments: object) -> subprocess.CompletedProcess[str]:
+        if "--lockstep" in arguments:
+            with chdir(tmp_path):
+                return run_here("replay", "--headless", *arguments)
         command = [*ibrobot, "replay", "--headless", *map(str, arguments)]
         return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
 
@@ -48,21 +57,23 @@ def test_in_lockstep_the_cube_comes_into_the_bin_again(replay: Command, picks: P
         assert max(each["max_rad"] for each in summary["replay"]["tracking"].values()) < 1e-6
 
 
-def test_an_episode_of_a_dataset_brings_the_cube_into_the_bin_too(
-    replay: Command, picks: Path, ibrobot: tuple[str, ...], tmp_path: Path
-):
-    convert = [*ibrobot, "convert", str(picks), "--out", str(tmp_path / "set"), "--norm-mode", "radians"]
-    subprocess.run(convert, capture_output=True, timeout=120, check=True)
+def test_an_episode_of_a_dataset_brings_the_cube_into_the_bin_too(replay: Command, picks: Path, tmp_path: Path):
+    made = run_here("convert", picks, "--out", tmp_path / "set", "--norm-mode", "radians")
+    assert made.returncode == 0, made.stderr
     done = replay("set:1", "--sim", "--lockstep", "--json")
     assert done.returncode == 0, done.stderr
     tracking = json.loads(done.stdout.splitlines()[-1])["replay"]["tracking"]
     assert 1e-4 < max(each["max_rad"] for each in tracking.values()) < 0.1, "commands at 30 Hz, interpolated"
 
 
-def test_joint_log_of_an_episode_is_replayed(replay: Command, ibrobot: tuple[str, ...], tmp_path: Path):
-    launch = [*ibrobot, "launch", "so101_blind", "--sim", "--lockstep", "--headless", "--episodes", "1", "--seed", "2"]
+def test_joint_log_of_an_episode_is_replayed(replay: Command, tmp_path: Path):
     recording = ["--set", "recording={type: joint_log, root: kept, dataset: log}"]
-    subprocess.run([*launch, *recording], cwd=tmp_path, capture_output=True, timeout=120, check=True)
+    with chdir(tmp_path):
+        run_here(
+            "launch",
+            *["so101_blind", "--sim", "--lockstep", "--headless", "--episodes", "1", "--seed", "2"],
+            *recording,
+        )
     done = replay("kept/log/episodes/episode_000001/joints.csv", "so101_blind", "--sim", "--lockstep", "--json")
     assert done.returncode == 0, done.stderr
     tracking = json.loads(done.stdout.splitlines()[-1])["replay"]["tracking"]

@@ -86,8 +86,9 @@ def test_all_execution_modes_pick_the_cube_by_the_same_motion(
     motions = {}
     for mode, more in {"monolithic": (), "process": (), "distributed": ("--set", network)}.items():
         ran, logs = recorded(
-            "--lockstep", "--episodes", "2", "--seed", "3", "--set", MODE.format(mode), *PATIENT, *more, dataset=mode
-        )
+            "--lockstep", "--episodes", "2", "--seed", "3", "--set", MODE.format(mode), *PATIENT, *more, dataset=mode,
+            child=mode != "monolithic",
+        )  # fmt: skip
         assert (ran.code, ran.summary["successes"]) == (0, 2), ran.err
         motions[mode] = np.concatenate([log.positions for log in logs])
     for mode in ("process", "distributed"):
