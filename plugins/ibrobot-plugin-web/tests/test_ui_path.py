@@ -26,7 +26,7 @@ def test_from_a_robot_to_its_dataset_by_clicks_alone(tmp_path: Path) -> None:
     hosts: set[str] = set()
     with ui_process(tmp_path) as address, sync_api.sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        page = browser.new_page()
+        page = browser.new_page(device_scale_factor=0.5)  # software draws it
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.on("console", lambda line: errors.extend([f"{line.text} {line.location}"] * (line.type == "error")))
         page.on("request", lambda request: hosts.add(request.url.split("/")[2]))
