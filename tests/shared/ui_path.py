@@ -82,16 +82,17 @@ def record(page: Any, shot: Shot = lambda page, name: None) -> None:
     run = opened.value
     until(run, "window.ibrobot?.jogs && ibrobot.status.episode")
     run.get_by_role("tab", name="Episodes").click()
-    for number, (joint, sign, verdict) in enumerate(
-        [("shoulder_pan", "up", "End: success"), ("shoulder_lift", "up", "End: failure")]
+    # Joints that meet nothing, however long a busy machine takes to release the button.
+    for number, (joint, index, verdict) in enumerate(
+        [("shoulder_pan", 0, "End: success"), ("wrist_roll", 4, "End: failure")]
     ):
         run.get_by_role("button", name="Begin an episode").click()
         until(run, "ibrobot.status.episode.recording")
         before = run.evaluate("ibrobot.state.position")
-        hold = run.get_by_label(f"{joint} {sign}, hold to move")
+        hold = run.get_by_label(f"{joint} up, hold to move")
         hold.hover()
         run.mouse.down()
-        until(run, f"Math.abs(ibrobot.state.position[{number}] - {before[number]}) > 0.3")
+        until(run, f"Math.abs(ibrobot.state.position[{index}] - {before[index]}) > 0.3")
         if number == 0:
             shot(run, "episode")
         run.mouse.up()

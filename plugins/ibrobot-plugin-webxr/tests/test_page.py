@@ -227,14 +227,20 @@ def test_the_page_shows_cameras_and_who_has_control(arm: Arm, server: PageServer
     bus = arm.ctx.bus
     assert bus is not None
     tab.goto(server.address)
+    tab.locator("button[data-event]:enabled").first.wait_for(state="attached")  # it has control
     second = tab.context.new_page()
     second.goto(server.address)
     second.get_by_text("Another page has control").wait_for()
     pixels = np.full(48 * 64 * 3, 200, np.uint8)
-    for _ in range(20):
+    shown = tab.locator("figure img[src^=blob]")
+
+    def comes() -> bool:
         bus.publish("/camera/wrist/image_raw", Image(Header(0), 48, 64, "rgb8", 192, pixels))
         tab.wait_for_timeout(50)
-    tab.locator("figure img[src^=blob]").wait_for()
+        return shown.count() > 0
+
+    arm.wait(comes)
+    shown.wait_for()
     assert tab.locator("figcaption").text_content() == "wrist"
     bus.publish("/robot_status", RobotStatus(Header(0), "so101", "phone", faults=("<b>a fault</b>",)))
     tab.get_by_text("<b>a fault</b>").wait_for()
