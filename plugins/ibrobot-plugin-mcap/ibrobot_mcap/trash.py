@@ -116,7 +116,8 @@ def copy_part(episode: Path, output: Path, begin_s: float, end_s: float | None) 
 
 def trashed_in(path: Path) -> list[Trashed]:
     """The originals in the trash folders at or below `path`, oldest first."""
-    return sorted(_found(path), key=lambda each: (each.id, each.name))
+    found = {each.folder: each for each in _found(path)}  # a dataset's trash matches two patterns
+    return sorted(found.values(), key=lambda each: (each.id, each.name))
 
 
 def restore(trashed: Trashed) -> Path:

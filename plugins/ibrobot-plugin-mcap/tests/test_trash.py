@@ -42,7 +42,8 @@ def test_a_deleted_episode_comes_back_as_it_was(tmp_path, episode):
     assert not episode.exists()
     with pytest.raises(RecorderError, match="contains no episode"):
         episodes_in(tmp_path)
-    (row,) = json.loads(run("trash", tmp_path, "--json"))
+    for path in (tmp_path, tmp_path / "pick", tmp_path / "pick/episodes"):
+        (row,) = json.loads(run("trash", path, "--json"))
     assert (row["done"], row["path"]) == ("deleted", str(episode))
     assert "restored" in run("trash", tmp_path, "--restore", row["id"])
     assert files(tmp_path) == before, "nothing else is left"
