@@ -11,7 +11,7 @@ takeover, and the keyboard is a queue of keys. The run is recorded, and converte
 Prints one JSON object per device, and exits with 1 unless every velocity and acceleration of the commands is within the
 limits, nothing is lost, who commands is labelled at every state as the person acted, the frames from the recording
 equal those of the run bit by bit, the column `intervention` is true in exactly the rows that the person commanded, and
-`--only interventions` gives each takeover as an episode. With `--live` the run is one by the clock of the wall, with
+`--only interventions` gives each takeover as an episode. With `--live` the run is in real time, with
 control in a process of its own; then who commands must change as the person acts, and each state must arrive.
 """
 
@@ -498,7 +498,7 @@ class Trial:
 
 @attrs.define(slots=False)
 class LiveTrial(Trial):
-    """A trial by the clock of the wall: states and labels come when they come."""
+    """A trial in real time: states and labels arrive when they are published."""
 
     said: list[tuple[int, str]] = attrs.field(factory=list)
     """Time of receipt and word of each label."""
@@ -667,7 +667,7 @@ def main() -> int:
     parser.add_argument("--takeovers", type=int, help="default: 100, with --live 10")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--device", action="append", choices=PERSONS)
-    parser.add_argument("--live", action="store_true", help="by the clock of the wall; not with the leader")
+    parser.add_argument("--live", action="store_true", help="in real time; not with the leader")
     arguments = parser.parse_args()
     devices = arguments.device or ["gamepad", "leader", "keyboard"]
     if arguments.live and arguments.device is None:

@@ -256,3 +256,10 @@ def test_every_table_of_options_names_options_that_exist() -> None:
     ]
     assert named
     assert [(option, place) for option, place in named if option not in known] == []
+
+
+def test_readme_names_every_command() -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    (table,) = re.findall(r"^## Commands$(.*?)^## ", text, re.MULTILINE | re.DOTALL)
+    names = cli.list_commands(click.Context(cli))
+    assert [name for name in names if not re.search(rf"`(?:ibrobot )?{name}`", table)] == []
