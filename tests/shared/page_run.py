@@ -92,6 +92,14 @@ class PageClient:
         """Request a file or a fact of the page."""
         return self._browser.get(self._base + path)
 
+    def post(self, path: str, body: Any) -> Any:
+        """Send something."""
+        return self._browser.post(self._base + path, data=body)
+
+    def connect(self, path: str) -> Any:
+        """A WebSocket of its own."""
+        return self._browser.ws_connect(self._base + path)
+
     async def _receive(self) -> None:
         async for message in self.stream:
             data: bytes = message.data

@@ -4,7 +4,8 @@
     uv run python plugins/ibrobot-plugin-web/tests/look.py FOLDER --axe package/axe.min.js [--only run]
 
 Writes FOLDER/STATE-SIZE-THEME.png for three sizes and for a desktop at 200 %, light and dark. Prints what axe-core
-finds serious or critical, and exits with 1 if there is any. It needs Chromium and playwright, and takes ten minutes.
+finds serious or critical, and exits with 1 if there is any. It needs Chromium and playwright, takes ten minutes, and
+looks at training where LeRobot is installed.
 """
 
 from __future__ import annotations
@@ -12,9 +13,11 @@ from __future__ import annotations
 import argparse
 import contextlib
 import shutil
+import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -112,6 +115,8 @@ def look_at_filled(chromium: Any, look: Look) -> None:
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)
         own_robot(folder)
+        own = folder / "my_arm.yaml"  # looking at an episode takes longer than 20 s
+        own.write_text(own.read_text(encoding="utf-8").replace("max_duration_s: 20", "max_duration_s: 900"), "utf-8")
         (folder / "wrong.yaml").write_text(WRONG, encoding="utf-8")
         (folder / "training/checkpoints/last/pretrained_model").mkdir(parents=True)
         (folder / "training/checkpoints/last/pretrained_model/config.json").write_text("{}", encoding="utf-8")
@@ -173,7 +178,9 @@ def look_at_failures(page: Any, look: Look) -> None:
     page.get_by_label("Simulation").check()
     view(page, "convert")
     page.get_by_label("Dataset", exact=True).fill("datasets/pick")
+    page.get_by_label("Add to it").check()
     page.get_by_text("More options").click()
+    page.get_by_label("Unit of joints").select_option("degrees")
     page.get_by_role("button", name="Convert", exact=True).click()
     page.locator(".job .state.failed:visible").first.wait_for(timeout=60_000)
     look(page, "ui-convert-failed")
@@ -267,6 +274,46 @@ def look_at_policy(chromium: Any, look: Look) -> None:
             look(ready(chromium, address), "run-seven-joints")
 
 
+def look_at_training(chromium: Any, look: Look) -> None:
+    """Training, its end, and a run of the trained policy; needs LeRobot in this environment."""
+    from page_run import IBROBOT
+    from ui_path import ROOT, ui_process
+
+    with tempfile.TemporaryDirectory() as made:
+        config = shutil.copy(ROOT / "configs/so101_pick_cube.yaml", Path(made) / "picking.yaml")
+        run = ("record", config, "--sim", "--lockstep", "--dataset", "pick", "--episodes", "2", "--headless")
+        for command in (run, ("convert", "episodes", "--out", "datasets/pick")):
+            subprocess.run([*IBROBOT, *command], cwd=made, check=True, stdin=subprocess.DEVNULL)
+        with ui_process(Path(made)) as address:
+            page = opened(chromium, address)
+            view(page, "training")
+            page.get_by_label("Steps").fill("200")
+            page.get_by_label("Frames in a step").fill("8")
+            page.get_by_role("button", name="Train").click()
+            page.get_by_text("step 1", exact=False).first.wait_for(timeout=180_000)
+            look(page, "ui-training-running")
+            page.get_by_role("button", name="Use it in a robot").click(timeout=300_000)
+            page.locator("#use-robot").select_option("picking.yaml")
+            look(page, "ui-training-done")
+            page.get_by_role("button", name="Show the change").click()
+            page.get_by_role("button", name="Write picking.yaml").click()
+            page.get_by_role("button", name="Launch it").click()
+            page.get_by_text("No problems found.").wait_for(timeout=60_000)
+            page.get_by_role("button", name="Launch", exact=True).click()
+            with page.context.expect_page(timeout=120_000) as opening:
+                page.get_by_role("link", name="Open the robot's page").click(timeout=120_000)
+            run_page = opening.value
+            for _ in range(1200):
+                if run_page.evaluate("(window.ibrobot?.status?.counts.dispatch?.plan_length ?? 0) > 0"):
+                    break
+                run_page.wait_for_timeout(100)
+            print("runs", run_page.evaluate("[ibrobot.status.mode, ibrobot.status.counts.dispatch]"), flush=True)
+            run_page.get_by_role("tab", name="Plots").click()
+            run_page.wait_for_timeout(3000)
+            run_page.get_by_label("Topic").select_option("counters of dispatch")
+            look(run_page, "run-trained")
+
+
 def ready(chromium: Any, address: str) -> Any:
     """The page of a run, once it shows the robot."""
     page = opened(chromium, address)
@@ -279,7 +326,10 @@ def ready(chromium: Any, address: str) -> Any:
     return page
 
 
-PARTS = {"empty": look_at_empty, "filled": look_at_filled, "run": look_at_run, "policy": look_at_policy}
+PARTS = {
+    "empty": look_at_empty, "filled": look_at_filled, "run": look_at_run, "policy": look_at_policy,
+    "training": look_at_training,
+}  # fmt: skip
 
 
 @contextlib.contextmanager
@@ -301,7 +351,8 @@ def main() -> None:
     parser.add_argument("--only", choices=PARTS, action="append", help="a part of the pages")
     chosen = parser.parse_args()
     look = Look(chosen.folder, chosen.axe.read_text(encoding="utf-8") if chosen.axe is not None else "")
-    for name in chosen.only or PARTS:
+    parts = [name for name in PARTS if name != "training" or find_spec("lerobot") is not None]
+    for name in chosen.only or parts:
         with browser() as chromium:
             PARTS[name](chromium, look)
     print(f"{look.wrong} serious or critical")

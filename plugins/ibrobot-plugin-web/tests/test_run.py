@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import itertools
 import time
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from typing import Any
 
+import aiohttp
 import numpy as np
 import pytest
 from page_run import SO101, PageClient, client, page_run
@@ -22,6 +24,7 @@ HOLD_S = 0.3
 """How long after a page is gone the robot may move."""
 MOVING_RAD = 1e-4
 """Change of a command between two states that counts as motion."""
+MALFORMED = 200
 PRESSES = itertools.count(1)
 
 
@@ -92,6 +95,40 @@ def test_one_operates_and_the_other_watches(address: str) -> None:
             await two.call("operate", take_over=True)
             with pytest.raises(RuntimeError, match="this page only watches"):
                 await one.call("jog", joints={})
+
+    run(test)
+
+
+def test_uploads_and_malformed_messages_harm_no_run(address: str) -> None:
+    async def upload(page: PageClient) -> None:
+        async def body() -> AsyncIterator[bytes]:
+            for _ in range(100):
+                yield bytes(1 << 20)
+
+        with contextlib.suppress(aiohttp.ClientConnectionError):
+            async with page.post("/", body()) as answer:
+                assert answer.status in (405, 413)
+
+    async def attack(page: PageClient) -> None:
+        for _ in range(MALFORMED // 20):
+            async with page.connect("/drive") as socket:
+                for text in ('{"do":', "[[[", "null", '{"do": 1}') * 5:
+                    with contextlib.suppress(ConnectionError):
+                        await socket.send_str(text)
+                while (await socket.receive(timeout=20)).type is aiohttp.WSMsgType.TEXT:
+                    pass
+
+    async def test() -> None:
+        async with client(address) as operator, client(address) as attacker:
+            await operator.call("operate", take_over=True)
+            await ready(operator)
+            before = operator.states[-1]["tick"]
+            jog = asyncio.create_task(operator.jog(1.0, next(PRESSES), joints={"shoulder_pan": 0.3}))
+            await asyncio.gather(upload(attacker), attack(attacker), jog)
+            assert moved_until_ns(operator) > 0, "the operator's commands arrive meanwhile"
+            await operator.until(lambda: operator.states[-1]["tick"] > before + 100)
+            assert operator.status["faults"] == []
+            await operator.call("mode", mode="web")
 
     run(test)
 

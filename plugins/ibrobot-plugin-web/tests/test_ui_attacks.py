@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -73,6 +74,29 @@ def test_large_and_malformed_bodies_are_refused(tmp_path: Path) -> None:
                 assert await status(server.client, method, path, data=body, headers=headers, json=None) == 400, path
             form = aiohttp.FormData({"path": "x"})  # what a form of another site could send
             assert await status(server.client, method, path, data=form, json=None) == 400, path
+        assert server.ui.jobs.all() == []
+
+    run_ui([tmp_path], test)
+
+
+def test_a_hundred_megabytes_are_refused_without_reading_them(tmp_path: Path) -> None:
+    async def test(server: UiServer) -> None:
+        for size in (None, 100 << 20):  # in chunks, and with their length beforehand
+            sent = 0
+
+            async def body() -> AsyncIterator[bytes]:
+                nonlocal sent
+                for _ in range(100):
+                    yield bytes(1 << 20)
+                    sent += 1
+
+            headers = {"Content-Type": "application/json"} | ({} if size is None else {"Content-Length": str(size)})
+            with contextlib.suppress(aiohttp.ClientConnectionError):
+                assert (
+                    await status(server.client, "POST", "/api/convert/start", data=body(), headers=headers, json=None)
+                    == 413
+                )
+            assert sent < 30
         assert server.ui.jobs.all() == []
 
     run_ui([tmp_path], test)

@@ -44,9 +44,10 @@ _LOGIN = """<!doctype html><html lang="en"><meta charset="utf-8"><meta name="vie
 <label for="password">Password</label><input id="password" name="password" type="password"
 autocomplete="current-password" autofocus required><button class="primary">Sign in</button>
 <p role="alert">{message}</p></form></main></html>"""
-_CLOSED = """<!doctype html><html lang="en"><meta charset="utf-8"><title>ibrobot</title>
-<main><h1>This page needs its link</h1><p>Open the whole address that the terminal shows, with its token.</p></main>
-</html>"""
+_CLOSED = """<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">
+<title>ibrobot</title><link rel="stylesheet" href="/static/style.css">
+<main class="signin"><h1>This page needs its link</h1>
+<p>Open the whole address that the terminal shows, with its token.</p></main></html>"""
 
 
 @attrs.define(eq=False)

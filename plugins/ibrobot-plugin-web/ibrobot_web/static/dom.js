@@ -26,6 +26,9 @@ export function refresh(element, description, make) {
 }
 
 let announced;
+// Removes all messages, e.g. when another view is shown.
+export function clearToasts() { announced?.replaceChildren(); }
+
 // A message for a few seconds; errors stay until the next one or a click.
 export function toast(text, kind = "info") {
   announced ??= document.body.appendChild(h("div", { class: "toasts", role: "status", "aria-live": "polite" }));

@@ -1,6 +1,6 @@
 // The page without a running robot: header, navigation, and one view at a time.
 
-import { h, refresh, say, toast } from "./dom.js";
+import { clearToasts, h, refresh, say, toast } from "./dom.js";
 
 const $ = (id) => document.getElementById(id);
 
@@ -74,7 +74,7 @@ async function ask(address, options) {
   try {
     response = await fetch(address, options);
   } catch {
-    throw new Error("the server of this page does not answer: is `ibrobot ui` still running?");
+    throw new Error("the server of this page does not answer: is ibrobot ui still running?");
   }
   const answer = response.headers.get("Content-Type")?.startsWith("application/json") ? await response.json() : null;
   if (!response.ok) {
@@ -105,6 +105,7 @@ async function showView() {
   }
   document.title = `ibrobot: ${ui.session.views.find((view) => view.name === name).title}`;
   if (current !== name) {
+    clearToasts();
     current = name;
     if (!views.has(name)) {
       const { View } = await import(`./ui/${name}.js`);
@@ -122,7 +123,7 @@ async function showView() {
 }
 
 function showConnection() {
-  say($("connection"), ui.connected ? "" : "not connected: is `ibrobot ui` running?");
+  say($("connection"), ui.connected ? "" : "not connected: is ibrobot ui running?");
   $("connection").classList.toggle("bad", !ui.connected);
 }
 

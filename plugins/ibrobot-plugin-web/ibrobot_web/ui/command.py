@@ -44,7 +44,7 @@ def ui(
     """Set up, launch and record robots in the browser.
 
     Reads and writes the files of each FOLDER, and no others; of the current folder by default. Prints the address of
-    the page, which contains a token. Ctrl-C ends the page, and every run and job that it started.
+    the page and one to watch only, each with its token. Ctrl-C ends the page, and every run and job that it started.
     """
     try:
         options = WebOptions(host=host, port=port, names=names, certificate=certificate, key=key)
@@ -84,8 +84,9 @@ async def _serve(options: WebOptions, context: Ui, *, browser: bool) -> None:
     await runner.setup()
     try:
         await web.SockSite(runner, listening, ssl_context=tls).start()
-        address = f"{'https' if tls else 'http'}://{names[0]}:{port}{guard.path('drive')}"
-        echo(f"page: {address}")
+        base = f"{'https' if tls else 'http'}://{names[0]}:{port}"
+        address = base + guard.path("drive")
+        echo(f"page: {address}  (to watch only: {base}{guard.path('watch')})")
         sys.stdout.flush()
         if browser and has_desktop():
             threading.Thread(target=webbrowser.open, args=(address,), name="browser", daemon=True).start()

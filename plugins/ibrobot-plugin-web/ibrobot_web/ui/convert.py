@@ -38,6 +38,8 @@ def start(ui: Ui, facts: Mapping[str, Any]) -> dict[str, int]:
     out = ui.folders.find(text(facts, "out"))
     if out in ui.folders.paths:
         raise IbrobotError(f"{out}: is an opened folder; choose a new folder in it, e.g. datasets/pick_cube")
+    if (out / "meta" / "info.json").is_file() and not flag(facts, "append"):
+        raise IbrobotError(f"{ui.folders.name(out)}: has a dataset already; choose “Add to it”, or another folder")
     arguments = ["convert", "--events", f"--out={out}"]
     for name, choices in _CHOICES.items():
         chosen = text(facts, name, "")

@@ -10,6 +10,11 @@ const TOOL = [
   ["roll left", { turn: [0, 0, -1] }], ["roll right", { turn: [0, 0, 1] }],
 ];
 
+const COMMANDS = {
+  policy: "The policy commands the robot.", operator: "An operator commands the robot.",
+  handover: "The robot brakes and holds until it is moved or given back.",
+};
+
 export class DrivePanel {
   id = "drive";
   title = "Drive";
@@ -68,9 +73,10 @@ export class DrivePanel {
     const { page } = this;
     const found = [];
     if (services.includes("goal")) found.push(...this.goals(services, status));
+    if (services.includes("intervene") || (services.includes("smoothing") && dispatch)) found.push(h("h3", {}, "Policy"));
     if (services.includes("intervene")) {
       const taken = status.commander !== "policy";
-      found.push(h("h3", {}, "Policy"), h("p", { class: "note" }, `Commands: ${status.commander}.`), h("div", { class: "row" },
+      found.push(h("p", { class: "note" }, COMMANDS[status.commander] ?? ""), h("div", { class: "row" },
         h("button", { class: taken ? "" : "primary", disabled: !page.operating || taken,
           onclick: () => page.command("intervene", { take: true }) }, "Take the robot from the policy"),
         h("button", { class: taken ? "primary" : "", disabled: !page.operating || !taken,
@@ -80,7 +86,7 @@ export class DrivePanel {
       const box = h("input", { type: "checkbox", disabled: !page.operating });
       box.checked = dispatch.smoothing;
       box.addEventListener("change", () => page.command("smoothing", { enabled: box.checked }));
-      found.push(h("h3", {}, "Policy"), h("label", { class: "row" }, box, "blend chunks (smoothing)"));
+      found.push(h("label", { class: "row" }, box, "blend chunks (smoothing)"));
     }
     return found;
   }

@@ -47,13 +47,15 @@ export class View {
     for (const job of this.ui.of("convert")) this.job(job);
     const found = await this.ui.attempt(() => this.ui.get("convert/list"));
     if (!found) return;
+    this.empty = !found.groups.length;
+    this.begin.disabled = !this.ui.drives || this.empty;
     refresh(this.known, found.datasets, () => found.datasets.map((path) => h("option", { value: path })));
     refresh(this.groups, found.groups, () => [h("legend", {}, "Episodes"), ...(found.groups.length
       ? found.groups.map(({ path, episodes }, i) => {
         const box = h("input", { type: "checkbox", value: path });
         box.checked = found.groups.length === 1 && i === 0;
         return h("label", { class: "row" }, box, `${path}: ${episodes} episode${episodes === 1 ? "" : "s"}`);
-      }) : [h("p", { class: "note" }, "No episodes in the opened folders.")])]);
+      }) : [h("p", { class: "note" }, "No episodes in the opened folders. Record some, in the view Record.")])]);
   }
 
   async start() {
@@ -63,7 +65,7 @@ export class View {
       paths, out: this.out.value, append: this.append.checked, success: this.success.checked, prompt: this.prompt.value,
       outcome: this.outcome.value, only: this.only.value, missing: this.missing.value, norm_mode: this.unit.value,
     }));
-    this.begin.disabled = !this.ui.drives;
+    this.begin.disabled = !this.ui.drives || this.empty;
   }
 
   job(job) {

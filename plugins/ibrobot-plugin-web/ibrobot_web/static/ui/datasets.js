@@ -53,7 +53,7 @@ export class View {
         h("table", {}, head(["Episode", "Length", "Frames", "Outcome", "Task", "Source"]), h("tbody", {}, facts.list.map((each) => h("tr", {},
           h("th", { scope: "row" }, h("button", { onclick: () => this.play(each.number) }, `Play ${each.number}`)),
           h("td", {}, `${each.seconds.toFixed(1)} s`), h("td", {}, String(each.frames)), h("td", {}, each.outcome),
-          h("td", {}, each.task), h("td", {}, each.source)))))))),
+          h("td", { class: each.task.length > 30 ? "text" : "" }, each.task), h("td", {}, each.source)))))))),
     h("div", { class: "card" }, h("h3", {}, "Features"), h("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Features" },
       h("table", {}, head(["Feature", "Type", "Shape", "Unit", "Value", "Minimum", "Mean", "Maximum", "Deviation"]),
         h("tbody", {}, facts.features.flatMap((feature) => rows(feature))))))];

@@ -94,17 +94,18 @@ export class View {
     const place = row.group === "." ? row.name : `${row.group}/${row.name}`;
     return h("tr", { class: row.path === this.path ? "current" : "" }, h("td", {}, box),
       h("th", { scope: "row" }, h("a", { href: `#episodes/${encodeURIComponent(row.path)}` }, place)),
-      h("td", {}, row.task || h("span", { class: "note" }, "none")),
+      h("td", { class: row.task.length > 30 ? "text" : "" }, row.task || h("span", { class: "note" }, "none")),
       h("td", {}, row.duration_s === null ? "" : `${row.duration_s.toFixed(1)} s`),
       h("td", {}, began(row.began_s)),
       h("td", {}, size(row.bytes)),
       h("td", { class: { success: "good", failure: "bad" }[row.outcome] ?? "" }, row.outcome),
-      h("td", { class: "bad" }, row.problems.join("; ")));
+      h("td", { class: row.problems.length ? "bad text" : "" }, row.problems.join("; ")));
   }
 
   bulkControls(rows) {
     const paths = rows.map(({ path }) => path).filter((path) => this.chosen.has(path));
-    if (!paths.length) return [h("p", { class: "note" }, `${rows.length} episodes. Choose some to judge or delete them together.`)];
+    if (!rows.length) return [];
+    if (!paths.length) return [h("p", { class: "note" }, `${rows.length} episode${rows.length === 1 ? "" : "s"}. Choose some to judge or delete them together.`)];
     const off = !this.ui.drives;
     return [h("span", {}, `${paths.length} chosen:`),
       ...OUTCOMES.map((outcome) => h("button", { disabled: off, onclick: () => this.mark(paths, outcome) }, `Judge ${outcome}`)),

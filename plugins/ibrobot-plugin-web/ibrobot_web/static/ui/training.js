@@ -38,14 +38,15 @@ export class View {
     this.model = h("input", { type: "text", id: "use-model", placeholder: "the first LeRobot model, or a new one" });
     this.mode = h("input", { type: "text", id: "use-mode", placeholder: "for a new model" });
     this.change = h("div", { "aria-live": "polite" });
-    const show = h("button", { class: "primary" }, "Show the change");
+    this.look = h("button", { class: "primary", disabled: true }, "Show the change");
+    this.none = h("p", { class: "note", hidden: true }, "No trained policies in the opened folders.");
     const form = h("form", {}, h("div", { class: "fields" },
       h("label", { for: "use-checkpoint" }, "Policy"), this.checkpoint, h("label", { for: "use-robot" }, "Robot"), this.robot,
       h("label", { for: "use-model" }, "Model"), this.model, h("label", { for: "use-mode" }, "Mode"), this.mode),
-    h("div", { class: "row" }, show));
+    h("div", { class: "row" }, this.look));
     form.addEventListener("submit", (event) => { event.preventDefault(); this.preview(); });
     for (const each of [this.checkpoint, this.robot, this.model, this.mode]) each.addEventListener("change", () => this.change.replaceChildren());
-    return h("section", { class: "card", "aria-labelledby": "use-title" }, h("h3", { id: "use-title" }, "Use a trained policy"), form, this.change);
+    return h("section", { class: "card", "aria-labelledby": "use-title" }, h("h3", { id: "use-title" }, "Use a trained policy"), this.none, form, this.change);
   }
 
   async show(shown) {
@@ -64,9 +65,11 @@ export class View {
       found.checkpoints.map(({ path, changed_s: at }) => `${path} (${new Date(at * 1000).toLocaleString([], { dateStyle: "short", timeStyle: "short" })})`));
     fill(this.robot, robots.map(({ robot }) => robot), robots.map(({ robot }) => robot));
     this.begin.disabled = !this.ui.drives || Boolean(found.missing) || !found.datasets.length;
+    this.look.disabled = !found.checkpoints.length;
+    this.none.hidden = found.checkpoints.length > 0;
     refresh(this.missing, found, () => [
       found.missing ? h("div", { class: "problem" }, "Training needs LeRobot. Install it where ibrobot is installed:\n", h("code", {}, found.missing)) : null,
-      found.datasets.length ? null : h("p", { class: "note" }, "No datasets in the opened folders. Convert episodes into one."),
+      found.datasets.length ? null : h("p", { class: "note" }, "No datasets in the opened folders. Convert episodes into one, in the view Convert."),
     ].filter(Boolean));
   }
 
