@@ -310,7 +310,7 @@ def look_at_training(chromium: Any, look: Look) -> None:
             print("runs", run_page.evaluate("[ibrobot.status.mode, ibrobot.status.counts.dispatch]"), flush=True)
             run_page.get_by_role("tab", name="Plots").click()
             run_page.wait_for_timeout(3000)
-            run_page.get_by_label("Topic").select_option("counters of dispatch")
+            run_page.locator("#plot-topic").select_option("counters of dispatch")
             look(run_page, "run-trained")
 
 

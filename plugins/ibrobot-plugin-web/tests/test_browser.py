@@ -150,10 +150,16 @@ def test_one_operates_the_other_watches_and_takes_over(chromium: Any, address: s
     try:
         assert "watching" in other.text("#operator")
         assert other.page.locator("#thumb").is_hidden()
+        for name in ("Reset", "End the run"):
+            assert other.page.get_by_role("button", name=name, exact=True).is_disabled()
+        assert other.page.locator(".joint .jog:visible, .joint :enabled, .motion button").count() == 0
         other.page.get_by_role("button", name="Take over").click()
         other.until(lambda: other.ask("ibrobot.operating"))
         tab.until(lambda: not tab.ask("ibrobot.operating"))
         assert "operates" in tab.text("#operator")
+        late = tab.ask("ibrobot.drive.call('mode', {mode: 'jog'}).then(() => 'done', (error) => error.message)")
+        assert "take over first" in late
+        assert other.ask("ibrobot.status.mode") == "web"
         other.until(lambda: other.page.locator("#thumb").is_visible())
         assert other.ask("document.documentElement.scrollWidth") <= 390
         box = other.page.locator("#stop").bounding_box()
@@ -169,6 +175,16 @@ def test_a_goal_is_previewed_before_it_is_executed(tab: Tab) -> None:
     tab.page.get_by_role("button", name="moveit_planning").click()
     tab.until(lambda: tab.page.locator("#goal").is_visible())
     before = tab.position(1)
+    tab.ask("window.scrollTo(0, 0)")
+    tab.until(lambda: tab.ask("ibrobot.view.frames") > 2)
+    x, y = tab.ask("ibrobot.view.handle()")
+    tab.page.mouse.move(x, y)
+    tab.page.mouse.down()
+    tab.page.mouse.move(x, y - 30, steps=4)
+    tab.page.mouse.up()
+    tab.until(lambda: tab.page.locator("#goal").input_value().startswith("xyz="))
+    tab.until(lambda: "path" in tab.text(".toasts"))
+    tab.ask("document.querySelector('.toasts').replaceChildren()")
     tab.page.get_by_role("button", name="rest", exact=True).click()
     tab.until(lambda: "The path takes" in tab.text(".toasts"))
     assert abs(tab.position(1) - before) < 0.02

@@ -159,14 +159,21 @@ def test_events_become_progress_results_and_problems() -> None:
 def test_the_loss_of_a_training_is_plotted(ui: Ui) -> None:
     read = training.event_reader(ui)
     facts: dict[str, Any] = {}
+    said = []
     for line in events(
-        {"event": "begin", "steps": 10}, {"event": "progress", "step": 5, "steps": 10, "loss": 0.5, "seconds": 60.0},
+        {"event": "begin", "steps": 10}, {"event": "progress", "step": 1, "steps": 10, "loss": 0.7, "seconds": 300.0},
+        {"event": "progress", "step": 4, "steps": 10, "loss": 0.5, "seconds": 360.0},
+        {"event": "progress", "step": 9, "steps": 10, "loss": 0.4, "seconds": 460.0},
         {"event": "report", "checkpoint": "training/checkpoints/000010/pretrained_model"},
     ):  # fmt: skip
         facts |= read(line) or {}
-        if "points" in facts and "checkpoint" not in facts:
-            assert facts["text"] == "step 5 of 10, loss 0.5, about 1 min left"
-    assert (facts["points"], facts["steps"], facts["progress"]) == ([(5, 0.5)], 10, 1.0)
+        said.append(facts["text"])
+    assert said[1:4] == [
+        "step 1 of 10, loss 0.7",
+        "step 4 of 10, loss 0.5, about 2 min left",
+        "step 9 of 10, loss 0.4, less than a minute left",
+    ]
+    assert (facts["points"], facts["steps"], facts["progress"]) == ([(1, 0.7), (4, 0.5), (9, 0.4)], 10, 1.0)
 
 
 @needs_data

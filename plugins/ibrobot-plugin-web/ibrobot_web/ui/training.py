@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import hashlib
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -76,6 +76,8 @@ def start(ui: Ui, facts: Mapping[str, Any]) -> dict[str, int]:
 def event_reader(ui: Ui) -> Reader:
     """A function that reads the events of `ibrobot train --events`: progress, text, points of the loss, checkpoint."""
     points: list[tuple[int, float]] = []
+    reports: list[tuple[int, float]] = []
+    """The first report's step and time, before which LeRobot loads, and the newest one's."""
 
     def read(line: str) -> Mapping[str, Any] | None:
         event = parse_event(line)
@@ -86,11 +88,12 @@ def event_reader(ui: Ui) -> Reader:
                 step, steps = int(event["step"]), int(event["steps"])
                 points.append((step, float(event["loss"])))
                 del points[:-_POINTS]
-                left_s = event["seconds"] / step * (steps - step)
+                reports[1:] = [(step, float(event["seconds"]))]
+                left = f", {_left(reports, steps)} left" if len(reports) > 1 else ""
                 return {
                     "progress": step / steps,
                     "points": list(points),
-                    "text": f"step {step} of {steps}, loss {event['loss']:.4g}, about {left_s / 60:.0f} min left",
+                    "text": f"step {step} of {steps}, loss {event['loss']:.4g}{left}",
                 }
             case "report":
                 checkpoint = ui.folders.name(Path(event["checkpoint"]).resolve())
@@ -98,6 +101,13 @@ def event_reader(ui: Ui) -> Reader:
         return None
 
     return read
+
+
+def _left(reports: Sequence[tuple[int, float]], steps: int) -> str:
+    """The time left, from the rate since the first report."""
+    (first, begin_s), (step, now_s) = reports
+    left_s = (now_s - begin_s) / max(1, step - first) * (steps - step)
+    return f"about {left_s / 60:.0f} min" if left_s >= 60 else "less than a minute"
 
 
 def preview(ui: Ui, facts: Mapping[str, Any]) -> dict[str, Any]:
