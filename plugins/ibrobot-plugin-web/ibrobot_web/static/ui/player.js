@@ -34,7 +34,7 @@ export class Player {
       SPEEDS.map((speed) => h("option", { value: speed, selected: speed === 1 }, `${speed}×`)));
     this.topic = h("select", { id: `${this.routes}-topic` });
     this.topic.addEventListener("change", () => this.plot());
-    this.group = h("select", { "aria-label": "Values" });
+    this.group = h("select", { "aria-label": "Values", hidden: true });
     this.group.addEventListener("change", () => this.draw());
     this.canvas = h("canvas", { class: "plot", role: "img", "aria-label": "Plot of the chosen topic; a click moves the time" });
     this.canvas.addEventListener("pointerdown", (event) => {
