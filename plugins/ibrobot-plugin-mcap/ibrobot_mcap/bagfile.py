@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import IO, Any, cast
@@ -19,6 +20,12 @@ from ibrobot_mcap.scan import REPEATED
 
 LIBRARY = f"ibrobot-plugin-mcap {version('ibrobot-plugin-mcap')}"
 _COMPRESSION = {"none": CompressionType.NONE, "lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD}
+
+
+@cache
+def _qos_text(latched: bool) -> str:
+    """The QoS profiles of a topic's publishers, as YAML."""
+    return dump(offered_qos(latched))
 
 
 @attrs.frozen
@@ -79,7 +86,7 @@ class BagFile:
             encoding = "ros2idl" if is_idl(text) else "ros2msg"
             self._schemas[topic.type] = self._writer.register_schema(topic.type, encoding, text.encode())
         metadata = {
-            "offered_qos_profiles": dump(offered_qos(topic.latched)),
+            "offered_qos_profiles": _qos_text(topic.latched),
             "topic_type_hash": topic.type_hash(),
         }
         with _whole_records(self._output):

@@ -6,6 +6,7 @@ import errno
 import os
 import resource
 import threading
+import time
 from collections import Counter
 from contextlib import contextmanager
 from typing import Any
@@ -250,6 +251,8 @@ def test_a_disk_that_fills_up_ends_the_episode_whole(bench, monkeypatch, threade
     made = bench(threaded=threaded, min_free=200 * MIB, chunk_period_s=0.001)
     made.begin()
     made.write(50)
+    while made.recorder.waiting():  # a busy machine has its thread come later
+        time.sleep(0.001)
     disk.free = 100 * MIB
     big = picture(0)
     big = Image(big.header, 2048, 2048, "mono8", 2048, np.zeros(4 * MIB))
