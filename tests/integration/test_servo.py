@@ -67,5 +67,5 @@ def test_twists_from_another_process_move_the_tool(tmp_path: Path, ibrobot: tupl
             assert height() > before + 0.03
         finally:
             launched.terminate()
-            out, err = launched.communicate(timeout=30)
+            out, err = launched.communicate(timeout=120)
     assert json.loads(out.splitlines()[-1])["faults"] == [], err

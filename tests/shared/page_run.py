@@ -49,7 +49,7 @@ def page_run(*arguments: str, folder: Path | None = None, command: Sequence[str]
         finally:
             run.send_signal(signal.SIGINT)
             try:
-                run.wait(20)
+                run.wait(60)
             finally:
                 run.kill()
                 run.wait()

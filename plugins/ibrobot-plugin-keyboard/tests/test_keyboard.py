@@ -311,7 +311,7 @@ def test_typing_in_a_terminal_moves_a_joint():
             teleop = KeyboardTeleop(KeyboardOptions(cartesian=False), host_context(keys=keys.subscribe))
             teleop.connect()
             os.write(person, b"w")
-            assert seen.get(timeout=10) == "w"
+            assert seen.get(timeout=60) == "w"
             # The reader feeds its subscribers one after another under one lock; subscribing again waits for that.
             keys.subscribe()
             first, second = (

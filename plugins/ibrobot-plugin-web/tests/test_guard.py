@@ -74,7 +74,7 @@ async def call(socket: aiohttp.ClientWebSocketResponse, **message: Any) -> dict[
     """Send a command and wait for its answer."""
     await socket.send_json({"id": 1, **message})
     while True:
-        answer: dict[str, Any] = await socket.receive_json(timeout=5)
+        answer: dict[str, Any] = await socket.receive_json(timeout=60)
         if answer.get("id") == 1:
             return answer
 
@@ -183,7 +183,7 @@ def test_a_large_upload_is_refused_without_reading_it() -> None:
             with contextlib.suppress(aiohttp.ClientError, ConnectionError):
                 await socket.send_bytes(bytes(100 << 20))
             with contextlib.suppress(aiohttp.ClientError, ConnectionError):
-                while (await socket.receive(timeout=5)).type is aiohttp.WSMsgType.TEXT:
+                while (await socket.receive(timeout=60)).type is aiohttp.WSMsgType.TEXT:
                     pass
             assert socket.closed
             await socket.close()
@@ -204,7 +204,7 @@ def test_malformed_messages_are_refused_and_harm_nobody() -> None:
             await server.signed_in(browser)
             await server.signed_in(other)
             operator = await other.ws_connect("/drive")
-            await operator.receive_json(timeout=5)
+            await operator.receive_json(timeout=60)
             sent = 0
             while sent < MALFORMED:
                 text = wrong[sent // 20 % len(wrong)]
@@ -215,7 +215,7 @@ def test_malformed_messages_are_refused_and_harm_nobody() -> None:
                     if len(text) > LARGEST_MESSAGE:
                         break
                 with contextlib.suppress(ConnectionError):
-                    while (await socket.receive(timeout=5)).type is aiohttp.WSMsgType.TEXT:
+                    while (await socket.receive(timeout=60)).type is aiohttp.WSMsgType.TEXT:
                         pass
                 await socket.close()
                 if sent % 1000 < 20:  # it also answers the server's pings
@@ -297,12 +297,12 @@ def test_slow_pages_skip_frames_and_delay_nobody() -> None:
             got = []
             for i in range(200):
                 server.broadcast.publish(0, i.to_bytes(2, "big"))
-                got.append(int.from_bytes((await fast.receive_bytes(timeout=5))[1:], "big"))
+                got.append(int.from_bytes((await fast.receive_bytes(timeout=60))[1:], "big"))
                 await fast.send_bytes(b"\x00")
             assert got == list(range(200))
-            late = [int.from_bytes((await slow.receive_bytes(timeout=5))[1:], "big") for _ in range(2)]
+            late = [int.from_bytes((await slow.receive_bytes(timeout=60))[1:], "big") for _ in range(2)]
             assert late == [0, 1], "without acknowledgements only the credits arrive"
             await slow.send_bytes(b"\x00")
-            assert int.from_bytes((await slow.receive_bytes(timeout=5))[1:], "big") == 199
+            assert int.from_bytes((await slow.receive_bytes(timeout=60))[1:], "big") == 199
 
     run(test)

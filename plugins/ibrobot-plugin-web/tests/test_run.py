@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import itertools
-import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from typing import Any
 
@@ -20,8 +19,10 @@ pytestmark = [
     pytest.mark.integration,
     pytest.mark.skipif(("hardware", "mujoco") not in installed_plugins().entries, reason="needs ibrobot-plugin-mujoco"),
 ]
-HOLD_S = 0.3
-"""How long after a page is gone the robot may move."""
+HOLD_NS = 500_000_000
+"""An arm whose commands stay the same for so long holds [ns]. `benchmarks/web_page.py deadman` measures how soon."""
+FAR_RAD = 1.5
+"""What an arm that went on would reach, on its way to a limit [rad]."""
 MOVING_RAD = 1e-4
 """Change of a command between two states that counts as motion."""
 MALFORMED = 200
@@ -69,12 +70,9 @@ def test_the_arm_holds_soon_after_the_operator_is_gone(address: str, end: str) -
                     await operator.drive.close()
                 elif end == "cut":
                     operator.cut()
-                gone_ns = time.time_ns()
-                await asyncio.sleep(0.8)
-            last_ns = moved_until_ns(watcher)
-            assert last_ns > gone_ns - 1e9, "it did not move at all"
-            assert (last_ns - gone_ns) * 1e-9 <= HOLD_S
-            assert watcher.states[-1]["stamp"] > last_ns + 3e8, "states went on arriving"
+                await watcher.until(lambda: moved_until_ns(watcher))  # it moves at all
+                await watcher.until(lambda: watcher.states[-1]["stamp"] > moved_until_ns(watcher) + HOLD_NS)
+            assert abs(watcher.states[-1]["command"][0]) < FAR_RAD
 
     run(test)
 

@@ -18,7 +18,7 @@ import aiohttp
 UNCHECKED = ssl.create_default_context()
 UNCHECKED.check_hostname = False
 UNCHECKED.verify_mode = ssl.CERT_NONE
-_WAIT_S = 5.0
+_WAIT_S = 60.0
 
 
 def hand(**changes: Any) -> dict[str, Any]:
