@@ -133,7 +133,7 @@ def panel(
     return Group(  # `Live` cuts off what does not fit
         styled(" ").join(styled(key, "bold reverse") + styled(f" {does}", "bold") for key, does in KEYS.items()),
         *_faults(session),
-        _Newest(log.lines),
+        _Newest(tuple(log.lines)),  # other threads log while it is drawn
         modes,
         *([styled(help_text, "cyan")] if help_text else []),
         *(styled(f"{heading:<10}", "bold") + styled(row) for heading, row in (*more, *_facts(session, rates))),

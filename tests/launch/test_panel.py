@@ -73,6 +73,17 @@ def estop(run: Runtime) -> None:
         run.step()
 
 
+def test_a_message_may_come_while_the_panel_is_drawn(terminal: Terminal):
+    class Interrupted:
+        def __rich__(self) -> str:
+            terminal.log.emit(logging.makeLogRecord({"msg": "late", "levelno": logging.INFO}))
+            return "drawn"
+
+    terminal.lines("first")
+    terminal.log.lines.append(Interrupted())
+    assert "drawn" in terminal.words()
+
+
 def test_keys_come_first_and_nothing_scrolls_away(terminal: Terminal):
     lines = terminal.lines("a message")
     shown = " ".join(" ".join(lines).split())
