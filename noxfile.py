@@ -256,15 +256,6 @@ def types(session: nox.Session) -> None:
 
 
 @nox.session
-@nox.parametrize("name", PLUGINS, ids=PLUGINS)
-def plugin(session: nox.Session, name: str) -> None:
-    """A plugin's tests with that plugin and core alone; those in a browser run in `integration`."""
-    install(session, name)
-    system_libraries(session)
-    session.run(*PYTEST, str(FOLDERS[name] / "tests"), *session.posargs)
-
-
-@nox.session
 def wheels(session: nox.Session) -> None:
     """Whether everything, with all extras, installs from wheels on each platform; what is installed runs by itself."""
     projects = [str(folder / "pyproject.toml") for folder in LOCAL.values()]
@@ -283,6 +274,15 @@ def wheels(session: nox.Session) -> None:
             for command in commands:
                 program, *arguments = shlex.split(command, comments=True)
                 session.run(str(environment / "bin" / program), *arguments, external=True)
+
+
+@nox.session
+@nox.parametrize("name", PLUGINS, ids=PLUGINS)
+def plugin(session: nox.Session, name: str) -> None:
+    """A plugin's tests with that plugin and core alone; those in a browser run in `integration`."""
+    install(session, name)
+    system_libraries(session)
+    session.run(*PYTEST, str(FOLDERS[name] / "tests"), *session.posargs)
 
 
 @nox.session
